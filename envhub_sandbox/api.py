@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from envhub_sandbox.making.making import make
-from envhub_sandbox.making.options import Options
+from envhub_sandbox.factory.make import make
+from envhub_sandbox.options import Options
 from envhub_sandbox.policy import Limits, Policy, Timeouts
 from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.vector.suites import EnvSuites
@@ -74,7 +74,7 @@ def make_env(
         num_workers: Processes over which the sub-environments are spread; by default one, or with
             ``use_async_envs`` as many as are useful for the cores there are.
         prewarm: How many of a suite's next tasks are started in the background when a task is first
-            reset, and so how many jails there are at most that nobody has used yet. By default one,
+            reset, and so how many unused jails there are at most. By default one,
             once tasks are seen to be closed before the next is reset, on this machine and without
             a GPU; else none.
         lane: ``"auto"`` steps over shared memory where that is possible, ``"frames"`` never does.
@@ -101,26 +101,5 @@ def make_env(
             (``ServerBusyError``).
         RuntimeError: ``sandbox=None`` without ``trust_remote_code=True``.
     """
-    options = Options(
-        n_envs=n_envs,
-        use_async_envs=use_async_envs,
-        hub_cache_dir=hub_cache_dir,
-        trust_remote_code=trust_remote_code,
-        sandbox=sandbox,
-        env_kwargs=env_kwargs,
-        policy=policy,
-        timeouts=timeouts,
-        limits=limits,
-        token=token,
-        endpoint=endpoint,
-        python=python,
-        dependencies=dependencies,
-        lock=lock,
-        num_workers=num_workers,
-        prewarm=prewarm,
-        lane=lane,
-        copy=copy,
-        validate=validate,
-        server_key=server_key,
-    )
-    return make(make_env, cfg, options)
+    given = locals().copy()  # the arguments, as long as nothing else has a name here
+    return make(make_env, given.pop("cfg"), Options(**given))

@@ -1,42 +1,103 @@
-"""The command line's commands."""
+"""The program ``envhub`` and its commands.
+
+Typer's classes have what all commands share, since no callback sees the errors of its parser:
+guarded output, help that is text, errors that name options.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Annotated
+import inspect as python
+from collections.abc import Callable, Mapping
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand, TyperGroup
 
-from envhub_sandbox.cli import (
-    cache,
-    diff,
-    gc,
-    image,
-    lock,
-    prefetch,
-    push,
-    replay,
-    version,
-)
+from envhub_sandbox.cli import cache, diff, image, lock, prefetch, push, replay, run, version
 from envhub_sandbox.cli.check.check import check
 from envhub_sandbox.cli.doctor.doctor import doctor
 from envhub_sandbox.cli.init.init import init
 from envhub_sandbox.cli.inspect.inspect import inspect
-from envhub_sandbox.cli.run.run import run
+from envhub_sandbox.cli.shared.console import guarded
 from envhub_sandbox.cli.shared.exits import EXIT_CODES
-from envhub_sandbox.cli.shared.program import Command, Program
+from envhub_sandbox.option_names import on_command_line, use_option_names
 
-app = typer.Typer(
+_COMMANDS: dict[str, Callable[..., None]] = {
+    "run": run.run,
+    "inspect": inspect,
+    "check": check,
+    "diff": diff.diff,
+    "prefetch": prefetch.prefetch,
+    "lock": lock.lock,
+    "verify": lock.verify,
+    "init": init,
+    "push": push.push,
+    "replay": replay.replay,
+    "doctor": doctor,
+    "gc": cache.gc,
+    "version": version.version,
+}
+_GROUPS: dict[str, tuple[str, dict[str, Callable[..., None]]]] = {
+    "cache": (
+        "List and remove what was downloaded, and made of it.",
+        {"list": cache.list_, "remove": cache.remove},
+    ),
+    "image": ("Container images for repositories.", {"build": image.build}),
+}
+
+
+class Program(TyperGroup):
+    """``envhub``: CI systems obey nothing of what it prints, usage errors included."""
+
+    def main(self, *args: Any, **options: Any) -> Any:
+        """Run a command."""
+        with guarded():
+            return super().main(*args, **options)
+
+
+class Command(TyperCommand):
+    """One command, whose errors name the options that it has."""
+
+    def __init__(self, *args: Any, **given: Any) -> None:
+        super().__init__(*args, **given)
+        paragraphs = python.cleandoc(self.help or "").split("\n\n")
+        # rich keeps the ends of lines of all but the first
+        self.help = "\n\n".join(" ".join(one.split()) for one in paragraphs)
+
+    def invoke(self, ctx: Any) -> Any:
+        """Call the function."""
+        known = {name for one in self.params for name in one.opts}
+        with use_option_names(on_command_line(known)):
+            return super().invoke(ctx)
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        """Print the help, in which rich reads no ``[word]`` of an option as markup."""
+        for one in self.params:
+            text = getattr(one, "help", None)
+            if text:
+                vars(one)["help"] = text.replace("[", "\\[")
+        super().format_help(ctx, formatter)
+
+
+def _group(text: str, commands: Mapping[str, Callable[..., None]], **options: Any) -> typer.Typer:
+    made = typer.Typer(help=text, no_args_is_help=True, rich_markup_mode="rich", **options)
+    for name, command in commands.items():
+        made.command(name, cls=Command, no_args_is_help=command is cache.remove)(command)
+    return made
+
+
+app = _group(
+    "Run anybody's Gymnasium environment from the Hugging Face Hub, without letting its code "
+    "into your process.",
+    _COMMANDS,
     name="envhub",
     cls=Program,
-    help="Run anybody's Gymnasium environment from the Hugging Face Hub, without letting its code "
-    "into your process.",
     epilog=EXIT_CODES,
-    no_args_is_help=True,
     pretty_exceptions_enable=False,
-    rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
+for name, group in _GROUPS.items():
+    app.add_typer(_group(*group), name=name)
 
 
 def _print_versions(wanted: bool) -> None:
@@ -58,24 +119,3 @@ def envhub(
     ] = False,
 ) -> None:
     """What stands before a command."""
-
-
-_COMMANDS: dict[str, Callable[..., None]] = {
-    "run": run,
-    "inspect": inspect,
-    "check": check,
-    "diff": diff.diff,
-    "prefetch": prefetch.prefetch,
-    "lock": lock.lock,
-    "verify": lock.verify,
-    "init": init,
-    "push": push.push,
-    "replay": replay.replay,
-    "doctor": doctor,
-    "gc": gc.gc,
-    "version": version.version,
-}
-for name, command in _COMMANDS.items():
-    app.command(name, cls=Command, epilog=EXIT_CODES)(command)
-app.add_typer(cache.app, name="cache")
-app.add_typer(image.app, name="image")

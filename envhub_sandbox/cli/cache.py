@@ -1,35 +1,30 @@
-"""``envhub cache``: what lies in the stores of snapshots and of environments, and how it goes."""
+"""``envhub cache``: the stores of snapshots and environments; ``envhub gc``: what was left."""
 
 from __future__ import annotations
 
 import json as json_module
 import shutil
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from envhub_sandbox.cli.shared.console import print_json, say, show_rows
-from envhub_sandbox.cli.shared.exits import UsageError, reported
-from envhub_sandbox.cli.shared.program import Command
+from envhub_sandbox.cli.shared import options as opt
+from envhub_sandbox.cli.shared.console import out, print_json, safe_line, say, show_rows
+from envhub_sandbox.cli.shared.exits import Exit, UsageError
 from envhub_worker.protocol.text import counted, size_text
 
 if TYPE_CHECKING:
     from envhub_sandbox.dependencies.environments import Environment
 
-app = typer.Typer(
-    help="List and remove what was downloaded, and made of it.",
-    no_args_is_help=True,
-    rich_markup_mode="rich",
-)
-
 _DAY_S = 24 * 3600.0
 
 
 @dataclass(frozen=True)
-class Stored:
+class StoredSnapshot:
     """A snapshot in the store.
 
     Attributes:
@@ -55,7 +50,7 @@ class Stored:
         return name == self.repository or (len(name) >= 7 and self.commit.startswith(name))
 
 
-def stored_snapshots() -> list[Stored]:
+def stored_snapshots() -> list[StoredSnapshot]:
     """Everything in the store, the latest used first. Nothing is verified."""
     from envhub_sandbox.hub import store
 
@@ -65,7 +60,7 @@ def stored_snapshots() -> list[Stored]:
     return sorted((one for one in found if one is not None), key=lambda one: -one.used)
 
 
-def _read(record: Path) -> Stored | None:
+def _read(record: Path) -> StoredSnapshot | None:
     try:
         document = json_module.loads(record.read_bytes())
         size = sum(row[1] for row in document["files"])
@@ -74,7 +69,7 @@ def _read(record: Path) -> Stored | None:
         return None
     home = record.parent
     revision = document.get("revision")
-    return Stored(_repository(home.parent.name), home.name, revision, used, size, home)
+    return StoredSnapshot(_repository(home.parent.name), home.name, revision, used, size, home)
 
 
 def _repository(name: str) -> str:
@@ -83,45 +78,32 @@ def _repository(name: str) -> str:
     return prefix + "/".join(parts) if parts else name
 
 
-@app.command("list", cls=Command)
+@opt.with_options()
 def list_(
-    json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    json: opt.Json = False,
 ) -> None:
     """List snapshots, and the environments of their packages, the latest used first."""
     from envhub_sandbox.dependencies import environments
     from envhub_sandbox.hub import store
 
-    with reported(debug=False):
-        found, made = stored_snapshots(), environments.every()
-        if json:
-            document = {"folder": str(store.cache_root()), "snapshots": _data(found)}
-            print_json({**document, "environments": _environment_data(made)})
-            return
-        if found:
-            _print(found)
-        if made:
-            _print_environments(made)
-        say(f"{_told(found, made)}, in {store.cache_root()}")
+    found, made = stored_snapshots(), environments.every()
+    if json:
+        own = _documents(found, repository="repository", commit="commit", revision="revision")
+        theirs = _documents(made, name="key", python="python", version="version", packages="pins")
+        folder = str(store.cache_root())
+        print_json({"folder": folder, "snapshots": own, "environments": theirs})
+        return
+    if found:
+        _print(found)
+    if made:
+        _print_environments(made)
+    say(f"{_told(found, made)}, in {store.cache_root()}")
 
 
-def _told(found: list[Stored], made: list[Environment]) -> str:
+def _told(found: list[StoredSnapshot], made: list[Environment]) -> str:
     total = sum(one.size for one in found) + sum(one.size for one in made)
     snapshots, environments = counted(len(found), "snapshot"), counted(len(made), "environment")
     return f"{snapshots}, {environments}, {size_text(total)}"
-
-
-def _environment_data(made: list[Environment]) -> list[dict[str, Any]]:
-    return [
-        {
-            "name": one.key,
-            "python": one.python,
-            "version": one.version,
-            "packages": list(one.pins),
-            "last_used": time.strftime("%FT%TZ", time.gmtime(one.used)),
-            "bytes": one.size,
-        }
-        for one in made
-    ]
 
 
 def _print_environments(made: list[Environment]) -> None:
@@ -132,12 +114,11 @@ def _print_environments(made: list[Environment]) -> None:
     show_rows([("environment", "Python", "last used", "size", "packages"), *rows], right=(3,))
 
 
-def _data(found: list[Stored]) -> list[dict[str, Any]]:
+def _documents(found: Sequence[StoredSnapshot | Environment], **named: str) -> list[dict[str, Any]]:
+    """What is stored as data: by name, which attribute; and what all have."""
     return [
         {
-            "repository": one.repository,
-            "commit": one.commit,
-            "revision": one.revision,
+            **{name: getattr(one, attribute) for name, attribute in named.items()},
             "last_used": time.strftime("%FT%TZ", time.gmtime(one.used)),
             "bytes": one.size,
         }
@@ -145,7 +126,7 @@ def _data(found: list[Stored]) -> list[dict[str, Any]]:
     ]
 
 
-def _print(found: list[Stored]) -> None:
+def _print(found: list[StoredSnapshot]) -> None:
     rows = [
         (one.repository, one.commit, one.revision or "", _day(one.used), size_text(one.size))
         for one in found
@@ -157,7 +138,7 @@ def _day(seconds: float) -> str:
     return time.strftime("%F", time.localtime(seconds))
 
 
-@app.command("remove", cls=Command, no_args_is_help=True)
+@opt.with_options()
 def remove(
     names: Annotated[
         list[str] | None,
@@ -171,32 +152,32 @@ def remove(
         bool, typer.Option("--all", help="Everything, remembered descriptions included.")
     ] = False,
     unused_for: Annotated[
-        float | None, typer.Option(metavar="DAYS", min=0, help="What nobody used for so long.")
+        float | None,
+        typer.Option(metavar="DAYS", min=0, help="What was not used for so long."),
     ] = None,
 ) -> None:
     """Remove snapshots and environments, and what was left half-made. Not while one is used."""
     from envhub_sandbox.dependencies import environments
     from envhub_sandbox.hub import store
 
-    with reported(debug=False):
-        found, made = stored_snapshots(), environments.every()
-        if everything:
-            for folder in ("manifests", "resolutions"):
-                shutil.rmtree(store.cache_root() / folder, ignore_errors=True)
-        else:
-            found, made = _chosen(found, made, names or [], unused_for)
-        kept = {one.commit: why for one in found if (why := _users_of(one))}
-        kept |= {one.key: why for one in made if (why := environments.remove(one))}
-        environments.remove_abandoned()
-        gone = [one for one in found if one.commit not in kept]
-        say(f"Removed {_told(gone, [one for one in made if one.key not in kept])}.")
-        if kept and names:
-            raise UsageError("; ".join(kept.values()))
-        for why in kept.values():
-            say(f"Kept: {why}.")
+    found, made = stored_snapshots(), environments.every()
+    if everything:
+        for folder in ("manifests", "resolutions"):
+            shutil.rmtree(store.cache_root() / folder, ignore_errors=True)
+    else:
+        found, made = _chosen(found, made, names or [], unused_for)
+    kept = {one.commit: why for one in found if (why := _users_of(one))}
+    kept |= {one.key: why for one in made if (why := environments.remove(one))}
+    environments.remove_abandoned()
+    gone = [one for one in found if one.commit not in kept]
+    say(f"Removed {_told(gone, [one for one in made if one.key not in kept])}.")
+    if kept and names:
+        raise UsageError("; ".join(kept.values()))
+    for why in kept.values():
+        say(f"Kept: {why}.")
 
 
-def _users_of(one: Stored) -> str:
+def _users_of(one: StoredSnapshot) -> str:
     """Remove a snapshot; who uses it, if somebody does: then it stays."""
     from envhub_sandbox.hub import store
 
@@ -210,9 +191,9 @@ def _users_of(one: Stored) -> str:
 
 
 def _chosen(
-    found: list[Stored], made: list[Environment], names: list[str], unused_for: float | None
-) -> tuple[list[Stored], list[Environment]]:
-    everyone: list[Stored | Environment] = [*found, *made]
+    found: list[StoredSnapshot], made: list[Environment], names: list[str], unused_for: float | None
+) -> tuple[list[StoredSnapshot], list[Environment]]:
+    everyone: list[StoredSnapshot | Environment] = [*found, *made]
     for name in names:
         if not any(one.answers_to(name) for one in everyone):
             raise UsageError(f"nothing in the store is called {name!r}; see: envhub cache list")
@@ -220,8 +201,41 @@ def _chosen(
     if not names and oldest is None:
         return [], []
 
-    def is_chosen(one: Stored | Environment) -> bool:
+    def is_chosen(one: StoredSnapshot | Environment) -> bool:
         meant = not names or any(one.answers_to(name) for name in names)
         return meant and (oldest is None or one.used < oldest)
 
     return [one for one in found if is_chosen(one)], [one for one in made if is_chosen(one)]
+
+
+@opt.with_options()
+def gc(
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", "-n", help="Say what would be removed.")
+    ] = False,
+    json: opt.Json = False,
+) -> None:
+    """Remove containers, runtime folders and control groups whose client is gone.
+
+    Usually there are none: they end with the client. Never touched are those of a client that
+    still runs, of another machine's clients while they run, or of anything but envhub; nor those
+    of another user, but root removes every user's containers and control groups. Exit code 9 says
+    that an engine is installed and could not be asked.
+    """
+    from envhub_sandbox.sandboxes.docker import leftovers
+
+    found, unasked = leftovers.find()
+    removed = [] if dry_run else [one for one in found if one.remove()]
+    if json:
+        items = [{"kind": one.kind, "name": one.name, "removed": one in removed} for one in found]
+        print_json({"found": items, "unasked": unasked})
+    for one in () if json else found:
+        done = "removed" if one in removed else "found" if dry_run else "could not remove"
+        out(f"{done}: {one.kind} {safe_line(one.name, 300)}")
+    for engine, why in unasked.items():
+        reason = safe_line(why, 500)
+        say(f"{engine} could not be asked, so its containers are not known: {reason}")
+    if not json:
+        say(f"{len(found)} left behind, {len(removed)} removed.")
+    if unasked:
+        raise typer.Exit(Exit.UNASKED)

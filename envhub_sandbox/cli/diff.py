@@ -1,4 +1,4 @@
-"""``envhub diff``: what is different between two commits, for whoever approves a new pin."""
+"""``envhub diff``: what is different between two commits, before a new pin is approved."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import typer
 
 from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import print_json, say, show
-from envhub_sandbox.cli.shared.exits import Exit, reported
+from envhub_sandbox.cli.shared.exits import Exit
 from envhub_sandbox.cli.shared.findings import FailOn, level, show_finding
 from envhub_sandbox.cli.shared.progress import Bar
 from envhub_worker.protocol.text import counted
@@ -21,7 +21,9 @@ if TYPE_CHECKING:
 _MARKS = {"new": "+", "gone": "-", "changed": "~", "renamed": ">"}
 
 
+@opt.with_options("env_kwargs", *opt.HUB)
 def diff(
+    *,
     then: Annotated[
         str,
         typer.Argument(metavar="REF_A", help="What is known: org/repo@commit, or a folder."),
@@ -32,12 +34,8 @@ def diff(
         typer.Option("--run", help="Load both, each in a sandbox, and compare tasks and spaces."),
     ] = False,
     fail_on: FailOn = None,
-    env_kwargs: opt.EnvKwargs = None,
     json: opt.Json = False,
-    token: opt.Token = None,
-    endpoint: opt.Endpoint = None,
-    hub_cache_dir: opt.HubCacheDir = None,
-    debug: opt.Debug = False,
+    make: opt.MakeOptions,
 ) -> None:
     """Say what changed from one commit to another, in terms of what a repository would do.
 
@@ -47,34 +45,31 @@ def diff(
 
     [bold]envhub diff org/repo@<approved> org/repo@<new> --fail-on note[/bold]
     """
-    hub = {"token": token, "endpoint": endpoint, "hub_cache_dir": hub_cache_dir}
-    with reported(debug=debug):
-        least = None if fail_on is None else level(fail_on)
-        from envhub_sandbox.check.static import changes
-        from envhub_sandbox.check.static.static import static
-        from envhub_sandbox.hub.snapshot import named
+    least = None if fail_on is None else level(fail_on)
+    from envhub_sandbox.check.static import changes
+    from envhub_sandbox.check.static.static import static
 
-        with Bar(quiet=json) as bar:
-            read = []
-            for ref in (then, now):
-                bar.begin(f"reading {ref}")
-                read.append(static(named(ref, **hub)))
-            found = changes.changes(read[0], read[1])
-            if run:
-                kwargs = opt.read_env_kwargs(env_kwargs or ())
-                tasks = []
-                for one in read:
-                    bar.begin(f"loading {one.reference} in a sandbox")
-                    tasks.append(_tasks(one.snapshot, kwargs, hub))
-                found += changes.environments(tasks[0], tasks[1])
-        if json:
-            print_json(changes.document(read[0], read[1], found))
-        else:
-            _print(read[0].reference, read[1].reference, found)
-        if least is None and found:
-            raise typer.Exit(Exit.DIFFERENT)
-        if least and any(one.weighs(least) for one in found):
-            raise typer.Exit(Exit.ENVIRONMENT)
+    with Bar(quiet=json) as bar:
+        read = []
+        for ref in (then, now):
+            bar.begin(f"reading {ref}")
+            read.append(static(make.snapshot(ref)))
+        found = changes.changes(read[0], read[1])
+        if run:
+            kwargs = make["env_kwargs"]
+            tasks = []
+            for one in read:
+                bar.begin(f"loading {one.reference} in a sandbox")
+                tasks.append(_tasks(one.snapshot, kwargs, make.hub))
+            found += changes.environments(tasks[0], tasks[1])
+    if json:
+        print_json(changes.document(read[0], read[1], found))
+    else:
+        _print(read[0].reference, read[1].reference, found)
+    if least is None and found:
+        raise typer.Exit(Exit.DIFFERENT)
+    if least and any(one.weighs(least) for one in found):
+        raise typer.Exit(Exit.ENVIRONMENT)
 
 
 def _tasks(snapshot: Snapshot, env_kwargs: dict[str, Any], hub: dict[str, Any]) -> tuple[Task, ...]:

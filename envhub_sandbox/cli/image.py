@@ -9,8 +9,6 @@ import typer
 
 from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import out, print_json, safe_line, say
-from envhub_sandbox.cli.shared.exits import reported
-from envhub_sandbox.cli.shared.program import Command
 from envhub_sandbox.cli.shared.progress import Bar
 from envhub_worker.protocol.text import counted
 
@@ -19,18 +17,10 @@ if TYPE_CHECKING:
     from envhub_sandbox.dependencies.resolve import Target
     from envhub_sandbox.hub.snapshot import Snapshot
 
-app = typer.Typer(
-    help="Container images for repositories.", no_args_is_help=True, rich_markup_mode="rich"
-)
 
-
-@app.callback()
-def images() -> None:
-    """Container images for repositories."""
-
-
-@app.command("build", cls=Command)
+@opt.with_options(*opt.HUB)
 def build(
+    *,
     ref: opt.Ref,
     base: Annotated[
         str, typer.Option(metavar="IMAGE", help="The worker's image that it derives from.")
@@ -51,30 +41,24 @@ def build(
         typer.Option(metavar="NAME", help="The network of the build, as in 'docker build'."),
     ] = None,
     json: opt.Json = False,
-    token: opt.Token = None,
-    endpoint: opt.Endpoint = None,
-    hub_cache_dir: opt.HubCacheDir = None,
-    debug: opt.Debug = False,
+    make: opt.MakeOptions,
 ) -> None:
     """Derive an image from envhub-worker with the packages that a repository declares.
 
     Its packages are pinned with hashes, wheels only: nothing of the repository runs. The image is
     tagged by the hash of all that it is made of, so the same again costs nothing.
     """
-    with reported(debug=debug):
-        with Bar(quiet=json) as bar:
-            bar.begin(f"reading {ref}")
-            from envhub_sandbox.hub.snapshot import named
-
-            snapshot = named(ref, hub_cache_dir=hub_cache_dir, token=token, endpoint=endpoint)
-            bar.begin("resolving and building")
-            made = _build(snapshot, base, engine, apt or [], exclude_newer, build_network)
-        if json:
-            print_json(made)
-            return
-        out(safe_line(made["image"], 300))
-        say(f"{counted(len(made['packages']), 'package')}, lock sha256:{made['lock']}")
-        say(f"Use it: envhub run {safe_line(ref)} --sandbox docker:{made['image']}")
+    with Bar(quiet=json) as bar:
+        bar.begin(f"reading {ref}")
+        snapshot = make.snapshot(ref)
+        bar.begin("resolving and building")
+        made = _build(snapshot, base, engine, apt or [], exclude_newer, build_network)
+    if json:
+        print_json(made)
+        return
+    out(safe_line(made["image"], 300))
+    say(f"{counted(len(made['packages']), 'package')}, lock sha256:{made['lock']}")
+    say(f"Use it: envhub run {safe_line(ref)} --sandbox docker:{made['image']}")
 
 
 def _build(

@@ -13,7 +13,7 @@ import typer
 
 from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import out, print_json, safe_line, say
-from envhub_sandbox.cli.shared.exits import UsageError, reported
+from envhub_sandbox.cli.shared.exits import UsageError
 from envhub_sandbox.cli.shared.progress import Bar
 from envhub_worker.protocol.text import counted
 
@@ -40,7 +40,9 @@ NoSpaces = Annotated[
 ]
 
 
+@opt.with_options("dependencies", "env_kwargs", *opt.HUB)
 def lock(
+    *,
     ref: opt.Ref,
     output: Output = None,
     upgrade: Annotated[
@@ -49,41 +51,35 @@ def lock(
             "--upgrade", help="Choose versions again, and show what differs from the file."
         ),
     ] = False,
-    dependencies: opt.Dependencies = "auto",
-    env_kwargs: opt.EnvKwargs = None,
     no_spaces: NoSpaces = False,
     json: opt.Json = False,
-    token: opt.Token = None,
-    endpoint: opt.Endpoint = None,
-    hub_cache_dir: opt.HubCacheDir = None,
-    debug: opt.Debug = False,
+    make: opt.MakeOptions,
 ) -> None:
     """Write down commit, file hashes, packages, Python and spaces, for make_env(lock=FILE).
 
     The packages are those of an environment of its own. To see its spaces the repository is loaded,
     in the sandbox.
     """
-    hub = {"token": token, "endpoint": endpoint, "hub_cache_dir": hub_cache_dir}
-    with reported(debug=debug):
-        with Bar(quiet=json) as bar:
-            bar.begin(f"locking {ref}")
-            from envhub_sandbox.hub.snapshot import named
-            from envhub_sandbox.locks import drift, lockfile, making
+    with Bar(quiet=json) as bar:
+        bar.begin(f"locking {ref}")
+        from envhub_sandbox.locks import drift, lockfile, making
 
-            snapshot = named(ref, **hub)
-            path = _path(output, snapshot)
-            old = _old(path, upgrade)
-            choice = _choice(opt.read_dependencies(dependencies), old)
-            made = making.locked(snapshot, choice, upgrade=upgrade)
-            if not no_spaces:
-                kwargs = opt.read_env_kwargs(env_kwargs or ())
-                made = _with_spaces(made, snapshot, _kwargs(kwargs, old), hub)
-            changes = [] if old is None else drift.differences(old, made)
-            lockfile.write(made, path)
-        _print(path, made, changes, old is not None, as_json=json)
+        snapshot = make.snapshot(ref)
+        path = _path(output, snapshot)
+        old = _old(path, upgrade)
+        choice = _choice(make["dependencies"], old)
+        made = making.locked(snapshot, choice, upgrade=upgrade)
+        if not no_spaces:
+            kwargs = _kwargs(make["env_kwargs"], old)
+            made = _with_spaces(made, snapshot, kwargs, make.hub)
+        changes = [] if old is None else drift.differences(old, made)
+        lockfile.write(made, path)
+    _print(path, made, changes, old is not None, as_json=json)
 
 
+@opt.with_options(*opt.HUB)
 def verify(
+    *,
     file: Annotated[Path, typer.Argument(metavar="FILE", help="What 'envhub lock' wrote.")],
     ref: Annotated[
         str | None,
@@ -98,33 +94,27 @@ def verify(
         bool, typer.Option("--no-index", help="Do not ask whether the index still has the files.")
     ] = False,
     json: opt.Json = False,
-    token: opt.Token = None,
-    endpoint: opt.Endpoint = None,
-    hub_cache_dir: opt.HubCacheDir = None,
-    debug: opt.Debug = False,
+    make: opt.MakeOptions,
 ) -> None:
     """Say whether a repository is still as it was locked, and if not, what differs (exit code 7).
 
-    Files, the packages on the index, Python, and, unless told otherwise, its spaces.
+    Files, the packages on the index, Python, and, except with --no-spaces, its spaces.
     """
-    hub = {"token": token, "endpoint": endpoint, "hub_cache_dir": hub_cache_dir}
-    with reported(debug=debug):
-        with Bar(quiet=json) as bar:
-            bar.begin(f"verifying {file}")
-            from envhub_sandbox.hub.snapshot import named
-            from envhub_sandbox.locks import drift, lockfile
+    with Bar(quiet=json) as bar:
+        bar.begin(f"verifying {file}")
+        from envhub_sandbox.locks import drift, lockfile
 
-            locked = lockfile.read(file)
-            snapshot = named(_reference(ref, locked, file), **hub)
-            now = _now(locked, snapshot, no_index=no_index)
-            if not no_spaces and not drift.differences(locked, now):
-                now = _spaces_again(now, locked, snapshot, hub)
-            found = drift.differences(locked, now)
-        if json:
-            print_json({"lock": str(file), "reference": snapshot.label, "drift": found})
-        drift.refuse(found, snapshot.label)
-        if not json:
-            say(f"{snapshot.label} is as it was locked in {file}.")
+        locked = lockfile.read(file)
+        snapshot = make.snapshot(_reference(ref, locked, file))
+        now = _now(locked, snapshot, no_index=no_index)
+        if not no_spaces and not drift.differences(locked, now):
+            now = _spaces_again(now, locked, snapshot, make.hub)
+        found = drift.differences(locked, now)
+    if json:
+        print_json({"lock": str(file), "reference": snapshot.label, "drift": found})
+    drift.refuse(found, snapshot.label)
+    if not json:
+        say(f"{snapshot.label} is as it was locked in {file}.")
 
 
 def _path(output: Path | None, snapshot: Snapshot) -> Path:

@@ -8,7 +8,6 @@ import typer
 
 from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import out, print_json, safe_line, say
-from envhub_sandbox.cli.shared.exits import reported
 from envhub_sandbox.cli.shared.progress import Bar
 from envhub_worker.protocol.text import counted, size_text
 
@@ -17,39 +16,33 @@ if TYPE_CHECKING:
     from envhub_sandbox.hub.snapshot import Snapshot
 
 
+@opt.with_options("dependencies", "lock", *opt.HUB)
 def prefetch(
+    *,
     ref: opt.Ref,
-    dependencies: opt.Dependencies = "auto",
-    lock: opt.Lock = None,
     upgrade: Annotated[
         bool, typer.Option("--upgrade", help="Choose versions again, the newest that fit.")
     ] = False,
     json: opt.Json = False,
-    token: opt.Token = None,
-    endpoint: opt.Endpoint = None,
-    hub_cache_dir: opt.HubCacheDir = None,
-    debug: opt.Debug = False,
+    make: opt.MakeOptions,
 ) -> None:
     """Download a repository and make the environment that it runs in, and run nothing of it.
 
     Afterwards the printed reference works without network.
     """
-    with reported(debug=debug):
-        with Bar(quiet=json) as bar:
-            bar.begin(f"reading {ref}")
-            from envhub_sandbox.hub.snapshot import named
-
-            snapshot = named(ref, hub_cache_dir=hub_cache_dir, token=token, endpoint=endpoint)
-            given = opt.read_dependencies(dependencies)
-            environment = (
-                _environment(snapshot, given, upgrade)
-                if lock is None
-                else _of_lock(snapshot, lock, given)
-            )
-        if json:
-            print_json(_document(snapshot, environment))
-        else:
-            _print(snapshot, environment)
+    with Bar(quiet=json) as bar:
+        bar.begin(f"reading {ref}")
+        snapshot = make.snapshot(ref)
+        given, lock = make["dependencies"], make["lock"]
+        environment = (
+            _environment(snapshot, given, upgrade)
+            if lock is None
+            else _of_lock(snapshot, lock, given)
+        )
+    if json:
+        print_json(_document(snapshot, environment))
+    else:
+        _print(snapshot, environment)
 
 
 def _environment(snapshot: Snapshot, given: Any, upgrade: bool) -> Environment | None:

@@ -10,7 +10,7 @@ import typer
 
 from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import out, print_json, safe_line, say
-from envhub_sandbox.cli.shared.exits import UsageError, reported
+from envhub_sandbox.cli.shared.exits import UsageError
 from envhub_sandbox.cli.shared.progress import Bar
 from envhub_worker.protocol.text import counted
 
@@ -29,7 +29,9 @@ _OF_THE_HUB = ".gitattributes"
 """What it puts into a repository that it makes."""
 
 
+@opt.with_options("env_kwargs", "dependencies", "token", "endpoint")
 def push(
+    *,
     folder: Annotated[str, typer.Argument(metavar="FOLDER", help="The folder, as in './my-env'.")],
     ref: Annotated[
         str,
@@ -47,12 +49,8 @@ def push(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Check, say what would be uploaded, and stop.")
     ] = False,
-    env_kwargs: opt.EnvKwargs = None,
-    dependencies: opt.Dependencies = "auto",
     json: opt.Json = False,
-    token: opt.Token = None,
-    endpoint: opt.Endpoint = None,
-    debug: opt.Debug = False,
+    make: opt.MakeOptions,
 ) -> None:
     """Publish a folder on the Hub as one commit, and print the pinned reference.
 
@@ -60,22 +58,21 @@ def push(
     fails there is not uploaded; what is uploaded is the very copy that was checked. Files of the
     repository that the folder lacks stay as they are.
     """
-    with reported(debug=debug):
-        from envhub_sandbox.hub.reference import HubRef
-        from envhub_sandbox.hub.snapshot import local
+    from envhub_sandbox.hub.reference import HubRef
+    from envhub_sandbox.hub.snapshot import local
 
-        target = HubRef.parse(ref)
-        others: list[str] = []
-        with Bar(quiet=json) as bar:
-            bar.begin(f"reading {folder}")
-            snapshot = local(folder)
-            _refuse_unfit(snapshot)
-            bar.begin("checking it in a sandbox")
-            _check(folder, snapshot, env_kwargs or [], dependencies)
-            if not dry_run:
-                bar.begin(f"uploading to {ref}")
-                target, others = _publish(snapshot, target, token, endpoint, message, private)
-        _tell(snapshot, target, others, dry_run, as_json=json)
+    target = HubRef.parse(ref)
+    others: list[str] = []
+    with Bar(quiet=json) as bar:
+        bar.begin(f"reading {folder}")
+        snapshot = local(folder)
+        _refuse_unfit(snapshot)
+        bar.begin("checking it in a sandbox")
+        _check(folder, snapshot, {key: make[key] for key in ("env_kwargs", "dependencies")})
+        if not dry_run:
+            bar.begin(f"uploading to {ref}")
+            target, others = _publish(snapshot, target, make, message, private)
+    _tell(snapshot, target, others, dry_run, as_json=json)
 
 
 def _refuse_unfit(snapshot: Snapshot) -> None:
@@ -99,7 +96,7 @@ def _unfit(path: str) -> str:
     return ""
 
 
-def _check(folder: str, snapshot: Snapshot, env_kwargs: list[str], dependencies: str) -> None:
+def _check(folder: str, snapshot: Snapshot, options: dict[str, Any]) -> None:
     """Load it and step it.
 
     Raises:
@@ -108,14 +105,7 @@ def _check(folder: str, snapshot: Snapshot, env_kwargs: list[str], dependencies:
     """
     from envhub_sandbox.api import make_env
 
-    made = make_env(
-        folder,
-        n_envs=2,
-        env_kwargs=opt.read_env_kwargs(env_kwargs),
-        dependencies=opt.read_dependencies(dependencies),
-        validate=True,
-    )
-    with made as suites:
+    with make_env(folder, n_envs=2, validate=True, **options) as suites:
         for env in suites.envs():
             env.reset(seed=0)
             env.action_space.seed(0)
@@ -130,8 +120,7 @@ def _check(folder: str, snapshot: Snapshot, env_kwargs: list[str], dependencies:
 def _publish(
     snapshot: Snapshot,
     target: HubRef,
-    token: str | None,
-    endpoint: str | None,
+    make: opt.MakeOptions,
     message: str,
     private: bool,
 ) -> tuple[HubRef, list[str]]:
@@ -151,7 +140,7 @@ def _publish(
     from envhub_sandbox.hub.hashing import differing
     from envhub_sandbox.hub.listing import DEFAULT_LIMITS, within_limits
 
-    hub = HubClient(checked_endpoint(endpoint), checked_token(token))
+    hub = HubClient(checked_endpoint(make["endpoint"]), checked_token(make["token"]))
     repo = Repository(target.repo_type or "model", target.repo_id)
     where = f"{target} on {hub.public_endpoint}"
     to_write = ". To publish takes a token that may write"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -9,7 +10,7 @@ import typer
 
 from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import out, print_json, safe_line, safe_text, say
-from envhub_sandbox.cli.shared.exits import Exit, UsageError, reported
+from envhub_sandbox.cli.shared.exits import Exit, UsageError
 from envhub_sandbox.cli.shared.progress import Bar
 
 if TYPE_CHECKING:
@@ -34,17 +35,13 @@ Grant = Annotated[
 ]
 
 
+@opt.with_options("sandbox", "profile", "python", *opt.HUB)
 def replay(
+    *,
     bundle: BundleFolder,
     grant: Grant = False,
-    sandbox: opt.SandboxName = "process",
-    profile: opt.Profile = None,
-    python: opt.Python = None,
-    token: opt.Token = None,
-    endpoint: opt.Endpoint = None,
-    hub_cache_dir: opt.HubCacheDir = None,
     json: opt.Json = False,
-    debug: opt.Debug = False,
+    make: opt.MakeOptions,
 ) -> None:
     """Make the environment of a crash bundle again, ask the same of it, and say how that ends.
 
@@ -54,24 +51,15 @@ def replay(
 
     [bold]envhub replay ~/.cache/envhub-sandbox/crashes/20261121T081500-5f3a9c01[/bold]
     """
-    given = {
-        "profile": profile,
-        "python": python,
-        "token": token,
-        "endpoint": endpoint,
-        "hub_cache_dir": hub_cache_dir,
-    }
-    with reported(debug=debug):
-        _Replay(bundle, grant, sandbox, given, as_json=json).execute()
+    _Replay(bundle, grant, make, as_json=json).execute()
 
 
 class _Replay:
     """One ``envhub replay``."""
 
-    def __init__(
-        self, folder: Path, grant: bool, sandbox: str, given: dict[str, Any], *, as_json: bool
-    ) -> None:
-        self._folder, self._grant, self._sandbox = folder, grant, sandbox
+    def __init__(self, folder: Path, grant: bool, make: opt.MakeOptions, *, as_json: bool) -> None:
+        self._folder, self._grant, self._sandbox = folder, grant, make["sandbox"]
+        given = {name: value for name, value in make.given.items() if name != "sandbox"}
         self._given = {name: value for name, value in given.items() if value is not None}
         self._as_json = as_json
         self._changed: list[str] = []
@@ -81,8 +69,6 @@ class _Replay:
         from envhub_sandbox.crash.bundle_reader import load_bundle
         from envhub_sandbox.crash.replay import Verdict
 
-        if self._sandbox == "none":
-            raise UsageError("this command needs a sandbox; leave out --sandbox none")
         bundle = load_bundle(self._folder)
         self._refuse_wishes(bundle)
         for doubt in bundle.doubts:
@@ -103,33 +89,29 @@ class _Replay:
         if wanted and not self._grant:
             raise UsageError(
                 f"the bundle asks for more than an ordinary run: {', '.join(wanted)}. If that is "
-                "yours, or you trust whoever gave you the bundle, add --grant"
+                "yours, or you trust where the bundle comes from, add --grant"
             )
 
     def _run(self, bundle: Bundle, bar: Bar) -> ReplayResult:
         from envhub_sandbox.crash.replay import replay
 
         bar.begin(f"loading {safe_line(bundle.label)}")
-        made: list[Any] = []
-        try:
-            return replay(lambda: self._make(bundle, bar, made), bundle)
-        finally:
-            for envs in made:
-                envs.close()
+        with contextlib.ExitStack() as stack:
+            return replay(lambda: self._make(bundle, bar, stack), bundle)
 
-    def _make(self, bundle: Bundle, bar: Bar, made: list[Any]) -> Any:
+    def _make(self, bundle: Bundle, bar: Bar, stack: contextlib.ExitStack) -> Any:
         """The environment that the bundle is about; None if it is about ``make_env`` alone."""
         from envhub_sandbox.api import make_env
         from envhub_sandbox.crash.replay import changed_files
         from envhub_sandbox.session.recipe import Recipe
 
-        envs = Recipe(
+        recipe = Recipe(
             make_env=make_env,
             reference=bundle.reference,
             config=bundle.load.cfg,
             options=self._options(bundle),
-        ).make()
-        made.append(envs)
+        )
+        envs = stack.enter_context(recipe.make())
         self._changed = list(changed_files(bundle.files, envs.provenance["files"]))
         if self._changed:
             say(f"The files have changed since: {safe_line(', '.join(self._changed))}.")

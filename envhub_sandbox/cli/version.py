@@ -3,27 +3,24 @@
 from __future__ import annotations
 
 import platform
-from typing import Annotated
 
-import typer
-
+from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import out, print_json
-from envhub_sandbox.cli.shared.exits import reported
 
 _PACKAGES = ("gymnasium", "numpy", "huggingface_hub", "pyzmq", "msgpack", "imageio-ffmpeg")
 
 
+@opt.with_options()
 def version(
-    json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    json: opt.Json = False,
 ) -> None:
     """Print versions: ours, the protocol's, Python's and of the packages that matter."""
-    with reported(debug=False):
-        found = versions()
-        if json:
-            print_json(found)
-        else:
-            for name, text in found.items():
-                out(f"{name:<16} {text or 'not installed'}")
+    found = versions()
+    if json:
+        print_json(found)
+    else:
+        for name, text in found.items():
+            out(f"{name:<16} {text or 'not installed'}")
 
 
 def versions() -> dict[str, str | int | None]:

@@ -101,10 +101,10 @@ class SandboxVecEnv(VecEnv):
 
     def step_wait(self) -> Any:
         """Observations, rewards float32 ``(num_envs,)``, dones bool ``(num_envs,)``, infos."""
-        batch, rewards, terminations, truncations, told = self.vector.step_wait()
-        with UNTRUSTED:  # of a repository's own class, nobody has declared what its results are
+        batch, rewards, terminations, truncations, batched = self.vector.step_wait()
+        with UNTRUSTED:  # of a repository's own class, whose results nothing declares
             dones = np.logical_or(terminations, truncations).reshape(self.num_envs)
-            infos = self._infos(told)
+            infos = self._infos(batched)
             for index, info in enumerate(infos):
                 info["TimeLimit.truncated"] = bool(truncations[index] and not terminations[index])
             rewards = np.asarray(rewards, np.float32)
@@ -121,11 +121,11 @@ class SandboxVecEnv(VecEnv):
             return batch
         with UNTRUSTED:
             lasts = list(iterate(self.vector.observation_space, batch))
-        batch, told = self.vector.reset(options={"reset_mask": dones})
+        batch, begun = self.vector.reset(options={"reset_mask": dones})
         with UNTRUSTED:
             for index in ended:
                 infos[index]["terminal_observation"] = lasts[index]
-                self.reset_infos[index] = info_of(told, index, self.num_envs)
+                self.reset_infos[index] = info_of(begun, index, self.num_envs)
         return batch
 
     def _begun(self, ended: list[int], infos: list[dict[str, Any]]) -> None:
@@ -179,5 +179,5 @@ class SandboxVecEnv(VecEnv):
         """What each sub-environment renders."""
         return self.vector.render() or [None] * self.num_envs
 
-    def _infos(self, told: dict[str, Any]) -> list[dict[str, Any]]:
-        return [info_of(told, index, self.num_envs) for index in range(self.num_envs)]
+    def _infos(self, batched: dict[str, Any]) -> list[dict[str, Any]]:
+        return [info_of(batched, index, self.num_envs) for index in range(self.num_envs)]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 from pathlib import Path
 
-from tests.integration.test_cli_run import envhub
+from tests.support.command_line import envhub
 from tests.support.pages import Page
 
 _SCRIPT = "<script>alert(1)<!--"

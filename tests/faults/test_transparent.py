@@ -14,7 +14,7 @@ import pytest
 from gymnasium.error import ClosedEnvironmentError
 
 from envhub_sandbox import errors, make_env
-from envhub_sandbox.making import proxies
+from envhub_sandbox.factory import env_factory
 from envhub_sandbox.session.survival.seeds import derived_seed
 from envhub_sandbox.transport.shared_memory.sharding import bounds_for
 from envhub_worker.protocol.lifecycle import State
@@ -35,7 +35,9 @@ pytestmark = pytest.mark.usefixtures("neighbour", "_evenly")
 @pytest.fixture
 def _evenly(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever an earlier test has measured: two and two."""
-    monkeypatch.setattr(proxies, "bounds_for", lambda env, count, _: bounds_for(env, count, None))
+    monkeypatch.setattr(
+        env_factory, "bounds_for", lambda env, count, _: bounds_for(env, count, None)
+    )
 
 
 def made(

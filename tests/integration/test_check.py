@@ -20,9 +20,9 @@ from envhub_sandbox.check.judge import judge
 from envhub_sandbox.check.settings import JudgeOptions
 from envhub_sandbox.errors import SandboxUnavailableError, SnapshotError
 from envhub_sandbox.rollouts.pictures import png
-from tests.integration.test_cli_run import envhub
 from tests.support import checks
 from tests.support.ci import obeyed
+from tests.support.command_line import envhub
 from tests.support.repositories import write_repository
 from tests.support.samples import EXAMPLES
 

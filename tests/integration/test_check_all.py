@@ -15,8 +15,7 @@ from xml.etree import ElementTree
 import pytest
 
 from tests.corpus.entries import Entry
-from tests.integration.test_cli_run import envhub
-from tests.integration.test_cli_signals import COMMAND, below, gone
+from tests.support.command_line import COMMAND, below, envhub, gone
 from tests.support.pages import Page
 from tests.support.processes import eventually
 from tests.support.repositories import write_repository

@@ -22,7 +22,7 @@ from envhub_sandbox.cli.app import app
 from envhub_sandbox.cli.check.deadline import DeadlineReached, deadline_alarm
 from envhub_sandbox.sources import parser
 from tests.hub.stub_hub import StubHub
-from tests.integration.test_cli_run import envhub
+from tests.support.command_line import envhub
 from tests.support.processes import descendants, eventually
 from tests.support.repositories import write_repository
 from tests.support.wheels import Index

@@ -388,7 +388,7 @@ def test_threads_may_play_tasks_at_once(tasks: Callable[..., Tasks], prewarm: in
 
 def test_it_takes_a_whole_number_or_none() -> None:
     """And means nothing without a sandbox."""
-    with pytest.raises(ValueError, match="`prewarm` must be 0 or more"):
+    with pytest.raises(ValueError, match="`prewarm` is -1, and must be at least 0"):
         make_env(sample("counter"), prewarm=-1)
     with pytest.raises(TypeError, match="`prewarm` is 'one'"):
         make_env(sample("counter"), prewarm="one")  # type: ignore[arg-type]

@@ -27,7 +27,7 @@ import envhub_sandbox.integrations.lerobot as ours
 from envhub_sandbox import make_env as sandboxed
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.integrations import lerobot_eval
-from envhub_sandbox.integrations.lerobot import waiting
+from envhub_sandbox.integrations.lerobot.config import SpareSuites
 
 FOUND: dict[str, Any] = {}
 COMMITS: dict[str, str] = json.loads(sys.argv[1])
@@ -210,12 +210,12 @@ def written() -> None:
 
 
 def waits() -> None:
-    """What told its spaces is used once by whoever asks for the same, and closed by and by."""
-    kept = waiting.Waiting(0.02)
+    """What answered for its spaces is used once, for the same request, and is closed in the end."""
+    kept = SpareSuites(0.02)
     first, second = (make_env("robots/cartpole") for _ in range(2))
     kept.put("a", first)
     closed = eventually(lambda: first["hub_env"][0].closed)
-    forever = waiting.Waiting(3600.0)
+    forever = SpareSuites(3600.0)
     forever.put("a", second)
     taken = forever.take("a") is second and forever.take("a") is None
     FOUND["waits"] = [closed, taken, second["hub_env"][0].closed]

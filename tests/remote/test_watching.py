@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from envhub_sandbox import errors, make_env
-from tests.integration.test_cli_run import envhub
 from tests.remote.listening import Listening
+from tests.support.command_line import envhub
 from tests.support.samples import sample
 
 

@@ -21,7 +21,7 @@ import zmq
 from envhub_sandbox.check.play import confinement
 from envhub_sandbox.crash import bundle_writer
 from envhub_sandbox.dependencies import environments, interpreters, modules, resolutions
-from envhub_sandbox.making import making
+from envhub_sandbox.factory import make
 from envhub_sandbox.sandboxes import remote
 from envhub_sandbox.sandboxes.docker import sandbox
 from envhub_sandbox.session import env_session
@@ -69,12 +69,12 @@ def state(env: Any) -> State:
 
 def choice_of_runtime() -> Spot:
     """Makes of an interpreter what a repository's jails run on."""
-    return making, "Runtime"
+    return make, "Runtime"
 
 
 def choice_of_packages() -> Spot:
     """Makes the packages that a repository declares."""
-    return making, "packages_for"
+    return make, "packages_for"
 
 
 def use_lock(env: Any) -> Spot:
@@ -256,7 +256,7 @@ CLOSE_PATIENCE: Spot = (env_session, "INTERRUPT_S")
 """For how long ``close`` waits for another thread."""
 WAITS_FOR_A_SERVER: tuple[Spot, Spot] = ((launcher_module, "_CLOSE_S"), (remote, "_CLOSE_S"))
 """For how long a close waits for a server's word, also where it has gone."""
-MAKER: Spot = (making, "Proxies")
+MAKER: Spot = (make, "EnvFactory")
 """What ``make_env`` starts to work with when its arguments have been checked."""
 CONTAINER_MARKS: Spot = (listen_options, "_CONTAINER_MARKS")
 """The files by which a container is told."""

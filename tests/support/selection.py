@@ -61,8 +61,8 @@ SHORT = (
     "tests/integration/test_samples.py::TestManyTasks::",
     "tests/integration/test_hub_olah.py::test_each_repository_type_loads",
     "tests/integration/test_hub_lies.py::",
-    "tests/integration/test_cli_run.py::test_a_run_prints_results_and_nothing_else",
-    "tests/integration/test_cli_run.py::test_failures_have_a_code_and_a_message",
+    "tests/integration/cli/test_run.py::test_a_run_prints_results_and_nothing_else",
+    "tests/integration/cli/test_run.py::test_failures_have_a_code_and_a_message",
     "tests/integration/test_cli_doctor.py::",
     # each layer that confines, as the kernel shows it
     "tests/integration/test_confinement.py::test_files_outside",

@@ -35,7 +35,7 @@ _PARTS = (
     ("Locks", ("envhub_sandbox/locks",), "dependencies.md#locks"),
     (
         "Arguments, policies, limits, timeouts",
-        ("envhub_sandbox/making", "envhub_sandbox/policy.py"),
+        ("envhub_sandbox/factory", "envhub_sandbox/options.py", "envhub_sandbox/policy.py"),
         "settings.md",
     ),
     ("What this host can enforce", ("envhub_worker/lockdown",), "threat-model.md"),
@@ -103,7 +103,9 @@ _CURE = re.compile(
     r"|needs a server that was started |must (?:return|expose) "
 )
 # What a function or a class of this name is told is no message: help, and checks (docs/checks.md).
-_NO_MESSAGES = {"Option", "Argument", "Typer", "add_argument", "add_parser", "Check", "Template"}
+_NO_MESSAGES = {
+    *("Option", "_option", "Argument", "Typer", "add_argument", "add_parser", "Check", "Template")
+}
 _NO_FILES = (
     "envhub_sandbox/check/page/markup.py",
     "envhub_sandbox/check/page/page.py",

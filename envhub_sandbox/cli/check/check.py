@@ -16,7 +16,6 @@ from envhub_sandbox.cli.shared.console import out, print_json, safe_line, say
 from envhub_sandbox.cli.shared.exits import Exit, UsageError, reported
 from envhub_sandbox.cli.shared.findings import STYLES, annotate, level, show_finding, write_report
 from envhub_sandbox.cli.shared.progress import Bar
-from envhub_sandbox.cli.shared.select import select
 from envhub_worker.protocol.text import counted
 
 if TYPE_CHECKING:
@@ -38,7 +37,13 @@ def _with_settings(ctx: typer.Context, path: Path | None) -> Path | None:
     return path
 
 
+_HERE = ("lock", "num_workers", "validate", "trust_remote_code", "network", "gpu", "readable")
+_OPTIONS = [key for key in opt.ALL if key not in (*_HERE, "environment", "output")]
+
+
+@opt.with_options(*_OPTIONS, n_envs=2)
 def check(
+    *,
     ctx: typer.Context,
     ref: Annotated[
         str | None,
@@ -116,13 +121,6 @@ def check(
     again: own.Again = False,
     suite: opt.Suite = None,
     task: opt.Task = None,
-    n_envs: opt.NEnvs = 2,
-    use_async: opt.UseAsync = False,
-    env_kwargs: opt.EnvKwargs = None,
-    python: opt.Python = None,
-    dependencies: opt.Dependencies = "auto",
-    sandbox: opt.SandboxName = "process",
-    server_key: opt.ServerKey = None,
     policy: Annotated[
         Path | None,
         typer.Option(
@@ -131,15 +129,7 @@ def check(
             rich_help_panel=_MAY,
         ),
     ] = None,
-    profile: opt.Profile = None,
-    memory: opt.Memory = None,
-    disk: opt.Disk = None,
-    processes: opt.Processes = None,
-    cpu_time: opt.CpuTime = None,
-    timeout: opt.Timeout = None,
-    token: opt.Token = None,
-    endpoint: opt.Endpoint = None,
-    hub_cache_dir: opt.HubCacheDir = None,
+    make: opt.MakeOptions,
     debug: opt.Debug = False,
 ) -> None:
     """Run a repository in a sandbox and say what is wrong with it.
@@ -153,7 +143,6 @@ def check(
     [bold]envhub check --all references.txt --output judged[/bold]
     """
     with reported(debug=debug):
-        make = opt.MakeOptions.of(ctx)
         if not math.isfinite(deadline):
             raise UsageError(f"--deadline is {deadline}; it takes seconds, such as 900")
         least, allowed = level(fail_on), _known(allow or ())
@@ -191,7 +180,7 @@ def check(
             steps=steps,
             resets=resets,
             slow_step_s=slow_step,
-            tasks=lambda envs: [one[:2] for one in select(envs, suite, task)],
+            tasks=lambda envs: [one[:2] for one in opt.select(envs, suite, task)],
             pictures=html is not None,
         )
         failures = report.failures(least, allowed)

@@ -12,18 +12,18 @@ import typer
 from envhub_sandbox.cli.init.starter import starter
 from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import out, safe_line, say
-from envhub_sandbox.cli.shared.exits import UsageError, reported
+from envhub_sandbox.cli.shared.exits import UsageError
 from envhub_sandbox.hub.checkout import make_checkout
 
 _NAME = re.compile(r"[A-Za-z0-9](?:[A-Za-z0-9._-]{0,94}[A-Za-z0-9])?", re.ASCII)
 
 
+@opt.with_options()
 def init(
     folder: Annotated[
         Path,
         typer.Argument(metavar="NAME", help="The new folder; its last part names the repository."),
     ],
-    debug: opt.Debug = False,
 ) -> None:
     """Write a new environment's repository: env.py, requirements, card, licence, test, CI workflow.
 
@@ -31,13 +31,12 @@ def init(
 
     [bold]envhub init my-env && envhub run ./my-env --validate[/bold]
     """
-    with reported(debug=debug):
-        name = repository_name(folder)
-        _write(folder, starter(name, time.localtime().tm_year))
-        make_checkout(folder)
-        shown = safe_line(str(folder) if folder.is_absolute() else f"./{folder}")
-        out(shown)
-        say(f"Try it: envhub run {shown} --validate. Publish it: envhub push {shown} OWNER/{name}")
+    name = repository_name(folder)
+    _write(folder, starter(name, time.localtime().tm_year))
+    make_checkout(folder)
+    shown = safe_line(str(folder) if folder.is_absolute() else f"./{folder}")
+    out(shown)
+    say(f"Try it: envhub run {shown} --validate. Publish it: envhub push {shown} OWNER/{name}")
 
 
 def repository_name(folder: Path) -> str:

@@ -10,17 +10,20 @@ import typer
 from envhub_sandbox.cli.inspect.static import check_options, inspect_static
 from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import out, print_json, safe_line, show
-from envhub_sandbox.cli.shared.exits import reported
 from envhub_sandbox.cli.shared.findings import FailOn
 from envhub_sandbox.cli.shared.progress import Bar
-from envhub_sandbox.cli.shared.report import print_provenance
-from envhub_sandbox.cli.shared.select import select
+from envhub_sandbox.cli.shared.results import print_provenance
 
 _SPACES = ("single_observation_space", "single_action_space", "observation_space", "action_space")
 _SPACE_TEXT = 2000
 
 
+_OPTIONS = [key for key in opt.ALL if key not in ("num_workers", "validate", "output")]
+
+
+@opt.with_options(*_OPTIONS)
 def inspect(
+    *,
     context: typer.Context,
     ref: opt.Ref,
     static: Annotated[
@@ -34,50 +37,18 @@ def inspect(
     json: opt.Json = False,
     suite: opt.Suite = None,
     task: opt.Task = None,
-    n_envs: opt.NEnvs = 1,
-    use_async: opt.UseAsync = False,
-    env_kwargs: opt.EnvKwargs = None,
-    python: opt.Python = None,
-    dependencies: opt.Dependencies = "auto",
-    lock: opt.Lock = None,
-    sandbox: opt.SandboxOrNone = "process",
-    server_key: opt.ServerKey = None,
-    trust: opt.Trust = False,
-    profile: opt.Profile = None,
-    network: opt.Network = None,
-    gpu: opt.Gpu = None,
-    readable: opt.Readable = None,
-    variables: opt.Variables = None,
-    memory: opt.Memory = None,
-    disk: opt.Disk = None,
-    processes: opt.Processes = None,
-    cpu_time: opt.CpuTime = None,
-    timeout: opt.Timeout = None,
-    token: opt.Token = None,
-    endpoint: opt.Endpoint = None,
-    hub_cache_dir: opt.HubCacheDir = None,
-    debug: opt.Debug = False,
+    make: opt.MakeOptions,
 ) -> None:
     """Print suites, tasks, spaces, metadata and provenance, without stepping anything.
 
     The repository's make_env runs (in the sandbox) unless its answer is remembered. With --static
     nothing runs: files, entry, packages, imports, and what is worth a look are read.
     """
-    with reported(debug=debug):
-        check_options(context, static=static)
-        if static:
-            inspect_static(
-                ref,
-                as_json=json,
-                sarif=sarif,
-                fail_on=fail_on,
-                token=token,
-                endpoint=endpoint,
-                hub_cache_dir=hub_cache_dir,
-            )
-            return
-        make = opt.MakeOptions.of(context)
-        _inspect(make, suite, task, as_json=json)
+    check_options(context, static=static)
+    if static:
+        inspect_static(ref, as_json=json, sarif=sarif, fail_on=fail_on, make=make)
+        return
+    _inspect(make, suite, task, as_json=json)
 
 
 def _inspect(
@@ -89,7 +60,7 @@ def _inspect(
     with Bar(quiet=as_json) as bar, make.explained():
         bar.begin(f"loading {make.ref} in a sandbox")
         with make_env(**arguments) as envs:
-            found = [describe_env(*item) for item in select(envs, suites, tasks)]
+            found = [describe_env(*item) for item in opt.select(envs, suites, tasks)]
             provenance = envs.provenance
     if as_json:
         print_json({"reference": make.ref, "envs": found, "provenance": provenance})
@@ -120,14 +91,14 @@ def _print(found: list[dict[str, Any]], provenance: dict[str, Any], *, in_proces
     for env in found:
         title = f"{env['suite']} / {env['task']}"
         out(title if env["spec_id"] is None else f"{title}  ({env['spec_id']})", "bold")
-        told = {
+        lines = {
             "sub-environments": env["num_envs"],
             "observations": env["single_observation_space"],
             "actions": env["single_action_space"],
             "autoreset mode": env["autoreset_mode"] or "not stated",
             "render mode": env["render_mode"] or "None",
         }
-        for name, value in (*told.items(), *env["metadata"].items()):
+        for name, value in (*lines.items(), *env["metadata"].items()):
             show(f"  {safe_line(name, 40)}", value, width=19)
     out()
     print_provenance(provenance, in_process=in_process)

@@ -12,7 +12,7 @@ import typer
 from envhub_sandbox.cli.shared.console import print_json, show
 from envhub_sandbox.cli.shared.exits import Exit, UsageError
 from envhub_sandbox.cli.shared.findings import level, show_finding, write_report
-from envhub_sandbox.cli.shared.options import is_typed
+from envhub_sandbox.cli.shared.options import MakeOptions, is_typed
 from envhub_sandbox.cli.shared.progress import Bar
 from envhub_worker.protocol.text import size_text
 
@@ -33,13 +33,11 @@ def check_options(context: typer.Context, *, static: bool) -> None:
     Raises:
         UsageError: There is one.
     """
-    given = [name for name in context.params if is_typed(context, name)]
     means = _OF_BOTH | _OF_STATIC if static else set(context.params) - _OF_STATIC
-    wrong = [name for name in given if name not in means]
-    if wrong:
-        shown = "--" + wrong[0].replace("_", "-")
-        why = "with --static nothing runs" if static else "it needs --static"
-        raise UsageError(f"{shown} means nothing here: {why}")
+    for one in context.command.params:
+        if one.name not in means and is_typed(context, one.name or ""):
+            why = "with --static nothing runs" if static else "it needs --static"
+            raise UsageError(f"{one.opts[0]} means nothing here: {why}")
 
 
 def inspect_static(
@@ -48,18 +46,15 @@ def inspect_static(
     as_json: bool,
     sarif: Path | None,
     fail_on: str | None,
-    token: str | None,
-    endpoint: str | None,
-    hub_cache_dir: str | None,
+    make: MakeOptions,
 ) -> None:
     """Read a repository, and say what is in it."""
     least = None if fail_on is None else level(fail_on)
     with Bar(quiet=as_json) as bar:
         bar.begin(f"reading {ref}")
         from envhub_sandbox.check.static.static import document, static
-        from envhub_sandbox.hub.snapshot import named
 
-        snapshot = named(ref, hub_cache_dir=hub_cache_dir, token=token, endpoint=endpoint)
+        snapshot = make.snapshot(ref)
         read = static(snapshot)
     failures = [one for one in read.findings if least and one.check.severity.reaches(least)]
     if sarif is not None:
@@ -114,10 +109,10 @@ def _print_files(read: Static) -> None:
     from envhub_sandbox.check.static.contents import LARGE
 
     kinds = Counter(one.kind for one in read.files)
-    told = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
+    counts = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))
     total = size_text(sum(one.record.size for one in read.files))
-    show("files", f"{len(read.files)}, {total}: {told}")
-    # what is large or no text first: that is what nobody would read
+    show("files", f"{len(read.files)}, {total}: {counts}")
+    # first what is large or no text: a reader would miss it
     odd = [one for one in read.files if one.record.size >= LARGE or one.kind not in _PLAIN]
     rest = [one for one in read.files if one not in odd]
     for one in (shown := [*odd, *rest][:_SHOWN]):

@@ -3,8 +3,8 @@
 Control characters are escaped, rich's markup is not read, and no line is folded: a terminal wraps
 what is long by itself, and what is folded begins lines. CI systems obey what they find in a log:
 GitHub ``::name::`` at the beginning of a line, GitHub and Azure ``##[name]`` and ``##vso[name]``
-anywhere, GitLab ``section_start:``. ``guarded`` breaks all of these, whoever writes them, warnings
-and the errors of the option parser included. ``command`` is the only way around it.
+anywhere, GitLab ``section_start:``. ``guarded`` breaks all of these, also in warnings
+and in errors of the option parser. ``command`` is the only way around it.
 """
 
 from __future__ import annotations

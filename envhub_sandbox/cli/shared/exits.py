@@ -21,34 +21,34 @@ _TAIL_LINES = 10
 
 
 class Exit(IntEnum):
-    """What the command's exit code says."""
+    """What the command's exit code says; ``docs/cli.md`` has the same table."""
 
-    OK = 0
-    ENVIRONMENT = 1
-    USAGE = 2
-    SNAPSHOT = 3
-    LOAD = 4
-    WORKER = 5
-    SANDBOX = 6
-    DIFFERENT = 7
-    SURVIVED = 8
-    UNASKED = 9
-    UNJUDGED = 10
-    BUG = 70
-    INTERRUPTED = 130
-    PIPE = 141
-    TERMINATED = 143
+    meaning: str
+
+    def __new__(cls, code: int, meaning: str) -> Exit:
+        """A code with its meaning."""
+        made = int.__new__(cls, code)
+        made._value_, made.meaning = code, meaning
+        return made
+
+    OK = 0, "done"
+    ENVIRONMENT = 1, "the environment raised, or broke the rules"
+    USAGE = 2, "usage, a bad reference, policy or limit"
+    SNAPSHOT = 3, "the files could not be had, or are not what the commit says"
+    LOAD = 4, "the repository did not load, or a package is missing"
+    WORKER = 5, "the worker died, took too long, or has no room"
+    SANDBOX = 6, "this host cannot enforce the policy"
+    DIFFERENT = 7, "a replay that ended otherwise, or what differs, or is not as it was locked"
+    SURVIVED = 8, "a replay in which nothing died"
+    UNASKED = 9, "a container engine could not be asked"
+    UNJUDGED = 10, "nothing fails, but not all could be judged"
+    BUG = 70, "a bug of ours"
+    INTERRUPTED = 130, "interrupted"
+    PIPE = 141, "broken pipe"
+    TERMINATED = 143, "terminated"
 
 
-EXIT_CODES = (
-    "Exit codes: 0 done; 1 the environment raised, or broke the rules; 2 usage, a bad reference, "
-    "policy or limit; 3 the files could not be had, or are not what the commit says; 4 the "
-    "repository did not load, or a package is missing; 5 the worker died, took too long, or has "
-    "no room; 6 this host cannot enforce the policy; 7 a replay that ended in another way, or "
-    "elsewhere, or what differs, or is not as it was locked; 8 a replay in which nothing died; 9 a "
-    "container engine could not be asked; 10 nothing fails, but not all could be judged; 70 "
-    "a bug of ours; 130 interrupted; 141 broken pipe; 143 terminated."
-)
+EXIT_CODES = f"Exit codes: {'; '.join(f'{int(one)} {one.meaning}' for one in Exit)}."
 
 _CODES: tuple[tuple[type[EnvHubError], Exit], ...] = (
     (errors.HubReferenceError, Exit.USAGE),
@@ -127,18 +127,18 @@ def reported(*, debug: bool) -> Iterator[None]:
         _discard_output()
         raise typer.Exit(Exit.PIPE) from None
     except KeyboardInterrupt:
-        with _to_whom_it_may_reach():
+        with _ignoring_full_or_closed_output():
             say("Interrupted.")
         raise typer.Exit(Exit.INTERRUPTED) from None
     except Exception as error:
-        with _to_whom_it_may_reach():
+        with _ignoring_full_or_closed_output():
             _explain(error, debug)
         raise typer.Exit(code_for(error)) from None
 
 
 @contextlib.contextmanager
-def _to_whom_it_may_reach() -> Iterator[None]:
-    """Last words change no exit code: Ctrl-C ends the reader of a pipe as well, a disk is full."""
+def _ignoring_full_or_closed_output() -> Iterator[None]:
+    """A message that cannot be written changes no exit code: a pipe is closed, a disk is full."""
     with contextlib.suppress(OSError):
         yield
     _discard_output()

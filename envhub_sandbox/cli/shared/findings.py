@@ -1,4 +1,4 @@
-"""Findings as lines, ``--fail-on``, and what GitHub is told of findings."""
+"""Findings as lines, ``--fail-on``, and GitHub's annotations."""
 
 from __future__ import annotations
 

@@ -18,7 +18,7 @@ _UNLIMITED = 1 << 60
 
 
 def free_bytes(proc: Path = Path("/proc")) -> int | None:
-    """What nobody uses, or the kernel would give back; None where it does not tell.
+    """What is free, or the kernel would give back; None where it does not say.
 
     A control group that we are in, or one around it, may have less left than the machine: that of
     a container, or of a service.

@@ -1,32 +1,34 @@
-"""Options that several commands share, and how they become arguments of ``make_env``."""
+"""The options of ``make_env`` as parameters of commands, and what a command line says by them."""
 
 from __future__ import annotations
 
 import contextlib
+import functools
+import inspect
 import json
 import os
+import re
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Annotated, Any
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from envhub_sandbox.cli.shared.exits import ForeignError, UsageError
-from envhub_sandbox.cli.shared.logs import output_policy
+from envhub_sandbox.cli.shared.console import safe_line
+from envhub_sandbox.cli.shared.exits import ForeignError, UsageError, reported
 from envhub_sandbox.errors import EnvHubError
-from envhub_sandbox.option_names import OPTION_NAMES
-from envhub_worker.protocol.confinement import NETWORKS, PROFILES
-from envhub_worker.protocol.limits import MAX_NUM_ENVS
+from envhub_sandbox.options import OPTIONS
 from envhub_worker.protocol.text import parse_size
 
-_CODE, _LIMITS, _HUB = "How it is built", "What it may do", "Where it comes from"
+if TYPE_CHECKING:
+    from envhub_sandbox.hub.snapshot import Snapshot
 
-
-def _one_of(*values: str) -> Callable[[], list[str]]:
-    """What a shell completes."""
-    return lambda: list(values)
-
+ALL = tuple(key for key, one in OPTIONS.items() if one.command)
+"""Every option that a command can have, by keys of ``OPTIONS``."""
+HUB = ("token", "endpoint", "hub_cache_dir")
+_PANEL = OPTIONS["n_envs"].panel
+_NAMED = 20
 
 Ref = Annotated[
     str,
@@ -36,208 +38,90 @@ Ref = Annotated[
         show_default=False,
     ),
 ]
-NEnvs = Annotated[
-    int,
-    typer.Option(
-        "--n-envs", "-n", min=1, max=MAX_NUM_ENVS, help="Sub-environments.", rich_help_panel=_CODE
-    ),
-]
-UseAsync = Annotated[
-    bool,
-    typer.Option(
-        "--async",
-        help="Ask for use_async_envs=True: sub-environments may run in several processes.",
-        rich_help_panel=_CODE,
-    ),
-]
-EnvKwargs = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--env-kwargs",
-        metavar="JSON|KEY=VALUE",
-        help="Further arguments of the repository's make_env: a JSON object, or key=value "
-        "(repeatable; values are JSON where they can be, else text).",
-        rich_help_panel=_CODE,
-    ),
-]
 Suite = Annotated[
     list[str] | None,
-    typer.Option("--suite", help="Only this suite (repeatable).", rich_help_panel=_CODE),
+    typer.Option("--suite", help="Only this suite (repeatable).", rich_help_panel=_PANEL),
 ]
 Task = Annotated[
     list[str] | None,
-    typer.Option("--task", help="Only this task id (repeatable).", rich_help_panel=_CODE),
-]
-Python = Annotated[
-    str | None,
-    typer.Option(
-        metavar="PATH",
-        help="The interpreter that runs the repository; this one by default.",
-        rich_help_panel=_CODE,
-    ),
-]
-Dependencies = Annotated[
-    str,
-    typer.Option(
-        metavar="auto|declared|host|PATH|JSON",
-        autocompletion=_one_of("auto", "declared", "host"),
-        help="Where its packages come from: an environment of its own where this interpreter lacks "
-        "something that it declares or imports; only what it declares; this interpreter; another, "
-        "or a virtual environment; or one of its own, adjusted: "
-        '\'{"extra": ["scipy"], "without": ["torch"], "python": "3.12"}\'.',
-        rich_help_panel=_CODE,
-    ),
-]
-Lock = Annotated[
-    str | None,
-    typer.Option(
-        metavar="FILE",
-        help="What 'envhub lock' wrote: its packages, and nothing that differs from it.",
-        rich_help_panel=_CODE,
-    ),
-]
-NumWorkers = Annotated[
-    int | None,
-    typer.Option(
-        min=1,
-        help="Processes over which sub-environments are spread.",
-        rich_help_panel=_CODE,
-    ),
-]
-Validate = Annotated[
-    bool,
-    typer.Option(
-        "--validate",
-        help="Hold every action and observation against its space, value by value.",
-        rich_help_panel=_CODE,
-    ),
-]
-SandboxName = Annotated[
-    str,
-    typer.Option(
-        "--sandbox",
-        metavar="process|docker[:IMAGE]|tcp://HOST:PORT",
-        help="Where it runs.",
-        autocompletion=_one_of("process", "docker", "tcp://"),
-        rich_help_panel=_LIMITS,
-    ),
-]
-SandboxOrNone = Annotated[
-    str,
-    typer.Option(
-        "--sandbox",
-        metavar="process|docker[:IMAGE]|tcp://HOST:PORT|none",
-        help="Where it runs; 'none' is this process, unprotected.",
-        autocompletion=_one_of("process", "docker", "tcp://", "none"),
-        rich_help_panel=_LIMITS,
-    ),
-]
-ServerKey = Annotated[
-    str | None,
-    typer.Option(
-        metavar="KEY",
-        help="With --sandbox tcp://...: that server's public key; else $ENVHUB_SERVER_KEY, or "
-        "what known_hosts says.",
-        rich_help_panel=_LIMITS,
-    ),
-]
-Trust = Annotated[
-    bool,
-    typer.Option(
-        "--trust-remote-code",
-        help="Needed for --sandbox none, where nothing protects you.",
-        rich_help_panel=_LIMITS,
-    ),
-]
-Profile = Annotated[
-    str | None,
-    typer.Option(
-        metavar="|".join(PROFILES),
-        help="Which layers must hold; strict by default.",
-        autocompletion=_one_of(*PROFILES),
-        rich_help_panel=_LIMITS,
-    ),
-]
-Network = Annotated[
-    str | None,
-    typer.Option(
-        metavar="|".join(NETWORKS),
-        help="None by default.",
-        autocompletion=_one_of(*NETWORKS),
-        rich_help_panel=_LIMITS,
-    ),
-]
-Gpu = Annotated[
-    str | None,
-    typer.Option(
-        "--gpu",
-        metavar="all|N[,N]",
-        help="Grant all GPUs, or those, as nvidia-smi counts them.",
-        rich_help_panel=_LIMITS,
-    ),
-]
-Readable = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--readable",
-        metavar="PATH",
-        help="A further absolute path that it may read (repeatable).",
-        rich_help_panel=_LIMITS,
-    ),
-]
-Variables = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--env",
-        metavar="NAME",
-        help="An environment variable that it may see (repeatable).",
-        rich_help_panel=_LIMITS,
-    ),
-]
-Memory = Annotated[
-    str | None,
-    typer.Option(metavar="SIZE", help="Memory, as in 512M or 4G.", rich_help_panel=_LIMITS),
-]
-Disk = Annotated[
-    str | None,
-    typer.Option(metavar="SIZE", help="Scratch space on disk.", rich_help_panel=_LIMITS),
-]
-Processes = Annotated[
-    int | None,
-    typer.Option(help="Processes and threads alive at once.", rich_help_panel=_LIMITS),
-]
-CpuTime = Annotated[
-    int | None,
-    typer.Option(metavar="SECONDS", help="CPU seconds of one process.", rich_help_panel=_LIMITS),
-]
-Timeout = Annotated[
-    float | None,
-    typer.Option(
-        metavar="SECONDS",
-        help="How long loading, one reset, one step or one render may take; 300 by default.",
-        rich_help_panel=_LIMITS,
-    ),
-]
-Token = Annotated[
-    str | None,
-    typer.Option(
-        help="For private repositories. Better: the variable HF_TOKEN, which no process list "
-        "shows, or 'hf auth login'.",
-        rich_help_panel=_HUB,
-    ),
-]
-Endpoint = Annotated[
-    str | None,
-    typer.Option(
-        metavar="URL", help="The Hub; $HF_ENDPOINT or huggingface.co.", rich_help_panel=_HUB
-    ),
-]
-HubCacheDir = Annotated[
-    str | None,
-    typer.Option(metavar="PATH", help="huggingface_hub's cache_dir.", rich_help_panel=_HUB),
+    typer.Option("--task", help="Only this task id (repeatable).", rich_help_panel=_PANEL),
 ]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")]
 Debug = Annotated[bool, typer.Option("--debug", help="Show tracebacks.")]
+
+_Command = Callable[..., None]
+
+
+def with_options(*keys: str, **defaults: Any) -> Callable[[_Command], _Command]:
+    """Report what ends a command, and give it options.
+
+    These are ``--debug``, and options of ``make_env`` in place of a parameter ``make``, which gets
+    ``MakeOptions``.
+
+    Args:
+        keys: Of ``OPTIONS``.
+        defaults: Those that differ from ``make_env``'s, by key.
+    """
+    made = {OPTIONS[key].parameter: _parameter(key, keys, defaults) for key in keys}
+
+    def decorate(function: _Command) -> _Command:
+        own = inspect.signature(function, eval_str=True).parameters
+        shown: dict[str, inspect.Parameter] = {}
+        for name, one in own.items():
+            shown |= made if name == "make" else {name: one}
+        shown.setdefault("debug", _keyword("debug", False, Debug))
+
+        @functools.wraps(function)
+        def command(**given: Any) -> None:
+            debug = given.get("debug", False) if "debug" in own else given.pop("debug", False)
+            with reported(debug=debug):
+                values = {name: given.pop(name) for name in made}
+                if "make" in own:
+                    said = {key: values[OPTIONS[key].parameter] for key in keys}
+                    given["make"] = MakeOptions(given.get("ref") or "", said)
+                function(**given)
+
+        # what typer reads
+        vars(command)["__signature__"] = inspect.Signature(
+            [_keyword(one.name, one.default, one.annotation) for one in shown.values()]
+        )
+        command.__annotations__ = {name: one.annotation for name, one in shown.items()}
+        return command
+
+    return decorate
+
+
+def _keyword(name: str, default: Any, annotation: Any) -> inspect.Parameter:
+    """A parameter whose place in a signature says nothing."""
+    kind = inspect.Parameter.KEYWORD_ONLY
+    return inspect.Parameter(name, kind, default=default, annotation=annotation)
+
+
+def _parameter(key: str, others: Sequence[str], defaults: Mapping[str, Any]) -> inspect.Parameter:
+    one = OPTIONS[key]
+    if key == "sandbox" and "trust_remote_code" in others:
+        text = "Where it runs; 'none' is this process, unprotected."
+        one = replace(one, metavar=f"{one.metavar}|none", help=text)
+    option = typer.Option(
+        *one.command.split(),
+        help=one.help,
+        metavar=one.metavar,
+        min=one.least,
+        max=one.most,
+        autocompletion=_completion(one.metavar or ""),
+        rich_help_panel=one.panel,
+    )
+    default = defaults.get(key, one.default)
+    kind: Any = list[str] if one.kind in (list, dict) else one.kind
+    annotation: Any = Annotated[kind if default is not None else kind | None, option]
+    return _keyword(one.parameter, default, annotation)
+
+
+def _completion(metavar: str) -> Callable[[], list[str]] | None:
+    """What a shell completes: what a metavar has in small letters."""
+    found = [re.match(r"[a-z][a-z:/-]*", one) for one in metavar.split("|")]
+    words = [one[0] for one in found if one is not None]
+    return (lambda: words) if words else None
 
 
 @dataclass(frozen=True)
@@ -246,21 +130,32 @@ class MakeOptions:
 
     Attributes:
         ref: The reference.
-        given: The values of the options that the command has, by keys of ``OPTION_NAMES``.
+        given: The values of the options that the command has, as typed, by keys of ``OPTIONS``.
     """
 
     ref: str
     given: Mapping[str, Any]
 
-    @classmethod
-    def of(cls, context: Any) -> MakeOptions:
-        """What a command was given."""
-        values = {
-            name: context.params[one.name] for one in context.command.params for name in one.opts
-        }
-        commands = {key: one.command for key, one in OPTION_NAMES.items()}
-        given = {key: values[name] for key, name in commands.items() if name in values}
-        return cls(context.params["ref"] or "", given)
+    def __getitem__(self, key: str) -> Any:
+        """An option as ``make_env`` takes it.
+
+        Raises:
+            UsageError: It cannot be read.
+        """
+        if key == "sandbox" and self.in_process:
+            self._check_trust()
+        return _READERS.get(key, lambda given: given)(self.given[key])
+
+    def snapshot(self, ref: str) -> Snapshot:
+        """What a reference names, fetched."""
+        from envhub_sandbox.hub.snapshot import named
+
+        return named(ref, **self.hub)
+
+    @property
+    def hub(self) -> dict[str, Any]:
+        """Which Hub, and how."""
+        return {key: self.given[key] for key in HUB}
 
     @property
     def in_process(self) -> bool:
@@ -273,18 +168,9 @@ class MakeOptions:
         Raises:
             UsageError: An option cannot be read.
         """
-        if self.in_process and "trust_remote_code" not in self.given:
-            raise UsageError("this command needs a sandbox; leave out --sandbox none")
-        if self.in_process and not self.given["trust_remote_code"]:
-            raise UsageError(
-                f"--sandbox none runs the code of {self.ref} in this process, with everything that "
-                "you may do. If you trust it, add --trust-remote-code. Otherwise leave out "
-                "--sandbox none: the sandbox needs no trust."
-            )
         made: dict[str, Any] = {"cfg": self.ref, "policy": {}, "limits": {}, "timeouts": {}}
-        for key, value in self.given.items():
-            one = OPTION_NAMES[key]
-            value = _READERS.get(key, lambda given: given)(value)
+        for key in self.given:
+            one, value = OPTIONS[key], self[key]
             if not one.field:
                 made[one.argument] = value
             elif value or type(value) in (int, float):  # else the library's default holds
@@ -292,6 +178,16 @@ class MakeOptions:
         if limits := made.pop("limits"):
             made["policy"]["limits"] = limits
         return made
+
+    def _check_trust(self) -> None:
+        if "trust_remote_code" not in self.given:
+            raise UsageError("this command needs a sandbox; leave out --sandbox none")
+        if not self.given["trust_remote_code"]:
+            raise UsageError(
+                f"--sandbox none runs the code of {self.ref} in this process, with everything that "
+                "you may do. If you trust it, add --trust-remote-code. Otherwise leave out "
+                "--sandbox none: the sandbox needs no trust."
+            )
 
     @contextlib.contextmanager
     def explained(self) -> Iterator[None]:
@@ -304,6 +200,29 @@ class MakeOptions:
                 raise
             text = f"{self.ref}: {type(error).__name__}: {error}"
             raise ForeignError(text) from error
+
+
+def select(
+    envs: Mapping[str, Mapping[Any, Any]],
+    suites: Sequence[str] | None,
+    tasks: Sequence[str] | None,
+) -> list[tuple[str, Any, Any]]:
+    """``(suite, task, env)`` for each chosen environment; all where nothing is chosen.
+
+    Raises:
+        UsageError: None fits; the text names what there is.
+    """
+    found = [(suite, task, env) for suite, group in envs.items() for task, env in group.items()]
+    chosen = [
+        item
+        for item in found
+        if (not suites or str(item[0]) in suites) and (not tasks or str(item[1]) in tasks)
+    ]
+    if not chosen:
+        names = ", ".join(safe_line(f"{suite}/{task}", 80) for suite, task, _ in found[:_NAMED])
+        more = f" and {len(found) - _NAMED} more" if len(found) > _NAMED else ""
+        raise UsageError(f"no such suite or task; there are (suite/task): {names}{more}")
+    return chosen
 
 
 def read_gpu(text: str | None) -> bool | list[int] | None:
@@ -402,7 +321,7 @@ _READERS: dict[str, Callable[[Any], Any]] = {
     "sandbox": lambda name: None if name == "none" else name,
     "env_kwargs": lambda texts: read_env_kwargs(texts or ()),
     "dependencies": read_dependencies,
-    "output": output_policy,
+    "output": lambda name: None if name == "-" else name,  # the log of run
     "gpu": read_gpu,
 }
 """How values are made of what was typed, where the two are not the same."""

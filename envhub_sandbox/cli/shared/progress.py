@@ -66,7 +66,7 @@ class Bar:
         self._also = contextlib.ExitStack()
 
     def begin(self, title: str, total: int | None = None) -> None:
-        """Show what begins; ``total`` in episodes, None where nobody knows how long."""
+        """Show what begins; ``total`` in episodes, None where that is unknown."""
         self._total = total or 0
         self._begun = self._shown = time.monotonic()
         if self._waits is not None:

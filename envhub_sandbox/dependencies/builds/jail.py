@@ -19,7 +19,7 @@ from envhub_worker.protocol.text import printable
 PROFILE_VARIABLE = "ENVHUB_BUILD_PROFILE"
 WALL_S = 1800.0
 LIMITS = {"memory_bytes": "8G", "disk_bytes": "6G", "disk_files": 400_000, "cpu_s": 7200}
-_PROGRAM = "envhub_sandbox.making.builder"
+_PROGRAM = "envhub_sandbox.factory.builder"
 _SHOWN = 6000
 _AROUND_S = 900.0
 _MOST_REQUIRED = 200
@@ -33,7 +33,7 @@ def build(order: Mapping[str, Any], folder: Path) -> Path | tuple[str, ...]:
     """A wheel below an empty folder, or what the build backend needs besides.
 
     Nothing of either has been looked at: they are a stranger's. The order is read by
-    ``making/builder.py``; limits, profile and what the jail may read are added here. Raises
+    ``factory/builder.py``; limits, profile and what the jail may read are added here. Raises
     ``BuildFailedError``, or ``DependencyError`` where there is no jail on this host.
     """
     said = _run(order, folder)

@@ -12,6 +12,6 @@ the Hub's code into this process; ``lerobot-eval-sandboxed`` is ``lerobot-eval``
 from __future__ import annotations
 
 from envhub_sandbox.integrations.lerobot.config import SandboxedEnvConfig
-from envhub_sandbox.integrations.lerobot.routing import install
+from envhub_sandbox.integrations.lerobot.install import install
 
 __all__ = ["SandboxedEnvConfig", "install"]

@@ -1,12 +1,14 @@
 """``--env.type=envhub_sandbox``: a repository of the Hub as one of LeRobot's own configurations.
 
-It is no ``HubEnvConfig``: those are refused without ``trust_remote_code``, which nobody needs who
-trusts nothing, and by ``lerobot-train`` altogether.
+It is no ``HubEnvConfig``: LeRobot refuses those without ``trust_remote_code``, which the sandbox
+does not need, and ``lerobot-train`` refuses them altogether.
 """
 
 from __future__ import annotations
 
 import json
+import threading
+from collections.abc import Hashable
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -20,20 +22,76 @@ from envhub_sandbox.api import make_env
 from envhub_sandbox.errors import HubReferenceError
 from envhub_sandbox.hub.logins import without_login
 from envhub_sandbox.integrations.lerobot.features import features_of
-from envhub_sandbox.integrations.lerobot.waiting import Waiting
-from envhub_sandbox.option_names import OPTION_NAMES, on_lerobots_command_line, use_option_names
+from envhub_sandbox.option_names import on_lerobots_command_line, use_option_names
+from envhub_sandbox.options import OPTIONS
 from envhub_sandbox.vector.suites import EnvSuites
 
 ASKS_CONFIGS = hasattr(EnvConfig, "create_envs")
 """Whether this LeRobot asks a configuration for its environments: 0.6 does, 0.4 and 0.5 do not."""
 
-_WAITING = Waiting()
 _SAID_OTHERWISE = {"n_envs", "use_async_envs", "trust_remote_code", "token"}
-_OPTIONS = {one.argument for one in OPTION_NAMES.values()} - _SAID_OTHERWISE
+_OPTIONS = {
+    key: one for key, one in OPTIONS.items() if not one.field and key not in _SAID_OTHERWISE
+}
+
+
+class SpareSuites:
+    """Environments that have answered for their spaces, kept for the request that follows.
+
+    LeRobot wants the features of an environment before it makes any. The jail that answered is used
+    then, so that a simulator is loaded once. Where no request follows, as before a training whose
+    first evaluation is an hour away, it is closed. At most one is kept for each key.
+
+    Args:
+        seconds: For how long one is kept.
+    """
+
+    def __init__(self, seconds: float = 60.0) -> None:
+        self._seconds = seconds
+        self._lock = threading.Lock()
+        self._kept: dict[Hashable, EnvSuites] = {}
+
+    def put(self, key: Hashable, suites: EnvSuites) -> None:
+        """Keep these; others of that key are closed."""
+        with self._lock:
+            before, self._kept[key] = self._kept.get(key), suites
+        if before is not None:
+            before.close()
+        timer = threading.Timer(self._seconds, self._give_up, (key, suites))
+        timer.daemon = True
+        timer.start()
+
+    def take(self, key: Hashable) -> EnvSuites | None:
+        """Those of this key, which are the caller's from now on."""
+        with self._lock:
+            return self._kept.pop(key, None)
+
+    def _give_up(self, key: Hashable, suites: EnvSuites) -> None:
+        with self._lock:
+            if self._kept.get(key) is not suites:
+                return
+            del self._kept[key]
+        suites.close()
+
+
+_SPARES = SpareSuites()
+
+
+def _with_options(config: type[Any]) -> type[Any]:
+    """A field for each option, of the type that it has on a command line."""
+    for key, one in _OPTIONS.items():
+        if one.kind is dict:
+            config.__annotations__[key] = dict[str, Any]
+            setattr(config, key, field(default_factory=dict))
+        else:
+            config.__annotations__[key] = one.kind if one.default is not None else one.kind | None
+            setattr(config, key, one.default)
+    return config
 
 
 @EnvConfig.register_subclass("envhub_sandbox")
 @dataclass
+@_with_options
 class SandboxedEnvConfig(EnvConfig):
     """The environments of a repository, each in a sandbox.
 
@@ -56,27 +114,12 @@ class SandboxedEnvConfig(EnvConfig):
     features_map: dict[str, str] = field(default_factory=dict)
     repo: str | None = None
     suite: str | None = None
-    sandbox: str = "process"
-    env_kwargs: dict[str, Any] = field(default_factory=dict)
-    policy: dict[str, Any] = field(default_factory=dict)
-    timeouts: dict[str, Any] = field(default_factory=dict)
-    limits: dict[str, Any] = field(default_factory=dict)
-    dependencies: str = "auto"
-    lock: str | None = None
-    python: str | None = None
-    num_workers: int | None = None
-    prewarm: int | None = None
-    lane: str = "auto"
-    copy: bool = True
-    validate: bool = False
-    endpoint: str | None = None
-    server_key: str | None = None
-    hub_cache_dir: str | None = None
 
     def __post_init__(self) -> None:
         if not self.repo:
             raise ValueError("env.repo is missing: which repository? --env.repo=org/repo@<commit>")
-        if self.endpoint is not None and without_login(self.endpoint) != self.endpoint:
+        endpoint = self._options()["endpoint"]
+        if endpoint is not None and without_login(endpoint) != endpoint:
             raise HubReferenceError(
                 "env.endpoint holds a login, and LeRobot prints and saves configurations; put it "
                 "into the environment variable HF_ENDPOINT"
@@ -89,7 +132,7 @@ class SandboxedEnvConfig(EnvConfig):
         except BaseException:
             suites.close()
             raise
-        _WAITING.put(self._key(n_envs, use_async_envs), suites)
+        _SPARES.put(self._key(n_envs, use_async_envs), suites)
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
@@ -115,17 +158,21 @@ class SandboxedEnvConfig(EnvConfig):
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> EnvSuites:
         """``{suite: {task_id: VectorEnv}}``; raises as ``envhub_sandbox.make_env``."""
-        waiting = _WAITING.take(self._key(n_envs, use_async_envs))
-        return self._made(n_envs, use_async_envs) if waiting is None else waiting
+        spare = _SPARES.take(self._key(n_envs, use_async_envs))
+        return self._made(n_envs, use_async_envs) if spare is None else spare
+
+    def _options(self) -> dict[str, Any]:
+        """``make_env``'s, as the fields say them."""
+        said = {key: getattr(self, key) for key in _OPTIONS}
+        said |= {key: said[key] or None for key, one in _OPTIONS.items() if one.kind is dict}
+        if isinstance(said["dependencies"], str) and said["dependencies"].startswith("{"):
+            said["dependencies"] = json.loads(said["dependencies"])
+        return said
 
     def _made(self, n_envs: int, use_async_envs: bool) -> EnvSuites:
-        options = {name: getattr(self, name) for name in _OPTIONS}
-        if isinstance(self.dependencies, str) and self.dependencies.startswith("{"):
-            options["dependencies"] = json.loads(self.dependencies)
-        for name in ("policy", "timeouts", "limits", "env_kwargs"):
-            options[name] = options[name] or None
+        asked = {"n_envs": n_envs, "use_async_envs": use_async_envs, **self._options()}
         with use_option_names(on_lerobots_command_line()):
-            suites = make_env(self.repo, n_envs=n_envs, use_async_envs=use_async_envs, **options)
+            suites = make_env(self.repo, **asked)
         try:
             suites.keep(self.suite, self.task)
         except BaseException:

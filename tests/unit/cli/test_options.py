@@ -2,29 +2,29 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
+import inspect
 from typing import Any
 
 import pytest
-import typer
 
-from envhub_sandbox.cli.app import app
 from envhub_sandbox.cli.shared.exits import ForeignError, UsageError
-from envhub_sandbox.cli.shared.options import MakeOptions, read_env_kwargs, read_gpu, read_size
-from envhub_sandbox.cli.shared.select import select
+from envhub_sandbox.cli.shared.options import (
+    ALL,
+    MakeOptions,
+    read_env_kwargs,
+    read_gpu,
+    read_size,
+    select,
+    with_options,
+)
 from envhub_sandbox.errors import PolicyError, RemoteEnvError
+from envhub_sandbox.options import OPTIONS
 from envhub_sandbox.policy import policy_from
-
-_OUTPUT = "worker_output"
-"""The panel of another kind has it."""
 
 
 def options(**given: Any) -> MakeOptions:
-    """Options of ``envhub run`` as typed; the others at their defaults."""
-    command = typer.main.get_command(app).commands["run"]  # type: ignore[attr-defined]
-    params = {one.name: one.default for one in command.params} | {"ref": "org/repo"}
-    assert set(given) <= set(params)
-    return MakeOptions.of(SimpleNamespace(command=command, params={**params, **given}))
+    """Options of ``envhub run``, by key; the others as if nothing was typed."""
+    return MakeOptions("org/repo", {**{key: OPTIONS[key].default for key in ALL}, **given})
 
 
 def test_gpus_are_all_or_named_by_number() -> None:
@@ -35,19 +35,20 @@ def test_gpus_are_all_or_named_by_number() -> None:
             read_gpu(text)
 
 
-@pytest.mark.parametrize("name", ["run", "inspect", "check"])
-def test_every_option_about_make_env_reaches_it(name: str) -> None:
-    """None is lost, and none of another meaning is taken for one."""
-    command = typer.main.get_command(app).commands[name]  # type: ignore[attr-defined]
-    panels = ("How it is built", "What it may do", "Where it comes from")
-    about = {
-        one.name for one in command.params if getattr(one, "rich_help_panel", None) in panels
-    } - {"suite", "task", "policy"}  # which make_env is not told, or not in this way
-    assert len(about) > 15
-    params = {one.name: f"<{one.name}>" for one in command.params}
-    made = MakeOptions.of(SimpleNamespace(command=command, params=params))
-    assert set(made.given.values()) == {f"<{one}>" for one in about | set(params) & {_OUTPUT}}
-    assert (made.ref, made.given["step_s"]) == ("<ref>", "<timeout>")
+def test_every_option_of_a_command_reaches_make_env() -> None:
+    """Under its key, and under no other; ``--timeout`` is four of them."""
+    made: list[MakeOptions] = []
+
+    @with_options(*ALL)
+    def probe(*, ref: str, make: MakeOptions) -> None:
+        made.append(make)
+
+    names = set(inspect.signature(probe).parameters)
+    probe(**{**{name: f"<{name}>" for name in names}, "debug": False})
+    given = {key: f"<{OPTIONS[key].parameter}>" for key in ALL}
+    assert made == [MakeOptions("<ref>", given)]
+    assert names == {*(OPTIONS[key].parameter for key in ALL), "ref", "debug"}
+    assert given["step_s"] == given["startup_s"] == "<timeout>"
 
 
 @pytest.mark.parametrize(
@@ -105,7 +106,12 @@ def test_only_what_was_given_reaches_the_policy() -> None:
     assert options().arguments()["policy"] == {}
     assert options().arguments()["timeouts"] == {}
     given = options(
-        memory="1G", cpu_time=5, network="loopback", gpu="all", readable=["/data"], variables=["A"]
+        memory_bytes="1G",
+        cpu_s=5,
+        network="loopback",
+        gpu="all",
+        readable=["/data"],
+        environment=["A"],
     )
     assert given.arguments()["policy"] == {
         "network": "loopback",
@@ -116,25 +122,27 @@ def test_only_what_was_given_reaches_the_policy() -> None:
     }
 
 
-@pytest.mark.parametrize("name", ["memory", "disk", "processes", "cpu_time"])
+@pytest.mark.parametrize("name", ["memory_bytes", "disk_bytes", "processes", "cpu_s"])
 def test_a_limit_of_nothing_is_refused(name: str) -> None:
     """And is not taken for the default."""
-    given = options(**{name: "0" if name in ("memory", "disk") else 0}).arguments()
+    given = options(**{name: "0" if name.endswith("_bytes") else 0}).arguments()
     with pytest.raises(PolicyError, match="above 0"):
         policy_from(given["policy"], None)
 
 
 def test_a_timeout_is_for_every_operation_but_close() -> None:
     """Closing is bounded by itself."""
-    timeouts = options(timeout=7.5).arguments()["timeouts"]
-    assert timeouts == {"startup_s": 7.5, "reset_s": 7.5, "step_s": 7.5, "call_s": 7.5}
+    keys = {key for key in ALL if OPTIONS[key].command == "--timeout"}
+    assert keys == {"startup_s", "reset_s", "step_s", "call_s"}
+    given = dict.fromkeys(keys, 7.5)
+    assert options(**given).arguments()["timeouts"] == given
 
 
 def test_running_unprotected_needs_the_word() -> None:
     """Before anything is fetched, and in the words of the command line."""
     with pytest.raises(UsageError, match="--trust-remote-code"):
         options(sandbox="none").arguments()
-    assert options(sandbox="none", trust=True).arguments()["sandbox"] is None
+    assert options(sandbox="none", trust_remote_code=True).arguments()["sandbox"] is None
 
 
 def test_only_without_a_sandbox_are_strange_errors_the_repositorys() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 import json
 from collections.abc import Callable
 from typing import Any
@@ -124,16 +123,3 @@ def test_options_become_arguments_of_make_env(monkeypatch: pytest.MonkeyPatch) -
         "num_workers": 2,
         "validate": True,
     }
-
-
-def test_make_env_takes_all_that_it_is_given(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The names are those of the real one."""
-    seen: dict[str, Any] = {}
-
-    def make_env(**kwargs: Any) -> EnvSuites:
-        seen.update(kwargs)
-        return suites(Noted(0, []))
-
-    known = set(inspect.signature(api.make_env).parameters)
-    run(monkeypatch, make_env)
-    assert set(seen) <= known

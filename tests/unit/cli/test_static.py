@@ -103,6 +103,7 @@ def test_findings_fail_where_that_is_asked_for(least: str, code: int, tmp_path: 
     [
         (["--static", "--n-envs", "2"], "--n-envs means nothing here: with --static nothing runs"),
         (["--static", "--sandbox", "process"], "--sandbox means nothing here"),
+        (["--static", "--async"], "--async means nothing here"),
         (["--fail-on", "note"], "--fail-on means nothing here: it needs --static"),
         (["--static", "--fail-on", "never"], "it takes error, warning or note"),
     ],

@@ -12,9 +12,10 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import HubReferenceError, PolicyError, RepositoryUnavailableError
+from envhub_sandbox.factory import sandbox_spec
+from envhub_sandbox.factory.config import plain_config
 from envhub_sandbox.hub import snapshot
-from envhub_sandbox.making import arguments
-from envhub_sandbox.making.config import plain_config
+from envhub_sandbox.options import Options
 from tests.support import inside
 from tests.support.samples import sample
 
@@ -62,10 +63,10 @@ def test_what_cannot_be_is_refused(
 
 def test_numpys_numbers_are_numbers() -> None:
     """As they come out of a configuration or a sweep."""
-    assert arguments.sub_environments(np.int64(4)) == 4
-    assert type(arguments.sub_environments(np.int64(4))) is int
-    assert arguments.flag("use_async_envs", np.True_) is True
-    assert arguments.workers(np.int8(2)) == 2
+    given: Any = {"n_envs": np.int64(4), "use_async_envs": np.True_, "num_workers": np.int8(2)}
+    made = Options(**given).checked()
+    assert (made.n_envs, made.use_async_envs, made.num_workers) == (4, True, 2)
+    assert [type(one) for one in (made.n_envs, made.use_async_envs)] == [int, bool]
 
 
 @pytest.mark.parametrize(
@@ -89,9 +90,9 @@ def test_without_a_sandbox_nothing_pretends_to_protect(given: dict[str, Any]) ->
 def test_a_name_is_looked_up_as_a_shell_does(monkeypatch: pytest.MonkeyPatch) -> None:
     """And a path is a path."""
     monkeypatch.setattr("shutil.which", lambda name: f"/somewhere/{name}")
-    assert arguments.interpreter("python3.12") == "/somewhere/python3.12"
-    assert arguments.interpreter("/a/../python3.12") == "/python3.12"
-    assert arguments.interpreter(None) == ""
+    assert sandbox_spec.interpreter("python3.12") == "/somewhere/python3.12"
+    assert sandbox_spec.interpreter("/a/../python3.12") == "/python3.12"
+    assert sandbox_spec.interpreter(None) == ""
 
 
 @dataclass

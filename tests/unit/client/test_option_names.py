@@ -17,15 +17,16 @@ from envhub_sandbox import Limits, Policy, Timeouts, make_env
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.errors import PolicyError
 from envhub_sandbox.option_names import (
-    OPTION_NAMES,
     in_python,
     on_command_line,
     on_lerobots_command_line,
     option_name,
     use_option_names,
 )
+from envhub_sandbox.options import OPTIONS
 
-_ALL = on_command_line({one.command for one in OPTION_NAMES.values()})
+_COMMANDS = {name for one in OPTIONS.values() for name in one.command.split()}
+_ALL = on_command_line(_COMMANDS)
 _GROUPS: dict[str, Any] = {"policy": Policy, "limits": Limits, "timeouts": Timeouts}
 _ROOT = Path(next(iter(envhub_sandbox.__path__)))
 
@@ -92,44 +93,31 @@ def test_what_is_wrong_with_an_option_names_it_as_it_was_given() -> None:
             Policy(limits=Limits(memory_bytes=0))
 
 
-def test_every_option_of_make_env_is_in_the_table() -> None:
-    """Each argument, and each key of one that is a mapping; and no other."""
-    arguments = set(inspect.signature(make_env).parameters) - {"cfg"} - set(_GROUPS)
-    assert {key for key, one in OPTION_NAMES.items() if not one.field} == arguments
+def test_the_signature_of_make_env_is_that_of_the_table() -> None:
+    """Each argument with its default, each key of one that is a mapping; and no other."""
+    signature = inspect.signature(make_env).parameters
+    arguments = {key: one.default for key, one in OPTIONS.items() if not one.field}
+    assert {key: one.default for key, one in signature.items() if key != "cfg"} == arguments
     for argument, kind in _GROUPS.items():
         known = {one.name for one in dataclasses.fields(kind)} - {"limits"}
-        assert {key for key, one in OPTION_NAMES.items() if one.argument == argument} == known, (
-            argument
-        )
+        keys = {key for key, one in OPTIONS.items() if one.argument == argument and one.field}
+        assert keys == known, argument
 
 
 def test_every_option_of_a_command_exists() -> None:
     """``envhub run`` has all of them."""
     commands = typer.main.get_command(app).commands  # type: ignore[attr-defined]
     there = {name for one in commands["run"].params for name in one.opts}
-    assert {one.command for one in OPTION_NAMES.values()} - {""} <= there
-
-
-def test_lerobots_configuration_has_every_argument() -> None:
-    """But for what LeRobot says itself, and a token, which it would print and save."""
-    module = ast.parse((_ROOT / "integrations" / "lerobot" / "config.py").read_text())
-    [config] = [node for node in module.body if isinstance(node, ast.ClassDef)]
-    fields = {
-        node.target.id
-        for node in config.body
-        if isinstance(node, ast.AnnAssign) and isinstance(node.target, ast.Name)
-    }
-    own = {"n_envs", "use_async_envs", "trust_remote_code", "token"}
-    assert {one.argument for one in OPTION_NAMES.values()} - own <= fields
+    assert there >= _COMMANDS
 
 
 def test_no_error_has_a_spelling_of_its_own() -> None:
     """No text but the documentation of Python writes an option with a value in the source."""
-    names = "|".join({one.argument for one in OPTION_NAMES.values()} - {"copy", "token", "n_envs"})
+    names = "|".join({one.argument for one in OPTIONS.values()} - {"copy", "token", "n_envs"})
     written = re.compile(rf"(?<![-\w.])(?:{names})=(?:['\"{{.]|[A-Z]{{2}})|Policy\(|Timeouts\(")
     found = []
     for path in _ROOT.rglob("*.py"):
-        if path.name in ("starter.py", "option_names.py", "inprocess.py", "api.py"):
+        if path.name in ("starter.py", "option_names.py", "options.py", "inprocess.py", "api.py"):
             continue
         module = ast.parse(path.read_text())
         docs = {id(one.value) for one in ast.walk(module) if isinstance(one, ast.Expr)}

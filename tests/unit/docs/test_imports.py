@@ -39,7 +39,7 @@ OPTIONAL = {
     "envhub_sandbox.integrations.sb3": {"stable_baselines3"},
     "envhub_sandbox.integrations.lerobot.config": {"draccus", "lerobot"},
     "envhub_sandbox.integrations.lerobot.features": {"lerobot"},
-    "envhub_sandbox.integrations.lerobot.routing": {"lerobot"},
+    "envhub_sandbox.integrations.lerobot.install": {"lerobot"},
     "envhub_sandbox.integrations.lerobot_eval": {"lerobot"},
     "envhub_worker.protocol.messages.base": {"typing_extensions"},  # for type checkers alone
     "envhub_sandbox.metrics": {"prometheus_client"},
@@ -54,6 +54,7 @@ DESERIALISERS = {"_pickle", "copyreg", "dill", "joblib", "marshal", "pickle", "s
 # Every package may import the lowest ones, LOWEST, as far as these stand below it.
 LOWEST = {
     *("envhub_sandbox.errors", "envhub_sandbox.option_names"),
+    "envhub_sandbox.options",
     *("envhub_sandbox.system", "envhub_worker.protocol"),
 }
 MAY_IMPORT = {
@@ -63,8 +64,8 @@ MAY_IMPORT = {
         *("", "api", "check", "crash", "dependencies", "hub", "locks", "policy", "rollouts"),
         *("sandboxes", "session"),
     },
-    "envhub_sandbox.api": {"making", "policy", "sandboxes", "vector"},
-    "envhub_sandbox.making": {
+    "envhub_sandbox.api": {"factory", "policy", "sandboxes", "vector"},
+    "envhub_sandbox.factory": {
         *("dependencies", "hub", "locks", "policy", "sandboxes", "session"),
         *("transport", "vector"),
     },
@@ -89,6 +90,7 @@ MAY_IMPORT = {
     "envhub_sandbox.policy": set(),
     "envhub_sandbox.errors": set(),
     "envhub_sandbox.option_names": set(),
+    "envhub_sandbox.options": set(),
     "envhub_sandbox.system": set(),
     "envhub_worker.__main__": {"cli"},
     "envhub_worker.cli": {"", "access", "lockdown", "server", "spawn"},
@@ -136,7 +138,7 @@ IMPORTERS = {
 }
 
 # the modules of LeRobot's package that import make_env
-_LEROBOT = ("lerobot.config", "lerobot.routing")
+_LEROBOT = ("lerobot.config", "lerobot.install")
 
 # where tests and benchmarks may name what starts with an underscore, and others' names that they do
 SEAM = "tests/support/inside.py"

@@ -1,4 +1,4 @@
-"""The program that has a jail build a wheel: ``python -I -m envhub_sandbox.making.builder FOLDER``.
+"""Has a jail build a wheel: ``python -I -m envhub_sandbox.factory.builder FOLDER``.
 
 ``dependencies`` starts it, since it knows no sandboxes. In the folder lies ``order.json``, and the
 sources; what came of it is printed as one object of JSON: ``wheel``, its name, which lies in
@@ -18,10 +18,10 @@ from pathlib import Path
 from typing import Any
 
 from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerTimeoutError
+from envhub_sandbox.factory import build_env
+from envhub_sandbox.factory.env_factory import EnvFactory
 from envhub_sandbox.hub import store
 from envhub_sandbox.hub.snapshot import local
-from envhub_sandbox.making import build_env
-from envhub_sandbox.making.proxies import Proxies
 from envhub_sandbox.policy import Limits, Policy, Timeouts
 from envhub_sandbox.sandboxes.process import PROCESS
 from envhub_sandbox.session.jails.launcher import Launcher
@@ -55,7 +55,7 @@ def _built(folder: Path, order: Mapping[str, Any]) -> dict[str, Any]:
     tools = _tools(folder / "tools")
     repository = _repository(folder, order)
     launcher = Launcher(repository, PROCESS, store.cache_root() / "snapshots")
-    with Proxies(launcher, 1, 0, SandboxVectorEnv, lambda manifest: None).make() as suites:
+    with EnvFactory(launcher, 1, 0, SandboxVectorEnv, lambda manifest: None).make() as suites:
         env = suites.env
         names = ("packages", "python", "backend", "backend_path", "known", "environment")
         asked = {name: order[name] for name in names}

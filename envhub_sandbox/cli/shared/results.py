@@ -134,8 +134,8 @@ def print_provenance(provenance: dict[str, Any], *, in_process: bool) -> None:
     show("repository", _repository(provenance), width=_WIDTH)
     interpreter = provenance.get("interpreter") or {}
     if interpreter:
-        told = _interpreter(interpreter, provenance.get("packages") or {})
-        show("ran on", told, width=_WIDTH)
+        text = _interpreter(interpreter, provenance.get("packages") or {})
+        show("ran on", text, width=_WIDTH)
     for title, text in _confinement(provenance, in_process):
         show(title, text, width=_WIDTH)
 

@@ -15,8 +15,8 @@ from envhub_sandbox.cli.init.init import repository_name
 from envhub_sandbox.cli.init.starter import starter
 from envhub_sandbox.cli.shared.exits import UsageError
 from envhub_sandbox.hub.local import LocalFolder
+from tests.support.command_line import COMMAND
 
-ENVHUB = [sys.executable, "-I", "-m", "envhub_sandbox"]
 PLUGIN = "envhub_sandbox.pytest_plugin"
 
 
@@ -44,7 +44,7 @@ def pytest_run(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
 
 def test_a_new_repository_passes_its_own_tests(tmp_path: Path) -> None:
     """In a sandbox, values held against spaces; so do its further options."""
-    made = run(tmp_path, *ENVHUB, "init", "my-env")
+    made = run(tmp_path, *COMMAND, "init", "my-env")
     assert (made.returncode, made.stdout) == (0, "./my-env\n")
     folder = tmp_path / "my-env"
     paths = {path.relative_to(folder) for path in folder.rglob("*") if path.is_file()}
@@ -77,7 +77,7 @@ def test_those_of_the_test_win(tmp_path, monkeypatch, request):
 def test_within_a_checkout_none_is_made(tmp_path: Path) -> None:
     """Its files are a part of that one; what its tests leave behind is a part of none."""
     subprocess.run(["git", "init", "--quiet", tmp_path], check=True)
-    assert run(tmp_path, *ENVHUB, "init", "my-env").returncode == 0
+    assert run(tmp_path, *COMMAND, "init", "my-env").returncode == 0
     assert not (tmp_path / "my-env/.git").exists()
     (tmp_path / "my-env/__pycache__").mkdir()
     (tmp_path / "my-env/__pycache__/env.pyc").write_text("")
@@ -116,6 +116,6 @@ def test_the_shell_completes_commands_and_options(tmp_path: Path) -> None:
     """By the script that ``--show-completion`` prints, which asks the program."""
     words = {"COMP_WORDS": "envhub run --vid", "COMP_CWORD": "2"}
     words |= {"_ENVHUB_COMPLETE": "complete_bash"}
-    assert run(tmp_path, *ENVHUB, **words).stdout.split() == ["--video"]
+    assert run(tmp_path, *COMMAND, **words).stdout.split() == ["--video"]
     shown = {"_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"}
-    assert "complete_bash" in run(tmp_path, *ENVHUB, "--show-completion", "bash", **shown).stdout
+    assert "complete_bash" in run(tmp_path, *COMMAND, "--show-completion", "bash", **shown).stdout

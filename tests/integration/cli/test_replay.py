@@ -10,7 +10,7 @@ import pytest
 
 from envhub_sandbox import errors, make_env
 from tests.hub.olah_server import OlahServer
-from tests.integration.test_cli_run import envhub
+from tests.support.command_line import envhub
 from tests.support.repositories import write_repository
 from tests.support.samples import sample
 

@@ -10,15 +10,14 @@ from envhub_sandbox.dependencies.modules import MissingModule
 from envhub_sandbox.dependencies.pipeline import PackageSet, packages_for
 from envhub_sandbox.dependencies.request import Choice, chosen
 from envhub_sandbox.errors import PolicyError
+from envhub_sandbox.factory import sandbox_spec
+from envhub_sandbox.factory.config import plain_config, reference_of
+from envhub_sandbox.factory.env_factory import EnvFactory
 from envhub_sandbox.hub import store
 from envhub_sandbox.hub.snapshot import Snapshot, named
 from envhub_sandbox.locks import use as locks
-from envhub_sandbox.making import arguments
-from envhub_sandbox.making.config import plain_config
-from envhub_sandbox.making.options import Options
-from envhub_sandbox.making.places import reference_of, sandbox_of
-from envhub_sandbox.making.proxies import Proxies
 from envhub_sandbox.option_names import option_name
+from envhub_sandbox.options import Options
 from envhub_sandbox.policy import Policy, Timeouts, policy_from, timeouts_from
 from envhub_sandbox.sandboxes import inprocess
 from envhub_sandbox.sandboxes.sandbox import Sandbox
@@ -49,7 +48,7 @@ def make(make_env: Callable[..., EnvSuites], cfg: Any, given: Options) -> EnvSui
         return _make_here(reference, config, options)
     processes.occupy_streams()  # before anything of ours is opened
     wanted = _wanted(options.sandbox, options)
-    snapshot = _snapshot(reference, options)
+    snapshot = named(reference, **options.hub)
     packages = _packages(snapshot, wanted)
     load = LoadArguments(
         n_envs=options.n_envs,
@@ -69,89 +68,8 @@ def make(make_env: Callable[..., EnvSuites], cfg: Any, given: Options) -> EnvSui
             dependencies="auto" if wanted.python is not None else options.dependencies,
         ),
     )
-    repository = _repository(snapshot, load, wanted, packages, options, recipe)
-    return Proxies(
-        Launcher(repository, wanted.place, store.cache_root() / "snapshots"),
-        options.num_workers,
-        _ahead(wanted, options),
-        _face(options.validate),
-        locks.checker(wanted.lock, snapshot.label, load.env_kwargs, config),
-    ).make()
-
-
-@dataclass(frozen=True)
-class _Wanted:
-    """What was asked for, looked at before anything is fetched or started."""
-
-    place: Sandbox
-    policy: Policy
-    timeouts: Timeouts
-    choice: Choice
-    python: Any
-    runtime: Runtime
-    lock: LockFile | None
-
-
-def _wanted(sandbox: str | Sandbox, options: Options) -> _Wanted:
-    lock = None
-    if options.lock is not None:
-        lock = locks.opened(options.lock, sandbox, options.python, options.dependencies)
-    choice, python = chosen(options.dependencies, options.python)
-    policy = policy_from(options.policy, options.limits)
-    timeouts = timeouts_from(options.timeouts)
-    place = sandbox_of(sandbox, options.server_key)
-    if choice.where == "own" and place.package_target() is None:
-        raise PolicyError(
-            f"packages by {option_name('dependencies')} are for this machine, for containers and "
-            "for servers on other hosts; this place has packages of its own"
-        )
-    runtime = Runtime(arguments.interpreter(python))
-    if sandbox == "process":
-        arguments.check_executable(runtime.python)
-        arguments.check_readable(policy.readable)
-    return _Wanted(place, policy, timeouts, choice, python, runtime, lock)
-
-
-def _snapshot(reference: str, options: Options) -> Snapshot:
-    return named(
-        reference,
-        hub_cache_dir=options.hub_cache_dir,
-        token=options.token,
-        endpoint=options.endpoint,
-    )
-
-
-def _make_here(reference: str, config: Any, options: Options) -> EnvSuites:
-    """In this process, without a sandbox, as LeRobot does."""
-    if not options.trust_remote_code:
-        raise inprocess.refusal(reference)
-    options.refuse_what_does_nothing()
-    snapshot = _snapshot(reference, options)
-    further = dict(options.env_kwargs or {})
-    envs = inprocess.make(snapshot, options.n_envs, options.use_async_envs, config, further)
-    return EnvSuites(envs, lambda: provenance_of(snapshot, None, []))
-
-
-def _packages(snapshot: Snapshot, wanted: _Wanted) -> PackageSet | None:
-    """The packages that are made for it; None for those of the place."""
-    if wanted.lock is not None:
-        return locks.provided(snapshot, wanted.lock)
-    target = wanted.place.package_target()
-    if target is None:
-        return None
-    return packages_for(snapshot, wanted.choice, target, gpu=bool(wanted.policy.gpu))
-
-
-def _repository(
-    snapshot: Snapshot,
-    load: LoadArguments,
-    wanted: _Wanted,
-    packages: PackageSet | None,
-    options: Options,
-    recipe: Recipe,
-) -> Repository:
     own = packages is not None
-    return Repository(
+    repository = Repository(
         snapshot,
         load,
         wanted.policy,
@@ -165,9 +83,70 @@ def _repository(
             snapshot, wanted.place.name, wanted.choice.where, wanted.python, own
         ).advice,
     )
+    return EnvFactory(
+        Launcher(repository, wanted.place, store.cache_root() / "snapshots"),
+        options.num_workers,
+        _ahead(wanted, options),
+        _face(options.validate),
+        locks.checker(wanted.lock, snapshot.label, load.env_kwargs, config),
+    ).make()
 
 
-def _ahead(wanted: _Wanted, options: Options) -> int | None:
+@dataclass(frozen=True)
+class _Plan:
+    """What was asked for, looked at before anything is fetched or started."""
+
+    place: Sandbox
+    policy: Policy
+    timeouts: Timeouts
+    choice: Choice
+    python: Any
+    runtime: Runtime
+    lock: LockFile | None
+
+
+def _wanted(sandbox: str | Sandbox, options: Options) -> _Plan:
+    lock = None
+    if options.lock is not None:
+        lock = locks.opened(options.lock, sandbox, options.python, options.dependencies)
+    choice, python = chosen(options.dependencies, options.python)
+    policy = policy_from(options.policy, options.limits)
+    timeouts = timeouts_from(options.timeouts)
+    place = sandbox_spec.sandbox_of(sandbox, options.server_key)
+    if choice.where == "own" and place.package_target() is None:
+        raise PolicyError(
+            f"packages by {option_name('dependencies')} are for this machine, for containers and "
+            "for servers on other hosts; this place has packages of its own"
+        )
+    runtime = Runtime(sandbox_spec.interpreter(python))
+    if sandbox == "process":
+        sandbox_spec.check_executable(runtime.python)
+        sandbox_spec.check_readable(policy.readable)
+    return _Plan(place, policy, timeouts, choice, python, runtime, lock)
+
+
+def _make_here(reference: str, config: Any, options: Options) -> EnvSuites:
+    """In this process, without a sandbox, as LeRobot does."""
+    if not options.trust_remote_code:
+        raise inprocess.refusal(reference)
+    options.refuse_sandboxed()
+    snapshot = named(reference, **options.hub)
+    further = dict(options.env_kwargs or {})
+    envs = inprocess.make(snapshot, options.n_envs, options.use_async_envs, config, further)
+    return EnvSuites(envs, lambda: provenance_of(snapshot, None, []))
+
+
+def _packages(snapshot: Snapshot, wanted: _Plan) -> PackageSet | None:
+    """The packages that are made for it; None for those of the place."""
+    if wanted.lock is not None:
+        return locks.provided(snapshot, wanted.lock)
+    target = wanted.place.package_target()
+    if target is None:
+        return None
+    return packages_for(snapshot, wanted.choice, target, gpu=bool(wanted.policy.gpu))
+
+
+def _ahead(wanted: _Plan, options: Options) -> int | None:
     """How many tasks are started ahead, unasked none where it is not ours alone to say.
 
     A container's memory is all its jails', a quota is all a key's, and a GPU everybody's.

@@ -2,31 +2,44 @@
 
 from __future__ import annotations
 
+import contextlib
+import logging
 import time
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from envhub_sandbox.cli.shared import logs
 from envhub_sandbox.cli.shared import options as opt
-from envhub_sandbox.cli.shared.console import out, print_json, safe_line, say
-from envhub_sandbox.cli.shared.exits import code_for, describe, reported
+from envhub_sandbox.cli.shared.console import out, print_json, safe_line, safe_text, say
+from envhub_sandbox.cli.shared.exits import code_for, describe
 from envhub_sandbox.cli.shared.progress import Bar
-from envhub_sandbox.cli.shared.report import (
+from envhub_sandbox.cli.shared.results import (
     TaskResult,
     print_provenance,
     print_results,
     task_document,
 )
-from envhub_sandbox.cli.shared.select import select
 from envhub_sandbox.errors import EnvHubError
+from envhub_sandbox.options import OPTIONS
 
 if TYPE_CHECKING:
     from envhub_sandbox.rollouts.episodes import EpisodeCounter, Rollout
     from envhub_sandbox.rollouts.video import VideoWriter
+
+
+Verbose = Annotated[
+    bool,
+    typer.Option(
+        "--verbose",
+        "-v",
+        help="Log jails and downloads on stderr.",
+        rich_help_panel=OPTIONS["output"].panel,
+    ),
+]
 
 
 class PolicyName(str, Enum):
@@ -36,8 +49,9 @@ class PolicyName(str, Enum):
     ZERO = "zero"
 
 
+@opt.with_options(*opt.ALL)
 def run(
-    context: typer.Context,
+    *,
     ref: opt.Ref,
     episodes: Annotated[
         int, typer.Option("--episodes", "-e", min=1, help="Episodes of each task, exactly.")
@@ -61,35 +75,10 @@ def run(
         ),
     ] = None,
     json: opt.Json = False,
-    worker_output: logs.WorkerOutput = None,
-    verbose: logs.Verbose = False,
+    verbose: Verbose = False,
     suite: opt.Suite = None,
     task: opt.Task = None,
-    n_envs: opt.NEnvs = 1,
-    use_async: opt.UseAsync = False,
-    env_kwargs: opt.EnvKwargs = None,
-    python: opt.Python = None,
-    dependencies: opt.Dependencies = "auto",
-    lock: opt.Lock = None,
-    num_workers: opt.NumWorkers = None,
-    validate: opt.Validate = False,
-    sandbox: opt.SandboxOrNone = "process",
-    server_key: opt.ServerKey = None,
-    trust: opt.Trust = False,
-    profile: opt.Profile = None,
-    network: opt.Network = None,
-    gpu: opt.Gpu = None,
-    readable: opt.Readable = None,
-    variables: opt.Variables = None,
-    memory: opt.Memory = None,
-    disk: opt.Disk = None,
-    processes: opt.Processes = None,
-    cpu_time: opt.CpuTime = None,
-    timeout: opt.Timeout = None,
-    token: opt.Token = None,
-    endpoint: opt.Endpoint = None,
-    hub_cache_dir: opt.HubCacheDir = None,
-    debug: opt.Debug = False,
+    make: opt.MakeOptions,
 ) -> None:
     """Play episodes of an environment and print returns, lengths, speed and provenance.
 
@@ -97,76 +86,70 @@ def run(
 
     [bold]envhub run ./examples/cartpole --episodes 20 --n-envs 4 --video cartpole.mp4[/bold]
     """
-    with reported(debug=debug), logs.logged(verbose=verbose, worker_output=worker_output):
-        make = opt.MakeOptions.of(context)
-        play = Play(episodes=episodes, policy=policy.value, seed=seed, steps=steps, video=video)
-        _Run(make, play, suite, task, as_json=json).execute()
+    with _logged(verbose=verbose, worker_output=make.given["output"]):
+        _Run(
+            make=make,
+            episodes=episodes,
+            policy=policy.value,
+            seed=seed,
+            steps=steps,
+            video=video,
+            suites=suite,
+            tasks=task,
+            as_json=json,
+        ).execute()
 
 
-@dataclass(frozen=True, kw_only=True)
-class Play:
-    """What is played, as the options say."""
+@dataclass(kw_only=True)
+class _Run:
+    """One ``envhub run``. Tasks run one after the other, each closed before the next begins."""
 
+    make: opt.MakeOptions
     episodes: int
     policy: str
     seed: int
     steps: int | None
     video: Path | None
-
-
-class _Run:
-    """One ``envhub run``. Tasks run one after the other, each closed before the next begins."""
-
-    def __init__(
-        self,
-        make: opt.MakeOptions,
-        play: Play,
-        suites: list[str] | None,
-        tasks: list[str] | None,
-        *,
-        as_json: bool,
-    ) -> None:
-        self._make, self._play = make, play
-        self._suites, self._tasks = suites, tasks
-        self._as_json = as_json
-        self._results: list[TaskResult] = []
-        self._provenance: dict[str, Any] | None = None
-        self._begun = time.perf_counter()
-        self._make_env_s: float | None = None
+    suites: list[str] | None
+    tasks: list[str] | None
+    as_json: bool
+    results: list[TaskResult] = field(default_factory=list)
+    provenance: dict[str, Any] | None = None
+    begun: float = field(default_factory=time.perf_counter)
+    make_env_s: float | None = None
 
     def execute(self) -> None:
         """Run, print what there is to print even if it fails midway, and raise what failed."""
         try:
-            self._check_video()
-            with Bar(quiet=self._as_json) as bar, self._make.explained():
+            if self.video is not None:
+                from envhub_sandbox.rollouts.video import check_target
+
+                check_target(self.video)
+            with Bar(quiet=self.as_json) as bar, self.make.explained():
                 self._run(bar)
         except EnvHubError as error:
             self._print(error)
             raise
         self._print(None)
 
-    def _check_video(self) -> None:
-        if self._play.video is not None:
-            from envhub_sandbox.rollouts.video import check_target
-
-            check_target(self._play.video)
-
     def _run(self, bar: Bar) -> None:
-        arguments = self._make.arguments()
-        bar.begin(f"loading {self._make.ref}")
+        arguments = self.make.arguments()
+        bar.begin(f"loading {self.make.ref}")
         from envhub_sandbox.api import make_env
 
         with make_env(**arguments) as envs:
-            self._make_env_s = time.perf_counter() - self._begun
+            self.make_env_s = time.perf_counter() - self.begun
             try:
-                chosen = select(envs, self._suites, self._tasks)
+                chosen = opt.select(envs, self.suites, self.tasks)
                 for number, (suite, task, env) in enumerate(chosen, start=1):
-                    video = self._video_path(number, len(chosen))
-                    bar.begin(f"{suite} / {task}", self._play.episodes)
-                    self._results.append(self._play_task(bar, suite, task, env, video))
+                    video = self.video
+                    if video is not None and len(chosen) > 1:
+                        video = video.with_stem(f"{video.stem}-{number}")
+                    bar.begin(f"{suite} / {task}", self.episodes)
+                    self.results.append(self._play_task(bar, suite, task, env, video))
                     env.close()
             finally:
-                self._provenance = envs.provenance
+                self.provenance = envs.provenance
 
     def _play_task(
         self, bar: Bar, suite: str, task: int | str, env: Any, video: Path | None
@@ -202,42 +185,32 @@ class _Run:
                 filming = counter.wants(0)  # so that the last episode's last frame is in
             bar.update(counter)
 
-        play = self._play
         return rollout(
             env,
-            episodes=play.episodes,
-            seed=play.seed,
-            policy=play.policy,
-            max_steps=play.steps,
+            episodes=self.episodes,
+            seed=self.seed,
+            policy=self.policy,
+            max_steps=self.steps,
             observe=observe,
         )
-
-    def _video_path(self, number: int, count: int) -> Path | None:
-        path = self._play.video
-        if path is None or count == 1:
-            return path
-        return path.with_stem(f"{path.stem}-{number}")
 
     # --- what is printed -----------------------------------------------------------------------
 
     def _print(self, error: EnvHubError | None) -> None:
-        if self._as_json:
-            print_json(self._document(error))
-        elif self._results:
-            self._print_text()
-
-    def _document(self, error: EnvHubError | None) -> dict[str, Any]:
-        play = self._play
+        if not self.as_json:
+            if self.results:
+                self._print_text()
+            return
         document: dict[str, Any] = {
-            "reference": self._make.ref,
-            "sandbox": self._make.given["sandbox"],
-            "policy": play.policy,
-            "seed": play.seed,
-            "episodes": play.episodes,
-            "make_env_s": self._make_env_s,
+            "reference": self.make.ref,
+            "sandbox": self.make.given["sandbox"],
+            "policy": self.policy,
+            "seed": self.seed,
+            "episodes": self.episodes,
+            "make_env_s": self.make_env_s,
             "time_to_first_step_s": self._time_to_first_step(),
-            "tasks": [task_document(result) for result in self._results],
-            "provenance": self._provenance,
+            "tasks": [task_document(result) for result in self.results],
+            "provenance": self.provenance,
             "error": None,
         }
         if error is not None:
@@ -247,27 +220,67 @@ class _Run:
                 "exit_code": int(code_for(error)),
                 "bundle": getattr(error, "bundle", None),
             }
-        return document
+        print_json(document)
 
     def _time_to_first_step(self) -> float | None:
-        if self._make_env_s is None or not self._results:
+        if self.make_env_s is None or not self.results:
             return None
-        return self._make_env_s + self._results[0].rollout.first_step_s
+        return self.make_env_s + self.results[0].rollout.first_step_s
 
     def _print_text(self) -> None:
-        print_results(self._results)
+        print_results(self.results)
         out()
-        if self._provenance is not None:
-            print_provenance(self._provenance, in_process=self._make.in_process)
-        play = self._play
+        if self.provenance is not None:
+            print_provenance(self.provenance, in_process=self.make.in_process)
         out(
-            f"{play.policy} actions, seed {play.seed}, --n-envs {self._make.given['n_envs']}; "
+            f"{self.policy} actions, seed {self.seed}, --n-envs {self.make.given['n_envs']}; "
             f"first step after {self._time_to_first_step():.2f} s",
             "dim",
         )
-        for result in self._results:
+        for result in self.results:
             if result.video is not None:
                 out(f"wrote {safe_line(result.video)}")
-        stopped = [result for result in self._results if not result.rollout.complete]
+        stopped = [result for result in self.results if not result.rollout.complete]
         if stopped:
-            say(f"{len(stopped)} of {len(self._results)} tasks were stopped by --steps.")
+            say(f"{len(stopped)} of {len(self.results)} tasks were stopped by --steps.")
+
+
+# --- what --verbose and --worker-output show on stderr -----------------------------------------
+
+
+class _SafeFormatter(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        return safe_text(super().format(record))
+
+
+@contextlib.contextmanager
+def _logged(*, verbose: bool, worker_output: str | None) -> Iterator[None]:
+    """Show logs on stderr while it lasts."""
+    from envhub_sandbox.system.log import OUTPUT, ROOT
+
+    shown = []
+    if verbose:
+        shown.append(_show(ROOT, logging.DEBUG, "%(asctime)s %(message)s"))
+        shown[-1][1].addFilter(lambda record: record.name != OUTPUT.name)
+        shown.append((OUTPUT, logging.NullHandler(), OUTPUT.level))
+        OUTPUT.setLevel(logging.INFO)  # else no jail's output is followed
+    if worker_output == "-":
+        shown.append(_show(OUTPUT, logging.DEBUG, "%(message)s"))
+    try:
+        yield
+    finally:
+        for logger, handler, level in reversed(shown):
+            logger.removeHandler(handler)
+            logger.setLevel(level)
+
+
+def _show(
+    logger: logging.Logger, level: int, form: str
+) -> tuple[logging.Logger, logging.Handler, int]:
+    handler = logging.StreamHandler()
+    handler.setLevel(level)
+    handler.setFormatter(_SafeFormatter(form, "%H:%M:%S"))
+    before = logger.level
+    logger.addHandler(handler)
+    logger.setLevel(level)
+    return logger, handler, before

@@ -1,10 +1,8 @@
-"""``envhub run`` and ``envhub inspect`` as a user types them, through a process of their own."""
+"""``envhub run``, ``inspect`` and ``diff --run``, each in a process of its own."""
 
 from __future__ import annotations
 
 import json
-import os
-import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,8 +10,9 @@ from typing import Any
 
 import pytest
 
+from tests.support.command_line import document, envhub
 from tests.support.processes import descendants, eventually
-from tests.support.repositories import write_repository
+from tests.support.repositories import CARTPOLES, write_repository
 from tests.support.samples import EXAMPLES, sample
 
 _PRINTS = """
@@ -49,27 +48,6 @@ def make_env(n_envs=1, use_async_envs=False, render_mode=None):
         return env
     return gym.vector.SyncVectorEnv([one] * n_envs)
 """
-
-
-def envhub(*arguments: str | Path, **variables: str) -> subprocess.CompletedProcess[str]:
-    """Run the command line to its end."""
-    return subprocess.run(
-        [sys.executable, "-I", "-m", "envhub_sandbox", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        encoding="utf-8",
-        env={**os.environ, "PYTHONIOENCODING": "utf-8", **variables},
-        timeout=240,
-        check=False,
-    )
-
-
-def document(*arguments: str | Path, code: int = 0) -> dict[str, Any]:
-    """The document of ``--json``, which is all that is on stdout."""
-    done = envhub(*arguments, "--json")
-    assert done.returncode == code, done.stderr
-    read: dict[str, Any] = json.loads(done.stdout, parse_constant=pytest.fail)
-    return read
 
 
 def one_env(folder: Path, step: str, render: str = "return None") -> Path:
@@ -217,8 +195,6 @@ def test_frames_that_are_none_end_the_run(tmp_path: Path, render: str, says: str
 OVER = "return np.zeros(1, np.float32), 1.0, True, False, {}"
 FAILURES: list[tuple[str, Sequence[str], int, str]] = [
     ("raise ValueError('no such luck')", (), 1, "ValueError: no such luck"),
-    (OVER, ("--memory", "lots"), 2, "--memory"),
-    (OVER, ("--profile", "lax"), 2, "strict"),
     (OVER, ("--task", "7"), 2, "hub_env/0"),
     (OVER, ("--policy", "clever"), 2, "clever"),
     (OVER, ("--sandbox", "none"), 2, "--trust-remote-code"),
@@ -360,3 +336,47 @@ def test_prints_stay_off_stdout_without_a_sandbox(command: str, tmp_path: Path) 
     json.loads(done.stdout)
     assert "printed by Python" in done.stderr
     assert "printed by a child" in done.stderr
+
+
+_DIES = ("--env-kwargs", "moment=step", "--env-kwargs", "fault=exit")
+_RAISES = ("--env-kwargs", "fault=raise")
+
+
+def test_worker_output_goes_where_it_is_wanted(tmp_path: Path) -> None:
+    """To a file, or to stderr, which has nothing of it otherwise but the end."""
+    path = tmp_path / "worker.log"
+    done = envhub("run", sample("faulty"), *_DIES, "--worker-output", path)
+    assert done.returncode == 5
+    assert path.read_text() == "about to exit\n"
+    done = envhub("run", sample("noisy"), "--worker-output", "-", "--steps", "1")
+    assert "\x1b" not in done.stderr
+    assert "\\x1b" in done.stderr
+
+
+def test_verbose_tells_of_jails() -> None:
+    """And stdout has only the results."""
+    done = envhub("run", EXAMPLES / "cartpole", "--episodes", "1", "--verbose")
+    assert done.returncode == 0
+    assert "opened" in done.stderr
+    assert "closes" in done.stderr
+    assert "opened" not in done.stdout
+
+
+def test_json_names_the_bundle() -> None:
+    """For whoever goes on from there by program."""
+    found = document("run", sample("faulty"), *_DIES, code=5)
+    assert (Path(found["error"]["bundle"]) / "bundle.json").exists()
+    found = document("run", sample("faulty"), "--env-kwargs", "moment=step", *_RAISES, code=1)
+    assert found["error"]["bundle"] is None
+
+
+def test_diff_compares_spaces_where_that_is_asked_for(tmp_path: Path) -> None:
+    """Without ``--run`` nothing is known of them."""
+    made = CARTPOLES + "\ndef make_env(n_envs=1, use_async_envs=False):\n    return cartpoles(1)\n"
+    old = write_repository(tmp_path / "old", made)
+    new = write_repository(tmp_path / "new", made.replace("CartPole-v1", "Acrobot-v1"))
+    read = envhub("diff", old, new)
+    assert (read.returncode, "Discrete" in read.stdout) == (7, False), read.stderr
+    ran = envhub("diff", old, new, "--run")
+    assert ran.returncode == 7, ran.stderr
+    assert "actions were Discrete(2), now Discrete(3)" in ran.stdout

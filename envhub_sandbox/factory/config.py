@@ -16,6 +16,23 @@ _PLAIN = (type(None), bool, int, float, complex, str, bytes, np.ndarray, np.gene
 _MAX_DEPTH = 16
 
 
+def reference_of(cfg: Any) -> tuple[str, Any]:
+    """The reference in ``cfg``, and the config object if it is one."""
+    if isinstance(cfg, str):
+        return cfg, None
+    if isinstance(cfg, os.PathLike):
+        return os.path.abspath(cfg), None
+    hub_path = getattr(cfg, "hub_path", None)
+    if isinstance(hub_path, os.PathLike):
+        return os.path.abspath(hub_path), cfg
+    if isinstance(hub_path, str):
+        return hub_path, cfg
+    kind = f"{type(cfg).__module__}.{type(cfg).__qualname__}"
+    if hasattr(cfg, "hub_path"):
+        raise TypeError(f"cfg is a {kind} whose hub_path is {hub_path!r}; it takes a hub reference")
+    raise TypeError(f"cfg is a hub reference, a folder, or an object with a hub_path, not {kind}")
+
+
 def plain_config(config: Any) -> dict[str, object]:
     """The ``vars()`` of a config object with nested ones, and its own public properties.
 

@@ -22,7 +22,7 @@ from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol.manifest.manifest import EnvManifest, Manifest
 
 
-class Proxies:
+class EnvFactory:
     """Makes the proxies, from the remembered manifest or from a first jail.
 
     Args:
@@ -119,7 +119,7 @@ class Proxies:
         return EnvSession(source, env, bounds, paces)
 
     def _use(self, loaded: LoadedJail, sessions: list[EnvSession]) -> None:
-        """The jail that told the manifest becomes the only task's; a suite holds none in stock."""
+        """The jail that gave the manifest becomes the only task's; a suite closes it."""
         if len(sessions) == 1:
             with self._repository.named():
                 sessions[0].prewarm.adopt(loaded)

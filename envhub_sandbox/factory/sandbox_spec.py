@@ -1,30 +1,15 @@
-"""Where it runs, and of what: the words for it that ``make_env`` takes."""
+"""Where the code runs: the sandbox and the interpreter that ``make_env`` is given."""
 
 from __future__ import annotations
 
 import os
-from typing import Any
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
 
 from envhub_sandbox.errors import PolicyError
 from envhub_sandbox.option_names import option_name
 from envhub_sandbox.sandboxes.sandbox import Sandbox
-
-
-def reference_of(cfg: Any) -> tuple[str, Any]:
-    """The reference in ``cfg``, and the config object if it is one."""
-    if isinstance(cfg, str):
-        return cfg, None
-    if isinstance(cfg, os.PathLike):
-        return os.path.abspath(cfg), None
-    hub_path = getattr(cfg, "hub_path", None)
-    if isinstance(hub_path, os.PathLike):
-        return os.path.abspath(hub_path), cfg
-    if isinstance(hub_path, str):
-        return hub_path, cfg
-    kind = f"{type(cfg).__module__}.{type(cfg).__qualname__}"
-    if hasattr(cfg, "hub_path"):
-        raise TypeError(f"cfg is a {kind} whose hub_path is {hub_path!r}; it takes a hub reference")
-    raise TypeError(f"cfg is a hub reference, a folder, or an object with a hub_path, not {kind}")
 
 
 def sandbox_of(sandbox: str | Sandbox, server_key: str | None) -> Sandbox:
@@ -63,3 +48,39 @@ def _unknown(sandbox: object) -> PolicyError:
         f"sandbox is {sandbox!r}; it is 'process', 'docker', 'tcp://HOST:PORT', or None to run the "
         "code here"
     )
+
+
+def interpreter(python: str | Path | None) -> str:
+    """Its path, absolute; a name alone is looked up as a shell does. Empty for ours."""
+    if python is None:
+        return ""
+    text = os.path.expanduser(python)
+    found = shutil.which(text) if os.sep not in str(text) else None
+    return os.path.abspath(found or text)
+
+
+def check_executable(python: str) -> None:
+    """Refuse an interpreter of this machine that cannot be run.
+
+    Raises:
+        PolicyError: It is not there, or is no program.
+    """
+    if python and not (os.path.isfile(python) and os.access(python, os.X_OK)):
+        raise PolicyError(
+            f"{option_name('python')} is {python!r}, which is no program; it takes the path of an "
+            "interpreter, such as '.venv/bin/python'"
+        )
+
+
+def check_readable(paths: Iterable[str]) -> None:
+    """Refuse to grant what is not on this machine: it would silently not be there.
+
+    Raises:
+        PolicyError: A path leads to nothing.
+    """
+    for path in paths:
+        if not os.path.exists(path):
+            raise PolicyError(
+                f"{option_name('readable')} holds {path!r}, and there is no such file or folder on "
+                "this machine"
+            )

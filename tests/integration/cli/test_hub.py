@@ -6,22 +6,13 @@ import json
 import signal
 import socket
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from tests.hub.olah_server import OlahServer
+from tests.support.command_line import COMMAND, envhub
 from tests.support.samples import EXAMPLES
-
-COMMAND = [sys.executable, "-I", "-m", "envhub_sandbox"]
-
-
-def envhub(*arguments: str) -> subprocess.CompletedProcess[str]:
-    """Run the command line to its end."""
-    return subprocess.run(
-        [*COMMAND, *arguments], capture_output=True, text=True, timeout=240, check=False
-    )
 
 
 @pytest.fixture

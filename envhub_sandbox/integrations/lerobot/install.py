@@ -2,12 +2,11 @@
 
 Its factory loads a repository in three steps, each a function that it looks up by its name when it
 is called: download, import, call. Those names are replaced; ``make_env`` itself cannot be, since
-whoever wants it has imported it already.
+LeRobot's programs have imported it already.
 """
 
 from __future__ import annotations
 
-import inspect
 from dataclasses import dataclass
 from types import ModuleType
 from typing import Any
@@ -17,11 +16,12 @@ import lerobot.envs.factory
 
 from envhub_sandbox.api import make_env
 from envhub_sandbox.integrations.lerobot.config import ASKS_CONFIGS, SandboxedEnvConfig
+from envhub_sandbox.options import OPTIONS
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 
 _HELPERS = ("_download_hub_file", "_import_hub_module", "_call_make_env")
-_GIVEN = ("cfg", "n_envs", "use_async_envs", "hub_cache_dir", "trust_remote_code")
+_GIVEN = ("n_envs", "use_async_envs", "hub_cache_dir", "trust_remote_code")
 
 
 def install(**options: Any) -> None:
@@ -37,7 +37,7 @@ def install(**options: Any) -> None:
         TypeError: An option that it does not have.
         RuntimeError: This LeRobot loads repositories in another way than is known here.
     """
-    known = [name for name in inspect.signature(make_env).parameters if name not in _GIVEN]
+    known = [key for key, one in OPTIONS.items() if not one.field and key not in _GIVEN]
     unknown = [name for name in options if name not in known]
     if unknown:
         raise TypeError(f"there is no option {', '.join(unknown)}; there are {', '.join(known)}")
@@ -51,7 +51,7 @@ def install(**options: Any) -> None:
             "another way than the versions that are known here (docs/lerobot.md). Nothing was "
             "changed, and its make_env would run their code in this process"
         )
-    routed = _Routed(options)
+    routed = _Routing(options)
     factory._download_hub_file = routed.download
     factory._import_hub_module = routed.load
     factory._call_make_env = routed.call
@@ -62,7 +62,7 @@ def install(**options: Any) -> None:
 
 
 @dataclass(frozen=True)
-class _Asked:
+class _HubRequest:
     """What stands for the downloaded file, and then for the module that it would be."""
 
     reference: str
@@ -70,22 +70,22 @@ class _Asked:
 
 
 @dataclass(frozen=True)
-class _Routed:
+class _Routing:
     """The three steps, of which only the last does anything."""
 
     options: dict[str, Any]
 
     def download(
         self, cfg_str: str, trust_remote_code: bool, hub_cache_dir: str | None
-    ) -> tuple[str, str, _Asked, None]:
+    ) -> tuple[str, str, _HubRequest, None]:
         """Nothing yet."""
-        return cfg_str, "", _Asked(cfg_str, hub_cache_dir), None
+        return cfg_str, "", _HubRequest(cfg_str, hub_cache_dir), None
 
-    def load(self, local_file: _Asked, repo_id: str) -> _Asked:
+    def load(self, local_file: _HubRequest, repo_id: str) -> _HubRequest:
         """Nothing is imported."""
         return local_file
 
-    def call(self, module: _Asked, n_envs: int, use_async_envs: bool, cfg: Any) -> EnvSuites:
+    def call(self, module: _HubRequest, n_envs: int, use_async_envs: bool, cfg: Any) -> EnvSuites:
         """The environments, from the sandbox."""
         if isinstance(cfg, SandboxedEnvConfig):
             return cfg.create_envs(n_envs, use_async_envs)
@@ -113,7 +113,7 @@ def _let_videos_be_written() -> None:
     try:
         import lerobot.scripts.lerobot_eval as evaluation
     except ImportError:
-        return  # without what an evaluation needs, nobody evaluates here
+        return  # an evaluation needs what is missing
     seen, vector = ModuleType("gymnasium"), ModuleType("gymnasium.vector")
     vars(vector).update(vars(gymnasium.vector))
     vars(vector)["AsyncVectorEnv"] = _AsyncOrSandboxed("AsyncVectorEnv", (), {})

@@ -7,17 +7,15 @@ import os
 import pty
 import signal
 import subprocess
-import sys
 import tempfile
 from pathlib import Path
 
-import psutil
 import pytest
 
+from tests.support.command_line import COMMAND, below, gone
 from tests.support.processes import eventually
 from tests.support.samples import EXAMPLES, sample
 
-COMMAND = [sys.executable, "-I", "-m", "envhub_sandbox"]
 _STEPPING = """
 import gymnasium as gym
 import numpy as np
@@ -35,25 +33,6 @@ class Endless(gym.Env):
 def make_env(n_envs=1, use_async_envs=False):
     return gym.vector.SyncVectorEnv([Endless] * n_envs)
 """
-
-
-def below(pid: int) -> list[psutil.Process]:
-    """The processes below a process that may have gone."""
-    with contextlib.suppress(psutil.NoSuchProcess):
-        return psutil.Process(pid).children(recursive=True)
-    return []
-
-
-def gone(processes: list[psutil.Process]) -> bool:
-    """Whether none of them is still running."""
-    return not any(map(runs, processes))
-
-
-def runs(process: psutil.Process) -> bool:
-    """Whether it is there, and not only its entry; it may go while it is looked at."""
-    with contextlib.suppress(psutil.NoSuchProcess):
-        return bool(process.is_running() and process.status() != psutil.STATUS_ZOMBIE)
-    return False
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from envhub_sandbox import make_env
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.cli.init.starter import starter
 from tests.hub.stub_hub import StubHub
-from tests.integration.test_cli_run import envhub
+from tests.support.command_line import envhub
 
 TOKEN = "hf_of_the_author"
 

@@ -11,7 +11,7 @@ import typer
 from envhub_sandbox import make_env
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.errors import EnvHubError
-from tests.integration.test_cli_run import envhub
+from tests.support.command_line import envhub
 from tests.support.repositories import write_repository
 
 _WANTS = "import nothing_of_this_name\n\ndef make_env(n_envs=1, use_async_envs=False): pass\n"

@@ -6,7 +6,6 @@ import json
 import os
 import shutil
 import subprocess
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,6 +14,7 @@ import pytest
 
 from envhub_sandbox import make_env
 from tests.faults.traces import temporary_root
+from tests.support.command_line import COMMAND
 from tests.support.samples import sample
 
 
@@ -24,7 +24,7 @@ def gc(
     """Run it with a folder for temporary files of its own, and without an engine."""
     variables = {"TMPDIR": str(temporary), "PATH": str(temporary)}
     return subprocess.run(
-        [*before, sys.executable, "-I", "-m", "envhub_sandbox", "gc", *options],
+        [*before, *COMMAND, "gc", *options],
         env=os.environ | variables,
         capture_output=True,
         text=True,

@@ -1,1 +1,0 @@
-"""``envhub run``: episodes, how they are played, filmed and counted."""

@@ -1,0 +1,326 @@
+"""Every option of ``make_env``, once: type, default, check, help, and its name for commands.
+
+The parameters of ``envhub``, the fields of LeRobot's configuration, ``docs/options.md`` and the
+names in errors (``option_names.py``) are made from this table. ``make_env`` has names and defaults
+in its signature too, for editors and readers; a test compares the two.
+"""
+
+# ruff: noqa: RUF009  # _option() is dataclasses.field()
+
+from __future__ import annotations
+
+import operator
+import os
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields, replace
+from keyword import iskeyword
+from pathlib import Path
+from typing import Any
+
+from envhub_sandbox.errors import PolicyError
+from envhub_worker.protocol.confinement import NETWORKS, PROFILES
+from envhub_worker.protocol.limits import MAX_NUM_ENVS
+
+_CODE, _LIMITS, _HUB = "How it is built", "What it may do", "Where it comes from"
+_LANES = ("auto", "frames")
+
+
+@dataclass(frozen=True)
+class Option:
+    """One option.
+
+    Attributes:
+        command: Its names for the commands of ``envhub`` that have it; empty if none has.
+        help: What the help of a command says of it.
+        metavar: How the help writes a value; a shell completes its small letters.
+        kind: The type of its value on a command line; ``list`` is of texts, ``dict`` is JSON.
+        least, most: The bounds of a number.
+        check: Called with its value; returns the form that the rest relies on, or raises.
+        panel: The heading that it stands under in a help.
+        sandboxed: Whether it means nothing without a sandbox.
+        travels: Whether a pickle of the environments holds it: trust and secrets are not handed on,
+            and limits are part of the policy.
+        argument: The argument of ``make_env``.
+        field: Its key, where that argument is a mapping.
+        default: What holds where it is not given.
+    """
+
+    command: str = ""
+    help: str = ""
+    metavar: str | None = None
+    kind: type[Any] = str
+    least: int | None = None
+    most: int | None = None
+    check: Callable[[Any], Any] | None = None
+    panel: str = ""
+    sandboxed: bool = False
+    travels: bool = True
+    argument: str = ""
+    field: str = ""
+    default: Any = None
+
+    @property
+    def parameter(self) -> str:
+        """What the parameter of a command is called."""
+        name = self.command.split()[0].lstrip("-").replace("-", "_")
+        return self.argument if iskeyword(name) else name
+
+    def checked(self, value: Any) -> Any:
+        """The form of a value that the rest relies on.
+
+        Raises:
+            TypeError, ValueError, PolicyError: Nothing can be made of it.
+        """
+        if self.check is not None:
+            return self.check(value)
+        return value if self.least is None else self._whole(value)
+
+    def _whole(self, value: Any) -> int | None:
+        """A number of Python or numpy; None where that is the default."""
+        if value is None and self.default is None:
+            return None
+        try:
+            count = operator.index(value)
+        except TypeError:
+            text = f"`{self.argument}` is {value!r}; it takes a whole number"
+            raise TypeError(text) from None
+        if self.least is not None and count < self.least:
+            raise ValueError(f"`{self.argument}` is {count}, and must be at least {self.least}")
+        if self.most is not None and count > self.most:
+            raise ValueError(f"`{self.argument}` is {count}, and must be at most {self.most}")
+        return count
+
+
+def _flag(value: Any) -> bool:
+    import numpy as np  # which a help must not cost
+
+    if not isinstance(value, (bool, np.bool_)):
+        raise TypeError(f"`use_async_envs` is {value!r}; it is True or False")
+    return bool(value)
+
+
+def _lane(value: Any) -> str:
+    if value not in _LANES:
+        raise PolicyError(f"lane is {value!r}; it is one of {', '.join(_LANES)}")
+    return str(value)
+
+
+def _keyword_arguments(value: Any) -> dict[str, Any]:
+    if value is None:
+        return {}
+    if not isinstance(value, Mapping) or not all(type(key) is str for key in value):
+        raise TypeError(f"`env_kwargs` is {value!r}; it takes a mapping of names to values")
+    for ours in ("n_envs", "use_async_envs"):
+        if ours in value:
+            raise TypeError(f"`env_kwargs` holds {ours!r}, which is an argument of its own")
+    return dict(value)
+
+
+def _option(default: Any, command: str = "", text: str = "", **known: Any) -> Any:
+    return field(default=default, metadata={"option": Option(command, text, **known)})
+
+
+@dataclass(frozen=True, kw_only=True, repr=False)
+class Options:
+    """What ``make_env`` takes beside its reference; its docstring explains each."""
+
+    n_envs: int = _option(
+        1, "--n-envs -n", "Sub-environments.", kind=int, least=1, most=MAX_NUM_ENVS
+    )
+    use_async_envs: bool = _option(
+        False,
+        "--async",
+        "Ask for use_async_envs=True: sub-environments may run in several processes.",
+        kind=bool,
+        check=_flag,
+    )
+    env_kwargs: Mapping[str, Any] | None = _option(
+        None,
+        "--env-kwargs",
+        "Further arguments of the repository's make_env: a JSON object, or key=value "
+        "(repeatable; values are JSON where they can be, else text).",
+        metavar="JSON|KEY=VALUE",
+        kind=dict,
+        check=_keyword_arguments,
+    )
+    python: str | Path | None = _option(
+        None,
+        "--python",
+        "The interpreter that runs the repository; this one by default.",
+        metavar="PATH",
+        sandboxed=True,
+    )
+    dependencies: str | os.PathLike[str] | Mapping[str, Any] = _option(
+        "auto",
+        "--dependencies",
+        "Where its packages come from: an environment of its own where this interpreter lacks "
+        "something that it declares or imports; only what it declares; this interpreter; another, "
+        "or a virtual environment; or one of its own, adjusted: "
+        '\'{"extra": ["scipy"], "without": ["torch"], "python": "3.12"}\'.',
+        metavar="auto|declared|host|PATH|JSON",
+        sandboxed=True,
+    )
+    lock: str | os.PathLike[str] | None = _option(
+        None,
+        "--lock",
+        "What 'envhub lock' wrote: its packages, and nothing that differs from it.",
+        metavar="FILE",
+        sandboxed=True,
+    )
+    num_workers: int | None = _option(
+        None,
+        "--num-workers",
+        "Processes over which sub-environments are spread.",
+        kind=int,
+        least=1,
+        sandboxed=True,
+    )
+    validate: bool = _option(
+        False,
+        "--validate",
+        "Hold every action and observation against its space, value by value.",
+        kind=bool,
+        sandboxed=True,
+    )
+    prewarm: int | None = _option(None, kind=int, least=0, sandboxed=True)
+    lane: str = _option("auto", check=_lane)
+    copy: bool = _option(True, kind=bool)
+    sandbox: Any = _option(
+        "process",
+        "--sandbox",
+        "Where it runs.",
+        metavar="process|docker[:IMAGE]|tcp://HOST:PORT",
+        panel=_LIMITS,
+    )
+    server_key: str | None = _option(
+        None,
+        "--server-key",
+        "With --sandbox tcp://...: that server's public key; else $ENVHUB_SERVER_KEY, or "
+        "what known_hosts says.",
+        metavar="KEY",
+        panel=_LIMITS,
+        sandboxed=True,
+    )
+    trust_remote_code: bool = _option(
+        False,
+        "--trust-remote-code",
+        "Needed for --sandbox none, where nothing protects you.",
+        kind=bool,
+        panel=_LIMITS,
+        travels=False,
+    )
+    policy: Any = _option(None, kind=dict, sandboxed=True)
+    timeouts: Any = _option(None, kind=dict, sandboxed=True)
+    limits: Any = _option(None, kind=dict, sandboxed=True, travels=False)
+    token: str | bool | None = _option(
+        None,
+        "--token",
+        "For private repositories. Better: the variable HF_TOKEN, which no process list "
+        "shows, or 'hf auth login'.",
+        panel=_HUB,
+        travels=False,
+    )
+    endpoint: str | None = _option(
+        None, "--endpoint", "The Hub; $HF_ENDPOINT or huggingface.co.", metavar="URL", panel=_HUB
+    )
+    hub_cache_dir: str | Path | None = _option(
+        None, "--hub-cache-dir", "huggingface_hub's cache_dir.", metavar="PATH", panel=_HUB
+    )
+
+    @property
+    def hub(self) -> dict[str, Any]:
+        """Which Hub, and how."""
+        return {key: getattr(self, key) for key in ("token", "endpoint", "hub_cache_dir")}
+
+    def checked(self) -> Options:
+        """The same, where each has the form that the rest relies on; nothing has been started yet.
+
+        Raises:
+            TypeError, ValueError: Something that nothing can be made of.
+            PolicyError: An unknown lane.
+        """
+        values = vars(self).items()
+        return Options(**{name: OPTIONS[name].checked(value) for name, value in values})
+
+    def refuse_sandboxed(self) -> None:
+        """Without a sandbox: refuse what would silently do nothing, by name.
+
+        Raises:
+            PolicyError: Some of these were given.
+        """
+        given = {name: value for name, value in vars(self).items() if OPTIONS[name].sandboxed}
+        idle = [name for name, value in given.items() if value and value != OPTIONS[name].default]
+        if idle:
+            raise PolicyError(
+                f"{', '.join(idle)}: for environments in a sandbox; with sandbox=None there is none"
+            )
+
+    def for_a_recipe(self, **changes: Any) -> dict[str, Any]:
+        """Those that make the same environments elsewhere."""
+        lock = None if self.lock is None else os.path.abspath(self.lock)
+        kept = {name: value for name, value in vars(self).items() if OPTIONS[name].travels}
+        return {**kept, "lock": lock, **changes}
+
+
+_TIMEOUT = Option(
+    "--timeout",
+    "How long loading, one reset, one step or one render may take; 300 by default.",
+    "SECONDS",
+    float,
+)
+_KEYS: dict[str, dict[str, Option]] = {
+    "policy": {
+        "profile": Option(
+            "--profile", "Which layers must hold; strict by default.", "|".join(PROFILES)
+        ),
+        "network": Option("--network", "None by default.", "|".join(NETWORKS)),
+        "gpu": Option("--gpu", "Grant all GPUs, or those, as nvidia-smi counts them.", "all|N[,N]"),
+        "readable": Option(
+            "--readable", "A further absolute path that it may read (repeatable).", "PATH", list
+        ),
+        "environment": Option(
+            "--env", "An environment variable that it may see (repeatable).", "NAME", list
+        ),
+        "output": Option(
+            "--worker-output",
+            "Write what the worker prints to this file, a further file for each further jail; "
+            "- is stderr.",
+            "FILE|-",
+            panel="What it logs",
+        ),
+    },
+    "limits": {
+        "memory_bytes": Option("--memory", "Memory, as in 512M or 4G.", "SIZE"),
+        "disk_bytes": Option("--disk", "Scratch space on disk.", "SIZE"),
+        "processes": Option("--processes", "Processes and threads alive at once.", kind=int),
+        "cpu_s": Option("--cpu-time", "CPU seconds of one process.", "SECONDS", int),
+    },
+    "timeouts": dict.fromkeys(("startup_s", "reset_s", "step_s", "call_s"), _TIMEOUT),
+}
+"""By the argument that is a mapping: those of its keys that commands have."""
+_IN_PYTHON = {
+    "policy": "restart restart_budget restart_backoff_s record_denials crash_history crash_folder",
+    "limits": "open_files disk_files file_bytes output_bytes message_bytes elements",
+    "timeouts": "close_s idle_s server_idle_s",
+}
+"""The other keys."""
+
+
+def _table() -> dict[str, Option]:
+    found = {}
+    for one in fields(Options):
+        option = one.metadata["option"]
+        panel = option.panel or _CODE
+        found[one.name] = replace(option, argument=one.name, default=one.default, panel=panel)
+    for argument, keys in _KEYS.items():
+        for key, option in {
+            **keys,
+            **dict.fromkeys(_IN_PYTHON[argument].split(), Option()),
+        }.items():
+            panel = option.panel or _LIMITS
+            found[key] = replace(option, argument=argument, field=key, panel=panel)
+    return found
+
+
+OPTIONS = _table()
+"""By key: every argument of ``make_env``, and every key of those that are mappings."""

@@ -1,0 +1,1 @@
+"""The commands of ``envhub`` as a user types them."""

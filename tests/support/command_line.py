@@ -1,0 +1,56 @@
+"""The command line ``envhub`` in a process of its own, and the processes below it."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+
+COMMAND = [sys.executable, "-I", "-m", "envhub_sandbox"]
+
+
+def envhub(*arguments: str | Path, **variables: str) -> subprocess.CompletedProcess[str]:
+    """Run the command line to its end."""
+    return subprocess.run(
+        [*COMMAND, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        encoding="utf-8",
+        env={**os.environ, "PYTHONIOENCODING": "utf-8", **variables},
+        timeout=240,
+        check=False,
+    )
+
+
+def document(*arguments: str | Path, code: int = 0) -> dict[str, Any]:
+    """The document of ``--json``, which is all that is on stdout."""
+    done = envhub(*arguments, "--json")
+    assert done.returncode == code, done.stderr
+    read: dict[str, Any] = json.loads(done.stdout, parse_constant=pytest.fail)
+    return read
+
+
+def below(pid: int) -> list[psutil.Process]:
+    """The processes below a process that may have gone."""
+    with contextlib.suppress(psutil.NoSuchProcess):
+        return psutil.Process(pid).children(recursive=True)
+    return []
+
+
+def gone(processes: list[psutil.Process]) -> bool:
+    """Whether none of them is still running."""
+    return not any(map(runs, processes))
+
+
+def runs(process: psutil.Process) -> bool:
+    """Whether it is there, and not only its entry; it may go while it is looked at."""
+    with contextlib.suppress(psutil.NoSuchProcess):
+        return bool(process.is_running() and process.status() != psutil.STATUS_ZOMBIE)
+    return False
