@@ -54,6 +54,15 @@ class Prometheus:
         lines = (line for line in self.said().splitlines() if "Listening on" in line)
         return next((line.rpartition("address=")[2] for line in lines), "")
 
+    @property
+    def is_ready(self) -> bool:
+        """Whether it answers queries; it listens before it does."""
+        try:
+            with urllib.request.urlopen(f"http://{self.address}/-/ready", timeout=60):
+                return True
+        except urllib.error.HTTPError:
+            return False
+
     def query(self, expression: str) -> list[Any]:
         """The samples of an expression now; an expression that it cannot read is an error."""
         words = urllib.parse.urlencode({"query": expression})
@@ -84,6 +93,7 @@ def scraping(folder: Path, port: int) -> Iterator[Prometheus]:
         found = Prometheus(process, folder / "log")
         assert eventually(lambda: bool(found.address) or process.poll() is not None)
         assert process.poll() is None, found.said()
+        assert eventually(lambda: found.is_ready), found.said()
         yield found
     finally:
         process.kill()

@@ -22,11 +22,11 @@ class Connection:
     """One of a session's.
 
     Attributes:
-        wire: Its number, by which it is known whether it is still there; 0 if that is not known.
+        wire: Its number, by which it is known whether it is still there; None if it is not counted.
         compression: What was agreed on; empty for none.
     """
 
-    wire: int = 0
+    wire: int | None = None
     compression: str = ""
 
 
@@ -75,7 +75,7 @@ class Sessions:
         """Every session of a key."""
         return [session for session in self._sessions.values() if session.key == key]
 
-    def connect(self, identity: bytes, key: bytes, name: bytes, wire: int = 0) -> Session:
+    def connect(self, identity: bytes, key: bytes, name: bytes, wire: int | None = None) -> Session:
         """A connection says which session it belongs to; one that is there is found again."""
         session = self._sessions.get(key + name)
         if session is None:
@@ -96,7 +96,7 @@ class Sessions:
         """Forget the connections that are not among these."""
         for session in self._sessions.values():
             for name, connection in list(session.connections.items()):
-                if connection.wire and connection.wire not in wires:
+                if connection.wire is not None and connection.wire not in wires:
                     self._disconnect(name)
 
     def find(self, identity: bytes, key: bytes) -> Session | None:

@@ -68,9 +68,9 @@ class ConnectionLimiter:
             self._log.say("handshake_failed", why="no key, another server's, or noise")
 
     def wire(self, fd: int) -> int:
-        """The number of the connection that a message has just come from; 0 if that is not known.
+        """The number of the connection that a message has come from; 0 if that has ended since.
 
-        A descriptor's number is given out again, this one never.
+        A descriptor's number is given out again, this one never, and none has 0.
         """
         self._drain()  # libzmq says that it has accepted before it hands anything on
         return self._wires.get(fd, 0)

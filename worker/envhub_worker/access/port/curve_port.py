@@ -89,9 +89,11 @@ class CurvePort:
         except (zmq.ZMQError, ValueError):
             return b""
 
-    def wire(self, descriptor: int) -> int:
-        """The connection that a message came over; 0 if that is not known."""
-        return 0 if self._limiter is None else self._limiter.wire(descriptor)
+    def wire(self, descriptor: int) -> int | None:
+        """The connection that a message came over; None if that is not known."""
+        if self._limiter is None or descriptor < 0:
+            return None
+        return self._limiter.wire(descriptor)
 
     def open_wires(self) -> frozenset[int] | None:
         """The connections that are there; None if they are not counted."""

@@ -1,0 +1,45 @@
+"""Which connections a server knows to be there."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+import zmq
+
+from envhub_worker.access.audit.log import Log
+from envhub_worker.access.port.curve_port import CurvePort
+from envhub_worker.access.sessions import Sessions
+from envhub_worker.loop import Loop
+from tests.support.processes import eventually
+
+
+@pytest.fixture
+def context() -> Iterator[zmq.Context[zmq.Socket[bytes]]]:
+    """For sockets of a test."""
+    with zmq.Context() as made:
+        yield made
+
+
+@pytest.mark.parametrize("goes", [False, True])
+def test_who_has_gone_before_its_greeting_is_read_holds_no_session(
+    goes: bool, context: zmq.Context[zmq.Socket[bytes]]
+) -> None:
+    """A server that was busy meanwhile would keep that place for ever. The control stays."""
+    port = CurvePort(None, lambda key, address: True, Log(lambda line: None), 10)
+    router, client = context.socket(zmq.ROUTER), context.socket(zmq.DEALER)
+    with router, client:
+        port.secure(router, Loop(lambda error: None))
+        router.bind("tcp://127.0.0.1:*")
+        client.connect(router.get_string(zmq.LAST_ENDPOINT))
+        client.send_multipart([b"", b"greeting"])
+        assert router.poll(60_000)
+        if goes:
+            client.close()
+            assert eventually(lambda: not port.open_wires())
+        came = port.receive(router)
+        sessions = Sessions()
+        session = sessions.connect(came.identity, came.key, b"one", port.wire(came.fd))
+        sessions.disconnect(port.open_wires() or ())
+        assert bool(session.connections) is not goes
+        port.close()
