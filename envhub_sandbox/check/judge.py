@@ -26,7 +26,7 @@ from envhub_sandbox.check.settings import JudgeOptions
 from envhub_sandbox.check.static.static import undeclared
 from envhub_sandbox.check.static.survey import survey
 from envhub_sandbox.dependencies.declared import declared
-from envhub_sandbox.dependencies.pipeline import packages_for
+from envhub_sandbox.dependencies.packages import packages_for
 from envhub_sandbox.dependencies.request import chosen
 from envhub_sandbox.errors import (
     DependencyError,
@@ -43,7 +43,7 @@ from envhub_sandbox.errors import (
     WorkerDiedError,
     WorkerTimeoutError,
 )
-from envhub_sandbox.hub.snapshot import Snapshot, named
+from envhub_sandbox.hub.snapshot import Snapshot, snapshot_named
 from envhub_sandbox.policy import policy_from
 from envhub_sandbox.session.recipe import pinned
 from envhub_sandbox.sources import imports, parsing
@@ -74,7 +74,7 @@ def judge(asked: JudgeOptions, report: Report | None = None) -> Report:
     """
     asked.tell(f"reading {asked.reference}")
     where = {name: asked.arguments.get(name) for name in ("hub_cache_dir", "token", "endpoint")}
-    snapshot = named(asked.reference, **where)
+    snapshot = snapshot_named(asked.reference, **where)
     report = Report(asked.reference) if report is None else report
     report.reference, report.commit = pinned(snapshot), snapshot.commit
     judging = _Judge(asked, snapshot, report)

@@ -14,7 +14,7 @@ import typer
 from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import out, print_json, safe_line, say
 from envhub_sandbox.cli.shared.exits import UsageError
-from envhub_sandbox.cli.shared.progress import Bar
+from envhub_sandbox.cli.shared.progress import ProgressBar
 from envhub_worker.protocol.text import counted
 
 if TYPE_CHECKING:
@@ -60,7 +60,7 @@ def lock(
     The packages are those of an environment of its own. To see its spaces the repository is loaded,
     in the sandbox.
     """
-    with Bar(quiet=json) as bar:
+    with ProgressBar(quiet=json) as bar:
         bar.begin(f"locking {ref}")
         from envhub_sandbox.locks import drift, lockfile, making
 
@@ -100,7 +100,7 @@ def verify(
 
     Files, the packages on the index, Python, and, except with --no-spaces, its spaces.
     """
-    with Bar(quiet=json) as bar:
+    with ProgressBar(quiet=json) as bar:
         bar.begin(f"verifying {file}")
         from envhub_sandbox.locks import drift, lockfile
 

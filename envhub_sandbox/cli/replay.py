@@ -11,7 +11,7 @@ import typer
 from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import out, print_json, safe_line, safe_text, say
 from envhub_sandbox.cli.shared.exits import Exit, UsageError
-from envhub_sandbox.cli.shared.progress import Bar
+from envhub_sandbox.cli.shared.progress import ProgressBar
 
 if TYPE_CHECKING:
     from envhub_sandbox.crash.bundle_reader import Bundle
@@ -76,7 +76,7 @@ class _Replay:
         place = bundle.arguments.get("sandbox")
         if place != self._sandbox:
             say(f"It died in sandbox {safe_line(place)}; this is sandbox {self._sandbox}.")
-        with Bar(quiet=self._as_json) as bar:
+        with ProgressBar(quiet=self._as_json) as bar:
             replayed = self._run(bundle, bar)
         self._print(bundle, replayed)
         codes = {Verdict.SAME: Exit.OK, Verdict.DIFFERENT: Exit.DIFFERENT}
@@ -92,14 +92,14 @@ class _Replay:
                 "yours, or you trust where the bundle comes from, add --grant"
             )
 
-    def _run(self, bundle: Bundle, bar: Bar) -> ReplayResult:
+    def _run(self, bundle: Bundle, bar: ProgressBar) -> ReplayResult:
         from envhub_sandbox.crash.replay import replay
 
         bar.begin(f"loading {safe_line(bundle.label)}")
         with contextlib.ExitStack() as stack:
             return replay(lambda: self._make(bundle, bar, stack), bundle)
 
-    def _make(self, bundle: Bundle, bar: Bar, stack: contextlib.ExitStack) -> Any:
+    def _make(self, bundle: Bundle, bar: ProgressBar, stack: contextlib.ExitStack) -> Any:
         """The environment that the bundle is about; None if it is about ``make_env`` alone."""
         from envhub_sandbox.api import make_env
         from envhub_sandbox.crash.replay import changed_files

@@ -16,7 +16,7 @@ import typer
 from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import out, print_json, safe_line, safe_text, say
 from envhub_sandbox.cli.shared.exits import code_for, describe
-from envhub_sandbox.cli.shared.progress import Bar
+from envhub_sandbox.cli.shared.progress import ProgressBar
 from envhub_sandbox.cli.shared.results import (
     TaskResult,
     print_provenance,
@@ -125,14 +125,14 @@ class _Run:
                 from envhub_sandbox.rollouts.video import check_target
 
                 check_target(self.video)
-            with Bar(quiet=self.as_json) as bar, self.make.explained():
+            with ProgressBar(quiet=self.as_json) as bar, self.make.explained():
                 self._run(bar)
         except EnvHubError as error:
             self._print(error)
             raise
         self._print(None)
 
-    def _run(self, bar: Bar) -> None:
+    def _run(self, bar: ProgressBar) -> None:
         arguments = self.make.arguments()
         bar.begin(f"loading {self.make.ref}")
         from envhub_sandbox.api import make_env
@@ -152,7 +152,7 @@ class _Run:
                 self.provenance = envs.provenance
 
     def _play_task(
-        self, bar: Bar, suite: str, task: int | str, env: Any, video: Path | None
+        self, bar: ProgressBar, suite: str, task: int | str, env: Any, video: Path | None
     ) -> TaskResult:
         from envhub_sandbox.rollouts.episodes import autoreset_mode
 
@@ -172,7 +172,7 @@ class _Run:
             video=None if video is None else str(video),
         )
 
-    def _roll_out(self, env: Any, bar: Bar, writer: VideoWriter | None) -> Rollout:
+    def _roll_out(self, env: Any, bar: ProgressBar, writer: VideoWriter | None) -> Rollout:
         from envhub_sandbox.rollouts.episodes import rollout
         from envhub_sandbox.rollouts.video import frame_of
 

@@ -25,7 +25,7 @@ from envhub_sandbox.transport.values.tensors import to_tensor
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.inert import one_line
 from envhub_worker.protocol.shared_memory.slabs import DTYPE_CODES
-from envhub_worker.protocol.stream import PacketReader
+from envhub_worker.protocol.stream import StreamReader
 from envhub_worker.protocol.text import printable
 from envhub_worker.protocol.untrusted import FAULTS
 
@@ -171,7 +171,7 @@ def _load(folder: Path) -> m.Load:
 
 
 def _packets(folder: Path, name: str) -> Iterator[m.Message]:
-    for packet in PacketReader().feed(_read(folder, name)):
+    for packet in StreamReader().feed(_read(folder, name)):
         yield m.unpack(packet.frames, tensors=to_tensor)
 
 

@@ -32,7 +32,7 @@ from envhub_sandbox.dependencies import (
     bounds,
     environments,
     interpreters,
-    pipeline,
+    packages,
     resolutions,
     uv,
 )
@@ -97,9 +97,9 @@ def _made(order: Mapping[str, Any], ended: int | None) -> dict[str, Any]:
     request = _request(order)
     # a client could have it ask any host that it reaches, and what a build takes is in no account
     resolutions.BUILDER = None
-    if not request.always and pipeline.HERE.meets(request):
+    if not request.always and packages.HERE.meets(request):
         return {"own": True}
-    made = pipeline.HERE.make(request, lambda line: _say({"told": line[:_WHERE_CHARS]}))
+    made = packages.HERE.make(request, lambda line: _say({"told": line[:_WHERE_CHARS]}))
     assert made.environment is not None
     return {
         "made": {

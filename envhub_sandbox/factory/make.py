@@ -7,14 +7,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from envhub_sandbox.dependencies.modules import MissingModule
-from envhub_sandbox.dependencies.pipeline import PackageSet, packages_for
+from envhub_sandbox.dependencies.packages import PackageSet, packages_for
 from envhub_sandbox.dependencies.request import Choice, chosen
 from envhub_sandbox.errors import PolicyError
 from envhub_sandbox.factory import sandbox_spec
 from envhub_sandbox.factory.config import plain_config, reference_of
 from envhub_sandbox.factory.env_factory import EnvFactory
 from envhub_sandbox.hub import store
-from envhub_sandbox.hub.snapshot import Snapshot, named
+from envhub_sandbox.hub.snapshot import Snapshot, snapshot_named
 from envhub_sandbox.locks import use as locks
 from envhub_sandbox.option_names import option_name
 from envhub_sandbox.options import Options
@@ -48,7 +48,7 @@ def make(make_env: Callable[..., EnvSuites], cfg: Any, given: Options) -> EnvSui
         return _make_here(reference, config, options)
     processes.occupy_streams()  # before anything of ours is opened
     wanted = _wanted(options.sandbox, options)
-    snapshot = named(reference, **options.hub)
+    snapshot = snapshot_named(reference, **options.hub)
     packages = _packages(snapshot, wanted)
     load = LoadArguments(
         n_envs=options.n_envs,
@@ -130,7 +130,7 @@ def _make_here(reference: str, config: Any, options: Options) -> EnvSuites:
     if not options.trust_remote_code:
         raise inprocess.refusal(reference)
     options.refuse_sandboxed()
-    snapshot = named(reference, **options.hub)
+    snapshot = snapshot_named(reference, **options.hub)
     further = dict(options.env_kwargs or {})
     envs = inprocess.make(snapshot, options.n_envs, options.use_async_envs, config, further)
     return EnvSuites(envs, lambda: provenance_of(snapshot, None, []))

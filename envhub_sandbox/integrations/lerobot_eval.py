@@ -22,7 +22,7 @@ def main() -> None:
         sys.exit("lerobot-eval-sandboxed needs LeRobot: pip install 'envhub-sandbox[lerobot]'")
     from envhub_sandbox.integrations.lerobot import install
 
-    options, rest = split(sys.argv[1:])
+    options, rest = split_eval_arguments(sys.argv[1:])
     try:
         install(**options)
     except (TypeError, RuntimeError) as error:
@@ -34,7 +34,7 @@ def main() -> None:
         evaluate()
 
 
-def split(arguments: list[str]) -> tuple[dict[str, Any], list[str]]:
+def split_eval_arguments(arguments: list[str]) -> tuple[dict[str, Any], list[str]]:
     """Our options by name, and the others."""
     ours = [one for one in arguments if one.startswith(_PREFIX)]
     options = {}

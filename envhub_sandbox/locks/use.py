@@ -14,7 +14,7 @@ from envhub_sandbox.option_names import option_name
 if TYPE_CHECKING:  # they cost time, and mostly there is no lock
     from envhub_sandbox.dependencies.builds.sources import WheelOrigin
     from envhub_sandbox.dependencies.interpreters import Interpreter
-    from envhub_sandbox.dependencies.pipeline import PackageSet
+    from envhub_sandbox.dependencies.packages import PackageSet
     from envhub_sandbox.dependencies.resolve import Lock
     from envhub_sandbox.locks.lockfile import LockFile
     from envhub_worker.protocol.manifest.manifest import Manifest
@@ -47,7 +47,7 @@ def provided(snapshot: Snapshot, lock: LockFile) -> PackageSet:
     Raises ``LockDriftError`` where the files or the interpreter are others.
     """
     from envhub_sandbox.dependencies import environments, interpreters, progress
-    from envhub_sandbox.dependencies.pipeline import PackageSet
+    from envhub_sandbox.dependencies.packages import PackageSet
     from envhub_sandbox.locks import drift, lockfile, pylock
 
     here = drift.with_files(lock, snapshot)
@@ -56,7 +56,7 @@ def provided(snapshot: Snapshot, lock: LockFile) -> PackageSet:
         interpreter = interpreters.find(lock.runner.python)
         here = replace(here, runner=lockfile.Runner.of(interpreter))
         drift.refuse(drift.differences(lock, here), snapshot.label)
-        with progress.shown("packages") as tell:
+        with progress.progress_shown("packages") as tell:
             locked = [one.origin for one in lock.packages if one.origin is not None]
             pins = _with_wheels(pylock.pins(lock.packages), locked, interpreter, tell)
             made = environments.provide(pins, interpreter, tell)
@@ -107,16 +107,16 @@ def checker(
         if lock is None or lock.spaces is None or config is not None:
             return
         from envhub_sandbox.locks import drift, lockfile
-        from envhub_sandbox.locks.fingerprint import task_of
+        from envhub_sandbox.locks.fingerprint import fingerprint_of_task
 
         if lockfile.arguments_text(env_kwargs) == lock.spaces.arguments:
             now = [
-                task_of(
+                fingerprint_of_task(
                     *(env.suite, env.task, env.autoreset_mode),
                     *(env.single_observation_space, env.single_action_space),
                 )
                 for env in manifest.envs
             ]
-            drift.refuse(list(drift.of_tasks(lock.spaces.tasks, now)), label)
+            drift.refuse(list(drift.drift_of_tasks(lock.spaces.tasks, now)), label)
 
     return check

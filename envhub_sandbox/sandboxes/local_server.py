@@ -10,7 +10,7 @@ from pathlib import Path
 
 from envhub_sandbox.sandboxes.pool import WorkerServer
 from envhub_sandbox.sandboxes.runtime_folder import RuntimeFolder
-from envhub_sandbox.system.processes import has_ended
+from envhub_sandbox.system import processes
 from envhub_sandbox.transport.forks import Owner
 
 
@@ -82,7 +82,7 @@ class LocalServer(WorkerServer):
         for: it takes no requests any more. Nor can anyone connect to one whose sockets a cleaner
         of temporary files has removed; who is connected already goes on.
         """
-        alive = self.process.poll() is None and not has_ended(self.process.pid)
+        alive = self.process.poll() is None and not processes.has_ended(self.process.pid)
         return alive and self._runtime.has_sockets(*self._sockets)
 
     def stop(self) -> None:

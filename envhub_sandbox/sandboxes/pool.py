@@ -28,7 +28,7 @@ from time import monotonic
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 if TYPE_CHECKING:
-    from envhub_sandbox.transport.tcp import Far
+    from envhub_sandbox.transport.tcp import TcpServer
 
 _LONGEST_WAIT_S = 3600.0
 
@@ -49,7 +49,7 @@ class WorkerServer(ABC):
     process_fd: int
     fd_path: str | None = None
     layers: Sequence[Mapping[str, Any]] = ()
-    far: Far | None = None
+    far: TcpServer | None = None
 
     @property
     @abstractmethod

@@ -27,7 +27,7 @@ from envhub_sandbox.system.log import WORKER
 from envhub_worker.protocol.runtime import OWN, Runtime
 
 if TYPE_CHECKING:
-    from envhub_sandbox.dependencies.pipeline import PackageTarget
+    from envhub_sandbox.dependencies.packages import PackageTarget
 
 BOOTSTRAP = Path(envhub_worker.protocol.__file__).parent.parent / "bootstrap.py"
 _STARTUP_S = 60.0
@@ -45,7 +45,7 @@ class ProcessSandbox(Sandbox):
 
     def package_target(self) -> PackageTarget:
         """Packages are made for the interpreters of this machine."""
-        from envhub_sandbox.dependencies.pipeline import HERE
+        from envhub_sandbox.dependencies.packages import HERE
 
         return HERE
 

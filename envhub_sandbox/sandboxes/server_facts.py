@@ -10,9 +10,9 @@ from time import monotonic
 from typing import Any
 
 from envhub_sandbox.sandboxes.remote import RemoteSandbox
-from envhub_sandbox.transport.connection import WorkerClient
+from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.replies import expect
+from envhub_sandbox.transport.replies import expect_reply
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import PROFILES
 from envhub_worker.protocol.text import printable
@@ -80,17 +80,17 @@ def ask(sandbox: RemoteSandbox) -> ServerFacts:
     begun, deadline = monotonic(), Deadline(_WAIT_S)
     with _connection(sandbox) as client:
         greeting = m.Hello(m.VERSION, _LOOKER)
-        welcome = expect(client.request(greeting, deadline=deadline)[0], m.Welcome)
+        welcome = expect_reply(client.request(greeting, deadline=deadline)[0], m.Welcome)
         answered_s = monotonic() - begun
-        sessions = expect(client.request(m.GetSessions(), deadline=deadline)[0], m.Sessions)
+        sessions = expect_reply(client.request(m.GetSessions(), deadline=deadline)[0], m.Sessions)
     return facts_of(welcome, answered_s, sessions.server)
 
 
 @contextlib.contextmanager
-def _connection(sandbox: RemoteSandbox) -> Iterator[WorkerClient]:
+def _connection(sandbox: RemoteSandbox) -> Iterator[WorkerConnection]:
     never, ends = os.pipe()
     try:
-        client = WorkerClient(sandbox.endpoint, never, far=sandbox.far())
+        client = WorkerConnection(sandbox.endpoint, never, far=sandbox.far())
         with contextlib.closing(client):
             yield client
     finally:

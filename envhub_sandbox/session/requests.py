@@ -35,7 +35,7 @@ from envhub_sandbox.session.use_lock import UseLock
 from envhub_sandbox.transport.deadline import Deadline, StepDeadline
 from envhub_sandbox.transport.jail import RunnersDiedError
 from envhub_sandbox.transport.lane import Lane, Request
-from envhub_sandbox.transport.replies import all_of
+from envhub_sandbox.transport.replies import all_replies
 from envhub_sandbox.transport.results import StepResult
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.lifecycle import Event, State
@@ -258,12 +258,12 @@ class Requests:
             if self._recovery is None:
                 raise self._failures.dead(deaths.first) from None
             replies = self._recovery.survive_request(deaths)
-        answers = all_of(replies, kind)
+        answers = all_replies(replies, kind)
         if self._recovery is not None:
             self._recovery.answered()
         return answers
 
-    def one_each(self, what: str, replies: list[m.Value] | list[m.Watched]) -> tuple[Any, ...]:
+    def one_each(self, what: str, replies: list[m.Value] | list[m.WatchDone]) -> tuple[Any, ...]:
         """One value for each sub-environment, out of the shards' replies."""
         try:
             return self.results.one_each(what, replies)
@@ -361,7 +361,7 @@ class Requests:
         except RunnersDiedError as deaths:
             self.lifecycle.answered()  # the next request meets the deaths
             raise deaths.first from None
-        return self.results.apart(all_of(replies, m.Value))
+        return self.results.apart(all_replies(replies, m.Value))
 
     # --- out and back --------------------------------------------------------------------------
 

@@ -8,7 +8,7 @@ import secrets
 from pathlib import Path
 
 
-def write_whole(path: Path, data: bytes, *, mode: int = 0o600, durable: bool = False) -> None:
+def write_whole_file(path: Path, data: bytes, *, mode: int = 0o600, durable: bool = False) -> None:
     """Write a file under another name, and rename it: meanwhile others read the old one.
 
     Args:

@@ -18,9 +18,9 @@ from envhub_sandbox.errors import (
 )
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.exit_status import describe_exit
-from envhub_sandbox.transport.forks import Owner, foreign
-from envhub_sandbox.transport.replies import expect
-from envhub_sandbox.transport.tcp import Far, Link
+from envhub_sandbox.transport.forks import Owner, fork_error_text
+from envhub_sandbox.transport.replies import expect_reply
+from envhub_sandbox.transport.tcp import TcpLink, TcpServer
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, LARGE_BYTES, WireLimits
@@ -33,7 +33,7 @@ SESSION = secrets.token_bytes(16)
 _contexts: dict[int, zmq.Context[zmq.Socket[bytes]]] = {}
 
 
-def far_session() -> bytes:
+def remote_session_id() -> bytes:
     """Our session on other hosts, where a fork of this process is another client."""
     return SESSION + os.getpid().to_bytes(4, "little")
 
@@ -53,7 +53,7 @@ _ROOM_S = 30.0
 """How long a socket may be full, or without a connection, until what is sent counts as lost."""
 
 
-class WorkerClient:
+class WorkerConnection:
     """A connection. Not thread-safe: its owner holds a lock.
 
     Args:
@@ -72,7 +72,7 @@ class WorkerClient:
         endpoint: str,
         process_fd: int,
         limits: WireLimits = DEFAULT_LIMITS,
-        far: Far | None = None,
+        far: TcpServer | None = None,
     ) -> None:
         self._owner = Owner()
         self._limits = limits
@@ -82,7 +82,7 @@ class WorkerClient:
         self._socket.setsockopt(zmq.MAXMSGSIZE, limits.frame_bytes)
         self._socket.setsockopt(zmq.RCVHWM, 64)
         self._far = far
-        self._link = None if far is None else Link(self._socket, endpoint, far)
+        self._link = None if far is None else TcpLink(self._socket, endpoint, far)
         self._socket.connect(endpoint)
         self._process_fd = process_fd
         self._poller = zmq.Poller()
@@ -102,10 +102,10 @@ class WorkerClient:
     def hello(self, deadline: Deadline) -> m.Welcome:
         """Agree on a protocol version."""
         self._compression = ""
-        session = SESSION if self._far is None else far_session()
+        session = SESSION if self._far is None else remote_session_id()
         greeting = m.Hello(m.VERSION, session)
         reply, _ = self.request(greeting, deadline=deadline)
-        welcome = expect(reply, m.Welcome)
+        welcome = expect_reply(reply, m.Welcome)
         if welcome.version != m.VERSION:
             raise VersionMismatchError(
                 f"this client speaks protocol {m.VERSION}, the worker {welcome.version}: install "
@@ -117,7 +117,7 @@ class WorkerClient:
 
     def _agree(self, deadline: Deadline) -> None:
         reply, _ = self.request(m.Agree(compression.available()), deadline=deadline)
-        agreed = expect(reply, m.Agreed)
+        agreed = expect_reply(reply, m.Agreement)
         if agreed.compression not in ("", *compression.available()):
             raise RemoteProtocolError("the worker chose a compression that was not offered")
         self._compression, self.patience_s = agreed.compression, agreed.idle_s
@@ -233,7 +233,7 @@ class WorkerClient:
 
     def _must_say_hello(self, request_id: int, reply: m.Message) -> bool:
         """Whether we came back over a new connection: nothing was done, so it can be asked anew."""
-        unknown = isinstance(reply, m.Refused) and reply.error == "HelloError"
+        unknown = isinstance(reply, m.Refusal) and reply.error == "HelloError"
         return unknown and request_id in self._sent
 
     def _wait(self, request_id: int, deadline: Deadline) -> None:
@@ -271,7 +271,7 @@ class WorkerClient:
             WorkerError: This is not the process that made the connection.
         """
         if os.getpid() != self._owner.pid:
-            raise WorkerError(foreign(self._owner.pid))
+            raise WorkerError(fork_error_text(self._owner.pid))
 
     def close(self) -> None:
         """Close the connection. Idempotent; in a forked child nothing is touched."""

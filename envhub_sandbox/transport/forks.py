@@ -21,7 +21,7 @@ class Owner:
         return os.getpid() == self.pid
 
 
-def foreign(owner: int | None = None) -> str:
+def fork_error_text(owner: int | None = None) -> str:
     """The text of the error of an environment that is used in a fork of its owner."""
     whose = "this environment belongs to another process"
     if owner is not None:

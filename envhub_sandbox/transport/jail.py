@@ -16,10 +16,10 @@ from envhub_sandbox.errors import (
     WorkerError,
 )
 from envhub_sandbox.transport.attribute_cache import AttributeCache
-from envhub_sandbox.transport.connection import WorkerClient
+from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.remote_warnings import RemoteWarnings
-from envhub_sandbox.transport.replies import check, death, expect, typed
+from envhub_sandbox.transport.replies import check_reply, death, expect_reply, typed_reply
 from envhub_sandbox.transport.values import pickles
 from envhub_sandbox.transport.values.descriptions import unpacked
 from envhub_worker.protocol import messages as m
@@ -75,7 +75,7 @@ class JailHandle:
 
     def __init__(
         self,
-        client: WorkerClient,
+        client: WorkerConnection,
         number: int,
         runners: Sequence[int],
         report: list[dict[str, Any]],
@@ -92,7 +92,7 @@ class JailHandle:
         self.limits = limits
         self._asked: dict[int, int] = {}  # how many runners, by request
 
-    def through(self, client: WorkerClient) -> JailHandle:
+    def through(self, client: WorkerConnection) -> JailHandle:
         """The same jail over another connection of ours."""
         jail = JailHandle(client, self.number, self.runners, self.report, self.limits)
         jail.before_end, jail.warnings, jail.watched = self.before_end, self.warnings, self.watched
@@ -101,20 +101,20 @@ class JailHandle:
     def start_runners(self, count: int, deadline: Deadline) -> list[int]:
         """Fork further runners; returns their numbers."""
         reply, _ = self.client.request(m.StartRunners(self.number, count), deadline=deadline)
-        started = _runners(expect(reply, m.JailOpened), count)
+        started = _runners(expect_reply(reply, m.JailOpened), count)
         self.runners += started
         return started
 
     def keep(self, deadline: Deadline) -> None:
         """From now on it goes on without a runner that dies."""
         reply, _ = self.client.request(m.KeepJail(self.number), deadline=deadline)
-        expect(reply, m.Done)
+        expect_reply(reply, m.Done)
         self.kept = True
 
     def expire(self, idle_s: float, deadline: Deadline) -> None:
         """From now on it ends once it has been idle for so long."""
         message = m.ExpireIdle(self.number, max(1, int(idle_s * 1000)))
-        expect(self.client.request(message, deadline=deadline)[0], m.Done)
+        expect_reply(self.client.request(message, deadline=deadline)[0], m.Done)
 
     def replace_runners(self, dead: Sequence[int], deadline: Deadline) -> list[int]:
         """Fork a runner in the place of each that has died; returns the new numbers, in order."""
@@ -157,12 +157,12 @@ class JailHandle:
         reply, payload = self.client.receive(request_id, deadline)
         asked = self._asked.pop(request_id, None)
         with UNTRUSTED:
-            if not (self.kept and isinstance(reply, m.RelayedPartly)):
-                reply = expect(reply, m.Relayed)
+            if not (self.kept and isinstance(reply, m.RelayDonePartly)):
+                reply = expect_reply(reply, m.RelayDone)
             parts = _cut(payload, reply.parts)
             if len(parts) != asked:
                 raise RemoteProtocolError(f"{asked} runners were asked, {len(parts)} answered")
-            if isinstance(reply, m.RelayedPartly):
+            if isinstance(reply, m.RelayDonePartly):
                 raise self._died(reply.dead, parts)
             return [self._unpack(part) for part in parts]
 
@@ -170,7 +170,7 @@ class JailHandle:
         """The server says which runners have died; a runner cannot."""
         if not dead or not set(dead) <= set(range(len(parts))):
             raise RemoteProtocolError("the worker names dead runners that were not asked")
-        deaths = {index: death(typed(self._unpack(parts[index]), m.Died)) for index in dead}
+        deaths = {index: death(typed_reply(self._unpack(parts[index]), m.Death)) for index in dead}
         living = [None if i in deaths else self._unpack(part) for i, part in enumerate(parts)]
         return RunnersDiedError(living, deaths)
 
@@ -191,7 +191,7 @@ class JailHandle:
         packed = [(runner, self.pack(message)) for runner, message in requests]
         replies = self.ask(operation, packed, deadline, deposited=deposited)
         for reply in replies:
-            check(reply)
+            check_reply(reply)
         return replies
 
     def ask(
@@ -215,7 +215,7 @@ class JailHandle:
             WorkerDiedError: The jail has ended, during ``operation``.
         """
         reply, _ = self.client.request(m.ReadOutput(self.number, operation), deadline=deadline)
-        return expect(reply, m.Output).text
+        return expect_reply(reply, m.Output).text
 
     def cause_of_death(self, operation: str) -> Exception:
         """Why it has ended: the server knows, at the latest when it has reaped it."""
@@ -273,7 +273,7 @@ def _nothing() -> None:
 
 
 def open_jail(
-    client: WorkerClient, request: m.OpenJail, limits: WireLimits, deadline: Deadline
+    client: WorkerConnection, request: m.OpenJail, limits: WireLimits, deadline: Deadline
 ) -> JailHandle:
     """Open a jail.
 
@@ -284,7 +284,7 @@ def open_jail(
     sent = client.send(request)
     try:
         reply, _ = client.receive(sent, deadline)
-        opened = expect(reply, m.JailOpened)
+        opened = expect_reply(reply, m.JailOpened)
         runners = _runners(opened, request.runners)
         report = [dict(layer) for layer in opened.report if isinstance(layer, dict)]
         client.hold(opened.jail)
@@ -296,11 +296,11 @@ def open_jail(
         raise
 
 
-def _end_unseen(client: WorkerClient, sent: int) -> None:
+def _end_unseen(client: WorkerConnection, sent: int) -> None:
     """End the jail that a request opens, whether or not the reply has been read."""
     deadline = Deadline(_UNSEEN_S)
     with contextlib.suppress(EnvHubError):
-        opened = expect(client.reply_again(sent, deadline), m.JailOpened)
+        opened = expect_reply(client.reply_again(sent, deadline), m.JailOpened)
         client.request(m.CloseJail(opened.jail), deadline=deadline)
         client.let_go(opened.jail)
 

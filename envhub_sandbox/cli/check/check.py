@@ -15,7 +15,7 @@ from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import out, print_json, safe_line, say
 from envhub_sandbox.cli.shared.exits import Exit, UsageError, reported
 from envhub_sandbox.cli.shared.findings import STYLES, annotate, level, show_finding, write_report
-from envhub_sandbox.cli.shared.progress import Bar
+from envhub_sandbox.cli.shared.progress import ProgressBar
 from envhub_worker.protocol.text import counted
 
 if TYPE_CHECKING:
@@ -170,7 +170,7 @@ def check(
             raise UsageError("name a repository, or a list of them: --all FILE --output DIR")
         if any(opt.is_typed(ctx, name) for name in own.OF_A_LIST):
             raise UsageError("--output, --jobs, --memory-budget and --again are for --all FILE")
-        own.refuse_the_judged({"--settings": settings, "--policy": policy}, ref)
+        own.refuse_options_of_the_judged({"--settings": settings, "--policy": policy}, ref)
         report = _judge(
             make,
             policy,
@@ -235,7 +235,7 @@ def _judge(
         )
 
     report, doing = Report(make.ref), ["starting"]
-    with Bar(quiet=quiet, long_s=_LONG_S) as bar:
+    with ProgressBar(quiet=quiet, long_s=_LONG_S) as bar:
 
         def tell(what: str) -> None:
             doing.append(what)

@@ -73,7 +73,9 @@ Again = Annotated[
 ]
 
 
-def refuse_the_judged(places: Mapping[str, Path | None], reference: str, where: str = "") -> None:
+def refuse_options_of_the_judged(
+    places: Mapping[str, Path | None], reference: str, where: str = ""
+) -> None:
     """No repository says how it is judged, and none holds what is found in it: refuse such places.
 
     Raises:

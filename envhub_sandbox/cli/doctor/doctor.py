@@ -26,8 +26,8 @@ import typer
 from envhub_sandbox.cli.init.starter import starter
 from envhub_sandbox.cli.shared.console import out, print_json, safe_line, safe_text, show
 from envhub_sandbox.cli.shared.exits import Exit, UsageError, describe, reported
-from envhub_sandbox.cli.shared.memory import free_bytes
-from envhub_sandbox.cli.shared.progress import Bar
+from envhub_sandbox.cli.shared.memory import free_memory_bytes
+from envhub_sandbox.cli.shared.progress import ProgressBar
 from envhub_sandbox.cli.version import versions
 from envhub_sandbox.errors import EnvHubError, SandboxUnavailableError, SnapshotError
 from envhub_worker.protocol.confinement import PROFILES
@@ -115,7 +115,7 @@ def doctor(
                 "--server-key and --insecure-loopback are of a server: envhub doctor "
                 "tcp://HOST:PORT"
             )
-        with Bar(quiet=json) as bar, _scratch_folder() as folder:
+        with ProgressBar(quiet=json) as bar, _scratch_folder() as folder:
             (folder / "idle").mkdir()
             (folder / "idle" / "env.py").write_text(starter("idle", 2026)["env.py"])
             trials = []
@@ -221,7 +221,7 @@ def resources(problem: str | None) -> dict[str, Any]:
     with contextlib.suppress(SnapshotError):  # it is the problem
         folder = next(one for one in (cache_root(), *cache_root().parents) if one.is_dir())
         disk |= {"folder": str(folder), "free_bytes": shutil.disk_usage(folder).free}
-    return {"free_memory_bytes": free_bytes(), "disk": disk}
+    return {"free_memory_bytes": free_memory_bytes(), "disk": disk}
 
 
 def probe() -> dict[str, Any]:

@@ -11,7 +11,7 @@ from envhub_sandbox.cli.inspect.static import check_options, inspect_static
 from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import out, print_json, safe_line, show
 from envhub_sandbox.cli.shared.findings import FailOn
-from envhub_sandbox.cli.shared.progress import Bar
+from envhub_sandbox.cli.shared.progress import ProgressBar
 from envhub_sandbox.cli.shared.results import print_provenance
 
 _SPACES = ("single_observation_space", "single_action_space", "observation_space", "action_space")
@@ -57,7 +57,7 @@ def _inspect(
     arguments = make.arguments()
     from envhub_sandbox.api import make_env
 
-    with Bar(quiet=as_json) as bar, make.explained():
+    with ProgressBar(quiet=as_json) as bar, make.explained():
         bar.begin(f"loading {make.ref} in a sandbox")
         with make_env(**arguments) as envs:
             found = [describe_env(*item) for item in opt.select(envs, suites, tasks)]

@@ -148,9 +148,9 @@ class MakeOptions:
 
     def snapshot(self, ref: str) -> Snapshot:
         """What a reference names, fetched."""
-        from envhub_sandbox.hub.snapshot import named
+        from envhub_sandbox.hub.snapshot import snapshot_named
 
-        return named(ref, **self.hub)
+        return snapshot_named(ref, **self.hub)
 
     @property
     def hub(self) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from envhub_sandbox.system.log import WORKER
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
 from envhub_sandbox.transport.jail import RunnersDiedError
 from envhub_sandbox.transport.lane import Lane, Request
-from envhub_sandbox.transport.replies import check, typed
+from envhub_sandbox.transport.replies import check_reply, typed_reply
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.lifecycle import Event
@@ -108,7 +108,7 @@ class Recovery:
         replies = self._of_survivors(deaths)
         fresh = self._revive(deaths, "step", self._revivals, _step_rows)
         merged = [fresh.get(index, reply) for index, reply in enumerate(replies)]
-        return [typed(reply, m.StepDone) for reply in merged if reply is not None]
+        return [typed_reply(reply, m.StepDone) for reply in merged if reply is not None]
 
     def mark(self, infos: dict[Any, Any]) -> dict[Any, Any]:
         """All infos of the last request, of which those of the fresh shards say that they are."""
@@ -125,7 +125,7 @@ class Recovery:
         try:
             for reply in deaths.replies:
                 if reply is not None:
-                    check(reply)
+                    check_reply(reply)
         except EnvHubError:
             self._lifecycle.answered()
             raise
@@ -202,12 +202,12 @@ class Recovery:
                 (lane.runners[index], [*frames[index]]) for index in dead
             ]
             replies = lane.jail.ask("set_attr", asked, deadline)
-            if any(isinstance(reply, m.Raised) for reply in replies):
+            if any(isinstance(reply, m.RaisedException) for reply in replies):
                 label = self._lease.repository.label
                 WORKER.warning("%s: %r could not be set again", label, name)
             for reply in replies:
-                if not isinstance(reply, m.Raised):
-                    typed(reply, m.Value)
+                if not isinstance(reply, m.RaisedException):
+                    typed_reply(reply, m.Value)
 
     def _revivals(self, lane: Lane, index: int) -> list[m.Message]:
         return [m.Revive(lane.number, self._derived(index))]
@@ -227,12 +227,12 @@ class Recovery:
 
 def _step_rows(reply: m.Message, size: int) -> m.Message:
     """Trust: input from the worker."""
-    return revived_step(typed(reply, m.StepDone), size)
+    return revived_step(typed_reply(reply, m.StepDone), size)
 
 
 def _reset_rows(reply: m.Message, size: int) -> m.Message:
     """Trust: input from the worker."""
-    done = typed(reply, m.ResetDone)
+    done = typed_reply(reply, m.ResetDone)
     return m.replace(done, info=mark_revived(done.info, size))
 
 

@@ -16,7 +16,7 @@ from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import RunnersDiedError
 from envhub_sandbox.transport.lane import Frames, RelayLane, Request
 from envhub_sandbox.transport.pace import Pace, PaceMeter
-from envhub_sandbox.transport.replies import typed
+from envhub_sandbox.transport.replies import typed_reply
 from envhub_sandbox.transport.results import Results, StepResult
 from envhub_sandbox.transport.shared_memory.attachment import Attachment
 from envhub_sandbox.transport.shared_memory.observations import RING, ObservationSlab
@@ -161,7 +161,7 @@ class SharedMemoryLane:
             attach = m.Attach(self.number, bounds[index][0], layout.count, layout.slots)
             messages.append((self.runners[index], attach))
         replies = self.jail.exchange("attach", messages, deadline, deposited=True)
-        return all(typed(reply, m.Value).value is True for reply in replies)
+        return all(typed_reply(reply, m.Value).value is True for reply in replies)
 
     # --- steps ---------------------------------------------------------------------------------
 
@@ -287,7 +287,9 @@ class SharedMemoryLane:
         """Replies to a reset as they would have come through the server."""
         with UNTRUSTED:
             return [
-                reply if isinstance(reply, m.Raised) else self._results.reset_done(part, reply)
+                reply
+                if isinstance(reply, m.RaisedException)
+                else self._results.reset_done(part, reply)
                 for part, reply in zip(self._observations(), replies, strict=True)
             ]
 
@@ -379,7 +381,7 @@ class SharedMemoryLane:
         return RunnersDiedError(replies, deaths)
 
     def _stepped(self, index: int, outcome: Outcome, observation: Any, flags: Any) -> m.Message:
-        if isinstance(outcome[1], m.Raised):
+        if isinstance(outcome[1], m.RaisedException):
             return outcome[1]
         rewards, over, cut = (column[slice(*self._bounds[index])] for column in flags)
         info = infos_of(self.shards[index], outcome, self._results)

@@ -17,7 +17,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.inert import RemoteObject, one_line
 from envhub_worker.protocol.codec.kinds import GENERATOR, SPACE, SPEC, Buffer
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
-from envhub_worker.protocol.manifest.facts import read_spec
+from envhub_worker.protocol.manifest.facts import read_spec_facts
 from envhub_worker.protocol.spaces.reader import (
     ELEMENT_BYTES,
     GENERATOR_BYTES,
@@ -68,6 +68,6 @@ class DescriptionReader:
 
 def _spec(value: object) -> Any:
     """A spec; a description of one whose id this Gymnasium cannot read."""
-    facts = read_spec(value)
+    facts = read_spec_facts(value)
     made = spec_of(facts)
     return RemoteObject(_SPEC_TYPE, one_line(str(facts), _SHOWN)) if made is None else made

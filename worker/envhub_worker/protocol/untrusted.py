@@ -36,7 +36,7 @@ FAULTS: tuple[type[Exception], ...] = (
 _MAX_CHARS = 500
 
 
-class Untrusted:
+class UntrustedInput:
     """A context in which a peer's input is handled; keeps nothing, so one serves all.
 
     Raises:
@@ -59,7 +59,7 @@ class Untrusted:
             raise blamed(error) from error
 
 
-UNTRUSTED = Untrusted()
+UNTRUSTED = UntrustedInput()
 
 
 def is_fault(error: BaseException) -> bool:

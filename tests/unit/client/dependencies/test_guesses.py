@@ -12,7 +12,7 @@ from envhub_sandbox.dependencies import interpreters, resolutions
 from envhub_sandbox.dependencies import resolve as resolving
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.dependencies.modules import MissingModule, guessed
-from envhub_sandbox.dependencies.pipeline import PackageSet, packages_for
+from envhub_sandbox.dependencies.packages import PackageSet, packages_for
 from envhub_sandbox.dependencies.request import (
     AUTO,
     DECLARED,

@@ -16,7 +16,7 @@ import pytest
 from envhub_sandbox.dependencies import bounds
 from envhub_sandbox.errors import SnapshotError, SnapshotIntegrityError
 from envhub_sandbox.hub import store as store
-from envhub_sandbox.hub.hashing import Mismatch, copy_verified, digest_of
+from envhub_sandbox.hub.hashing import HashMismatch, copy_verified, digest_of
 from envhub_sandbox.hub.listing import FileRecord
 from tests.hub.stub_hub import git_blob_id
 
@@ -367,7 +367,7 @@ def test_copy_is_what_the_record_says_or_an_error(tmp_path: Path, kind: str) -> 
     flipped = bytes([data[0] ^ 1]) + data[1:]
     for number, other in enumerate([data + b"1", data[:-1], flipped]):
         source.write_bytes(other)
-        with pytest.raises(Mismatch):
+        with pytest.raises(HashMismatch):
             copy_verified(source, tmp_path / str(number), record)
 
 
@@ -383,5 +383,5 @@ def test_git_digest_is_gits_own(tmp_path: Path) -> None:
 def test_pipe_is_not_waited_for(tmp_path: Path) -> None:
     """A pipe in place of a file is refused at once, where opening it would block."""
     os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(Mismatch, match="not a regular file"):
+    with pytest.raises(HashMismatch, match="not a regular file"):
         copy_verified(tmp_path / "pipe", tmp_path / "x", FileRecord("x", 1, "sha256:0"))

@@ -229,7 +229,7 @@ def test_the_profile_permits_what_jails_may_call() -> None:
         name
         for namespaced in (True, False)
         for network in ("none", "loopback", "host")
-        for name, verdict in seccomp_policy.table(
+        for name, verdict in seccomp_policy.policy_table(
             namespaced=namespaced, network=network, brokered=not namespaced
         ).items()
         if verdict not in (seccomp_policy.EPERM, seccomp_policy.ENOSYS)

@@ -20,11 +20,10 @@ import struct
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
-from envhub_worker.lockdown.mechanisms import procfs
-from envhub_worker.lockdown.mechanisms.kernel import syscall
+from envhub_worker.lockdown.mechanisms import kernel, procfs
 from envhub_worker.lockdown.seccomp.policy import refusal
-from envhub_worker.lockdown.seccomp.syscalls import c_int, name_of, number
-from envhub_worker.lockdown.seccomp.targets import NAMING, OTHER, PRETENDED, is_another
+from envhub_worker.lockdown.seccomp.syscalls import c_int, syscall_name, syscall_number
+from envhub_worker.lockdown.seccomp.targets import NAMING, OTHER, PRETENDED, is_another_target
 
 _RECEIVE = 0xC0502100
 _SEND = 0xC0182101
@@ -99,7 +98,7 @@ def serve(
     caller = procfs.process_of(thread)
     request = Request(thread, caller, call, (first, second, third), tuple(words), still_waits)
     note(request)  # before the caller goes on: what it did is known when it is looked for
-    name = name_of(request.call)
+    name = syscall_name(request.call)
     if name in permitted:
         answer = _PROCEED
     elif name in _SIGNALS:
@@ -120,8 +119,8 @@ MOST_FILES = 32
 
 def detail(request: Request) -> str:
     """Of the arguments of a call what the kernel itself reads in a register."""
-    call = name_of(request.call)
-    if call in NAMING and is_another(call, request.arguments, request.caller, os.getpid()):
+    call = syscall_name(request.call)
+    if call in NAMING and is_another_target(call, request.arguments, request.caller, os.getpid()):
         return OTHER
     if call not in ("socket", "socketpair"):
         return ""
@@ -154,9 +153,9 @@ def decide(request: Request, inside: _Inside) -> Answer:
     first, second, third = request.arguments
     if request.caller == 0:
         return Answer(errno.ESRCH)
-    if request.call == number("kill"):
+    if request.call == syscall_number("kill"):
         return _kill(request.caller, first, second, inside)
-    if request.call == number("tkill"):
+    if request.call == syscall_number("tkill"):
         if first == request.thread:
             return _PROCEED
         return _send_to_thread(procfs.process_of(first), first, second, inside)
@@ -193,8 +192,8 @@ def _send(pid: int, signum: int, inside: _Inside) -> int:
 def _send_to_thread(pid: int, thread: int, signum: int, inside: _Inside) -> Answer:
     if pid <= 0 or thread <= 0:
         return Answer(errno.ESRCH)
-    tgkill = number("tgkill")
-    return Answer(_held(pid, inside, lambda _: syscall(tgkill, pid, thread, signum)))
+    tgkill = syscall_number("tgkill")
+    return Answer(_held(pid, inside, lambda _: kernel.syscall(tgkill, pid, thread, signum)))
 
 
 def _held(pid: int, inside: _Inside, act: Callable[[int], object]) -> int:

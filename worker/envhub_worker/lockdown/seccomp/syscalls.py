@@ -103,7 +103,7 @@ def _numbered(names: str) -> dict[str, int]:
 NUMBERS = {"x86_64": _numbered(_X86_64), "aarch64": _numbered(_AARCH64)}
 
 
-def number(name: str) -> int:
+def syscall_number(name: str) -> int:
     """The number of ``name`` on this machine.
 
     Raises:
@@ -113,7 +113,7 @@ def number(name: str) -> int:
 
 
 @functools.cache
-def name_of(call: int) -> str:
+def syscall_name(call: int) -> str:
     """The name of a call of this machine by its number."""
     numbers = NUMBERS[os.uname().machine]
     return next((name for name, one in numbers.items() if one == call), f"call {call}")

@@ -97,7 +97,7 @@ def packages_for(
         request = request_of(snapshot, choice, gpu=gpu)
         if request is None or (not request.always and target.meets(request)):
             return None
-        with progress.shown("packages") as tell:
+        with progress.progress_shown("packages") as tell:
             try:
                 return target.make(request, tell)
             except (ResolutionError, IndexUnavailableError) as error:
