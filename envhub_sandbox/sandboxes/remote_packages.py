@@ -91,7 +91,7 @@ def request_packages(
             return PackageSet(_name(found.name), _facts(found.facts, order))
         if found.state != "making":
             raise RemoteProtocolError("the server has packages in a state that there is not")
-        line = printable(found.told[:_MAX_CHARS], _MAX_CHARS)
+        line = printable(found.progress[:_MAX_CHARS], _MAX_CHARS)
         if line != shown:
             tell(line)
             shown = line

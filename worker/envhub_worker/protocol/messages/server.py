@@ -312,11 +312,11 @@ class NeedPackages(Message, kind=31):
 class Packages(Message, kind=32):
     """How far they are. ``state`` is ``"making"``, ``"made"``, or ``"own"`` for the server's own.
 
-    ``name`` is what ``OpenJail`` may call them, ``told`` a line for people. ``facts`` are the
+    ``name`` is what ``OpenJail`` may call them, ``progress`` a line for people. ``facts`` are the
     lock's hash and the pins.
     """
 
     state: str
     name: str
     facts: dict[str, object]
-    told: str
+    progress: str
