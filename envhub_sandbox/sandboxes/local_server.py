@@ -88,7 +88,8 @@ class LocalServer(WorkerServer):
     def stop(self) -> None:
         """End it and everything below it, in bounded time. A fork of its owner does nothing.
 
-        Idempotent. If interrupted, the next call finishes the work.
+        Idempotent. If interrupted, the next call finishes the work: interruption.md,
+        rule 7.
         """
         if self.stopped or not self._owner.is_here:
             return
@@ -105,4 +106,4 @@ class LocalServer(WorkerServer):
             os.close(self.process_fd)
 
     def __del__(self) -> None:
-        self.stop()  # a start that was interrupted before it was noted
+        self.stop()  # interruption.md, rule 5: a start was interrupted before it was noted

@@ -291,7 +291,7 @@ class RemoteServer(WorkerServer):
         """Close what is open there, and no longer say that we live.
 
         A fork of its owner does nothing. Idempotent. If interrupted, the next call finishes the
-        work.
+        work: interruption.md, rules 7 and 14.
         """
         if self._ended or not self._owner.is_here:
             return

@@ -169,4 +169,4 @@ def _add(total: dict[str, Any], more: Mapping[str, float]) -> None:
 
 
 LEDGER = Ledger()
-os.register_at_fork(after_in_child=LEDGER.forget)
+os.register_at_fork(after_in_child=LEDGER.forget)  # interruption.md, rule 14

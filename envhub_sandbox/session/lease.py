@@ -73,9 +73,8 @@ class Lease:
         self.counters = counters
         self._paces = paces
         self._builder = Builder(jails, results)
-        self._ending = (
-            threading.RLock()
-        )  # interruption.md, rule 12: none gives back what another ends
+        # interruption.md, rule 12: none gives back what another ends
+        self._ending = threading.RLock()
         self._owner = Owner()
         self._was_loaded = False
         self._startup: StartupDeadline | None = None

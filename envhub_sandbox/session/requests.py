@@ -409,8 +409,8 @@ class Requests:
         except EnvHubError as error:
             self._lease.forget_watched()
             self._failed(error, deadline)
-        except BaseException as error:  # Ctrl-C, or what another signal handler raises
-            self._lease.forget_watched()  # interruption.md, rule 3
+        except BaseException as error:  # interruption.md, rules 2 and 3: a Ctrl-C, for instance
+            self._lease.forget_watched()
             self._failures.interrupted(error)
             raise
         self.lifecycle.answered()

@@ -274,7 +274,7 @@ class WorkerConnection:
             raise WorkerError(fork_error_text(self._owner.pid))
 
     def close(self) -> None:
-        """Close the connection. Idempotent; in a forked child nothing is touched."""
+        """Close the connection. Idempotent; a fork touches nothing: interruption.md, rule 14."""
         if self._owner.is_here and not self._socket.closed:
             if self._link is not None:
                 self._link.close()

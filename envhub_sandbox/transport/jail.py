@@ -240,7 +240,7 @@ class JailHandle:
             request = self.client.send(m.CloseJail(self.number))
         except WorkerError:
             pass
-        except BaseException:
+        except BaseException:  # interruption.md, rule 7: the jail may not know of its end yet
             self._part(None, Deadline(0))
             raise
         return partial(self._part, request)

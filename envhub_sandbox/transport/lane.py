@@ -1,8 +1,8 @@
 """The way of an environment's requests to its runners: one interface, and the way over the server.
 
 There are two: ``RelayLane``, below, and ``SharedMemoryLane``. Which of them an environment has is
-decided once, when it is built (``session/jails/placement``); a request
-does not depend on it.
+decided once, when it is built (``session/jails/builder``). What a request means does not depend on
+the lane.
 """
 
 from __future__ import annotations

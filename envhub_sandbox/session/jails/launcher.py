@@ -87,7 +87,7 @@ class Launcher:
             WorkerError: The jail did not come up, died, or took too long.
         """
         use = self._acquire()
-        try:
+        try:  # interruption.md, rule 4
             # one on another host runs anyway
             if self.repository.timeouts.server_idle_s != 0 and use.server.far is None:
                 self._hold.keep(use.server)
@@ -210,7 +210,7 @@ class Launcher:
     def connect(self, loaded: LoadedJail, deadline: Deadline) -> LoadedJail:
         """A further connection to an open jail; environments that share one wait apart."""
         use = self._acquire()
-        try:
+        try:  # interruption.md, rule 4
             client = self._connected(use.server, deadline)
         except BaseException:
             use.release()

@@ -65,7 +65,8 @@ class LoadedJail:
         return self.use.server
 
     def __del__(self) -> None:
-        # at the end of the process, which closes nothing one by one, no server is in use any more
+        # interruption.md, rule 5. At the end of the process no server is in use any more: nothing
+        # is closed one by one there (rule 13).
         if not self.closed and self.use.live and self.owner.is_here:
             self.ending = True  # its connection may have gone before it
             self.give_back(self)

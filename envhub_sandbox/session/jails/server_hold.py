@@ -91,7 +91,7 @@ class ServerHold:
         return use is not None and use.live and use.server is server
 
     def _leave(self, ticket: object) -> None:
-        """If interrupted, the next one who leaves finishes the work; it may be the same."""
+        """If interrupted, the next call finishes the work: interruption.md, rule 7."""
         if not self._owner.is_here:
             return  # a fork: the server is the parent's, and another thread may have held the lock
         with self._lock:

@@ -71,7 +71,7 @@ class SharedJail(JailSource):
     def provide(self, loaded: LoadedJail) -> None:
         """Start with a jail that is loaded already."""
         self._first = loaded
-        # it may never be taken, nor closed
+        # interruption.md, rule 13; it may never be taken, nor closed
         weakref.finalize(self, self.launcher.close, loaded).atexit = False
 
     def take(self, deadline: Deadline) -> LoadedJail:
@@ -110,5 +110,5 @@ class SharedJail(JailSource):
     def _close_first(self) -> None:
         first = self._first
         if first is not None:
-            self.launcher.close(first)  # what interrupts it leaves it for the next to close
+            self.launcher.close(first)  # interruption.md, rule 7
             self._first = None

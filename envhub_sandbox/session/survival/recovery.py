@@ -152,7 +152,7 @@ class Recovery:
         except EnvHubError as error:
             cause = error.__cause__ or deaths.first
             raise failures.dead(error) from (None if cause is error else cause)
-        except BaseException as error:
+        except BaseException as error:  # interruption.md, rule 2
             failures.interrupted(error)
             lifecycle.request = None
             raise
