@@ -1,4 +1,4 @@
-"""Asks a repository every question of the table, and runs it in the sandbox for that.
+"""Judges a repository: makes every check of the table, and runs it in the sandbox for that.
 
 What it answers is hostile: a report says what was seen from outside, and a check passes because
 our own comparison found nothing, never because the repository says so.

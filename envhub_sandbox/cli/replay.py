@@ -1,4 +1,4 @@
-"""``envhub replay``: does it die again?"""
+"""``envhub replay``: repeat what a crash bundle holds, and say whether the jail dies again."""
 
 from __future__ import annotations
 

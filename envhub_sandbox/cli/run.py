@@ -140,7 +140,7 @@ class _Run:
         with make_env(**arguments) as envs:
             self.make_env_s = time.perf_counter() - self.begun
             try:
-                chosen = opt.select(envs, self.suites, self.tasks)
+                chosen = opt.select_envs(envs, self.suites, self.tasks)
                 for number, (suite, task, env) in enumerate(chosen, start=1):
                     video = self.video
                     if video is not None and len(chosen) > 1:

@@ -1,4 +1,4 @@
-"""What is going on while packages are chosen and installed: on a terminal or in a notebook.
+"""Progress lines while packages are chosen and installed: on a terminal or in a notebook.
 
 It is shown only if it takes a moment. Elsewhere (in CI, under a program) there is the log.
 """

@@ -1,4 +1,4 @@
-"""What is no longer as it was locked, in words."""
+"""Drift: what differs from a lock file, a line each, and the error for it."""
 
 from __future__ import annotations
 

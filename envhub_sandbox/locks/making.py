@@ -1,4 +1,4 @@
-"""What is there now, as a lock file says it."""
+"""Makes lock files: what is there now, as a lock file says it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files that are whole, or not there."""
+"""Writes files atomically: others see the old content or the new, and never a part of it."""
 
 from __future__ import annotations
 

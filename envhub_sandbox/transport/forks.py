@@ -1,4 +1,4 @@
-"""Which process something belongs to: docs/internals/interruption.md, rule 14."""
+"""Which process an object belongs to, so that a fork leaves it alone: interruption.md, rule 14."""
 
 from __future__ import annotations
 

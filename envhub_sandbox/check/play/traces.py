@@ -1,4 +1,6 @@
-"""One play of an environment, as something that can be compared: a digest for each step."""
+"""Plays an environment with seeded actions and keeps a trace: a digest of each step, to compare.
+
+What a step returns is looked at meanwhile: shapes of masks, numbers that are not finite, times."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a repository would do, in one piece: its files, entry, imports, packages and findings.
+"""``Static``: all that is read of a repository without running it, put together and as JSON.
 
 ``undeclared`` says which of the imports nothing declares.
 """

@@ -1,4 +1,4 @@
-"""What a repository holds and would do, read file by file without running any of it.
+"""Looks at each file of a repository without running it: its kind, and findings in it.
 
 What is found is a hint for a person and no wall: who wants to hide a call can. The walls are the
 sandbox's. What could not be read is found, too.

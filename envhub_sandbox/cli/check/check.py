@@ -180,7 +180,7 @@ def check(
             steps=steps,
             resets=resets,
             slow_step_s=slow_step,
-            tasks=lambda envs: [one[:2] for one in opt.select(envs, suite, task)],
+            tasks=lambda envs: [one[:2] for one in opt.select_envs(envs, suite, task)],
             pictures=html is not None,
         )
         failures = report.failures(least, allowed)

@@ -1,4 +1,4 @@
-"""What a repository holds, without playing it."""
+"""``envhub inspect``: the environments that a repository makes, without playing them."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def _inspect(
     with ProgressBar(quiet=as_json) as bar, make.explained():
         bar.begin(f"loading {make.ref} in a sandbox")
         with make_env(**arguments) as envs:
-            found = [describe_env(*item) for item in opt.select(envs, suites, tasks)]
+            found = [describe_env(*item) for item in opt.select_envs(envs, suites, tasks)]
             provenance = envs.provenance
     if as_json:
         print_json({"reference": make.ref, "envs": found, "provenance": provenance})

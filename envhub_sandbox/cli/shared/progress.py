@@ -1,4 +1,4 @@
-"""What is going on, on stderr, while a terminal looks."""
+"""A progress bar of a command, on stderr, where that is a terminal."""
 
 from __future__ import annotations
 

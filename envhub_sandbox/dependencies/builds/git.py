@@ -1,4 +1,4 @@
-"""The files of one commit of a repository of git, fetched as data.
+"""Fetches the files of one commit of a git repository, as data.
 
 Git gets no settings but ours: no hooks, no filters, no submodules, no logins, and no protocol but
 https. Nothing is checked out: files are read out of the objects, whose names are hashes of their

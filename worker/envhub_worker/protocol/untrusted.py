@@ -1,4 +1,4 @@
-"""Whatever the handling of a peer's input raises is the peer's fault: said in one place.
+"""``UNTRUSTED``: the context in which whatever a peer's input raises is the peer's error.
 
 Readers check for known lies, and say what is wrong. An unknown one, such as a key that cannot be
 hashed or a mask that is longer than its values, comes up as a ``TypeError`` or an ``IndexError``

@@ -1,4 +1,4 @@
-"""What a worker server remembers of its jails, and of who waits for what of them."""
+"""Records of a worker server: each of its jails, and the requests that wait for it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is called about everything that happens to jails."""
+"""``Witness``: the interface that is called about each event of a jail."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Snapshots that clients bring along, by content.
+"""Uploads of snapshots: the listing is checked, files arrive in pieces, a tree is made of them.
 
 ::
 

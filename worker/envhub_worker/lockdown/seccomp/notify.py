@@ -1,6 +1,7 @@
-"""Signals of a jail without a pid namespace, where Landlock cannot scope them (before ABI 6).
+"""Init's answers to calls that the filter hands over: signals, and calls that are recorded.
 
-The filter hands ``kill``, ``tkill`` and ``tgkill`` to init, which sends the signal when the
+In a jail without a pid namespace, where Landlock cannot scope signals (before ABI 6), the filter
+hands ``kill``, ``tkill`` and ``tgkill`` to init, which sends the signal when the
 target is a process of the jail. All of their arguments are numbers in registers, so nothing can
 change between the check and the act; a target is held by a pidfd before it is looked at, so no
 other process can take its pid. The kernel goes on with what a process sends to itself:

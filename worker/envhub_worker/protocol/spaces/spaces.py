@@ -1,4 +1,4 @@
-"""Gymnasium spaces as plain values, and back with every claim checked.
+"""Gymnasium spaces to plain values; ``reader.py`` reads them back.
 
 Works with Gymnasium 0.26 to 1.4, which may differ between the two ends.
 """
