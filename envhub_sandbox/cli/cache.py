@@ -153,10 +153,10 @@ def remove(
     ] = False,
     unused_for: Annotated[
         float | None,
-        typer.Option(metavar="DAYS", min=0, help="What was not used for so long."),
+        typer.Option(metavar="DAYS", min=0, help="Those that were not used for so many days."),
     ] = None,
 ) -> None:
-    """Remove snapshots and environments, and what was left half-made. Not while one is used."""
+    """Remove snapshots, environments and unfinished remains; what is in use stays."""
     from envhub_sandbox.dependencies import environments
     from envhub_sandbox.hub import store
 

@@ -26,9 +26,11 @@ def diff(
     *,
     then: Annotated[
         str,
-        typer.Argument(metavar="REF_A", help="What is known: org/repo@commit, or a folder."),
+        typer.Argument(
+            metavar="REF_A", help="The commit that is known: org/repo@commit, or a folder."
+        ),
     ],
-    now: Annotated[str, typer.Argument(metavar="REF_B", help="What is to be judged.")],
+    now: Annotated[str, typer.Argument(metavar="REF_B", help="The commit to compare with it.")],
     run: Annotated[
         bool,
         typer.Option("--run", help="Load both, each in a sandbox, and compare tasks and spaces."),

@@ -35,7 +35,7 @@ NoSpaces = Annotated[
     bool,
     typer.Option(
         "--no-spaces",
-        help="Run nothing: the lock then says nothing of what the environments look like.",
+        help="Run nothing, and leave the environments' spaces out.",
     ),
 ]
 
@@ -85,8 +85,8 @@ def verify(
         str | None,
         typer.Argument(
             metavar="[REF]",
-            help="What is held against it; by default the commit that was locked. A branch says "
-            "whether that has moved on. A folder has to be named.",
+            help="What to compare with it; by default the commit that was locked. A branch says "
+            "whether it has moved on. A folder has to be named.",
         ),
     ] = None,
     no_spaces: NoSpaces = False,

@@ -44,7 +44,7 @@ def push(
         str, typer.Option("--message", "-m", help="The commit's message.")
     ] = "Publish the environment with envhub",
     private: Annotated[
-        bool, typer.Option("--private", help="A repository that is made is private.")
+        bool, typer.Option("--private", help="If the repository is new, make it private.")
     ] = False,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Check, say what would be uploaded, and stop.")

@@ -59,7 +59,8 @@ def check(
     resets: Annotated[
         int,
         typer.Option(
-            min=0, help="In a row, four times: what they leave behind is counted. 0 asks nothing."
+            min=0,
+            help="Resets in a row, four times, to count what they leave behind; 0 skips this.",
         ),
     ] = 8,
     slow_step: Annotated[
@@ -67,15 +68,15 @@ def check(
         typer.Option(
             metavar="SECONDS",
             min=0.0,
-            help="What half of the steps may take, and a fifth of a reset.",
+            help="The longest that the median step may take; a reset may take five times that.",
         ),
     ] = 1.0,
-    seed: Annotated[int, typer.Option("--seed", "-s", min=0, help="Of each play.")] = 0,
+    seed: Annotated[int, typer.Option("--seed", "-s", min=0, help="The seed of each play.")] = 0,
     fail_on: Annotated[
         str,
         typer.Option(
             metavar="|".join(STYLES),
-            help="The least finding that fails it.",
+            help="Findings of this severity or a worse one make it fail.",
             autocompletion=lambda: list(STYLES),
         ),
     ] = "error",
@@ -85,13 +86,15 @@ def check(
             metavar=_FILE,
             callback=_with_settings,
             is_eager=True,
-            help="Your own TOML, with options in [check]; what you type counts more.",
+            help="A TOML file of your own with options in [check]; the command line wins.",
         ),
     ] = None,
     allow: Annotated[
         list[str] | None,
         typer.Option(
-            "--allow", metavar="ID", help="A check whose findings fail nothing (repeatable)."
+            "--allow",
+            metavar="ID",
+            help="A check whose findings do not change the exit code (repeatable).",
         ),
     ] = None,
     json: opt.Json = False,
@@ -125,7 +128,7 @@ def check(
         Path | None,
         typer.Option(
             metavar=_FILE,
-            help="TOML with fields of Policy, and [limits]; options say otherwise.",
+            help="A TOML file with fields of Policy and [limits]; options win.",
             rich_help_panel=_MAY,
         ),
     ] = None,

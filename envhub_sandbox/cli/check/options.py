@@ -68,7 +68,9 @@ Deadline = Annotated[
 Again = Annotated[
     bool,
     typer.Option(
-        "--again", help="With --all: judge all of them, as if nothing was.", rich_help_panel=_PANEL
+        "--again",
+        help="With --all: judge all of them again, also those with results.",
+        rich_help_panel=_PANEL,
     ),
 ]
 

@@ -84,9 +84,7 @@ def doctor(
     ] = None,
     insecure_loopback: Annotated[
         bool,
-        typer.Option(
-            "--insecure-loopback", help="Without keys, of a server of this machine that has none."
-        ),
+        typer.Option("--insecure-loopback", help="Ask a server of this machine that has no keys."),
     ] = False,
 ) -> None:
     """Try what this host can enforce, say what is missing and how to get it.
