@@ -49,7 +49,7 @@ def copy_verified(source: Path, target: Path, record: FileRecord) -> None:
     The hash is taken of the bytes on their way, so they cannot change in between.
 
     Raises:
-        Mismatch: Other bytes or another size. The new file may be there in part.
+        HashMismatch: Other bytes or another size. The new file may be there in part.
     """
     running = _start(record.digest.partition(":")[0], record.size)
     written = 0

@@ -14,7 +14,7 @@ _REFUSAL = f"{__name__}:not_here"
 
 
 def spec_of(given: dict[str, Any] | None, reference: str = "") -> EnvSpec | None:
-    """A spec with these facts, as ``read_spec`` lets them through.
+    """A spec with these facts, as ``read_spec_facts`` lets them through.
 
     A string names what refuses, so that it can be written as JSON like any other.
 
