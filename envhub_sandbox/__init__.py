@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from envhub_sandbox import errors as errors
     from envhub_sandbox.api import make_env as make_env
-    from envhub_sandbox.gym import SandboxEnv as SandboxEnv
     from envhub_sandbox.hub.reference import HubRef as HubRef
+    from envhub_sandbox.integrations.gym import SandboxEnv as SandboxEnv
     from envhub_sandbox.policy import Limits as Limits
     from envhub_sandbox.policy import Policy as Policy
     from envhub_sandbox.policy import Timeouts as Timeouts
@@ -34,7 +34,7 @@ _HOMES = {
     "Limits": "policy",
     "Policy": "policy",
     "RemoteSandbox": "sandboxes.remote",
-    "SandboxEnv": "gym",
+    "SandboxEnv": "integrations.gym",
     "SandboxVectorEnv": "vector.vector_env",
     "Timeouts": "policy",
     "errors": "errors",

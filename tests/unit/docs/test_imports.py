@@ -42,11 +42,11 @@ OPTIONAL = {
     "envhub_sandbox.integrations.lerobot.install": {"lerobot"},
     "envhub_sandbox.integrations.lerobot_eval": {"lerobot"},
     "envhub_worker.protocol.messages.base": {"typing_extensions"},  # for type checkers alone
-    "envhub_sandbox.metrics": {"prometheus_client"},
+    "envhub_sandbox.integrations.metrics": {"prometheus_client"},
     "envhub_worker.cli.metrics": {"prometheus_client"},
     "envhub_sandbox.transport.values.tensors": {"torch"},
     "envhub_sandbox.rollouts.video": {"imageio_ffmpeg"},
-    "envhub_sandbox.pytest_plugin": {"pytest"},
+    "envhub_sandbox.integrations.pytest_plugin": {"pytest"},
 }
 DESERIALISERS = {"_pickle", "copyreg", "dill", "joblib", "marshal", "pickle", "shelve"}
 
@@ -58,7 +58,7 @@ LOWEST = {
     *("envhub_sandbox.system", "envhub_worker.protocol"),
 }
 MAY_IMPORT = {
-    "envhub_sandbox": {"api", "gym", "hub", "policy", "sandboxes", "vector"},
+    "envhub_sandbox": {"api", "hub", "integrations", "policy", "sandboxes", "vector"},
     "envhub_sandbox.__main__": {"cli"},
     "envhub_sandbox.cli": {
         *("", "api", "check", "crash", "dependencies", "hub", "locks", "policy", "rollouts"),
@@ -74,11 +74,8 @@ MAY_IMPORT = {
         *("sources", "vector"),
     },
     "envhub_sandbox.rollouts": set(),
-    "envhub_sandbox.gym": {"api", "vector"},
-    "envhub_sandbox.pytest_plugin": {"api", "hub"},
-    "envhub_sandbox.integrations": {"api", "hub", "vector"},
+    "envhub_sandbox.integrations": {"api", "hub", "session", "vector"},
     "envhub_sandbox.vector": {"session", "transport"},
-    "envhub_sandbox.metrics": {"session"},
     "envhub_sandbox.session": {"crash", "hub", "policy", "sandboxes", "transport"},
     "envhub_sandbox.crash": {"hub", "policy", "transport"},
     "envhub_sandbox.sandboxes": {"dependencies", "hub", "policy", "transport"},
@@ -316,9 +313,8 @@ def test_only_faces_and_the_command_line_import_make_env() -> None:
     assert {name for name in importers if not below(name, "envhub_sandbox.cli")} <= {
         "envhub_sandbox",
         "envhub_sandbox.check.judge",
-        "envhub_sandbox.gym",
-        *(f"envhub_sandbox.integrations.{name}" for name in ("sb3", *_LEROBOT)),
-        "envhub_sandbox.pytest_plugin",
+        *(f"envhub_sandbox.integrations.{name}" for name in ("gym", "pytest_plugin", "sb3")),
+        *(f"envhub_sandbox.integrations.{name}" for name in _LEROBOT),
     }
 
 
@@ -483,7 +479,7 @@ def test_the_package_imports_nothing_heavy() -> None:
 
 def test_the_pytest_plugin_costs_nothing_until_it_is_used() -> None:
     """Every run of pytest on the machine imports it."""
-    loaded = loaded_by("import envhub_sandbox.pytest_plugin")
+    loaded = loaded_by("import envhub_sandbox.integrations.pytest_plugin")
     assert "pytest" in loaded
     assert not loaded & (CLIENTS_OWN - {"envhub_sandbox"} | {"torch"}) - loaded_by("import pytest")
 
@@ -492,7 +488,7 @@ def test_the_pytest_plugin_is_declared(checkout: Path) -> None:
     """Under the name by which it can be left out."""
     declared = (checkout / "pyproject.toml").read_text()
     table = declared.partition("[project.entry-points.pytest11]\n")[2].partition("\n[")[0]
-    assert table.strip() == 'envhub = "envhub_sandbox.pytest_plugin"'
+    assert table.strip() == 'envhub = "envhub_sandbox.integrations.pytest_plugin"'
 
 
 def test_every_public_name_is_there() -> None:
