@@ -27,8 +27,8 @@ from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.options import OPTIONS
 
 if TYPE_CHECKING:
-    from envhub_sandbox.rollouts.episodes import EpisodeCounter, Rollout
-    from envhub_sandbox.rollouts.video import VideoWriter
+    from envhub_sandbox.check.play.episodes import EpisodeCounter, Rollout
+    from envhub_sandbox.check.play.video import VideoWriter
 
 
 Verbose = Annotated[
@@ -122,7 +122,7 @@ class _Run:
         """Run, print what there is to print even if it fails midway, and raise what failed."""
         try:
             if self.video is not None:
-                from envhub_sandbox.rollouts.video import check_target
+                from envhub_sandbox.check.play.video import check_target
 
                 check_target(self.video)
             with Bar(quiet=self.as_json) as bar, self.make.explained():
@@ -154,12 +154,12 @@ class _Run:
     def _play_task(
         self, bar: Bar, suite: str, task: int | str, env: Any, video: Path | None
     ) -> TaskResult:
-        from envhub_sandbox.rollouts.episodes import autoreset_mode
+        from envhub_sandbox.check.play.episodes import autoreset_mode
 
         if video is None:
             rollout = self._roll_out(env, bar, None)
         else:
-            from envhub_sandbox.rollouts.video import VideoWriter, fps_of
+            from envhub_sandbox.check.play.video import VideoWriter, fps_of
 
             with VideoWriter(video, fps_of(env.metadata)) as writer:
                 rollout = self._roll_out(env, bar, writer)
@@ -173,8 +173,8 @@ class _Run:
         )
 
     def _roll_out(self, env: Any, bar: Bar, writer: VideoWriter | None) -> Rollout:
-        from envhub_sandbox.rollouts.episodes import rollout
-        from envhub_sandbox.rollouts.video import frame_of
+        from envhub_sandbox.check.play.episodes import rollout
+        from envhub_sandbox.check.play.video import frame_of
 
         filming = writer is not None
 

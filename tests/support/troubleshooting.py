@@ -74,7 +74,6 @@ _PARTS = (
             "envhub_sandbox/cli",
             "envhub_sandbox/check",
             "envhub_sandbox/crash",
-            "envhub_sandbox/rollouts",
         ),
         "cli.md",
     ),

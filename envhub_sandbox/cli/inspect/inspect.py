@@ -70,7 +70,7 @@ def _inspect(
 
 def describe_env(suite: str, task: Any, env: Any) -> dict[str, Any]:
     """One environment as data. Trust: all of it is input from the worker."""
-    from envhub_sandbox.rollouts.episodes import autoreset_mode
+    from envhub_sandbox.check.play.episodes import autoreset_mode
 
     metadata = dict(getattr(env, "metadata", None) or {})
     metadata.pop("autoreset_mode", None)

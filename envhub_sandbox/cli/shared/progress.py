@@ -16,7 +16,7 @@ from envhub_worker.protocol.text import duration_text
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
-    from envhub_sandbox.rollouts.episodes import EpisodeCounter
+    from envhub_sandbox.check.play.episodes import EpisodeCounter
 
 _EVERY_S = 0.1
 

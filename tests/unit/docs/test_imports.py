@@ -45,7 +45,7 @@ OPTIONAL = {
     "envhub_sandbox.integrations.metrics": {"prometheus_client"},
     "envhub_worker.cli.metrics": {"prometheus_client"},
     "envhub_sandbox.transport.values.tensors": {"torch"},
-    "envhub_sandbox.rollouts.video": {"imageio_ffmpeg"},
+    "envhub_sandbox.check.play.video": {"imageio_ffmpeg"},
     "envhub_sandbox.integrations.pytest_plugin": {"pytest"},
 }
 DESERIALISERS = {"_pickle", "copyreg", "dill", "joblib", "marshal", "pickle", "shelve"}
@@ -61,7 +61,7 @@ MAY_IMPORT = {
     "envhub_sandbox": {"api", "hub", "integrations", "policy", "sandboxes", "vector"},
     "envhub_sandbox.__main__": {"cli"},
     "envhub_sandbox.cli": {
-        *("", "api", "check", "crash", "dependencies", "hub", "locks", "policy", "rollouts"),
+        *("", "api", "check", "crash", "dependencies", "hub", "locks", "policy"),
         *("sandboxes", "session"),
     },
     "envhub_sandbox.api": {"factory", "policy", "sandboxes", "vector"},
@@ -70,10 +70,9 @@ MAY_IMPORT = {
         *("transport", "vector"),
     },
     "envhub_sandbox.check": {
-        *("", "api", "dependencies", "hub", "locks", "policy", "rollouts", "session"),
+        *("", "api", "dependencies", "hub", "locks", "policy", "session"),
         *("sources", "vector"),
     },
-    "envhub_sandbox.rollouts": set(),
     "envhub_sandbox.integrations": {"api", "hub", "session", "vector"},
     "envhub_sandbox.vector": {"session", "transport"},
     "envhub_sandbox.session": {"crash", "hub", "policy", "sandboxes", "transport"},
