@@ -44,9 +44,9 @@ from envhub_sandbox.errors import (
     WorkerTimeoutError,
 )
 from envhub_sandbox.hub.snapshot import Snapshot, named
+from envhub_sandbox.hub.sources import imports, parsing
 from envhub_sandbox.policy import policy_from
 from envhub_sandbox.session.recipe import pinned
-from envhub_sandbox.sources import imports, parsing
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_worker.protocol.text import size_text
 
