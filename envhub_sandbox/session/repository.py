@@ -11,8 +11,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from envhub_sandbox.crash.bundle_writer import Crash, write_bundle
-from envhub_sandbox.crash.history import Recording
 from envhub_sandbox.errors import (
     DependencyError,
     EnvHubError,
@@ -25,6 +23,8 @@ from envhub_sandbox.hub.store import cache_root
 from envhub_sandbox.option_names import option_name
 from envhub_sandbox.policy import Policy, Timeouts
 from envhub_sandbox.session.author_lines import add_author_line
+from envhub_sandbox.session.crash.bundle_writer import Crash, write_bundle
+from envhub_sandbox.session.crash.history import Recording
 from envhub_sandbox.session.jails.loaded import LoadedJail
 from envhub_sandbox.session.provenance import provenance_of
 from envhub_sandbox.session.recipe import Recipe

@@ -73,7 +73,7 @@ _PARTS = (
         (
             "envhub_sandbox/cli",
             "envhub_sandbox/check",
-            "envhub_sandbox/crash",
+            "envhub_sandbox/session/crash",
         ),
         "cli.md",
     ),
@@ -145,15 +145,23 @@ class Message:
 
 def document() -> str:
     """What the file has to hold."""
-    parts, left = [_HEAD], list(messages())
-    for title, places, more in _PARTS:
-        mine = [one for one in left if one.place.startswith(places)]
-        left = [one for one in left if one not in mine]
-        rows = sorted({_row(one) for one in mine})
+    parts, all_messages = [_HEAD], list(messages())
+    for title, _, more in _PARTS:
+        rows = sorted({_row(one) for one in all_messages if _part(one.place) == title})
         parts += [f"## {title}\n\nMore in [{more.partition('#')[0]}]({more}).\n"]
         parts += ["| The error says | What to do |\n| --- | --- |"]
         parts += [*(f"| {says} | {cure} |" for says, cure in rows), ""]
     return "\n".join(parts)
+
+
+def _part(file: str) -> str:
+    """The title of what a file belongs to: that with the longest prefix of its path."""
+    return max(
+        (len(place), title)
+        for title, places, _ in _PARTS
+        for place in places
+        if file.startswith(place)
+    )[1]
 
 
 def messages() -> Iterator[Message]:

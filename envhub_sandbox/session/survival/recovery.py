@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from envhub_sandbox.crash.history import History
 from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerError, WorkerTimeoutError
+from envhub_sandbox.session.crash.history import History
 from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.session.survival.failures import Failures
 from envhub_sandbox.session.survival.restart_policy import Restarts

@@ -61,7 +61,7 @@ MAY_IMPORT = {
     "envhub_sandbox": {"api", "hub", "integrations", "policy", "sandboxes", "vector"},
     "envhub_sandbox.__main__": {"cli"},
     "envhub_sandbox.cli": {
-        *("", "api", "check", "crash", "dependencies", "hub", "locks", "policy"),
+        *("", "api", "check", "dependencies", "hub", "locks", "policy"),
         *("sandboxes", "session"),
     },
     "envhub_sandbox.api": {"factory", "policy", "sandboxes", "vector"},
@@ -75,8 +75,7 @@ MAY_IMPORT = {
     },
     "envhub_sandbox.integrations": {"api", "hub", "session", "vector"},
     "envhub_sandbox.vector": {"session", "transport"},
-    "envhub_sandbox.session": {"crash", "hub", "policy", "sandboxes", "transport"},
-    "envhub_sandbox.crash": {"hub", "policy", "transport"},
+    "envhub_sandbox.session": {"hub", "policy", "sandboxes", "transport"},
     "envhub_sandbox.sandboxes": {"dependencies", "hub", "policy", "transport"},
     "envhub_sandbox.transport": set(),
     "envhub_sandbox.locks": {"dependencies", "hub"},
