@@ -15,8 +15,8 @@ from envhub_worker.protocol.text import counted
 
 if TYPE_CHECKING:
     from envhub_sandbox.check.static.changes import Change
+    from envhub_sandbox.dependencies.locks.fingerprint import Task
     from envhub_sandbox.hub.snapshot import Snapshot
-    from envhub_sandbox.locks.fingerprint import Task
 
 _MARKS = {"new": "+", "gone": "-", "changed": "~", "renamed": ">"}
 
@@ -74,7 +74,7 @@ def diff(
 
 def _tasks(snapshot: Snapshot, env_kwargs: dict[str, Any], hub: dict[str, Any]) -> tuple[Task, ...]:
     from envhub_sandbox.api import make_env
-    from envhub_sandbox.locks.making import tasks_of
+    from envhub_sandbox.dependencies.locks.making import tasks_of
     from envhub_sandbox.session.recipe import pinned
 
     with make_env(pinned(snapshot), env_kwargs=env_kwargs, **hub) as suites:

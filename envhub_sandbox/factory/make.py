@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from envhub_sandbox.dependencies.locks import use as locks
 from envhub_sandbox.dependencies.modules import MissingModule
 from envhub_sandbox.dependencies.pipeline import PackageSet, packages_for
 from envhub_sandbox.dependencies.request import Choice, chosen
@@ -15,7 +16,6 @@ from envhub_sandbox.factory.config import plain_config, reference_of
 from envhub_sandbox.factory.env_factory import EnvFactory
 from envhub_sandbox.hub import store
 from envhub_sandbox.hub.snapshot import Snapshot, named
-from envhub_sandbox.locks import use as locks
 from envhub_sandbox.option_names import option_name
 from envhub_sandbox.options import Options
 from envhub_sandbox.policy import Policy, Timeouts, policy_from, timeouts_from
@@ -31,7 +31,7 @@ from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol.runtime import Runtime
 
 if TYPE_CHECKING:
-    from envhub_sandbox.locks.lockfile import LockFile
+    from envhub_sandbox.dependencies.locks.lockfile import LockFile
 
 
 def make(make_env: Callable[..., EnvSuites], cfg: Any, given: Options) -> EnvSuites:

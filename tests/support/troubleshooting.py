@@ -32,7 +32,7 @@ that are no error are in the [FAQ](faq.md), what a dying environment looks like 
 _PARTS = (
     ("References, the Hub and local folders", ("envhub_sandbox/hub",), "snapshots.md"),
     ("A repository's packages", ("envhub_sandbox/dependencies",), "dependencies.md"),
-    ("Locks", ("envhub_sandbox/locks",), "dependencies.md#locks"),
+    ("Locks", ("envhub_sandbox/dependencies/locks",), "dependencies.md#locks"),
     (
         "Arguments, policies, limits, timeouts",
         ("envhub_sandbox/factory", "envhub_sandbox/options.py", "envhub_sandbox/policy.py"),
@@ -111,7 +111,7 @@ _NO_FILES = (
     "envhub_sandbox/check/checks.py",
     "envhub_sandbox/check/static/survey.py",
     "envhub_sandbox/cli/init/starter.py",
-    "envhub_sandbox/locks/lockfile.py",
+    "envhub_sandbox/dependencies/locks/lockfile.py",
 )
 # Nor is this: parts of other formats, and what is said after success.
 _NO_ERRORS = re.compile(

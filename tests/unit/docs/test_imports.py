@@ -61,16 +61,16 @@ MAY_IMPORT = {
     "envhub_sandbox": {"api", "hub", "integrations", "policy", "sandboxes", "vector"},
     "envhub_sandbox.__main__": {"cli"},
     "envhub_sandbox.cli": {
-        *("", "api", "check", "dependencies", "hub", "locks", "policy"),
+        *("", "api", "check", "dependencies", "hub", "policy"),
         *("sandboxes", "session"),
     },
     "envhub_sandbox.api": {"factory", "policy", "sandboxes", "vector"},
     "envhub_sandbox.factory": {
-        *("dependencies", "hub", "locks", "policy", "sandboxes", "session"),
+        *("dependencies", "hub", "policy", "sandboxes", "session"),
         *("transport", "vector"),
     },
     "envhub_sandbox.check": {
-        *("", "api", "dependencies", "hub", "locks", "policy", "session"),
+        *("", "api", "dependencies", "hub", "policy", "session"),
         "vector",
     },
     "envhub_sandbox.integrations": {"api", "hub", "session", "vector"},
@@ -78,7 +78,6 @@ MAY_IMPORT = {
     "envhub_sandbox.session": {"hub", "policy", "sandboxes", "transport"},
     "envhub_sandbox.sandboxes": {"dependencies", "hub", "policy", "transport"},
     "envhub_sandbox.transport": set(),
-    "envhub_sandbox.locks": {"dependencies", "hub"},
     "envhub_sandbox.dependencies": {"hub"},
     "envhub_sandbox.hub": set(),
     "envhub_sandbox.policy": set(),
