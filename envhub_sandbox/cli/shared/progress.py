@@ -10,7 +10,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING
 
 from envhub_sandbox.cli.shared.console import console, safe_line, say
-from envhub_sandbox.dependencies.progress import shown_by
+from envhub_sandbox.system.progress import shown_by
 from envhub_worker.protocol.text import duration_text
 
 if TYPE_CHECKING:

@@ -46,9 +46,10 @@ def provided(snapshot: Snapshot, lock: LockFile) -> PackageSet:
 
     Raises ``LockDriftError`` where the files or the interpreter are others.
     """
-    from envhub_sandbox.dependencies import environments, interpreters, progress
+    from envhub_sandbox.dependencies import environments, interpreters
     from envhub_sandbox.dependencies.locks import drift, lockfile, pylock
     from envhub_sandbox.dependencies.pipeline import PackageSet
+    from envhub_sandbox.system import progress
 
     here = drift.with_files(lock, snapshot)
     drift.refuse(drift.differences(lock, here), snapshot.label)
