@@ -6,7 +6,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from envhub_sandbox.hub import store
+from envhub_sandbox.hub.cache import cache_root
 from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.jails.launcher import Launcher
 from envhub_sandbox.session.jails.loaded import ExpectedManifest, LoadedJail
@@ -49,7 +49,7 @@ class EnvFactory:
         self._prewarm = prewarm
         load = repository.arguments.message()
         key = manifest_key(repository.snapshot, load, repository.policy, launcher.runs_on)
-        self._cache = ManifestCache(store.cache_root() / "manifests", key)
+        self._cache = ManifestCache(cache_root() / "manifests", key)
 
     def make(self) -> EnvSuites:
         """The environments; a first jail is opened where nothing is remembered of them."""

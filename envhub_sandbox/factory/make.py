@@ -14,7 +14,7 @@ from envhub_sandbox.errors import PolicyError
 from envhub_sandbox.factory import sandbox_spec
 from envhub_sandbox.factory.config import plain_config, reference_of
 from envhub_sandbox.factory.env_factory import EnvFactory
-from envhub_sandbox.hub import store
+from envhub_sandbox.hub.cache import cache_root
 from envhub_sandbox.hub.snapshot import Snapshot, named
 from envhub_sandbox.option_names import option_name
 from envhub_sandbox.options import Options
@@ -84,7 +84,7 @@ def make(make_env: Callable[..., EnvSuites], cfg: Any, given: Options) -> EnvSui
         ).advice,
     )
     return EnvFactory(
-        Launcher(repository, wanted.place, store.cache_root() / "snapshots"),
+        Launcher(repository, wanted.place, cache_root() / "snapshots"),
         options.num_workers,
         _ahead(wanted, options),
         _face(options.validate),

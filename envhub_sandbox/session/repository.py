@@ -18,8 +18,8 @@ from envhub_sandbox.errors import (
     WorkerTimeoutError,
     name_source,
 )
+from envhub_sandbox.hub.cache import cache_root
 from envhub_sandbox.hub.snapshot import Snapshot
-from envhub_sandbox.hub.store import cache_root
 from envhub_sandbox.option_names import option_name
 from envhub_sandbox.policy import Policy, Timeouts
 from envhub_sandbox.session.author_lines import add_author_line

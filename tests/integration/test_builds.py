@@ -18,8 +18,8 @@ from envhub_sandbox.dependencies.locks.making import locked
 from envhub_sandbox.dependencies.request import Choice
 from envhub_sandbox.dependencies.resolutions import lock_for
 from envhub_sandbox.errors import DependencyError, PackageIntegrityError, ResolutionError
+from envhub_sandbox.hub.cache import cache_root, remove_tree
 from envhub_sandbox.hub.snapshot import local
-from envhub_sandbox.hub.store import cache_root, remove_tree
 from tests.support.git_server import git_served, make_repository
 from tests.support.repositories import write_repository
 from tests.support.sdists import backend, make_sdist

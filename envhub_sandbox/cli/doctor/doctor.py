@@ -145,7 +145,7 @@ def _scratch_folder() -> Iterator[Path]:
     Raises:
         SandboxUnavailableError: There is no place for one.
     """
-    from envhub_sandbox.hub.store import CACHE_VARIABLE
+    from envhub_sandbox.hub.cache import CACHE_VARIABLE
 
     try:
         made = tempfile.TemporaryDirectory(prefix="envhub-doctor-")
@@ -172,7 +172,7 @@ def _cache_problem(*, by_others: bool) -> str | None:
     Args:
         by_others: Whether root's jails read it as another user: all but those with a private root.
     """
-    from envhub_sandbox.hub.store import cache_root
+    from envhub_sandbox.hub.cache import cache_root
 
     try:
         root = cache_root()
@@ -215,7 +215,7 @@ def engine() -> dict[str, Any]:
 
 def resources(problem: str | None) -> dict[str, Any]:
     """Bytes that are free: of memory, None where the kernel does not say, and for the cache."""
-    from envhub_sandbox.hub.store import cache_root
+    from envhub_sandbox.hub.cache import cache_root
 
     disk: dict[str, Any] = {"folder": None, "free_bytes": None, "problem": problem}
     with contextlib.suppress(SnapshotError):  # it is the problem
