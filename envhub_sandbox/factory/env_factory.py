@@ -14,7 +14,7 @@ from envhub_sandbox.session.jails.retry_while_busy import retry_while_busy
 from envhub_sandbox.session.jails.sources import JailSource, SharedJail
 from envhub_sandbox.session.manifest_cache import ManifestCache, manifest_key
 from envhub_sandbox.session.prewarm import Prewarm, SuitePrewarm
-from envhub_sandbox.session.provenance import provenance_of
+from envhub_sandbox.session.recipe import provenance_of
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.shared_memory.sharding import bounds_for
 from envhub_sandbox.vector.suites import EnvSuites

@@ -22,8 +22,7 @@ from envhub_sandbox.policy import Policy, Timeouts, policy_from, timeouts_from
 from envhub_sandbox.sandboxes import inprocess
 from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.session.jails.launcher import Launcher
-from envhub_sandbox.session.provenance import provenance_of
-from envhub_sandbox.session.recipe import Recipe, pinned
+from envhub_sandbox.session.recipe import Recipe, pinned, provenance_of
 from envhub_sandbox.session.repository import LoadArguments, Repository
 from envhub_sandbox.system import processes
 from envhub_sandbox.vector.suites import EnvSuites

@@ -26,8 +26,7 @@ from envhub_sandbox.session.author_lines import add_author_line
 from envhub_sandbox.session.crash.bundle_writer import Crash, write_bundle
 from envhub_sandbox.session.crash.history import Recording
 from envhub_sandbox.session.jails.loaded import LoadedJail
-from envhub_sandbox.session.provenance import provenance_of
-from envhub_sandbox.session.recipe import Recipe
+from envhub_sandbox.session.recipe import Recipe, provenance_of
 from envhub_sandbox.system.locks import SharedLock
 from envhub_sandbox.system.log import CRASHES
 from envhub_sandbox.transport import trace
