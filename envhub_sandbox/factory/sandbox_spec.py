@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from envhub_sandbox.errors import PolicyError
-from envhub_sandbox.option_names import option_name
+from envhub_sandbox.options import option_name
 from envhub_sandbox.sandboxes.sandbox import Sandbox
 
 

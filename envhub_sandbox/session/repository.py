@@ -20,7 +20,7 @@ from envhub_sandbox.errors import (
 )
 from envhub_sandbox.hub.cache import cache_root
 from envhub_sandbox.hub.snapshot import Snapshot
-from envhub_sandbox.option_names import option_name
+from envhub_sandbox.options import option_name
 from envhub_sandbox.policy import Policy, Timeouts
 from envhub_sandbox.session.author_lines import add_author_line
 from envhub_sandbox.session.crash.bundle_writer import Crash, write_bundle

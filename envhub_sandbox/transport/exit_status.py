@@ -6,7 +6,7 @@ import contextlib
 import os
 import signal
 
-from envhub_sandbox.option_names import option_name
+from envhub_sandbox.options import option_name
 
 _KILLED_IN_A_CONTAINER = 128
 """And the signal's number: an engine's exit code, where the container's program got one."""

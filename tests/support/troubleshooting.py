@@ -16,7 +16,7 @@ from typing import Any
 
 import envhub_sandbox
 import envhub_worker
-from envhub_sandbox.option_names import option_name
+from envhub_sandbox.options import option_name
 
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "troubleshooting.md"
 _HEAD = """# Troubleshooting

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 from envhub_sandbox.dependencies.pipeline import HERE, PackageSet
 from envhub_sandbox.dependencies.request import PackageRequest
 from envhub_sandbox.errors import InterpreterUnavailableError, SandboxUnavailableError
-from envhub_sandbox.option_names import option_name
+from envhub_sandbox.options import option_name
 from envhub_sandbox.sandboxes.docker.engines import (
     Engine,
     EngineError,

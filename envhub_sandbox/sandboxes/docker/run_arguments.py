@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from envhub_sandbox.errors import PolicyError
-from envhub_sandbox.option_names import option_name
+from envhub_sandbox.options import option_name
 from envhub_sandbox.policy import Policy
 from envhub_sandbox.sandboxes.docker.engines import Engine
 

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import cast
 
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerStartupError
-from envhub_sandbox.option_names import option_name
+from envhub_sandbox.options import option_name
 from envhub_sandbox.policy import Policy
 from envhub_sandbox.sandboxes import runtime_folder
 from envhub_sandbox.sandboxes.docker import attestation, packages, run_arguments, seccomp_profile

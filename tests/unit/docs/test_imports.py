@@ -53,8 +53,7 @@ DESERIALISERS = {"_pickle", "copyreg", "dill", "joblib", "marshal", "pickle", "s
 # Which package may import which; a package is a folder or a module right below one of the two.
 # Every package may import the lowest ones, LOWEST, as far as these stand below it.
 LOWEST = {
-    *("envhub_sandbox.errors", "envhub_sandbox.option_names"),
-    "envhub_sandbox.options",
+    *("envhub_sandbox.errors", "envhub_sandbox.options"),
     *("envhub_sandbox.system", "envhub_worker.protocol"),
 }
 MAY_IMPORT = {
@@ -82,7 +81,6 @@ MAY_IMPORT = {
     "envhub_sandbox.hub": set(),
     "envhub_sandbox.policy": set(),
     "envhub_sandbox.errors": set(),
-    "envhub_sandbox.option_names": set(),
     "envhub_sandbox.options": set(),
     "envhub_sandbox.system": set(),
     "envhub_worker.__main__": {"cli"},
