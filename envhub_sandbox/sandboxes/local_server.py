@@ -10,8 +10,7 @@ from pathlib import Path
 
 from envhub_sandbox.sandboxes.pool import WorkerServer
 from envhub_sandbox.sandboxes.runtime_folder import RuntimeFolder
-from envhub_sandbox.system.processes import has_ended
-from envhub_sandbox.transport.forks import Owner
+from envhub_sandbox.system.processes import Owner, has_ended
 
 
 class LocalServer(WorkerServer):

@@ -25,9 +25,9 @@ from envhub_sandbox.sandboxes import remote_keys, remote_packages, upload
 from envhub_sandbox.sandboxes.pool import ServerPool, ServerUse, WorkerServer
 from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.system.log import WORKER
+from envhub_sandbox.system.processes import Owner
 from envhub_sandbox.transport.connection import WorkerClient
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.forks import Owner
 from envhub_sandbox.transport.tcp import Far
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.runtime import OWN, Runtime

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerError, WorkerTimeoutError
 from envhub_sandbox.options import option_name
-from envhub_sandbox.transport.forks import foreign
+from envhub_sandbox.system.processes import foreign
 from envhub_worker.protocol.lifecycle import State
 
 

@@ -19,8 +19,8 @@ from envhub_sandbox.errors import (
     WorkerTimeoutError,
 )
 from envhub_sandbox.options import option_name
+from envhub_sandbox.system.processes import Owner, foreign
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.forks import Owner, foreign
 from envhub_sandbox.transport.replies import expect
 from envhub_sandbox.transport.tcp import Far, Link
 from envhub_worker.protocol import messages as m

@@ -59,7 +59,10 @@ _PARTS = (
     ),
     (
         "Environments in use",
-        ("envhub_sandbox/session", "envhub_sandbox/vector", "envhub_sandbox/transport"),
+        (
+            *("envhub_sandbox/session", "envhub_sandbox/vector", "envhub_sandbox/transport"),
+            "envhub_sandbox/system/processes.py",
+        ),
         "faults.md",
     ),
     (
