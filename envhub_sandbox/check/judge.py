@@ -45,8 +45,8 @@ from envhub_sandbox.errors import (
 )
 from envhub_sandbox.hub.snapshot import Snapshot, named
 from envhub_sandbox.hub.sources import imports, parsing
-from envhub_sandbox.policy import policy_from
 from envhub_sandbox.session.recipe import pinned
+from envhub_sandbox.settings.policy import policy_from
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_worker.protocol.text import size_text
 

@@ -24,7 +24,7 @@ from envhub_sandbox.cli.shared.results import (
     task_document,
 )
 from envhub_sandbox.errors import EnvHubError
-from envhub_sandbox.options import OPTIONS
+from envhub_sandbox.settings.options import OPTIONS
 
 if TYPE_CHECKING:
     from envhub_sandbox.check.play.episodes import EpisodeCounter, Rollout

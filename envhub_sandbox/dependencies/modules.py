@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 from envhub_sandbox.errors import RequirementError
 from envhub_sandbox.hub.cache import cache_root, keep, recall
 from envhub_sandbox.hub.snapshot import Snapshot
-from envhub_sandbox.options import option_name
+from envhub_sandbox.settings.options import option_name
 from envhub_worker.protocol.text import printable
 
 if TYPE_CHECKING:

@@ -22,11 +22,11 @@ from envhub_sandbox.factory import build_env
 from envhub_sandbox.factory.env_factory import EnvFactory
 from envhub_sandbox.hub.cache import CACHE_VARIABLE, cache_root
 from envhub_sandbox.hub.snapshot import local
-from envhub_sandbox.policy import Limits, Policy, Timeouts
 from envhub_sandbox.sandboxes.process import PROCESS
 from envhub_sandbox.session.jails.launcher import Launcher
 from envhub_sandbox.session.recipe import Recipe, pinned
 from envhub_sandbox.session.repository import LoadArguments, Repository
+from envhub_sandbox.settings.policy import Limits, Policy, Timeouts
 from envhub_sandbox.system import processes
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol.runtime import Runtime

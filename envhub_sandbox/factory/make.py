@@ -16,13 +16,13 @@ from envhub_sandbox.factory.config import plain_config, reference_of
 from envhub_sandbox.factory.env_factory import EnvFactory
 from envhub_sandbox.hub.cache import cache_root
 from envhub_sandbox.hub.snapshot import Snapshot, named
-from envhub_sandbox.options import Options, option_name
-from envhub_sandbox.policy import Policy, Timeouts, policy_from, timeouts_from
 from envhub_sandbox.sandboxes import inprocess
 from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.session.jails.launcher import Launcher
 from envhub_sandbox.session.recipe import Recipe, pinned, provenance_of
 from envhub_sandbox.session.repository import LoadArguments, Repository
+from envhub_sandbox.settings.options import Options, option_name
+from envhub_sandbox.settings.policy import Policy, Timeouts, policy_from, timeouts_from
 from envhub_sandbox.system import processes
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv

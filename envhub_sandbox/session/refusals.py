@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerError, WorkerTimeoutError
-from envhub_sandbox.options import option_name
+from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.system.processes import foreign
 from envhub_worker.protocol.lifecycle import State
 

@@ -20,13 +20,13 @@ from envhub_sandbox.errors import (
 )
 from envhub_sandbox.hub.cache import cache_root
 from envhub_sandbox.hub.snapshot import Snapshot
-from envhub_sandbox.options import option_name
-from envhub_sandbox.policy import Policy, Timeouts
 from envhub_sandbox.session.author_lines import add_author_line
 from envhub_sandbox.session.crash.bundle_writer import Crash, write_bundle
 from envhub_sandbox.session.crash.history import Recording
 from envhub_sandbox.session.jails.loaded import LoadedJail
 from envhub_sandbox.session.recipe import Recipe, provenance_of
+from envhub_sandbox.settings.options import option_name
+from envhub_sandbox.settings.policy import Policy, Timeouts
 from envhub_sandbox.system.locks import SharedLock
 from envhub_sandbox.system.log import CRASHES
 from envhub_sandbox.transport import trace

@@ -18,7 +18,7 @@ from envhub_sandbox.errors import (
     WorkerError,
     WorkerTimeoutError,
 )
-from envhub_sandbox.options import option_name
+from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.system.processes import Owner, foreign
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.replies import expect

@@ -13,7 +13,7 @@ from envhub_sandbox import __version__, api
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.cli.doctor import doctor as doctor_command
 from envhub_sandbox.errors import SandboxUnavailableError, WorkerStartupError
-from envhub_sandbox.policy import PROFILES
+from envhub_sandbox.settings.policy import PROFILES
 from envhub_worker.lockdown.gpus import gpu_devices
 from envhub_worker.lockdown.root_plan import real_host
 

@@ -9,9 +9,9 @@ from typing import Any, cast
 import numpy as np
 
 from envhub_sandbox.errors import WorkerTimeoutError
-from envhub_sandbox.policy import Policy, Timeouts
 from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.repository import Repository
+from envhub_sandbox.settings.policy import Policy, Timeouts
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import WatchedAttributes
 from envhub_sandbox.transport.lane import Request

@@ -16,7 +16,7 @@ from typing import Any
 
 import envhub_sandbox
 import envhub_worker
-from envhub_sandbox.options import option_name
+from envhub_sandbox.settings.options import option_name
 
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "troubleshooting.md"
 _HEAD = """# Troubleshooting
@@ -35,7 +35,7 @@ _PARTS = (
     ("Locks", ("envhub_sandbox/dependencies/locks",), "dependencies.md#locks"),
     (
         "Arguments, policies, limits, timeouts",
-        ("envhub_sandbox/factory", "envhub_sandbox/options.py", "envhub_sandbox/policy.py"),
+        ("envhub_sandbox/factory", "envhub_sandbox/settings"),
         "settings.md",
     ),
     ("What this host can enforce", ("envhub_worker/lockdown",), "threat-model.md"),

@@ -97,7 +97,7 @@ def doctor(
     refuses.
     """
     with reported(debug=debug):
-        from envhub_sandbox.policy import Policy
+        from envhub_sandbox.settings.policy import Policy
 
         Policy(profile=profile)  # refuses a name that there is not, before anything is tried
         if server is not None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from envhub_sandbox.errors import DependencyError, LockError, PolicyError, name_source
 from envhub_sandbox.hub.snapshot import Snapshot
-from envhub_sandbox.options import option_name
+from envhub_sandbox.settings.options import option_name
 
 if TYPE_CHECKING:  # they cost time, and mostly there is no lock
     from envhub_sandbox.dependencies.builds.sources import WheelOrigin

@@ -22,7 +22,7 @@ from envhub_sandbox.api import make_env
 from envhub_sandbox.errors import HubReferenceError
 from envhub_sandbox.hub.logins import without_login
 from envhub_sandbox.integrations.lerobot.features import features_of
-from envhub_sandbox.options import OPTIONS, on_lerobots_command_line, use_option_names
+from envhub_sandbox.settings.options import OPTIONS, on_lerobots_command_line, use_option_names
 from envhub_sandbox.vector.suites import EnvSuites
 
 ASKS_CONFIGS = hasattr(EnvConfig, "create_envs")

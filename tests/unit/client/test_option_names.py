@@ -16,7 +16,7 @@ import envhub_sandbox
 from envhub_sandbox import Limits, Policy, Timeouts, make_env
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.errors import PolicyError
-from envhub_sandbox.options import (
+from envhub_sandbox.settings.options import (
     OPTIONS,
     in_python,
     on_command_line,

@@ -53,35 +53,34 @@ DESERIALISERS = {"_pickle", "copyreg", "dill", "joblib", "marshal", "pickle", "s
 # Which package may import which; a package is a folder or a module right below one of the two.
 # Every package may import the lowest ones, LOWEST, as far as these stand below it.
 LOWEST = {
-    *("envhub_sandbox.errors", "envhub_sandbox.options"),
+    *("envhub_sandbox.errors", "envhub_sandbox.settings"),
     *("envhub_sandbox.system", "envhub_worker.protocol"),
 }
 MAY_IMPORT = {
-    "envhub_sandbox": {"api", "hub", "integrations", "policy", "sandboxes", "vector"},
+    "envhub_sandbox": {"api", "hub", "integrations", "sandboxes", "vector"},
     "envhub_sandbox.__main__": {"cli"},
     "envhub_sandbox.cli": {
-        *("", "api", "check", "dependencies", "hub", "policy"),
+        *("", "api", "check", "dependencies", "hub"),
         *("sandboxes", "session"),
     },
-    "envhub_sandbox.api": {"factory", "policy", "sandboxes", "vector"},
+    "envhub_sandbox.api": {"factory", "sandboxes", "vector"},
     "envhub_sandbox.factory": {
-        *("dependencies", "hub", "policy", "sandboxes", "session"),
+        *("dependencies", "hub", "sandboxes", "session"),
         *("transport", "vector"),
     },
     "envhub_sandbox.check": {
-        *("", "api", "dependencies", "hub", "policy", "session"),
+        *("", "api", "dependencies", "hub", "session"),
         "vector",
     },
     "envhub_sandbox.integrations": {"api", "hub", "session", "vector"},
     "envhub_sandbox.vector": {"session", "transport"},
-    "envhub_sandbox.session": {"hub", "policy", "sandboxes", "transport"},
-    "envhub_sandbox.sandboxes": {"dependencies", "hub", "policy", "transport"},
+    "envhub_sandbox.session": {"hub", "sandboxes", "transport"},
+    "envhub_sandbox.sandboxes": {"dependencies", "hub", "transport"},
     "envhub_sandbox.transport": set(),
     "envhub_sandbox.dependencies": {"hub"},
     "envhub_sandbox.hub": set(),
-    "envhub_sandbox.policy": set(),
     "envhub_sandbox.errors": set(),
-    "envhub_sandbox.options": set(),
+    "envhub_sandbox.settings": set(),
     "envhub_sandbox.system": set(),
     "envhub_worker.__main__": {"cli"},
     "envhub_worker.cli": {"", "access", "lockdown", "server", "spawn"},
@@ -101,9 +100,11 @@ MAY_IMPORT = {
 # beyond the table: what a module or a package must know nothing of
 IGNORANT = {
     "envhub_sandbox.vector": {"zmq", "socket", "subprocess", "envhub_sandbox.transport.connection"},
-    "envhub_sandbox.transport": {"gymnasium.vector"},
-    "envhub_sandbox.policy": {"zmq", "gymnasium", "subprocess"},
-    "envhub_sandbox.hub": {"zmq", "gymnasium", "runpy"},
+    "envhub_sandbox.transport": {"gymnasium.vector", "envhub_sandbox.settings.policy"},
+    "envhub_sandbox.settings": {"zmq", "gymnasium", "subprocess"},
+    "envhub_sandbox.hub": {"zmq", "gymnasium", "runpy", "envhub_sandbox.settings.policy"},
+    "envhub_sandbox.dependencies": {"envhub_sandbox.settings.policy"},
+    "envhub_sandbox.system": {"envhub_sandbox.settings"},
     "envhub_sandbox.hub.reference": {"huggingface_hub"},
     "envhub_sandbox.hub.snapshot": {"importlib"},
     "envhub_worker.supervisor": {"zmq"},

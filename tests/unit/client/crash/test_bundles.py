@@ -17,7 +17,6 @@ from gymnasium import spaces
 
 from envhub_sandbox.cli.shared.console import safe_line
 from envhub_sandbox.errors import ActionError, BundleError, WorkerDiedError
-from envhub_sandbox.policy import Limits, Policy, Timeouts
 from envhub_sandbox.session.crash import bundle_reader, bundle_writer
 from envhub_sandbox.session.crash.bundle_reader import (
     MAX_DOCUMENT_BYTES,
@@ -27,6 +26,7 @@ from envhub_sandbox.session.crash.bundle_reader import (
 )
 from envhub_sandbox.session.crash.history import History
 from envhub_sandbox.session.crash.replay import Verdict, replay
+from envhub_sandbox.settings.policy import Limits, Policy, Timeouts
 from envhub_worker.protocol import messages as m
 from tests.support import inside
 from tests.support.wire import requested
