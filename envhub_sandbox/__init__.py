@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from envhub_sandbox import errors as errors
-    from envhub_sandbox.api import make_env as make_env
+    from envhub_sandbox.factory.make_env import make_env as make_env
     from envhub_sandbox.hub.reference import HubRef as HubRef
     from envhub_sandbox.integrations.gym import SandboxEnv as SandboxEnv
     from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox as DockerSandbox
@@ -38,7 +38,7 @@ _HOMES = {
     "SandboxVectorEnv": "vector.vector_env",
     "Timeouts": "settings.policy",
     "errors": "errors",
-    "make_env": "api",
+    "make_env": "factory.make_env",
 }
 
 __all__ = [*_HOMES]

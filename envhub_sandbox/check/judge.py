@@ -17,7 +17,6 @@ from typing import Any
 from gymnasium.error import CustomSpaceError
 
 from envhub_sandbox import __version__
-from envhub_sandbox.api import make_env
 from envhub_sandbox.check.checks import CHECKS
 from envhub_sandbox.check.findings import Report
 from envhub_sandbox.check.play.confinement import Confinement, denial_findings
@@ -43,6 +42,7 @@ from envhub_sandbox.errors import (
     WorkerDiedError,
     WorkerTimeoutError,
 )
+from envhub_sandbox.factory.make_env import make_env
 from envhub_sandbox.hub.snapshot import Snapshot, named
 from envhub_sandbox.hub.sources import imports, parsing
 from envhub_sandbox.session.recipe import pinned

@@ -73,8 +73,8 @@ def diff(
 
 
 def _tasks(snapshot: Snapshot, env_kwargs: dict[str, Any], hub: dict[str, Any]) -> tuple[Task, ...]:
-    from envhub_sandbox.api import make_env
     from envhub_sandbox.dependencies.locks.making import tasks_of
+    from envhub_sandbox.factory.make_env import make_env
     from envhub_sandbox.session.recipe import pinned
 
     with make_env(pinned(snapshot), env_kwargs=env_kwargs, **hub) as suites:

@@ -167,8 +167,8 @@ def _with_spaces(
     made: LockFile, snapshot: Snapshot, env_kwargs: dict[str, Any], hub: dict[str, Any]
 ) -> LockFile:
     """The lock with what its repository returns, in the sandbox and in its own environment."""
-    from envhub_sandbox.api import make_env
     from envhub_sandbox.dependencies.locks import lockfile, making
+    from envhub_sandbox.factory.make_env import make_env
     from envhub_sandbox.session.recipe import pinned
 
     with tempfile.TemporaryDirectory(prefix="envhub-lock-") as folder:

@@ -101,7 +101,7 @@ class _Replay:
 
     def _make(self, bundle: Bundle, bar: Bar, stack: contextlib.ExitStack) -> Any:
         """The environment that the bundle is about; None if it is about ``make_env`` alone."""
-        from envhub_sandbox.api import make_env
+        from envhub_sandbox.factory.make_env import make_env
         from envhub_sandbox.session.crash.replay import changed_files
         from envhub_sandbox.session.recipe import Recipe
 

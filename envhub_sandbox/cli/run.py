@@ -135,7 +135,7 @@ class _Run:
     def _run(self, bar: Bar) -> None:
         arguments = self.make.arguments()
         bar.begin(f"loading {self.make.ref}")
-        from envhub_sandbox.api import make_env
+        from envhub_sandbox.factory.make_env import make_env
 
         with make_env(**arguments) as envs:
             self.make_env_s = time.perf_counter() - self.begun

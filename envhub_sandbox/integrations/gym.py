@@ -15,7 +15,7 @@ from typing import Any
 import gymnasium
 from gymnasium.vector import VectorEnv
 
-from envhub_sandbox.api import make_env
+from envhub_sandbox.factory.make_env import make_env
 from envhub_sandbox.vector.single_env import SingleEnv
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_sandbox.vector.tracebacks import short_traceback

@@ -244,7 +244,7 @@ def probe() -> dict[str, Any]:
 
 def examine(folder: str, profile: str) -> Trial:
     """Run the idle environment under a profile."""
-    from envhub_sandbox.api import make_env
+    from envhub_sandbox.factory.make_env import make_env
 
     begun = time.perf_counter()
     try:

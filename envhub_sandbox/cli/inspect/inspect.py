@@ -55,7 +55,7 @@ def _inspect(
     make: opt.MakeOptions, suites: list[str] | None, tasks: list[str] | None, *, as_json: bool
 ) -> None:
     arguments = make.arguments()
-    from envhub_sandbox.api import make_env
+    from envhub_sandbox.factory.make_env import make_env
 
     with Bar(quiet=as_json) as bar, make.explained():
         bar.begin(f"loading {make.ref} in a sandbox")

@@ -57,22 +57,18 @@ LOWEST = {
     *("envhub_sandbox.system", "envhub_worker.protocol"),
 }
 MAY_IMPORT = {
-    "envhub_sandbox": {"api", "hub", "integrations", "sandboxes", "vector"},
+    "envhub_sandbox": {"factory", "hub", "integrations", "sandboxes", "vector"},
     "envhub_sandbox.__main__": {"cli"},
     "envhub_sandbox.cli": {
-        *("", "api", "check", "dependencies", "hub"),
+        *("", "check", "dependencies", "factory", "hub"),
         *("sandboxes", "session"),
     },
-    "envhub_sandbox.api": {"factory", "sandboxes", "vector"},
     "envhub_sandbox.factory": {
         *("dependencies", "hub", "sandboxes", "session"),
         *("transport", "vector"),
     },
-    "envhub_sandbox.check": {
-        *("", "api", "dependencies", "hub", "session"),
-        "vector",
-    },
-    "envhub_sandbox.integrations": {"api", "hub", "session", "vector"},
+    "envhub_sandbox.check": {"", "dependencies", "factory", "hub", "session", "vector"},
+    "envhub_sandbox.integrations": {"factory", "hub", "session", "vector"},
     "envhub_sandbox.vector": {"session", "transport"},
     "envhub_sandbox.session": {"hub", "sandboxes", "transport"},
     "envhub_sandbox.sandboxes": {"dependencies", "hub", "transport"},
@@ -203,7 +199,11 @@ def foreign(package: str, own: set[str]) -> list[tuple[str, str]]:
 def test_both_packages_are_seen() -> None:
     """The walk below finds something to look at."""
     names = set(modules())
-    assert {"envhub_sandbox.api", "envhub_worker.server", "envhub_worker.runner.loader"} <= names
+    assert {
+        "envhub_sandbox.factory.make_env",
+        "envhub_worker.server",
+        "envhub_worker.runner.loader",
+    } <= names
 
 
 def test_worker_is_self_contained() -> None:
@@ -304,7 +304,14 @@ def test_nobody_imports_the_runner() -> None:
 
 def test_only_faces_and_the_command_line_import_make_env() -> None:
     """Everything else is below it."""
-    importers = {name for name, target in arrows("envhub_sandbox") if target.endswith(".api")}
+    factory = "envhub_sandbox.factory"
+    found = {
+        (name, target)
+        for name, target in arrows("envhub_sandbox")
+        if below(target, factory) and not below(name, factory)
+    }
+    assert {target for _, target in found} == {f"{factory}.make_env"}
+    importers = {name for name, _ in found}
     assert {name for name in importers if not below(name, "envhub_sandbox.cli")} <= {
         "envhub_sandbox",
         "envhub_sandbox.check.judge",
