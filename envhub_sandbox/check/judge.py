@@ -17,7 +17,6 @@ from typing import Any
 from gymnasium.error import CustomSpaceError
 
 from envhub_sandbox import __version__
-from envhub_sandbox.api import make_env
 from envhub_sandbox.check.checks import CHECKS
 from envhub_sandbox.check.findings import Report
 from envhub_sandbox.check.play.confinement import Confinement, denial_findings
@@ -43,10 +42,11 @@ from envhub_sandbox.errors import (
     WorkerDiedError,
     WorkerTimeoutError,
 )
+from envhub_sandbox.factory.make_env import make_env
 from envhub_sandbox.hub.snapshot import Snapshot, snapshot_named
-from envhub_sandbox.policy import policy_from
+from envhub_sandbox.hub.sources import imports, parsing
 from envhub_sandbox.session.recipe import pinned
-from envhub_sandbox.sources import imports, parsing
+from envhub_sandbox.settings.policy import policy_from
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_worker.protocol.text import size_text
 

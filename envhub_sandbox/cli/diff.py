@@ -15,8 +15,8 @@ from envhub_worker.protocol.text import counted
 
 if TYPE_CHECKING:
     from envhub_sandbox.check.static.changes import Change
+    from envhub_sandbox.dependencies.locks.fingerprint import TaskFingerprint
     from envhub_sandbox.hub.snapshot import Snapshot
-    from envhub_sandbox.locks.fingerprint import TaskFingerprint
 
 _MARKS = {"new": "+", "gone": "-", "changed": "~", "renamed": ">"}
 
@@ -77,8 +77,8 @@ def diff(
 def _tasks(
     snapshot: Snapshot, env_kwargs: dict[str, Any], hub: dict[str, Any]
 ) -> tuple[TaskFingerprint, ...]:
-    from envhub_sandbox.api import make_env
-    from envhub_sandbox.locks import making
+    from envhub_sandbox.dependencies.locks import making
+    from envhub_sandbox.factory.make_env import make_env
     from envhub_sandbox.session.recipe import pinned
 
     with make_env(pinned(snapshot), env_kwargs=env_kwargs, **hub) as suites:

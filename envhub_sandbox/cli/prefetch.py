@@ -55,7 +55,7 @@ def _environment(snapshot: Snapshot, given: Any, upgrade: bool) -> Environment |
 
 
 def _of_lock(snapshot: Snapshot, lock: str, given: Any) -> Environment | None:
-    from envhub_sandbox.locks import use
+    from envhub_sandbox.dependencies.locks import use
 
     return use.provided(snapshot, use.opened(lock, "process", None, given)).environment
 

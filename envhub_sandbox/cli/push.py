@@ -103,7 +103,7 @@ def _check(folder: str, snapshot: Snapshot, options: dict[str, Any]) -> None:
         EnvHubError: It does not load, or breaks a rule.
         UsageError: The folder was changed meanwhile.
     """
-    from envhub_sandbox.api import make_env
+    from envhub_sandbox.factory.make_env import make_env
 
     with make_env(folder, n_envs=2, validate=True, **options) as suites:
         for env in suites.envs():

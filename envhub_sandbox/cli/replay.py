@@ -14,8 +14,8 @@ from envhub_sandbox.cli.shared.exits import Exit, UsageError
 from envhub_sandbox.cli.shared.progress import ProgressBar
 
 if TYPE_CHECKING:
-    from envhub_sandbox.crash.bundle_reader import Bundle
-    from envhub_sandbox.crash.replay import ReplayResult
+    from envhub_sandbox.session.crash.bundle_reader import Bundle
+    from envhub_sandbox.session.crash.replay import ReplayResult
 
 BundleFolder = Annotated[
     Path,
@@ -66,8 +66,8 @@ class _Replay:
 
     def execute(self) -> None:
         """Read, check, repeat, print; the exit code is the verdict."""
-        from envhub_sandbox.crash.bundle_reader import load_bundle
-        from envhub_sandbox.crash.replay import Verdict
+        from envhub_sandbox.session.crash.bundle_reader import load_bundle
+        from envhub_sandbox.session.crash.replay import Verdict
 
         bundle = load_bundle(self._folder)
         self._refuse_wishes(bundle)
@@ -83,7 +83,7 @@ class _Replay:
         raise typer.Exit(codes.get(replayed.verdict, Exit.SURVIVED))
 
     def _refuse_wishes(self, bundle: Bundle) -> None:
-        from envhub_sandbox.crash.bundle_reader import wishes
+        from envhub_sandbox.session.crash.bundle_reader import wishes
 
         wanted = [wish for wish in wishes(bundle) if wish.partition("=")[0] not in self._given]
         if wanted and not self._grant:
@@ -93,7 +93,7 @@ class _Replay:
             )
 
     def _run(self, bundle: Bundle, bar: ProgressBar) -> ReplayResult:
-        from envhub_sandbox.crash.replay import replay
+        from envhub_sandbox.session.crash.replay import replay
 
         bar.begin(f"loading {safe_line(bundle.label)}")
         with contextlib.ExitStack() as stack:
@@ -101,8 +101,8 @@ class _Replay:
 
     def _make(self, bundle: Bundle, bar: ProgressBar, stack: contextlib.ExitStack) -> Any:
         """The environment that the bundle is about; None if it is about ``make_env`` alone."""
-        from envhub_sandbox.api import make_env
-        from envhub_sandbox.crash.replay import changed_files
+        from envhub_sandbox.factory.make_env import make_env
+        from envhub_sandbox.session.crash.replay import changed_files
         from envhub_sandbox.session.recipe import Recipe
 
         recipe = Recipe(
@@ -132,7 +132,7 @@ class _Replay:
         return env
 
     def _options(self, bundle: Bundle) -> dict[str, Any]:
-        from envhub_sandbox.crash.bundle_reader import replayed_arguments
+        from envhub_sandbox.session.crash.bundle_reader import replayed_arguments
 
         options = replayed_arguments(bundle, granted=self._grant)
         given = dict(self._given)

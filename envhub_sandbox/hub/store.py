@@ -29,10 +29,7 @@ from typing import NamedTuple
 from urllib.parse import urlsplit
 
 from envhub_sandbox.errors import SnapshotError, SnapshotIntegrityError
-from envhub_sandbox.hub.cache import BUILDING, draft
-from envhub_sandbox.hub.cache import CACHE_VARIABLE as CACHE_VARIABLE
-from envhub_sandbox.hub.cache import cache_root as cache_root
-from envhub_sandbox.hub.cache import remove_tree as remove_tree
+from envhub_sandbox.hub.cache import BUILDING, cache_root, draft, remove_tree
 from envhub_sandbox.hub.hashing import HashMismatch, digest_of
 from envhub_sandbox.hub.listing import FileRecord
 from envhub_sandbox.system import folders

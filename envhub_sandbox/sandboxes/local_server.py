@@ -10,8 +10,7 @@ from pathlib import Path
 
 from envhub_sandbox.sandboxes.pool import WorkerServer
 from envhub_sandbox.sandboxes.runtime_folder import RuntimeFolder
-from envhub_sandbox.system import processes
-from envhub_sandbox.transport.forks import Owner
+from envhub_sandbox.system.processes import Owner, has_ended
 
 
 class LocalServer(WorkerServer):
@@ -82,7 +81,7 @@ class LocalServer(WorkerServer):
         for: it takes no requests any more. Nor can anyone connect to one whose sockets a cleaner
         of temporary files has removed; who is connected already goes on.
         """
-        alive = self.process.poll() is None and not processes.has_ended(self.process.pid)
+        alive = self.process.poll() is None and not has_ended(self.process.pid)
         return alive and self._runtime.has_sockets(*self._sockets)
 
     def stop(self) -> None:

@@ -17,11 +17,11 @@ from typing import TYPE_CHECKING
 
 import envhub_worker.protocol
 from envhub_sandbox.errors import SandboxUnavailableError, WorkerStartupError
-from envhub_sandbox.option_names import option_name
 from envhub_sandbox.sandboxes import runtime_folder
 from envhub_sandbox.sandboxes.local_server import LocalServer
 from envhub_sandbox.sandboxes.pool import ServerPool, ServerUse
 from envhub_sandbox.sandboxes.sandbox import Sandbox
+from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.system import processes
 from envhub_sandbox.system.log import WORKER
 from envhub_worker.protocol.runtime import OWN, Runtime

@@ -19,15 +19,15 @@ from typing import Any, cast
 from envhub_sandbox.dependencies.packages import PackageSet
 from envhub_sandbox.dependencies.request import PackageRequest
 from envhub_sandbox.errors import DependencyError, EnvHubError, PolicyError
-from envhub_sandbox.option_names import option_name
-from envhub_sandbox.policy import Policy
 from envhub_sandbox.sandboxes import remote_keys, remote_packages, upload
 from envhub_sandbox.sandboxes.pool import ServerPool, ServerUse, WorkerServer
 from envhub_sandbox.sandboxes.sandbox import Sandbox
+from envhub_sandbox.settings.options import option_name
+from envhub_sandbox.settings.policy import Policy
 from envhub_sandbox.system.log import WORKER
+from envhub_sandbox.system.processes import Owner
 from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.forks import Owner
 from envhub_sandbox.transport.tcp import TcpServer
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.runtime import OWN, Runtime

@@ -11,7 +11,7 @@ from envhub_worker.protocol.runtime import OWN, Runtime
 
 if TYPE_CHECKING:
     from envhub_sandbox.dependencies.packages import PackageTarget
-    from envhub_sandbox.policy import Policy
+    from envhub_sandbox.settings.policy import Policy
     from envhub_sandbox.transport.connection import WorkerConnection
     from envhub_sandbox.transport.deadline import Deadline
     from envhub_worker.protocol.messages import OpenJail

@@ -1,6 +1,6 @@
 """Counters of the environments: cheap to keep, and summed up only when they are read.
 
-``LEDGER`` has those of all environments of this process, so that ``envhub_sandbox.metrics`` sees
+``LEDGER`` has those of all environments of this process, so that ``integrations/metrics.py`` sees
 counts that only grow, also when environments are closed.
 """
 

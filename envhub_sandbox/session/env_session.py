@@ -13,9 +13,9 @@ import weakref
 from collections.abc import Sequence
 from typing import Any, cast
 
-from envhub_sandbox.crash.history import History
 from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerError, WorkerTimeoutError
 from envhub_sandbox.session.counters import LEDGER, Counters, Labels
+from envhub_sandbox.session.crash.history import History
 from envhub_sandbox.session.jails.sources import JailSource
 from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.session.prewarm import INTERRUPT_S, LOOK_S, Prewarm

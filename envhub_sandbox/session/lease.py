@@ -24,8 +24,8 @@ from envhub_sandbox.session.jails.retry_while_busy import (
 from envhub_sandbox.session.jails.sources import JailSource
 from envhub_sandbox.session.refusals import closed_during
 from envhub_sandbox.session.repository import Repository
+from envhub_sandbox.system.processes import Owner
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
-from envhub_sandbox.transport.forks import Owner
 from envhub_sandbox.transport.lane import Lane
 from envhub_sandbox.transport.pace import PaceBook
 from envhub_sandbox.transport.results import Results

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.hub.snapshot import Snapshot
-from envhub_sandbox.policy import Policy
+from envhub_sandbox.settings.policy import Policy
 from envhub_sandbox.system import folders
 from envhub_sandbox.system.files import write_whole_file
 from envhub_sandbox.transport.pace import PaceBook

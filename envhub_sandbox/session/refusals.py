@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerError, WorkerTimeoutError
-from envhub_sandbox.option_names import option_name
-from envhub_sandbox.transport.forks import fork_error_text
+from envhub_sandbox.settings.options import option_name
+from envhub_sandbox.system.processes import fork_error_text
 from envhub_worker.protocol.lifecycle import State
 
 

@@ -16,7 +16,6 @@ from typing import Any, NoReturn, TypeVar
 
 from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError
 
-from envhub_sandbox.crash.history import History
 from envhub_sandbox.errors import (
     EnvHubError,
     LocalProtocolError,
@@ -26,6 +25,7 @@ from envhub_sandbox.errors import (
     WorkerTimeoutError,
 )
 from envhub_sandbox.session.attribute_cache import AttributeCache
+from envhub_sandbox.session.crash.history import History
 from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.session.prewarm import Prewarm
 from envhub_sandbox.session.refusals import refusal

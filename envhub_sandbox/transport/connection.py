@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
 import secrets
+import signal
 from collections.abc import Sequence
 
 import zmq
@@ -16,9 +18,9 @@ from envhub_sandbox.errors import (
     WorkerError,
     WorkerTimeoutError,
 )
+from envhub_sandbox.settings.options import option_name
+from envhub_sandbox.system.processes import Owner, fork_error_text
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.exit_status import describe_exit
-from envhub_sandbox.transport.forks import Owner, fork_error_text
 from envhub_sandbox.transport.replies import expect_reply
 from envhub_sandbox.transport.tcp import TcpLink, TcpServer
 from envhub_worker.protocol import messages as m
@@ -29,6 +31,8 @@ from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _NOW = int(zmq.NOBLOCK)
 _MORE_NOW = int(zmq.SNDMORE) | _NOW
+_KILLED_IN_A_CONTAINER = 128
+"""And the signal's number: an engine's exit code, where the container's program got one."""
 SESSION = secrets.token_bytes(16)
 _contexts: dict[int, zmq.Context[zmq.Socket[bytes]]] = {}
 
@@ -279,3 +283,41 @@ class WorkerConnection:
             if self._link is not None:
                 self._link.close()
             self._socket.close(0)
+
+
+def describe_exit(process_fd: int) -> str:
+    """How a server ended and what to do, as the rest of a sentence. The process stays to be reaped.
+
+    Args:
+        process_fd: A pidfd of it, or of the monitor of its container.
+    """
+    status = None
+    with contextlib.suppress(OSError):  # it was reaped already, or it is no process
+        status = os.waitid(os.P_PIDFD, process_fd, os.WEXITED | os.WNOHANG | os.WNOWAIT)
+    if status is None:
+        return f". {_what_next()}"
+    if status.si_code in (os.CLD_KILLED, os.CLD_DUMPED):
+        return f" by {_signal_name(status.si_status)}{_culprit(status.si_status)}. {_what_next()}"
+    number = status.si_status - _KILLED_IN_A_CONTAINER
+    if number in signal.valid_signals():
+        where = "; the container's own limit is DockerSandbox(memory=...) in Python"
+        why = _culprit(number) + (where if number == signal.SIGKILL else "")
+        return f" with its container, by {_signal_name(number)}{why}. {_what_next()}"
+    return f", with exit code {status.si_status}. {_what_next()}"
+
+
+def _what_next() -> str:
+    fresh = option_name("restart", "on_reset")
+    return f"The next make_env, or with {fresh} the next reset(), starts another"
+
+
+def _signal_name(number: int) -> str:
+    with contextlib.suppress(ValueError):
+        return signal.Signals(number).name
+    return f"signal {number}"
+
+
+def _culprit(number: int) -> str:
+    if number != signal.SIGKILL:
+        return ""
+    return ", by another process or by the kernel, as where memory runs out (dmesg says so)"

@@ -15,7 +15,6 @@ from envhub_sandbox.errors import (
     WorkerDiedError,
     WorkerError,
 )
-from envhub_sandbox.transport.attribute_cache import AttributeCache
 from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.remote_warnings import RemoteWarnings
@@ -24,7 +23,8 @@ from envhub_sandbox.transport.values import pickles
 from envhub_sandbox.transport.values.descriptions import unpacked
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
-from envhub_worker.protocol.limits import WireLimits
+from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
+from envhub_worker.protocol.messages.prefix import CHANGES, WATCHED_TYPES, Attribute
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _CAUSE_S = 10.0
@@ -88,7 +88,7 @@ class JailHandle:
         self.report = report
         self.before_end: Callable[[], None] = _nothing
         self.warnings = RemoteWarnings()
-        self.watched = AttributeCache()
+        self.watched = WatchedAttributes()
         self.limits = limits
         self._asked: dict[int, int] = {}  # how many runners, by request
 
@@ -314,3 +314,43 @@ def _runners(opened: m.JailOpened, count: int) -> list[int]:
     ):
         raise RemoteProtocolError(f"the worker did not start {count} runners, each with a number")
     return runners
+
+
+class WatchedAttributes:
+    """The values of attributes that the runners watch: by the environment's number and their name.
+
+    A reply names the attributes that have changed before it; the others have the values that are
+    kept here, and need no request. Trust: the values come from the worker, as those of a ``call``
+    do. They are of immutable types, so a caller cannot change what is kept.
+    """
+
+    def __init__(self) -> None:
+        self._values: dict[Attribute, tuple[Any, ...]] = {}
+
+    def note(self, number: int, name: str, values: tuple[Any, ...]) -> bool:
+        """Keep values that were read. Returns whether they can be kept."""
+        if not all(type(value) in WATCHED_TYPES for value in values):
+            return False
+        self._values[number, name] = values
+        return True
+
+    def values(self, number: int, name: str) -> tuple[Any, ...] | None:
+        """One for each sub-environment; None if they are not known."""
+        return self._values.get((number, name))
+
+    def forget(self) -> None:
+        """Drop all: a runner was replaced, or a reply was lost."""
+        self._values.clear()
+
+    def take(self, frames: Sequence[Buffer]) -> Sequence[Buffer]:
+        """A reply's own frames, without the changes in front. Trust: input from the worker.
+
+        Raises:
+            RemoteProtocolError: These are not what was agreed on.
+        """
+        if len(frames) >= DEFAULT_LIMITS.frames:  # there was no room in front
+            self.forget()
+        changed, rest = CHANGES.read(frames)
+        for attribute in changed:
+            self._values.pop(attribute, None)
+        return rest

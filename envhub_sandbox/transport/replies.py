@@ -31,7 +31,7 @@ from envhub_sandbox.errors import (
     load_error,
     remote_error,
 )
-from envhub_sandbox.option_names import option_name
+from envhub_sandbox.settings.options import option_name
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.inert import one_line
 from envhub_worker.protocol.confinement import Reason

@@ -25,7 +25,7 @@ from envhub_sandbox.transport.jail import JailHandle, RunnersDiedError, open_jai
 from envhub_sandbox.transport.remote_warnings import MOST, RemoteWarnings
 from envhub_sandbox.transport.replies import check_reply, death, expect_reply, raised
 from envhub_sandbox.transport.results import Results
-from envhub_sandbox.transport.values import specs
+from envhub_sandbox.transport.values import descriptions
 from envhub_sandbox.transport.values.descriptions import DescriptionReader
 from envhub_sandbox.transport.values.generators import generator
 from envhub_sandbox.vector import from_manifest
@@ -275,7 +275,7 @@ def manifest(dice: Dice) -> None:
         usable((env.metadata, env.attributes, env.render_mode, env.suite, env.task))
         from_manifest.metadata(env)
         spec = from_manifest.spec(env, "a/b@c")
-        entry = f"{specs.__name__}:{specs.not_here.__name__}"
+        entry = f"{descriptions.__name__}:{descriptions.not_here.__name__}"
         demand(spec is None or spec.entry_point == entry, "an entry point of the worker's")
         for space in (env.single_observation_space, env.single_action_space):
             repr(space)

@@ -19,13 +19,13 @@ from typing import Any
 import zmq
 
 from envhub_sandbox.check.play import confinement
-from envhub_sandbox.crash import bundle_writer
 from envhub_sandbox.dependencies import environments, interpreters, modules, resolutions
 from envhub_sandbox.factory import make
 from envhub_sandbox.sandboxes import remote
 from envhub_sandbox.sandboxes.docker import sandbox
 from envhub_sandbox.session import env_session
 from envhub_sandbox.session.counters import Ledger
+from envhub_sandbox.session.crash import bundle_writer
 from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.jails import launcher as launcher_module
 from envhub_sandbox.session.jails.launcher import Launcher

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import VectorEnv
 
-from envhub_sandbox.rollouts.episodes import Episode, EpisodeCounter, RolloutError
+from envhub_sandbox.check.play.episodes import Episode, EpisodeCounter, RolloutError
 
 Env = VectorEnv[Any, Any, Any]
 _NOTED = 3

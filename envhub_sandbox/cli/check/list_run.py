@@ -35,7 +35,7 @@ from envhub_sandbox.cli.shared.memory import free_memory_bytes
 from envhub_sandbox.cli.version import versions
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.hub.snapshot import commit_of
-from envhub_sandbox.policy import policy_from
+from envhub_sandbox.settings.policy import policy_from
 from envhub_worker.protocol.text import duration_text, size_text
 
 if TYPE_CHECKING:

@@ -95,7 +95,7 @@ def doctor(
     refuses.
     """
     with reported(debug=debug):
-        from envhub_sandbox.policy import Policy
+        from envhub_sandbox.settings.policy import Policy
 
         Policy(profile=profile)  # refuses a name that there is not, before anything is tried
         if server is not None:
@@ -143,7 +143,7 @@ def _scratch_folder() -> Iterator[Path]:
     Raises:
         SandboxUnavailableError: There is no place for one.
     """
-    from envhub_sandbox.hub.store import CACHE_VARIABLE
+    from envhub_sandbox.hub.cache import CACHE_VARIABLE
 
     try:
         made = tempfile.TemporaryDirectory(prefix="envhub-doctor-")
@@ -170,7 +170,7 @@ def _cache_problem(*, by_others: bool) -> str | None:
     Args:
         by_others: Whether root's jails read it as another user: all but those with a private root.
     """
-    from envhub_sandbox.hub.store import cache_root
+    from envhub_sandbox.hub.cache import cache_root
 
     try:
         root = cache_root()
@@ -213,7 +213,7 @@ def engine() -> dict[str, Any]:
 
 def resources(problem: str | None) -> dict[str, Any]:
     """Bytes that are free: of memory, None where the kernel does not say, and for the cache."""
-    from envhub_sandbox.hub.store import cache_root
+    from envhub_sandbox.hub.cache import cache_root
 
     disk: dict[str, Any] = {"folder": None, "free_bytes": None, "problem": problem}
     with contextlib.suppress(SnapshotError):  # it is the problem
@@ -242,7 +242,7 @@ def probe() -> dict[str, Any]:
 
 def examine(folder: str, profile: str) -> Trial:
     """Run the idle environment under a profile."""
-    from envhub_sandbox.api import make_env
+    from envhub_sandbox.factory.make_env import make_env
 
     begun = time.perf_counter()
     try:

@@ -55,7 +55,7 @@ def _inspect(
     make: opt.MakeOptions, suites: list[str] | None, tasks: list[str] | None, *, as_json: bool
 ) -> None:
     arguments = make.arguments()
-    from envhub_sandbox.api import make_env
+    from envhub_sandbox.factory.make_env import make_env
 
     with ProgressBar(quiet=as_json) as bar, make.explained():
         bar.begin(f"loading {make.ref} in a sandbox")
@@ -70,7 +70,7 @@ def _inspect(
 
 def describe_env(suite: str, task: Any, env: Any) -> dict[str, Any]:
     """One environment as data. Trust: all of it is input from the worker."""
-    from envhub_sandbox.rollouts.episodes import autoreset_mode
+    from envhub_sandbox.check.play.episodes import autoreset_mode
 
     metadata = dict(getattr(env, "metadata", None) or {})
     metadata.pop("autoreset_mode", None)

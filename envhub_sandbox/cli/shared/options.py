@@ -16,7 +16,7 @@ import typer
 from envhub_sandbox.cli.shared.console import prints_on_stderr, safe_line
 from envhub_sandbox.cli.shared.exits import ForeignError, UsageError, reported
 from envhub_sandbox.errors import EnvHubError
-from envhub_sandbox.options import OPTIONS
+from envhub_sandbox.settings.options import OPTIONS
 from envhub_worker.protocol.text import parse_size
 
 if TYPE_CHECKING:

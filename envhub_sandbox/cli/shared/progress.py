@@ -10,13 +10,13 @@ from types import TracebackType
 from typing import TYPE_CHECKING
 
 from envhub_sandbox.cli.shared.console import console, safe_line, say
-from envhub_sandbox.dependencies.progress import progress_shown_by
+from envhub_sandbox.system.progress import progress_shown_by
 from envhub_worker.protocol.text import duration_text
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
-    from envhub_sandbox.rollouts.episodes import EpisodeCounter
+    from envhub_sandbox.check.play.episodes import EpisodeCounter
 
 _EVERY_S = 0.1
 

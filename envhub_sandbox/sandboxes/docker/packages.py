@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING
 from envhub_sandbox.dependencies.packages import HERE, PackageSet
 from envhub_sandbox.dependencies.request import PackageRequest
 from envhub_sandbox.errors import InterpreterUnavailableError, SandboxUnavailableError
-from envhub_sandbox.option_names import option_name
 from envhub_sandbox.sandboxes.docker.engines import (
     Engine,
     EngineError,
     find_image,
     own_limits,
 )
+from envhub_sandbox.settings.options import option_name
 
 if TYPE_CHECKING:
     from envhub_sandbox.dependencies.installed import InstalledPackage

@@ -21,8 +21,6 @@ from pathlib import Path
 from typing import cast
 
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerStartupError
-from envhub_sandbox.option_names import option_name
-from envhub_sandbox.policy import Policy
 from envhub_sandbox.sandboxes import runtime_folder
 from envhub_sandbox.sandboxes.docker import attestation, packages, run_arguments, seccomp_profile
 from envhub_sandbox.sandboxes.docker.engines import (
@@ -37,6 +35,8 @@ from envhub_sandbox.sandboxes.docker.run_arguments import Container
 from envhub_sandbox.sandboxes.local_server import LocalServer
 from envhub_sandbox.sandboxes.pool import ServerPool, ServerUse, WorkerServer
 from envhub_sandbox.sandboxes.sandbox import Sandbox
+from envhub_sandbox.settings.options import option_name
+from envhub_sandbox.settings.policy import Policy
 from envhub_sandbox.system import processes
 from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline

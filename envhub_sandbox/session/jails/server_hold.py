@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from envhub_sandbox.sandboxes.pool import ServerUse, WorkerServer
-from envhub_sandbox.transport.forks import Owner
+from envhub_sandbox.system.processes import Owner
 
 
 class ServerHold:

@@ -12,8 +12,8 @@ from collections.abc import Callable
 
 from envhub_sandbox.session.jails.launcher import Launcher
 from envhub_sandbox.session.jails.loaded import ExpectedManifest, LoadedJail
+from envhub_sandbox.system.processes import Owner
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.forks import Owner
 
 
 class JailSource:

@@ -18,8 +18,8 @@ from envhub_sandbox.cli.shared.options import (
     with_options,
 )
 from envhub_sandbox.errors import PolicyError, RemoteEnvError
-from envhub_sandbox.options import OPTIONS
-from envhub_sandbox.policy import policy_from
+from envhub_sandbox.settings.options import OPTIONS
+from envhub_sandbox.settings.policy import policy_from
 
 
 def options(**given: Any) -> MakeOptions:

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 
 from envhub_sandbox.dependencies import uv
+from envhub_sandbox.dependencies.locks import drift, lockfile, making, pylock
+from envhub_sandbox.dependencies.locks.fingerprint import fingerprint_of_spaces, fingerprint_of_task
+from envhub_sandbox.dependencies.locks.lockfile import LockFile, Runner, Spaces
+from envhub_sandbox.dependencies.locks.pylock import PylockPackage, Wheel
 from envhub_sandbox.dependencies.request import chosen
 from envhub_sandbox.errors import EnvHubError, LockDriftError, LockError, PackageIntegrityError
 from envhub_sandbox.hub.snapshot import local
-from envhub_sandbox.locks import drift, lockfile, making, pylock
-from envhub_sandbox.locks.fingerprint import fingerprint_of_spaces, fingerprint_of_task
-from envhub_sandbox.locks.lockfile import LockFile, Runner, Spaces
-from envhub_sandbox.locks.pylock import PylockPackage, Wheel
 from tests.support.wheels import WORKERS, Index, make_wheel, served
 
 A, B = "a" * 64, "b" * 64

@@ -13,11 +13,11 @@ from typing import Any
 import pytest
 
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerStartupError
-from envhub_sandbox.policy import Limits, Policy
 from envhub_sandbox.sandboxes.docker import attestation, engines, run_arguments, seccomp_profile
 from envhub_sandbox.sandboxes.docker.engines import Engine
 from envhub_sandbox.sandboxes.docker.run_arguments import Container
 from envhub_sandbox.sandboxes.docker.sandbox import ContainerServer, DockerSandbox
+from envhub_sandbox.settings.policy import Limits, Policy
 from envhub_worker.lockdown.seccomp import policy as seccomp_policy
 from envhub_worker.protocol.messages.surroundings import Surroundings
 from envhub_worker.protocol.runtime import Runtime

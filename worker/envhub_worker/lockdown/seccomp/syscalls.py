@@ -95,7 +95,9 @@ _COMMON = """
 
 
 def _numbered(names: str) -> dict[str, int]:
-    table = {name: number for number, name in enumerate(names.split()) if name != "-"}
+    table = {
+        name: syscall_number for syscall_number, name in enumerate(names.split()) if name != "-"
+    }
     return table | {name: _COMMON_FROM + n for n, name in enumerate(_COMMON.split())}
 
 

@@ -26,7 +26,7 @@ from envhub_sandbox.dependencies.builds.sources import Source, WheelOrigin, of_g
 from envhub_sandbox.dependencies.resolve import Lock, Target, torch_options
 from envhub_sandbox.errors import LockError, PackageIntegrityError
 from envhub_sandbox.hub.logins import without_login
-from envhub_sandbox.sources import toml
+from envhub_sandbox.hub.sources import toml
 
 MAX_CHARACTERS = 16 * 1024 * 1024
 MAX_PACKAGES = 2000

@@ -8,14 +8,14 @@ from typing import Any
 
 from envhub_sandbox.dependencies import interpreters
 from envhub_sandbox.dependencies.declared import WantedPackage, parse_requirement
+from envhub_sandbox.dependencies.locks import lockfile, pylock
+from envhub_sandbox.dependencies.locks.drift import with_files
+from envhub_sandbox.dependencies.locks.fingerprint import TaskFingerprint, fingerprint_of_task
+from envhub_sandbox.dependencies.locks.lockfile import LockFile, Runner, Spaces
 from envhub_sandbox.dependencies.request import Choice, request_of
 from envhub_sandbox.dependencies.resolutions import resolution_for
 from envhub_sandbox.errors import LockError
 from envhub_sandbox.hub.snapshot import Snapshot
-from envhub_sandbox.locks import lockfile, pylock
-from envhub_sandbox.locks.drift import with_files
-from envhub_sandbox.locks.fingerprint import TaskFingerprint, fingerprint_of_task
-from envhub_sandbox.locks.lockfile import LockFile, Runner, Spaces
 
 
 def locked(

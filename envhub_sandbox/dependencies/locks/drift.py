@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
+from envhub_sandbox.dependencies.locks.fingerprint import TaskFingerprint
+from envhub_sandbox.dependencies.locks.lockfile import LOCAL, LockFile, repository_of
+from envhub_sandbox.dependencies.locks.pylock import PylockPackage
 from envhub_sandbox.errors import LockDriftError
 from envhub_sandbox.hub.snapshot import Snapshot
-from envhub_sandbox.locks.fingerprint import TaskFingerprint
-from envhub_sandbox.locks.lockfile import LOCAL, LockFile, repository_of
-from envhub_sandbox.locks.pylock import PylockPackage
 from envhub_worker.protocol.text import printable
 
 _SHOWN = 30

@@ -13,7 +13,7 @@ from functools import cache
 from pathlib import Path
 
 from envhub_sandbox.hub.snapshot import Snapshot
-from envhub_sandbox.sources.parsing import ImportStatement, ParsedFile
+from envhub_sandbox.hub.sources.parsing import ImportStatement, ParsedFile
 
 Files = Mapping[str, ParsedFile | None]
 

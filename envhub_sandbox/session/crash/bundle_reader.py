@@ -17,10 +17,10 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from envhub_sandbox.crash.bundle_writer import FORMAT
 from envhub_sandbox.errors import BundleError, EnvHubError
 from envhub_sandbox.hub.reference import HubRef
-from envhub_sandbox.policy import Limits, Policy
+from envhub_sandbox.session.crash.bundle_writer import FORMAT
+from envhub_sandbox.settings.policy import Limits, Policy
 from envhub_sandbox.transport.values.tensors import to_tensor
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.inert import one_line

@@ -32,10 +32,10 @@ from typing import Any
 
 import numpy as np
 
-from envhub_sandbox.crash.history import RecordedRequest, Recording, Steps, encoded
 from envhub_sandbox.errors import WorkerDiedError, WorkerTimeoutError
 from envhub_sandbox.hub.logins import without_login
-from envhub_sandbox.policy import Policy, Timeouts
+from envhub_sandbox.session.crash.history import RecordedRequest, Recording, Steps, encoded
+from envhub_sandbox.settings.policy import Policy, Timeouts
 from envhub_sandbox.system import folders
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer

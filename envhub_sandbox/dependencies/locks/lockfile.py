@@ -16,12 +16,12 @@ from typing import Any
 
 from envhub_sandbox.dependencies.declared import parse_requirement
 from envhub_sandbox.dependencies.interpreters import Interpreter
+from envhub_sandbox.dependencies.locks import pylock
+from envhub_sandbox.dependencies.locks.fingerprint import TaskFingerprint
+from envhub_sandbox.dependencies.locks.pylock import PylockPackage, quoted, table
 from envhub_sandbox.dependencies.request import DATE
 from envhub_sandbox.errors import LockError, RequirementError
 from envhub_sandbox.hub.snapshot import Snapshot
-from envhub_sandbox.locks import pylock
-from envhub_sandbox.locks.fingerprint import TaskFingerprint
-from envhub_sandbox.locks.pylock import PylockPackage, quoted, table
 from envhub_sandbox.system.files import write_whole_file
 
 FORMAT = 1
