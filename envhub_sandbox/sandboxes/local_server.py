@@ -10,7 +10,7 @@ from pathlib import Path
 
 from envhub_sandbox.sandboxes.pool import WorkerServer
 from envhub_sandbox.sandboxes.runtime_folder import RuntimeFolder
-from envhub_sandbox.system.processes import Owner, has_ended
+from envhub_sandbox.system.processes import OwnerProcess, has_ended
 
 
 class LocalServer(WorkerServer):
@@ -30,7 +30,7 @@ class LocalServer(WorkerServer):
     stopped = True  # until there is something to stop
 
     def __init__(self, prefix: str, sockets: str, stop_s: float) -> None:
-        self._owner = Owner()
+        self._owner = OwnerProcess()
         self._stop_s = stop_s
         self._process: subprocess.Popen[bytes] | None = None
         self.process_fd = -1

@@ -25,7 +25,7 @@ from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.settings.policy import Policy
 from envhub_sandbox.system.log import WORKER
-from envhub_sandbox.system.processes import Owner
+from envhub_sandbox.system.processes import OwnerProcess
 from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.tcp import TcpServer
@@ -239,7 +239,7 @@ class RemoteServer(WorkerServer):
         self.endpoint = endpoint
         self.far = far
         self.uploading = threading.Lock()
-        self._owner = Owner()
+        self._owner = OwnerProcess()
         self._ended = False
         self._wakes: int | None
         self.process_fd, self._wakes = os.pipe()

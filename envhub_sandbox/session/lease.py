@@ -24,7 +24,7 @@ from envhub_sandbox.session.jails.retry_while_busy import (
 from envhub_sandbox.session.jails.sources import JailSource
 from envhub_sandbox.session.refusals import closed_during
 from envhub_sandbox.session.repository import Repository
-from envhub_sandbox.system.processes import Owner
+from envhub_sandbox.system.processes import OwnerProcess
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
 from envhub_sandbox.transport.lane import Lane
 from envhub_sandbox.transport.pace import PaceBook
@@ -75,7 +75,7 @@ class Lease:
         self._builder = Builder(jails, results)
         # interruption.md, rule 12: none gives back what another ends
         self._ending = threading.RLock()
-        self._owner = Owner()
+        self._owner = OwnerProcess()
         self._was_loaded = False
         self._startup: StartupDeadline | None = None
         self._release_server: Callable[[], None] = _nothing

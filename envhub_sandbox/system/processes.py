@@ -1,6 +1,6 @@
 """Processes of ours: whose this is, one that ends with its parent, whether a child has ended.
 
-``Owner`` is docs/internals/interruption.md, rule 14.
+``OwnerProcess`` is docs/internals/interruption.md, rule 14.
 
 A parent hands its child a pidfd of itself, which the child watches. The kernel's own signal at a
 parent's death would come when the thread ends that has started the child, and a change of user
@@ -22,7 +22,7 @@ from pathlib import Path
 _STREAMS = 3
 
 
-class Owner:
+class OwnerProcess:
     """The process that made this.
 
     Attributes:

@@ -19,7 +19,7 @@ from envhub_sandbox.errors import (
     WorkerTimeoutError,
 )
 from envhub_sandbox.settings.options import option_name
-from envhub_sandbox.system.processes import Owner, fork_error_text
+from envhub_sandbox.system.processes import OwnerProcess, fork_error_text
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.replies import expect_reply
 from envhub_sandbox.transport.tcp import TcpLink, TcpServer
@@ -78,7 +78,7 @@ class WorkerConnection:
         limits: WireLimits = DEFAULT_LIMITS,
         far: TcpServer | None = None,
     ) -> None:
-        self._owner = Owner()
+        self._owner = OwnerProcess()
         self._limits = limits
         self._ids = itertools.count(1)
         self._socket = _context().socket(zmq.DEALER)

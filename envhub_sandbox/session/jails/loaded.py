@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from envhub_sandbox.sandboxes.pool import ServerUse, WorkerServer
-from envhub_sandbox.system.processes import Owner
+from envhub_sandbox.system.processes import OwnerProcess
 from envhub_sandbox.transport.jail import JailHandle
 from envhub_worker.protocol.manifest.manifest import EnvManifest, Manifest
 
@@ -57,7 +57,7 @@ class LoadedJail:
     ended: bool = False
     closed: bool = False
     changed: bool = False
-    owner: Owner = field(default_factory=Owner)
+    owner: OwnerProcess = field(default_factory=OwnerProcess)
 
     @property
     def server(self) -> WorkerServer:

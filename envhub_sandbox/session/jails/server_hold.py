@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from envhub_sandbox.sandboxes.pool import ServerUse, WorkerServer
-from envhub_sandbox.system.processes import Owner
+from envhub_sandbox.system.processes import OwnerProcess
 
 
 class ServerHold:
@@ -35,7 +35,7 @@ class ServerHold:
         self._on_empty = on_empty
         # interruption.md, rule 12
         self._lock = threading.RLock()
-        self._owner = Owner()
+        self._owner = OwnerProcess()
         self._open: set[object] = set()
         self._use: ServerUse[Any] | None = None
         self._left: list[ServerUse[Any]] = []

@@ -12,7 +12,7 @@ from collections.abc import Callable
 
 from envhub_sandbox.session.jails.launcher import Launcher
 from envhub_sandbox.session.jails.loaded import ExpectedManifest, LoadedJail
-from envhub_sandbox.system.processes import Owner
+from envhub_sandbox.system.processes import OwnerProcess
 from envhub_sandbox.transport.deadline import Deadline
 
 
@@ -64,7 +64,7 @@ class SharedJail(JailSource):
     def __init__(self, launcher: Launcher, forget_manifest: Callable[[], None]) -> None:
         super().__init__(launcher, forget_manifest)
         self._lock = threading.RLock()  # interruption.md, rule 12
-        self._owner = Owner()
+        self._owner = OwnerProcess()
         self._first: LoadedJail | None = None
         self._users: weakref.WeakSet[LoadedJail] = weakref.WeakSet()
 
