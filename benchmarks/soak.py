@@ -29,7 +29,7 @@ import numpy as np
 import psutil
 
 from envhub_sandbox import errors, make_env
-from envhub_sandbox.session.survival.revived_rows import RESTARTED
+from envhub_sandbox.session.survival.recovery import RESTARTED
 from envhub_sandbox.session.survival.seeds import derived_seed
 from tests.support import inside
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from benchmarks.load import Patience
 from envhub_sandbox import make_env
-from envhub_sandbox.transport.connection import WorkerClient
+from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import open_jail
 from tests.support import inside
@@ -45,7 +45,7 @@ class Warm:
     def spawn(self) -> float:
         """Milliseconds until a worker is confined, has tried its denials and reports."""
         limits, server = self._launcher.repository.wire_limits, self._server
-        client = WorkerClient(server.endpoint, server.process_fd, limits)
+        client = WorkerConnection(server.endpoint, server.process_fd, limits)
         client.hello(Deadline(_LONG_S))
         self._patience.wait()
         order = inside.order(self._launcher)

@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from envhub_sandbox import errors as errors
-    from envhub_sandbox.api import make_env as make_env
-    from envhub_sandbox.gym import SandboxEnv as SandboxEnv
+    from envhub_sandbox.factory.make_env import make_env as make_env
     from envhub_sandbox.hub.reference import HubRef as HubRef
-    from envhub_sandbox.policy import Limits as Limits
-    from envhub_sandbox.policy import Policy as Policy
-    from envhub_sandbox.policy import Timeouts as Timeouts
+    from envhub_sandbox.integrations.gym import SandboxEnv as SandboxEnv
     from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox as DockerSandbox
     from envhub_sandbox.sandboxes.remote import RemoteSandbox as RemoteSandbox
+    from envhub_sandbox.settings.policy import Limits as Limits
+    from envhub_sandbox.settings.policy import Policy as Policy
+    from envhub_sandbox.settings.policy import Timeouts as Timeouts
     from envhub_sandbox.vector.suites import EnvSuites as EnvSuites
     from envhub_sandbox.vector.vector_env import SandboxVectorEnv as SandboxVectorEnv
 
@@ -31,14 +31,14 @@ _HOMES = {
     "DockerSandbox": "sandboxes.docker.sandbox",
     "EnvSuites": "vector.suites",
     "HubRef": "hub.reference",
-    "Limits": "policy",
-    "Policy": "policy",
+    "Limits": "settings.policy",
+    "Policy": "settings.policy",
     "RemoteSandbox": "sandboxes.remote",
-    "SandboxEnv": "gym",
+    "SandboxEnv": "integrations.gym",
     "SandboxVectorEnv": "vector.vector_env",
-    "Timeouts": "policy",
+    "Timeouts": "settings.policy",
     "errors": "errors",
-    "make_env": "api",
+    "make_env": "factory.make_env",
 }
 
 __all__ = [*_HOMES]

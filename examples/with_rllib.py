@@ -18,7 +18,9 @@ CARTPOLE = str(Path(__file__).with_name("cartpole"))
 if __name__ == "__main__":
     ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False)
     for mode in ("sync", "vector_entry_point"):
-        config = PPOConfig().environment("envhub_sandbox.gym:Hub-v0", env_config={"ref": CARTPOLE})
+        config = PPOConfig().environment(
+            "envhub_sandbox.integrations.gym:Hub-v0", env_config={"ref": CARTPOLE}
+        )
         config.env_runners(
             num_env_runners=0, num_envs_per_env_runner=2, gym_env_vectorize_mode=mode
         )

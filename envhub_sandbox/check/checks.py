@@ -1,4 +1,4 @@
-"""What is judged: each check once, what it means, and what cures it.
+"""The table of checks: each once, what it means, and what cures it.
 
 The checks, their reports and ``docs/checks.md`` are all of this table.
 """

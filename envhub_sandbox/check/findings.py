@@ -1,4 +1,4 @@
-"""What was found, and what follows from it."""
+"""``Finding`` and ``Report``: what checks found, how severe it is, and the verdict."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Asks a repository every question of the table, and runs it in the sandbox for that.
+"""Judges a repository: makes every check of the table, and runs it in the sandbox for that.
 
 What it answers is hostile: a report says what was seen from outside, and a check passes because
 our own comparison found nothing, never because the repository says so.
@@ -17,7 +17,6 @@ from typing import Any
 from gymnasium.error import CustomSpaceError
 
 from envhub_sandbox import __version__
-from envhub_sandbox.api import make_env
 from envhub_sandbox.check.checks import CHECKS
 from envhub_sandbox.check.findings import Report
 from envhub_sandbox.check.play.confinement import Confinement, denial_findings
@@ -26,7 +25,7 @@ from envhub_sandbox.check.settings import JudgeOptions
 from envhub_sandbox.check.static.static import undeclared
 from envhub_sandbox.check.static.survey import survey
 from envhub_sandbox.dependencies.declared import declared
-from envhub_sandbox.dependencies.pipeline import packages_for
+from envhub_sandbox.dependencies.packages import packages_for
 from envhub_sandbox.dependencies.request import chosen
 from envhub_sandbox.errors import (
     DependencyError,
@@ -43,10 +42,11 @@ from envhub_sandbox.errors import (
     WorkerDiedError,
     WorkerTimeoutError,
 )
-from envhub_sandbox.hub.snapshot import Snapshot, named
-from envhub_sandbox.policy import policy_from
+from envhub_sandbox.factory.make_env import make_env
+from envhub_sandbox.hub.snapshot import Snapshot, snapshot_named
+from envhub_sandbox.hub.sources import imports, parsing
 from envhub_sandbox.session.recipe import pinned
-from envhub_sandbox.sources import imports, parsing
+from envhub_sandbox.settings.policy import policy_from
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_worker.protocol.text import size_text
 
@@ -74,7 +74,7 @@ def judge(asked: JudgeOptions, report: Report | None = None) -> Report:
     """
     asked.tell(f"reading {asked.reference}")
     where = {name: asked.arguments.get(name) for name in ("hub_cache_dir", "token", "endpoint")}
-    snapshot = named(asked.reference, **where)
+    snapshot = snapshot_named(asked.reference, **where)
     report = Report(asked.reference) if report is None else report
     report.reference, report.commit = pinned(snapshot), snapshot.commit
     judging = _Judge(asked, snapshot, report)

@@ -20,7 +20,7 @@ from envhub_sandbox.cli.init.init import init
 from envhub_sandbox.cli.inspect.inspect import inspect
 from envhub_sandbox.cli.shared.console import guarded
 from envhub_sandbox.cli.shared.exits import EXIT_CODES
-from envhub_sandbox.option_names import on_command_line, use_option_names
+from envhub_sandbox.settings.options import on_command_line, use_option_names
 
 _COMMANDS: dict[str, Callable[..., None]] = {
     "run": run.run,

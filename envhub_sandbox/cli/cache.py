@@ -52,9 +52,9 @@ class StoredSnapshot:
 
 def stored_snapshots() -> list[StoredSnapshot]:
     """Everything in the store, the latest used first. Nothing is verified."""
-    from envhub_sandbox.hub import store
+    from envhub_sandbox.hub.cache import cache_root
 
-    folder = store.cache_root() / "snapshots"
+    folder = cache_root() / "snapshots"
     records = [*folder.glob("local/*/record.json"), *folder.glob("*/*/*/record.json")]
     found = [_read(record) for record in records]
     return sorted((one for one in found if one is not None), key=lambda one: -one.used)
@@ -84,20 +84,20 @@ def list_(
 ) -> None:
     """List snapshots, and the environments of their packages, the latest used first."""
     from envhub_sandbox.dependencies import environments
-    from envhub_sandbox.hub import store
+    from envhub_sandbox.hub.cache import cache_root
 
     found, made = stored_snapshots(), environments.every()
     if json:
         own = _documents(found, repository="repository", commit="commit", revision="revision")
         theirs = _documents(made, name="key", python="python", version="version", packages="pins")
-        folder = str(store.cache_root())
+        folder = str(cache_root())
         print_json({"folder": folder, "snapshots": own, "environments": theirs})
         return
     if found:
         _print(found)
     if made:
         _print_environments(made)
-    say(f"{_told(found, made)}, in {store.cache_root()}")
+    say(f"{_told(found, made)}, in {cache_root()}")
 
 
 def _told(found: list[StoredSnapshot], made: list[Environment]) -> str:
@@ -153,17 +153,17 @@ def remove(
     ] = False,
     unused_for: Annotated[
         float | None,
-        typer.Option(metavar="DAYS", min=0, help="What was not used for so long."),
+        typer.Option(metavar="DAYS", min=0, help="Those that were not used for so many days."),
     ] = None,
 ) -> None:
-    """Remove snapshots and environments, and what was left half-made. Not while one is used."""
+    """Remove snapshots, environments and unfinished remains; what is in use stays."""
     from envhub_sandbox.dependencies import environments
-    from envhub_sandbox.hub import store
+    from envhub_sandbox.hub.cache import cache_root
 
     found, made = stored_snapshots(), environments.every()
     if everything:
         for folder in ("manifests", "resolutions"):
-            shutil.rmtree(store.cache_root() / folder, ignore_errors=True)
+            shutil.rmtree(cache_root() / folder, ignore_errors=True)
     else:
         found, made = _chosen(found, made, names or [], unused_for)
     kept = {one.commit: why for one in found if (why := _users_of(one))}

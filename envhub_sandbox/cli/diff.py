@@ -10,13 +10,13 @@ from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import print_json, say, show
 from envhub_sandbox.cli.shared.exits import Exit
 from envhub_sandbox.cli.shared.findings import FailOn, level, show_finding
-from envhub_sandbox.cli.shared.progress import Bar
+from envhub_sandbox.cli.shared.progress import ProgressBar
 from envhub_worker.protocol.text import counted
 
 if TYPE_CHECKING:
     from envhub_sandbox.check.static.changes import Change
+    from envhub_sandbox.dependencies.locks.fingerprint import TaskFingerprint
     from envhub_sandbox.hub.snapshot import Snapshot
-    from envhub_sandbox.locks.fingerprint import Task
 
 _MARKS = {"new": "+", "gone": "-", "changed": "~", "renamed": ">"}
 
@@ -26,9 +26,11 @@ def diff(
     *,
     then: Annotated[
         str,
-        typer.Argument(metavar="REF_A", help="What is known: org/repo@commit, or a folder."),
+        typer.Argument(
+            metavar="REF_A", help="The commit that is known: org/repo@commit, or a folder."
+        ),
     ],
-    now: Annotated[str, typer.Argument(metavar="REF_B", help="What is to be judged.")],
+    now: Annotated[str, typer.Argument(metavar="REF_B", help="The commit to compare with it.")],
     run: Annotated[
         bool,
         typer.Option("--run", help="Load both, each in a sandbox, and compare tasks and spaces."),
@@ -49,7 +51,7 @@ def diff(
     from envhub_sandbox.check.static import changes
     from envhub_sandbox.check.static.static import static
 
-    with Bar(quiet=json) as bar:
+    with ProgressBar(quiet=json) as bar:
         read = []
         for ref in (then, now):
             bar.begin(f"reading {ref}")
@@ -72,13 +74,15 @@ def diff(
         raise typer.Exit(Exit.ENVIRONMENT)
 
 
-def _tasks(snapshot: Snapshot, env_kwargs: dict[str, Any], hub: dict[str, Any]) -> tuple[Task, ...]:
-    from envhub_sandbox.api import make_env
-    from envhub_sandbox.locks.making import tasks_of
+def _tasks(
+    snapshot: Snapshot, env_kwargs: dict[str, Any], hub: dict[str, Any]
+) -> tuple[TaskFingerprint, ...]:
+    from envhub_sandbox.dependencies.locks import making
+    from envhub_sandbox.factory.make_env import make_env
     from envhub_sandbox.session.recipe import pinned
 
     with make_env(pinned(snapshot), env_kwargs=env_kwargs, **hub) as suites:
-        return tasks_of(suites)
+        return making.tasks_of(suites)
 
 
 def _print(then: str, now: str, found: list[Change]) -> None:

@@ -9,7 +9,7 @@ import typer
 
 from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import out, print_json, safe_line, say
-from envhub_sandbox.cli.shared.progress import Bar
+from envhub_sandbox.cli.shared.progress import ProgressBar
 from envhub_worker.protocol.text import counted
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ def build(
     Its packages are pinned with hashes, wheels only: nothing of the repository runs. The image is
     tagged by the hash of all that it is made of, so the same again costs nothing.
     """
-    with Bar(quiet=json) as bar:
+    with ProgressBar(quiet=json) as bar:
         bar.begin(f"reading {ref}")
         snapshot = make.snapshot(ref)
         bar.begin("resolving and building")

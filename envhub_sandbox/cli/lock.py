@@ -14,13 +14,13 @@ import typer
 from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import out, print_json, safe_line, say
 from envhub_sandbox.cli.shared.exits import UsageError
-from envhub_sandbox.cli.shared.progress import Bar
+from envhub_sandbox.cli.shared.progress import ProgressBar
 from envhub_worker.protocol.text import counted
 
 if TYPE_CHECKING:
+    from envhub_sandbox.dependencies.locks.lockfile import LockFile
     from envhub_sandbox.dependencies.request import Choice
     from envhub_sandbox.hub.snapshot import Snapshot
-    from envhub_sandbox.locks.lockfile import LockFile
 
 Output = Annotated[
     Path | None,
@@ -35,7 +35,7 @@ NoSpaces = Annotated[
     bool,
     typer.Option(
         "--no-spaces",
-        help="Run nothing: the lock then says nothing of what the environments look like.",
+        help="Run nothing, and leave the environments' spaces out.",
     ),
 ]
 
@@ -60,9 +60,9 @@ def lock(
     The packages are those of an environment of its own. To see its spaces the repository is loaded,
     in the sandbox.
     """
-    with Bar(quiet=json) as bar:
+    with ProgressBar(quiet=json) as bar:
         bar.begin(f"locking {ref}")
-        from envhub_sandbox.locks import drift, lockfile, making
+        from envhub_sandbox.dependencies.locks import drift, lockfile, making
 
         snapshot = make.snapshot(ref)
         path = _path(output, snapshot)
@@ -85,8 +85,8 @@ def verify(
         str | None,
         typer.Argument(
             metavar="[REF]",
-            help="What is held against it; by default the commit that was locked. A branch says "
-            "whether that has moved on. A folder has to be named.",
+            help="What to compare with it; by default the commit that was locked. A branch says "
+            "whether it has moved on. A folder has to be named.",
         ),
     ] = None,
     no_spaces: NoSpaces = False,
@@ -100,9 +100,9 @@ def verify(
 
     Files, the packages on the index, Python, and, except with --no-spaces, its spaces.
     """
-    with Bar(quiet=json) as bar:
+    with ProgressBar(quiet=json) as bar:
         bar.begin(f"verifying {file}")
-        from envhub_sandbox.locks import drift, lockfile
+        from envhub_sandbox.dependencies.locks import drift, lockfile
 
         locked = lockfile.read(file)
         snapshot = make.snapshot(_reference(ref, locked, file))
@@ -138,14 +138,14 @@ def _old(path: Path, upgrade: bool) -> LockFile | None:
             f"there is {path} already. 'envhub lock --upgrade' chooses again and shows what "
             "differs, 'envhub verify' says whether it still holds"
         )
-    from envhub_sandbox.locks import lockfile
+    from envhub_sandbox.dependencies.locks import lockfile
 
     return lockfile.read(path)
 
 
 def _choice(given: Any, old: LockFile | None) -> Choice:
+    from envhub_sandbox.dependencies.locks import making
     from envhub_sandbox.dependencies.request import chosen
-    from envhub_sandbox.locks import making
 
     if given == "auto":
         return chosen({}, None)[0] if old is None else making.again(old)
@@ -167,8 +167,8 @@ def _with_spaces(
     made: LockFile, snapshot: Snapshot, env_kwargs: dict[str, Any], hub: dict[str, Any]
 ) -> LockFile:
     """The lock with what its repository returns, in the sandbox and in its own environment."""
-    from envhub_sandbox.api import make_env
-    from envhub_sandbox.locks import lockfile, making
+    from envhub_sandbox.dependencies.locks import lockfile, making
+    from envhub_sandbox.factory.make_env import make_env
     from envhub_sandbox.session.recipe import pinned
 
     with tempfile.TemporaryDirectory(prefix="envhub-lock-") as folder:
@@ -179,7 +179,7 @@ def _with_spaces(
 
 
 def _reference(ref: str | None, locked: LockFile, file: Path) -> str:
-    from envhub_sandbox.locks import lockfile
+    from envhub_sandbox.dependencies.locks import lockfile
 
     found = ref or lockfile.reference_of(locked)
     if found is None:
@@ -189,8 +189,8 @@ def _reference(ref: str | None, locked: LockFile, file: Path) -> str:
 
 def _now(locked: LockFile, snapshot: Snapshot, *, no_index: bool) -> LockFile:
     from envhub_sandbox.dependencies import interpreters
-    from envhub_sandbox.locks import lockfile, making
-    from envhub_sandbox.locks.drift import with_files
+    from envhub_sandbox.dependencies.locks import lockfile, making
+    from envhub_sandbox.dependencies.locks.drift import with_files
 
     here = lockfile.Runner.of(interpreters.find(locked.runner.python))
     now = replace(with_files(locked, snapshot), runner=here)
@@ -208,7 +208,7 @@ def _spaces_again(
 def _print(
     path: Path, made: LockFile, changes: list[str], was_there: bool, *, as_json: bool
 ) -> None:
-    from envhub_sandbox.locks import lockfile
+    from envhub_sandbox.dependencies.locks import lockfile
 
     if as_json:
         packages = [f"{one.name}=={one.version}" for one in made.packages]

@@ -8,7 +8,7 @@ import typer
 
 from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import out, print_json, safe_line, say
-from envhub_sandbox.cli.shared.progress import Bar
+from envhub_sandbox.cli.shared.progress import ProgressBar
 from envhub_worker.protocol.text import counted, size_text
 
 if TYPE_CHECKING:
@@ -30,7 +30,7 @@ def prefetch(
 
     Afterwards the printed reference works without network.
     """
-    with Bar(quiet=json) as bar:
+    with ProgressBar(quiet=json) as bar:
         bar.begin(f"reading {ref}")
         snapshot = make.snapshot(ref)
         given, lock = make["dependencies"], make["lock"]
@@ -46,7 +46,7 @@ def prefetch(
 
 
 def _environment(snapshot: Snapshot, given: Any, upgrade: bool) -> Environment | None:
-    from envhub_sandbox.dependencies.pipeline import ThisMachine, packages_for
+    from envhub_sandbox.dependencies.packages import ThisMachine, packages_for
     from envhub_sandbox.dependencies.request import chosen
 
     choice, _ = chosen(given, None)
@@ -55,7 +55,7 @@ def _environment(snapshot: Snapshot, given: Any, upgrade: bool) -> Environment |
 
 
 def _of_lock(snapshot: Snapshot, lock: str, given: Any) -> Environment | None:
-    from envhub_sandbox.locks import use
+    from envhub_sandbox.dependencies.locks import use
 
     return use.provided(snapshot, use.opened(lock, "process", None, given)).environment
 

@@ -11,7 +11,7 @@ import typer
 from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import out, print_json, safe_line, say
 from envhub_sandbox.cli.shared.exits import UsageError
-from envhub_sandbox.cli.shared.progress import Bar
+from envhub_sandbox.cli.shared.progress import ProgressBar
 from envhub_worker.protocol.text import counted
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def push(
         str, typer.Option("--message", "-m", help="The commit's message.")
     ] = "Publish the environment with envhub",
     private: Annotated[
-        bool, typer.Option("--private", help="A repository that is made is private.")
+        bool, typer.Option("--private", help="If the repository is new, make it private.")
     ] = False,
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Check, say what would be uploaded, and stop.")
@@ -63,7 +63,7 @@ def push(
 
     target = HubRef.parse(ref)
     others: list[str] = []
-    with Bar(quiet=json) as bar:
+    with ProgressBar(quiet=json) as bar:
         bar.begin(f"reading {folder}")
         snapshot = local(folder)
         _refuse_unfit(snapshot)
@@ -103,7 +103,7 @@ def _check(folder: str, snapshot: Snapshot, options: dict[str, Any]) -> None:
         EnvHubError: It does not load, or breaks a rule.
         UsageError: The folder was changed meanwhile.
     """
-    from envhub_sandbox.api import make_env
+    from envhub_sandbox.factory.make_env import make_env
 
     with make_env(folder, n_envs=2, validate=True, **options) as suites:
         for env in suites.envs():
@@ -138,7 +138,7 @@ def _publish(
     from envhub_sandbox.errors import SnapshotIntegrityError
     from envhub_sandbox.hub.client import HubClient, Repository, checked_endpoint, checked_token
     from envhub_sandbox.hub.hashing import differing
-    from envhub_sandbox.hub.listing import DEFAULT_LIMITS, within_limits
+    from envhub_sandbox.hub.listing import DEFAULT_LIMITS, listing_within_limits
 
     hub = HubClient(checked_endpoint(make["endpoint"]), checked_token(make["token"]))
     repo = Repository(target.repo_type or "model", target.repo_id)
@@ -148,7 +148,7 @@ def _publish(
         hub.publish(repo, snapshot.root, target.revision, message, private=private)
     with _explained(f"{where}: it was published, and cannot be read back"):
         commit = hub.resolve(repo, target.revision)
-        found = within_limits(hub.listing(repo, commit), DEFAULT_LIMITS, where)
+        found = listing_within_limits(hub.listing(repo, commit), DEFAULT_LIMITS, where)
     missing = differing(snapshot.root, snapshot.files, found)
     if missing:
         raise SnapshotIntegrityError(

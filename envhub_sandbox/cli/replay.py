@@ -1,4 +1,4 @@
-"""``envhub replay``: does it die again?"""
+"""``envhub replay``: repeat what a crash bundle holds, and say whether the jail dies again."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import typer
 from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import out, print_json, safe_line, safe_text, say
 from envhub_sandbox.cli.shared.exits import Exit, UsageError
-from envhub_sandbox.cli.shared.progress import Bar
+from envhub_sandbox.cli.shared.progress import ProgressBar
 
 if TYPE_CHECKING:
-    from envhub_sandbox.crash.bundle_reader import Bundle
-    from envhub_sandbox.crash.replay import ReplayResult
+    from envhub_sandbox.session.crash.bundle_reader import Bundle
+    from envhub_sandbox.session.crash.replay import ReplayResult
 
 BundleFolder = Annotated[
     Path,
@@ -66,8 +66,8 @@ class _Replay:
 
     def execute(self) -> None:
         """Read, check, repeat, print; the exit code is the verdict."""
-        from envhub_sandbox.crash.bundle_reader import load_bundle
-        from envhub_sandbox.crash.replay import Verdict
+        from envhub_sandbox.session.crash.bundle_reader import load_bundle
+        from envhub_sandbox.session.crash.replay import Verdict
 
         bundle = load_bundle(self._folder)
         self._refuse_wishes(bundle)
@@ -76,14 +76,14 @@ class _Replay:
         place = bundle.arguments.get("sandbox")
         if place != self._sandbox:
             say(f"It died in sandbox {safe_line(place)}; this is sandbox {self._sandbox}.")
-        with Bar(quiet=self._as_json) as bar:
+        with ProgressBar(quiet=self._as_json) as bar:
             replayed = self._run(bundle, bar)
         self._print(bundle, replayed)
         codes = {Verdict.SAME: Exit.OK, Verdict.DIFFERENT: Exit.DIFFERENT}
         raise typer.Exit(codes.get(replayed.verdict, Exit.SURVIVED))
 
     def _refuse_wishes(self, bundle: Bundle) -> None:
-        from envhub_sandbox.crash.bundle_reader import wishes
+        from envhub_sandbox.session.crash.bundle_reader import wishes
 
         wanted = [wish for wish in wishes(bundle) if wish.partition("=")[0] not in self._given]
         if wanted and not self._grant:
@@ -92,17 +92,17 @@ class _Replay:
                 "yours, or you trust where the bundle comes from, add --grant"
             )
 
-    def _run(self, bundle: Bundle, bar: Bar) -> ReplayResult:
-        from envhub_sandbox.crash.replay import replay
+    def _run(self, bundle: Bundle, bar: ProgressBar) -> ReplayResult:
+        from envhub_sandbox.session.crash.replay import replay
 
         bar.begin(f"loading {safe_line(bundle.label)}")
         with contextlib.ExitStack() as stack:
             return replay(lambda: self._make(bundle, bar, stack), bundle)
 
-    def _make(self, bundle: Bundle, bar: Bar, stack: contextlib.ExitStack) -> Any:
+    def _make(self, bundle: Bundle, bar: ProgressBar, stack: contextlib.ExitStack) -> Any:
         """The environment that the bundle is about; None if it is about ``make_env`` alone."""
-        from envhub_sandbox.api import make_env
-        from envhub_sandbox.crash.replay import changed_files
+        from envhub_sandbox.factory.make_env import make_env
+        from envhub_sandbox.session.crash.replay import changed_files
         from envhub_sandbox.session.recipe import Recipe
 
         recipe = Recipe(
@@ -132,7 +132,7 @@ class _Replay:
         return env
 
     def _options(self, bundle: Bundle) -> dict[str, Any]:
-        from envhub_sandbox.crash.bundle_reader import replayed_arguments
+        from envhub_sandbox.session.crash.bundle_reader import replayed_arguments
 
         options = replayed_arguments(bundle, granted=self._grant)
         given = dict(self._given)

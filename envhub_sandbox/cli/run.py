@@ -16,7 +16,7 @@ import typer
 from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import out, print_json, safe_line, safe_text, say
 from envhub_sandbox.cli.shared.exits import code_for, describe
-from envhub_sandbox.cli.shared.progress import Bar
+from envhub_sandbox.cli.shared.progress import ProgressBar
 from envhub_sandbox.cli.shared.results import (
     TaskResult,
     print_provenance,
@@ -24,11 +24,11 @@ from envhub_sandbox.cli.shared.results import (
     task_document,
 )
 from envhub_sandbox.errors import EnvHubError
-from envhub_sandbox.options import OPTIONS
+from envhub_sandbox.settings.options import OPTIONS
 
 if TYPE_CHECKING:
-    from envhub_sandbox.rollouts.episodes import EpisodeCounter, Rollout
-    from envhub_sandbox.rollouts.video import VideoWriter
+    from envhub_sandbox.check.play.episodes import EpisodeCounter, Rollout
+    from envhub_sandbox.check.play.video import VideoWriter
 
 
 Verbose = Annotated[
@@ -122,25 +122,25 @@ class _Run:
         """Run, print what there is to print even if it fails midway, and raise what failed."""
         try:
             if self.video is not None:
-                from envhub_sandbox.rollouts.video import check_target
+                from envhub_sandbox.check.play.video import check_target
 
                 check_target(self.video)
-            with Bar(quiet=self.as_json) as bar, self.make.explained():
+            with ProgressBar(quiet=self.as_json) as bar, self.make.explained():
                 self._run(bar)
         except EnvHubError as error:
             self._print(error)
             raise
         self._print(None)
 
-    def _run(self, bar: Bar) -> None:
+    def _run(self, bar: ProgressBar) -> None:
         arguments = self.make.arguments()
         bar.begin(f"loading {self.make.ref}")
-        from envhub_sandbox.api import make_env
+        from envhub_sandbox.factory.make_env import make_env
 
         with make_env(**arguments) as envs:
             self.make_env_s = time.perf_counter() - self.begun
             try:
-                chosen = opt.select(envs, self.suites, self.tasks)
+                chosen = opt.select_envs(envs, self.suites, self.tasks)
                 for number, (suite, task, env) in enumerate(chosen, start=1):
                     video = self.video
                     if video is not None and len(chosen) > 1:
@@ -152,14 +152,14 @@ class _Run:
                 self.provenance = envs.provenance
 
     def _play_task(
-        self, bar: Bar, suite: str, task: int | str, env: Any, video: Path | None
+        self, bar: ProgressBar, suite: str, task: int | str, env: Any, video: Path | None
     ) -> TaskResult:
-        from envhub_sandbox.rollouts.episodes import autoreset_mode
+        from envhub_sandbox.check.play.episodes import autoreset_mode
 
         if video is None:
             rollout = self._roll_out(env, bar, None)
         else:
-            from envhub_sandbox.rollouts.video import VideoWriter, fps_of
+            from envhub_sandbox.check.play.video import VideoWriter, fps_of
 
             with VideoWriter(video, fps_of(env.metadata)) as writer:
                 rollout = self._roll_out(env, bar, writer)
@@ -172,9 +172,9 @@ class _Run:
             video=None if video is None else str(video),
         )
 
-    def _roll_out(self, env: Any, bar: Bar, writer: VideoWriter | None) -> Rollout:
-        from envhub_sandbox.rollouts.episodes import rollout
-        from envhub_sandbox.rollouts.video import frame_of
+    def _roll_out(self, env: Any, bar: ProgressBar, writer: VideoWriter | None) -> Rollout:
+        from envhub_sandbox.check.play.episodes import rollout
+        from envhub_sandbox.check.play.video import frame_of
 
         filming = writer is not None
 

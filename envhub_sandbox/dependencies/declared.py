@@ -23,8 +23,8 @@ from packaging.utils import canonicalize_name
 
 from envhub_sandbox.dependencies.builds.sources import of_git
 from envhub_sandbox.errors import RequirementError
-from envhub_sandbox.option_names import option_name
-from envhub_sandbox.sources import toml
+from envhub_sandbox.hub.sources import toml
+from envhub_sandbox.settings.options import option_name
 
 PROJECT = "pyproject.toml"
 MAX_BYTES = 256 * 1024

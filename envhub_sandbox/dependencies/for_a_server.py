@@ -1,9 +1,9 @@
 """The program by which ``envhub-worker listen --dependencies`` makes clients' packages.
 
 ``python -I -m envhub_sandbox.dependencies.for_a_server --server-pidfd=N``: stdin is one order as
-JSON, stdout a file that holds what there is to say at any time, as one object of JSON: ``told``, a
-line of progress; and at the end ``own``, ``made``, or ``error`` and ``said``. With the word
-``check`` it only says whether it could work.
+JSON, stdout a file that holds the present state, as one object of JSON: ``progress``, a line for
+people; and at the end ``own``, ``made``, or ``error`` and ``said``. With the word ``check`` it only
+says whether it could work.
 
 An order comes from a client on another host, and nothing of it is believed: requirements are
 read as a stranger's file is. What is made lies in a folder of that client's key, uv's cache
@@ -32,7 +32,7 @@ from envhub_sandbox.dependencies import (
     bounds,
     environments,
     interpreters,
-    pipeline,
+    packages,
     resolutions,
     uv,
 )
@@ -97,9 +97,9 @@ def _made(order: Mapping[str, Any], ended: int | None) -> dict[str, Any]:
     request = _request(order)
     # a client could have it ask any host that it reaches, and what a build takes is in no account
     resolutions.BUILDER = None
-    if not request.always and pipeline.HERE.meets(request):
+    if not request.always and packages.HERE.meets(request):
         return {"own": True}
-    made = pipeline.HERE.make(request, lambda line: _say({"told": line[:_WHERE_CHARS]}))
+    made = packages.HERE.make(request, lambda line: _say({"progress": line[:_WHERE_CHARS]}))
     assert made.environment is not None
     return {
         "made": {

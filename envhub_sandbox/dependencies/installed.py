@@ -45,7 +45,7 @@ def first_unmet(
     hashed = next((one for one in request.wanted if one.hashes or one.requirement.url), None)
     if hashed is not None:
         return str(hashed.requirement)
-    there_or_here = _Installed() if there is None else _Installed(there, found)
+    there_or_here = _InstalledPackages() if there is None else _InstalledPackages(there, found)
     for wanted, met_by in there_or_here.reached(one.requirement for one in request.wanted):
         if met_by is None or not _is_among(met_by, wanted.specifier):
             return str(wanted)
@@ -54,11 +54,11 @@ def first_unmet(
 
 def brought(requirements: Iterable[Requirement]) -> list[metadata.Distribution]:
     """What this interpreter has of these, whichever version, and of all that they lead to."""
-    found = (one for _, one in _Installed().reached(requirements))
+    found = (one for _, one in _InstalledPackages().reached(requirements))
     return [one for one in found if isinstance(one, metadata.Distribution)]
 
 
-class _Installed:
+class _InstalledPackages:
     """What an interpreter has: this one, or one elsewhere of that version."""
 
     def __init__(

@@ -23,7 +23,7 @@ from packaging.version import InvalidVersion, Version
 
 from envhub_sandbox.dependencies import uv
 from envhub_sandbox.errors import DependencyError, InterpreterUnavailableError
-from envhub_sandbox.option_names import option_name
+from envhub_sandbox.settings.options import option_name
 
 _ASK_S = 60.0
 _FIND_S = 120.0

@@ -1,7 +1,7 @@
 """The modules that a repository imports: what brings each, and what to do where one is missing.
 
 Which distribution brings one says its own pyproject.toml, or a table of ours,
-``sources/modules.txt``; never an index: anybody may publish a package under a module's name.
+``hub/sources/modules.txt``; never an index: anybody may publish a package under a module's name.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING
 from envhub_sandbox.errors import RequirementError
 from envhub_sandbox.hub.cache import cache_root, keep, recall
 from envhub_sandbox.hub.snapshot import Snapshot
-from envhub_sandbox.option_names import option_name
+from envhub_sandbox.settings.options import option_name
 from envhub_worker.protocol.text import printable
 
 if TYPE_CHECKING:
@@ -111,7 +111,7 @@ def _of_id(text: str) -> tuple[str, str, list[str]] | None:
 def _of_module(name: str, extras: Mapping[str, WantedPackage]) -> tuple[str, str, list[str]] | None:
     from packaging.utils import canonicalize_name
 
-    from envhub_sandbox.sources.imports import of_module
+    from envhub_sandbox.hub.sources.imports import of_module
 
     distributions = of_module(name)
     names = list(map(str, map(canonicalize_name, distributions or [name.partition(".")[0]])))
@@ -147,7 +147,7 @@ def _recalled(snapshot: Snapshot) -> tuple[tuple[str, str, int], ...]:
     with contextlib.suppress(ValueError, TypeError):
         rows = json.loads(recall(folder, key) or "")
         return tuple((str(name), str(file), int(line)) for name, file, line in rows)
-    from envhub_sandbox.sources import imports, parsing
+    from envhub_sandbox.hub.sources import imports, parsing
 
     files = parsing.read(snapshot)
     found = [(one.module, one.file, one.line) for one in imports.imports(snapshot, files)]
@@ -195,7 +195,7 @@ class MissingModule:
         return ""
 
     def _cure(self, module: str, says: DeclaredPackages | None) -> str:
-        from envhub_sandbox.sources.imports import of_module
+        from envhub_sandbox.hub.sources.imports import of_module
 
         name = next(iter(of_module(module)), "NAME-OF-THE-PACKAGE")
         extra = option_name("dependencies", {"extra": [name]})

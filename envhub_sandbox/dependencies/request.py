@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from envhub_sandbox.errors import PolicyError
 from envhub_sandbox.hub.snapshot import Snapshot
-from envhub_sandbox.option_names import option_name
+from envhub_sandbox.settings.options import option_name
 
 if TYPE_CHECKING:  # they cost time, and most repositories need none of them
     from envhub_sandbox.dependencies.declared import WantedPackage

@@ -26,7 +26,7 @@ from envhub_sandbox.dependencies.request import PackageRequest
 from envhub_sandbox.dependencies.resolve import WORKERS, Lock, Target
 from envhub_sandbox.errors import ResolutionError
 from envhub_sandbox.hub import cache
-from envhub_sandbox.option_names import option_name
+from envhub_sandbox.settings.options import option_name
 
 if TYPE_CHECKING:
     from envhub_sandbox.dependencies.modules import Guess

@@ -21,8 +21,8 @@ from envhub_sandbox.errors import (
     RequirementError,
     ResolutionError,
 )
-from envhub_sandbox.option_names import option_name
-from envhub_sandbox.sources import toml
+from envhub_sandbox.hub.sources import toml
+from envhub_sandbox.settings.options import option_name
 
 WORKERS = ("cloudpickle>=3", "gymnasium>=0.26", "msgpack>=1.0.5", "numpy>=1.26")
 """What the worker's jails import besides: the repository's versions must be among these.

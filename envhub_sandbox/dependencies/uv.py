@@ -29,7 +29,7 @@ from envhub_sandbox.errors import (
     ResolutionError,
 )
 from envhub_sandbox.hub.cache import remove_tree
-from envhub_sandbox.option_names import option_name
+from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.system import locks
 from envhub_worker.protocol.text import printable
 

@@ -20,13 +20,13 @@ from typing import Any
 from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerTimeoutError
 from envhub_sandbox.factory import build_env
 from envhub_sandbox.factory.env_factory import EnvFactory
-from envhub_sandbox.hub import store
+from envhub_sandbox.hub.cache import CACHE_VARIABLE, cache_root
 from envhub_sandbox.hub.snapshot import local
-from envhub_sandbox.policy import Limits, Policy, Timeouts
 from envhub_sandbox.sandboxes.process import PROCESS
 from envhub_sandbox.session.jails.launcher import Launcher
 from envhub_sandbox.session.recipe import Recipe, pinned
 from envhub_sandbox.session.repository import LoadArguments, Repository
+from envhub_sandbox.settings.policy import Limits, Policy, Timeouts
 from envhub_sandbox.system import processes
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol.runtime import Runtime
@@ -38,7 +38,7 @@ def main(folder: Path, ended: int) -> int:
     """Carry out the order that lies in a folder."""
     processes.end_with(ended, 10.0)
     order = json.loads((folder / "order.json").read_text())
-    os.environ[store.CACHE_VARIABLE] = str(folder / "cache")  # it goes with the folder
+    os.environ[CACHE_VARIABLE] = str(folder / "cache")  # it goes with the folder
     try:
         said = _built(folder, order)
     except WorkerTimeoutError:
@@ -54,7 +54,7 @@ def main(folder: Path, ended: int) -> int:
 def _built(folder: Path, order: Mapping[str, Any]) -> dict[str, Any]:
     tools = _tools(folder / "tools")
     repository = _repository(folder, order)
-    launcher = Launcher(repository, PROCESS, store.cache_root() / "snapshots")
+    launcher = Launcher(repository, PROCESS, cache_root() / "snapshots")
     with EnvFactory(launcher, 1, 0, SandboxVectorEnv, lambda manifest: None).make() as suites:
         env = suites.env
         names = ("packages", "python", "backend", "backend_path", "known", "environment")

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
-from envhub_sandbox.hub import store
+from envhub_sandbox.hub.cache import cache_root
 from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.jails.launcher import Launcher
 from envhub_sandbox.session.jails.loaded import ExpectedManifest, LoadedJail
@@ -14,7 +14,7 @@ from envhub_sandbox.session.jails.retry_while_busy import retry_while_busy
 from envhub_sandbox.session.jails.sources import JailSource, SharedJail
 from envhub_sandbox.session.manifest_cache import ManifestCache, manifest_key
 from envhub_sandbox.session.prewarm import Prewarm, SuitePrewarm
-from envhub_sandbox.session.provenance import provenance_of
+from envhub_sandbox.session.recipe import provenance_of
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.shared_memory.sharding import bounds_for
 from envhub_sandbox.vector.suites import EnvSuites
@@ -49,7 +49,7 @@ class EnvFactory:
         self._prewarm = prewarm
         load = repository.arguments.message()
         key = manifest_key(repository.snapshot, load, repository.policy, launcher.runs_on)
-        self._cache = ManifestCache(store.cache_root() / "manifests", key)
+        self._cache = ManifestCache(cache_root() / "manifests", key)
 
     def make(self) -> EnvSuites:
         """The environments; a first jail is opened where nothing is remembered of them."""

@@ -6,32 +6,30 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from envhub_sandbox.dependencies.locks import use as locks
 from envhub_sandbox.dependencies.modules import MissingModule
-from envhub_sandbox.dependencies.pipeline import PackageSet, packages_for
+from envhub_sandbox.dependencies.packages import PackageSet, packages_for
 from envhub_sandbox.dependencies.request import Choice, chosen
 from envhub_sandbox.errors import PolicyError
 from envhub_sandbox.factory import sandbox_spec
 from envhub_sandbox.factory.config import plain_config, reference_of
 from envhub_sandbox.factory.env_factory import EnvFactory
-from envhub_sandbox.hub import store
-from envhub_sandbox.hub.snapshot import Snapshot, named
-from envhub_sandbox.locks import use as locks
-from envhub_sandbox.option_names import option_name
-from envhub_sandbox.options import Options
-from envhub_sandbox.policy import Policy, Timeouts, policy_from, timeouts_from
+from envhub_sandbox.hub.cache import cache_root
+from envhub_sandbox.hub.snapshot import Snapshot, snapshot_named
 from envhub_sandbox.sandboxes import inprocess
 from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.session.jails.launcher import Launcher
-from envhub_sandbox.session.provenance import provenance_of
-from envhub_sandbox.session.recipe import Recipe, pinned
+from envhub_sandbox.session.recipe import Recipe, pinned, provenance_of
 from envhub_sandbox.session.repository import LoadArguments, Repository
+from envhub_sandbox.settings.options import Options, option_name
+from envhub_sandbox.settings.policy import Policy, Timeouts, policy_from, timeouts_from
 from envhub_sandbox.system import processes
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol.runtime import Runtime
 
 if TYPE_CHECKING:
-    from envhub_sandbox.locks.lockfile import LockFile
+    from envhub_sandbox.dependencies.locks.lockfile import LockFile
 
 
 def make(make_env: Callable[..., EnvSuites], cfg: Any, given: Options) -> EnvSuites:
@@ -48,7 +46,7 @@ def make(make_env: Callable[..., EnvSuites], cfg: Any, given: Options) -> EnvSui
         return _make_here(reference, config, options)
     processes.occupy_streams()  # before anything of ours is opened
     wanted = _wanted(options.sandbox, options)
-    snapshot = named(reference, **options.hub)
+    snapshot = snapshot_named(reference, **options.hub)
     packages = _packages(snapshot, wanted)
     load = LoadArguments(
         n_envs=options.n_envs,
@@ -84,7 +82,7 @@ def make(make_env: Callable[..., EnvSuites], cfg: Any, given: Options) -> EnvSui
         ).advice,
     )
     return EnvFactory(
-        Launcher(repository, wanted.place, store.cache_root() / "snapshots"),
+        Launcher(repository, wanted.place, cache_root() / "snapshots"),
         options.num_workers,
         _ahead(wanted, options),
         _face(options.validate),
@@ -130,7 +128,7 @@ def _make_here(reference: str, config: Any, options: Options) -> EnvSuites:
     if not options.trust_remote_code:
         raise inprocess.refusal(reference)
     options.refuse_sandboxed()
-    snapshot = named(reference, **options.hub)
+    snapshot = snapshot_named(reference, **options.hub)
     further = dict(options.env_kwargs or {})
     envs = inprocess.make(snapshot, options.n_envs, options.use_async_envs, config, further)
     return EnvSuites(envs, lambda: provenance_of(snapshot, None, []))

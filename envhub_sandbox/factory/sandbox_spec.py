@@ -8,8 +8,8 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from envhub_sandbox.errors import PolicyError
-from envhub_sandbox.option_names import option_name
 from envhub_sandbox.sandboxes.sandbox import Sandbox
+from envhub_sandbox.settings.options import option_name
 
 
 def sandbox_of(sandbox: str | Sandbox, server_key: str | None) -> Sandbox:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 from envhub_sandbox.errors import SnapshotError
 from envhub_sandbox.system import folders
-from envhub_sandbox.system.files import write_whole
+from envhub_sandbox.system.files import write_whole_file
 
 CACHE_VARIABLE = "ENVHUB_CACHE"
 BUILDING = ".building-"
@@ -81,4 +81,4 @@ def keep(folder: Path, key: str, text: str) -> None:
     """Remember a text. A cache that cannot be written is no error."""
     with contextlib.suppress(OSError):
         folders.make_private(folder)
-        write_whole(folder / key, text.encode())
+        write_whole_file(folder / key, text.encode())

@@ -11,7 +11,7 @@ import errno
 from collections.abc import Iterator
 from enum import Enum
 
-from envhub_sandbox.option_names import option_name
+from envhub_sandbox.settings.options import option_name
 
 _LONGEST_QUOTE = 200
 _LOG_IN = "log in with `hf auth login` (`huggingface-cli login` before 1.0) or pass a token"

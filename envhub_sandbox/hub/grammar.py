@@ -13,7 +13,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 from urllib.parse import unquote, urlsplit
 
-from envhub_sandbox.option_names import option_name
+from envhub_sandbox.settings.options import option_name
 
 DEFAULT_PATH = "env.py"
 REPO_TYPES = ("model", "space", "dataset")

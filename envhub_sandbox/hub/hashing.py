@@ -17,7 +17,7 @@ GIT_SHA1 = "git-sha1"
 SHA256 = "sha256"
 
 
-class Mismatch(Exception):
+class HashMismatch(Exception):
     """Bytes are not the ones that were recorded; ``found`` says in words what they are."""
 
     def __init__(self, found: str) -> None:
@@ -49,7 +49,7 @@ def copy_verified(source: Path, target: Path, record: FileRecord) -> None:
     The hash is taken of the bytes on their way, so they cannot change in between.
 
     Raises:
-        Mismatch: Other bytes or another size. The new file may be there in part.
+        HashMismatch: Other bytes or another size. The new file may be there in part.
     """
     running = _start(record.digest.partition(":")[0], record.size)
     written = 0
@@ -57,12 +57,12 @@ def copy_verified(source: Path, target: Path, record: FileRecord) -> None:
         for chunk in _chunks(stream):
             written += len(chunk)
             if written > record.size:
-                raise Mismatch(f"more than {record.size} bytes")
+                raise HashMismatch(f"more than {record.size} bytes")
             running.update(chunk)
             out.write(chunk)
     found = f"{record.digest.partition(':')[0]}:{running.hexdigest()}"
     if written != record.size or found != record.digest:
-        raise Mismatch(f"{written} bytes with {found}")
+        raise HashMismatch(f"{written} bytes with {found}")
 
 
 def differing(root: Path, mine: Iterable[FileRecord], theirs: Iterable[FileRecord]) -> list[str]:
@@ -82,10 +82,10 @@ def _open_regular(path: Path) -> Iterator[BinaryIO]:
     try:
         # A pipe or device under the name would block or never end.
         if not stat.S_ISREG(os.stat(path).st_mode):
-            raise Mismatch("not a regular file")
+            raise HashMismatch("not a regular file")
         stream = path.open("rb")
     except OSError as error:
-        raise Mismatch(f"unreadable ({error})") from error
+        raise HashMismatch(f"unreadable ({error})") from error
     with stream:
         yield stream
 

@@ -106,7 +106,9 @@ DEFAULT_LIMITS = SnapshotLimits()
 _File = TypeVar("_File", bound=Any)  # with a path and a size
 
 
-def within_limits(files: Iterable[_File], limits: SnapshotLimits, title: str) -> tuple[_File, ...]:
+def listing_within_limits(
+    files: Iterable[_File], limits: SnapshotLimits, title: str
+) -> tuple[_File, ...]:
     """The files, sorted by path; ``SnapshotTooLargeError`` as soon as a limit is passed."""
     taken: list[_File] = []
     total = 0
@@ -132,7 +134,7 @@ def _too_large(title: str, what: str, name: str, limit: int) -> SnapshotTooLarge
     )
 
 
-def check_names(files: Iterable[FileRecord], title: str) -> None:
+def check_listing_names(files: Iterable[FileRecord], title: str) -> None:
     """Raise ``SnapshotError`` for a name that could leave the tree, hide, or clash."""
     seen: set[str] = set()
     folders: set[str] = set()

@@ -23,13 +23,13 @@ from envhub_sandbox.errors import (
     SnapshotTooLargeError,
 )
 from envhub_sandbox.hub.checkout import Checkout, read_checkout
-from envhub_sandbox.hub.hashing import SHA256, Mismatch, copy_verified, digest_of
+from envhub_sandbox.hub.hashing import SHA256, HashMismatch, copy_verified, digest_of
 from envhub_sandbox.hub.listing import (
     MAX_DEPTH,
     FileRecord,
     SnapshotLimits,
-    check_names,
-    within_limits,
+    check_listing_names,
+    listing_within_limits,
 )
 
 _GIT = ".git"
@@ -88,7 +88,7 @@ class LocalFolder:
     ) -> tuple[tuple[LocalFile, ...], tuple[FileRecord, ...]]:
         """The files of the snapshot, within limits, and their records, by reading all of them."""
         try:
-            found = within_limits(self.files(), limits, str(self))
+            found = listing_within_limits(self.files(), limits, str(self))
         except OSError as error:
             raise SnapshotError(f"{self}: it cannot be read: {error}") from error
         except SnapshotTooLargeError as error:
@@ -96,7 +96,7 @@ class LocalFolder:
                 error.args = (f"{error}. {_ALL_COUNTS}",)
             raise
         records = hash_files(found, str(self))
-        check_names(records, str(self))
+        check_listing_names(records, str(self))
         return found, records
 
     def why_left_out(self, path: str) -> tuple[str, str] | None:
@@ -225,7 +225,7 @@ def _digest(file: LocalFile, title: str) -> str:
         return f"{SHA256}:{hashlib.sha256(file.link).hexdigest()}"
     try:
         return digest_of(file.source, SHA256, file.size)
-    except (OSError, Mismatch) as error:
+    except (OSError, HashMismatch) as error:
         raise SnapshotError(f"{title}: {file.path!r} cannot be read: {error}") from error
 
 
@@ -246,7 +246,7 @@ def copier(files: tuple[LocalFile, ...], title: str) -> Callable[[FileRecord, Pa
             return
         try:
             copy_verified(file.source, target, record)
-        except Mismatch as error:
+        except HashMismatch as error:
             raise SnapshotError(
                 f"{title}: {record.path!r} changed while it was copied; try again"
             ) from error

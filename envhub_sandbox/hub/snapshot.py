@@ -24,14 +24,14 @@ from envhub_sandbox.errors import (
 from envhub_sandbox.hub import store as store
 from envhub_sandbox.hub.client import HubClient, Repository, checked_endpoint, checked_token
 from envhub_sandbox.hub.failures import ABSENT, UNREACHABLE, HubFailure, Kind
-from envhub_sandbox.hub.hashing import Mismatch, copy_verified
+from envhub_sandbox.hub.hashing import HashMismatch, copy_verified
 from envhub_sandbox.hub.listing import (
     DEFAULT_LIMITS,
     FileRecord,
     Snapshot,
     SnapshotLimits,
-    check_names,
-    within_limits,
+    check_listing_names,
+    listing_within_limits,
 )
 from envhub_sandbox.hub.local import LocalFolder, content_commit, copier, split_local
 from envhub_sandbox.hub.reference import DEFAULT_PATH, HubRef, is_local
@@ -45,7 +45,7 @@ _SHOWN_FILES = 20
 T = TypeVar("T")
 
 
-def named(
+def snapshot_named(
     reference: str,
     *,
     hub_cache_dir: str | Path | None = None,
@@ -81,7 +81,7 @@ def commit_of(
     token: str | bool | None = None,
     endpoint: str | None = None,
 ) -> str:
-    """The commit that a reference means now; raises as ``named`` does.
+    """The commit that a reference means now; raises as ``snapshot_named`` does.
 
     Nothing is downloaded or copied, and a full commit costs no request. Whether it has the entry
     file is not looked at.
@@ -269,8 +269,8 @@ class _Candidate:
 
     def _bring(self, slot: store.Slot) -> None:
         listing = self.hub.listing(self.repo, slot.commit)
-        files = within_limits(listing, self.limits, slot.title)
-        check_names(files, slot.title)
+        files = listing_within_limits(listing, self.limits, slot.title)
+        check_listing_names(files, slot.title)
         self._require_entry(files)
         size = sum(file.size for file in files)
         SNAPSHOT.info("%s: downloading %d files, %d bytes", slot.title, len(files), size)
@@ -284,7 +284,7 @@ class _Candidate:
         def copy(record: FileRecord, target: Path) -> None:
             try:
                 copy_verified(folder / record.path, target, record)
-            except Mismatch:
+            except HashMismatch:
                 # The Hub cache may hold an edited or half-written file: once more, from the Hub.
                 target.unlink(missing_ok=True)
                 again = self.hub.download_again(self.repo, slot.commit, record.path)
@@ -297,7 +297,7 @@ class _Candidate:
     ) -> None:
         try:
             copy_verified(source, target, record)
-        except Mismatch as mismatch:
+        except HashMismatch as mismatch:
             raise SnapshotIntegrityError(
                 f"{slot.title}: the file {record.path!r} came with other content than the "
                 f"commit's listing says: {mismatch.found}, not {record.size} bytes with "
@@ -307,7 +307,7 @@ class _Candidate:
             ) from mismatch
 
     def _finished(self, slot: store.Slot, files: tuple[FileRecord, ...]) -> Snapshot:
-        within_limits(files, self.limits, slot.title)
+        listing_within_limits(files, self.limits, slot.title)
         self._require_entry(files)
         repo_type, repo_id = self.repo
         return Snapshot(repo_id, repo_type, slot.commit, self.ref.path, slot.tree, files)

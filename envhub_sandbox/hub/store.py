@@ -29,14 +29,11 @@ from typing import NamedTuple
 from urllib.parse import urlsplit
 
 from envhub_sandbox.errors import SnapshotError, SnapshotIntegrityError
-from envhub_sandbox.hub.cache import BUILDING, draft
-from envhub_sandbox.hub.cache import CACHE_VARIABLE as CACHE_VARIABLE
-from envhub_sandbox.hub.cache import cache_root as cache_root
-from envhub_sandbox.hub.cache import remove_tree as remove_tree
-from envhub_sandbox.hub.hashing import Mismatch, digest_of
+from envhub_sandbox.hub.cache import BUILDING, cache_root, draft, remove_tree
+from envhub_sandbox.hub.hashing import HashMismatch, digest_of
 from envhub_sandbox.hub.listing import FileRecord
 from envhub_sandbox.system import folders
-from envhub_sandbox.system.files import write_whole
+from envhub_sandbox.system.files import write_whole_file
 from envhub_sandbox.system.locks import sharers
 from envhub_sandbox.system.log import SNAPSHOT
 
@@ -192,7 +189,7 @@ def _verify_again(slot: Slot, changed: list[FileRecord]) -> None:
         path = slot.tree / entry.path
         try:
             found = digest_of(path, entry.digest.partition(":")[0], entry.size)
-        except (OSError, Mismatch) as error:
+        except (OSError, HashMismatch) as error:
             raise _damaged(slot, f"the file {entry.path!r} cannot be read ({error})") from error
         if found != entry.digest or path.lstat().st_size != entry.size:
             raise _damaged(
@@ -340,7 +337,7 @@ def _write_record(
         [file.path, file.size, file.digest, *_fingerprint((tree / file.path).lstat())[1:]]
         for file in files
     ]
-    write_whole(home / "record.json", json.dumps({**document, "files": rows}).encode())
+    write_whole_file(home / "record.json", json.dumps({**document, "files": rows}).encode())
 
 
 def _rename(building: Path, home: Path) -> None:

@@ -11,7 +11,7 @@ import sys
 from importlib.util import find_spec
 from typing import Any
 
-from envhub_sandbox.option_names import on_lerobots_command_line, use_option_names
+from envhub_sandbox.settings.options import on_lerobots_command_line, use_option_names
 
 _PREFIX = "--sandbox."
 
@@ -22,7 +22,7 @@ def main() -> None:
         sys.exit("lerobot-eval-sandboxed needs LeRobot: pip install 'envhub-sandbox[lerobot]'")
     from envhub_sandbox.integrations.lerobot import install
 
-    options, rest = split(sys.argv[1:])
+    options, rest = split_eval_arguments(sys.argv[1:])
     try:
         install(**options)
     except (TypeError, RuntimeError) as error:
@@ -34,7 +34,7 @@ def main() -> None:
         evaluate()
 
 
-def split(arguments: list[str]) -> tuple[dict[str, Any], list[str]]:
+def split_eval_arguments(arguments: list[str]) -> tuple[dict[str, Any], list[str]]:
     """Our options by name, and the others."""
     ours = [one for one in arguments if one.startswith(_PREFIX)]
     options = {}

@@ -17,8 +17,8 @@ from gymnasium.vector import VectorEnv
 from gymnasium.vector.utils import iterate
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
-from envhub_sandbox.api import make_env
-from envhub_sandbox.vector.infos import info_of
+from envhub_sandbox.factory.make_env import make_env
+from envhub_sandbox.vector.single_env import info_of
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _Indices = int | Iterable[int] | None

@@ -10,8 +10,7 @@ from pathlib import Path
 
 from envhub_sandbox.sandboxes.pool import WorkerServer
 from envhub_sandbox.sandboxes.runtime_folder import RuntimeFolder
-from envhub_sandbox.system.processes import has_ended
-from envhub_sandbox.transport.forks import Owner
+from envhub_sandbox.system.processes import OwnerProcess, has_ended
 
 
 class LocalServer(WorkerServer):
@@ -31,7 +30,7 @@ class LocalServer(WorkerServer):
     stopped = True  # until there is something to stop
 
     def __init__(self, prefix: str, sockets: str, stop_s: float) -> None:
-        self._owner = Owner()
+        self._owner = OwnerProcess()
         self._stop_s = stop_s
         self._process: subprocess.Popen[bytes] | None = None
         self.process_fd = -1
@@ -88,7 +87,8 @@ class LocalServer(WorkerServer):
     def stop(self) -> None:
         """End it and everything below it, in bounded time. A fork of its owner does nothing.
 
-        Idempotent. If interrupted, the next call finishes the work.
+        Idempotent. If interrupted, the next call finishes the work: interruption.md,
+        rule 7.
         """
         if self.stopped or not self._owner.is_here:
             return
@@ -105,4 +105,4 @@ class LocalServer(WorkerServer):
             os.close(self.process_fd)
 
     def __del__(self) -> None:
-        self.stop()  # a start that was interrupted before it was noted
+        self.stop()  # interruption.md, rule 5: a start was interrupted before it was noted

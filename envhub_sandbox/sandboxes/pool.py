@@ -28,7 +28,7 @@ from time import monotonic
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 if TYPE_CHECKING:
-    from envhub_sandbox.transport.tcp import Far
+    from envhub_sandbox.transport.tcp import TcpServer
 
 _LONGEST_WAIT_S = 3600.0
 
@@ -49,7 +49,7 @@ class WorkerServer(ABC):
     process_fd: int
     fd_path: str | None = None
     layers: Sequence[Mapping[str, Any]] = ()
-    far: Far | None = None
+    far: TcpServer | None = None
 
     @property
     @abstractmethod
@@ -120,7 +120,7 @@ class ServerUse(Generic[S_co]):
             self._done = self._pool.give_back(self, self._entry, self._idle_s)
 
     def __del__(self) -> None:
-        self.release()
+        self.release()  # interruption.md, rule 5
 
 
 class ServerPool(Generic[S]):
@@ -219,7 +219,8 @@ class ServerPool(Generic[S]):
         if self._thread is None and self._earliest() is not None:
             thread = threading.Thread(target=self._run, name="envhub-idle", daemon=True)
             thread.start()
-            self._thread = thread  # only now: one that a Ctrl-C kept from starting is not joined
+            # interruption.md, rule 4: one that a Ctrl-C kept from starting is not joined
+            self._thread = thread
 
     # --- their ends ----------------------------------------------------------------------------
 
@@ -266,14 +267,14 @@ class ServerPool(Generic[S]):
             self._idle = [entry for entry in self._idle if entry not in entries]
             self._used = {p: entry for p, entry in self._used.items() if entry not in entries}
             self._changed.notify_all()
-        with contextlib.ExitStack() as stack:  # whatever interrupts one end, the others follow
+        with contextlib.ExitStack() as stack:  # interruption.md, rule 9
             if thread is not None and thread is not threading.current_thread():
                 stack.callback(thread.join)
             for entry in entries:
                 stack.callback(entry.server.stop)
 
     def forked(self) -> None:
-        """In a fork: the thread that held the lock does not exist, nor does the one that waits."""
+        """In a fork no thread holds the lock, and none waits: interruption.md, rule 14."""
         self._changed = threading.Condition(threading.RLock())
         self._thread = None
 
@@ -283,13 +284,13 @@ _pools: weakref.WeakSet[ServerPool[Any]] = weakref.WeakSet()
 
 def stop_idle() -> None:
     """End the unused servers of this process, of every kind."""
-    with contextlib.ExitStack() as stack:
+    with contextlib.ExitStack() as stack:  # interruption.md, rule 9
         for pool in list(_pools):
             stack.callback(pool.stop_idle)
 
 
 def _stop_all() -> None:
-    with contextlib.ExitStack() as stack:
+    with contextlib.ExitStack() as stack:  # interruption.md, rule 9
         for pool in list(_pools):
             stack.callback(pool.stop_all)
 

@@ -17,17 +17,17 @@ from typing import TYPE_CHECKING
 
 import envhub_worker.protocol
 from envhub_sandbox.errors import SandboxUnavailableError, WorkerStartupError
-from envhub_sandbox.option_names import option_name
 from envhub_sandbox.sandboxes import runtime_folder
 from envhub_sandbox.sandboxes.local_server import LocalServer
 from envhub_sandbox.sandboxes.pool import ServerPool, ServerUse
 from envhub_sandbox.sandboxes.sandbox import Sandbox
+from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.system import processes
 from envhub_sandbox.system.log import WORKER
 from envhub_worker.protocol.runtime import OWN, Runtime
 
 if TYPE_CHECKING:
-    from envhub_sandbox.dependencies.pipeline import PackageTarget
+    from envhub_sandbox.dependencies.packages import PackageTarget
 
 BOOTSTRAP = Path(envhub_worker.protocol.__file__).parent.parent / "bootstrap.py"
 _STARTUP_S = 60.0
@@ -45,7 +45,7 @@ class ProcessSandbox(Sandbox):
 
     def package_target(self) -> PackageTarget:
         """Packages are made for the interpreters of this machine."""
-        from envhub_sandbox.dependencies.pipeline import HERE
+        from envhub_sandbox.dependencies.packages import HERE
 
         return HERE
 

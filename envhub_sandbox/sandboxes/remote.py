@@ -16,19 +16,19 @@ from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
-from envhub_sandbox.dependencies.pipeline import PackageSet
+from envhub_sandbox.dependencies.packages import PackageSet
 from envhub_sandbox.dependencies.request import PackageRequest
 from envhub_sandbox.errors import DependencyError, EnvHubError, PolicyError
-from envhub_sandbox.option_names import option_name
-from envhub_sandbox.policy import Policy
 from envhub_sandbox.sandboxes import remote_keys, remote_packages, upload
 from envhub_sandbox.sandboxes.pool import ServerPool, ServerUse, WorkerServer
 from envhub_sandbox.sandboxes.sandbox import Sandbox
+from envhub_sandbox.settings.options import option_name
+from envhub_sandbox.settings.policy import Policy
 from envhub_sandbox.system.log import WORKER
-from envhub_sandbox.transport.connection import WorkerClient
+from envhub_sandbox.system.processes import OwnerProcess
+from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.forks import Owner
-from envhub_sandbox.transport.tcp import Far
+from envhub_sandbox.transport.tcp import TcpServer
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.runtime import OWN, Runtime
 
@@ -123,7 +123,7 @@ class RemoteSandbox(Sandbox):
         use = _use_of(self.endpoint, self.far())
         server = use.server
         try:
-            client = WorkerClient(self.endpoint, server.process_fd, far=server.far)
+            client = WorkerConnection(self.endpoint, server.process_fd, far=server.far)
             with contextlib.closing(client):
                 client.hello(Deadline(_HELLO_S))
                 made = remote_packages.request_packages(order, client, Deadline(_MAKE_S), tell)
@@ -133,16 +133,16 @@ class RemoteSandbox(Sandbox):
             self._orders[made.packages] = order
         return made
 
-    def far(self) -> Far:
+    def far(self) -> TcpServer:
         """The server's key and ours.
 
         Raises:
             SandboxUnavailableError: One is missing.
         """
         if self.insecure_loopback:
-            return Far(None, None, self.heartbeat_s)
+            return TcpServer(None, None, self.heartbeat_s)
         server_key = remote_keys.server_key(self.endpoint, self.server_key)
-        return Far(server_key, remote_keys.client_key(self.client_key), self.heartbeat_s)
+        return TcpServer(server_key, remote_keys.client_key(self.client_key), self.heartbeat_s)
 
 
 def check_policy(policy: Policy, runtime: Runtime) -> None:
@@ -184,7 +184,7 @@ class RemoteRepository(Sandbox):
 
     name = "remote"
     endpoint: str
-    far: Far
+    far: TcpServer
     snapshot: Path
     order: m.NeedPackages | None
     packages: str
@@ -203,7 +203,7 @@ class RemoteRepository(Sandbox):
         return _use_of(self.endpoint, self.far)
 
     def prepare(
-        self, order: m.OpenJail, server: WorkerServer, client: WorkerClient, deadline: Deadline
+        self, order: m.OpenJail, server: WorkerServer, client: WorkerConnection, deadline: Deadline
     ) -> m.OpenJail:
         """Bring the files there, and see that the packages are. One of our threads at a time."""
         with cast("RemoteServer", server).uploading:
@@ -214,7 +214,7 @@ class RemoteRepository(Sandbox):
         return m.replace(order, snapshot=snapshot, python="", packages=self.packages)
 
     def _check_packages(
-        self, order: m.NeedPackages, client: WorkerClient, deadline: Deadline
+        self, order: m.NeedPackages, client: WorkerConnection, deadline: Deadline
     ) -> None:
         """The server may have been replaced, or have needed the room; it may make them again."""
         made = remote_packages.request_packages(order, client, deadline)
@@ -233,13 +233,13 @@ class RemoteServer(WorkerServer):
         uploading: Held while something is brought there.
     """
 
-    far: Far
+    far: TcpServer
 
-    def __init__(self, endpoint: str, far: Far) -> None:
+    def __init__(self, endpoint: str, far: TcpServer) -> None:
         self.endpoint = endpoint
         self.far = far
         self.uploading = threading.Lock()
-        self._owner = Owner()
+        self._owner = OwnerProcess()
         self._ended = False
         self._wakes: int | None
         self.process_fd, self._wakes = os.pipe()
@@ -254,7 +254,7 @@ class RemoteServer(WorkerServer):
 
         Without this thread the server would end all jails of a client that lives.
         """
-        client: WorkerClient | None = None
+        client: WorkerConnection | None = None
         every_s = _FIRST_S
         while not self._stop.wait(every_s):
             try:
@@ -279,8 +279,8 @@ class RemoteServer(WorkerServer):
             for jail in tuple(self.far.held):
                 client.request(m.CloseJail(jail), deadline=deadline)
 
-    def _connection(self) -> WorkerClient:
-        return WorkerClient(self.endpoint, self.process_fd, far=self.far)
+    def _connection(self) -> WorkerConnection:
+        return WorkerConnection(self.endpoint, self.process_fd, far=self.far)
 
     @property
     def runs(self) -> bool:
@@ -291,7 +291,7 @@ class RemoteServer(WorkerServer):
         """Close what is open there, and no longer say that we live.
 
         A fork of its owner does nothing. Idempotent. If interrupted, the next call finishes the
-        work.
+        work: interruption.md, rules 7 and 14.
         """
         if self._ended or not self._owner.is_here:
             return
@@ -306,7 +306,7 @@ class RemoteServer(WorkerServer):
             os.close(self.process_fd)
 
 
-def _close(client: WorkerClient | None) -> None:
+def _close(client: WorkerConnection | None) -> None:
     """Close a connection, whatever state it is in."""
     with contextlib.suppress(Exception):
         if client is not None:
@@ -317,5 +317,5 @@ SERVERS: ServerPool[RemoteServer] = ServerPool()
 """Those that this process uses, each once for an endpoint and its keys."""
 
 
-def _use_of(endpoint: str, far: Far) -> ServerUse[RemoteServer]:
+def _use_of(endpoint: str, far: TcpServer) -> ServerUse[RemoteServer]:
     return SERVERS.acquire((endpoint, far), partial(RemoteServer, endpoint, far))

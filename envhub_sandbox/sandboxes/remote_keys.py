@@ -10,7 +10,7 @@ from urllib.parse import urlsplit
 
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError
 from envhub_sandbox.hub.logins import without_login
-from envhub_sandbox.option_names import option_name
+from envhub_sandbox.settings.options import option_name
 from envhub_worker.protocol.keys import parse_key
 
 SERVER_KEY_VARIABLE = "ENVHUB_SERVER_KEY"

@@ -11,12 +11,12 @@ import time
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, cast
 
-from envhub_sandbox.dependencies.pipeline import PackageSet
+from envhub_sandbox.dependencies.packages import PackageSet
 from envhub_sandbox.dependencies.request import PackageRequest
 from envhub_sandbox.errors import PolicyError, RemoteProtocolError
-from envhub_sandbox.transport.connection import WorkerClient
+from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.replies import expect
+from envhub_sandbox.transport.replies import expect_reply
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.text import printable
 
@@ -69,7 +69,7 @@ def _rows(wanted: Sequence[WantedPackage]) -> tuple[tuple[str, str], ...]:
 
 def request_packages(
     order: m.NeedPackages,
-    client: WorkerClient,
+    client: WorkerConnection,
     deadline: Deadline,
     tell: Callable[[str], None] = lambda line: None,
 ) -> PackageSet | None:
@@ -84,14 +84,14 @@ def request_packages(
     shown = ""
     while True:
         reply, _ = client.request(order, deadline=deadline)
-        found = expect(reply, m.Packages)
+        found = expect_reply(reply, m.Packages)
         if found.state == "own":
             return None
         if found.state == "made":
             return PackageSet(_name(found.name), _facts(found.facts, order))
         if found.state != "making":
             raise RemoteProtocolError("the server has packages in a state that there is not")
-        line = printable(found.told[:_MAX_CHARS], _MAX_CHARS)
+        line = printable(found.progress[:_MAX_CHARS], _MAX_CHARS)
         if line != shown:
             tell(line)
             shown = line

@@ -10,9 +10,9 @@ from envhub_sandbox.sandboxes.pool import ServerUse, WorkerServer
 from envhub_worker.protocol.runtime import OWN, Runtime
 
 if TYPE_CHECKING:
-    from envhub_sandbox.dependencies.pipeline import PackageTarget
-    from envhub_sandbox.policy import Policy
-    from envhub_sandbox.transport.connection import WorkerClient
+    from envhub_sandbox.dependencies.packages import PackageTarget
+    from envhub_sandbox.settings.policy import Policy
+    from envhub_sandbox.transport.connection import WorkerConnection
     from envhub_sandbox.transport.deadline import Deadline
     from envhub_worker.protocol.messages import OpenJail
 
@@ -73,7 +73,7 @@ class Sandbox:
         raise SandboxUnavailableError(f"{self.name}: a server is started for one repository only")
 
     def prepare(
-        self, order: OpenJail, server: WorkerServer, client: WorkerClient, deadline: Deadline
+        self, order: OpenJail, server: WorkerServer, client: WorkerConnection, deadline: Deadline
     ) -> OpenJail:
         """The order for a jail as a server of this place understands it.
 

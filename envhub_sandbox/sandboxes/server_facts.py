@@ -10,9 +10,9 @@ from time import monotonic
 from typing import Any
 
 from envhub_sandbox.sandboxes.remote import RemoteSandbox
-from envhub_sandbox.transport.connection import WorkerClient
+from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.replies import expect
+from envhub_sandbox.transport.replies import expect_reply
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import PROFILES
 from envhub_worker.protocol.text import printable
@@ -34,7 +34,7 @@ class ServerFacts:
         version: Of its package.
         protocol: The version that was agreed on.
         answered_s: From knocking to its welcome.
-        told: Whether it says more than that; older servers do not.
+        detailed: Whether it says more than that; older servers do not.
         python: Of the server.
         profile: The strongest that a jail can have there.
         weakest_profile: That a policy may ask for.
@@ -51,7 +51,7 @@ class ServerFacts:
     answered_s: float
     quotas: dict[str, int]
     used: dict[str, int]
-    told: bool = False
+    detailed: bool = False
     python: str = ""
     profile: str = ""
     weakest_profile: str = ""
@@ -80,17 +80,17 @@ def ask(sandbox: RemoteSandbox) -> ServerFacts:
     begun, deadline = monotonic(), Deadline(_WAIT_S)
     with _connection(sandbox) as client:
         greeting = m.Hello(m.VERSION, _LOOKER)
-        welcome = expect(client.request(greeting, deadline=deadline)[0], m.Welcome)
+        welcome = expect_reply(client.request(greeting, deadline=deadline)[0], m.Welcome)
         answered_s = monotonic() - begun
-        sessions = expect(client.request(m.GetSessions(), deadline=deadline)[0], m.Sessions)
+        sessions = expect_reply(client.request(m.GetSessions(), deadline=deadline)[0], m.Sessions)
     return facts_of(welcome, answered_s, sessions.server)
 
 
 @contextlib.contextmanager
-def _connection(sandbox: RemoteSandbox) -> Iterator[WorkerClient]:
+def _connection(sandbox: RemoteSandbox) -> Iterator[WorkerConnection]:
     never, ends = os.pipe()
     try:
-        client = WorkerClient(sandbox.endpoint, never, far=sandbox.far())
+        client = WorkerConnection(sandbox.endpoint, never, far=sandbox.far())
         with contextlib.closing(client):
             yield client
     finally:
@@ -98,22 +98,22 @@ def _connection(sandbox: RemoteSandbox) -> Iterator[WorkerClient]:
         os.close(ends)
 
 
-def facts_of(welcome: m.Welcome, answered_s: float, told: dict[Any, Any]) -> ServerFacts:
+def facts_of(welcome: m.Welcome, answered_s: float, said: dict[Any, Any]) -> ServerFacts:
     """What is kept of a server's answer. Trust: input from the server."""
-    clients = told.get("clients")
+    clients = said.get("clients")
     mine: object = next(iter(clients.values()), {}) if isinstance(clients, dict) else {}
-    words = {name: _text(told.get(name)) for name in _WORDS}
+    words = {name: _text(said.get(name)) for name in _WORDS}
     return ServerFacts(
         version=_text(welcome.worker),
         protocol=welcome.version,
         answered_s=answered_s,
-        told=bool(told),
+        detailed=bool(said),
         **words,
-        network=told.get("network") is True,
-        gpu=told.get("gpu") is True,
-        dependencies=told.get("dependencies") is True,
-        draining=told.get("draining_s") is not None,
-        quotas=_numbers(told.get("quotas")),
+        network=said.get("network") is True,
+        gpu=said.get("gpu") is True,
+        dependencies=said.get("dependencies") is True,
+        draining=said.get("draining_s") is not None,
+        quotas=_numbers(said.get("quotas")),
         used=_numbers(mine),
     )
 

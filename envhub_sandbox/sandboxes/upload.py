@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 from envhub_sandbox.errors import SnapshotError, WorkerError
-from envhub_sandbox.transport.connection import WorkerClient
+from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.replies import expect
+from envhub_sandbox.transport.replies import expect_reply
 from envhub_worker.protocol import messages as m
 
 PIECE_BYTES = 256 * 1024
@@ -56,7 +56,7 @@ def _sent(root: Path, path: Path) -> Sent:
 
 
 def upload(
-    client: WorkerClient, root: Path, files: tuple[Sent, ...], deadline: Deadline
+    client: WorkerConnection, root: Path, files: tuple[Sent, ...], deadline: Deadline
 ) -> tuple[str, int]:
     """Bring files to a server.
 
@@ -79,21 +79,21 @@ def upload(
     return wanted.snapshot, sum(file.size for file in missing)
 
 
-def _offer(client: WorkerClient, files: tuple[Sent, ...], deadline: Deadline) -> m.Wanted:
+def _offer(client: WorkerConnection, files: tuple[Sent, ...], deadline: Deadline) -> m.MissingBlobs:
     offer = m.OfferSnapshot(tuple(tuple(file) for file in files))
     reply, _ = client.request(offer, deadline=deadline)
-    return expect(reply, m.Wanted)
+    return expect_reply(reply, m.MissingBlobs)
 
 
-def _put(client: WorkerClient, root: Path, missing: list[Sent], deadline: Deadline) -> None:
+def _put(client: WorkerConnection, root: Path, missing: list[Sent], deadline: Deadline) -> None:
     """Send piece after piece, with some under way; the server answers in order."""
     under_way: deque[int] = deque()
     for sha256, offset, piece in _pieces(root, missing):
         if len(under_way) >= _WINDOW:
-            expect(client.receive(under_way.popleft(), deadline)[0], m.Done)
+            expect_reply(client.receive(under_way.popleft(), deadline)[0], m.Done)
         under_way.append(client.send(m.PutBlob(sha256, offset), [piece]))
     while under_way:
-        expect(client.receive(under_way.popleft(), deadline)[0], m.Done)
+        expect_reply(client.receive(under_way.popleft(), deadline)[0], m.Done)
 
 
 def _pieces(root: Path, missing: list[Sent]) -> Iterator[tuple[bytes, int, bytes]]:

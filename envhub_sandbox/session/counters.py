@@ -1,6 +1,6 @@
 """Counters of the environments: cheap to keep, and summed up only when they are read.
 
-``LEDGER`` has those of all environments of this process, so that ``envhub_sandbox.metrics`` sees
+``LEDGER`` has those of all environments of this process, so that ``integrations/metrics.py`` sees
 counts that only grow, also when environments are closed.
 """
 
@@ -169,4 +169,4 @@ def _add(total: dict[str, Any], more: Mapping[str, float]) -> None:
 
 
 LEDGER = Ledger()
-os.register_at_fork(after_in_child=LEDGER.forget)
+os.register_at_fork(after_in_child=LEDGER.forget)  # interruption.md, rule 14

@@ -13,9 +13,9 @@ import weakref
 from collections.abc import Sequence
 from typing import Any, cast
 
-from envhub_sandbox.crash.history import History
 from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerError, WorkerTimeoutError
 from envhub_sandbox.session.counters import LEDGER, Counters, Labels
+from envhub_sandbox.session.crash.history import History
 from envhub_sandbox.session.jails.sources import JailSource
 from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.session.prewarm import INTERRUPT_S, LOOK_S, Prewarm
@@ -172,8 +172,13 @@ class EnvSession:
         if not self.use.lock.acquire(blocking=False):
             self._interrupt()
             return
-        # interruption.md, rules 7, 9 and 11. CLOSED comes first: from then on no other thread
-        # starts anything. Then the repository's own close may run; then the jail is given back.
+        # interruption.md, rules 7, 9 and 11. The lock is free, so no request runs. CLOSED comes
+        # first: from then on no other thread starts anything. What steps took is noted while the
+        # lane is still there. Then the repository's own ``close`` may run, but only if no reply is
+        # owed: a runner that is busy would not answer in time. Then the jail is given back. The
+        # lock is released whatever fails, or every later ``close`` would take this one for a
+        # running request. After an interrupt the state is CLOSED, and the next ``close`` goes on in
+        # ``_finish``.
         try:
             state = self.lifecycle.state
             self._end_life()
@@ -202,6 +207,11 @@ class EnvSession:
 
         If that thread does not release the lock in time, it cleans up itself.
         """
+        # The other thread holds the lock and may wait without end, so we cannot wait for the lock
+        # first. CLOSED and the end of the jail are one act under the lease's own lock: a thread
+        # that takes a jail at this moment either sees CLOSED and gives it back, or has noted it and
+        # finds it ended. The end of the jail wakes that thread, which releases the lock. Only then
+        # do we have the lock and clean up; no longer than ``patience_s``, as ``close`` is bounded.
         if not self.lease.interrupt(self._end_life):
             # The other thread sees CLOSED where it takes a jail; it may be past that, so the server
             # is released here.
@@ -232,4 +242,4 @@ def _abandon_all() -> None:
         env.abandon()
 
 
-os.register_at_fork(after_in_child=_abandon_all)
+os.register_at_fork(after_in_child=_abandon_all)  # interruption.md, rule 14

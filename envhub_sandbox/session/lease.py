@@ -24,8 +24,8 @@ from envhub_sandbox.session.jails.retry_while_busy import (
 from envhub_sandbox.session.jails.sources import JailSource
 from envhub_sandbox.session.refusals import closed_during
 from envhub_sandbox.session.repository import Repository
+from envhub_sandbox.system.processes import OwnerProcess
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
-from envhub_sandbox.transport.forks import Owner
 from envhub_sandbox.transport.lane import Lane
 from envhub_sandbox.transport.pace import PaceBook
 from envhub_sandbox.transport.results import Results
@@ -73,10 +73,9 @@ class Lease:
         self.counters = counters
         self._paces = paces
         self._builder = Builder(jails, results)
-        self._ending = (
-            threading.RLock()
-        )  # interruption.md, rule 12: none gives back what another ends
-        self._owner = Owner()
+        # interruption.md, rule 12: none gives back what another ends
+        self._ending = threading.RLock()
+        self._owner = OwnerProcess()
         self._was_loaded = False
         self._startup: StartupDeadline | None = None
         self._release_server: Callable[[], None] = _nothing

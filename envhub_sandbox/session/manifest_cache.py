@@ -14,9 +14,9 @@ from pathlib import Path
 
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.hub.snapshot import Snapshot
-from envhub_sandbox.policy import Policy
+from envhub_sandbox.settings.policy import Policy
 from envhub_sandbox.system import folders
-from envhub_sandbox.system.files import write_whole
+from envhub_sandbox.system.files import write_whole_file
 from envhub_sandbox.transport.pace import PaceBook
 from envhub_sandbox.transport.values import pickles
 from envhub_sandbox.transport.values.generators import generator
@@ -25,7 +25,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import encode
 from envhub_worker.protocol.manifest.manifest import Manifest, decode_manifest
 from envhub_worker.protocol.runtime import Runtime
-from envhub_worker.protocol.stream import PacketReader, pack_packet
+from envhub_worker.protocol.stream import StreamReader, pack_packet
 
 _FORMAT = 1
 
@@ -48,9 +48,9 @@ class ManifestCache:
         try:
             if not folders.is_ours_alone(self._path.parent):
                 return None
-            [packet] = PacketReader().feed(self._path.read_bytes())
+            [packet] = StreamReader().feed(self._path.read_bytes())
             message = m.unpack(packet.frames)
-            if isinstance(message, m.Loaded):
+            if isinstance(message, m.LoadDone):
                 return decode_manifest(
                     message.manifest, max_elements=max_elements, generator=generator
                 )
@@ -64,10 +64,10 @@ class ManifestCache:
         """Remember a manifest. A cache that cannot be written is no error."""
         if self._path is None:
             return
-        data = b"".join(map(bytes, pack_packet(1, m.pack(m.Loaded(value)))))
+        data = b"".join(map(bytes, pack_packet(1, m.pack(m.LoadDone(value)))))
         with contextlib.suppress(OSError):
             folders.make_private(self._path.parent)
-            write_whole(self._path, data)
+            write_whole_file(self._path, data)
 
     def forget(self) -> None:
         """Drop the entry."""

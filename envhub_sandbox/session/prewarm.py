@@ -15,8 +15,8 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import chain
 
-from envhub_sandbox.crash.history import History
 from envhub_sandbox.errors import EnvHubError
+from envhub_sandbox.session.crash.history import History
 from envhub_sandbox.session.jails.loaded import LoadedJail
 from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.session.refusals import closed_during

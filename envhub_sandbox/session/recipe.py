@@ -1,8 +1,8 @@
-"""How to make environments again, in another process: what a pickle of a proxy holds.
+"""What ran (``provenance_of``), and how to make it again in another process (``Recipe``).
 
-A process cannot be handed over, so a proxy travels as the arguments that made it. The other side
-gets a fresh environment in a worker of its own, of the very same commit. A token never travels,
-nor does a login in ``endpoint``: the other side uses its own.
+A process cannot be handed over, so a pickle of a proxy holds the arguments that made it. The other
+side gets a fresh environment in a worker of its own, of the very same commit. A token never
+travels, nor does a login in ``endpoint``: the other side uses its own.
 """
 
 from __future__ import annotations
@@ -16,6 +16,8 @@ from envhub_sandbox.hub.client import default_endpoint
 from envhub_sandbox.hub.logins import without_login
 from envhub_sandbox.hub.reference import HubRef
 from envhub_sandbox.hub.snapshot import Snapshot
+from envhub_worker.protocol.manifest.manifest import Manifest
+from envhub_worker.protocol.messages import VERSION
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -61,3 +63,34 @@ def pinned(snapshot: Snapshot) -> str:
         return f"{snapshot.repo_id}:{snapshot.path}"
     kind = snapshot.repo_type
     return str(HubRef(snapshot.repo_id, snapshot.commit, snapshot.path, kind))
+
+
+def provenance_of(
+    snapshot: Snapshot,
+    manifest: Manifest | None,
+    report: list[dict[str, Any]],
+    installed: dict[str, Any] | None = None,
+    profile: str | None = None,
+) -> dict[str, Any]:
+    """What ran, as plain data: enough to run the same again, or to see that it cannot be the same.
+
+    Args:
+        snapshot: The files; every hash has been verified.
+        manifest: What the worker said. Trust: interpreter and packages are its own words.
+        report: The layers that confine it, once it runs.
+        installed: What was installed for it: our own record.
+        profile: Of its jails, once it runs.
+    """
+    return {
+        "repository": snapshot.repo_id,
+        "repo_type": snapshot.repo_type,
+        "commit": snapshot.commit,
+        "path": snapshot.path,
+        "files": {record.path: record.digest for record in snapshot.files},
+        "interpreter": dict(manifest.interpreter) if manifest else None,
+        "packages": dict(manifest.packages) if manifest else None,
+        "installed": installed,
+        "protocol": VERSION,
+        "profile": profile,
+        "layers": [dict(layer) for layer in report],
+    }

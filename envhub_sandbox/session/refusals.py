@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerError, WorkerTimeoutError
-from envhub_sandbox.option_names import option_name
-from envhub_sandbox.transport.forks import foreign
+from envhub_sandbox.settings.options import option_name
+from envhub_sandbox.system.processes import fork_error_text
 from envhub_worker.protocol.lifecycle import State
 
 
@@ -44,7 +44,7 @@ def refusal(
     if state is State.EXPIRED:
         return expiry(operation, "it was idle for too long")
     if state is State.FOREIGN:
-        return WorkerError(f"cannot {operation}: {foreign()}")
+        return WorkerError(f"cannot {operation}: {fork_error_text()}")
     if state is State.CLOSED:
         return closed_during(operation)
     return WorkerError(f"cannot {operation}: the environment is {state.value}")

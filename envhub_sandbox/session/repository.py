@@ -11,8 +11,6 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from envhub_sandbox.crash.bundle_writer import Crash, write_bundle
-from envhub_sandbox.crash.history import Recording
 from envhub_sandbox.errors import (
     DependencyError,
     EnvHubError,
@@ -20,14 +18,15 @@ from envhub_sandbox.errors import (
     WorkerTimeoutError,
     name_source,
 )
+from envhub_sandbox.hub.cache import cache_root
 from envhub_sandbox.hub.snapshot import Snapshot
-from envhub_sandbox.hub.store import cache_root
-from envhub_sandbox.option_names import option_name
-from envhub_sandbox.policy import Policy, Timeouts
 from envhub_sandbox.session.author_lines import add_author_line
+from envhub_sandbox.session.crash.bundle_writer import Crash, write_bundle
+from envhub_sandbox.session.crash.history import Recording
 from envhub_sandbox.session.jails.loaded import LoadedJail
-from envhub_sandbox.session.provenance import provenance_of
-from envhub_sandbox.session.recipe import Recipe
+from envhub_sandbox.session.recipe import Recipe, provenance_of
+from envhub_sandbox.settings.options import option_name
+from envhub_sandbox.settings.policy import Policy, Timeouts
 from envhub_sandbox.system.locks import SharedLock
 from envhub_sandbox.system.log import CRASHES
 from envhub_sandbox.transport import trace

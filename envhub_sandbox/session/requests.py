@@ -16,7 +16,6 @@ from typing import Any, NoReturn, TypeVar
 
 from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError
 
-from envhub_sandbox.crash.history import History
 from envhub_sandbox.errors import (
     EnvHubError,
     LocalProtocolError,
@@ -26,6 +25,7 @@ from envhub_sandbox.errors import (
     WorkerTimeoutError,
 )
 from envhub_sandbox.session.attribute_cache import AttributeCache
+from envhub_sandbox.session.crash.history import History
 from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.session.prewarm import Prewarm
 from envhub_sandbox.session.refusals import refusal
@@ -35,7 +35,7 @@ from envhub_sandbox.session.use_lock import UseLock
 from envhub_sandbox.transport.deadline import Deadline, StepDeadline
 from envhub_sandbox.transport.jail import RunnersDiedError
 from envhub_sandbox.transport.lane import Lane, Request
-from envhub_sandbox.transport.replies import all_of
+from envhub_sandbox.transport.replies import all_replies
 from envhub_sandbox.transport.results import StepResult
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.lifecycle import Event, State
@@ -258,12 +258,12 @@ class Requests:
             if self._recovery is None:
                 raise self._failures.dead(deaths.first) from None
             replies = self._recovery.survive_request(deaths)
-        answers = all_of(replies, kind)
+        answers = all_replies(replies, kind)
         if self._recovery is not None:
             self._recovery.answered()
         return answers
 
-    def one_each(self, what: str, replies: list[m.Value] | list[m.Watched]) -> tuple[Any, ...]:
+    def one_each(self, what: str, replies: list[m.Value] | list[m.WatchDone]) -> tuple[Any, ...]:
         """One value for each sub-environment, out of the shards' replies."""
         try:
             return self.results.one_each(what, replies)
@@ -361,7 +361,7 @@ class Requests:
         except RunnersDiedError as deaths:
             self.lifecycle.answered()  # the next request meets the deaths
             raise deaths.first from None
-        return self.results.apart(all_of(replies, m.Value))
+        return self.results.apart(all_replies(replies, m.Value))
 
     # --- out and back --------------------------------------------------------------------------
 
@@ -409,8 +409,8 @@ class Requests:
         except EnvHubError as error:
             self._lease.forget_watched()
             self._failed(error, deadline)
-        except BaseException as error:  # Ctrl-C, or what another signal handler raises
-            self._lease.forget_watched()  # interruption.md, rule 3
+        except BaseException as error:  # interruption.md, rules 2 and 3: a Ctrl-C, for instance
+            self._lease.forget_watched()
             self._failures.interrupted(error)
             raise
         self.lifecycle.answered()

@@ -27,7 +27,7 @@ class UseLock:
     """
 
     def __init__(self, lease: Lease, failures: Failures) -> None:
-        self.lock = threading.RLock()
+        self.lock = threading.RLock()  # interruption.md, rule 12
         self._lease = lease
         self._failures = failures
 

@@ -1,4 +1,4 @@
-"""Files that are whole, or not there."""
+"""Writes files atomically: others see the old content or the new, and never a part of it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import secrets
 from pathlib import Path
 
 
-def write_whole(path: Path, data: bytes, *, mode: int = 0o600, durable: bool = False) -> None:
+def write_whole_file(path: Path, data: bytes, *, mode: int = 0o600, durable: bool = False) -> None:
     """Write a file under another name, and rename it: meanwhile others read the old one.
 
     Args:

@@ -1,4 +1,6 @@
-"""Processes of ours: one that ends with its parent, whether a child has ended, standard streams.
+"""Processes of ours: whose this is, one that ends with its parent, whether a child has ended.
+
+``OwnerProcess`` is docs/internals/interruption.md, rule 14.
 
 A parent hands its child a pidfd of itself, which the child watches. The kernel's own signal at a
 parent's death would come when the thread ends that has started the child, and a change of user
@@ -18,6 +20,33 @@ from collections.abc import Iterator
 from pathlib import Path
 
 _STREAMS = 3
+
+
+class OwnerProcess:
+    """The process that made this.
+
+    Attributes:
+        pid: Its number. Where each step asks, this is compared without a call.
+    """
+
+    def __init__(self) -> None:
+        self.pid = os.getpid()
+
+    @property
+    def is_here(self) -> bool:
+        """Whether it is this one, and no fork of it."""
+        return os.getpid() == self.pid
+
+
+def fork_error_text(owner: int | None = None) -> str:
+    """The text of the error of an environment that is used in a fork of its owner."""
+    whose = "this environment belongs to another process"
+    if owner is not None:
+        whose = f"this environment belongs to process {owner}"
+    return (
+        f"{whose}, and this is a fork of it ({os.getpid()}); call make_env here to get one of its "
+        "own"
+    )
 
 
 @contextlib.contextmanager

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
 import secrets
+import signal
 from collections.abc import Sequence
 
 import zmq
@@ -16,11 +18,11 @@ from envhub_sandbox.errors import (
     WorkerError,
     WorkerTimeoutError,
 )
+from envhub_sandbox.settings.options import option_name
+from envhub_sandbox.system.processes import OwnerProcess, fork_error_text
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.exit_status import describe_exit
-from envhub_sandbox.transport.forks import Owner, foreign
-from envhub_sandbox.transport.replies import expect
-from envhub_sandbox.transport.tcp import Far, Link
+from envhub_sandbox.transport.replies import expect_reply
+from envhub_sandbox.transport.tcp import TcpLink, TcpServer
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, LARGE_BYTES, WireLimits
@@ -29,11 +31,13 @@ from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _NOW = int(zmq.NOBLOCK)
 _MORE_NOW = int(zmq.SNDMORE) | _NOW
+_KILLED_IN_A_CONTAINER = 128
+"""And the signal's number: an engine's exit code, where the container's program got one."""
 SESSION = secrets.token_bytes(16)
 _contexts: dict[int, zmq.Context[zmq.Socket[bytes]]] = {}
 
 
-def far_session() -> bytes:
+def remote_session_id() -> bytes:
     """Our session on other hosts, where a fork of this process is another client."""
     return SESSION + os.getpid().to_bytes(4, "little")
 
@@ -53,7 +57,7 @@ _ROOM_S = 30.0
 """How long a socket may be full, or without a connection, until what is sent counts as lost."""
 
 
-class WorkerClient:
+class WorkerConnection:
     """A connection. Not thread-safe: its owner holds a lock.
 
     Args:
@@ -72,9 +76,9 @@ class WorkerClient:
         endpoint: str,
         process_fd: int,
         limits: WireLimits = DEFAULT_LIMITS,
-        far: Far | None = None,
+        far: TcpServer | None = None,
     ) -> None:
-        self._owner = Owner()
+        self._owner = OwnerProcess()
         self._limits = limits
         self._ids = itertools.count(1)
         self._socket = _context().socket(zmq.DEALER)
@@ -82,7 +86,7 @@ class WorkerClient:
         self._socket.setsockopt(zmq.MAXMSGSIZE, limits.frame_bytes)
         self._socket.setsockopt(zmq.RCVHWM, 64)
         self._far = far
-        self._link = None if far is None else Link(self._socket, endpoint, far)
+        self._link = None if far is None else TcpLink(self._socket, endpoint, far)
         self._socket.connect(endpoint)
         self._process_fd = process_fd
         self._poller = zmq.Poller()
@@ -102,10 +106,10 @@ class WorkerClient:
     def hello(self, deadline: Deadline) -> m.Welcome:
         """Agree on a protocol version."""
         self._compression = ""
-        session = SESSION if self._far is None else far_session()
+        session = SESSION if self._far is None else remote_session_id()
         greeting = m.Hello(m.VERSION, session)
         reply, _ = self.request(greeting, deadline=deadline)
-        welcome = expect(reply, m.Welcome)
+        welcome = expect_reply(reply, m.Welcome)
         if welcome.version != m.VERSION:
             raise VersionMismatchError(
                 f"this client speaks protocol {m.VERSION}, the worker {welcome.version}: install "
@@ -117,7 +121,7 @@ class WorkerClient:
 
     def _agree(self, deadline: Deadline) -> None:
         reply, _ = self.request(m.Agree(compression.available()), deadline=deadline)
-        agreed = expect(reply, m.Agreed)
+        agreed = expect_reply(reply, m.Agreement)
         if agreed.compression not in ("", *compression.available()):
             raise RemoteProtocolError("the worker chose a compression that was not offered")
         self._compression, self.patience_s = agreed.compression, agreed.idle_s
@@ -233,7 +237,7 @@ class WorkerClient:
 
     def _must_say_hello(self, request_id: int, reply: m.Message) -> bool:
         """Whether we came back over a new connection: nothing was done, so it can be asked anew."""
-        unknown = isinstance(reply, m.Refused) and reply.error == "HelloError"
+        unknown = isinstance(reply, m.Refusal) and reply.error == "HelloError"
         return unknown and request_id in self._sent
 
     def _wait(self, request_id: int, deadline: Deadline) -> None:
@@ -271,11 +275,49 @@ class WorkerClient:
             WorkerError: This is not the process that made the connection.
         """
         if os.getpid() != self._owner.pid:
-            raise WorkerError(foreign(self._owner.pid))
+            raise WorkerError(fork_error_text(self._owner.pid))
 
     def close(self) -> None:
-        """Close the connection. Idempotent; in a forked child nothing is touched."""
+        """Close the connection. Idempotent; a fork touches nothing: interruption.md, rule 14."""
         if self._owner.is_here and not self._socket.closed:
             if self._link is not None:
                 self._link.close()
             self._socket.close(0)
+
+
+def describe_exit(process_fd: int) -> str:
+    """How a server ended and what to do, as the rest of a sentence. The process stays to be reaped.
+
+    Args:
+        process_fd: A pidfd of it, or of the monitor of its container.
+    """
+    status = None
+    with contextlib.suppress(OSError):  # it was reaped already, or it is no process
+        status = os.waitid(os.P_PIDFD, process_fd, os.WEXITED | os.WNOHANG | os.WNOWAIT)
+    if status is None:
+        return f". {_what_next()}"
+    if status.si_code in (os.CLD_KILLED, os.CLD_DUMPED):
+        return f" by {_signal_name(status.si_status)}{_culprit(status.si_status)}. {_what_next()}"
+    number = status.si_status - _KILLED_IN_A_CONTAINER
+    if number in signal.valid_signals():
+        where = "; the container's own limit is DockerSandbox(memory=...) in Python"
+        why = _culprit(number) + (where if number == signal.SIGKILL else "")
+        return f" with its container, by {_signal_name(number)}{why}. {_what_next()}"
+    return f", with exit code {status.si_status}. {_what_next()}"
+
+
+def _what_next() -> str:
+    fresh = option_name("restart", "on_reset")
+    return f"The next make_env, or with {fresh} the next reset(), starts another"
+
+
+def _signal_name(number: int) -> str:
+    with contextlib.suppress(ValueError):
+        return signal.Signals(number).name
+    return f"signal {number}"
+
+
+def _culprit(number: int) -> str:
+    if number != signal.SIGKILL:
+        return ""
+    return ", by another process or by the kernel, as where memory runs out (dmesg says so)"

@@ -15,16 +15,16 @@ from envhub_sandbox.errors import (
     WorkerDiedError,
     WorkerError,
 )
-from envhub_sandbox.transport.attribute_cache import AttributeCache
-from envhub_sandbox.transport.connection import WorkerClient
+from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.remote_warnings import RemoteWarnings
-from envhub_sandbox.transport.replies import check, death, expect, typed
+from envhub_sandbox.transport.replies import check_reply, death, expect_reply, typed_reply
 from envhub_sandbox.transport.values import pickles
 from envhub_sandbox.transport.values.descriptions import unpacked
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
-from envhub_worker.protocol.limits import WireLimits
+from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
+from envhub_worker.protocol.messages.prefix import CHANGES, WATCHED_TYPES, Attribute
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _CAUSE_S = 10.0
@@ -75,7 +75,7 @@ class JailHandle:
 
     def __init__(
         self,
-        client: WorkerClient,
+        client: WorkerConnection,
         number: int,
         runners: Sequence[int],
         report: list[dict[str, Any]],
@@ -88,11 +88,11 @@ class JailHandle:
         self.report = report
         self.before_end: Callable[[], None] = _nothing
         self.warnings = RemoteWarnings()
-        self.watched = AttributeCache()
+        self.watched = WatchedAttributes()
         self.limits = limits
         self._asked: dict[int, int] = {}  # how many runners, by request
 
-    def through(self, client: WorkerClient) -> JailHandle:
+    def through(self, client: WorkerConnection) -> JailHandle:
         """The same jail over another connection of ours."""
         jail = JailHandle(client, self.number, self.runners, self.report, self.limits)
         jail.before_end, jail.warnings, jail.watched = self.before_end, self.warnings, self.watched
@@ -101,20 +101,20 @@ class JailHandle:
     def start_runners(self, count: int, deadline: Deadline) -> list[int]:
         """Fork further runners; returns their numbers."""
         reply, _ = self.client.request(m.StartRunners(self.number, count), deadline=deadline)
-        started = _runners(expect(reply, m.JailOpened), count)
+        started = _runners(expect_reply(reply, m.JailOpened), count)
         self.runners += started
         return started
 
     def keep(self, deadline: Deadline) -> None:
         """From now on it goes on without a runner that dies."""
         reply, _ = self.client.request(m.KeepJail(self.number), deadline=deadline)
-        expect(reply, m.Done)
+        expect_reply(reply, m.Done)
         self.kept = True
 
     def expire(self, idle_s: float, deadline: Deadline) -> None:
         """From now on it ends once it has been idle for so long."""
         message = m.ExpireIdle(self.number, max(1, int(idle_s * 1000)))
-        expect(self.client.request(message, deadline=deadline)[0], m.Done)
+        expect_reply(self.client.request(message, deadline=deadline)[0], m.Done)
 
     def replace_runners(self, dead: Sequence[int], deadline: Deadline) -> list[int]:
         """Fork a runner in the place of each that has died; returns the new numbers, in order."""
@@ -157,12 +157,12 @@ class JailHandle:
         reply, payload = self.client.receive(request_id, deadline)
         asked = self._asked.pop(request_id, None)
         with UNTRUSTED:
-            if not (self.kept and isinstance(reply, m.RelayedPartly)):
-                reply = expect(reply, m.Relayed)
+            if not (self.kept and isinstance(reply, m.RelayDonePartly)):
+                reply = expect_reply(reply, m.RelayDone)
             parts = _cut(payload, reply.parts)
             if len(parts) != asked:
                 raise RemoteProtocolError(f"{asked} runners were asked, {len(parts)} answered")
-            if isinstance(reply, m.RelayedPartly):
+            if isinstance(reply, m.RelayDonePartly):
                 raise self._died(reply.dead, parts)
             return [self._unpack(part) for part in parts]
 
@@ -170,7 +170,7 @@ class JailHandle:
         """The server says which runners have died; a runner cannot."""
         if not dead or not set(dead) <= set(range(len(parts))):
             raise RemoteProtocolError("the worker names dead runners that were not asked")
-        deaths = {index: death(typed(self._unpack(parts[index]), m.Died)) for index in dead}
+        deaths = {index: death(typed_reply(self._unpack(parts[index]), m.Death)) for index in dead}
         living = [None if i in deaths else self._unpack(part) for i, part in enumerate(parts)]
         return RunnersDiedError(living, deaths)
 
@@ -191,7 +191,7 @@ class JailHandle:
         packed = [(runner, self.pack(message)) for runner, message in requests]
         replies = self.ask(operation, packed, deadline, deposited=deposited)
         for reply in replies:
-            check(reply)
+            check_reply(reply)
         return replies
 
     def ask(
@@ -215,7 +215,7 @@ class JailHandle:
             WorkerDiedError: The jail has ended, during ``operation``.
         """
         reply, _ = self.client.request(m.ReadOutput(self.number, operation), deadline=deadline)
-        return expect(reply, m.Output).text
+        return expect_reply(reply, m.Output).text
 
     def cause_of_death(self, operation: str) -> Exception:
         """Why it has ended: the server knows, at the latest when it has reaped it."""
@@ -240,7 +240,7 @@ class JailHandle:
             request = self.client.send(m.CloseJail(self.number))
         except WorkerError:
             pass
-        except BaseException:
+        except BaseException:  # interruption.md, rule 7: the jail may not know of its end yet
             self._part(None, Deadline(0))
             raise
         return partial(self._part, request)
@@ -273,7 +273,7 @@ def _nothing() -> None:
 
 
 def open_jail(
-    client: WorkerClient, request: m.OpenJail, limits: WireLimits, deadline: Deadline
+    client: WorkerConnection, request: m.OpenJail, limits: WireLimits, deadline: Deadline
 ) -> JailHandle:
     """Open a jail.
 
@@ -284,7 +284,7 @@ def open_jail(
     sent = client.send(request)
     try:
         reply, _ = client.receive(sent, deadline)
-        opened = expect(reply, m.JailOpened)
+        opened = expect_reply(reply, m.JailOpened)
         runners = _runners(opened, request.runners)
         report = [dict(layer) for layer in opened.report if isinstance(layer, dict)]
         client.hold(opened.jail)
@@ -296,11 +296,11 @@ def open_jail(
         raise
 
 
-def _end_unseen(client: WorkerClient, sent: int) -> None:
+def _end_unseen(client: WorkerConnection, sent: int) -> None:
     """End the jail that a request opens, whether or not the reply has been read."""
     deadline = Deadline(_UNSEEN_S)
     with contextlib.suppress(EnvHubError):
-        opened = expect(client.reply_again(sent, deadline), m.JailOpened)
+        opened = expect_reply(client.reply_again(sent, deadline), m.JailOpened)
         client.request(m.CloseJail(opened.jail), deadline=deadline)
         client.let_go(opened.jail)
 
@@ -314,3 +314,43 @@ def _runners(opened: m.JailOpened, count: int) -> list[int]:
     ):
         raise RemoteProtocolError(f"the worker did not start {count} runners, each with a number")
     return runners
+
+
+class WatchedAttributes:
+    """The values of attributes that the runners watch: by the environment's number and their name.
+
+    A reply names the attributes that have changed before it; the others have the values that are
+    kept here, and need no request. Trust: the values come from the worker, as those of a ``call``
+    do. They are of immutable types, so a caller cannot change what is kept.
+    """
+
+    def __init__(self) -> None:
+        self._values: dict[Attribute, tuple[Any, ...]] = {}
+
+    def note(self, number: int, name: str, values: tuple[Any, ...]) -> bool:
+        """Keep values that were read. Returns whether they can be kept."""
+        if not all(type(value) in WATCHED_TYPES for value in values):
+            return False
+        self._values[number, name] = values
+        return True
+
+    def values(self, number: int, name: str) -> tuple[Any, ...] | None:
+        """One for each sub-environment; None if they are not known."""
+        return self._values.get((number, name))
+
+    def forget(self) -> None:
+        """Drop all: a runner was replaced, or a reply was lost."""
+        self._values.clear()
+
+    def take(self, frames: Sequence[Buffer]) -> Sequence[Buffer]:
+        """A reply's own frames, without the changes in front. Trust: input from the worker.
+
+        Raises:
+            RemoteProtocolError: These are not what was agreed on.
+        """
+        if len(frames) >= DEFAULT_LIMITS.frames:  # there was no room in front
+            self.forget()
+        changed, rest = CHANGES.read(frames)
+        for attribute in changed:
+            self._values.pop(attribute, None)
+        return rest

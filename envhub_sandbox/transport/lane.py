@@ -1,8 +1,8 @@
 """The way of an environment's requests to its runners: one interface, and the way over the server.
 
 There are two: ``RelayLane``, below, and ``SharedMemoryLane``. Which of them an environment has is
-decided once, when it is built (``session/jails/placement``); a request
-does not depend on it.
+decided once, when it is built (``session/jails/builder``). What a request means does not depend on
+the lane.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from envhub_sandbox.errors import EnvHubError, WorkerError
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import JailHandle, RunnersDiedError
 from envhub_sandbox.transport.pace import Pace
-from envhub_sandbox.transport.replies import all_of
+from envhub_sandbox.transport.replies import all_replies
 from envhub_sandbox.transport.results import Results, StepResult
 from envhub_sandbox.transport.values import pickles
 from envhub_worker.protocol import messages as m
@@ -205,7 +205,7 @@ class RelayLane:
         # not kept: a large batch that its owner has dropped is memory for the next
         answers, self._answers = self._answers, []
         try:
-            return self._results.step(all_of(answers, m.StepDone), infos)
+            return self._results.step(all_replies(answers, m.StepDone), infos)
         except batches.Misfit:
             self._answers = answers  # to be joined once more, with other infos
             raise

@@ -18,9 +18,9 @@ from typing import TextIO
 
 from envhub_sandbox.errors import EnvHubError, PolicyError
 from envhub_sandbox.system.log import OUTPUT
-from envhub_sandbox.transport.connection import WorkerClient
+from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.replies import expect
+from envhub_sandbox.transport.replies import expect_reply
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.text import printable
 
@@ -69,7 +69,7 @@ class Lines:
             sink(text)
 
 
-class Bounded:
+class BoundedSink:
     """Takes lines, up to a number of bytes.
 
     Args:
@@ -103,14 +103,14 @@ class OutputSinks:
     """
 
     def __init__(self, label: str, path: Path | None, *, stderr: bool = False) -> None:
-        self.sinks: list[Sink] = [Bounded(_write_to_stderr, FILE_BYTES)] if stderr else []
+        self.sinks: list[Sink] = [BoundedSink(_write_to_stderr, FILE_BYTES)] if stderr else []
         self._file: TextIO | None = None
         if path is not None:
             try:
                 self._file = open(path, "a", encoding="utf-8", buffering=1)  # noqa: SIM115
             except OSError as error:
                 raise PolicyError(f"policy: output {str(path)!r}: {error}") from error
-            self.sinks.append(Bounded(self._file.write, FILE_BYTES - self._file.tell()))
+            self.sinks.append(BoundedSink(self._file.write, FILE_BYTES - self._file.tell()))
         if OUTPUT.isEnabledFor(logging.DEBUG):
             self.sinks.append(lambda line: OUTPUT.debug("%s: %s", label, line))
 
@@ -129,7 +129,9 @@ class OutputFollower:
         sinks: Where its lines go.
     """
 
-    def __init__(self, connect: Callable[[], WorkerClient], jail: int, sinks: OutputSinks) -> None:
+    def __init__(
+        self, connect: Callable[[], WorkerConnection], jail: int, sinks: OutputSinks
+    ) -> None:
         self._connect, self._jail, self._sinks = connect, jail, sinks
         self._lines = Lines(sinks.sinks)
         self._offset = 0
@@ -159,10 +161,10 @@ class OutputFollower:
             self._lines.end()
             self._sinks.close()
 
-    def _ask(self, client: WorkerClient) -> int:
+    def _ask(self, client: WorkerConnection) -> int:
         """Bring what there is; returns how many bytes that was."""
         request = m.FollowOutput(self._jail, self._offset)
-        reply = expect(client.request(request, deadline=Deadline(_ASK_S))[0], m.OutputBytes)
+        reply = expect_reply(client.request(request, deadline=Deadline(_ASK_S))[0], m.OutputBytes)
         if reply.start > self._offset:
             self._lines.say(f"{reply.start - self._offset} bytes are lost: it printed too fast")
         self._offset = reply.start + len(reply.data)

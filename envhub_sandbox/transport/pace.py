@@ -10,7 +10,7 @@ from pathlib import Path
 from statistics import median
 from typing import NamedTuple
 
-from envhub_sandbox.system.files import write_whole
+from envhub_sandbox.system.files import write_whole_file
 from envhub_worker.protocol.manifest.manifest import EnvManifest
 
 ASK_NS = 10_000.0
@@ -155,7 +155,9 @@ class PaceBook:
         entry = [*awake, *asleep]
         if all(map(_is_sane, entry)):
             with contextlib.suppress(OSError):
-                write_whole(self._path, json.dumps({**self._read(), _name(env): entry}).encode())
+                write_whole_file(
+                    self._path, json.dumps({**self._read(), _name(env): entry}).encode()
+                )
 
     def _read(self) -> dict[str, object]:
         try:

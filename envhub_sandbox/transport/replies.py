@@ -31,7 +31,7 @@ from envhub_sandbox.errors import (
     load_error,
     remote_error,
 )
-from envhub_sandbox.option_names import option_name
+from envhub_sandbox.settings.options import option_name
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.inert import one_line
 from envhub_worker.protocol.confinement import Reason
@@ -43,7 +43,7 @@ _PROFILE = re.compile('profile "(strict|no-userns|container)"')
 # --- what was asked for ------------------------------------------------------------------------
 
 
-def expect(reply: m.Message, kind: type[m.M]) -> m.M:
+def expect_reply(reply: m.Message, kind: type[m.M]) -> m.M:
     """The reply, if it is of the kind that the request asks for.
 
     Raises:
@@ -51,27 +51,27 @@ def expect(reply: m.Message, kind: type[m.M]) -> m.M:
         WorkerDiedError: A process of the jail ended.
         RemoteProtocolError: It is another message.
     """
-    if isinstance(reply, m.Refused) and kind is not m.Refused:
+    if isinstance(reply, m.Refusal) and kind is not m.Refusal:
         raise refusal(reply)
-    if isinstance(reply, m.Died) and kind is not m.Died:
+    if isinstance(reply, m.Death) and kind is not m.Death:
         raise death(reply)
-    return typed(reply, kind)
+    return typed_reply(reply, kind)
 
 
-def check(reply: m.Message) -> None:
+def check_reply(reply: m.Message) -> None:
     """Raise what a runner's reply says went wrong.
 
     Raises:
         EnvHubError: What the repository raised.
         RemoteProtocolError: A runner spoke in the server's name.
     """
-    if isinstance(reply, m.Raised):
+    if isinstance(reply, m.RaisedException):
         raise raised(reply)
     if reply.kind < m.FIRST_RUNNER_KIND:
         raise RemoteProtocolError(f"a runner sent {type(reply).__name__}")
 
 
-def typed(reply: m.Message, kind: type[m.M] | tuple[type[m.M], ...]) -> m.M:
+def typed_reply(reply: m.Message, kind: type[m.M] | tuple[type[m.M], ...]) -> m.M:
     """The reply, if it is of the kind, or of one of the kinds, that the request asks for.
 
     Raises:
@@ -86,7 +86,7 @@ def typed(reply: m.Message, kind: type[m.M] | tuple[type[m.M], ...]) -> m.M:
     )
 
 
-def all_of(replies: Sequence[m.Message], kind: type[m.M] | tuple[type[m.M], ...]) -> list[m.M]:
+def all_replies(replies: Sequence[m.Message], kind: type[m.M] | tuple[type[m.M], ...]) -> list[m.M]:
     """The runners' replies, all of the kind, or of one of the kinds, that was asked for.
 
     Raises:
@@ -95,9 +95,9 @@ def all_of(replies: Sequence[m.Message], kind: type[m.M] | tuple[type[m.M], ...]
     """
     others = [reply for reply in replies if type(reply) is not kind]
     for reply in others:
-        check(reply)
+        check_reply(reply)
     for reply in others:
-        typed(reply, kind)
+        typed_reply(reply, kind)
     return cast("list[m.M]", replies)
 
 
@@ -109,7 +109,7 @@ def _named(fix: str) -> str:
     return _PROFILE.sub(lambda found: option_name("profile", found[1]), fix)
 
 
-def refusal(reply: m.Refused) -> Exception:
+def refusal(reply: m.Refusal) -> Exception:
     """The error for a refused request. Trust: text from the worker."""
     message = printable(reply.message)
     if reply.error == "SandboxUnavailableError":
@@ -150,7 +150,7 @@ _REASONS: dict[Reason, str] = {
 }
 
 
-def death(reply: m.Died) -> WorkerDiedError:
+def death(reply: m.Death) -> WorkerDiedError:
     """The error for a jail that ended."""
     how = _REASONS.get(reply.reason, reply.reason)
     if reply.signal:
@@ -182,7 +182,7 @@ _LOADERS_OWN = (".EntryError", ".ArgumentsError")
 """What our own loader raises; its traceback is of no use."""
 
 
-def raised(reply: m.Raised) -> EnvHubError:
+def raised(reply: m.RaisedException) -> EnvHubError:
     """The error for an exception of the repository. Trust: text from the worker."""
     reply = _harmless(reply)
     if reply.stage not in _LOADING:
@@ -201,9 +201,9 @@ def raised(reply: m.Raised) -> EnvHubError:
     return error
 
 
-def _harmless(reply: m.Raised) -> m.Raised:
+def _harmless(reply: m.RaisedException) -> m.RaisedException:
     """The same without what a terminal would obey, and bounded."""
-    return m.Raised(
+    return m.RaisedException(
         reply.builtin,
         one_line(reply.type_name, 512),
         printable(reply.message),

@@ -8,7 +8,7 @@ from typing import Any, cast
 import numpy as np
 
 from envhub_sandbox.errors import EnvHubError, RemoteProtocolError, remote_error
-from envhub_sandbox.transport.replies import check, typed
+from envhub_sandbox.transport.replies import check_reply, typed_reply
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.inert import one_line
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
@@ -106,10 +106,10 @@ class Results:
         """
         if reply is None:
             return {}
-        check(reply)
-        return self._info(typed(reply, m.Value).value)
+        check_reply(reply)
+        return self._info(typed_reply(reply, m.Value).value)
 
-    def one_each(self, what: str, replies: Sequence[m.Value | m.Watched]) -> tuple[Any, ...]:
+    def one_each(self, what: str, replies: Sequence[m.Value | m.WatchDone]) -> tuple[Any, ...]:
         """One value for each sub-environment."""
         gathered: list[Any] = []
         for reply, size in zip(replies, self._sizes, strict=True):

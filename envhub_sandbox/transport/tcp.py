@@ -39,7 +39,7 @@ class UnreachableError(SandboxUnavailableError):
 
 
 @dataclass(frozen=True)
-class Far:
+class TcpServer:
     """A server on another host, as its clients know it.
 
     Attributes:
@@ -61,10 +61,10 @@ class Far:
         return z85.decode(zmq.curve_public(z85.encode(self.client_key))).hex()
 
 
-class Link:
+class TcpLink:
     """What is known of one socket's connection. To be made before it connects."""
 
-    def __init__(self, socket: zmq.Socket[bytes], endpoint: str, far: Far) -> None:
+    def __init__(self, socket: zmq.Socket[bytes], endpoint: str, far: TcpServer) -> None:
         self._endpoint = endpoint
         self._far = far
         self._socket = socket
@@ -76,7 +76,7 @@ class Link:
         self._set_options(socket, far)
         self.monitor = socket.get_monitor_socket(_EVENTS)
 
-    def _set_options(self, socket: zmq.Socket[bytes], far: Far) -> None:
+    def _set_options(self, socket: zmq.Socket[bytes], far: TcpServer) -> None:
         heartbeat_ms = max(1, int(far.heartbeat_s * 1000))
         socket.setsockopt(zmq.IPV6, "[" in self._endpoint)
         socket.setsockopt(zmq.HEARTBEAT_IVL, max(1, heartbeat_ms // _PINGS))

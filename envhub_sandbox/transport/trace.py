@@ -1,7 +1,7 @@
 """``ENVHUB_TRACE=1``: print each message to and from a worker to stderr, with its time.
 
-    +0.004210 MainThread > WorkerClient.send OpenJail
-    +0.052377 MainThread < WorkerClient.receive JailOpened (48.1 ms)
+    +0.004210 MainThread > WorkerConnection.send OpenJail
+    +0.052377 MainThread < WorkerConnection.receive JailOpened (48.1 ms)
 
 A line names classes of messages and operations, and never a value. Without the variable no class is
 changed, so a step costs the same.
@@ -17,19 +17,19 @@ from collections.abc import Callable
 from time import perf_counter
 from typing import Any
 
-from envhub_sandbox.transport.connection import WorkerClient
+from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.lane import RelayLane, Request
 from envhub_sandbox.transport.shared_memory.lane import SharedMemoryLane
 from envhub_worker.protocol import messages as m
 
 _VARIABLE = "ENVHUB_TRACE"
 _SENDING: dict[type, tuple[str, ...]] = {
-    WorkerClient: ("send",),
+    WorkerConnection: ("send",),
     RelayLane: ("send_step", "send", "send_for_infos"),
     SharedMemoryLane: ("send_step", "send", "send_for_infos"),
 }
 _WAITING: dict[type, tuple[str, ...]] = {
-    WorkerClient: ("receive",),
+    WorkerConnection: ("receive",),
     RelayLane: ("wait", "replies"),
     SharedMemoryLane: ("wait", "replies"),
 }

@@ -17,7 +17,6 @@ from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
-from envhub_sandbox.vector.infos import info_of
 from envhub_sandbox.vector.tracebacks import short_traceback, shortened
 from envhub_worker.protocol.manifest.names import absent, is_servable
 from envhub_worker.protocol.untrusted import UNTRUSTED
@@ -197,3 +196,28 @@ class SingleEnv(gym.Env[Any, Any]):
 
     def _first(self, batch: Any) -> Any:
         return next(iter(iterate(self._vector.observation_space, batch)))
+
+
+def info_of(infos: dict[Any, Any], index: int, num_envs: int) -> dict[Any, Any]:
+    """The info of sub-environment ``index``.
+
+    The other way round from ``VectorEnv._add_info``: a key counts where its mask, ``"_" + key``,
+    bool ``(num_envs,)``, is set, and mappings are nested. Keys may be numbers, as in Gymnasium.
+    """
+    info = {}
+    masks = {f"_{key}" for key in infos}
+    for key, value in infos.items():
+        if key in masks:
+            continue
+        mask = infos.get(f"_{key}")
+        if mask is None or np.asarray(mask).flat[index]:
+            info[key] = _of_one(value, index, num_envs)
+    return info
+
+
+def _of_one(value: Any, index: int, num_envs: int) -> Any:
+    if isinstance(value, dict):
+        return info_of(value, index, num_envs)
+    if isinstance(value, (np.ndarray, list, tuple)) and len(value) == num_envs:
+        return value[index]
+    return value  # not of the sub-environments, but of the vector environment

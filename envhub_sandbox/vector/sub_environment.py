@@ -14,7 +14,7 @@ import gymnasium as gym
 
 from envhub_sandbox.errors import RemoteProtocolError
 from envhub_sandbox.session.requests import OneMessageFor
-from envhub_sandbox.transport.replies import typed
+from envhub_sandbox.transport.replies import typed_reply
 from envhub_sandbox.transport.values import generators
 from envhub_sandbox.vector.tracebacks import short_traceback
 from envhub_worker.protocol import messages as m
@@ -240,7 +240,7 @@ class SubEnvironment(gym.Env[Any, Any]):
             given = (args, kwargs) if place is not None else ((), {})
             return m.CallOne(number, place, where, name, *given)
 
-        return typed(self._ask(name, self._index, message), m.Value).value
+        return typed_reply(self._ask(name, self._index, message), m.Value).value
 
     def _restored(self, result: Any) -> Any:
         """The result of a reset or a step, with the classes that the space gives observations."""

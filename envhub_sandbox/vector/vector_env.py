@@ -19,7 +19,7 @@ from gymnasium.vector import VectorEnv
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.requests import Bounds, MessageFor, OneMessageFor
-from envhub_sandbox.transport.replies import typed
+from envhub_sandbox.transport.replies import typed_reply
 from envhub_sandbox.transport.results import StepResult
 from envhub_sandbox.transport.values import generators
 from envhub_sandbox.vector import from_manifest
@@ -242,7 +242,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             self._send_call(name, (), {})
             return self._end_call(self._timeouts.call_s)
         self._send_call(name, (), {}, lambda number, _: m.Watch(number, name))
-        replies = self._requests.collect(self._timeouts.call_s, m.Watched)
+        replies = self._requests.collect(self._timeouts.call_s, m.WatchDone)
         values = self._requests.one_each("call", replies)
         attributes.put(name, values, watched=all(reply.watched for reply in replies))
         return values
@@ -416,7 +416,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         @short_traceback
         def method(*args: Any, **kwargs: Any) -> Any:
             result = self._requests.ask_own(name, m.CallOwn, name, args, kwargs)
-            return typed(result, m.Value).value
+            return typed_reply(result, m.Value).value
 
         return method
 

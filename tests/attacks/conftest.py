@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from envhub_sandbox.hub import store
+from envhub_sandbox.hub.cache import cache_root
 from envhub_sandbox.sandboxes.process import PROCESS
 from tests.attacks import table
 from tests.attacks.harness import Arena
@@ -37,7 +37,7 @@ def _warm_server(_own_cache: None, _open_ground: Path) -> Iterator[None]:
     """One worker server for all tests in a row: its zygotes stay warm between them."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("ENVHUB_CACHE", str(_open_ground / "cache"))
-        use = PROCESS.acquire(store.cache_root() / "snapshots")
+        use = PROCESS.acquire(cache_root() / "snapshots")
         yield
         use.release()
 

@@ -67,7 +67,7 @@ class Asked:
             assert isinstance(message, m.Message)
             return m.pack_header(message, number)
         frames = m.pack(message) if isinstance(message, m.Message) else message
-        relayed = m.Relayed((len(frames),))
+        relayed = m.RelayDone((len(frames),))
         return [*m.pack_header(relayed, number), *frames]
 
 
@@ -193,9 +193,9 @@ def honest(request: m.Message) -> m.Message:
         m.CloseJail: m.Done(),
         m.ReadOutput: m.Output(""),
         m.GetStatus: m.Status(()),
-        m.Load: m.Loaded(manifest()),
+        m.Load: m.LoadDone(manifest()),
         m.LoadTask: m.Value((NUM_ENVS, True)),
-        m.Build: m.Built(encode_env(env_manifest())),
+        m.Build: m.BuildDone(encode_env(env_manifest())),
         m.Call: m.Value((None,) * NUM_ENVS),
     }
     return answers.get(type(request), m.Value(None))

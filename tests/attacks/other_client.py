@@ -11,7 +11,7 @@ import json
 import os
 import sys
 
-from envhub_sandbox.hub import store
+from envhub_sandbox.hub.cache import cache_root
 from envhub_sandbox.sandboxes.process import PROCESS
 from tests.attacks.harness import Arena, Run, call, new_alias
 
@@ -26,7 +26,7 @@ def become(user: int) -> None:
 
 def main(profile: str, secret: str) -> int:
     """Hold a jail open until there is nothing more to read."""
-    cache = store.cache_root()
+    cache = cache_root()
     use = PROCESS.acquire(cache / "snapshots")
     server = use.server
     with Arena(profile, "").environment() as env:

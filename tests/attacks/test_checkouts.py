@@ -12,7 +12,7 @@ import pytest
 
 from envhub_sandbox.check.static.static import static
 from envhub_sandbox.hub.checkout import read_checkout
-from envhub_sandbox.hub.snapshot import named
+from envhub_sandbox.hub.snapshot import snapshot_named
 from tests.hub.olah_server import GitRepository
 
 pytestmark = pytest.mark.skipif(shutil.which("git") is None, reason="needs git")
@@ -93,7 +93,7 @@ def test_no_program_of_a_checkout_runs(
     command = ["git", "-C", str(checkout.folder), *trap(checkout, program)]
     subprocess.run(command, capture_output=True, check=False, stdin=subprocess.DEVNULL, timeout=60)
     assert ran(program)
-    read = static(named(str(checkout.folder)))
+    read = static(snapshot_named(str(checkout.folder)))
     assert "env.py" in {one.record.path for one in read.files}
     assert not ran(program)
 

@@ -159,7 +159,7 @@ def test_pickles_in_manifests_are_never_loaded(
     described = manifest()
     evil: Any = Canary(canary)
     described["envs"][0][name] = {"a": evil} if name in ("metadata", "spec") else evil
-    liar.lies[m.Load] = relayed(pickled(m.Loaded(described)))
+    liar.lies[m.Load] = relayed(pickled(m.LoadDone(described)))
     refuses(lambda: opened(liar, folder))
     assert not canary.exists()
 
@@ -235,7 +235,7 @@ def test_wrong_arrays_are_refused(liar: LyingServer, folder: str, what: str) -> 
 
 def described(value: object) -> Frames:
     """An answer to Load with a hand-made manifest."""
-    return m.pack(m.Loaded(value))  # type: ignore[arg-type]
+    return m.pack(m.LoadDone(value))  # type: ignore[arg-type]
 
 
 def changed(**fields: Any) -> dict[str, Any]:
@@ -349,10 +349,13 @@ OTHERS: dict[str, tuple[type[m.Message], m.Message]] = {
     "a vector environment of its own": (m.LoadTask, m.Value((NUM_ENVS, False))),
     "arrays": (m.LoadTask, m.Value((np.arange(3), np.arange(3)))),
     "an array": (m.LoadTask, m.Value(np.arange(2))),
-    "a manifest": (m.LoadTask, m.Loaded(manifest())),
-    "fewer built": (m.Build, m.Built(encode_env(env_manifest(num_envs=1)))),
-    "another mode built": (m.Build, m.Built(encode_env(env_manifest(autoreset_mode="Disabled")))),
-    "nothing built": (m.Build, m.Built({})),
+    "a manifest": (m.LoadTask, m.LoadDone(manifest())),
+    "fewer built": (m.Build, m.BuildDone(encode_env(env_manifest(num_envs=1)))),
+    "another mode built": (
+        m.Build,
+        m.BuildDone(encode_env(env_manifest(autoreset_mode="Disabled"))),
+    ),
+    "nothing built": (m.Build, m.BuildDone({})),
     "a value built": (m.Build, m.Value(None)),
 }
 
@@ -467,11 +470,11 @@ def test_malformed_answers_of_the_server_are_refused(
         m.Welcome(1, "x", 1),
         m.Method(),
         m.Value(None),
-        m.Loaded({}),
+        m.LoadDone({}),
         m.Step(1, None),
         m.Hello(m.VERSION, b""),
-        m.Died(1, "exit", 0, None, "", "", ""),
-        m.Refused("SandboxUnavailableError", "x", "y", "z"),
+        m.Death(1, "exit", 0, None, "", "", ""),
+        m.Refusal("SandboxUnavailableError", "x", "y", "z"),
         m.JailOpened(1, (), ()),
     ],
     ids=lambda reply: type(reply).__name__,
@@ -491,7 +494,7 @@ def test_exceptions_choose_no_class(liar: LyingServer, folder: str) -> None:
     before = set(sys.modules)
     names = ("SystemExit", "KeyboardInterrupt", "os.system", "antigravity.Oops", "__import__", "")
     for name in names:
-        liar.lies[m.Step] = relayed(m.Raised(name, name, "x" * 100, "y", "step"))
+        liar.lies[m.Step] = relayed(m.RaisedException(name, name, "x" * 100, "y", "step"))
         with opened(liar, folder) as suites:
             suites.env.reset()
             refuses(lambda suites=suites: suites.env.step(ACTIONS))
@@ -559,7 +562,7 @@ def test_parts_that_do_not_add_up_are_refused(
     """The server's count of frames has to fit what came, and what was asked."""
     frames = m.pack(step_done())
     liar.lies[m.Step] = lambda asked: [
-        [*m.pack_header(m.Relayed(parts), asked.request_id), *frames]
+        [*m.pack_header(m.RelayDone(parts), asked.request_id), *frames]
     ]
     with opened(liar, folder) as suites:
         suites.env.reset()
@@ -570,8 +573,8 @@ def test_parts_that_do_not_add_up_are_refused(
     "reply",
     [
         m.Welcome(99, "x", 1),
-        m.Refused("VersionMismatchError", "\x1b[2J", "", ""),
-        m.Refused("os.system", "\x1b[2J", "", ""),
+        m.Refusal("VersionMismatchError", "\x1b[2J", "", ""),
+        m.Refusal("os.system", "\x1b[2J", "", ""),
         m.JailOpened(1, (), ()),
         m.Value(None),
     ],

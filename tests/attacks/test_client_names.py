@@ -75,8 +75,8 @@ def greedy(liar: LyingServer, folder: str, answer: Lie | None = None, **fields: 
     first = ("__deepcopy__", "__array_interface__", "_repr_html_", "__html__", "hub_config")
     listed = tuple(dict.fromkeys((*first, *NAMES)))[:1024]
     value["envs"][0].update({"attributes": listed, "shardable": False, **fields})
-    liar.lies[m.Load] = relayed(m.Loaded(value))
-    liar.lies[m.Build] = relayed(m.Built(value["envs"][0]))
+    liar.lies[m.Load] = relayed(m.LoadDone(value))
+    liar.lies[m.Build] = relayed(m.BuildDone(value["envs"][0]))
     liar.lies[m.GetOwn] = answer or relayed(m.Method())
     liar.lies[m.CallOwn] = relayed(m.Value(SCRIPT))
     return opened(liar, folder)
@@ -322,7 +322,9 @@ def test_what_libraries_look_for_is_served_to_who_names_it(liar: LyingServer, fo
 def test_the_clients_own_names_are_nobody_elses(liar: LyingServer, folder: str) -> None:
     """A property of ours that fails does not fall back to the worker's attribute of that name."""
     own = tuple(name for name in dir(SandboxVectorEnv) if not name.startswith("__"))
-    liar.lies[m.GetRandom] = relayed(m.Raised("AttributeError", "AttributeError", "no", "", "x"))
+    liar.lies[m.GetRandom] = relayed(
+        m.RaisedException("AttributeError", "AttributeError", "no", "", "x")
+    )
     with greedy(liar, folder, attributes=own) as suites:
         with pytest.raises(AttributeError):
             suites.env.np_random  # noqa: B018
@@ -347,7 +349,7 @@ def test_sub_environments_run_nothing_when_looked_at(liar: LyingServer, folder: 
         assert sub.task == "lift"
 
 
-@pytest.mark.parametrize("lie", [m.Done(), m.ResetDone(0, {}), m.Built({})], ids=repr)
+@pytest.mark.parametrize("lie", [m.Done(), m.ResetDone(0, {}), m.BuildDone({})], ids=repr)
 def test_sub_environments_take_only_values_and_methods(
     liar: LyingServer, folder: str, lie: m.Message
 ) -> None:

@@ -47,7 +47,7 @@ def specified(liar: LyingServer, folder: str, spec: dict[str, Any]) -> Any:
     """``make_env`` of an environment with this specification."""
     value = manifest()
     value["envs"][0]["spec"] = spec
-    liar.lies[m.Load] = relayed(m.Loaded(value))
+    liar.lies[m.Load] = relayed(m.LoadDone(value))
     return opened(liar, folder)
 
 
@@ -253,7 +253,7 @@ def test_names_of_suites_write_nothing_elsewhere(
     suite = str(elsewhere) if up == "absolute" else "../../home"
     value = manifest()
     value["envs"][0]["suite"] = suite
-    liar.lies[m.Load] = relayed(m.Loaded(value))
+    liar.lies[m.Load] = relayed(m.LoadDone(value))
     assert isinstance(refuses(lambda: opened(liar, folder)), RemoteProtocolError)
 
     results = tmp_path / "results" / "videos"

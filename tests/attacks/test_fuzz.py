@@ -31,7 +31,16 @@ ROOT = Path(__file__).parents[2]
 EXAMPLES = 250
 SEED = 1
 MANY = 2000
-KINDS = {"Loaded", "Built", "ResetDone", "StepDone", "Value", "Raised", "Relayed", "JailOpened"}
+KINDS = {
+    "LoadDone",
+    "BuildDone",
+    "ResetDone",
+    "StepDone",
+    "Value",
+    "RaisedException",
+    "RelayDone",
+    "JailOpened",
+}
 
 
 @pytest.fixture(scope="module")

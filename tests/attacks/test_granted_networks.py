@@ -15,7 +15,7 @@ from typing import Any
 import psutil
 import pytest
 
-from envhub_sandbox.hub import store
+from envhub_sandbox.hub.cache import cache_root
 from envhub_sandbox.sandboxes.process import PROCESS
 from tests.attacks.harness import USER, Arena, Run, call, control_run, new_alias, token
 from tests.attacks.listeners import Listener, listening
@@ -170,7 +170,7 @@ def granted(env: Any, payload: str, options: dict[str, Any]) -> None:
 
 def test_servers_sockets_are_not_part_of_the_hosts_network(arena: Arena) -> None:
     """The folder with a server's socket and the one that takes descriptors is out of reach."""
-    use = PROCESS.acquire(store.cache_root() / "snapshots")
+    use = PROCESS.acquire(cache_root() / "snapshots")
     server = use.server
     place = server.folder / f"{token()[:8]}.sock"
     server.folder.chmod(0o711)  # file modes shall not be what stops it

@@ -259,7 +259,7 @@ def test_as_many_answers_as_runners(liar: LyingServer, tmp_path: Path, parts: in
 
     def lie(asked: Asked) -> list[Frames]:
         return [
-            [*m.pack_header(m.Relayed((len(frames),) * parts), asked.request_id), *frames * parts]
+            [*m.pack_header(m.RelayDone((len(frames),) * parts), asked.request_id), *frames * parts]
         ]
 
     liar.lies[m.Step] = lie
@@ -298,8 +298,8 @@ def test_odd_observations_of_graphs(
         single_observation_space=GRAPHS,
         observation_space=batch_space(GRAPHS, NUM_ENVS),
     )
-    liar.lies[m.Load] = relayed(m.Loaded(encode_manifest(Manifest(envs=(described,), lazy=True))))
-    liar.lies[m.Build] = relayed(m.Built(encode_env(described)))
+    liar.lies[m.Load] = relayed(m.LoadDone(encode_manifest(Manifest(envs=(described,), lazy=True))))
+    liar.lies[m.Build] = relayed(m.BuildDone(encode_env(described)))
     graph = (np.zeros((1, 2), np.float32), None, None)
     good = {"g": (graph,) * NUM_ENVS, "x": np.zeros(NUM_ENVS, np.int64)}
     odd = ODD[what]

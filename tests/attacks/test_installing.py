@@ -271,7 +271,7 @@ bootstrap = runpy.run_path(sys.argv[1])
 bootstrap["load_package"]()
 from envhub_worker import bytecode
 if sys.argv[2] == "confined":
-    bytecode.confine(sys.argv[3])
+    bytecode.confine_to_bytecode_folder(sys.argv[3])
 def attempt(work):
     try:
         work()

@@ -118,14 +118,14 @@ def test_a_worker_that_lies_about_warnings_is_given_up(tmp_path: Path, lie: str)
 
 
 def _with(said: Any) -> Callable[[Asked], list[Frames]]:
-    frames = [*m.pack(m.Warned(said)), *m.pack(step_done())]
+    frames = [*m.pack(m.Warnings(said)), *m.pack(step_done())]
     return lambda asked: [asked.answer(frames)]
 
 
 def test_two_in_front_of_one_reply_are_refused(tmp_path: Path) -> None:
     """As many frames as one likes are no reply."""
     folder = write_repository(tmp_path / "repository", f"# {tmp_path}")
-    front = m.pack(m.Warned((("UserWarning", "x"),)))
+    front = m.pack(m.Warnings((("UserWarning", "x"),)))
     with lying() as liar:
         liar.lies[m.Step] = lambda asked: [asked.answer([*front * 1000, *m.pack(step_done())])]
         with make_env(str(folder), sandbox=LyingSandbox(liar), n_envs=NUM_ENVS) as suites:

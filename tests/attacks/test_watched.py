@@ -33,7 +33,7 @@ TRUE = ("reach",) * NUM_ENVS
 def liar() -> Iterator[LyingServer]:
     """A worker server that lies as told; of what it is to watch it says the truth."""
     with lying() as server:
-        server.lies[m.Watch] = answered(m.Watched(TRUE, True))
+        server.lies[m.Watch] = answered(m.WatchDone(TRUE, True))
         yield server
 
 
@@ -70,18 +70,18 @@ def test_values_are_kept_while_nothing_is_said(liar: LyingServer, folder: str) -
 
 
 LIES: dict[str, m.Message] = {
-    "too many": m.Changed(((1, "task"),) * (CHANGES.most + 1)),
-    "a giant": m.Changed(((1, "x" * 4_000_000),)),
-    "no name": m.Changed(((1, 1),)),
-    "no pairs": m.Changed(("task",)),
-    "an array": m.Changed((np.zeros(10_000),)),
+    "too many": m.Changes(((1, "task"),) * (CHANGES.most + 1)),
+    "a giant": m.Changes(((1, "x" * 4_000_000),)),
+    "no name": m.Changes(((1, 1),)),
+    "no pairs": m.Changes(("task",)),
+    "an array": m.Changes((np.zeros(10_000),)),
 }
 
 
 @pytest.mark.parametrize("lie", LIES)
 def test_lies_about_changes_are_refused(liar: LyingServer, folder: str, lie: str) -> None:
     """Its environment dies of them, as of any other lie; the control hears of a true one."""
-    for said, breaks in ((LIES[lie], True), (m.Changed(((1, "task"), (99, "other"))), False)):
+    for said, breaks in ((LIES[lie], True), (m.Changes(((1, "task"), (99, "other"))), False)):
         liar.lies.pop(m.Step, None)
         with watching(liar, folder) as suites:
             liar.lies[m.Step] = answered(said, step_done())
@@ -94,7 +94,7 @@ def test_lies_about_changes_are_refused(liar: LyingServer, folder: str, lie: str
 
 def test_what_can_be_changed_is_not_kept(liar: LyingServer, folder: str) -> None:
     """Who changes what he was given would change what the next one gets."""
-    liar.lies[m.Watch] = answered(m.Watched(tuple([["reach"]] * NUM_ENVS), True))
+    liar.lies[m.Watch] = answered(m.WatchDone(tuple([["reach"]] * NUM_ENVS), True))
     with watching(liar, folder) as suites:
         before = suites.env.stats()["requests"]
         for _ in range(5):
@@ -105,7 +105,7 @@ def test_what_can_be_changed_is_not_kept(liar: LyingServer, folder: str) -> None
 
 @pytest.mark.parametrize(
     "lie",
-    [m.Watched(("reach",), True), m.Watched("reach", True), m.Value(TRUE)],
+    [m.WatchDone(("reach",), True), m.WatchDone("reach", True), m.Value(TRUE)],
     ids=["too few", "no tuple", "another reply"],
 )
 def test_other_answers_are_refused(liar: LyingServer, folder: str, lie: m.Message) -> None:
@@ -118,7 +118,7 @@ def test_other_answers_are_refused(liar: LyingServer, folder: str, lie: m.Messag
 def test_a_flood_of_changes_is_one_reply(liar: LyingServer, folder: str) -> None:
     """As many frames as one likes are no reply; and it is not read one by one."""
     with watching(liar, folder) as suites:
-        front = [m.Changed(((1, "task"),))] * (DEFAULT_LIMITS.frames // 4)
+        front = [m.Changes(((1, "task"),))] * (DEFAULT_LIMITS.frames // 4)
         liar.lies[m.Step] = answered(*front, step_done())
         with pytest.raises(RemoteProtocolError):
             suites.env.step(ACTIONS)

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from envhub_sandbox.hub import snapshot, store
+from envhub_sandbox.hub import snapshot
+from envhub_sandbox.hub.cache import cache_root
 from tests.attacks.harness import HOSTILE, USER, Arena, Run, call, control_run, new_alias, token
 
 FAMILY = "Changing files"
@@ -80,7 +81,7 @@ def test_shared_memory_of_the_host_cannot_be_written(arena: Arena) -> None:
 )
 def test_files_outside_cannot_be_created(arena: Arena, home: Path, title: str, folder: str) -> None:
     """No new file appears in a folder that everybody may write, nor in our own caches."""
-    place = Path(folder.format(home=home, cache=store.cache_root()))
+    place = Path(folder.format(home=home, cache=cache_root()))
     ours = not place.exists()
     place.mkdir(parents=True, exist_ok=True)
     path, sticky = place / f"planted-{token()}", place.stat().st_mode & stat.S_ISVTX

@@ -39,7 +39,7 @@ def make_env(n_envs=1, use_async_envs=False):
 @pytest.fixture
 def fits(engine: Engine) -> None:
     """An image whose Python this machine has, with a glibc that is no older."""
-    theirs, _ = packages.inside(engine, find_image(engine, IMAGE))
+    theirs, _ = packages.image_packages(engine, find_image(engine, IMAGE))
     ours = interpreters.own()
     same = ours.version.split(".")[:2] == theirs.version.split(".")[:2]
     if not same or ours.machine != theirs.machine:

@@ -32,7 +32,7 @@ In every cell:
 - After `close()` no process, zombie, descriptor, mapped slab, socket, file, mount or control group
   of a jail is there that was not there before. This is read from `/proc` and the file system. The
   worker server lingers (see below). Where other tasks of a suite are open yet, `close()` has
-  asked for the end of its jail and does not wait for it: whoever closes the next one does, and the
+  asked for the end of its jail and does not wait for it: the next `close()` does, and the
   last.
 
 "In seconds" is the median of a row's six cells, on two busy cores, from the request to the error
@@ -58,25 +58,26 @@ test for each sentence here.
 - **In a reset** the fresh process is asked for the same reset with the same seeds, once, and the
   infos have `worker_restarted`. A reset with a mask also brings back those rows of the dead
   process that the mask does not name: their episodes begin anew.
-- **In a `call`, `get_attr`, `set_attr` or `render`** nothing is repeated, for nobody knows how far
-  it came: it raises `WorkerDiedError`, and so do others until a step (which then reports the rows
-  as above) or a reset has brought them back. A death between two requests is met by the next.
+- **In a `call`, `get_attr`, `set_attr` or `render`** nothing is repeated, because it is
+  unknown how far it came: it raises `WorkerDiedError`, and so do others until a step (which then
+  reports the rows as above) or a reset has brought them back. A death between two requests is met
+  by the next.
 - **Attributes** that `set_attr` had set everywhere are set again, as they were sent, the last value
   of each, before anything else is asked; one whose setter raises there is left out, and the log
   says so. What calls had changed is lost. A fresh jail after a timeout, an expiry or a death that
-  was told has neither.
-- **Seeds**: whoever was last seeded with `s` comes back with
+  was raised has neither.
+- **Seeds**: a sub-environment that was last seeded with `s` comes back with
   `int(np.random.SeedSequence((abs(s), n)).generate_state(1)[0])` at the environment's `n`-th
-  restart, so that a seeded run with the same deaths is the same run. Whoever was never seeded
+  restart, so that a seeded run with the same deaths is the same run. One that was never seeded
   draws a seed.
 - **Who dies**: an exit, a signal, a crash or the cpu limit takes one process. The memory limit is
   the jail's: where the kernel does not say whom it ended for it, all processes end and all rows
   come back. The jail's own end, or the server's, takes all rows, and they come back in another
-  jail. A suite that `make_env` has built at once shares one process: a death there is everybody's,
-  and each environment is told at its own next request.
+  jail. A suite that `make_env` has built at once shares one process: a death there is the
+  death of all, and each environment reports it at its own next request.
 - **How long**: the step waits for the others as long as `step_s` says; starting and resetting have
   `startup_s` and `reset_s` for themselves. A timeout stays a `WorkerTimeoutError`, and `reset()`
-  recovers, also if somebody has died meanwhile.
+  recovers, also if a process has died meanwhile.
 - **How often**: `restart_budget` and `restart_backoff_s` count every time that a step or a reset
   had to bring something back. When they are used up, or when what is coming back dies again or
   cannot be built, the error says how, and the environment is dead: the next `reset()` starts afresh
@@ -96,8 +97,8 @@ With `timeouts={"idle_s": 60}` the processes of an environment of which nothing 
 minute (and up to two seconds more: the server looks once a second) are ended, and their memory is
 given back. That is no death: no policy is asked and no budget spent. The next `reset()` starts
 others; a step or a call before it raises a `WorkerDiedError` with `reason="idle"` that says so.
-Each task of a suite has its own clock, unless `make_env` has built them all at once. Whoever owes
-an answer is not idle.
+Each task of a suite has its own clock, unless `make_env` has built them all at once. An
+environment that owes an answer is not idle.
 
 ## However the client ends
 
@@ -125,7 +126,7 @@ stay. The folder says whose it was: the next server that this user starts remove
   own. Whatever it does, the parent's go on; its end ends nothing of theirs.
 - **`close()` from another thread, or from a signal handler**, ends a running step or a start with
   Gymnasium's `ClosedEnvironmentError`.
-- **A proxy that nobody holds** any more ends its processes when it is collected.
+- **A proxy without references** ends its processes when it is collected.
 
 ## The rows
 

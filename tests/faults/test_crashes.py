@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from envhub_sandbox import errors, make_env
-from envhub_sandbox.crash import bundle_writer
-from envhub_sandbox.crash.bundle_reader import load_bundle
+from envhub_sandbox.session.crash import bundle_writer
+from envhub_sandbox.session.crash.bundle_reader import load_bundle
 from envhub_worker.protocol import messages as m
 from tests.support.processes import eventually
 from tests.support.samples import sample

@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from envhub_sandbox import errors
-from envhub_sandbox.transport.connection import WorkerClient
+from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
@@ -22,13 +22,13 @@ _SOON_S = 0.02
 
 
 @contextmanager
-def connected() -> Iterator[tuple[WorkerClient, zmq.Socket[bytes]]]:
+def connected() -> Iterator[tuple[WorkerConnection, zmq.Socket[bytes]]]:
     """A client, and the socket of a server that says what we like."""
     with tempfile.TemporaryDirectory(dir="/tmp") as folder, zmq.Context() as context:
         router = context.socket(zmq.ROUTER)
         router.bind(f"ipc://{folder}/server")
         never, end = os.pipe()
-        client = WorkerClient(f"ipc://{folder}/server", never)
+        client = WorkerConnection(f"ipc://{folder}/server", never)
         client.version = m.VERSION
         try:
             yield client, router

@@ -14,7 +14,7 @@ prometheus_client = pytest.importorskip("prometheus_client")
 from prometheus_client.parser import text_string_to_metric_families  # noqa: E402
 
 from envhub_sandbox import errors, make_env  # noqa: E402
-from envhub_sandbox.metrics import EnvHubCollector  # noqa: E402
+from envhub_sandbox.integrations.metrics import EnvHubCollector  # noqa: E402
 from envhub_sandbox.session import counters  # noqa: E402
 from envhub_sandbox.session.counters import Counters, Labels, Ledger  # noqa: E402
 from envhub_worker.protocol.lifecycle import Lifecycle  # noqa: E402
@@ -156,7 +156,7 @@ def test_names_of_the_worker_cannot_break_the_exposition(
     ledger, env = Ledger(), Env()
     nasty = 'a"b\\c\nd} 5\x1b[31m'
     ledger.add(env, Labels("r", nasty, nasty * 1000), Counters(), Lifecycle())
-    monkeypatch.setattr("envhub_sandbox.metrics.LEDGER", ledger)
+    monkeypatch.setattr("envhub_sandbox.integrations.metrics.LEDGER", ledger)
     found = scraped(registry, "r")
     assert all("\x1b" not in value for _, labels in found for _, value in labels)
     suites = {dict(labels)["suite"] for _, labels in found}

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from envhub_sandbox import errors, make_env
-from envhub_sandbox.policy import Policy
+from envhub_sandbox.settings.policy import Policy
 from tests.support.samples import sample
 
 

@@ -23,7 +23,7 @@ from typing import Any
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import EnvHubError
-from envhub_worker.lockdown.seccomp.policy import ALLOW, ByArguments, table
+from envhub_worker.lockdown.seccomp.policy import ALLOW, ByArguments, policy_table
 from envhub_worker.lockdown.seccomp.syscalls import NUMBERS
 from tests.libraries import make
 from tests.support.repositories import write_repository
@@ -121,7 +121,7 @@ def unused(traces: Path) -> list[str]:
     """The calls that a jail may make, and that no trace has."""
     permitted = {
         name
-        for name, verdict in table(namespaced=True, network="none").items()
+        for name, verdict in policy_table(namespaced=True, network="none").items()
         if verdict == ALLOW or isinstance(verdict, ByArguments)
     }
     made = {call for one in traces.glob("*.strace") for call in _CALL.findall(one.read_text())}

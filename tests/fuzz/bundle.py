@@ -10,9 +10,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from envhub_sandbox.crash.bundle_reader import load_bundle, replayed_arguments, wishes
-from envhub_sandbox.crash.replay import replay
 from envhub_sandbox.errors import BundleError, EnvHubError
+from envhub_sandbox.session.crash.bundle_reader import load_bundle, replayed_arguments, wishes
+from envhub_sandbox.session.crash.replay import replay
 from tests.fuzz.oracle import demand
 from tests.fuzz.targets import Dice
 from tests.unit.client.crash.test_bundles import bundle as written

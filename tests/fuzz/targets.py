@@ -23,9 +23,9 @@ from envhub_sandbox.session.author_lines import add_author_line
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import JailHandle, RunnersDiedError, open_jail
 from envhub_sandbox.transport.remote_warnings import MOST, RemoteWarnings
-from envhub_sandbox.transport.replies import check, death, expect, raised
+from envhub_sandbox.transport.replies import check_reply, death, expect_reply, raised
 from envhub_sandbox.transport.results import Results
-from envhub_sandbox.transport.values import specs
+from envhub_sandbox.transport.values import descriptions
 from envhub_sandbox.transport.values.descriptions import DescriptionReader
 from envhub_sandbox.transport.values.generators import generator
 from envhub_sandbox.vector import from_manifest
@@ -39,7 +39,7 @@ from envhub_worker.protocol.messages.prefix import MAX_TEXT
 from envhub_worker.protocol.shared_memory import columns
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.spaces.spaces import OpaqueSpace, encode_space
-from envhub_worker.protocol.stream import PacketReader, pack_packet
+from envhub_worker.protocol.stream import StreamReader, pack_packet
 from envhub_worker.protocol.untrusted import UNTRUSTED
 from tests.attacks.lying_server import env_manifest
 from tests.fuzz.mutate import Spoiler, crossing
@@ -265,7 +265,7 @@ def restore(dice: Dice) -> None:
 
 def manifest(dice: Dice) -> None:
     """What is accepted of a description can be shown, compared, drawn from and stepped."""
-    loaded = [one for one in dice.messages if isinstance(one, m.Loaded)]
+    loaded = [one for one in dice.messages if isinstance(one, m.LoadDone)]
     value = dice.spoiled(dice.rng.choice(loaded).manifest)
     if dice.rng.random() < 0.2 and type(value) is dict and type(value.get("envs")) is tuple:
         value["envs"] *= dice.rng.choice((2, 50))
@@ -275,7 +275,7 @@ def manifest(dice: Dice) -> None:
         usable((env.metadata, env.attributes, env.render_mode, env.suite, env.task))
         from_manifest.metadata(env)
         spec = from_manifest.spec(env, "a/b@c")
-        entry = f"{specs.__name__}:{specs.not_here.__name__}"
+        entry = f"{descriptions.__name__}:{descriptions.not_here.__name__}"
         demand(spec is None or spec.entry_point == entry, "an entry point of the worker's")
         for space in (env.single_observation_space, env.single_action_space):
             repr(space)
@@ -285,7 +285,7 @@ def manifest(dice: Dice) -> None:
 
 def built(dice: Dice) -> None:
     """The same for the answer to ``Build``."""
-    found = [one for one in dice.messages if isinstance(one, m.Built)]
+    found = [one for one in dice.messages if isinstance(one, m.BuildDone)]
     decode_env(dice.spoiled(dice.rng.choice(found).manifest), max_elements=ELEMENTS)
 
 
@@ -352,10 +352,10 @@ def relay(dice: Dice) -> None:
     runners = rng.choice((1, 2))
     runner_replies = [rng.choice(dice.corpus) for _ in range(runners)]
     counts = tuple(map(len, runner_replies))
-    died = m.Died(1, "exit", 3, None, "", "", "step")
+    died = m.Death(1, "exit", 3, None, "", "", "step")
     answers: list[m.Message] = [
-        m.Relayed(counts), m.RelayedPartly(counts, (0,)), died,
-        m.Refused("SandboxUnavailableError", "x", "y", "z"),
+        m.RelayDone(counts), m.RelayDonePartly(counts, (0,)), died,
+        m.Refusal("SandboxUnavailableError", "x", "y", "z"),
         m.JailOpened(1, tuple(range(runners)), ()),
     ]  # fmt: skip
     if rng.random() < 0.3:
@@ -380,7 +380,7 @@ def relay(dice: Dice) -> None:
         raise
     demand(len(found) == runners, "more answers than runners")
     for one in found:
-        check(one)
+        check_reply(one)
 
 
 def warnings(dice: Dice) -> None:
@@ -389,7 +389,7 @@ def warnings(dice: Dice) -> None:
     reply = rng.choice(dice.corpus)
     for _ in range(rng.randrange(1, 9)):
         some = [(f"UserWarning {rng.random()}", "x" * rng.randrange(3000)) for _ in range(3)]
-        told = m.Warned(tuple(dice.inside(list(some))))
+        told = m.Warnings(tuple(dice.inside(list(some))))
         front = attempt(lambda told=told: m.pack(told))  # type: ignore[misc]
         if is_error(front):
             raise NotSentError
@@ -418,11 +418,11 @@ def server(dice: Dice) -> None:
     """What the server says of deaths and refusals is text, whatever it says."""
     rng = dice.rng
     message = spoiled_message(dice, rng.choice(dice.messages))
-    if isinstance(message, m.Died):
+    if isinstance(message, m.Death):
         usable(str(death(message)))
-    wanted = rng.choice((m.Done, m.Relayed, m.JailOpened, m.Output, m.Welcome))
-    usable(str(attempt(lambda: expect(message, wanted))))  # type: ignore[type-abstract]
-    check(message)
+    wanted = rng.choice((m.Done, m.RelayDone, m.JailOpened, m.Output, m.Welcome))
+    usable(str(attempt(lambda: expect_reply(message, wanted))))  # type: ignore[type-abstract]
+    check_reply(message)
 
 
 _PIECES = (
@@ -446,7 +446,7 @@ def tracebacks(dice: Dice) -> None:
     rng = dice.rng
     text = "".join(rng.choices(_PIECES, k=rng.choice((3, 10, 40, 4000))))
     stage = rng.choice(("step", "import", "make_env"))
-    error: Any = raised(m.Raised("ValueError", text[:600], text[:9000], text, stage))
+    error: Any = raised(m.RaisedException("ValueError", text[:600], text[:9000], text, stage))
     add_author_line(error, _SNAPSHOT)
     for told in (str(error), *vars(error).get("__notes__", ())):
         demand(all(one in "\n\t" or one.isprintable() for one in told), "a control character")
@@ -491,7 +491,7 @@ class _Same(EnvHubError):
 
 
 def _read(data: bytes, cuts: list[int]) -> tuple[list[Any], list[_Same]]:
-    reader, found, start = PacketReader(), [], 0
+    reader, found, start = StreamReader(), [], 0
     try:
         for stop in cuts:
             for packet in reader.feed(data[start:stop]):

@@ -62,7 +62,7 @@ def test_the_page_lists_the_files_of_a_step(checkout: Path) -> None:
     ("lane", "step"),
     [
         ("auto", "> SharedMemoryLane.send_step\n< SharedMemoryLane.wait"),
-        ("frames", "> RelayLane.send_step\n> WorkerClient.send Relay step"),
+        ("frames", "> RelayLane.send_step\n> WorkerConnection.send Relay step"),
     ],
 )
 def test_a_trace_names_each_message(lane: str, step: str) -> None:
@@ -72,7 +72,12 @@ def test_a_trace_names_each_message(lane: str, step: str) -> None:
     traced = subprocess.run(program, env=variables, check=True, capture_output=True, text=True)
     lines = [re.sub(r"^\+\d+\.\d{6} MainThread ", "", line) for line in traced.stderr.splitlines()]
     said = "\n".join(re.sub(r" \([\d.]+ ms\)$", "", line) for line in lines)
-    order = ["> WorkerClient.send Hello", "< WorkerClient.receive JailOpened", step, "CloseJail"]
+    order = [
+        "> WorkerConnection.send Hello",
+        "< WorkerConnection.receive JailOpened",
+        step,
+        "CloseJail",
+    ]
     assert said == re.sub(r"[^\x20-\x7e\n]", "", said)
     assert [said.index(one) for one in order] == sorted(said.index(one) for one in order)
     del variables["ENVHUB_TRACE"]

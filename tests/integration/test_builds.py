@@ -13,13 +13,13 @@ from envhub_sandbox.dependencies import interpreters
 from envhub_sandbox.dependencies.builds import git, wheel_store
 from envhub_sandbox.dependencies.builds.build import build_wheels
 from envhub_sandbox.dependencies.builds.sources import Source
+from envhub_sandbox.dependencies.locks import lockfile
+from envhub_sandbox.dependencies.locks.making import locked
 from envhub_sandbox.dependencies.request import Choice
 from envhub_sandbox.dependencies.resolutions import lock_for
 from envhub_sandbox.errors import DependencyError, PackageIntegrityError, ResolutionError
+from envhub_sandbox.hub.cache import cache_root, remove_tree
 from envhub_sandbox.hub.snapshot import local
-from envhub_sandbox.hub.store import cache_root, remove_tree
-from envhub_sandbox.locks import lockfile
-from envhub_sandbox.locks.making import locked
 from tests.support.git_server import git_served, make_repository
 from tests.support.repositories import write_repository
 from tests.support.sdists import backend, make_sdist

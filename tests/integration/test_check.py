@@ -17,9 +17,9 @@ from envhub_sandbox.check import judge as judging
 from envhub_sandbox.check.checks import CHECKS, Severity
 from envhub_sandbox.check.findings import Report
 from envhub_sandbox.check.judge import judge
+from envhub_sandbox.check.play.pictures import png
 from envhub_sandbox.check.settings import JudgeOptions
 from envhub_sandbox.errors import SandboxUnavailableError, SnapshotError
-from envhub_sandbox.rollouts.pictures import png
 from tests.support import checks
 from tests.support.ci import obeyed
 from tests.support.command_line import envhub

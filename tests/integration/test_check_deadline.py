@@ -20,7 +20,7 @@ from typer.testing import CliRunner
 
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.cli.check.deadline import DeadlineReached, deadline_alarm
-from envhub_sandbox.sources import parser
+from envhub_sandbox.hub.sources import parser
 from tests.hub.stub_hub import StubHub
 from tests.support.command_line import envhub
 from tests.support.processes import descendants, eventually

@@ -9,11 +9,11 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from envhub_sandbox import __version__, api
+from envhub_sandbox import __version__
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.cli.doctor import doctor as doctor_command
 from envhub_sandbox.errors import SandboxUnavailableError, WorkerStartupError
-from envhub_sandbox.policy import PROFILES
+from envhub_sandbox.settings.policy import PROFILES
 from envhub_worker.lockdown.gpus import gpu_devices
 from envhub_worker.lockdown.root_plan import real_host
 
@@ -84,7 +84,7 @@ def fail_with(monkeypatch: pytest.MonkeyPatch, errors: dict[str, Exception]) -> 
     def make_env(folder: str, *, policy: dict[str, Any]) -> Any:
         raise errors.get(policy["profile"], SandboxUnavailableError("not this either"))
 
-    monkeypatch.setattr(api, "make_env", make_env)
+    monkeypatch.setattr("envhub_sandbox.factory.make_env.make_env", make_env)
 
 
 def test_what_is_missing_comes_with_its_fix(monkeypatch: pytest.MonkeyPatch) -> None:

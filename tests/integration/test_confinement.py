@@ -658,7 +658,7 @@ from envhub_worker.spawn.jail import JailFailed
 from envhub_worker.lockdown.seccomp import bpf, filter as seccomp
 from envhub_worker.lockdown.mechanisms import namespaces, process
 from envhub_worker.lockdown.seccomp.bpf import LOAD, RETURN, JUMP_EQUAL, Branch, Do, Label
-from envhub_worker.lockdown.seccomp.syscalls import number
+from envhub_worker.lockdown.seccomp.syscalls import syscall_number
 {restrict}
 with open_folder() as folder, cell_in(folder, Confinement(profile={profile!r})) as cell:
     while not any(isinstance(event, (JailFailed, RunnerStarted)) for event in cell.events):
@@ -677,7 +677,7 @@ NO_LANDLOCK = """
 process.set_no_new_privileges()
 seccomp.install(bpf.to_bytes(bpf.assemble([
     Do(LOAD, 0),
-    Branch(JUMP_EQUAL, number("landlock_create_ruleset"), "hide", None),
+    Branch(JUMP_EQUAL, syscall_number("landlock_create_ruleset"), "hide", None),
     Do(RETURN, 0x7FFF0000), Label("hide"), Do(RETURN, 0x00050000 | 38)])))
 """
 

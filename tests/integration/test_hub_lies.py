@@ -417,7 +417,7 @@ def test_a_login_in_a_bad_endpoint_is_not_shown() -> None:
 
 
 def _remove_store(store: Path) -> None:
-    from envhub_sandbox.hub.store import remove_tree
+    from envhub_sandbox.hub.cache import remove_tree
 
     remove_tree(store)
 

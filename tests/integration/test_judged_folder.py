@@ -15,7 +15,7 @@ from envhub_sandbox.check.checks import Severity
 from envhub_sandbox.check.findings import Report
 from envhub_sandbox.check.judge import judge
 from envhub_sandbox.check.settings import JudgeOptions
-from envhub_sandbox.hub.snapshot import named
+from envhub_sandbox.hub.snapshot import snapshot_named
 from tests.hub.olah_server import GitRepository, OlahServer
 
 _ENV = """
@@ -92,7 +92,7 @@ def test_a_folder_is_judged_as_its_commit(
     repository.git("clone", "--quiet", str(repository.folder), str(tmp_path / "clone"))
     hub: Mapping[str, Any] = {"endpoint": olah.endpoint, "hub_cache_dir": hub_cache, "token": False}
     places = {str(tmp_path / "clone"): {}, f"org/hostile-places@{commit}": hub}
-    here, there = (content(named(ref, **given).root) for ref, given in places.items())
+    here, there = (content(snapshot_named(ref, **given).root) for ref, given in places.items())
     assert here == there
     ran, reports = [], []
     for ref, given in places.items():

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from envhub_sandbox import make_env
-from envhub_sandbox.transport.connection import WorkerClient
+from envhub_sandbox.transport.connection import WorkerConnection
 from tests.support.samples import sample
 
 
@@ -16,13 +16,13 @@ from tests.support.samples import sample
 def asked(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The requests of this process, by name."""
     names: list[str] = []
-    send = WorkerClient.send
+    send = WorkerConnection.send
 
-    def noted(self: WorkerClient, message: Any, payload: Any = ()) -> int:
+    def noted(self: WorkerConnection, message: Any, payload: Any = ()) -> int:
         names.append(type(message).__name__)
         return send(self, message, payload)
 
-    monkeypatch.setattr(WorkerClient, "send", noted)
+    monkeypatch.setattr(WorkerConnection, "send", noted)
     return names
 
 

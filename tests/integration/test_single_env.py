@@ -13,7 +13,7 @@ from gymnasium.utils.env_checker import check_env
 from envhub_sandbox import SandboxEnv, make_env
 from tests.support.samples import EXAMPLES
 
-_ID = "envhub_sandbox.gym:Hub-v0"
+_ID = "envhub_sandbox.integrations.gym:Hub-v0"
 
 
 @pytest.fixture(autouse=True)

@@ -18,7 +18,7 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import RemoteEnvError
-from envhub_sandbox.hub import store
+from envhub_sandbox.hub.cache import cache_root
 from envhub_sandbox.sandboxes.pool import stop_idle
 from tests.support import inside
 from tests.support.processes import descendants, eventually
@@ -397,5 +397,5 @@ def test_it_takes_a_whole_number_or_none() -> None:
 
 
 def _bundles() -> list[Path]:
-    folder = store.cache_root() / "crashes"
+    folder = cache_root() / "crashes"
     return list(folder.iterdir()) if folder.is_dir() else []

@@ -179,7 +179,7 @@ def commands() -> None:
 def taken(program: str, *words: str) -> list[str | None]:
     """What is played, and by what kind of policy, as that program of LeRobot's understands it."""
     if program == "lerobot-eval-sandboxed":
-        options, words = lerobot_eval.split([*words])  # type: ignore[assignment]
+        options, words = lerobot_eval.split_eval_arguments([*words])  # type: ignore[assignment]
         ours.install(**options)
     made: list[Any] = []
     kind = TrainPipelineConfig if program == "lerobot-train" else EvalPipelineConfig

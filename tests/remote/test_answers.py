@@ -88,7 +88,7 @@ def test_a_malformed_request_is_refused(client: Peer, good: Any, what: str) -> N
     assert client.socket.poll(30_000), "no answer"
     number, reply = m.unpack_header(client.socket.recv_multipart()[0])
     assert number == client.number
-    assert isinstance(reply, m.Refused)
+    assert isinstance(reply, m.Refusal)
 
 
 def test_many_in_a_row_do_not_end_the_server(client: Peer, good: Any, server: Listening) -> None:
@@ -99,6 +99,6 @@ def test_many_in_a_row_do_not_end_the_server(client: Peer, good: Any, server: Li
         client.socket.send_multipart([b"\0\0\0\0"])
         client.socket.send_multipart([b"\xff" * 100])
         client.socket.send_multipart([b""])
-    assert isinstance(client.ask(m.GetStatus()), (m.Status, m.Refused))
+    assert isinstance(client.ask(m.GetStatus()), (m.Status, m.Refusal))
     assert server.process.poll() is None
     assert "Traceback" not in server.said()

@@ -13,7 +13,7 @@ import pytest
 import zmq
 
 from envhub_sandbox import make_env
-from envhub_sandbox.transport.connection import far_session
+from envhub_sandbox.transport.connection import remote_session_id
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_worker.access import keys
 from envhub_worker.access.keys import KeyPair
@@ -65,10 +65,10 @@ class Peer:
         assert self.socket.poll(30_000)
         return m.unpack_header(self.socket.recv_multipart()[0])[1]
 
-    def refused(self, message: m.Message, *payload: bytes) -> m.Refused:
+    def refused(self, message: m.Message, *payload: bytes) -> m.Refusal:
         """The refusal of a request."""
         reply = self.ask(message, *payload)
-        assert isinstance(reply, m.Refused), reply
+        assert isinstance(reply, m.Refusal), reply
         return reply
 
 
@@ -90,7 +90,7 @@ def peer(server: Listening, pair: KeyPair, *, routing_id: bytes = b"") -> Iterat
 def mallory(shared: Listening) -> Iterator[Peer]:
     """She has said Hello, under Alice's session: what she claims to be is worth nothing."""
     with peer(shared, MALLORY) as found:
-        assert isinstance(found.ask(m.Hello(m.VERSION, far_session())), m.Welcome)
+        assert isinstance(found.ask(m.Hello(m.VERSION, remote_session_id())), m.Welcome)
         yield found
 
 

@@ -40,7 +40,7 @@ def test_what_does_not_pay_is_left_alone(frames: list[bytes]) -> None:
 
 def packed_by_hand(sizes: tuple[int, ...], *bodies: bytes, name: str = "lz4") -> list[bytes]:
     """A message as a liar would write it."""
-    return [*map(bytes, m.pack_header(m.Packed(name, sizes), 0)), *bodies]
+    return [*map(bytes, m.pack_header(m.CompressionHeader(name, sizes), 0)), *bodies]
 
 
 @pytest.mark.parametrize(

@@ -12,8 +12,8 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import PolicyError, WorkerError
-from envhub_sandbox.policy import Policy
 from envhub_sandbox.sandboxes.remote import check_policy as check_place
+from envhub_sandbox.settings.policy import Policy
 from envhub_worker.access.quotas import (
     InFlight,
     Permissions,

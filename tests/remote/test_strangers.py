@@ -20,7 +20,7 @@ import zmq
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerError
-from envhub_sandbox.transport.tcp import Link
+from envhub_sandbox.transport.tcp import TcpLink
 from envhub_worker.access import keys
 from envhub_worker.access.audit.log import LINES, PERIOD_S, Log
 from envhub_worker.access.gate import ClientRequest, Incoming
@@ -88,14 +88,14 @@ def test_a_refusal_between_looking_and_sending_is_no_wait(
     server: Listening, repository: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The socket has nowhere to put the request then, and libzmq would wait for that for ever."""
-    whole = Link.next_number
+    whole = TcpLink.next_number
 
-    def slowly(link: Link) -> int:
-        monkeypatch.setattr(Link, "next_number", whole)
+    def slowly(link: TcpLink) -> int:
+        monkeypatch.setattr(TcpLink, "next_number", whole)
         assert eventually(lambda: not inside.can_send(link))
         return 1  # as if it had looked just before
 
-    monkeypatch.setattr(Link, "next_number", slowly)
+    monkeypatch.setattr(TcpLink, "next_number", slowly)
     with pytest.raises(SandboxUnavailableError, match="does not know our key"):
         make_env(repository, sandbox=server.sandbox(client_key=key_text(keys.generate().secret)))
 

@@ -13,7 +13,7 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.sandboxes import upload
-from envhub_sandbox.transport.connection import WorkerClient
+from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_worker.access.quotas import Quotas
 from envhub_worker.access.store.blob_store import BLOCK_BYTES
@@ -297,7 +297,7 @@ def test_only_the_edited_file_travels_to_a_real_server(server: Listening, tmp_pa
         suites.env.reset(seed=1)
         suites.env.step(np.array([0]))
         remote = inside.server(suites.env)
-        client = WorkerClient(remote.endpoint, remote.process_fd, far=remote.far)
+        client = WorkerConnection(remote.endpoint, remote.process_fd, far=remote.far)
         client.hello(Deadline(30))
         (repository / "empty").write_bytes(b"no more")
         files = upload.listing(repository)

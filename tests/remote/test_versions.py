@@ -13,7 +13,7 @@ import zmq
 
 from envhub_sandbox.errors import VersionMismatchError
 from envhub_sandbox.sandboxes.process import PROCESS
-from envhub_sandbox.transport.connection import WorkerClient
+from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_worker.protocol import messages as m
 
@@ -25,13 +25,13 @@ def test_a_server_refuses_a_client_of_another_version(tmp_path: Path, version: i
     """The refusal names both versions."""
     use = PROCESS.acquire(tmp_path)
     server = use.server
-    client = WorkerClient(server.endpoint, server.process_fd)
+    client = WorkerConnection(server.endpoint, server.process_fd)
     try:
         reply, _ = client.request(m.Hello(version, b"x"), deadline=Deadline(30))
     finally:
         client.close()
         use.release()
-    assert isinstance(reply, m.Refused)
+    assert isinstance(reply, m.Refusal)
     assert reply.error == "VersionMismatchError"
     assert f"protocol {version}, this worker {m.VERSION}" in reply.message
 
@@ -68,7 +68,7 @@ def worker_of_another_version(tmp_path: Path) -> Iterator[tuple[str, int]]:
 def test_a_client_refuses_a_worker_of_another_version(tmp_path: Path) -> None:
     """The error names both versions, and what to do."""
     with worker_of_another_version(tmp_path) as (endpoint, never):
-        client = WorkerClient(endpoint, never)
+        client = WorkerConnection(endpoint, never)
         try:
             text = f"protocol {m.VERSION}, the worker {ANOTHER}: install the same release"
             with pytest.raises(VersionMismatchError, match=text):

@@ -9,11 +9,11 @@ from typing import Any, cast
 import numpy as np
 
 from envhub_sandbox.errors import WorkerTimeoutError
-from envhub_sandbox.policy import Policy, Timeouts
 from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.repository import Repository
-from envhub_sandbox.transport.attribute_cache import AttributeCache
+from envhub_sandbox.settings.policy import Policy, Timeouts
 from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.jail import WatchedAttributes
 from envhub_sandbox.transport.lane import Request
 from envhub_sandbox.transport.remote_warnings import RemoteWarnings
 from envhub_sandbox.transport.results import StepResult
@@ -36,7 +36,7 @@ class FakeLane:
 
     def __init__(self) -> None:
         ignore = lambda *_: None  # noqa: E731
-        self.jail = SimpleNamespace(watched=AttributeCache(), send=ignore, receive=ignore)
+        self.jail = SimpleNamespace(watched=WatchedAttributes(), send=ignore, receive=ignore)
         self.runners, self.number, self.elapsed_ns = [1], 7, 1
         self.sent: list[m.Message] = []
         self.answer: m.Message = m.Value((None,) * NUM_ENVS)

@@ -19,13 +19,13 @@ from typing import Any
 import zmq
 
 from envhub_sandbox.check.play import confinement
-from envhub_sandbox.crash import bundle_writer
 from envhub_sandbox.dependencies import environments, interpreters, modules, resolutions
 from envhub_sandbox.factory import make
 from envhub_sandbox.sandboxes import remote
 from envhub_sandbox.sandboxes.docker import sandbox
 from envhub_sandbox.session import env_session
 from envhub_sandbox.session.counters import Ledger
+from envhub_sandbox.session.crash import bundle_writer
 from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.jails import launcher as launcher_module
 from envhub_sandbox.session.jails.launcher import Launcher
@@ -33,7 +33,7 @@ from envhub_sandbox.session.jails.loaded import LoadedJail
 from envhub_sandbox.session.recipe import Recipe
 from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.system import folders
-from envhub_sandbox.transport.connection import WorkerClient
+from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import JailHandle
 from envhub_sandbox.transport.shared_memory.lane import SharedMemoryLane
@@ -145,7 +145,7 @@ def jail(env: Any) -> JailHandle:
     return _running(env).jail
 
 
-def client(env: Any) -> WorkerClient:
+def client(env: Any) -> WorkerConnection:
     """The connection to its server."""
     return jail(env).client
 
@@ -243,7 +243,7 @@ def fall_silent(env: Any) -> None:
     server(env)._stop.set()
 
 
-def send_half(connection: WorkerClient, frames: Sequence[Buffer]) -> None:
+def send_half(connection: WorkerConnection, frames: Sequence[Buffer]) -> None:
     """The first frame of a message, and no more."""
     connection._socket.send(frames[0], zmq.SNDMORE)
 
@@ -304,7 +304,7 @@ def noting_pace(env: Any) -> Spot:
     return session(env).lease, "note_pace"
 
 
-def sending(connection: WorkerClient) -> Spot:
+def sending(connection: WorkerConnection) -> Spot:
     """Where the frames of a message go out."""
     return connection, "_put"
 

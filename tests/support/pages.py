@@ -10,9 +10,9 @@ from envhub_sandbox.check.findings import Finding, Report
 from envhub_sandbox.check.many.entries import ListEntry
 from envhub_sandbox.check.many.results import Result, Verdict
 from envhub_sandbox.check.play.confinement import Confinement
+from envhub_sandbox.check.play.episodes import Episode
+from envhub_sandbox.check.play.pictures import png
 from envhub_sandbox.check.play.plays import Film, Play
-from envhub_sandbox.rollouts.episodes import Episode
-from envhub_sandbox.rollouts.pictures import png
 
 FRAME = np.full((4, 6, 3), 200, np.uint8)
 HOSTILE = (

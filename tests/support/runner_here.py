@@ -32,13 +32,13 @@ class RunnerHere:
     def __init__(self, folder: Path, n_envs: int = 2, entry: str = "env.py") -> None:
         self._runner = Runner(str(folder.absolute()), entry)
         loaded = self.ask(m.Load(n_envs, False, None, {}))
-        assert isinstance(loaded, m.Loaded), loaded
+        assert isinstance(loaded, m.LoadDone), loaded
         self.manifest: EnvManifest = decode_manifest(loaded.manifest, max_elements=1 << 24).envs[0]
         task = self.manifest
         self.ask(m.Build(1, task.suite, task.task, 0, task.num_envs))
 
     def ask(self, message: m.Message) -> m.Message:
-        """What it answers; ``m.Raised`` has the traceback of what the repository raised."""
+        """What it answers; ``m.RaisedException`` has the traceback of the repository's error."""
         return m.unpack(self._runner.reply(Packet(1, m.pack(message))))
 
 

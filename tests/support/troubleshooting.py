@@ -16,7 +16,7 @@ from typing import Any
 
 import envhub_sandbox
 import envhub_worker
-from envhub_sandbox.option_names import option_name
+from envhub_sandbox.settings.options import option_name
 
 DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "troubleshooting.md"
 _HEAD = """# Troubleshooting
@@ -32,10 +32,10 @@ that are no error are in the [FAQ](faq.md), what a dying environment looks like 
 _PARTS = (
     ("References, the Hub and local folders", ("envhub_sandbox/hub",), "snapshots.md"),
     ("A repository's packages", ("envhub_sandbox/dependencies",), "dependencies.md"),
-    ("Locks", ("envhub_sandbox/locks",), "dependencies.md#locks"),
+    ("Locks", ("envhub_sandbox/dependencies/locks",), "dependencies.md#locks"),
     (
         "Arguments, policies, limits, timeouts",
-        ("envhub_sandbox/factory", "envhub_sandbox/options.py", "envhub_sandbox/policy.py"),
+        ("envhub_sandbox/factory", "envhub_sandbox/settings"),
         "settings.md",
     ),
     ("What this host can enforce", ("envhub_worker/lockdown",), "threat-model.md"),
@@ -59,7 +59,10 @@ _PARTS = (
     ),
     (
         "Environments in use",
-        ("envhub_sandbox/session", "envhub_sandbox/vector", "envhub_sandbox/transport"),
+        (
+            *("envhub_sandbox/session", "envhub_sandbox/vector", "envhub_sandbox/transport"),
+            "envhub_sandbox/system/processes.py",
+        ),
         "faults.md",
     ),
     (
@@ -73,8 +76,7 @@ _PARTS = (
         (
             "envhub_sandbox/cli",
             "envhub_sandbox/check",
-            "envhub_sandbox/crash",
-            "envhub_sandbox/rollouts",
+            "envhub_sandbox/session/crash",
         ),
         "cli.md",
     ),
@@ -112,7 +114,7 @@ _NO_FILES = (
     "envhub_sandbox/check/checks.py",
     "envhub_sandbox/check/static/survey.py",
     "envhub_sandbox/cli/init/starter.py",
-    "envhub_sandbox/locks/lockfile.py",
+    "envhub_sandbox/dependencies/locks/lockfile.py",
 )
 # Nor is this: parts of other formats, and what is said after success.
 _NO_ERRORS = re.compile(
@@ -146,15 +148,23 @@ class Message:
 
 def document() -> str:
     """What the file has to hold."""
-    parts, left = [_HEAD], list(messages())
-    for title, places, more in _PARTS:
-        mine = [one for one in left if one.place.startswith(places)]
-        left = [one for one in left if one not in mine]
-        rows = sorted({_row(one) for one in mine})
+    parts, all_messages = [_HEAD], list(messages())
+    for title, _, more in _PARTS:
+        rows = sorted({_row(one) for one in all_messages if _part(one.place) == title})
         parts += [f"## {title}\n\nMore in [{more.partition('#')[0]}]({more}).\n"]
         parts += ["| The error says | What to do |\n| --- | --- |"]
         parts += [*(f"| {says} | {cure} |" for says, cure in rows), ""]
     return "\n".join(parts)
+
+
+def _part(file: str) -> str:
+    """The title of what a file belongs to: that with the longest prefix of its path."""
+    return max(
+        (len(place), title)
+        for title, places, _ in _PARTS
+        for place in places
+        if file.startswith(place)
+    )[1]
 
 
 def messages() -> Iterator[Message]:

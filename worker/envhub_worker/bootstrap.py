@@ -67,7 +67,7 @@ def main(argv: Sequence[str]) -> int:
         return 2
     load_package()
     # now: later this process may be another user, who may not read it
-    hidden = importlib.import_module("envhub_worker.file_access").why_hidden
+    hidden = importlib.import_module("envhub_worker.file_access").why_file_hidden
     try:
         program = importlib.import_module(_PROGRAMS[argv[0]])
         return int(program.main(list(argv[1:])) or 0)

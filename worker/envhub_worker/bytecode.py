@@ -19,7 +19,7 @@ from collections.abc import Sequence
 
 from envhub_worker.lockdown.layers import LayerUnavailableError
 from envhub_worker.lockdown.mechanisms import landlock, process
-from envhub_worker.lockdown.mechanisms.landlock import READ, WRITE, Rule
+from envhub_worker.lockdown.mechanisms.landlock import READ, WRITE, LandlockRule
 from envhub_worker.lockdown.seccomp import filter
 
 _LIMITS = (
@@ -30,7 +30,7 @@ _LIMITS = (
 )
 
 
-def confine(folder: str) -> None:
+def confine_to_bytecode_folder(folder: str) -> None:
     """Bind this single-threaded process to a folder, for good.
 
     Raises:
@@ -48,7 +48,9 @@ def confine(folder: str) -> None:
     process.drop_capabilities()
     process.set_no_new_privileges()
     # without an ABI it raises: no layer is left out
-    landlock.restrict(landlock.ruleset(abi, "none"), [Rule(library, READ), Rule(folder, WRITE)])
+    landlock.restrict(
+        landlock.ruleset(abi, "none"), [LandlockRule(library, READ), LandlockRule(folder, WRITE)]
+    )
     filter.install(program)
 
 
@@ -56,7 +58,7 @@ def main(argv: Sequence[str]) -> int:
     """Compile all that is below a folder, but for tests, which are not imported."""
     [folder] = argv
     try:
-        confine(folder)
+        confine_to_bytecode_folder(folder)
     except LayerUnavailableError:
         return 1
     left_out = re.compile(re.escape(folder) + r"(/.*)?/tests?/", re.DOTALL)

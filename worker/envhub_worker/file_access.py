@@ -13,7 +13,7 @@ import sys
 _REFUSALS = (errno.EACCES, errno.EPERM, errno.EROFS)
 
 
-def why_hidden(module: str) -> str:
+def why_file_hidden(module: str) -> str:
     """Why a module that was not found may be there all the same; empty if nothing hides it.
 
     Args:
@@ -52,7 +52,7 @@ def _closed(path: str) -> str:
     )
 
 
-def why_unwritable(error: BaseException, root: str) -> str:
+def why_file_unwritable(error: BaseException, root: str) -> str:
     """A sentence for an error whose file lies among what a jail shares; empty for any other."""
     name = getattr(error, "filename", None)
     if not isinstance(error, OSError) or error.errno not in _REFUSALS or type(name) is not str:

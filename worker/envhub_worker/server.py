@@ -223,7 +223,7 @@ class Server:
         """Answer before it holds, so that the answer itself can be read."""
         known = compression.available() if self._gate.compresses else ()
         chosen = next((name for name in request.compressions if name in known), "")
-        self.reply(asker, m.Agreed(str(chosen), self._gate.idle_s))
+        self.reply(asker, m.Agreement(str(chosen), self._gate.idle_s))
         self._sessions.agree(asker.identity, asker.key, str(chosen))
 
 

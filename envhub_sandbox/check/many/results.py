@@ -23,8 +23,8 @@ from typing import Any
 from envhub_sandbox.check import reports
 from envhub_sandbox.check.findings import Finding, Report
 from envhub_sandbox.check.many.entries import ListEntry
-from envhub_sandbox.sources.parsing import content
-from envhub_sandbox.system.files import write_whole
+from envhub_sandbox.hub.sources.parsing import content
+from envhub_sandbox.system.files import write_whole_file
 from envhub_sandbox.system.locks import held
 from envhub_worker.protocol.text import printable
 
@@ -237,7 +237,7 @@ def link(listed: ListEntry, kind: str) -> str:
     return f"{_REPORTS}/{listed.name}.{kind}"
 
 
-_write = partial(write_whole, mode=0o666, durable=True)
+_write = partial(write_whole_file, mode=0o666, durable=True)
 
 
 def _result(

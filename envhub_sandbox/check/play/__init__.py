@@ -1,1 +1,1 @@
-"""How a repository is played, and what is seen from outside meanwhile."""
+"""How a repository is played, for a verdict and by ``envhub run``, and what is seen meanwhile."""

@@ -11,10 +11,10 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.vector import VectorEnv
 
+from envhub_sandbox.check.play import video
+from envhub_sandbox.check.play.episodes import Episode
+from envhub_sandbox.check.play.pictures import Frame, even, png, small_picture
 from envhub_sandbox.errors import EnvHubError
-from envhub_sandbox.rollouts import video
-from envhub_sandbox.rollouts.episodes import Episode
-from envhub_sandbox.rollouts.pictures import Frame, even, png, small_picture
 from envhub_worker.protocol.text import printable
 
 _SIDE = 320

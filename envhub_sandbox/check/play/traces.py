@@ -1,4 +1,6 @@
-"""One play of an environment, as something that can be compared: a digest for each step."""
+"""Plays an environment with seeded actions and keeps a trace: a digest of each step, to compare.
+
+What a step returns is looked at meanwhile: shapes of masks, numbers that are not finite, times."""
 
 from __future__ import annotations
 
@@ -13,7 +15,7 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import VectorEnv
 
-from envhub_sandbox.rollouts.episodes import Episode, EpisodeCounter, RolloutError
+from envhub_sandbox.check.play.episodes import Episode, EpisodeCounter, RolloutError
 
 Env = VectorEnv[Any, Any, Any]
 _NOTED = 3

@@ -16,10 +16,10 @@ from typing import Any
 from envhub_sandbox.check.checks import Severity
 from envhub_sandbox.check.findings import Finding
 from envhub_sandbox.check.static.static import Static
+from envhub_sandbox.dependencies.locks.drift import drift_of_tasks
+from envhub_sandbox.dependencies.locks.fingerprint import TaskFingerprint
 from envhub_sandbox.hub.hashing import differing
 from envhub_sandbox.hub.listing import FileRecord
-from envhub_sandbox.locks.drift import of_tasks
-from envhub_sandbox.locks.fingerprint import Task
 from envhub_worker.protocol.text import printable, size_text
 
 _MOST_BYTES = 1 << 20
@@ -159,9 +159,9 @@ def _lines(path: Path) -> list[str]:
     return [line.strip() for line in re.split("\r\n|\r|\n", text)]
 
 
-def environments(then: Sequence[Task], now: Sequence[Task]) -> list[Change]:
+def environments(then: Sequence[TaskFingerprint], now: Sequence[TaskFingerprint]) -> list[Change]:
     """What differs in what two of them return. Trust: input from the worker, already checked."""
-    lines = (line.removeprefix("environment ") for line in of_tasks(then, now))
+    lines = (line.removeprefix("environment ") for line in drift_of_tasks(then, now))
     return [Change("environment", "changed", _shown(line)) for line in lines]
 
 

@@ -9,7 +9,7 @@ import re
 from collections.abc import Iterator
 
 from envhub_sandbox.check.findings import Finding
-from envhub_sandbox.sources.parsing import ParsedFile
+from envhub_sandbox.hub.sources.parsing import ParsedFile
 
 _NETWORK, _PROCESS, _DYNAMIC, _PICKLE, _NATIVE, _OUTSIDE, _OBSCURE = (
     f"source-{kind}"

@@ -1,4 +1,4 @@
-"""What a repository would do, in one piece: its files, entry, imports, packages and findings.
+"""``Static``: all that is read of a repository without running it, put together and as JSON.
 
 ``undeclared`` says which of the imports nothing declares.
 """
@@ -22,9 +22,9 @@ from envhub_sandbox.dependencies.declared import DeclaredPackages, declared
 from envhub_sandbox.dependencies.resolve import WORKERS
 from envhub_sandbox.errors import RequirementError
 from envhub_sandbox.hub.snapshot import Snapshot
+from envhub_sandbox.hub.sources import parsing
+from envhub_sandbox.hub.sources.imports import Import, imports
 from envhub_sandbox.session.recipe import pinned
-from envhub_sandbox.sources import parsing
-from envhub_sandbox.sources.imports import Import, imports
 from envhub_worker.protocol.text import printable
 
 _LONGEST = 500

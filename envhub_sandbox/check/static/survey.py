@@ -1,4 +1,4 @@
-"""What a repository holds and would do, read file by file without running any of it.
+"""Looks at each file of a repository without running it: its kind, and findings in it.
 
 What is found is a hint for a person and no wall: who wants to hide a call can. The walls are the
 sandbox's. What could not be read is found, too.
@@ -19,7 +19,7 @@ from envhub_sandbox.errors import SnapshotError
 from envhub_sandbox.hub.checkout import Checkout
 from envhub_sandbox.hub.listing import FileRecord, Snapshot
 from envhub_sandbox.hub.local import LocalFolder
-from envhub_sandbox.sources.parsing import MOST_BYTES, ParsedFile
+from envhub_sandbox.hub.sources.parsing import MOST_BYTES, ParsedFile
 
 _MOST_BYTES_OF_TEXT = 1 << 20
 _MOST_BYTES_IN_ALL = 32 << 20

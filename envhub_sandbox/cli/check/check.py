@@ -15,7 +15,7 @@ from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import out, print_json, safe_line, say
 from envhub_sandbox.cli.shared.exits import Exit, UsageError, reported
 from envhub_sandbox.cli.shared.findings import STYLES, annotate, level, show_finding, write_report
-from envhub_sandbox.cli.shared.progress import Bar
+from envhub_sandbox.cli.shared.progress import ProgressBar
 from envhub_worker.protocol.text import counted
 
 if TYPE_CHECKING:
@@ -59,7 +59,8 @@ def check(
     resets: Annotated[
         int,
         typer.Option(
-            min=0, help="In a row, four times: what they leave behind is counted. 0 asks nothing."
+            min=0,
+            help="Resets in a row, four times, to count what they leave behind; 0 skips this.",
         ),
     ] = 8,
     slow_step: Annotated[
@@ -67,15 +68,15 @@ def check(
         typer.Option(
             metavar="SECONDS",
             min=0.0,
-            help="What half of the steps may take, and a fifth of a reset.",
+            help="The longest that the median step may take; a reset may take five times that.",
         ),
     ] = 1.0,
-    seed: Annotated[int, typer.Option("--seed", "-s", min=0, help="Of each play.")] = 0,
+    seed: Annotated[int, typer.Option("--seed", "-s", min=0, help="The seed of each play.")] = 0,
     fail_on: Annotated[
         str,
         typer.Option(
             metavar="|".join(STYLES),
-            help="The least finding that fails it.",
+            help="Findings of this severity or a worse one make it fail.",
             autocompletion=lambda: list(STYLES),
         ),
     ] = "error",
@@ -85,13 +86,15 @@ def check(
             metavar=_FILE,
             callback=_with_settings,
             is_eager=True,
-            help="Your own TOML, with options in [check]; what you type counts more.",
+            help="A TOML file of your own with options in [check]; the command line wins.",
         ),
     ] = None,
     allow: Annotated[
         list[str] | None,
         typer.Option(
-            "--allow", metavar="ID", help="A check whose findings fail nothing (repeatable)."
+            "--allow",
+            metavar="ID",
+            help="A check whose findings do not change the exit code (repeatable).",
         ),
     ] = None,
     json: opt.Json = False,
@@ -125,7 +128,7 @@ def check(
         Path | None,
         typer.Option(
             metavar=_FILE,
-            help="TOML with fields of Policy, and [limits]; options say otherwise.",
+            help="A TOML file with fields of Policy and [limits]; options win.",
             rich_help_panel=_MAY,
         ),
     ] = None,
@@ -170,7 +173,7 @@ def check(
             raise UsageError("name a repository, or a list of them: --all FILE --output DIR")
         if any(opt.is_typed(ctx, name) for name in own.OF_A_LIST):
             raise UsageError("--output, --jobs, --memory-budget and --again are for --all FILE")
-        own.refuse_the_judged({"--settings": settings, "--policy": policy}, ref)
+        own.refuse_options_of_the_judged({"--settings": settings, "--policy": policy}, ref)
         report = _judge(
             make,
             policy,
@@ -180,7 +183,7 @@ def check(
             steps=steps,
             resets=resets,
             slow_step_s=slow_step,
-            tasks=lambda envs: [one[:2] for one in opt.select(envs, suite, task)],
+            tasks=lambda envs: [one[:2] for one in opt.select_envs(envs, suite, task)],
             pictures=html is not None,
         )
         failures = report.failures(least, allowed)
@@ -235,7 +238,7 @@ def _judge(
         )
 
     report, doing = Report(make.ref), ["starting"]
-    with Bar(quiet=quiet, long_s=_LONG_S) as bar:
+    with ProgressBar(quiet=quiet, long_s=_LONG_S) as bar:
 
         def tell(what: str) -> None:
             doing.append(what)

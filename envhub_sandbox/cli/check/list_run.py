@@ -26,16 +26,16 @@ from envhub_sandbox.check.many.results import (
     Verdict,
 )
 from envhub_sandbox.check.settings import merged_settings, read_file
-from envhub_sandbox.cli.check.options import refuse_the_judged
+from envhub_sandbox.cli.check.options import refuse_options_of_the_judged
 from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import print_json, safe_line, say, show
 from envhub_sandbox.cli.shared.exits import Exit, UsageError
 from envhub_sandbox.cli.shared.findings import annotate, write_report
-from envhub_sandbox.cli.shared.memory import free_bytes
+from envhub_sandbox.cli.shared.memory import free_memory_bytes
 from envhub_sandbox.cli.version import versions
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.hub.snapshot import commit_of
-from envhub_sandbox.policy import policy_from
+from envhub_sandbox.settings.policy import policy_from
 from envhub_worker.protocol.text import duration_text, size_text
 
 if TYPE_CHECKING:
@@ -113,7 +113,9 @@ class ListRun:
         self.of = {one: Result(listed=one) for one in self._listed()}
         places = {"--settings": self.settings, "--policy": self.policy, "--output": self.output}
         for one in self.of:
-            refuse_the_judged(places, one.reference, f" (line {one.line} of {self.file})")
+            refuse_options_of_the_judged(
+                places, one.reference, f" (line {one.line} of {self.file})"
+            )
         try:
             policy = b"" if self.policy is None else self.policy.read_bytes()
         except OSError as error:
@@ -252,7 +254,7 @@ class ListRun:
         each, budget = _JAILS * one, opt.read_size("--memory-budget", self.memory_budget)
         needs = f"a judgement may take {size_text(each)}: {_JAILS} jails of {size_text(one)}"
         if budget is None:
-            budget = max(each, free_bytes() or 0)
+            budget = max(each, free_memory_bytes() or 0)
         elif budget < each:
             raise UsageError(
                 f"--memory-budget {self.memory_budget} is too little: {needs}. "

@@ -68,12 +68,16 @@ Deadline = Annotated[
 Again = Annotated[
     bool,
     typer.Option(
-        "--again", help="With --all: judge all of them, as if nothing was.", rich_help_panel=_PANEL
+        "--again",
+        help="With --all: judge all of them again, also those with results.",
+        rich_help_panel=_PANEL,
     ),
 ]
 
 
-def refuse_the_judged(places: Mapping[str, Path | None], reference: str, where: str = "") -> None:
+def refuse_options_of_the_judged(
+    places: Mapping[str, Path | None], reference: str, where: str = ""
+) -> None:
     """No repository says how it is judged, and none holds what is found in it: refuse such places.
 
     Raises:

@@ -26,8 +26,8 @@ import typer
 from envhub_sandbox.cli.init.starter import starter
 from envhub_sandbox.cli.shared.console import out, print_json, safe_line, safe_text, show
 from envhub_sandbox.cli.shared.exits import Exit, UsageError, describe, reported
-from envhub_sandbox.cli.shared.memory import free_bytes
-from envhub_sandbox.cli.shared.progress import Bar
+from envhub_sandbox.cli.shared.memory import free_memory_bytes
+from envhub_sandbox.cli.shared.progress import ProgressBar
 from envhub_sandbox.cli.version import versions
 from envhub_sandbox.errors import EnvHubError, SandboxUnavailableError, SnapshotError
 from envhub_worker.protocol.confinement import PROFILES
@@ -84,9 +84,7 @@ def doctor(
     ] = None,
     insecure_loopback: Annotated[
         bool,
-        typer.Option(
-            "--insecure-loopback", help="Without keys, of a server of this machine that has none."
-        ),
+        typer.Option("--insecure-loopback", help="Ask a server of this machine that has no keys."),
     ] = False,
 ) -> None:
     """Try what this host can enforce, say what is missing and how to get it.
@@ -97,7 +95,7 @@ def doctor(
     refuses.
     """
     with reported(debug=debug):
-        from envhub_sandbox.policy import Policy
+        from envhub_sandbox.settings.policy import Policy
 
         Policy(profile=profile)  # refuses a name that there is not, before anything is tried
         if server is not None:
@@ -115,7 +113,7 @@ def doctor(
                 "--server-key and --insecure-loopback are of a server: envhub doctor "
                 "tcp://HOST:PORT"
             )
-        with Bar(quiet=json) as bar, _scratch_folder() as folder:
+        with ProgressBar(quiet=json) as bar, _scratch_folder() as folder:
             (folder / "idle").mkdir()
             (folder / "idle" / "env.py").write_text(starter("idle", 2026)["env.py"])
             trials = []
@@ -145,7 +143,7 @@ def _scratch_folder() -> Iterator[Path]:
     Raises:
         SandboxUnavailableError: There is no place for one.
     """
-    from envhub_sandbox.hub.store import CACHE_VARIABLE
+    from envhub_sandbox.hub.cache import CACHE_VARIABLE
 
     try:
         made = tempfile.TemporaryDirectory(prefix="envhub-doctor-")
@@ -172,7 +170,7 @@ def _cache_problem(*, by_others: bool) -> str | None:
     Args:
         by_others: Whether root's jails read it as another user: all but those with a private root.
     """
-    from envhub_sandbox.hub.store import cache_root
+    from envhub_sandbox.hub.cache import cache_root
 
     try:
         root = cache_root()
@@ -215,13 +213,13 @@ def engine() -> dict[str, Any]:
 
 def resources(problem: str | None) -> dict[str, Any]:
     """Bytes that are free: of memory, None where the kernel does not say, and for the cache."""
-    from envhub_sandbox.hub.store import cache_root
+    from envhub_sandbox.hub.cache import cache_root
 
     disk: dict[str, Any] = {"folder": None, "free_bytes": None, "problem": problem}
     with contextlib.suppress(SnapshotError):  # it is the problem
         folder = next(one for one in (cache_root(), *cache_root().parents) if one.is_dir())
         disk |= {"folder": str(folder), "free_bytes": shutil.disk_usage(folder).free}
-    return {"free_memory_bytes": free_bytes(), "disk": disk}
+    return {"free_memory_bytes": free_memory_bytes(), "disk": disk}
 
 
 def probe() -> dict[str, Any]:
@@ -244,7 +242,7 @@ def probe() -> dict[str, Any]:
 
 def examine(folder: str, profile: str) -> Trial:
     """Run the idle environment under a profile."""
-    from envhub_sandbox.api import make_env
+    from envhub_sandbox.factory.make_env import make_env
 
     begun = time.perf_counter()
     try:

@@ -41,7 +41,7 @@ def examine(server: RemoteSandbox, profile: str, *, json: bool) -> Exit:
 def _verdict(facts: ServerFacts, profile: str) -> tuple[Exit, str | None]:
     if facts.draining:
         return Exit.WORKER, "it is about to end, and lets nothing new in"
-    if not facts.told or facts.enforces(profile):
+    if not facts.detailed or facts.enforces(profile):
         return Exit.OK, None
     return Exit.SANDBOX, (
         f"no jail with the profile {profile!r} there: {facts.profile!r} is the strongest that it "
@@ -56,7 +56,7 @@ def print_facts(server: RemoteSandbox, facts: ServerFacts, problem: str | None) 
         f"{safe_line(server.endpoint)}: envhub-worker {facts.version}, protocol {facts.protocol}; "
         f"it {let_in}, and answered after {facts.answered_s:.2f} s"
     )
-    if not facts.told:
+    if not facts.detailed:
         out("It is older than this client, and does not say what it can enforce.")
     else:
         granted = [name for name in ("network", "gpu") if getattr(facts, name)]

@@ -1,4 +1,4 @@
-"""What a repository holds, without playing it."""
+"""``envhub inspect``: the environments that a repository makes, without playing them."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from envhub_sandbox.cli.inspect.static import check_options, inspect_static
 from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import out, print_json, safe_line, show
 from envhub_sandbox.cli.shared.findings import FailOn
-from envhub_sandbox.cli.shared.progress import Bar
+from envhub_sandbox.cli.shared.progress import ProgressBar
 from envhub_sandbox.cli.shared.results import print_provenance
 
 _SPACES = ("single_observation_space", "single_action_space", "observation_space", "action_space")
@@ -55,12 +55,12 @@ def _inspect(
     make: opt.MakeOptions, suites: list[str] | None, tasks: list[str] | None, *, as_json: bool
 ) -> None:
     arguments = make.arguments()
-    from envhub_sandbox.api import make_env
+    from envhub_sandbox.factory.make_env import make_env
 
-    with Bar(quiet=as_json) as bar, make.explained():
+    with ProgressBar(quiet=as_json) as bar, make.explained():
         bar.begin(f"loading {make.ref} in a sandbox")
         with make_env(**arguments) as envs:
-            found = [describe_env(*item) for item in opt.select(envs, suites, tasks)]
+            found = [describe_env(*item) for item in opt.select_envs(envs, suites, tasks)]
             provenance = envs.provenance
     if as_json:
         print_json({"reference": make.ref, "envs": found, "provenance": provenance})
@@ -70,7 +70,7 @@ def _inspect(
 
 def describe_env(suite: str, task: Any, env: Any) -> dict[str, Any]:
     """One environment as data. Trust: all of it is input from the worker."""
-    from envhub_sandbox.rollouts.episodes import autoreset_mode
+    from envhub_sandbox.check.play.episodes import autoreset_mode
 
     metadata = dict(getattr(env, "metadata", None) or {})
     metadata.pop("autoreset_mode", None)

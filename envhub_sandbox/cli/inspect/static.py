@@ -13,7 +13,7 @@ from envhub_sandbox.cli.shared.console import print_json, show
 from envhub_sandbox.cli.shared.exits import Exit, UsageError
 from envhub_sandbox.cli.shared.findings import level, show_finding, write_report
 from envhub_sandbox.cli.shared.options import MakeOptions, is_typed
-from envhub_sandbox.cli.shared.progress import Bar
+from envhub_sandbox.cli.shared.progress import ProgressBar
 from envhub_worker.protocol.text import size_text
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ def inspect_static(
 ) -> None:
     """Read a repository, and say what is in it."""
     least = None if fail_on is None else level(fail_on)
-    with Bar(quiet=as_json) as bar:
+    with ProgressBar(quiet=as_json) as bar:
         bar.begin(f"reading {ref}")
         from envhub_sandbox.check.static.static import document, static
 

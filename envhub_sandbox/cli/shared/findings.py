@@ -24,7 +24,7 @@ FailOn = Annotated[
         "--fail-on",
         metavar="|".join(STYLES),
         autocompletion=lambda: list(STYLES),
-        help="Exit with 1 if something is found that weighs as much.",
+        help="Exit with 1 for findings of this severity or a worse one.",
     ),
 ]
 

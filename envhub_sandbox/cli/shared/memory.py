@@ -17,7 +17,7 @@ _UNLIMITED = 1 << 60
 """The first version writes no limit as the largest number of pages."""
 
 
-def free_bytes(proc: Path = Path("/proc")) -> int | None:
+def free_memory_bytes(proc: Path = Path("/proc")) -> int | None:
     """What is free, or the kernel would give back; None where it does not say.
 
     A control group that we are in, or one around it, may have less left than the machine: that of

@@ -1,4 +1,4 @@
-"""The options of ``make_env`` as parameters of commands, and what a command line says by them."""
+"""The options of ``make_env`` as parameters of commands: declared, read, and handed on."""
 
 from __future__ import annotations
 
@@ -6,19 +6,17 @@ import contextlib
 import functools
 import inspect
 import json
-import os
 import re
-import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from envhub_sandbox.cli.shared.console import safe_line
+from envhub_sandbox.cli.shared.console import prints_on_stderr, safe_line
 from envhub_sandbox.cli.shared.exits import ForeignError, UsageError, reported
 from envhub_sandbox.errors import EnvHubError
-from envhub_sandbox.options import OPTIONS
+from envhub_sandbox.settings.options import OPTIONS
 from envhub_worker.protocol.text import parse_size
 
 if TYPE_CHECKING:
@@ -148,9 +146,9 @@ class MakeOptions:
 
     def snapshot(self, ref: str) -> Snapshot:
         """What a reference names, fetched."""
-        from envhub_sandbox.hub.snapshot import named
+        from envhub_sandbox.hub.snapshot import snapshot_named
 
-        return named(ref, **self.hub)
+        return snapshot_named(ref, **self.hub)
 
     @property
     def hub(self) -> dict[str, Any]:
@@ -202,7 +200,7 @@ class MakeOptions:
             raise ForeignError(text) from error
 
 
-def select(
+def select_envs(
     envs: Mapping[str, Mapping[Any, Any]],
     suites: Sequence[str] | None,
     tasks: Sequence[str] | None,
@@ -242,20 +240,6 @@ def is_typed(context: typer.Context, name: str) -> bool:
     """Whether a parameter stands on the command line, and not in a file or nowhere."""
     source = context.get_parameter_source(name)
     return source is not None and source.name == "COMMANDLINE"
-
-
-@contextlib.contextmanager
-def prints_on_stderr() -> Iterator[None]:
-    """Keep stdout to the results: what Python prints meanwhile, and what libraries do."""
-    sys.stdout.flush()
-    kept = os.dup(1)
-    os.dup2(2, 1)
-    try:
-        with contextlib.redirect_stdout(sys.stderr):
-            yield
-    finally:
-        os.dup2(kept, 1)
-        os.close(kept)
 
 
 def read_size(option: str, text: str | None) -> int | None:

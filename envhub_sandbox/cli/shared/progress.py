@@ -1,4 +1,4 @@
-"""What is going on, on stderr, while a terminal looks."""
+"""A progress bar of a command, on stderr, where that is a terminal."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from types import TracebackType
 from typing import TYPE_CHECKING
 
 from envhub_sandbox.cli.shared.console import console, safe_line, say
-from envhub_sandbox.dependencies.progress import shown_by
+from envhub_sandbox.system.progress import progress_shown_by
 from envhub_worker.protocol.text import duration_text
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
-    from envhub_sandbox.rollouts.episodes import EpisodeCounter
+    from envhub_sandbox.check.play.episodes import EpisodeCounter
 
 _EVERY_S = 0.1
 
@@ -48,7 +48,7 @@ class _LongWaits:
                 say(f"{safe_line(self._what)}: {duration_text(round(spent))} so far", "dim")
 
 
-class Bar:
+class ProgressBar:
     """A progress bar; shows nothing if stderr is no terminal. A context manager.
 
     Args:
@@ -88,12 +88,12 @@ class Bar:
         detail = f"{done}/{self._total} episodes, {counter.steps} steps, {speed:,.0f} steps/s"
         self._progress.update(self._task, completed=done, detail=detail)
 
-    def __enter__(self) -> Bar:
+    def __enter__(self) -> ProgressBar:
         if self._progress is not None:
             self._progress.start()
         if self._waits is not None:
             self._waits.start()
-        self._also.enter_context(shown_by(self.begin))
+        self._also.enter_context(progress_shown_by(self.begin))
         return self
 
     def __exit__(

@@ -10,7 +10,7 @@ from envhub_sandbox.cli.shared.console import safe_line, show, show_rows
 from envhub_worker.protocol.text import counted
 
 if TYPE_CHECKING:
-    from envhub_sandbox.rollouts.episodes import Rollout
+    from envhub_sandbox.check.play.episodes import Rollout
 
 _SHOWN_DIGITS = 12
 _SHOWN_PACKAGES = ("gymnasium", "numpy")

@@ -97,7 +97,7 @@ def _fetched(source: Source, place: Path, tell: Tell) -> Path:
         return _below(tree, source)
     archive = place / Path(unquote(urlsplit(source.url).path)).name
     download.download(source.url, source.sha256, archive)
-    top = trees.unpack(archive, tree, _title(source))
+    top = trees.unpack_tree(archive, tree, _title(source))
     archive.unlink()
     return top
 

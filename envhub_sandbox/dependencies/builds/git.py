@@ -1,4 +1,4 @@
-"""The files of one commit of a repository of git, fetched as data.
+"""Fetches the files of one commit of a git repository, as data.
 
 Git gets no settings but ours: no hooks, no filters, no submodules, no logins, and no protocol but
 https. Nothing is checked out: files are read out of the objects, whose names are hashes of their
@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import IO, NamedTuple
 
 from envhub_sandbox.dependencies import index
-from envhub_sandbox.dependencies.builds.trees import MAX_BYTES, MAX_FILES, Member, lay_out
+from envhub_sandbox.dependencies.builds.trees import MAX_BYTES, MAX_FILES, Member, write_tree
 from envhub_sandbox.errors import (
     DependencyError,
     IndexUnavailableError,
@@ -90,7 +90,7 @@ def check_out(url: str, commit: str, folder: Path, tell: Callable[[str], None]) 
         with (store / "blobs").open("w+b") as file:
             names = "".join(f"{blob.digest}\n" for blob in blobs)
             _git(store, "cat-file", "--batch", given=names.encode(), output=file)
-            lay_out(_members(blobs, file), folder, title)
+            write_tree(_members(blobs, file), folder, title)
 
 
 class _Blob(NamedTuple):

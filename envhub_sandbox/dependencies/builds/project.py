@@ -8,7 +8,7 @@ from typing import Any
 
 from envhub_sandbox.dependencies.declared import MAX_BYTES, WantedPackage, parse_requirement
 from envhub_sandbox.errors import RequirementError
-from envhub_sandbox.sources import toml
+from envhub_sandbox.hub.sources import toml
 
 _LEGACY = ("setuptools", "wheel")
 _LEGACY_BACKEND = "setuptools.build_meta:__legacy__"

@@ -1,6 +1,6 @@
 """A folder of a stranger's source files: written file by file, within bounds, without links.
 
-Source distributions and commits of git both come as ``Member``s, which ``lay_out`` writes.
+Source distributions and commits of git both come as ``Member``s, which ``write_tree`` writes.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from envhub_sandbox.errors import PackageIntegrityError, PackagesTooLargeError, SnapshotError
-from envhub_sandbox.hub.listing import FileRecord, check_names
+from envhub_sandbox.hub.listing import FileRecord, check_listing_names
 from envhub_sandbox.system import folders
 from envhub_worker.protocol.text import size_text
 
@@ -51,13 +51,13 @@ class Member:
     open: Callable[[], IO[bytes]]
 
 
-def lay_out(members: Iterable[Member], folder: Path, title: str) -> None:
+def write_tree(members: Iterable[Member], folder: Path, title: str) -> None:
     """Write files below a folder that is there and empty; within bounds, under names that stay in
     it.
     """
     kept = list(_bounded(members, title))
     try:
-        check_names([FileRecord(one.path, one.size, "") for one in kept], title)
+        check_listing_names([FileRecord(one.path, one.size, "") for one in kept], title)
     except SnapshotError as error:
         raise PackageIntegrityError(str(error)) from error
     for member in kept:
@@ -91,11 +91,11 @@ def _copy(source: IO[bytes], target: IO[bytes], member: Member, title: str) -> N
         raise PackageIntegrityError(f"{title}: {member.path!r} has not the size that it says")
 
 
-def unpack(archive: Path, folder: Path, title: str) -> Path:
-    """Unpack a source distribution below a folder, as ``lay_out``; gives its one top folder."""
+def unpack_tree(archive: Path, folder: Path, title: str) -> Path:
+    """Unpack a source distribution below a folder, as ``write_tree``; gives its one top folder."""
     try:
         with _members(archive, title) as members:
-            lay_out(members, folder, title)
+            write_tree(members, folder, title)
     except (*_BROKEN, *_BROKEN_ZIP) as error:
         raise PackageIntegrityError(f"{title} cannot be unpacked: {error}") from error
     tops = list(folder.iterdir())
@@ -179,7 +179,7 @@ def _of_tar(archive: tarfile.TarFile, title: str) -> Iterator[Member]:
         yield Member(path, member.size, bool(member.mode & stat.S_IXUSR), opened)
 
 
-def check_packing(member: zipfile.ZipInfo, title: str) -> None:
+def check_zip_member(member: zipfile.ZipInfo, title: str) -> None:
     """Refuse what is neither file nor folder, and what Python unpacks whole."""
     kinds = (0, stat.S_IFREG, *([stat.S_IFDIR] if member.is_dir() else []))
     if stat.S_IFMT(member.external_attr >> 16) not in kinds:
@@ -195,7 +195,7 @@ def _of_zip(archive: zipfile.ZipFile, title: str) -> Iterator[Member]:
         mode = member.external_attr >> 16
         if member.is_dir():
             continue
-        check_packing(member, title)
+        check_zip_member(member, title)
 
         def opened(member: zipfile.ZipInfo = member) -> IO[bytes]:
             return archive.open(member)

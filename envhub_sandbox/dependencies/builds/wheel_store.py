@@ -21,7 +21,7 @@ from envhub_sandbox.dependencies.builds.sources import Source, WheelOrigin
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.errors import DependencyError
 from envhub_sandbox.hub.cache import cache_root, draft, remove_tree
-from envhub_sandbox.hub.hashing import SHA256, Mismatch, digest_of
+from envhub_sandbox.hub.hashing import SHA256, HashMismatch, digest_of
 from envhub_sandbox.hub.logins import without_login
 from envhub_sandbox.system import folders
 
@@ -45,7 +45,7 @@ def recall(source: Source, interpreter: Interpreter) -> Path | None:
 
 def _whole(record: Path) -> Path | None:
     """The wheel beside a record, if it is what that one says."""
-    with contextlib.suppress(OSError, ValueError, Mismatch):
+    with contextlib.suppress(OSError, ValueError, HashMismatch):
         [wheel] = record.parent.glob("*.whl")
         built = describe(wheel)
         return wheel if built is not None and _hash(wheel) == f"sha256:{built.wheel}" else None

@@ -19,10 +19,10 @@ from packaging import tags
 from packaging.utils import InvalidWheelFilename, canonicalize_name, parse_wheel_filename
 from packaging.version import InvalidVersion, Version
 
-from envhub_sandbox.dependencies.builds.trees import MAX_TABLE, BoundedStream, check_packing
+from envhub_sandbox.dependencies.builds.trees import MAX_TABLE, BoundedStream, check_zip_member
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.errors import DependencyError, PackageIntegrityError, SnapshotError
-from envhub_sandbox.hub.listing import FileRecord, check_names
+from envhub_sandbox.hub.listing import FileRecord, check_listing_names
 from envhub_worker.protocol.text import printable, size_text
 
 MAX_BYTES = 512 * 2**20
@@ -92,9 +92,9 @@ def _files(archive: zipfile.ZipFile) -> None:
             f"it holds more than {MAX_FILES} files or {size_text(MAX_UNPACKED)}"
         )
     for member in members:
-        check_packing(member, "it")
+        check_zip_member(member, "it")
     names = (one.filename + "_" * one.is_dir() for one in members)  # a folder as a file in it
-    check_names([FileRecord(name, 0, "") for name in names], "it")
+    check_listing_names([FileRecord(name, 0, "") for name in names], "it")
 
 
 def _info(archive: zipfile.ZipFile, name: str, version: Version) -> str:

@@ -18,12 +18,11 @@ from lerobot.configs.default import EvalConfig
 from lerobot.configs.types import PolicyFeature
 from lerobot.envs.configs import EnvConfig
 
-from envhub_sandbox.api import make_env
 from envhub_sandbox.errors import HubReferenceError
+from envhub_sandbox.factory.make_env import make_env
 from envhub_sandbox.hub.logins import without_login
 from envhub_sandbox.integrations.lerobot.features import features_of
-from envhub_sandbox.option_names import on_lerobots_command_line, use_option_names
-from envhub_sandbox.options import OPTIONS
+from envhub_sandbox.settings.options import OPTIONS, on_lerobots_command_line, use_option_names
 from envhub_sandbox.vector.suites import EnvSuites
 
 ASKS_CONFIGS = hasattr(EnvConfig, "create_envs")

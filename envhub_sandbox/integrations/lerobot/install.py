@@ -14,9 +14,9 @@ from typing import Any
 import gymnasium
 import lerobot.envs.factory
 
-from envhub_sandbox.api import make_env
+from envhub_sandbox.factory.make_env import make_env
 from envhub_sandbox.integrations.lerobot.config import ASKS_CONFIGS, SandboxedEnvConfig
-from envhub_sandbox.options import OPTIONS
+from envhub_sandbox.settings.options import OPTIONS
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 

@@ -15,8 +15,8 @@ from envhub_sandbox.errors import (
     SandboxUnavailableError,
     WorkerStartupError,
 )
-from envhub_sandbox.option_names import option_name
 from envhub_sandbox.sandboxes.docker.run_arguments import Container
+from envhub_sandbox.settings.options import option_name
 from envhub_worker.protocol.messages.surroundings import Surroundings
 from envhub_worker.protocol.untrusted import UNTRUSTED
 

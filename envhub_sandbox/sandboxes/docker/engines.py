@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError
-from envhub_sandbox.option_names import option_name
+from envhub_sandbox.settings.options import option_name
 
 ENGINES = ("docker", "podman")
 _ANSWER_S = 60.0

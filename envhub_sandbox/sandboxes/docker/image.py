@@ -18,7 +18,7 @@ from pathlib import Path
 from envhub_sandbox.dependencies.resolve import Lock, Target
 from envhub_sandbox.errors import DependencyError
 from envhub_sandbox.sandboxes.docker.engines import Engine, EngineError, environment
-from envhub_sandbox.sandboxes.docker.packages import inside
+from envhub_sandbox.sandboxes.docker.packages import image_packages
 
 LOCK_LABEL = "dev.envhub.lock"
 _PACKAGE = re.compile(r"[a-z0-9][a-z0-9.+-]+")
@@ -40,8 +40,8 @@ USER 65532:65532
 
 
 def target_of(engine: Engine, image: str) -> Target:
-    """What runs in a worker's image; raises as ``inside``."""
-    found, _ = inside(engine, image)
+    """What runs in a worker's image; raises as ``image_packages``."""
+    found, _ = image_packages(engine, image)
     return Target(version=".".join(found.version.split(".")[:2]), machine=found.machine)
 
 

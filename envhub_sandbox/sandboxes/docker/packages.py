@@ -12,16 +12,16 @@ from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
-from envhub_sandbox.dependencies.pipeline import HERE, PackageSet
+from envhub_sandbox.dependencies.packages import HERE, PackageSet
 from envhub_sandbox.dependencies.request import PackageRequest
 from envhub_sandbox.errors import InterpreterUnavailableError, SandboxUnavailableError
-from envhub_sandbox.option_names import option_name
 from envhub_sandbox.sandboxes.docker.engines import (
     Engine,
     EngineError,
     find_image,
     own_limits,
 )
+from envhub_sandbox.settings.options import option_name
 
 if TYPE_CHECKING:
     from envhub_sandbox.dependencies.installed import InstalledPackage
@@ -55,10 +55,10 @@ class ImageTarget:
 
     def _inside(self) -> tuple[Interpreter, dict[str, InstalledPackage]]:
         engine = self._engine()
-        return inside(engine, find_image(engine, self._image))
+        return image_packages(engine, find_image(engine, self._image))
 
     def meets(self, request: PackageRequest) -> bool:
-        """Whether the image has all of it; raises as ``inside``."""
+        """Whether the image has all of it; raises as ``image_packages``."""
         from packaging.utils import canonicalize_name
 
         from envhub_sandbox.dependencies import installed
@@ -75,13 +75,13 @@ class ImageTarget:
             DependencyError: It cannot be made, or not for that image.
             SandboxUnavailableError: It is no image of ours.
         """
-        ours = fitting(self._inside()[0], request)
+        ours = interpreter_fitting(self._inside()[0], request)
         made = HERE.make(replace(request, python=ours.path), tell)
         return replace(made, python="")
 
 
 @lru_cache(maxsize=16)
-def inside(engine: Engine, image: str) -> tuple[Interpreter, dict[str, InstalledPackage]]:
+def image_packages(engine: Engine, image: str) -> tuple[Interpreter, dict[str, InstalledPackage]]:
     """The interpreter of an image, and what is installed for its jails; by the image's id.
 
     Raises:
@@ -108,7 +108,7 @@ def inside(engine: Engine, image: str) -> tuple[Interpreter, dict[str, Installed
     return Interpreter(_INTERPRETER, *facts), installed
 
 
-def fitting(theirs: Interpreter, request: PackageRequest) -> Interpreter:
+def interpreter_fitting(theirs: Interpreter, request: PackageRequest) -> Interpreter:
     """An interpreter of this machine whose packages the image's can import.
 
     Raises:

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from envhub_sandbox.errors import PolicyError
-from envhub_sandbox.option_names import option_name
-from envhub_sandbox.policy import Policy
 from envhub_sandbox.sandboxes.docker.engines import Engine
+from envhub_sandbox.settings.options import option_name
+from envhub_sandbox.settings.policy import Policy
 
 CLIENT_LABEL = "dev.envhub.client"
 """The client's pid, in its own namespace: for people."""

@@ -21,8 +21,6 @@ from pathlib import Path
 from typing import cast
 
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerStartupError
-from envhub_sandbox.option_names import option_name
-from envhub_sandbox.policy import Policy
 from envhub_sandbox.sandboxes import runtime_folder
 from envhub_sandbox.sandboxes.docker import attestation, packages, run_arguments, seccomp_profile
 from envhub_sandbox.sandboxes.docker.engines import (
@@ -37,8 +35,10 @@ from envhub_sandbox.sandboxes.docker.run_arguments import Container
 from envhub_sandbox.sandboxes.local_server import LocalServer
 from envhub_sandbox.sandboxes.pool import ServerPool, ServerUse, WorkerServer
 from envhub_sandbox.sandboxes.sandbox import Sandbox
+from envhub_sandbox.settings.options import option_name
+from envhub_sandbox.settings.policy import Policy
 from envhub_sandbox.system import processes
-from envhub_sandbox.transport.connection import WorkerClient
+from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.runtime import OWN, Runtime
@@ -180,7 +180,7 @@ class RepositoryContainer(Sandbox):
         return _POOL.acquire(repr(self), self._start, idle_s, group=self)
 
     def prepare(
-        self, order: m.OpenJail, server: WorkerServer, client: WorkerClient, deadline: Deadline
+        self, order: m.OpenJail, server: WorkerServer, client: WorkerConnection, deadline: Deadline
     ) -> m.OpenJail:
         """Files and packages lie elsewhere in there, and not every profile can be had."""
         container = cast("ContainerServer", server)

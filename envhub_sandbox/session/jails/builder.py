@@ -11,7 +11,7 @@ from envhub_sandbox.session.jails.loaded import LoadedJail
 from envhub_sandbox.session.jails.sources import JailSource
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.lane import Lane, RelayLane
-from envhub_sandbox.transport.replies import typed
+from envhub_sandbox.transport.replies import typed_reply
 from envhub_sandbox.transport.results import Results
 from envhub_sandbox.transport.shared_memory.attachment import Attachment
 from envhub_sandbox.transport.shared_memory.lane import SharedMemoryLane
@@ -90,9 +90,9 @@ class Builder:
         ]
         replies = relay.jail.exchange("make_env", builds, deadline)
         for index, reply in zip(shards, replies, strict=True):
-            self._check_built(typed(reply, m.Built), *self._bounds[index])
+            self._check_built(typed_reply(reply, m.BuildDone), *self._bounds[index])
 
-    def _check_built(self, reply: m.Built, start: int, stop: int) -> None:
+    def _check_built(self, reply: m.BuildDone, start: int, stop: int) -> None:
         """Hold what was built against the manifest. Trust: input from the worker."""
         most = self._repository.policy.limits.elements
         built, wanted = decode_env(reply.manifest, max_elements=most), self._manifest

@@ -18,11 +18,11 @@ from envhub_sandbox.session.jails.loaded import ExpectedManifest, LoadedJail
 from envhub_sandbox.session.jails.server_hold import ServerHold
 from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.system.log import WORKER
-from envhub_sandbox.transport.connection import WorkerClient
+from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import JailHandle, open_jail
 from envhub_sandbox.transport.output import OutputFollower, OutputSinks
-from envhub_sandbox.transport.replies import expect, typed
+from envhub_sandbox.transport.replies import expect_reply, typed_reply
 from envhub_sandbox.transport.values.generators import generator
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest.manifest import EnvManifest, decode_manifest
@@ -80,14 +80,14 @@ class Launcher:
         Args:
             deadline: For all of it.
             known: What that returns. It is then described no more, which for a suite means to
-                build an environment of each of its tasks; ``Built`` is held against it instead.
+                build an environment of each of its tasks; ``BuildDone`` is held against it instead.
 
         Raises:
             LoadError: The repository failed to load, or returned something unusable.
             WorkerError: The jail did not come up, died, or took too long.
         """
         use = self._acquire()
-        try:
+        try:  # interruption.md, rule 4
             # one on another host runs anyway
             if self.repository.timeouts.server_idle_s != 0 and use.server.far is None:
                 self._hold.keep(use.server)
@@ -135,11 +135,13 @@ class Launcher:
                 jail.close(Deadline(_CLOSE_S))
             raise
 
-    def _client(self, server: WorkerServer) -> WorkerClient:
+    def _client(self, server: WorkerServer) -> WorkerConnection:
         limits = self.repository.wire_limits
-        return WorkerClient(server.endpoint, server.process_fd, limits, server.far)
+        return WorkerConnection(server.endpoint, server.process_fd, limits, server.far)
 
-    def _connected(self, server: WorkerServer, deadline: Deadline | None = None) -> WorkerClient:
+    def _connected(
+        self, server: WorkerServer, deadline: Deadline | None = None
+    ) -> WorkerConnection:
         client = self._client(server)
         try:
             client.hello(deadline or Deadline(_CLOSE_S))
@@ -161,7 +163,7 @@ class Launcher:
         [reply] = jail.exchange(
             "make_env", [(runner, self.repository.arguments.message())], deadline
         )
-        if not isinstance(reply, m.Loaded):
+        if not isinstance(reply, m.LoadDone):
             raise LoadError(f"the worker answered Load with {type(reply).__name__}")
         elements = self.repository.policy.limits.elements
         in_time = partial(_refuse_late, deadline)
@@ -201,14 +203,14 @@ class Launcher:
         jail = loaded.jail
         again = self.repository.arguments.message_for(task)
         replies = jail.exchange("make_env", [(runner, again) for runner in runners], deadline)
-        found = [typed(reply, m.Value).value for reply in replies]
+        found = [typed_reply(reply, m.Value).value for reply in replies]
         loaded.changed |= not all(_is_what(value, task) for value in found)
         loaded.loaded.update(runners)
 
     def connect(self, loaded: LoadedJail, deadline: Deadline) -> LoadedJail:
         """A further connection to an open jail; environments that share one wait apart."""
         use = self._acquire()
-        try:
+        try:  # interruption.md, rule 4
             client = self._connected(use.server, deadline)
         except BaseException:
             use.release()
@@ -294,7 +296,9 @@ class Launcher:
         try:
             status = self._ask(server, m.GetStatus(), deadline)
             with UNTRUSTED:
-                jails = [one for one in expect(status, m.Status).jails if isinstance(one, dict)]
+                jails = [
+                    one for one in expect_reply(status, m.Status).jails if isinstance(one, dict)
+                ]
                 return next((one for one in jails if one.get("jail") == jail), {})
         except EnvHubError:  # it is for a text, or a figure that may be missing
             return {}

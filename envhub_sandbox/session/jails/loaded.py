@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from envhub_sandbox.sandboxes.pool import ServerUse, WorkerServer
-from envhub_sandbox.transport.forks import Owner
+from envhub_sandbox.system.processes import OwnerProcess
 from envhub_sandbox.transport.jail import JailHandle
 from envhub_worker.protocol.manifest.manifest import EnvManifest, Manifest
 
@@ -57,7 +57,7 @@ class LoadedJail:
     ended: bool = False
     closed: bool = False
     changed: bool = False
-    owner: Owner = field(default_factory=Owner)
+    owner: OwnerProcess = field(default_factory=OwnerProcess)
 
     @property
     def server(self) -> WorkerServer:
@@ -65,7 +65,8 @@ class LoadedJail:
         return self.use.server
 
     def __del__(self) -> None:
-        # at the end of the process, which closes nothing one by one, no server is in use any more
+        # interruption.md, rule 5. At the end of the process no server is in use any more: nothing
+        # is closed one by one there (rule 13).
         if not self.closed and self.use.live and self.owner.is_here:
             self.ending = True  # its connection may have gone before it
             self.give_back(self)

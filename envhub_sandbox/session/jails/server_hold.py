@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Any
 
 from envhub_sandbox.sandboxes.pool import ServerUse, WorkerServer
-from envhub_sandbox.transport.forks import Owner
+from envhub_sandbox.system.processes import OwnerProcess
 
 
 class ServerHold:
@@ -35,7 +35,7 @@ class ServerHold:
         self._on_empty = on_empty
         # interruption.md, rule 12
         self._lock = threading.RLock()
-        self._owner = Owner()
+        self._owner = OwnerProcess()
         self._open: set[object] = set()
         self._use: ServerUse[Any] | None = None
         self._left: list[ServerUse[Any]] = []
@@ -91,7 +91,7 @@ class ServerHold:
         return use is not None and use.live and use.server is server
 
     def _leave(self, ticket: object) -> None:
-        """If interrupted, the next one who leaves finishes the work; it may be the same."""
+        """If interrupted, the next call finishes the work: interruption.md, rule 7."""
         if not self._owner.is_here:
             return  # a fork: the server is the parent's, and another thread may have held the lock
         with self._lock:

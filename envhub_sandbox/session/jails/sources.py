@@ -12,8 +12,8 @@ from collections.abc import Callable
 
 from envhub_sandbox.session.jails.launcher import Launcher
 from envhub_sandbox.session.jails.loaded import ExpectedManifest, LoadedJail
+from envhub_sandbox.system.processes import OwnerProcess
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.forks import Owner
 
 
 class JailSource:
@@ -64,14 +64,14 @@ class SharedJail(JailSource):
     def __init__(self, launcher: Launcher, forget_manifest: Callable[[], None]) -> None:
         super().__init__(launcher, forget_manifest)
         self._lock = threading.RLock()  # interruption.md, rule 12
-        self._owner = Owner()
+        self._owner = OwnerProcess()
         self._first: LoadedJail | None = None
         self._users: weakref.WeakSet[LoadedJail] = weakref.WeakSet()
 
     def provide(self, loaded: LoadedJail) -> None:
         """Start with a jail that is loaded already."""
         self._first = loaded
-        # it may never be taken, nor closed
+        # interruption.md, rule 13; it may never be taken, nor closed
         weakref.finalize(self, self.launcher.close, loaded).atexit = False
 
     def take(self, deadline: Deadline) -> LoadedJail:
@@ -110,5 +110,5 @@ class SharedJail(JailSource):
     def _close_first(self) -> None:
         first = self._first
         if first is not None:
-            self.launcher.close(first)  # what interrupts it leaves it for the next to close
+            self.launcher.close(first)  # interruption.md, rule 7
             self._first = None

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from envhub_sandbox.crash.history import History
 from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerTimeoutError
+from envhub_sandbox.session.crash.history import History
 from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.session.refusals import closed_during, expiry
 from envhub_sandbox.system.log import WORKER

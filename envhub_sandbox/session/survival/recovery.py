@@ -6,26 +6,30 @@ others go on. Without it there is no ``Recovery``, and a death is an error.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
-from envhub_sandbox.crash.history import History
+import numpy as np
+
 from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerError, WorkerTimeoutError
+from envhub_sandbox.session.crash.history import History
 from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.session.survival.failures import Failures
 from envhub_sandbox.session.survival.restart_policy import Restarts
-from envhub_sandbox.session.survival.revived_rows import mark_revived, revived_step
 from envhub_sandbox.session.survival.seeds import SeedBook, Settings, resets
 from envhub_sandbox.system.log import WORKER
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
 from envhub_sandbox.transport.jail import RunnersDiedError
 from envhub_sandbox.transport.lane import Lane, Request
-from envhub_sandbox.transport.replies import check, typed
+from envhub_sandbox.transport.replies import check_reply, typed_reply
+from envhub_sandbox.transport.results import is_batch
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.lifecycle import Event
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
+RESTARTED = "worker_restarted"
+"""The key in the infos: whether a sub-environment was lost and came back reset."""
 MessagesFor = Callable[[Lane, int], list[m.Message]]
 """Makes what a shard's fresh runner is asked, one after the other."""
 RowsOf = Callable[[m.Message, int], m.Message]
@@ -108,7 +112,7 @@ class Recovery:
         replies = self._of_survivors(deaths)
         fresh = self._revive(deaths, "step", self._revivals, _step_rows)
         merged = [fresh.get(index, reply) for index, reply in enumerate(replies)]
-        return [typed(reply, m.StepDone) for reply in merged if reply is not None]
+        return [typed_reply(reply, m.StepDone) for reply in merged if reply is not None]
 
     def mark(self, infos: dict[Any, Any]) -> dict[Any, Any]:
         """All infos of the last request, of which those of the fresh shards say that they are."""
@@ -125,7 +129,7 @@ class Recovery:
         try:
             for reply in deaths.replies:
                 if reply is not None:
-                    check(reply)
+                    check_reply(reply)
         except EnvHubError:
             self._lifecycle.answered()
             raise
@@ -152,7 +156,7 @@ class Recovery:
         except EnvHubError as error:
             cause = error.__cause__ or deaths.first
             raise failures.dead(error) from (None if cause is error else cause)
-        except BaseException as error:
+        except BaseException as error:  # interruption.md, rule 2
             failures.interrupted(error)
             lifecycle.request = None
             raise
@@ -202,12 +206,12 @@ class Recovery:
                 (lane.runners[index], [*frames[index]]) for index in dead
             ]
             replies = lane.jail.ask("set_attr", asked, deadline)
-            if any(isinstance(reply, m.Raised) for reply in replies):
+            if any(isinstance(reply, m.RaisedException) for reply in replies):
                 label = self._lease.repository.label
                 WORKER.warning("%s: %r could not be set again", label, name)
             for reply in replies:
-                if not isinstance(reply, m.Raised):
-                    typed(reply, m.Value)
+                if not isinstance(reply, m.RaisedException):
+                    typed_reply(reply, m.Value)
 
     def _revivals(self, lane: Lane, index: int) -> list[m.Message]:
         return [m.Revive(lane.number, self._derived(index))]
@@ -227,12 +231,12 @@ class Recovery:
 
 def _step_rows(reply: m.Message, size: int) -> m.Message:
     """Trust: input from the worker."""
-    return revived_step(typed(reply, m.StepDone), size)
+    return revived_step(typed_reply(reply, m.StepDone), size)
 
 
 def _reset_rows(reply: m.Message, size: int) -> m.Message:
     """Trust: input from the worker."""
-    done = typed(reply, m.ResetDone)
+    done = typed_reply(reply, m.ResetDone)
     return m.replace(done, info=mark_revived(done.info, size))
 
 
@@ -244,3 +248,29 @@ def _ask_anew(
         asked = [(lane.runners[i], message) for i, message in zip(dead, messages, strict=True)]
         replies = lane.jail.exchange("reset", asked, deadline)
     return dict(zip(dead, replies, strict=True))
+
+
+def revived_step(reply: m.StepDone, count: int) -> m.StepDone:
+    """A fresh runner's rows of the step in which another died. Trust: its flags are not used.
+
+    Of the rewards the shape is used where they are an array: then it was paid for in bytes. A
+    described space also has a ``shape``, of any size, for a few.
+    """
+    rewards: Any = reply.rewards
+    return m.StepDone(
+        reply.observation,
+        np.zeros(rewards.shape if is_batch(rewards) else (count,)),
+        np.zeros(count, np.bool_),
+        np.ones(count, np.bool_),
+        mark_revived(reply.info, count),
+    )
+
+
+def mark_revived(
+    info: dict[Any, Any], count: int, bounds: Iterable[tuple[int, int]] | None = None
+) -> dict[Any, Any]:
+    """Infos that say of each sub-environment, or of those within, that it came back."""
+    yes = np.zeros(count, np.bool_)
+    for start, stop in [(0, count)] if bounds is None else bounds:
+        yes[start:stop] = True
+    return {**info, RESTARTED: yes, f"_{RESTARTED}": yes.copy()}

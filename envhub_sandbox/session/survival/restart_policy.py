@@ -5,8 +5,8 @@ from __future__ import annotations
 import time
 
 from envhub_sandbox.errors import WorkerDiedError
-from envhub_sandbox.policy import Policy
 from envhub_sandbox.session.counters import Counters
+from envhub_sandbox.settings.policy import Policy
 
 _CALM_S = 60.0
 _LONGEST_S = 30.0

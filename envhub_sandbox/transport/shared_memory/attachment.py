@@ -46,6 +46,11 @@ class Attachment:
         Raises:
             WorkerDiedError: There is no such runner any more, or no server.
         """
+        # In this order. The bell is watched before a runner can ring it. The server gives the pidfd
+        # in exchange for the descriptors, so the death that we watch is that of their new holder;
+        # it becomes ours by ``_pidfds`` before anything else is called (interruption.md, rule 4).
+        # Our copies of the runner's ends are closed last: if we kept them, a bell whose runner has
+        # died would look open, and every deposit would hold five descriptors of this process.
         self.watch.bell(shard.bell)
         try:
             wait_s = _wait_s(deadline)

@@ -16,7 +16,7 @@ from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import RunnersDiedError
 from envhub_sandbox.transport.lane import Frames, RelayLane, Request
 from envhub_sandbox.transport.pace import Pace, PaceMeter
-from envhub_sandbox.transport.replies import typed
+from envhub_sandbox.transport.replies import typed_reply
 from envhub_sandbox.transport.results import Results, StepResult
 from envhub_sandbox.transport.shared_memory.attachment import Attachment
 from envhub_sandbox.transport.shared_memory.observations import RING, ObservationSlab
@@ -151,6 +151,14 @@ class SharedMemoryLane:
 
     def _attach(self, shards: Sequence[int], deadline: Deadline) -> bool:
         """Have the runners of some shards serve these slabs; whether all of them do."""
+        # In this order. ZeroMQ carries no descriptors: so each shard's are deposited with the
+        # server first, which answers with a pidfd. From then on a death is noticed by the watch,
+        # and the client's copies of the descriptors are closed (``hand_over``). Then one ``Relay``
+        # goes to all runners, and takes each one's deposit along with its ``Attach``: no runner can
+        # see the message without the descriptors. Who dies in between is an error of the ``Relay``;
+        # what then still waits in the server is closed there with the jail (``FdStore.drop``).
+        # Nothing goes through the slabs before every runner has answered, for one that refuses
+        # makes all of them use the other lane.
         layout, bounds = self.observations.layout, self._bounds
         messages: list[tuple[int, m.Message]] = []
         for index in shards:
@@ -161,7 +169,7 @@ class SharedMemoryLane:
             attach = m.Attach(self.number, bounds[index][0], layout.count, layout.slots)
             messages.append((self.runners[index], attach))
         replies = self.jail.exchange("attach", messages, deadline, deposited=True)
-        return all(typed(reply, m.Value).value is True for reply in replies)
+        return all(typed_reply(reply, m.Value).value is True for reply in replies)
 
     # --- steps ---------------------------------------------------------------------------------
 
@@ -287,7 +295,9 @@ class SharedMemoryLane:
         """Replies to a reset as they would have come through the server."""
         with UNTRUSTED:
             return [
-                reply if isinstance(reply, m.Raised) else self._results.reset_done(part, reply)
+                reply
+                if isinstance(reply, m.RaisedException)
+                else self._results.reset_done(part, reply)
                 for part, reply in zip(self._observations(), replies, strict=True)
             ]
 
@@ -313,6 +323,15 @@ class SharedMemoryLane:
             WorkerTimeoutError: The deadline came first.
             _RunnerGoneError: A runner ended first.
         """
+        # In this order. The sleepers, who share this core, cannot run before we sleep: so we sleep
+        # for them first, at once, while the others compute on their own cores. What these have
+        # taken by then costs nothing more. Only then do we wait awake for the others, within one
+        # budget for all of them, since a sleep and a wake-up cost more than most steps; for who is
+        # later than that we sleep as well. Each wait looks at its shard's answer before it looks at
+        # a death: a runner that answers and then dies has answered. All shards are waited for, also
+        # after one has raised: an answer that is left in its slab would be taken for the answer to
+        # the next request (interruption.md, rule 1). An interrupt anywhere here leaves ``_owed`` as
+        # it was, and ``catch_up`` waits for the same answers again: to wait takes nothing away.
         for shard in self._sleepers:
             if not shard.answered_before_death(self._watch, deadline):
                 raise _RunnerGoneError
@@ -379,7 +398,7 @@ class SharedMemoryLane:
         return RunnersDiedError(replies, deaths)
 
     def _stepped(self, index: int, outcome: Outcome, observation: Any, flags: Any) -> m.Message:
-        if isinstance(outcome[1], m.Raised):
+        if isinstance(outcome[1], m.RaisedException):
             return outcome[1]
         rewards, over, cut = (column[slice(*self._bounds[index])] for column in flags)
         info = infos_of(self.shards[index], outcome, self._results)

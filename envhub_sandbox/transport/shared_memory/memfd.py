@@ -18,11 +18,11 @@ _SIZE_SEALS = 0x1 | 0x2 | 0x4
 this file too."""
 
 
-def slab(name: str, size: int, further_seals: int = 0) -> tuple[mmap.mmap, io.FileIO]:
+def sealed_memfd(name: str, size: int, further_seals: int = 0) -> tuple[mmap.mmap, io.FileIO]:
     """A sealed memfd of a fixed size, mapped here, and its file.
 
     Without the seals a jail could cut the memory, and the next look at it would be a SIGBUS. It is
-    a file and no number, so that an interrupt leaves no descriptor open.
+    a file and no number: interruption.md, rule 5.
     """
     file = io.FileIO(os.memfd_create(f"envhub-{name}", os.MFD_CLOEXEC | os.MFD_ALLOW_SEALING), "r+")
     file.truncate(size)

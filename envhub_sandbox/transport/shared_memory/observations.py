@@ -20,7 +20,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from envhub_sandbox.transport.shared_memory.memfd import slab
+from envhub_sandbox.transport.shared_memory.memfd import sealed_memfd
 from envhub_worker.protocol.shared_memory import slabs
 
 RING = 4
@@ -43,7 +43,7 @@ class ObservationSlab:
 
     def __init__(self, space: gym.Space[Any], layout: slabs.ObservationLayout) -> None:
         self.layout = layout
-        self._memory, self._file = slab("observations", layout.total_bytes)
+        self._memory, self._file = sealed_memfd("observations", layout.total_bytes)
         self.fd = self._file.fileno()
         self._assemble = slabs.assembler(space)
         if layout.slots == 1:

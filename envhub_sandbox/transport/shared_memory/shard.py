@@ -17,7 +17,7 @@ import numpy as np
 from envhub_sandbox.errors import RemoteProtocolError, WorkerTimeoutError
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.shared_memory.doorbell import OwnBell, RunnerBell, Watch
-from envhub_sandbox.transport.shared_memory.memfd import SEAL_FUTURE_WRITE, slab
+from envhub_sandbox.transport.shared_memory.memfd import SEAL_FUTURE_WRITE, sealed_memfd
 from envhub_sandbox.transport.values.descriptions import unpacked
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.shared_memory import slabs
@@ -49,8 +49,8 @@ class LaneShard:
 
     def __init__(self, layout: slabs.Layout, observations: int) -> None:
         self.layout = layout
-        self._request, request = slab("request", layout.request_bytes, SEAL_FUTURE_WRITE)
-        self._reply, reply = slab("reply", layout.reply_bytes)
+        self._request, request = sealed_memfd("request", layout.request_bytes, SEAL_FUTURE_WRITE)
+        self._reply, reply = sealed_memfd("reply", layout.reply_bytes)
         self._runner_bell, self.bell = RunnerBell(), OwnBell()
         self._ring = self._runner_bell.ring
         self._slab_files = [request, reply]

@@ -7,17 +7,19 @@ is fields of a fixed form, each held against what such a thing can have.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NoReturn
+
+import gymnasium as gym
+from gymnasium.envs.registration import EnvSpec
 
 from envhub_sandbox.errors import RemoteProtocolError
 from envhub_sandbox.transport.values.generators import generator
-from envhub_sandbox.transport.values.specs import spec_of
 from envhub_sandbox.transport.values.tensors import to_tensor
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.inert import RemoteObject, one_line
 from envhub_worker.protocol.codec.kinds import GENERATOR, SPACE, SPEC, Buffer
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
-from envhub_worker.protocol.manifest.facts import read_spec
+from envhub_worker.protocol.manifest.facts import read_spec_facts
 from envhub_worker.protocol.spaces.reader import (
     ELEMENT_BYTES,
     GENERATOR_BYTES,
@@ -35,6 +37,7 @@ def unpacked(frames: Sequence[Buffer], limits: WireLimits = DEFAULT_LIMITS) -> m
     return m.unpack(frames, limits=limits, tensors=to_tensor, things=DescriptionReader)
 
 
+_REFUSAL = f"{__name__}:not_here"
 _SPEC_TYPE = "gymnasium.envs.registration.EnvSpec"
 _SHOWN = 200
 
@@ -68,6 +71,44 @@ class DescriptionReader:
 
 def _spec(value: object) -> Any:
     """A spec; a description of one whose id this Gymnasium cannot read."""
-    facts = read_spec(value)
+    facts = read_spec_facts(value)
     made = spec_of(facts)
     return RemoteObject(_SPEC_TYPE, one_line(str(facts), _SHOWN)) if made is None else made
+
+
+def spec_of(given: dict[str, Any] | None, reference: str = "") -> EnvSpec | None:
+    """A spec with these facts, as ``read_spec`` lets them through.
+
+    A string names what refuses, so that it can be written as JSON like any other.
+
+    Args:
+        given: ``id``, ``max_episode_steps``, ``reward_threshold``, ``nondeterministic``.
+        reference: The repository, for the text of the refusal.
+    """
+    # gym.make imports what stands before a colon
+    if given is None or given.get("id") is None or ":" in given["id"]:
+        return None
+    facts = {name: value for name, value in given.items() if value is not None}
+    try:
+        return EnvSpec(
+            **facts,
+            entry_point=_REFUSAL,
+            vector_entry_point=_REFUSAL,
+            kwargs={"reference": reference} if reference else {},
+        )
+    except Exception:  # an id that this Gymnasium cannot read: not worth failing for
+        return None
+
+
+def not_here(*args: Any, reference: str = "", **kwargs: Any) -> NoReturn:
+    """What ``gym.make(env.spec)`` calls.
+
+    Raises:
+        gymnasium.error.Error: Always.
+    """
+    where = f", {reference}" if reference else ""
+    raise gym.error.Error(
+        f"this is of an environment in a sandbox{where}: to make one here would need its code "
+        "in this process, which it never enters. Use envhub_sandbox.make_env with that repository, "
+        "or copy.deepcopy(env) for another one like it"
+    )

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy.typing as npt
 
-from envhub_worker.protocol.codec.numpy_forms import widened
+from envhub_worker.protocol.codec.numpy_forms import widened_numpy
 
 
 @cache
@@ -30,6 +30,6 @@ def to_tensor(array: npt.NDArray[Any], dtype: str) -> Any:
     """
     torch = _torch()
     if torch is None:
-        return widened(array) if dtype == "bfloat16" else array
+        return widened_numpy(array) if dtype == "bfloat16" else array
     tensor = torch.from_numpy(array)
     return tensor.view(torch.bfloat16) if dtype == "bfloat16" else tensor

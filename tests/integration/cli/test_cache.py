@@ -15,7 +15,7 @@ from envhub_sandbox.cli.app import app
 from envhub_sandbox.cli.cache import stored_snapshots
 from envhub_sandbox.dependencies import environments
 from envhub_sandbox.hub import snapshot
-from envhub_sandbox.hub.store import cache_root
+from envhub_sandbox.hub.cache import cache_root
 from envhub_sandbox.system.locks import SharedLock
 from envhub_worker.protocol.runtime import RECORD
 from tests.support.repositories import write_repository

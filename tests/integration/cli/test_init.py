@@ -17,7 +17,7 @@ from envhub_sandbox.cli.shared.exits import UsageError
 from envhub_sandbox.hub.local import LocalFolder
 from tests.support.command_line import COMMAND
 
-PLUGIN = "envhub_sandbox.pytest_plugin"
+PLUGIN = "envhub_sandbox.integrations.pytest_plugin"
 
 
 def run(folder: Path, *command: str, **variables: str) -> subprocess.CompletedProcess[str]:

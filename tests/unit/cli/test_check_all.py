@@ -35,7 +35,7 @@ def started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, 
             )
 
     monkeypatch.setattr(list_run, "judgements", judgements)
-    monkeypatch.setattr(list_run, "free_bytes", lambda: 64 << 30)
+    monkeypatch.setattr(list_run, "free_memory_bytes", lambda: 64 << 30)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "list").write_text("org/repo\n./env\n")
     (tmp_path / "env").mkdir()

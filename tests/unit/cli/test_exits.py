@@ -16,6 +16,8 @@ import pytest
 import typer
 
 from envhub_sandbox import errors
+from envhub_sandbox.check.play.episodes import Episode, Rollout, RolloutError
+from envhub_sandbox.check.play.video import VideoError
 from envhub_sandbox.cli.shared.console import plain, print_json, safe_line, say
 from envhub_sandbox.cli.shared.exits import (
     Exit,
@@ -26,8 +28,6 @@ from envhub_sandbox.cli.shared.exits import (
 )
 from envhub_sandbox.cli.shared.results import TaskResult, returns_of, statistics, task_document
 from envhub_sandbox.errors import EnvHubError
-from envhub_sandbox.rollouts.episodes import Episode, Rollout, RolloutError
-from envhub_sandbox.rollouts.video import VideoError
 from envhub_worker.protocol.text import quoted
 
 CODES = {

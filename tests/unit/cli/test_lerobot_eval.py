@@ -7,14 +7,14 @@ from importlib.util import find_spec
 
 import pytest
 
-from envhub_sandbox.integrations.lerobot_eval import main, split
+from envhub_sandbox.integrations.lerobot_eval import main, split_eval_arguments
 
 
 def test_ours_are_taken_out() -> None:
     """JSON, or text; the others stay as they are, in order."""
     ours = ['--sandbox.policy={"gpu": true}', "--sandbox.num-workers=2", "--sandbox.lane=frames"]
     theirs = ["--env.type=pusht", "--env.sandbox=process", "--seed", "1"]
-    options, rest = split([theirs[0], *ours, *theirs[1:]])
+    options, rest = split_eval_arguments([theirs[0], *ours, *theirs[1:]])
     assert options == {"policy": {"gpu": True}, "num_workers": 2, "lane": "frames"}
     assert rest == theirs
 
@@ -22,7 +22,7 @@ def test_ours_are_taken_out() -> None:
 def test_an_option_without_a_value_is_refused() -> None:
     """It would be taken for something else."""
     with pytest.raises(SystemExit, match=r"--sandbox\.policy takes a value"):
-        split(["--sandbox.policy", "{}"])
+        split_eval_arguments(["--sandbox.policy", "{}"])
 
 
 @pytest.mark.skipif(find_spec("lerobot") is not None, reason="there is LeRobot here")

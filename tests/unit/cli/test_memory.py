@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from envhub_sandbox.cli.shared.memory import free_bytes
+from envhub_sandbox.cli.shared.memory import free_memory_bytes
 
 _MIB = 1 << 20
 _NO_LIMIT = str((1 << 63) - 4096)
@@ -98,10 +98,10 @@ def test_the_least_that_is_left_counts(
     tmp_path: Path,
 ) -> None:
     """Of the machine, of our group, and of each around it; what the kernel gives back is free."""
-    assert free_bytes(host(tmp_path, own, mounts, **groups)) == free * _MIB
+    assert free_memory_bytes(host(tmp_path, own, mounts, **groups)) == free * _MIB
 
 
 def test_where_the_kernel_tells_nothing(tmp_path: Path) -> None:
     """None, and here more than none."""
-    assert free_bytes(tmp_path) is None
-    assert (free_bytes() or 0) > 0
+    assert free_memory_bytes(tmp_path) is None
+    assert (free_memory_bytes() or 0) > 0

@@ -14,12 +14,12 @@ from envhub_sandbox.cli.shared.options import (
     read_env_kwargs,
     read_gpu,
     read_size,
-    select,
+    select_envs,
     with_options,
 )
 from envhub_sandbox.errors import PolicyError, RemoteEnvError
-from envhub_sandbox.options import OPTIONS
-from envhub_sandbox.policy import policy_from
+from envhub_sandbox.settings.options import OPTIONS
+from envhub_sandbox.settings.policy import policy_from
 
 
 def options(**given: Any) -> MakeOptions:
@@ -170,13 +170,13 @@ SUITES: dict[str, dict[Any, Any]] = {"a": {0: "a0", 1: "a1"}, "b": {"x": "bx", 0
 )
 def test_selection_keeps_the_order(suites: Any, tasks: Any, expected: list[str]) -> None:
     """Task ids may be numbers or text; on the command line both are text."""
-    assert [env for _, _, env in select(SUITES, suites, tasks)] == expected
+    assert [env for _, _, env in select_envs(SUITES, suites, tasks)] == expected
 
 
 def test_a_selection_of_nothing_names_what_there_is() -> None:
     """Escaped, since the names are the worker's."""
     with pytest.raises(UsageError, match=r"a/0, .*evil\\x1b/0"):
-        select({**SUITES, "evil\x1b": {0: 1}}, ["c"], None)
+        select_envs({**SUITES, "evil\x1b": {0: 1}}, ["c"], None)
 
 
 def test_a_servers_key_reaches_make_env_and_is_none_without_a_word() -> None:

@@ -18,7 +18,7 @@ def test_what_takes_long_has_lines_in_a_log(
         written.append(capfd.readouterr().err)
         return "".join(written).splitlines()
 
-    with progress.Bar(quiet=True, long_s=0.05) as bar:
+    with progress.ProgressBar(quiet=True, long_s=0.05) as bar:
         bar.begin("brief")
         bar.begin("a / 0: ::error::8 resets, round 1 of 4")
         assert eventually(lambda: len(lines()) >= 2)

@@ -11,7 +11,6 @@ import pytest
 from gymnasium.vector import SyncVectorEnv
 from typer.testing import CliRunner
 
-from envhub_sandbox import api
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.errors import WorkerDiedError
 from envhub_sandbox.vector.suites import EnvSuites
@@ -50,7 +49,7 @@ def run(
     monkeypatch: pytest.MonkeyPatch, make_env: Callable[..., EnvSuites], *arguments: str
 ) -> tuple[int, dict[str, Any]]:
     """The exit code and the document of a run in which ``make_env`` is replaced."""
-    monkeypatch.setattr(api, "make_env", make_env)
+    monkeypatch.setattr("envhub_sandbox.factory.make_env.make_env", make_env)
     done = CliRunner().invoke(app, ["run", "org/repo", "--episodes", "2", "--json", *arguments])
     text = done.stdout  # older versions of the runner mix stderr into it
     return done.exit_code, json.loads(text[text.index("{") : text.rindex("}") + 1])

@@ -15,7 +15,7 @@ from envhub_sandbox.errors import HubReferenceError, PolicyError, RepositoryUnav
 from envhub_sandbox.factory import sandbox_spec
 from envhub_sandbox.factory.config import plain_config
 from envhub_sandbox.hub import snapshot
-from envhub_sandbox.options import Options
+from envhub_sandbox.settings.options import Options
 from tests.support import inside
 from tests.support.samples import sample
 

@@ -12,7 +12,7 @@ import pytest
 from envhub_sandbox.check.static.survey import Survey, survey
 from envhub_sandbox.hub.listing import FileRecord, Snapshot
 from envhub_sandbox.hub.snapshot import local
-from envhub_sandbox.sources import parsing
+from envhub_sandbox.hub.sources import parsing
 from tests.support.repositories import write_repository
 
 _ENTRY = "def make_env(n_envs=1, use_async_envs=False): pass"

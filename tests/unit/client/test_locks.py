@@ -13,25 +13,25 @@ import numpy as np
 import pytest
 
 from envhub_sandbox.dependencies import uv
+from envhub_sandbox.dependencies.locks import drift, lockfile, making, pylock
+from envhub_sandbox.dependencies.locks.fingerprint import fingerprint_of_spaces, fingerprint_of_task
+from envhub_sandbox.dependencies.locks.lockfile import LockFile, Runner, Spaces
+from envhub_sandbox.dependencies.locks.pylock import PylockPackage, Wheel
 from envhub_sandbox.dependencies.request import chosen
 from envhub_sandbox.errors import EnvHubError, LockDriftError, LockError, PackageIntegrityError
 from envhub_sandbox.hub.snapshot import local
-from envhub_sandbox.locks import drift, lockfile, making, pylock
-from envhub_sandbox.locks.fingerprint import spaces_of, task_of
-from envhub_sandbox.locks.lockfile import LockFile, Runner, Spaces
-from envhub_sandbox.locks.pylock import Package, Wheel
 from tests.support.wheels import WORKERS, Index, make_wheel, served
 
 A, B = "a" * 64, "b" * 64
 BOX = gym.spaces.Box(-1, 1, (3,), np.float32)
-TASK = task_of("suite", 0, "NextStep", BOX, gym.spaces.Discrete(2))
+TASK = fingerprint_of_task("suite", 0, "NextStep", BOX, gym.spaces.Discrete(2))
 LOCK = LockFile(
     "org/repo",
     "0" * 40,
     "env.py",
     {"env.py": f"sha256:{A}", 'a "b".py': f"git-sha1:{'1' * 40}"},
     Runner("cpython", "3.11", "x86_64"),
-    (Package("one", "1.0", (Wheel(A, "https://index/one-1.0.whl", 7), Wheel(B))),),
+    (PylockPackage("one", "1.0", (Wheel(A, "https://index/one-1.0.whl", 7), Wheel(B))),),
     ("scipy>=1.11",),
     "2026-01-31",
     Spaces('{"size": 8}', (TASK,)),
@@ -169,11 +169,11 @@ OTHER_BOX = gym.spaces.Box(-1, 2, (3,), np.float32)
             "Python: cpython 3.11 on x86_64 was locked, this is cpython 3.12 on x86_64",
         ),
         (
-            changed(packages=(Package("one", "1.1", LOCK.packages[0].wheels),)),
+            changed(packages=(PylockPackage("one", "1.1", LOCK.packages[0].wheels),)),
             "package one: 1.0 was locked, this is 1.1",
         ),
         (
-            changed(packages=(Package("one", "1.0", (Wheel(A),)),)),
+            changed(packages=(PylockPackage("one", "1.0", (Wheel(A),)),)),
             f"package one==1.0: the file with SHA-256 {B[:12]}... was locked, there is {A[:12]}",
         ),
         (changed(packages=()), "package one: gone, 1.0 was locked"),
@@ -185,7 +185,11 @@ OTHER_BOX = gym.spaces.Box(-1, 2, (3,), np.float32)
             changed(
                 spaces=Spaces(
                     '{"size": 8}',
-                    (task_of("suite", 0, "NextStep", OTHER_BOX, gym.spaces.Discrete(2)),),
+                    (
+                        fingerprint_of_task(
+                            "suite", 0, "NextStep", OTHER_BOX, gym.spaces.Discrete(2)
+                        ),
+                    ),
                 )
             ),
             "environment suite/0: observations were Box(-1.0, 1.0, (3,), float32), now "
@@ -212,7 +216,7 @@ def test_what_differs_is_said(now: LockFile, said: str) -> None:
 
 def test_other_arguments_make_other_environments() -> None:
     """Spaces of other arguments are not held against those that were locked."""
-    other = task_of("suite", 0, None, OTHER_BOX, gym.spaces.Discrete(2))
+    other = fingerprint_of_task("suite", 0, None, OTHER_BOX, gym.spaces.Discrete(2))
     assert drift.differences(LOCK, changed(spaces=Spaces("{}", (other,)))) == []
 
 
@@ -231,9 +235,9 @@ def test_no_two_spaces_look_alike(other: gym.Space[Any]) -> None:
     """Kind, shape, dtype and every bound count; what was drawn from one does not."""
     same = gym.spaces.Box(-1, 1, (3,), np.float32, seed=7)
     same.sample()
-    assert spaces_of(same) == spaces_of(BOX)
-    assert spaces_of(other) != spaces_of(BOX)
-    assert spaces_of(BOX, other) != spaces_of(other, BOX)
+    assert fingerprint_of_spaces(same) == fingerprint_of_spaces(BOX)
+    assert fingerprint_of_spaces(other) != fingerprint_of_spaces(BOX)
+    assert fingerprint_of_spaces(BOX, other) != fingerprint_of_spaces(other, BOX)
 
 
 def spoiled(tmp_path: Path, change: Callable[[str], str]) -> Path:
@@ -304,7 +308,7 @@ def test_a_name_with_a_line_end_would_be_obeyed(index: Index, tmp_path: Path) ->
     make_wheel(folder, "one")
     with served(folder) as evil:
         name = f"--extra-index-url {evil.url}\none"
-        lock = changed(packages=(Package(name, "1.0", (Wheel(A),)),))
+        lock = changed(packages=(PylockPackage(name, "1.0", (Wheel(A),)),))
         pins = pylock.pins(lock.packages).text.replace(f" \\\n    --hash=sha256:{A}", "")
         command = ["pip", "compile", "-", *uv.NO_BUILDS, "--python", chosen_python()]
         uv.run(command, what="the control", given=pins, timeout_s=300)

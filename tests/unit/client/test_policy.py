@@ -11,7 +11,7 @@ import pytest
 
 from envhub_sandbox import Limits, Policy, Timeouts
 from envhub_sandbox.errors import PolicyError
-from envhub_sandbox.policy import limits_from, policy_from, timeouts_from
+from envhub_sandbox.settings.policy import limits_from, policy_from, timeouts_from
 
 
 def test_nothing_given_means_the_strictest() -> None:

@@ -110,7 +110,9 @@ def held(words: list[str]) -> None:
         assert importlib.util.find_spec(rest[1]) is not None, words
     elif program == "pytest":
         ours = (CHECKOUT / "tests" / "support" / "selection.py").read_text()
-        plugin = inspect.getsource(importlib.import_module("envhub_sandbox.pytest_plugin"))
+        plugin = inspect.getsource(
+            importlib.import_module("envhub_sandbox.integrations.pytest_plugin")
+        )
         long = [word for word in rest if word.startswith("--")]
         assert all(f'"{word}"' in ours + plugin for word in long), words
     elif program == "bash":

@@ -42,55 +42,41 @@ OPTIONAL = {
     "envhub_sandbox.integrations.lerobot.install": {"lerobot"},
     "envhub_sandbox.integrations.lerobot_eval": {"lerobot"},
     "envhub_worker.protocol.messages.base": {"typing_extensions"},  # for type checkers alone
-    "envhub_sandbox.metrics": {"prometheus_client"},
+    "envhub_sandbox.integrations.metrics": {"prometheus_client"},
     "envhub_worker.cli.metrics": {"prometheus_client"},
     "envhub_sandbox.transport.values.tensors": {"torch"},
-    "envhub_sandbox.rollouts.video": {"imageio_ffmpeg"},
-    "envhub_sandbox.pytest_plugin": {"pytest"},
+    "envhub_sandbox.check.play.video": {"imageio_ffmpeg"},
+    "envhub_sandbox.integrations.pytest_plugin": {"pytest"},
 }
 DESERIALISERS = {"_pickle", "copyreg", "dill", "joblib", "marshal", "pickle", "shelve"}
 
 # Which package may import which; a package is a folder or a module right below one of the two.
 # Every package may import the lowest ones, LOWEST, as far as these stand below it.
 LOWEST = {
-    *("envhub_sandbox.errors", "envhub_sandbox.option_names"),
-    "envhub_sandbox.options",
+    *("envhub_sandbox.errors", "envhub_sandbox.settings"),
     *("envhub_sandbox.system", "envhub_worker.protocol"),
 }
 MAY_IMPORT = {
-    "envhub_sandbox": {"api", "gym", "hub", "policy", "sandboxes", "vector"},
+    "envhub_sandbox": {"factory", "hub", "integrations", "sandboxes", "vector"},
     "envhub_sandbox.__main__": {"cli"},
     "envhub_sandbox.cli": {
-        *("", "api", "check", "crash", "dependencies", "hub", "locks", "policy", "rollouts"),
+        *("", "check", "dependencies", "factory", "hub"),
         *("sandboxes", "session"),
     },
-    "envhub_sandbox.api": {"factory", "policy", "sandboxes", "vector"},
     "envhub_sandbox.factory": {
-        *("dependencies", "hub", "locks", "policy", "sandboxes", "session"),
+        *("dependencies", "hub", "sandboxes", "session"),
         *("transport", "vector"),
     },
-    "envhub_sandbox.check": {
-        *("", "api", "dependencies", "hub", "locks", "policy", "rollouts", "session"),
-        *("sources", "vector"),
-    },
-    "envhub_sandbox.rollouts": set(),
-    "envhub_sandbox.gym": {"api", "vector"},
-    "envhub_sandbox.pytest_plugin": {"api", "hub"},
-    "envhub_sandbox.integrations": {"api", "hub", "vector"},
+    "envhub_sandbox.check": {"", "dependencies", "factory", "hub", "session", "vector"},
+    "envhub_sandbox.integrations": {"factory", "hub", "session", "vector"},
     "envhub_sandbox.vector": {"session", "transport"},
-    "envhub_sandbox.metrics": {"session"},
-    "envhub_sandbox.session": {"crash", "hub", "policy", "sandboxes", "transport"},
-    "envhub_sandbox.crash": {"hub", "policy", "transport"},
-    "envhub_sandbox.sandboxes": {"dependencies", "hub", "policy", "transport"},
+    "envhub_sandbox.session": {"hub", "sandboxes", "transport"},
+    "envhub_sandbox.sandboxes": {"dependencies", "hub", "transport"},
     "envhub_sandbox.transport": set(),
-    "envhub_sandbox.locks": {"dependencies", "hub", "sources"},
-    "envhub_sandbox.dependencies": {"hub", "sources"},
-    "envhub_sandbox.sources": {"hub"},
+    "envhub_sandbox.dependencies": {"hub"},
     "envhub_sandbox.hub": set(),
-    "envhub_sandbox.policy": set(),
     "envhub_sandbox.errors": set(),
-    "envhub_sandbox.option_names": set(),
-    "envhub_sandbox.options": set(),
+    "envhub_sandbox.settings": set(),
     "envhub_sandbox.system": set(),
     "envhub_worker.__main__": {"cli"},
     "envhub_worker.cli": {"", "access", "lockdown", "server", "spawn"},
@@ -110,9 +96,11 @@ MAY_IMPORT = {
 # beyond the table: what a module or a package must know nothing of
 IGNORANT = {
     "envhub_sandbox.vector": {"zmq", "socket", "subprocess", "envhub_sandbox.transport.connection"},
-    "envhub_sandbox.transport": {"gymnasium.vector"},
-    "envhub_sandbox.policy": {"zmq", "gymnasium", "subprocess"},
-    "envhub_sandbox.hub": {"zmq", "gymnasium", "runpy"},
+    "envhub_sandbox.transport": {"gymnasium.vector", "envhub_sandbox.settings.policy"},
+    "envhub_sandbox.settings": {"zmq", "gymnasium", "subprocess"},
+    "envhub_sandbox.hub": {"zmq", "gymnasium", "runpy", "envhub_sandbox.settings.policy"},
+    "envhub_sandbox.dependencies": {"envhub_sandbox.settings.policy"},
+    "envhub_sandbox.system": {"envhub_sandbox.settings"},
     "envhub_sandbox.hub.reference": {"huggingface_hub"},
     "envhub_sandbox.hub.snapshot": {"importlib"},
     "envhub_worker.supervisor": {"zmq"},
@@ -211,7 +199,11 @@ def foreign(package: str, own: set[str]) -> list[tuple[str, str]]:
 def test_both_packages_are_seen() -> None:
     """The walk below finds something to look at."""
     names = set(modules())
-    assert {"envhub_sandbox.api", "envhub_worker.server", "envhub_worker.runner.loader"} <= names
+    assert {
+        "envhub_sandbox.factory.make_env",
+        "envhub_worker.server",
+        "envhub_worker.runner.loader",
+    } <= names
 
 
 def test_worker_is_self_contained() -> None:
@@ -312,13 +304,19 @@ def test_nobody_imports_the_runner() -> None:
 
 def test_only_faces_and_the_command_line_import_make_env() -> None:
     """Everything else is below it."""
-    importers = {name for name, target in arrows("envhub_sandbox") if target.endswith(".api")}
+    factory = "envhub_sandbox.factory"
+    found = {
+        (name, target)
+        for name, target in arrows("envhub_sandbox")
+        if below(target, factory) and not below(name, factory)
+    }
+    assert {target for _, target in found} == {f"{factory}.make_env"}
+    importers = {name for name, _ in found}
     assert {name for name in importers if not below(name, "envhub_sandbox.cli")} <= {
         "envhub_sandbox",
         "envhub_sandbox.check.judge",
-        "envhub_sandbox.gym",
-        *(f"envhub_sandbox.integrations.{name}" for name in ("sb3", *_LEROBOT)),
-        "envhub_sandbox.pytest_plugin",
+        *(f"envhub_sandbox.integrations.{name}" for name in ("gym", "pytest_plugin", "sb3")),
+        *(f"envhub_sandbox.integrations.{name}" for name in _LEROBOT),
     }
 
 
@@ -483,7 +481,7 @@ def test_the_package_imports_nothing_heavy() -> None:
 
 def test_the_pytest_plugin_costs_nothing_until_it_is_used() -> None:
     """Every run of pytest on the machine imports it."""
-    loaded = loaded_by("import envhub_sandbox.pytest_plugin")
+    loaded = loaded_by("import envhub_sandbox.integrations.pytest_plugin")
     assert "pytest" in loaded
     assert not loaded & (CLIENTS_OWN - {"envhub_sandbox"} | {"torch"}) - loaded_by("import pytest")
 
@@ -492,7 +490,7 @@ def test_the_pytest_plugin_is_declared(checkout: Path) -> None:
     """Under the name by which it can be left out."""
     declared = (checkout / "pyproject.toml").read_text()
     table = declared.partition("[project.entry-points.pytest11]\n")[2].partition("\n[")[0]
-    assert table.strip() == 'envhub = "envhub_sandbox.pytest_plugin"'
+    assert table.strip() == 'envhub = "envhub_sandbox.integrations.pytest_plugin"'
 
 
 def test_every_public_name_is_there() -> None:

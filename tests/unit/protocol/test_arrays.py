@@ -14,7 +14,7 @@ from hypothesis.extra import numpy as hnp
 from envhub_worker.protocol.codec import arrays
 from envhub_worker.protocol.codec.arrays import ArrayReader, ArrayWriter
 from envhub_worker.protocol.codec.codec import decode, encode
-from envhub_worker.protocol.codec.numpy_forms import read_scalar
+from envhub_worker.protocol.codec.numpy_forms import read_numpy_scalar
 from envhub_worker.protocol.errors import (
     LocalProtocolError,
     MessageTooLargeError,
@@ -243,7 +243,7 @@ def test_scalar_comes_back_as_the_same_numpy_type(name: str) -> None:
 def test_malformed_scalar_is_refused(data: bytes) -> None:
     """A scalar of a wrong length, value or dtype raises RemoteProtocolError."""
     with pytest.raises(RemoteProtocolError):
-        read_scalar(data)
+        read_numpy_scalar(data)
 
 
 def test_descriptors_are_stable() -> None:

@@ -29,13 +29,13 @@ REQUEST_ID = 7
 SAMPLES: list[m.Message] = [
     m.Hello(m.VERSION, bytes(range(16))),
     m.Welcome(1, "0.1.0", 4242),
-    m.Refused("SandboxUnavailableError", "no user namespaces", "user-namespace", "sysctl ..."),
+    m.Refusal("SandboxUnavailableError", "no user namespaces", "user-namespace", "sysctl ..."),
     m.OpenJail("org/repo@abc:env.py", "", "", "/s", "env.py", {"limits": {"processes": 5}}, 2),
     m.JailOpened(3, (1, 2), ({"layer": "seccomp", "enforced": True, "detail": "x"},)),
     m.StartRunners(3, 1),
     m.Relay(3, "step", ((1, 2), (2, 1))),
-    m.Relayed((2, 1)),
-    m.Died(1, "signal", None, "SIGKILL", "", "last words", "step"),
+    m.RelayDone((2, 1)),
+    m.Death(1, "signal", None, "SIGKILL", "", "last words", "step"),
     m.CloseJail(3),
     m.Done(),
     m.ReadOutput(3, "call"),
@@ -44,12 +44,12 @@ SAMPLES: list[m.Message] = [
     m.Status(({"jail": 3, "name": "a", "pids": (9,), "busy_s": 0.5, "operation": "step"},)),
     m.Deposit(bytes(range(16)), 3, 1),
     m.OfferSnapshot((("env.py", 3, bytes(32)),)),
-    m.Wanted("sha256:00", (bytes(32),)),
+    m.MissingBlobs("sha256:00", (bytes(32),)),
     m.PutBlob(bytes(32), 4096),
     m.KeepAlive((3, 4)),
     m.Agree(("lz4",)),
-    m.Agreed("lz4", 120),
-    m.Packed("lz4", (-1, 4096)),
+    m.Agreement("lz4", 120),
+    m.CompressionHeader("lz4", (-1, 4096)),
     m.GetSessions(),
     m.Sessions(({"client": "a", "session": "b", "heard_s": 0.5, "jails": ()},), {"pid": 7}),
     m.ExpireIdle(3, 60_000),
@@ -64,12 +64,12 @@ SAMPLES: list[m.Message] = [
         True,
     ),
     m.Packages("made", "00" * 20, {"lock": "sha256:00", "packages": ("scipy==1.11",)}, "made"),
-    m.RelayedPartly((2, 1), (1,)),
+    m.RelayDonePartly((2, 1), (1,)),
     m.Load(4, True, {"task": "pick"}, {"seed": 1}),
     m.LoadTask(4, True, {"task": "pick"}, {"seed": 1}, "suite", "task"),
-    m.Loaded({"envs": ()}),
+    m.LoadDone({"envs": ()}),
     m.Build(1, "suite", "task", 0, 2),
-    m.Built({"num_envs": 2}),
+    m.BuildDone({"num_envs": 2}),
     m.Reset(1, [5, None], {"key": "value"}, np.array([True, False])),
     m.ResetDone(np.zeros((2, 3), np.float32), {"a": np.array([1]), "_a": np.array([True])}),
     m.Step(1, np.array([0, 1])),
@@ -97,11 +97,11 @@ SAMPLES: list[m.Message] = [
     m.Revive(1, [5, None]),
     m.FollowOutput(3, 4096),
     m.OutputBytes(4096, b"caf\xc3\xa9\x1b"),
-    m.Raised("KeyError", "mypkg.Oops", "gone", "Traceback ...", "step"),
-    m.Warned((("UserWarning", "slow"), ("mypkg.Own", "caf\u00e9"))),
+    m.RaisedException("KeyError", "mypkg.Oops", "gone", "Traceback ...", "step"),
+    m.Warnings((("UserWarning", "slow"), ("mypkg.Own", "caf\u00e9"))),
     m.Watch(1, "task"),
-    m.Watched(("reach", "lift"), True),
-    m.Changed(((1, "task"), (2, "x"))),
+    m.WatchDone(("reach", "lift"), True),
+    m.Changes(((1, "task"), (2, "x"))),
 ]  # fmt: skip
 BY_NAME = {type(message).__name__: message for message in SAMPLES}
 
@@ -172,7 +172,7 @@ def test_an_impossible_id_is_refused(number: int) -> None:
 
 @pytest.mark.parametrize("number", [1, 148 + 25 * 256, 2**63 - 1])
 def test_a_header_is_never_taken_for_packed(number: int) -> None:
-    """``Packed`` alone has the id 0."""
+    """``CompressionHeader`` alone has the id 0."""
     header = m.pack_header(m.Done(), number)
     assert compression.unpack_frames(header, DEFAULT_LIMITS) == header
 
@@ -192,9 +192,9 @@ def test_a_header_is_never_taken_for_packed(number: int) -> None:
         ([10, "3"], "CloseJail.jail cannot be of type str"),
         ([10, True], "CloseJail.jail cannot be of type bool"),
         ([10, np.int64(3)], "CloseJail.jail cannot be of type int64"),
-        ([8, [1]], "Relayed.parts cannot be of type list"),
-        ([m.Loaded.kind, None], "Loaded.manifest cannot be of type NoneType"),
-        ([9, 1, "exit", None, None, b"", "", ""], "Died.detail cannot be of type bytes"),
+        ([8, [1]], "RelayDone.parts cannot be of type list"),
+        ([m.LoadDone.kind, None], "LoadDone.manifest cannot be of type NoneType"),
+        ([9, 1, "exit", None, None, b"", "", ""], "Death.detail cannot be of type bytes"),
     ],
 )
 def test_what_is_no_message_is_refused(value: object, complaint: str) -> None:
@@ -265,7 +265,7 @@ def test_messages_are_made_like_dataclasses() -> None:
             m.KeepJail(*values, **named)
 
 
-OF_A_SERVER = ("Hello", "OpenJail", "JailOpened", "Relay", "Died")
+OF_A_SERVER = ("Hello", "OpenJail", "JailOpened", "Relay", "Death")
 WITHOUT_NUMPY = """
 import sys
 sys.path.insert(0, sys.argv[1])

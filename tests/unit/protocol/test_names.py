@@ -20,7 +20,7 @@ from envhub_sandbox.vector import from_manifest
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol.codec.codec import decode, encode
 from envhub_worker.protocol.codec.inert import RemoteEnum, RemoteObject
-from envhub_worker.protocol.manifest.facts import MAX_METADATA, read_metadata, read_spec
+from envhub_worker.protocol.manifest.facts import MAX_METADATA, read_metadata_facts, read_spec_facts
 from envhub_worker.protocol.manifest.names import GYMNASIUMS, PROBED, is_servable
 from tests.support.curious import names_asked_for
 from tests.support.protocol_names import names_that_libraries_call
@@ -107,8 +107,8 @@ def test_names_of_tasks_may_be_anything_else(name: str) -> None:
 def test_metadata_keeps_what_people_read() -> None:
     """Other keys are free; those of Gymnasium hold what Gymnasium takes."""
     given = {"render_fps": 30, "render_modes": ["rgb_array"], "robot": {"arms": 2}, "jax": False}
-    assert read_metadata(given) == given
-    assert read_metadata({"render_fps": np.float32(12.5)}) == {"render_fps": np.float32(12.5)}
+    assert read_metadata_facts(given) == given
+    assert read_metadata_facts({"render_fps": np.float32(12.5)}) == {"render_fps": np.float32(12.5)}
 
 
 @pytest.mark.parametrize(
@@ -130,7 +130,7 @@ def test_metadata_keeps_what_people_read() -> None:
 )
 def test_metadata_on_which_gymnasium_acts_is_typed(key: str, lie: object) -> None:
     """A key with anything else is left out; the rest stays."""
-    assert read_metadata({key: lie, "robot": "so100"}) == {"robot": "so100"}
+    assert read_metadata_facts({key: lie, "robot": "so100"}) == {"robot": "so100"}
 
 
 @pytest.mark.parametrize(
@@ -148,7 +148,7 @@ def test_metadata_on_which_gymnasium_acts_is_typed(key: str, lie: object) -> Non
 def test_metadata_is_bounded(lie: object) -> None:
     """However its values are nested."""
     with pytest.raises(RemoteProtocolError):
-        read_metadata(lie)
+        read_metadata_facts(lie)
 
 
 def test_autoreset_modes_that_are_arrays_are_refused() -> None:
@@ -161,12 +161,12 @@ def test_autoreset_modes_that_are_arrays_are_refused() -> None:
 def test_specs_keep_their_facts_only() -> None:
     """What else is said there is left out, so that newer workers can say more."""
     facts = {"id": "X-v0", "max_episode_steps": 5, "reward_threshold": 0.5}
-    assert read_spec({**facts, "entry_point": "os:system", "kwargs": {}}) == facts
+    assert read_spec_facts({**facts, "entry_point": "os:system", "kwargs": {}}) == facts
     numpys = {"max_episode_steps": np.int64(5), "nondeterministic": np.bool_(True)}
-    made = read_spec(numpys)
+    made = read_spec_facts(numpys)
     assert made == {"max_episode_steps": 5, "nondeterministic": True}
     assert [type(value) for value in made.values()] == [int, bool]
-    assert read_spec(None) is None
+    assert read_spec_facts(None) is None
 
 
 @pytest.mark.parametrize(
@@ -189,7 +189,7 @@ def test_specs_keep_their_facts_only() -> None:
 def test_specs_of_wrong_types_are_refused(lie: object) -> None:
     """Each fact has a type and bounds."""
     with pytest.raises(RemoteProtocolError):
-        read_spec(lie)
+        read_spec_facts(lie)
 
 
 def test_specs_name_the_repository_that_makes_them() -> None:

@@ -25,12 +25,12 @@ CHANGE = (1, "task")
 
 def warned(*things: object) -> Buffer:
     """What stands in front of a reply, whatever it holds."""
-    return m.pack(m.Warned(tuple(things)))[0]
+    return m.pack(m.Warnings(tuple(things)))[0]
 
 
 def changed(*things: object) -> Buffer:
     """The same of changes."""
-    return m.pack(m.Changed(tuple(things)))[0]
+    return m.pack(m.Changes(tuple(things)))[0]
 
 
 def test_what_was_put_in_front_is_read() -> None:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from envhub_worker.protocol.errors import MessageTooLargeError, RemoteProtocolError
 from envhub_worker.protocol.limits import WireLimits
-from envhub_worker.protocol.stream import Packet, PacketReader, pack_packet
+from envhub_worker.protocol.stream import Packet, StreamReader, pack_packet
 
 Plain = tuple[int, list[bytes]]
 LIMITS = WireLimits(header_bytes=1000, frame_bytes=10_000, message_bytes=12_000, frames=4)
@@ -38,7 +38,7 @@ def plain(packet: Packet) -> Plain:
 
 def read(chunks: list[bytes], limits: WireLimits = LIMITS) -> list[Plain]:
     """The packets that come out of a stream that arrives in these chunks."""
-    reader = PacketReader(limits)
+    reader = StreamReader(limits)
     return [plain(packet) for chunk in chunks for packet in reader.feed(chunk)]
 
 
@@ -63,7 +63,7 @@ def test_packets_arrive_byte_by_byte(sent: list[Plain]) -> None:
 
 def test_empty_frames_complete_a_packet_at_once() -> None:
     """Frames without bytes do not wait for the next packet."""
-    reader = PacketReader(LIMITS)
+    reader = StreamReader(LIMITS)
     [packet] = reader.feed(on_the_wire([(3, [b"", b"", b""])]))
     assert plain(packet) == (3, [b"", b"", b""])
 
@@ -71,14 +71,14 @@ def test_empty_frames_complete_a_packet_at_once() -> None:
 def test_half_a_packet_waits() -> None:
     """Nothing comes out before the last byte is there."""
     data = on_the_wire([(3, [b"head", b"body"])])
-    reader = PacketReader(LIMITS)
+    reader = StreamReader(LIMITS)
     assert list(reader.feed(data[:-1])) == []
     assert [plain(packet) for packet in reader.feed(data[-1:])] == [(3, [b"head", b"body"])]
 
 
 def test_frames_do_not_change_with_the_next_packet() -> None:
     """The memory of a packet is its own."""
-    reader = PacketReader(LIMITS)
+    reader = StreamReader(LIMITS)
     [first] = reader.feed(on_the_wire([(1, [b"first"])]))
     list(reader.feed(on_the_wire([(2, [b"other"])])))
     assert plain(first) == (1, [b"first"])
@@ -127,7 +127,7 @@ def test_lengths_at_the_limit_are_accepted() -> None:
 def test_declared_and_never_sent_costs_no_memory() -> None:
     """A runner that promises 256 MB and sends nothing does not make anybody touch them."""
     limits = WireLimits()
-    reader = PacketReader(limits)
+    reader = StreamReader(limits)
     before = resident_bytes()
     assert list(reader.feed(head(2, 100, limits.frame_bytes - 1000))) == []
     assert resident_bytes() - before < 64 * 1024 * 1024
@@ -141,7 +141,7 @@ def resident_bytes() -> int:
 
 def test_many_small_packets_keep_nothing() -> None:
     """A reader that has handed its packets out holds no memory of them."""
-    reader = PacketReader(LIMITS)
+    reader = StreamReader(LIMITS)
     data = on_the_wire([(1, [bytes(500)])])
     list(reader.feed(data))
     tracemalloc.start()
@@ -155,7 +155,7 @@ def test_many_small_packets_keep_nothing() -> None:
 def test_a_flood_of_small_packets_is_read_in_linear_work() -> None:
     """Two hundred thousand packets in one chunk come out one by one, without copying the rest."""
     flood = head(1, 0) * 200_000
-    assert sum(1 for _ in PacketReader(LIMITS).feed(flood)) == 200_000
+    assert sum(1 for _ in StreamReader(LIMITS).feed(flood)) == 200_000
 
 
 @given(st.lists(st.binary(max_size=64), max_size=8))
@@ -174,7 +174,7 @@ def test_what_must_not_come_is_refused_before_there_is_memory_for_it() -> None:
         if request_id != 1:
             raise RemoteProtocolError("nobody asked")
 
-    reader = PacketReader(check=check)
+    reader = StreamReader(check=check)
     [packet] = reader.feed(b"".join(pack_packet(1, [b"asked"])))
     assert packet.request_id == 1
     header = pack_packet(2, [bytes(1 << 20)])[0]

@@ -26,7 +26,7 @@ for name in sys.argv[3:]:
         exec(f"from {name} import anything")
         found[name] = None
     except ImportError as error:
-        found[name] = file_access.why_hidden(error.name or "")
+        found[name] = file_access.why_file_hidden(error.name or "")
 print(json.dumps(found))
 """
 

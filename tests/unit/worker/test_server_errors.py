@@ -48,7 +48,7 @@ def serving(gate: LocalGate) -> Iterator[str]:
         thread.join()
 
 
-def refused(endpoint: str) -> m.Refused:
+def refused(endpoint: str) -> m.Refusal:
     """The reply to a request."""
     with zmq.Context() as context, context.socket(zmq.DEALER) as peer:
         peer.setsockopt(zmq.LINGER, 0)
@@ -57,7 +57,7 @@ def refused(endpoint: str) -> m.Refused:
             peer.send_multipart(m.pack_header(request, number))
             assert peer.poll(_PATIENCE_MS)
             _, reply = m.unpack_header(peer.recv_multipart()[0])
-    assert isinstance(reply, m.Refused)
+    assert isinstance(reply, m.Refusal)
     return reply
 
 

@@ -252,7 +252,7 @@ class Packages:
         order = self._line[work.place]
         said, code = work.said(), work.code
         if code is None:
-            order.progress = str(said.get("told", order.progress))
+            order.progress = str(said.get("progress", order.progress))
             late = now - work.since > self._make_s
             if work.ended_at is None and (late or now - order.asked > _FORGOTTEN_S):
                 work.terminate(now)

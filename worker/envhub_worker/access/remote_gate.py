@@ -30,7 +30,7 @@ from envhub_worker.protocol.keys import KEY_BYTES, key_text
 from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.runtime import OWN
 from envhub_worker.supervisor.jails import Jails
-from envhub_worker.supervisor.records import Asker, JailEntry, RefusedError
+from envhub_worker.supervisor.records import Asker, JailRecord, RefusedError
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -221,7 +221,7 @@ class RemoteGate(Gate):
     def answered(self, asker: Asker, reply: m.Message) -> None:
         """Its bytes are no longer in flight; a refusal is counted and written down."""
         self._in_flight.answered(asker)
-        if isinstance(reply, m.Refused):
+        if isinstance(reply, m.Refusal):
             self._tally.refused(reply.error, reply.missing)
             self._events.refused(asker, reply)
 
@@ -328,6 +328,6 @@ class RemoteGate(Gate):
         self._port.close()
 
 
-def _key_of(entry: JailEntry) -> bytes:
+def _key_of(entry: JailRecord) -> bytes:
     """Whose a jail is: what it is marked with begins with the key, see ``Session.owner``."""
     return entry.session[:KEY_BYTES]

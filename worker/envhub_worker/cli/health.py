@@ -6,7 +6,7 @@ import argparse
 import socket
 from pathlib import Path
 
-from envhub_worker.cli.status import is_healthy
+from envhub_worker.cli.status import status_is_healthy
 
 # ZMTP 3: how both sides begin, unasked, before any key is needed (https://rfc.zeromq.org/spec/23).
 _GREETING = b"\xff"
@@ -21,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Say whether a server answers: one that listens by its key, any other by its greeting."""
-    healthy = is_healthy(arguments.state_dir)
+    healthy = status_is_healthy(arguments.state_dir)
     return 0 if healthy or (healthy is None and answers("127.0.0.1", arguments.port)) else 1
 
 

@@ -88,7 +88,7 @@ def announcement(endpoint: str, identity: Identity) -> str:
         secret = "<its secret key, or the file that holds it>"
     elif identity.fresh:
         lines.append(f"No --authorized-clients: one client key was made ({identity.client_file}).")
-        lines.append("Whoever has it can run code here, confined. The client writes:")
+        lines.append("A client with this key can run code here, confined. The client writes:")
         secret = key_text(identity.client.secret)
     else:
         lines.append("No --authorized-clients: one client key, made earlier. The client writes:")

@@ -39,7 +39,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--max-connections",
         type=_count,
         default=MAX_CONNECTIONS,
-        help=f"of everybody together, strangers included (default: {MAX_CONNECTIONS})",
+        help=f"connections of all together, strangers included (default: {MAX_CONNECTIONS})",
     )
     parser.add_argument(
         "--bind",
@@ -93,19 +93,19 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         type=_count,
         default=int(MAKE_S),
         metavar="SECONDS",
-        help=f"for so long an order of them may be at work (default: {MAKE_S:.0f})",
+        help=f"how long one order of packages may take (default: {MAKE_S:.0f})",
     )
     parser.add_argument(
         "--log-format",
         choices=tuple(FORMS),
         default="text",
-        help="of the log, which goes to stderr, a line an event (default: text)",
+        help="the form of the log on stderr, a line an event (default: text)",
     )
     parser.add_argument(
         "--log-level",
         choices=LEVELS,
         default="info",
-        help="what is less important is left out (default: info)",
+        help="the least important events in the log (default: info)",
     )
     _add_quotas(parser)
 

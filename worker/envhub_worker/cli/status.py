@@ -82,7 +82,7 @@ def _noted(chosen: Path | None) -> tuple[str, bytes | None, keys.KeyPair] | None
     return reachable(noted.endpoint), parse_key(noted.public), keys.load(Path(noted.key_file))
 
 
-def is_healthy(chosen: Path | None) -> bool | None:
+def status_is_healthy(chosen: Path | None) -> bool | None:
     """Whether the server of this user answers requests; None if none was started here."""
     try:
         noted = _noted(chosen)
@@ -129,7 +129,7 @@ def _request(
     if not socket.poll(_WAIT_MS):
         raise UnreachableError("the server does not answer: is the key one that it knows?")
     _, reply = m.unpack_header(socket.recv_multipart()[0])
-    if isinstance(reply, m.Refused):
+    if isinstance(reply, m.Refusal):
         raise UnreachableError(printable(reply.message))
     if not isinstance(reply, kind):
         raise UnreachableError(f"the server answered with {type(reply).__name__}")

@@ -42,7 +42,7 @@ class About(NamedTuple):
     shown: tuple[str, ...]
 
 
-class Frozen:
+class FrozenRecord:
     """The methods that records share, and messages with them."""
 
     __record__: ClassVar[About]
@@ -89,7 +89,7 @@ def _recorded(cls: Any, *, kw_only: bool, shown: bool) -> Any:
     own = set(vars(cls))
     for name in ("__init__", "__setattr__", "__delattr__", "__eq__", "__hash__", "__repr__"):
         if name not in own and (shown or name != "__repr__"):
-            setattr(cls, name, vars(Frozen)[name])
+            setattr(cls, name, vars(FrozenRecord)[name])
     return cls
 
 

@@ -120,7 +120,7 @@ def _space(size: int) -> memoryview:
     return np.empty(size, np.uint8).data
 
 
-class PacketReader:
+class StreamReader:
     """Cuts a byte stream into packets.
 
     Args:

@@ -1,4 +1,4 @@
-"""Whatever the handling of a peer's input raises is the peer's fault: said in one place.
+"""``UNTRUSTED``: the context in which whatever a peer's input raises is the peer's error.
 
 Readers check for known lies, and say what is wrong. An unknown one, such as a key that cannot be
 hashed or a mask that is longer than its values, comes up as a ``TypeError`` or an ``IndexError``
@@ -36,7 +36,7 @@ FAULTS: tuple[type[Exception], ...] = (
 _MAX_CHARS = 500
 
 
-class Untrusted:
+class UntrustedInput:
     """A context in which a peer's input is handled; keeps nothing, so one serves all.
 
     Raises:
@@ -59,7 +59,7 @@ class Untrusted:
             raise blamed(error) from error
 
 
-UNTRUSTED = Untrusted()
+UNTRUSTED = UntrustedInput()
 
 
 def is_fault(error: BaseException) -> bool:

@@ -51,7 +51,7 @@ class Lane:
         fds: list[int],
         answer: Callable[[Packet], list[Any]],
         pack: Callable[[m.Message], list[Any]],
-        raised: Callable[[BaseException, str], m.Raised],
+        raised: Callable[[BaseException, str], m.RaisedException],
         warned: Sequence[Any] = (),
         watches: Watches | None = None,
     ) -> None:
@@ -230,7 +230,7 @@ class Lane:
         return self._env.joined(self._pairs)
 
 
-def _raised_frame(message: m.Raised) -> Any:
+def _raised_frame(message: m.RaisedException) -> Any:
     """The encoded exception; without its traceback where that does not fit."""
     [frame] = m.pack(message)
     if len(frame) > slabs.INFO_BYTES:

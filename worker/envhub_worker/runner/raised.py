@@ -8,8 +8,8 @@ import os
 import traceback
 from collections.abc import Iterator
 
-from envhub_worker.file_access import why_hidden, why_unwritable
-from envhub_worker.protocol.messages import Raised
+from envhub_worker.file_access import why_file_hidden, why_file_unwritable
+from envhub_worker.protocol.messages import RaisedException
 from envhub_worker.protocol.text import printable
 
 _MAX_MESSAGE = 8_192
@@ -19,7 +19,7 @@ _OURS = os.path.dirname(os.path.dirname(os.path.abspath(__file__))) + os.sep
 _IMPORTING = ("<frozen importlib.", f"{os.path.dirname(os.__file__)}{os.sep}importlib{os.sep}")
 
 
-def raised(error: BaseException, stage: str, root: str = "") -> Raised:
+def raised(error: BaseException, stage: str, root: str = "") -> RaisedException:
     """The message for an exception: its nearest builtin ancestor, its text, its traceback.
 
     Args:
@@ -28,17 +28,17 @@ def raised(error: BaseException, stage: str, root: str = "") -> Raised:
     # a package that may not be read is imported all the same, as one without a file of its own
     why = ""
     nowhere = isinstance(error, ImportError) and error.path is None
-    hidden = why_hidden(str(getattr(error, "name", ""))) if nowhere else ""
+    hidden = why_file_hidden(str(getattr(error, "name", ""))) if nowhere else ""
     if hidden:
         denied = PermissionError(f"{_text(error)}, but {hidden}")
         error = denied.with_traceback(error.__traceback__)
     with contextlib.suppress(Exception):  # the error may be of a class of the repository's
-        why = why_unwritable(error, root)
+        why = why_file_unwritable(error, root)
     kind = type(error)
     name = kind.__qualname__
     if kind.__module__ not in ("builtins", "__main__"):
         name = f"{kind.__module__}.{name}"
-    return Raised(
+    return RaisedException(
         builtin=_builtin(kind),
         type_name=printable(name, 512),
         message=printable(". ".join(filter(None, (_text(error), why))), _MAX_MESSAGE),

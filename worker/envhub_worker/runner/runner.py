@@ -21,7 +21,7 @@ from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest.manifest import encode_env, encode_manifest
 from envhub_worker.protocol.spaces import batches
-from envhub_worker.protocol.stream import Packet, PacketReader, pack_packet
+from envhub_worker.protocol.stream import Packet, StreamReader, pack_packet
 from envhub_worker.runner import loader, manifest
 from envhub_worker.runner.described import described
 from envhub_worker.runner.gymnasium_compat import joined_infos
@@ -42,7 +42,7 @@ def main(stream: socket.socket, spec: JailSpec, fds: list[int]) -> int:
     """Serve until the other side closes the stream. Runs confined, as the jail's main program."""
     runner = Runner(spec.snapshot, spec.entry)
     runner.warned.listen()
-    reader = PacketReader()
+    reader = StreamReader()
     poller = select.poll()
     poller.register(stream, select.POLLIN)
     timeout: int | None = None
@@ -63,7 +63,7 @@ def main(stream: socket.socket, spec: JailSpec, fds: list[int]) -> int:
         timeout = _RECHECK_MS if ready and runner.lane is not None else None
 
 
-def _serve(stream: socket.socket, reader: PacketReader, runner: Runner) -> bool:
+def _serve(stream: socket.socket, reader: StreamReader, runner: Runner) -> bool:
     """Answer what has come; False at the end of the stream."""
     data, ancillary, _, _ = stream.recvmsg(reader.chunk, _ANCILLARY_BYTES)
     runner.descriptors = [fd for part in ancillary for fd in array("i", part[2])]
@@ -102,7 +102,7 @@ class Runner:
         return self.watches.in_front(self.warned.in_front(self.reply(packet)))
 
     def reply(self, packet: Packet, *, by_lane: bool = False) -> list[Any]:
-        """The reply's frames; whatever the repository raises becomes ``Raised``."""
+        """The reply's frames; whatever the repository raises becomes ``RaisedException``."""
         try:
             # the caller's own arguments may be pickled: this is the only place that unpickles
             request = m.unpack(packet.frames, unpickler=cloudpickle.loads)
@@ -130,7 +130,7 @@ class Runner:
     def load(self, request: m.Load) -> m.Message:
         """Import the repository, call ``make_env``, describe what came back."""
         made = manifest.describe(self._load(request))
-        return m.Loaded(encode_manifest(made, seeded=True))
+        return m.LoadDone(encode_manifest(made, seeded=True))
 
     def load_task(self, request: m.LoadTask) -> m.Message:
         """Import the repository, call ``make_env``, and describe nothing: it is known."""
@@ -158,7 +158,7 @@ class Runner:
         task = self._tasks[request.suite, request.task]
         env = self._envs[request.env] = task.build(request.start, request.stop)
         live = Task(task.suite, task.task, vector=env)
-        return m.Built(encode_env(manifest.describe_vector(live, env)))
+        return m.BuildDone(encode_env(manifest.describe_vector(live, env)))
 
     def reset(self, request: m.Reset) -> m.Message:
         """``VectorEnv.reset``."""
@@ -223,7 +223,7 @@ class Runner:
         number, name = request.env, request.name
         called = self.call(m.Call(number, name, (), {}))
         values = called.value if isinstance(called, m.Value) else ()
-        return m.Watched(values, self.watches.begin(number, self._envs[number], name, values))
+        return m.WatchDone(values, self.watches.begin(number, self._envs[number], name, values))
 
     def set_attr(self, request: m.SetAttr) -> m.Message:
         """``VectorEnv.set_attr``."""

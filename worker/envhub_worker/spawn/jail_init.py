@@ -38,10 +38,10 @@ from envhub_worker.lockdown.limits.watchdog import Watchdog
 from envhub_worker.lockdown.mechanisms import process, procfs, reap
 from envhub_worker.lockdown.plan import HostFacts, plan
 from envhub_worker.lockdown.seccomp import notify, paths
-from envhub_worker.lockdown.seccomp.syscalls import name_of
+from envhub_worker.lockdown.seccomp.syscalls import syscall_name
 from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.lockdown.stages import jail
-from envhub_worker.lockdown.stages.runner import own
+from envhub_worker.lockdown.stages.runner import runner_paths
 from envhub_worker.protocol.confinement import Reason
 from envhub_worker.spawn import runner_entry
 from envhub_worker.spawn.channel import Channel, close_fds
@@ -225,13 +225,13 @@ class Init:
         runner = self._runners.get(request.caller)
         if runner is not None and runner.status is not None:
             return
-        call = name_of(request.call)
+        call = syscall_name(request.call)
         if call not in paths.NAMED or call not in self._common.watched:
             detail = notify.detail(request)
             if detail or not notify.is_own_affair(call, self._common.watched):
                 self._report_denied(call, detail)
             return
-        mine = own(self._jail, request.caller, request.thread)
+        mine = runner_paths(self._jail, request.caller, request.thread)
         waits = request.still_waits
         for deed, path in paths.asked(call, request.words, request.thread, mine, waits):
             known = sum(text.startswith("/") for _, text in self._denials)

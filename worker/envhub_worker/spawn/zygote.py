@@ -64,6 +64,14 @@ _END_S = 5.0
 
 def main(argv: Sequence[str]) -> int:
     """Preload, then fork an init for each request until the server goes away."""
+    # In this order. Descriptors go first: what a fork inherits, every jail has. What may be
+    # imported before confinement is, since the server starts us before it needs us. The
+    # configuration is read then, and our end is tied to the server's before anything can take long.
+    # Confinement comes before any package of an interpreter that the server does not run itself.
+    # After ``enter`` this may be another process, the first one of a pid namespace: so what is a
+    # process's own, such as being the reaper of orphans, is set after it. Objects are frozen last,
+    # so that no collection in a jail writes to the pages that all of them share. From then on this
+    # process imports nothing, starts no thread, and reads nothing about a jail: it forks.
     control = int(argv[0])
     process.close_all_but({0, 1, 2, control})
     channel = Channel(socket.socket(fileno=control))
@@ -147,6 +155,10 @@ class Zygote:
         self._running = False
 
     def _serve(self) -> None:
+        # In this order. The child leaves this function at once and never returns to the loop. The
+        # parent closes its copies of the descriptors before the next fork, or that jail would hold
+        # this one's. Then the init is noted, and only then announced: the loop, which is
+        # single-threaded, reaps no child in between, so "exited" always comes after "spawned".
         received = self._channel.receive()
         if received is None:
             self._stop()
@@ -173,7 +185,8 @@ class Zygote:
             reap.kill_descendants(keep=self._inits)
 
     def _end(self) -> None:
-        # Every init sees its own channel end; give it the time to end its jail.
+        # Every init sees its own channel end; give it the time to end its jail. What is left then
+        # is killed: orphans become children of this process, so it finds them all.
         deadline = time.monotonic() + _END_S
         while self._inits and time.monotonic() < deadline:
             self._reap()

@@ -20,7 +20,7 @@ from envhub_worker.spawn.jail import CallDenied, JailFailed, RunnerExited, Runne
 from envhub_worker.spawn.spawner import JailExited, ZygoteDied
 from envhub_worker.supervisor.fd_store import FdStore
 from envhub_worker.supervisor.records import (
-    JailEntry,
+    JailRecord,
     Pending,
     RefusedError,
     Reply,
@@ -49,7 +49,7 @@ class JailEvents:
         self,
         loop: Loop,
         reply: Reply,
-        jails: dict[int, JailEntry],
+        jails: dict[int, JailRecord],
         fds: FdStore,
         witness: Witness,
     ) -> None:
@@ -61,16 +61,16 @@ class JailEvents:
         self.deaths: Counter[str] = Counter()
         self._outer_limit = SurroundingLimit()
 
-    def follow(self, entry: JailEntry) -> None:
+    def follow(self, entry: JailRecord) -> None:
         """Hear of a new jail from now on."""
         self._watch(entry, entry.control, lambda: self._jail_events(entry))
         self._watch(entry, entry.output.fileno(), lambda: self._read_output(entry))
 
-    def follow_runner(self, entry: JailEntry, runner: int) -> None:
+    def follow_runner(self, entry: JailRecord, runner: int) -> None:
         """Hear of a new runner from now on."""
         self._watch(entry, entry.links[runner].fileno(), lambda: self._runner_ready(entry, runner))
 
-    def _watch(self, entry: JailEntry, fd: int, callback: Callable[[], None]) -> None:
+    def _watch(self, entry: JailRecord, fd: int, callback: Callable[[], None]) -> None:
         """Whatever goes wrong with a jail is its own end, and not the server's."""
 
         def guarded() -> None:
@@ -89,13 +89,13 @@ class JailEvents:
             link.watched = link.wants_write
             self._loop.watch_writes(link.fileno(), link.watched)
 
-    def _runner_ready(self, entry: JailEntry, runner: int) -> None:
+    def _runner_ready(self, entry: JailRecord, runner: int) -> None:
         link = entry.links[runner]
         link.flush()
         try:
             answers = link.receive()
         except ProtocolError as error:
-            self._runner_died(entry, m.Died(runner, "protocol", detail=str(error)))
+            self._runner_died(entry, m.Death(runner, "protocol", detail=str(error)))
             return
         if answers is None:
             self._loop.unwatch(link.fileno())
@@ -114,21 +114,21 @@ class JailEvents:
             payload = [frame for frames in replies for frame in frames]
             counts = tuple(map(len, replies))
             dead = tuple(sorted(pending.dead))
-            answer = m.RelayedPartly(counts, dead) if dead else m.Relayed(counts)
+            answer = m.RelayDonePartly(counts, dead) if dead else m.RelayDone(counts)
             self._reply(pending.asker, answer, payload)
 
-    def _read_output(self, entry: JailEntry) -> None:
+    def _read_output(self, entry: JailRecord) -> None:
         entry.output.read()
         if entry.output.ended:
             self._loop.unwatch(entry.output.fileno())
             entry.output.close()
 
-    def catch_up(self, entry: JailEntry) -> None:
+    def catch_up(self, entry: JailRecord) -> None:
         """Hear now what a jail has said, as its loop would in a moment."""
         if entry.death is None and entry.jail.fileno() >= 0:
             self._jail_events(entry)
 
-    def _jail_events(self, entry: JailEntry) -> None:
+    def _jail_events(self, entry: JailRecord) -> None:
         events = entry.jail.poll()
         if entry.jail.fileno() < 0:
             self._unwatch_control(entry)
@@ -142,7 +142,7 @@ class JailEvents:
             elif isinstance(event, CallDenied):
                 self._denied(entry, event)
 
-    def _runner_started(self, entry: JailEntry, event: RunnerStarted) -> None:
+    def _runner_started(self, entry: JailRecord, event: RunnerStarted) -> None:
         entry.pids[event.runner] = event.pid
         entry.report = tuple(event.report)
         for opening in list(entry.opening):
@@ -155,15 +155,15 @@ class JailEvents:
                 self._witness.opened(entry, len(opening.runners), took)
                 entry.opened = True
 
-    def _failed(self, entry: JailEntry, event: JailFailed) -> None:
+    def _failed(self, entry: JailRecord, event: JailFailed) -> None:
         for opening in entry.opening:
             why = ("SandboxUnavailableError", event.reason, event.layer, event.fix)
             self._reply(opening.asker, RefusedError(*why).reply)
         entry.opening.clear()
         self.end(entry, whole_jail("unavailable", detail=event.reason))
 
-    def _runner_exited(self, entry: JailEntry, event: RunnerExited) -> None:
-        death = m.Died(
+    def _runner_exited(self, entry: JailRecord, event: RunnerExited) -> None:
+        death = m.Death(
             event.runner,
             event.reason,
             exit_code=event.code,
@@ -172,7 +172,7 @@ class JailEvents:
         )
         self._runner_died(entry, self._judged(entry, death))
 
-    def _judged(self, entry: JailEntry, death: m.Died) -> m.Died:
+    def _judged(self, entry: JailRecord, death: m.Death) -> m.Death:
         """A kill is the kernel's, where it has counted one for the memory around all of us."""
         by_signal = death.signal == "SIGKILL" and death.reason in ("signal", "exit")
         if entry.death is None and by_signal and self._outer_limit.killed_one():
@@ -189,14 +189,14 @@ class JailEvents:
         """Nothing happens any more."""
         self._outer_limit.close()
 
-    def _runner_died(self, entry: JailEntry, death: m.Died) -> None:
+    def _runner_died(self, entry: JailRecord, death: m.Death) -> None:
         """The end of its jail too, unless that is kept."""
         if not entry.kept:
             self.end(entry, death)
         elif entry.death is None and death.runner in entry.links:
             self._lose(entry, death)
 
-    def _lose(self, entry: JailEntry, death: m.Died) -> None:
+    def _lose(self, entry: JailRecord, death: m.Death) -> None:
         """Go on without a runner: the requests that wait for it are answered with its death."""
         self.deaths[death.reason] += 1
         entry.output.read()
@@ -220,7 +220,7 @@ class JailEvents:
             self._reply(opening.asker, m.replace(death, operation="start"))
         self._witness.lost(entry, death)
 
-    def end(self, entry: JailEntry, death: m.Died) -> None:
+    def end(self, entry: JailRecord, death: m.Death) -> None:
         """Write the jail's death down, tell everybody who waits, and make it true."""
         if entry.death is not None:
             return
@@ -236,7 +236,7 @@ class JailEvents:
         self._witness.died(entry)
         self.kill(entry)
 
-    def _hear_last(self, entry: JailEntry) -> None:
+    def _hear_last(self, entry: JailRecord) -> None:
         """Read what it was denied, which was sent before whatever ends it, on another descriptor.
 
         It ends also where that cannot be read: then it may be this that ends it.
@@ -250,16 +250,16 @@ class JailEvents:
             if isinstance(event, CallDenied):
                 self._denied(entry, event)
 
-    def _denied(self, entry: JailEntry, event: CallDenied) -> None:
+    def _denied(self, entry: JailRecord, event: CallDenied) -> None:
         entry.denied.append(f"{event.call} {event.detail}".strip())
 
-    def kill(self, entry: JailEntry) -> None:
+    def kill(self, entry: JailRecord) -> None:
         """End its processes; ``jail_gone`` is when they are gone."""
         self._fds.drop(entry.number)
         self._unwatch_control(entry)
         entry.jail.kill()
 
-    def _unwatch_control(self, entry: JailEntry) -> None:
+    def _unwatch_control(self, entry: JailRecord) -> None:
         """Once: after that the number may be another's."""
         self._loop.unwatch(entry.control)
         entry.control = -1
@@ -282,7 +282,7 @@ class JailEvents:
         if entry.death is None:
             self._witness.closed(entry)
 
-    def _release(self, entry: JailEntry) -> None:
+    def _release(self, entry: JailRecord) -> None:
         entry.released = True
         for link in entry.links.values():
             self._loop.unwatch(link.fileno())

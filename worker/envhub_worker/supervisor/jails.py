@@ -25,7 +25,7 @@ from envhub_worker.supervisor.output_tail import OutputTail
 from envhub_worker.supervisor.records import (
     AnsweredError,
     Asker,
-    JailEntry,
+    JailRecord,
     Opening,
     Pending,
     RefusedError,
@@ -67,7 +67,7 @@ class Jails:
         witness: Witness,
     ) -> None:
         self._limits = limits
-        self._jails: dict[int, JailEntry] = {}
+        self._jails: dict[int, JailRecord] = {}
         self._packet_ids = itertools.count(1)
         self._counting = CountLimit()
         self._fds = FdStore(str(fd_path), self._pidfd_for)
@@ -100,7 +100,7 @@ class Jails:
             name=request.name,
         )
         zygote, jail = self._zygotes.fork(request.runtime, spec)
-        entry = JailEntry(
+        entry = JailRecord(
             number=secrets.randbits(62),
             name=request.name,
             session=asker.session,
@@ -121,7 +121,7 @@ class Jails:
             raise RefusedError("WorkerError", f"{len(entry.lost)} of its runners have died")
         self._start_runners(asker, entry, request.runners)
 
-    def _start_runners(self, asker: Asker, entry: JailEntry, count: int) -> None:
+    def _start_runners(self, asker: Asker, entry: JailRecord, count: int) -> None:
         runners = []
         for _ in range(count):
             runner, sock = entry.jail.start_runner()
@@ -182,11 +182,11 @@ class Jails:
         # the zygote reports the jail, and may do so only after it has reported itself
         return entry.jail.runner_pidfd(request.runner) if entry.kept else entry.jail.pidfd
 
-    def _found(self, session: bytes, number: int) -> JailEntry | None:
+    def _found(self, session: bytes, number: int) -> JailRecord | None:
         entry = self._jails.get(number)
         return entry if entry is not None and entry.session == session else None
 
-    def _owned(self, asker: Asker, number: int, operation: str = "") -> JailEntry:
+    def _owned(self, asker: Asker, number: int, operation: str = "") -> JailRecord:
         """A jail of the asker's that lives; raises the reply where it has none."""
         entry = self._found(asker.session, number)
         if entry is None:
@@ -232,7 +232,7 @@ class Jails:
 
     # --- for the gate --------------------------------------------------------------------------
 
-    def open_ones(self, owner: bytes = b"") -> list[JailEntry]:
+    def open_ones(self, owner: bytes = b"") -> list[JailRecord]:
         """Jails that live, of sessions whose name begins like that."""
         return [
             entry
@@ -254,12 +254,12 @@ class Jails:
         """How many have ended unasked since the start, by reason."""
         return self._events.deaths
 
-    def end(self, entry: JailEntry, why: str) -> None:
+    def end(self, entry: JailRecord, why: str) -> None:
         """End a jail that no client closes; its client reads why if it comes back."""
         self._events.end(entry, whole_jail("idle", detail=why))
 
 
-def _held(entry: JailEntry, children: Children | None) -> dict[str, object]:
+def _held(entry: JailRecord, children: Children | None) -> dict[str, object]:
     usage: dict[str, int] = {}
     if entry.death is None and children is not None:
         usage = usage_of(entry.jail.pid, entry.pids.values(), children)
@@ -270,7 +270,7 @@ def _held(entry: JailEntry, children: Children | None) -> dict[str, object]:
     return {**usage, "denied": tuple(entry.denied)}
 
 
-def _note_limits(entry: JailEntry, usage: dict[str, int]) -> None:
+def _note_limits(entry: JailRecord, usage: dict[str, int]) -> None:
     """What a jail has used up it is denied; in front, where no flood of attempts hides it."""
     wanted = entry.jail.spec.confinement
     runners, own_root = entry.jail.runner_pids(), wanted.profile == "strict"
@@ -283,7 +283,7 @@ def _note_limits(entry: JailEntry, usage: dict[str, int]) -> None:
 
 
 def _targets(
-    entry: JailEntry, request: m.Relay, payload: list[bytes]
+    entry: JailRecord, request: m.Relay, payload: list[bytes]
 ) -> list[tuple[int, list[bytes]]] | None:
     """Which runner gets which frames; None if the request does not add up."""
     targets: list[tuple[int, list[bytes]]] = []

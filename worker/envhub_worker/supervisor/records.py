@@ -1,4 +1,4 @@
-"""What a worker server remembers of its jails, and of who waits for what of them."""
+"""Records of a worker server: each of its jails, and the requests that wait for it."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class RefusedError(AnsweredError):
 
     def __init__(self, error: str, message: str, missing: str = "", fix: str = "") -> None:
         # what the client has sent may be quoted in the message, at any length
-        super().__init__(m.Refused(error, message[:_MAX_SAID], missing, fix))
+        super().__init__(m.Refusal(error, message[:_MAX_SAID], missing, fix))
         self.error, self.message, self.missing, self.fix = error, message, missing, fix
 
     def __str__(self) -> str:
@@ -77,14 +77,14 @@ class Pending:
     dead: set[int] = field(default_factory=set)
     since: float = field(default_factory=monotonic)
 
-    def lost(self, index: int, death: m.Died) -> None:
+    def lost(self, index: int, death: m.Death) -> None:
         """In the place of a runner's answer: how it died."""
         self.dead.add(index)
         self.replies[index] = m.pack(m.replace(death, operation=self.operation))
 
 
 @dataclass
-class JailEntry:
+class JailRecord:
     """A jail and everything that waits for it.
 
     Attributes:
@@ -105,8 +105,8 @@ class JailEntry:
     closing: list[Asker] = field(default_factory=list)
     kept: bool = False
     idle: IdleTimer | None = None
-    lost: dict[int, m.Died] = field(default_factory=dict)
-    death: m.Died | None = None
+    lost: dict[int, m.Death] = field(default_factory=dict)
+    death: m.Death | None = None
     released: bool = False
     opened: bool = False
     since: float = field(default_factory=monotonic)
@@ -130,7 +130,7 @@ class JailEntry:
         return self.links.pop(runner)
 
 
-def waiting(entry: JailEntry) -> list[Pending]:
+def waiting(entry: JailRecord) -> list[Pending]:
     """Everything that runners owe an answer to; they owe it no more."""
     found = {}
     for link in entry.links.values():
@@ -140,15 +140,15 @@ def waiting(entry: JailEntry) -> list[Pending]:
     return list(found.values())
 
 
-def owes(entry: JailEntry, runner: int) -> int:
+def owes(entry: JailRecord, runner: int) -> int:
     """How many answers a runner owes; one that has died owes none any more."""
     link = entry.links.get(runner)
     return 0 if link is None else len(link.pending)
 
 
-def whole_jail(reason: Reason, **how: Any) -> m.Died:
-    """A death that was not one runner's; ``how`` are further fields of ``Died``."""
-    return m.Died(-1, reason, **how)
+def whole_jail(reason: Reason, **how: Any) -> m.Death:
+    """A death that was not one runner's; ``how`` are further fields of ``Death``."""
+    return m.Death(-1, reason, **how)
 
 
 def signal_name(number: int | None) -> str | None:
@@ -172,7 +172,7 @@ def _state_of(pid: int) -> str:
         return "gone"
 
 
-def status_of(entry: JailEntry) -> dict[str, object]:
+def status_of(entry: JailRecord) -> dict[str, object]:
     """What a jail is doing, for ``Status``."""
     owed = [pending for link in entry.links.values() for pending, _ in link.pending.values()]
     oldest = min(owed, key=lambda pending: pending.since, default=None)

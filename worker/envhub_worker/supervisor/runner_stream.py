@@ -11,7 +11,7 @@ from typing import Any
 from envhub_worker.protocol.codec.kinds import Buffer
 from envhub_worker.protocol.errors import RemoteProtocolError
 from envhub_worker.protocol.limits import LARGE_BYTES, WireLimits
-from envhub_worker.protocol.stream import Packet, PacketReader, pack_packet
+from envhub_worker.protocol.stream import Packet, StreamReader, pack_packet
 
 MAX_PENDING = 16
 """Requests that one runner may owe: a client waits for its answer before it asks again, but a
@@ -38,7 +38,7 @@ class RunnerLink:
 
     def __post_init__(self) -> None:
         self.sock.setblocking(False)
-        self._reader = PacketReader(self.limits, self._check_owed)
+        self._reader = StreamReader(self.limits, self._check_owed)
 
     def fileno(self) -> int:
         """The stream's descriptor."""

@@ -1,4 +1,4 @@
-"""What is called about everything that happens to jails."""
+"""``Witness``: the interface that is called about each event of a jail."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import contextlib
 import traceback
 
 from envhub_worker.protocol import messages as m
-from envhub_worker.supervisor.records import JailEntry
+from envhub_worker.supervisor.records import JailRecord
 
 
 class Witness:
@@ -15,16 +15,16 @@ class Witness:
     This one writes nothing down: the server's client is on this machine, and logs by itself.
     """
 
-    def opened(self, entry: JailEntry, runners: int, seconds: float) -> None:
+    def opened(self, entry: JailRecord, runners: int, seconds: float) -> None:
         """A jail has come up, or further runners in it, so long after it was asked for."""
 
-    def lost(self, entry: JailEntry, death: m.Died) -> None:
+    def lost(self, entry: JailRecord, death: m.Death) -> None:
         """A runner has died in a jail that goes on."""
 
-    def died(self, entry: JailEntry) -> None:
+    def died(self, entry: JailRecord) -> None:
         """A jail is dead: ``entry.death`` says how."""
 
-    def closed(self, entry: JailEntry) -> None:
+    def closed(self, entry: JailRecord) -> None:
         """Nothing is left of a jail that its client has closed, or that the server ends with."""
 
     def failed(self, error: Exception) -> None:

@@ -13,7 +13,7 @@ from envhub_worker.spawn.jail import Jail
 from envhub_worker.spawn.spawner import JailExited, Spawner
 from envhub_worker.spawn.zygote_process import ZygoteProcess
 from envhub_worker.supervisor.jail_events import JailEvents
-from envhub_worker.supervisor.records import JailEntry
+from envhub_worker.supervisor.records import JailRecord
 
 MAX_IDLE_ZYGOTES = 2
 """Without a jail, when another is started. A client mostly has one policy, or two in turns."""
@@ -34,7 +34,7 @@ class Zygotes:
         loop: Loop,
         runtime_dir: Path,
         readable_roots: Sequence[str],
-        jails: Mapping[int, JailEntry],
+        jails: Mapping[int, JailRecord],
         events: JailEvents,
         ahead: ZygoteProcess | None,
     ) -> None:

@@ -13,7 +13,7 @@ from envhub_sandbox.check.static.survey import survey
 from envhub_sandbox.errors import SnapshotError
 from envhub_sandbox.hub import checkout
 from envhub_sandbox.hub.snapshot import local
-from envhub_sandbox.sources import parsing
+from envhub_sandbox.hub.sources import parsing
 from tests.hub.olah_server import GitRepository
 
 pytestmark = pytest.mark.skipif(shutil.which("git") is None, reason="needs git")

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from envhub_sandbox.check.checks import Severity
 from envhub_sandbox.check.static.survey import survey
 from envhub_sandbox.hub.snapshot import local
-from envhub_sandbox.sources import parsing
+from envhub_sandbox.hub.sources import parsing
 
 pytestmark = pytest.mark.skipif(shutil.which("git") is None, reason="needs git")
 _COMMITTER = "author A <a@b> 0 +0000\ncommitter A <a@b> 0 +0000\n"

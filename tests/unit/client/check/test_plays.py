@@ -9,10 +9,9 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from envhub_sandbox.check.play import traces
+from envhub_sandbox.check.play import traces, video
 from envhub_sandbox.check.play.plays import Play, facts_of, film
 from envhub_sandbox.errors import RemoteEnvError
-from envhub_sandbox.rollouts import video
 
 pytest.importorskip("imageio_ffmpeg")
 Modes = gym.vector.AutoresetMode

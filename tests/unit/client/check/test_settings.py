@@ -8,7 +8,7 @@ import pytest
 
 from envhub_sandbox.check import settings
 from envhub_sandbox.errors import PolicyError
-from envhub_sandbox.policy import policy_from
+from envhub_sandbox.settings.policy import policy_from
 
 
 def test_a_policy_is_a_file(tmp_path: Path) -> None:

@@ -1,1 +1,1 @@
-"""Unit tests of ``envhub_sandbox/crash``."""
+"""Unit tests of ``envhub_sandbox/session/crash``."""

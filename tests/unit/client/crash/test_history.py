@@ -11,8 +11,8 @@ from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 
-from envhub_sandbox.crash import history
-from envhub_sandbox.crash.history import History, RecordedRequest, Recording, Steps
+from envhub_sandbox.session.crash import history
+from envhub_sandbox.session.crash.history import History, RecordedRequest, Recording, Steps
 from envhub_worker.protocol import messages as m
 from tests.support.compare import assert_same
 from tests.support.wire import requested

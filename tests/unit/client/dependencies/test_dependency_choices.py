@@ -15,7 +15,7 @@ import pytest
 from envhub_sandbox.dependencies import installed, interpreters
 from envhub_sandbox.dependencies.declared import parse_requirement
 from envhub_sandbox.dependencies.modules import MissingModule
-from envhub_sandbox.dependencies.pipeline import HERE
+from envhub_sandbox.dependencies.packages import HERE
 from envhub_sandbox.dependencies.request import (
     AUTO,
     DECLARED,

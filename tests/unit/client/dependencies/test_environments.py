@@ -19,7 +19,7 @@ import pytest
 from envhub_sandbox.dependencies import bounds, environments, uv
 from envhub_sandbox.dependencies import index as index_settings
 from envhub_sandbox.dependencies.environments import Environment
-from envhub_sandbox.dependencies.pipeline import ThisMachine
+from envhub_sandbox.dependencies.packages import ThisMachine
 from envhub_sandbox.dependencies.request import chosen, request_of
 from envhub_sandbox.errors import (
     DependencyError,

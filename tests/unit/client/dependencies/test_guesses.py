@@ -12,7 +12,7 @@ from envhub_sandbox.dependencies import interpreters, resolutions
 from envhub_sandbox.dependencies import resolve as resolving
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.dependencies.modules import MissingModule, guessed
-from envhub_sandbox.dependencies.pipeline import PackageSet, packages_for
+from envhub_sandbox.dependencies.packages import PackageSet, packages_for
 from envhub_sandbox.dependencies.request import (
     AUTO,
     DECLARED,
@@ -24,7 +24,7 @@ from envhub_sandbox.dependencies.request import (
 from envhub_sandbox.dependencies.resolve import Lock, Target
 from envhub_sandbox.errors import ResolutionError
 from envhub_sandbox.hub.snapshot import Snapshot, local
-from envhub_sandbox.sources import parsing
+from envhub_sandbox.hub.sources import parsing
 from tests.support import inside
 from tests.support.wheels import Index, make_wheel
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from envhub_sandbox.dependencies import interpreters, pipeline, resolutions
+from envhub_sandbox.dependencies import interpreters, packages, resolutions
 from envhub_sandbox.dependencies.builds.sources import Source, of_git
 from envhub_sandbox.dependencies.declared import parse_requirement
 from envhub_sandbox.dependencies.interpreters import Interpreter
@@ -73,7 +73,7 @@ def test_a_source_is_chosen_and_built_by_none_but_the_builder(
         name: source_distribution(index.folder, name, "1.5", tmp_path / "ran")
         for name in ("only-source", "deeper-source")
     }
-    made = pipeline.HERE.make(request("only-source>1"), lambda line: None)
+    made = packages.HERE.make(request("only-source>1"), lambda line: None)
     assert {"only-source==1.5", "deeper-source==1.5"} <= set(made.facts["packages"])
     assert {(one.name, one.version, one.sha256) for one in built} == {
         (name, "1.5", digest) for name, digest in hashes.items()
@@ -81,7 +81,7 @@ def test_a_source_is_chosen_and_built_by_none_but_the_builder(
     assert all(one.url.startswith("http") for one in built)
     assert not (tmp_path / "ran").exists()
     again = len(built)
-    assert pipeline.HERE.make(request("only-source>1"), lambda line: None) == made
+    assert packages.HERE.make(request("only-source>1"), lambda line: None) == made
     assert len(built) == again
 
 

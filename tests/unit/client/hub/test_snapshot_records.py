@@ -9,7 +9,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from envhub_sandbox.errors import PolicyError, SnapshotError, SnapshotTooLargeError
-from envhub_sandbox.hub.listing import FileRecord, SnapshotLimits, check_names, within_limits
+from envhub_sandbox.hub.listing import (
+    FileRecord,
+    SnapshotLimits,
+    check_listing_names,
+    listing_within_limits,
+)
 
 DIGEST = "sha256:" + "0" * 64
 
@@ -32,7 +37,7 @@ def test_listing_exactly_at_the_limits_passes_sorted() -> None:
     """Limits are inclusive, and the files come sorted by path."""
     limits = SnapshotLimits(max_bytes=5, max_files=2, max_file_bytes=3)
     files = [record("b", 3), record("a", 2)]
-    assert [file.path for file in within_limits(files, limits, "t")] == ["a", "b"]
+    assert [file.path for file in listing_within_limits(files, limits, "t")] == ["a", "b"]
 
 
 def test_limit_stops_reading_the_listing() -> None:
@@ -45,7 +50,7 @@ def test_limit_stops_reading_the_listing() -> None:
             yield record(str(len(read)))
 
     with pytest.raises(SnapshotTooLargeError, match=r"SnapshotLimits\(max_files=\.\.\.\)"):
-        within_limits(endless(), SnapshotLimits(max_files=3), "t")  # type: ignore[arg-type]
+        listing_within_limits(endless(), SnapshotLimits(max_files=3), "t")  # type: ignore[arg-type]
     assert len(read) == 4
 
 
@@ -61,19 +66,19 @@ def test_limit_stops_reading_the_listing() -> None:
 def test_hostile_name_is_refused(path: str) -> None:
     """A name that could climb, hide, or break a file system names itself in the error."""
     with pytest.raises(SnapshotError, match="refused"):
-        check_names([record("env.py"), record(path)], "t")
+        check_listing_names([record("env.py"), record(path)], "t")
 
 
 @pytest.mark.parametrize("paths", [["a", "a"], ["a", "a/b"], ["a/b/c", "a/b"]])
 def test_names_that_clash_are_refused(paths: list[str]) -> None:
     """Two files of one name, or a file that is also a folder, cannot both be laid out."""
     with pytest.raises(SnapshotError, match=r"listed twice|both a file and a folder"):
-        check_names(map(record, paths), "t")
+        check_listing_names(map(record, paths), "t")
 
 
 def test_ordinary_names_pass() -> None:
     """Dots, spaces, other scripts and names that differ by case only are fine."""
-    check_names(map(record, [".gitattributes", "A.py", "a.py", "my env/ж.txt", "..a"]), "t")
+    check_listing_names(map(record, [".gitattributes", "A.py", "a.py", "my env/ж.txt", "..a"]), "t")
 
 
 @given(st.lists(st.text(min_size=1, max_size=12), max_size=4))
@@ -81,7 +86,7 @@ def test_accepted_names_stay_below_the_root(names: list[str]) -> None:
     """Whatever passes, joined to a root, lies below that root."""
     root = Path("/store/tree")
     try:
-        check_names(map(record, names), "t")
+        check_listing_names(map(record, names), "t")
     except SnapshotError:
         return
     for name in names:

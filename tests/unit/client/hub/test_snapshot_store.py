@@ -16,7 +16,8 @@ import pytest
 from envhub_sandbox.dependencies import bounds
 from envhub_sandbox.errors import SnapshotError, SnapshotIntegrityError
 from envhub_sandbox.hub import store as store
-from envhub_sandbox.hub.hashing import Mismatch, copy_verified, digest_of
+from envhub_sandbox.hub.cache import cache_root, remove_tree
+from envhub_sandbox.hub.hashing import HashMismatch, copy_verified, digest_of
 from envhub_sandbox.hub.listing import FileRecord
 from tests.hub.stub_hub import git_blob_id
 
@@ -175,11 +176,11 @@ def test_damage_is_refused_with_the_command_that_repairs(
 
 
 def _empty(slot: store.Slot) -> None:
-    store.remove_tree(slot.tree)
+    remove_tree(slot.tree)
 
 
 def _leave_a_name(slot: store.Slot) -> None:
-    store.remove_tree(slot.home)
+    remove_tree(slot.home)
     slot.home.mkdir()
 
 
@@ -303,10 +304,10 @@ def test_store_is_in_the_users_cache_unless_said_otherwise(
     """$ENVHUB_CACHE moves the store; without it the platform's cache folder is used."""
     monkeypatch.setenv("ENVHUB_CACHE", "~/x")
     monkeypatch.setenv("HOME", str(tmp_path))
-    assert store.cache_root() == tmp_path / "x"
+    assert cache_root() == tmp_path / "x"
     monkeypatch.delenv("ENVHUB_CACHE")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
-    assert store.cache_root() == tmp_path / "xdg" / "envhub-sandbox"
+    assert cache_root() == tmp_path / "xdg" / "envhub-sandbox"
 
 
 def test_endpoints_types_and_names_have_places_of_their_own(snapshot_store: Path) -> None:
@@ -350,7 +351,7 @@ def test_a_tree_of_any_depth_is_walked_and_removed(tmp_path: Path) -> None:
     (top / "link").symlink_to(outside)
     assert len(list(bounds.walk(top))) == 1201
     top.chmod(0o555)
-    store.remove_tree(top)
+    remove_tree(top)
     assert not top.exists()
     assert outside.exists()
 
@@ -367,7 +368,7 @@ def test_copy_is_what_the_record_says_or_an_error(tmp_path: Path, kind: str) -> 
     flipped = bytes([data[0] ^ 1]) + data[1:]
     for number, other in enumerate([data + b"1", data[:-1], flipped]):
         source.write_bytes(other)
-        with pytest.raises(Mismatch):
+        with pytest.raises(HashMismatch):
             copy_verified(source, tmp_path / str(number), record)
 
 
@@ -383,5 +384,5 @@ def test_git_digest_is_gits_own(tmp_path: Path) -> None:
 def test_pipe_is_not_waited_for(tmp_path: Path) -> None:
     """A pipe in place of a file is refused at once, where opening it would block."""
     os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(Mismatch, match="not a regular file"):
+    with pytest.raises(HashMismatch, match="not a regular file"):
         copy_verified(tmp_path / "pipe", tmp_path / "x", FileRecord("x", 1, "sha256:0"))

@@ -1,1 +1,1 @@
-"""Unit tests of ``envhub_sandbox/rollouts``."""
+"""Unit tests of what plays in ``envhub_sandbox/check/play``."""

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import SyncVectorEnv, VectorEnv
 
-from envhub_sandbox.rollouts.episodes import (
+from envhub_sandbox.check.play.episodes import (
     MAX_COMPONENTS,
     EpisodeCounter,
     RolloutError,

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from envhub_sandbox.errors import RemoteEnvError
-from envhub_sandbox.rollouts.video import (
+from envhub_sandbox.check.play.video import (
     MAX_SIDE,
     VideoError,
     VideoWriter,
@@ -19,6 +18,7 @@ from envhub_sandbox.rollouts.video import (
     fps_of,
     frame_of,
 )
+from envhub_sandbox.errors import RemoteEnvError
 
 imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 from envhub_sandbox.errors import EnvHubError
-from envhub_sandbox.policy import Policy
 from envhub_sandbox.sandboxes.docker.engines import Engine
 from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox, RepositoryContainer
+from envhub_sandbox.settings.policy import Policy
 from tests.support.processes import descendants, eventually
 
 _ENGINE = """#!{python} -S

@@ -13,7 +13,7 @@ from envhub_sandbox.dependencies.modules import Guess
 from envhub_sandbox.dependencies.request import PackageRequest
 from envhub_sandbox.errors import InterpreterUnavailableError
 from envhub_sandbox.sandboxes.docker import packages
-from envhub_sandbox.sandboxes.docker.packages import fitting
+from envhub_sandbox.sandboxes.docker.packages import interpreter_fitting
 
 OURS = interpreters.own()
 NEWER = replace(OURS, path="/opt/envhub-worker/bin/python", libc="99.0")
@@ -51,7 +51,7 @@ def test_what_an_image_has_is_read_off_its_metadata(
 def test_what_it_imports_is_in_the_image_or_made(monkeypatch: pytest.MonkeyPatch) -> None:
     """By the names of distributions: nothing of an image is imported to see."""
     monkeypatch.setattr(packages, "find_image", lambda engine, image: image)
-    monkeypatch.setattr(packages, "inside", lambda engine, image: (NEWER, THERE))
+    monkeypatch.setattr(packages, "image_packages", lambda engine, image: (NEWER, THERE))
     target = packages.ImageTarget(lambda: None, "image")  # type: ignore[arg-type, return-value]
     for brought_by, met in ((("absent", "wanted-one"), True), (("absent",), False)):
         guess = Guess("module", parse_requirement("absent", "env.py, line 1"), brought_by)
@@ -61,7 +61,7 @@ def test_what_it_imports_is_in_the_image_or_made(monkeypatch: pytest.MonkeyPatch
 def test_an_interpreter_of_its_kind_fits() -> None:
     """Another patch release does; wheels that were chosen for an older glibc do."""
     minor = ".".join(OURS.version.split(".")[:2])
-    assert fitting(replace(NEWER, version=f"{minor}.99"), declares()).path == OURS.path
+    assert interpreter_fitting(replace(NEWER, version=f"{minor}.99"), declares()).path == OURS.path
 
 
 @pytest.mark.parametrize(
@@ -77,7 +77,7 @@ def test_an_interpreter_of_its_kind_fits() -> None:
 def test_one_of_another_kind_does_not(theirs: interpreters.Interpreter, said: str) -> None:
     """A wheel that was chosen for the one may crash in the other; the text has the other way."""
     with pytest.raises(InterpreterUnavailableError, match=said) as caught:
-        fitting(theirs, declares())
+        interpreter_fitting(theirs, declares())
     assert "envhub image build" in str(caught.value)
 
 
@@ -89,4 +89,4 @@ def test_the_images_python_is_the_one_that_there_is() -> None:
         declares(supports=">=3.99"),
     ):
         with pytest.raises(InterpreterUnavailableError, match="the image has"):
-            fitting(NEWER, request)
+            interpreter_fitting(NEWER, request)

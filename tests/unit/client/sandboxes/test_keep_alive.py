@@ -11,7 +11,7 @@ import zmq
 
 from envhub_sandbox.errors import WorkerTimeoutError
 from envhub_sandbox.sandboxes import remote
-from envhub_sandbox.transport.tcp import Far
+from envhub_sandbox.transport.tcp import TcpServer
 from envhub_worker.protocol import messages as m
 
 FAULTS = (
@@ -48,8 +48,8 @@ def test_the_thread_outlives_every_fault(moment: str, monkeypatch: pytest.Monkey
             if moment == "close":
                 raise zmq.ZMQError(errno.ENOTSOCK)
 
-    monkeypatch.setattr(remote, "WorkerClient", Connection)
-    server = remote.RemoteServer("tcp://host:1", Far(None, None))
+    monkeypatch.setattr(remote, "WorkerConnection", Connection)
+    server = remote.RemoteServer("tcp://host:1", TcpServer(None, None))
     assert heard.wait(60)
     assert left == []
     server.stop()

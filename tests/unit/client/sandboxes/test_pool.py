@@ -10,11 +10,11 @@ from typing import Any
 
 import pytest
 
-from envhub_sandbox.policy import Policy, timeouts_from
 from envhub_sandbox.sandboxes import pool as pool_module
 from envhub_sandbox.sandboxes.docker import sandbox as docker
 from envhub_sandbox.sandboxes.docker.engines import Engine
 from envhub_sandbox.sandboxes.pool import ServerPool, ServerUse, WorkerServer
+from envhub_sandbox.settings.policy import Policy, timeouts_from
 from tests.support import inside
 from tests.support.interrupts import before_line
 from tests.support.processes import eventually

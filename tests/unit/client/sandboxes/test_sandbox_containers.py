@@ -13,11 +13,11 @@ from typing import Any
 import pytest
 
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerStartupError
-from envhub_sandbox.policy import Limits, Policy
 from envhub_sandbox.sandboxes.docker import attestation, engines, run_arguments, seccomp_profile
 from envhub_sandbox.sandboxes.docker.engines import Engine
 from envhub_sandbox.sandboxes.docker.run_arguments import Container
 from envhub_sandbox.sandboxes.docker.sandbox import ContainerServer, DockerSandbox
+from envhub_sandbox.settings.policy import Limits, Policy
 from envhub_worker.lockdown.seccomp import policy as seccomp_policy
 from envhub_worker.protocol.messages.surroundings import Surroundings
 from envhub_worker.protocol.runtime import Runtime
@@ -229,7 +229,7 @@ def test_the_profile_permits_what_jails_may_call() -> None:
         name
         for namespaced in (True, False)
         for network in ("none", "loopback", "host")
-        for name, verdict in seccomp_policy.table(
+        for name, verdict in seccomp_policy.policy_table(
             namespaced=namespaced, network=network, brokered=not namespaced
         ).items()
         if verdict not in (seccomp_policy.EPERM, seccomp_policy.ENOSYS)

@@ -38,7 +38,7 @@ ValueError: no
 
 def failed(traceback: str, snapshot: Snapshot = LOCAL, stage: str = "step") -> EnvHubError:
     """The error that is raised for this traceback."""
-    error = raised(m.Raised("ValueError", "ValueError", "no", traceback, stage))
+    error = raised(m.RaisedException("ValueError", "ValueError", "no", traceback, stage))
     add_author_line(error, snapshot)
     return error
 
@@ -156,7 +156,7 @@ def test_names_of_the_machine_that_a_terminal_would_obey_are_escaped() -> None:
 # --- in the worker --------------------------------------------------------------------------
 
 
-def a_failure(folder: Path, source: str) -> m.Raised:
+def a_failure(folder: Path, source: str) -> m.RaisedException:
     """What a runner says of a file that raises when it is run."""
     path = folder / "env.py"
     path.write_text(source)

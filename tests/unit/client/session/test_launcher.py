@@ -66,7 +66,7 @@ class _Place(Sandbox):
 def client(monkeypatch: pytest.MonkeyPatch) -> _Client:
     """What the launcher speaks by."""
     made = _Client()
-    monkeypatch.setattr(launcher_module, "WorkerClient", lambda *_: made)
+    monkeypatch.setattr(launcher_module, "WorkerConnection", lambda *_: made)
     return made
 
 

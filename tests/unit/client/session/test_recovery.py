@@ -9,9 +9,9 @@ import pytest
 from gymnasium import spaces
 
 from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
-from envhub_sandbox.session.survival.revived_rows import revived_step
+from envhub_sandbox.session.survival.recovery import revived_step
 from envhub_sandbox.session.survival.seeds import SeedBook, derived_seed, resets
-from envhub_sandbox.transport.connection import WorkerClient
+from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import JailHandle, RunnersDiedError
 from envhub_sandbox.transport.results import Results
@@ -23,7 +23,7 @@ from envhub_worker.protocol.spaces.opaque import OpaqueSpace
 from envhub_worker.runner.described import described
 from tests.attacks.lying_server import env_manifest
 
-DIED = m.Died(2, "exit", 3, None, "", "last words", "step")
+DIED = m.Death(2, "exit", 3, None, "", "last words", "step")
 ASKED = [(1, m.Render(1)), (2, m.Render(1))]
 """What the two runners of a jail are asked."""
 
@@ -47,7 +47,7 @@ class Told:
 
 def jail(reply: m.Message, *parts: m.Message, kept: bool = True) -> JailHandle:
     """A jail of two runners whose server says this."""
-    client = cast("WorkerClient", Told(reply, *parts))
+    client = cast("WorkerConnection", Told(reply, *parts))
     made = JailHandle(client, 1, [1, 2], [], DEFAULT_LIMITS)
     made.kept = kept
     return made
@@ -55,7 +55,7 @@ def jail(reply: m.Message, *parts: m.Message, kept: bool = True) -> JailHandle:
 
 def test_deaths_come_with_the_answers_of_the_others() -> None:
     """Each in its place: what lived has answered, and of the dead one knows how."""
-    said = jail(m.RelayedPartly((1, 1), (1,)), m.Value(7), DIED)
+    said = jail(m.RelayDonePartly((1, 1), (1,)), m.Value(7), DIED)
     with pytest.raises(RunnersDiedError) as caught:
         said.receive(said.send("step", ASKED), Deadline(1))
     assert caught.value.replies == [m.Value(7), None]
@@ -67,30 +67,30 @@ def test_deaths_come_with_the_answers_of_the_others() -> None:
 
 
 def test_a_runners_word_is_no_death() -> None:
-    """A ``Died`` in the place of a living runner is an answer, and an illegal one."""
-    said = jail(m.RelayedPartly((1, 1), (1,)), DIED, DIED)
+    """A ``Death`` in the place of a living runner is an answer, and an illegal one."""
+    said = jail(m.RelayDonePartly((1, 1), (1,)), DIED, DIED)
     with pytest.raises(RunnersDiedError) as caught:
         said.receive(said.send("step", ASKED), Deadline(1))
     assert list(caught.value.deaths) == [1]
-    with pytest.raises(RemoteProtocolError, match="a runner sent Died"):
-        jail(m.Relayed((1, 1)), m.Value(7), DIED).exchange("step", ASKED, Deadline(1))
+    with pytest.raises(RemoteProtocolError, match="a runner sent Death"):
+        jail(m.RelayDone((1, 1)), m.Value(7), DIED).exchange("step", ASKED, Deadline(1))
 
 
 @pytest.mark.parametrize(
     ("reply", "parts"),
     [
-        (m.RelayedPartly((1, 1), ()), (m.Value(7), DIED)),
-        (m.RelayedPartly((1, 1), (2,)), (m.Value(7), DIED)),
-        (m.RelayedPartly((1, 1), (-1,)), (m.Value(7), DIED)),
-        (m.RelayedPartly((1, 1), (0,)), (m.Value(7), DIED)),
-        (m.RelayedPartly((1, 2), (1,)), (m.Value(7), DIED)),
-        (m.RelayedPartly((2, 0), (1,)), (m.Value(7), DIED)),
+        (m.RelayDonePartly((1, 1), ()), (m.Value(7), DIED)),
+        (m.RelayDonePartly((1, 1), (2,)), (m.Value(7), DIED)),
+        (m.RelayDonePartly((1, 1), (-1,)), (m.Value(7), DIED)),
+        (m.RelayDonePartly((1, 1), (0,)), (m.Value(7), DIED)),
+        (m.RelayDonePartly((1, 2), (1,)), (m.Value(7), DIED)),
+        (m.RelayDonePartly((2, 0), (1,)), (m.Value(7), DIED)),
     ],
 )
 def test_deaths_that_do_not_add_up_are_refused(
-    reply: m.RelayedPartly, parts: tuple[m.Message, ...]
+    reply: m.RelayDonePartly, parts: tuple[m.Message, ...]
 ) -> None:
-    """Nobody dead, nobody asked, no ``Died``, frames too many or too few."""
+    """Nobody dead, nobody asked, no ``Death``, frames too many or too few."""
     said = jail(reply, *parts)
     with pytest.raises(RemoteProtocolError):
         said.receive(said.send("step", ASKED), Deadline(1))
@@ -98,8 +98,8 @@ def test_deaths_that_do_not_add_up_are_refused(
 
 def test_a_jail_that_is_not_kept_has_no_partial_answers() -> None:
     """What was not asked for is not taken."""
-    said = jail(m.RelayedPartly((1, 1), (1,)), m.Value(7), DIED, kept=False)
-    with pytest.raises(RemoteProtocolError, match="RelayedPartly"):
+    said = jail(m.RelayDonePartly((1, 1), (1,)), m.Value(7), DIED, kept=False)
+    with pytest.raises(RemoteProtocolError, match="RelayDonePartly"):
         said.receive(said.send("step", ASKED), Deadline(1))
 
 

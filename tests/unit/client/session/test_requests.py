@@ -82,8 +82,8 @@ def test_of_two_kinds_either_is_taken(session: EnvSession, lane: FakeLane) -> No
     """An attribute is a value or a method; a third kind is named."""
     for lane.answer in (m.Value(1), m.Method()):
         assert session.requests.ask_own("name", m.GetOwn, "name") == lane.answer
-    lane.answer = m.Watched((), False)
-    with pytest.raises(RemoteProtocolError, match="Watched where Value or Method belongs"):
+    lane.answer = m.WatchDone((), False)
+    with pytest.raises(RemoteProtocolError, match="WatchDone where Value or Method belongs"):
         session.requests.ask_own("name", m.GetOwn, "name")
 
 
@@ -91,7 +91,7 @@ def test_what_the_repository_raises_leaves_the_environment_usable(
     session: EnvSession, lane: FakeLane
 ) -> None:
     """It is the repository's error, by its name."""
-    lane.answer = m.Raised("ValueError", "a.Oops", "no", "trace", "run")
+    lane.answer = m.RaisedException("ValueError", "a.Oops", "no", "trace", "run")
     with pytest.raises(RemoteEnvError, match="no"):
         session.requests.ask("render", render)
     assert session.lifecycle.state is State.READY

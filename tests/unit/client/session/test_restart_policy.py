@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from envhub_sandbox.errors import WorkerDiedError
-from envhub_sandbox.policy import Policy
 from envhub_sandbox.session.counters import Counters
 from envhub_sandbox.session.survival.restart_policy import Restarts, backoff_s
+from envhub_sandbox.settings.policy import Policy
 
 
 def test_backoff_doubles_and_is_bounded() -> None:

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from envhub_sandbox.transport.exit_status import describe_exit
+from envhub_sandbox.transport.connection import describe_exit
 
 
 @contextmanager

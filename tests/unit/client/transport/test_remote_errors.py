@@ -13,7 +13,7 @@ import pytest
 
 from envhub_sandbox import errors
 from envhub_sandbox.session.author_lines import add_author_line
-from envhub_sandbox.transport.replies import check, death, expect, raised, refusal
+from envhub_sandbox.transport.replies import check_reply, death, expect_reply, raised, refusal
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import REASONS
 from envhub_worker.runner.raised import raised as described
@@ -21,7 +21,7 @@ from envhub_worker.runner.raised import raised as described
 ESCAPE = "\x1b]0;owned\x07\x1b[2J\r"
 
 
-def a_raised(**changed: str) -> m.Raised:
+def a_raised(**changed: str) -> m.RaisedException:
     """What a runner says about an exception, with some fields changed."""
     fields = {
         "builtin": "ValueError",
@@ -30,7 +30,7 @@ def a_raised(**changed: str) -> m.Raised:
         "traceback": "Traceback ...",
         "stage": "step",
     }
-    return m.Raised(**{**fields, **changed})
+    return m.RaisedException(**{**fields, **changed})
 
 
 @pytest.mark.parametrize(
@@ -112,7 +112,7 @@ def test_long_texts_are_cut() -> None:
         (a_raised(stage="return"), errors.LoadError),
     ],
 )
-def test_failures_to_load_say_so(reply: m.Raised, expected: type[Exception]) -> None:
+def test_failures_to_load_say_so(reply: m.RaisedException, expected: type[Exception]) -> None:
     """What fails before there is an environment is an error of loading, as its pickle is."""
     error = raised(reply)
     assert isinstance(error, expected)
@@ -179,9 +179,9 @@ def test_gymnasiums_own_errors_are_themselves() -> None:
 
 
 SERVERS = [
-    m.Died(1, "exit", 0, None, ESCAPE, ESCAPE, "step"),
-    m.Refused("SandboxUnavailableError", ESCAPE, "", ESCAPE),
-    m.Relayed((1,)),
+    m.Death(1, "exit", 0, None, ESCAPE, ESCAPE, "step"),
+    m.Refusal("SandboxUnavailableError", ESCAPE, "", ESCAPE),
+    m.RelayDone((1,)),
     m.Done(),
 ]
 
@@ -190,27 +190,35 @@ SERVERS = [
 def test_a_runner_cannot_speak_in_the_servers_name(message: m.Message) -> None:
     """A death or a refusal inside a runner's reply is a broken rule, not news."""
     with pytest.raises(errors.RemoteProtocolError, match="a runner sent") as caught:
-        check(message)
+        check_reply(message)
     assert "\x1b" not in str(caught.value)
 
 
 def test_the_kinds_of_both_conversations_are_apart() -> None:
     """What runners may send begins at one number."""
     runners = {cls.__name__ for kind, cls in m.KINDS.items() if kind >= m.FIRST_RUNNER_KIND}
-    assert {"Loaded", "Built", "ResetDone", "StepDone", "Value", "Method", "Raised"} <= runners
+    assert {
+        "LoadDone",
+        "BuildDone",
+        "ResetDone",
+        "StepDone",
+        "Value",
+        "Method",
+        "RaisedException",
+    } <= runners
     assert not runners & {type(message).__name__ for message in SERVERS}
 
 
 @pytest.mark.parametrize(
     ("reply", "text"),
     [
-        (m.Died(1, "exit", 3, None, "", "", "step"), "died during step: it exited (exit code 3)"),
-        (m.Died(1, "signal", None, "SIGKILL", "", "", ""), "died: a signal ended it (SIGKILL)"),
-        (m.Died(1, "exit", 0, None, "", "bye", "reset"), "Its last output:\n  | bye"),
-        (m.Died(1, "exit", 0, None, "why", "", "reset"), "\nwhy"),
+        (m.Death(1, "exit", 3, None, "", "", "step"), "died during step: it exited (exit code 3)"),
+        (m.Death(1, "signal", None, "SIGKILL", "", "", ""), "died: a signal ended it (SIGKILL)"),
+        (m.Death(1, "exit", 0, None, "", "bye", "reset"), "Its last output:\n  | bye"),
+        (m.Death(1, "exit", 0, None, "why", "", "reset"), "\nwhy"),
     ],
 )
-def test_deaths_say_how(reply: m.Died, text: str) -> None:
+def test_deaths_say_how(reply: m.Death, text: str) -> None:
     """Exit code or signal, the request that was being served, and the last output."""
     error = death(reply)
     assert text in str(error)
@@ -235,31 +243,31 @@ def test_deaths_say_how(reply: m.Died, text: str) -> None:
 )
 def test_refusals_come_from_a_table(name: str, expected: type[Exception]) -> None:
     """The server names an error; what it does not know is a WorkerError."""
-    assert type(refusal(m.Refused(name, "text", "", ""))) is expected
+    assert type(refusal(m.Refusal(name, "text", "", ""))) is expected
 
 
 def test_a_missing_layer_comes_with_its_fix() -> None:
     """The reader learns the layer, the reason and what to do."""
-    error = refusal(m.Refused("SandboxUnavailableError", "it is off", "landlock", "turn it on"))
+    error = refusal(m.Refusal("SandboxUnavailableError", "it is off", "landlock", "turn it on"))
     assert str(error) == "this host cannot enforce landlock: it is off\nturn it on"
 
 
 def test_other_replies_than_expected_break_the_rules() -> None:
     """A reply of another kind is the worker's fault; deaths and refusals are told as such."""
-    assert expect(m.Done(), m.Done) == m.Done()
+    assert expect_reply(m.Done(), m.Done) == m.Done()
     with pytest.raises(errors.RemoteProtocolError, match="with Output where Done belongs"):
-        expect(m.Output(""), m.Done)
+        expect_reply(m.Output(""), m.Done)
     with pytest.raises(errors.WorkerDiedError):
-        expect(SERVERS[0], m.Done)
+        expect_reply(SERVERS[0], m.Done)
     with pytest.raises(errors.WorkerError):
-        expect(m.Refused("WorkerError", "no", "", ""), m.Done)
+        expect_reply(m.Refusal("WorkerError", "no", "", ""), m.Done)
 
 
 def test_check_raises_what_a_reply_says() -> None:
     """Everything else passes."""
-    check(m.Value(3))
+    check_reply(m.Value(3))
     with pytest.raises(errors.RemoteEnvError):
-        check(a_raised())
+        check_reply(a_raised())
 
 
 def test_every_reason_of_a_death_is_told() -> None:
@@ -268,7 +276,7 @@ def test_every_reason_of_a_death_is_told() -> None:
     told = attributes.partition("reason:")[2].partition("log_tail:")[0]
     assert re.findall(r'``"([a-z-]+)"``', told) == list(REASONS)
     for reason in REASONS[: REASONS.index("server")]:
-        text = str(death(m.Died(-1, reason, None, None, "", "", "step")))
+        text = str(death(m.Death(-1, reason, None, None, "", "", "step")))
         assert not text.endswith(f": {reason}")
 
 
@@ -282,7 +290,7 @@ _IMITATION = (
 @pytest.mark.parametrize("builtin", ["ValueError", "ModuleNotFoundError"])
 def test_a_strangers_lines_cannot_be_taken_for_ours(stage: str, builtin: str) -> None:
     """Nor for a traceback of the caller's: all but the first have a margin."""
-    error = raised(m.Raised(builtin, "Oops", _IMITATION, _IMITATION, stage))
+    error = raised(m.RaisedException(builtin, "Oops", _IMITATION, _IMITATION, stage))
     if not isinstance(error, errors.RemoteEnvError) and error.__cause__ is None:
         shown = [str(error)]
     else:
@@ -298,7 +306,7 @@ def test_a_strangers_lines_cannot_be_taken_for_ours(stage: str, builtin: str) ->
 
 def test_the_last_output_cannot_be_taken_for_ours() -> None:
     """What a worker prints before it dies is told apart from what is said of its death."""
-    died = death(m.Died(1, "exit", 1, None, "", _IMITATION, "step"))
+    died = death(m.Death(1, "exit", 1, None, "", _IMITATION, "step"))
     _, _, *lines = str(died).splitlines()
     assert len(lines) == 3
     assert all(line.startswith("  | ") for line in lines)

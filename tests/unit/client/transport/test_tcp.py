@@ -12,7 +12,7 @@ import zmq
 from zmq.utils import z85
 
 from envhub_sandbox.errors import SandboxUnavailableError
-from envhub_sandbox.transport.tcp import Far, Link, UnreachableError
+from envhub_sandbox.transport.tcp import TcpLink, TcpServer, UnreachableError
 from tests.support import inside
 from tests.support.processes import eventually
 
@@ -20,12 +20,12 @@ _PUBLIC, _SECRET = zmq.curve_keypair()
 
 
 @contextlib.contextmanager
-def linked(port: int, far: Far) -> Iterator[Link]:
+def linked(port: int, far: TcpServer) -> Iterator[TcpLink]:
     """A link that has begun to connect."""
     with zmq.Context() as context, context.socket(zmq.DEALER) as client:
         client.linger = 0
         endpoint = f"tcp://127.0.0.1:{port}"
-        link = Link(client, endpoint, far)
+        link = TcpLink(client, endpoint, far)
         client.connect(endpoint)
         try:
             yield link
@@ -42,7 +42,7 @@ def hangs_up(listener: socket.socket) -> None:
 
 def test_a_server_that_restarts_is_waited_for() -> None:
     """The handshake that it ended is followed by one that succeeds."""
-    far = Far(_PUBLIC, z85.decode(_SECRET))
+    far = TcpServer(_PUBLIC, z85.decode(_SECRET))
     listener = socket.create_server(("127.0.0.1", 0))
     port = listener.getsockname()[1]
     with linked(port, far) as link, zmq.Context() as context:
@@ -57,7 +57,7 @@ def test_a_server_that_restarts_is_waited_for() -> None:
 @pytest.mark.parametrize("keys", [True, False])
 def test_one_that_ends_every_handshake_is_refused(keys: bool) -> None:
     """By an error that names every cause that looks like that."""
-    far = Far(_PUBLIC, z85.decode(_SECRET)) if keys else Far(None, None)
+    far = TcpServer(_PUBLIC, z85.decode(_SECRET)) if keys else TcpServer(None, None)
     with socket.create_server(("127.0.0.1", 0)) as listener:
 
         def serve() -> None:

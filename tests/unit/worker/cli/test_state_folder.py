@@ -45,7 +45,7 @@ def test_that_of_a_server_that_was_killed_is_none(
     subprocess.run([sys.executable, "-c", _WRITER, str(tmp_path)], env=environment, timeout=120)
     assert (tmp_path / "endpoint").exists()
     assert state_folder.read_note(tmp_path) is None
-    assert status.is_healthy(tmp_path) is None
+    assert status.status_is_healthy(tmp_path) is None
     asked = argparse.Namespace(state_dir=tmp_path, endpoint=None, json=False)
     assert status.run(asked) == 1
     assert "is running here" in capsys.readouterr().err

@@ -6,7 +6,7 @@ from typing import Any
 
 from envhub_worker.spawn.jail import CallDenied, RunnerExited
 from envhub_worker.supervisor.jail_events import JailEvents
-from envhub_worker.supervisor.records import JailEntry, whole_jail
+from envhub_worker.supervisor.records import JailRecord, whole_jail
 from envhub_worker.supervisor.witness import Witness
 
 
@@ -40,7 +40,7 @@ def test_what_a_jail_was_denied_is_known_when_it_is_ended() -> None:
     tried = CallDenied("socket", "AF_INET")
     jail: Any = _Jail(tried, RunnerExited(1, None, 9, "signal"))
     silent: Any = _Silent()
-    entry = JailEntry(7, "one", b"", jail, (), silent)
+    entry = JailRecord(7, "one", b"", jail, (), silent)
     events = JailEvents(silent, silent, {7: entry}, silent, Witness())
     try:
         events.end(entry, whole_jail("protocol"))
@@ -66,7 +66,7 @@ def test_a_jail_that_cannot_be_heard_any_more_ends_alone() -> None:
     failures: list[str] = []
     jail: Any = Unheard()
     silent: Any = _Silent()
-    entry = JailEntry(7, "one", b"", jail, (), silent)
+    entry = JailRecord(7, "one", b"", jail, (), silent)
     events = JailEvents(silent, silent, {7: entry}, silent, Told())
     try:
         events.end(entry, whole_jail("protocol"))

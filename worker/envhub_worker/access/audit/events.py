@@ -14,7 +14,7 @@ from envhub_worker.protocol.keys import KEY_BYTES, key_text
 from envhub_worker.protocol.messages import busy
 from envhub_worker.protocol.messages.busy import Busy
 from envhub_worker.protocol.text import shortage
-from envhub_worker.supervisor.records import Asker, JailEntry
+from envhub_worker.supervisor.records import Asker, JailRecord
 from envhub_worker.supervisor.witness import Witness
 
 
@@ -66,7 +66,7 @@ class Events(Witness):
         level = "warning" if "error" in said else "info"
         self._client(owner, "packages", level, seconds=seconds, **fields)
 
-    def refused(self, asker: Asker, refused: m.Refused) -> None:
+    def refused(self, asker: Asker, refused: m.Refusal) -> None:
         """A request was not done. Who waits in line asks every second: that is said once."""
         owner, level = asker.session or asker.key, "warning"
         fields: dict[str, object] = {"error": refused.error, "why": refused.message}
@@ -81,7 +81,7 @@ class Events(Witness):
 
     # --- jails ---------------------------------------------------------------------------------
 
-    def opened(self, entry: JailEntry, runners: int, seconds: float) -> None:
+    def opened(self, entry: JailRecord, runners: int, seconds: float) -> None:
         """A jail has come up, or further runners in it."""
         spec = entry.jail.spec
         self._in_line -= {one for one in self._in_line if one[0] == entry.session}
@@ -98,19 +98,19 @@ class Events(Witness):
         }
         self._client(entry.session, "jail_opened", "info", **fields)
 
-    def lost(self, entry: JailEntry, death: m.Died) -> None:
+    def lost(self, entry: JailRecord, death: m.Death) -> None:
         """A runner has died in a jail that goes on."""
         fields = {**_jail(entry), "environment": entry.name, "runner": death.runner, **_how(death)}
         self._client(entry.session, "runner_died", "warning", **fields)
 
-    def died(self, entry: JailEntry) -> None:
+    def died(self, entry: JailRecord) -> None:
         """A jail is dead; where it could not be made, its refusal says so."""
         refused = entry.death is not None and entry.death.reason == "unavailable"
         if entry.death is not None and (entry.opened or not refused):
             fields = {**_jail(entry), "environment": entry.name, **_how(entry.death), **_use(entry)}
             self._client(entry.session, "jail_died", "warning", **fields)
 
-    def closed(self, entry: JailEntry) -> None:
+    def closed(self, entry: JailRecord) -> None:
         """Nothing is left of a jail that its client has closed, or that the server ends with."""
         fields = {**_jail(entry), "environment": entry.name, **_use(entry)}
         self._client(entry.session, "jail_closed", "info", **fields)
@@ -137,11 +137,11 @@ def session_id(owner: bytes) -> str:
     return owner[KEY_BYTES:].hex()[:8]
 
 
-def _jail(entry: JailEntry) -> dict[str, object]:
+def _jail(entry: JailRecord) -> dict[str, object]:
     return {"jail": f"{entry.number:016x}"}
 
 
-def _how(death: m.Died) -> dict[str, object]:
+def _how(death: m.Death) -> dict[str, object]:
     """Trust: the detail may quote a jail."""
     fields = {
         "reason": death.reason,
@@ -152,7 +152,7 @@ def _how(death: m.Died) -> dict[str, object]:
     return {name: value for name, value in fields.items() if value is not None}
 
 
-def _use(entry: JailEntry) -> dict[str, object]:
+def _use(entry: JailRecord) -> dict[str, object]:
     """Over the server; what goes through shared memory is not counted."""
     sent, received = entry.bytes_moved()
     return {"seconds": monotonic() - entry.since, "bytes_in": sent, "bytes_out": received}

@@ -21,7 +21,7 @@ from envhub_worker.access.audit.usage import Usage
 from envhub_worker.access.quotas import Permissions, Quotas
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.text import printable
-from envhub_worker.supervisor.records import JailEntry
+from envhub_worker.supervisor.records import JailRecord
 
 MAX_CLIENTS = 256
 """Names that are kept apart; what comes after them is one."""
@@ -133,7 +133,7 @@ class Client:
     opened: int = 0
     requests: dict[str, int] = field(default_factory=dict)
 
-    def add_jail(self, entry: JailEntry) -> None:
+    def add_jail(self, entry: JailRecord) -> None:
         """Count an open jail."""
         self.jails += 1
         self.runners += len(entry.links)

@@ -1,4 +1,4 @@
-"""Snapshots that clients bring along, by content.
+"""Uploads of snapshots: the listing is checked, files arrive in pieces, a tree is made of them.
 
 ::
 
@@ -91,7 +91,7 @@ class Uploads:
 
     def offer(
         self, owner: bytes, key: bytes, request: m.OfferSnapshot, in_use: Collection[str]
-    ) -> m.Wanted:
+    ) -> m.MissingBlobs:
         """What is missing of a snapshot. Nothing: it lies ready.
 
         Args:
@@ -107,7 +107,7 @@ class Uploads:
         if store.tree(digest).is_dir():
             if store.has_all(digest, files):
                 os.utime(store.tree(digest))
-                return m.Wanted(PREFIX + digest, ())
+                return m.MissingBlobs(PREFIX + digest, ())
             store.set_aside(digest)
         sizes = {file.sha256: file.size for file in files}
         missing = {sha: size for sha, size in sizes.items() if not store.blob(sha).exists()}
@@ -121,7 +121,7 @@ class Uploads:
         except BaseException:
             self.forget(owner)
             raise
-        return m.Wanted(PREFIX + digest, tuple(missing))
+        return m.MissingBlobs(PREFIX + digest, tuple(missing))
 
     def _lay_out(
         self, owner: bytes, digest: str, files: list[ListedFile], in_use: Collection[str]

@@ -3,7 +3,7 @@
 A resource limit counts one process, and misses files in memory (memfd), shared anonymous memory
 and what waits in sockets and pipes. So init looks at all processes of the jail, the sooner the
 nearer they are to the limit, and ends them over it. What it cannot see the filter denies
-(``seccomp.policy.table``, "measured") or the kernel bounds; ``plan`` names what remains.
+(``seccomp.policy.policy_table``, "measured") or the kernel bounds; ``plan`` names what remains.
 """
 
 from __future__ import annotations

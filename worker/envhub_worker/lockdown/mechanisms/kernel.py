@@ -6,7 +6,7 @@ import ctypes
 import os
 import struct
 
-from envhub_worker.lockdown.seccomp.syscalls import number
+from envhub_worker.lockdown.seccomp.syscalls import syscall_number
 
 _libc = ctypes.CDLL(None, use_errno=True)
 _libc.syscall.restype = ctypes.c_long
@@ -76,14 +76,14 @@ def unmount(target: str) -> None:
 
 def pivot_root(new_root: str, put_old: str) -> None:
     """``pivot_root(2)``."""
-    syscall(number("pivot_root"), os.fsencode(new_root), os.fsencode(put_old))
+    syscall(syscall_number("pivot_root"), os.fsencode(new_root), os.fsencode(put_old))
 
 
 def clone_tree(path: str) -> int:
     """A detached copy of the mounts at and below ``path``, as a descriptor."""
     flags = _OPEN_TREE_CLONE | _OPEN_TREE_CLOEXEC | _AT_RECURSIVE
     try:
-        return syscall(number("open_tree"), _AT_FDCWD, os.fsencode(path), flags)
+        return syscall(syscall_number("open_tree"), _AT_FDCWD, os.fsencode(path), flags)
     except OSError as error:
         raise OSError(error.errno, error.strerror, path) from None
 
@@ -91,20 +91,27 @@ def clone_tree(path: str) -> int:
 def restrict_tree(tree: int, attributes: int, *, userns: int = 0) -> None:
     """Add mount ``attributes`` (``ATTR_*``) to the detached ``tree``."""
     words = struct.pack("=QQQQ", attributes, 0, 0, userns)
-    syscall(number("mount_setattr"), tree, b"", _AT_EMPTY_PATH | _AT_RECURSIVE, words, len(words))
+    syscall(
+        syscall_number("mount_setattr"),
+        tree,
+        b"",
+        _AT_EMPTY_PATH | _AT_RECURSIVE,
+        words,
+        len(words),
+    )
 
 
 def restrict_mount(path: str, attributes: int) -> None:
     """Add mount ``attributes`` to the one mount at ``path``."""
     words = struct.pack("=QQQQ", attributes, 0, 0, 0)
-    syscall(number("mount_setattr"), _AT_FDCWD, os.fsencode(path), 0, words, len(words))
+    syscall(syscall_number("mount_setattr"), _AT_FDCWD, os.fsencode(path), 0, words, len(words))
 
 
 def attach_tree(tree: int, path: str) -> None:
     """Attach the detached ``tree`` at ``path``; the descriptor stays the caller's."""
     words = (b"", _AT_FDCWD, os.fsencode(path), _MOVE_MOUNT_F_EMPTY_PATH)
     try:
-        syscall(number("move_mount"), tree, *words)
+        syscall(syscall_number("move_mount"), tree, *words)
     except OSError as error:
         raise OSError(error.errno, error.strerror, path) from None
 
@@ -113,7 +120,7 @@ def capget() -> tuple[int, int, int]:
     """This thread's (effective, permitted, inheritable) capabilities as bit masks."""
     header = struct.pack("=Ii", _CAPABILITY_VERSION_3, 0)
     data = ctypes.create_string_buffer(24)
-    _checked(_libc.syscall(ctypes.c_long(number("capget")), header, data))
+    _checked(_libc.syscall(ctypes.c_long(syscall_number("capget")), header, data))
     words = struct.unpack("=6I", data.raw)
     effective, permitted, inheritable = (words[n] | words[n + 3] << 32 for n in range(3))
     return effective, permitted, inheritable
@@ -124,7 +131,7 @@ def capset(effective: int, permitted: int, inheritable: int) -> None:
     header = struct.pack("=Ii", _CAPABILITY_VERSION_3, 0)
     low = [mask & 0xFFFFFFFF for mask in (effective, permitted, inheritable)]
     high = [mask >> 32 for mask in (effective, permitted, inheritable)]
-    syscall(number("capset"), header, struct.pack("=6I", *low, *high))
+    syscall(syscall_number("capset"), header, struct.pack("=6I", *low, *high))
 
 
 def _checked(result: int, path: str | None = None) -> int:

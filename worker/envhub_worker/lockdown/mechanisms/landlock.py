@@ -13,8 +13,8 @@ import struct
 from collections.abc import Iterable
 
 from envhub_worker.lockdown.layers import LayerUnavailableError
-from envhub_worker.lockdown.mechanisms.kernel import syscall
-from envhub_worker.lockdown.seccomp.syscalls import number
+from envhub_worker.lockdown.mechanisms import kernel
+from envhub_worker.lockdown.seccomp.syscalls import syscall_number
 from envhub_worker.protocol.records import dataclass
 
 _VERSION = 1
@@ -37,7 +37,7 @@ _SCOPE_ABSTRACT_UNIX_SOCKET, _SCOPE_SIGNAL = 1, 2
 
 
 @dataclass(frozen=True)
-class Rule:
+class LandlockRule:
     """What is permitted at and below a path."""
 
     path: str
@@ -75,12 +75,12 @@ def scopes(abi: int) -> bool:
 def version() -> int:
     """The ABI that this kernel offers, or 0."""
     try:
-        return syscall(number("landlock_create_ruleset"), None, 0, _VERSION)
+        return kernel.syscall(syscall_number("landlock_create_ruleset"), None, 0, _VERSION)
     except OSError:
         return 0
 
 
-def restrict(wanted: Ruleset, rules: Iterable[Rule]) -> None:
+def restrict(wanted: Ruleset, rules: Iterable[LandlockRule]) -> None:
     """Enforce ``wanted`` on this thread for good. ``no_new_privs`` must be set.
 
     A rule whose path does not exist is left out: it would permit nothing.
@@ -93,18 +93,18 @@ def restrict(wanted: Ruleset, rules: Iterable[Rule]) -> None:
         # A kernel refuses a structure that is longer than its own, unless the rest is zero; the
         # first ones know the first field only.
         size = 24 if wanted.scope else 16 if wanted.tcp else 8
-        fd = syscall(number("landlock_create_ruleset"), words, size, 0)
+        fd = kernel.syscall(syscall_number("landlock_create_ruleset"), words, size, 0)
         try:
             for rule in rules:
                 _add(fd, rule, wanted.files)
-            syscall(number("landlock_restrict_self"), fd, 0)
+            kernel.syscall(syscall_number("landlock_restrict_self"), fd, 0)
         finally:
             os.close(fd)
     except OSError as error:
         raise unavailable(error) from error
 
 
-def _add(ruleset_fd: int, rule: Rule, handled: int) -> None:
+def _add(ruleset_fd: int, rule: LandlockRule, handled: int) -> None:
     try:
         path = os.open(rule.path, os.O_PATH | os.O_CLOEXEC)
     except FileNotFoundError:
@@ -114,7 +114,9 @@ def _add(ruleset_fd: int, rule: Rule, handled: int) -> None:
         if not stat.S_ISDIR(os.fstat(path).st_mode):
             access &= _ON_FILES
         words = struct.pack("=Qi", access, path)
-        syscall(number("landlock_add_rule"), ruleset_fd, _RULE_PATH_BENEATH, words, 0)
+        kernel.syscall(
+            syscall_number("landlock_add_rule"), ruleset_fd, _RULE_PATH_BENEATH, words, 0
+        )
     finally:
         os.close(path)
 

@@ -10,8 +10,8 @@ import os
 import signal
 from collections.abc import Iterable
 
-from envhub_worker.lockdown.mechanisms.kernel import capget, capset, prctl, syscall
-from envhub_worker.lockdown.seccomp.syscalls import number
+from envhub_worker.lockdown.mechanisms import kernel
+from envhub_worker.lockdown.seccomp.syscalls import syscall_number
 
 _PR_SET_PDEATHSIG = 1
 _PR_SET_DUMPABLE = 4
@@ -31,51 +31,51 @@ def die_with_parent(parent: int, signum: int = signal.SIGKILL) -> None:
     Arm again after every change of user: that clears it. A parent that has already gone sends
     nothing, so that is checked after arming.
     """
-    prctl(_PR_SET_PDEATHSIG, signum)
+    kernel.prctl(_PR_SET_PDEATHSIG, signum)
     if os.getppid() != parent:
         os.kill(os.getpid(), signal.SIGKILL)
 
 
 def set_dumpable(dumpable: bool) -> None:
     """Say whether same-user processes may trace this one and read its memory."""
-    prctl(_PR_SET_DUMPABLE, int(dumpable))
+    kernel.prctl(_PR_SET_DUMPABLE, int(dumpable))
 
 
 def become_subreaper() -> None:
     """Adopt the orphans among our descendants."""
-    prctl(_PR_SET_CHILD_SUBREAPER, 1)
+    kernel.prctl(_PR_SET_CHILD_SUBREAPER, 1)
 
 
 def set_no_new_privileges() -> None:
     """Let no later ``execve`` gain anything: set-user-id bits and file capabilities are dead."""
-    prctl(_PR_SET_NO_NEW_PRIVS, 1)
+    kernel.prctl(_PR_SET_NO_NEW_PRIVS, 1)
 
 
 def has_no_new_privileges() -> bool:
     """Whether ``set_no_new_privileges`` holds for this thread."""
-    return prctl(_PR_GET_NO_NEW_PRIVS) == 1
+    return kernel.prctl(_PR_GET_NO_NEW_PRIVS) == 1
 
 
 def drop_capabilities() -> None:
     """Empty the bounding, ambient, inheritable, permitted and effective sets."""
     empty_the_bounding_set()
-    prctl(_PR_CAP_AMBIENT, _PR_CAP_AMBIENT_CLEAR_ALL)
-    capset(0, 0, 0)
+    kernel.prctl(_PR_CAP_AMBIENT, _PR_CAP_AMBIENT_CLEAR_ALL)
+    kernel.capset(0, 0, 0)
 
 
 def held_capabilities() -> int:
     """Mask of what this thread has, may have or may pass on."""
-    effective, permitted, inheritable = capget()
+    effective, permitted, inheritable = kernel.capget()
     return effective | permitted | inheritable
 
 
 def empty_the_bounding_set() -> None:
     """Let no later ``execve`` bring a capability in. Nothing happens without the right to."""
-    if not capget()[0] >> _CAP_SETPCAP & 1:
+    if not kernel.capget()[0] >> _CAP_SETPCAP & 1:
         return
     for capability in range(64):
         try:
-            prctl(_PR_CAPBSET_DROP, capability)
+            kernel.prctl(_PR_CAPBSET_DROP, capability)
         except OSError as error:
             if error.errno != errno.EINVAL:
                 raise
@@ -94,7 +94,7 @@ def close_all_but(keep: Iterable[int]) -> None:
 
 def _close_range(low: int, high: int) -> None:
     try:
-        syscall(number("close_range"), low, high, 0)
+        kernel.syscall(syscall_number("close_range"), low, high, 0)
     except OSError as error:
         if error.errno != errno.ENOSYS:
             raise

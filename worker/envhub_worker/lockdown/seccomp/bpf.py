@@ -49,7 +49,7 @@ class Branch:
 
 
 @dataclass(frozen=True)
-class Instruction:
+class BpfInstruction:
     """One ``struct sock_filter``."""
 
     code: int
@@ -61,7 +61,7 @@ class Instruction:
 Item = Label | Do | Branch
 
 
-def assemble(items: Sequence[Item]) -> list[Instruction]:
+def assemble(items: Sequence[Item]) -> list[BpfInstruction]:
     """Resolve the labels. A jump over more than 255 instructions becomes a pair.
 
     Raises:
@@ -83,7 +83,7 @@ def assemble(items: Sequence[Item]) -> list[Instruction]:
         for target, skip in zip(branch.targets, skips[index], strict=True):
             if skip < 0:
                 raise ValueError(f"label {target!r} lies behind its branch")
-    program: list[Instruction] = []
+    program: list[BpfInstruction] = []
     for index, item in enumerate(items):
         program += _encode(item, places[index], labels, far=index in far)
     if len(program) > _MAX_INSTRUCTIONS:
@@ -107,32 +107,32 @@ def _lay_out(items: Sequence[Item], far: set[int]) -> tuple[list[int], dict[str,
     return places, labels
 
 
-def _encode(item: Item, place: int, labels: dict[str, int], *, far: bool) -> list[Instruction]:
+def _encode(item: Item, place: int, labels: dict[str, int], *, far: bool) -> list[BpfInstruction]:
     if isinstance(item, Label):
         return []
     if isinstance(item, Do):
-        return [Instruction(item.code, 0, 0, item.k)]
+        return [BpfInstruction(item.code, 0, 0, item.k)]
     if not far:
         ends = (item.if_true, item.if_false)
         if_true, if_false = (0 if end is None else labels[end] - place - 1 for end in ends)
-        return [Instruction(item.code, if_true, if_false, item.k)]
+        return [BpfInstruction(item.code, if_true, if_false, item.k)]
     # the comparison skips to one of up to two unconditional jumps, or over them
     targets = item.targets
     skip_true = len(targets) if item.if_true is None else 0
     skip_false = len(targets) if item.if_false is None else len(targets) - 1
     jumps = [
-        Instruction(_JUMP, 0, 0, labels[target] - place - 2 - slot)
+        BpfInstruction(_JUMP, 0, 0, labels[target] - place - 2 - slot)
         for slot, target in enumerate(targets)
     ]
-    return [Instruction(item.code, skip_true, skip_false, item.k), *jumps]
+    return [BpfInstruction(item.code, skip_true, skip_false, item.k), *jumps]
 
 
-def to_bytes(program: Sequence[Instruction]) -> bytes:
+def to_bytes(program: Sequence[BpfInstruction]) -> bytes:
     """As the kernel reads it: an array of ``struct sock_filter``."""
     return b"".join(struct.pack("=HBBI", i.code, i.if_true, i.if_false, i.k) for i in program)
 
 
-def listing(program: Sequence[Instruction]) -> str:
+def listing(program: Sequence[BpfInstruction]) -> str:
     """One line per instruction, for people and golden files."""
     names = {
         LOAD: "load",

@@ -8,7 +8,7 @@ import os
 from collections.abc import Mapping
 
 from envhub_worker.lockdown.layers import LayerUnavailableError, no_system_calls
-from envhub_worker.lockdown.mechanisms.kernel import prctl, syscall
+from envhub_worker.lockdown.mechanisms import kernel
 from envhub_worker.lockdown.seccomp import bpf
 from envhub_worker.lockdown.seccomp.bpf import Branch, Do, Item, Label
 from envhub_worker.lockdown.seccomp.policy import (
@@ -18,10 +18,10 @@ from envhub_worker.lockdown.seccomp.policy import (
     ByArguments,
     Check,
     Verdict,
-    recorded,
-    table,
+    policy_table,
+    recorded_calls,
 )
-from envhub_worker.lockdown.seccomp.syscalls import NUMBERS, number
+from envhub_worker.lockdown.seccomp.syscalls import NUMBERS, syscall_number
 
 _AUDIT_ARCH = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}
 # The x32 ABI reaches the same calls under numbers that a table does not list.
@@ -48,19 +48,19 @@ def compile_filter(
     scoped: bool = True,
     record: bool = False,
 ) -> bytes:
-    """The program for ``machine`` as bytes; see ``policy.table``, and ``recorded`` if ``record``.
+    """The program for ``machine`` as bytes; see ``policy_table``; ``recorded_calls`` if ``record``.
 
     Raises:
         LayerUnavailableError: No table for this machine.
     """
     conditions = {"brokered": brokered, "measured": measured, "scoped": scoped}
-    verdicts = table(namespaced=namespaced, network=network, **conditions)
+    verdicts = policy_table(namespaced=namespaced, network=network, **conditions)
     if record:
-        verdicts = recorded(verdicts, NUMBERS.get(machine, ()))
+        verdicts = recorded_calls(verdicts, NUMBERS.get(machine, ()))
     return bpf.to_bytes(program(machine, verdicts))
 
 
-def program(machine: str, verdicts: Mapping[str, Verdict]) -> list[bpf.Instruction]:
+def program(machine: str, verdicts: Mapping[str, Verdict]) -> list[bpf.BpfInstruction]:
     """Architecture first, then a balanced tree over the numbers, then the argument checks."""
     if machine not in NUMBERS:
         raise no_system_calls(machine)
@@ -173,7 +173,7 @@ def install(compiled: bytes, *, brokered: bool = False) -> int:
     try:
         if brokered:
             return _listener(ctypes.addressof(header))
-        prctl(_PR_SET_SECCOMP, _MODE_FILTER, ctypes.addressof(header))
+        kernel.prctl(_PR_SET_SECCOMP, _MODE_FILTER, ctypes.addressof(header))
     except OSError as error:
         raise LayerUnavailableError(
             "seccomp",
@@ -191,13 +191,15 @@ def _listener(place: int) -> int:
     to ask anew where its handler has calls restarted.
     """
     try:
-        return syscall(number("seccomp"), _SET_MODE_FILTER, _NEW_LISTENER | WAIT_KILLABLE, place)
+        return kernel.syscall(
+            syscall_number("seccomp"), _SET_MODE_FILTER, _NEW_LISTENER | WAIT_KILLABLE, place
+        )
     except OSError as error:
         if error.errno != errno.EINVAL:
             raise
-    return syscall(number("seccomp"), _SET_MODE_FILTER, _NEW_LISTENER, place)
+    return kernel.syscall(syscall_number("seccomp"), _SET_MODE_FILTER, _NEW_LISTENER, place)
 
 
 def installed() -> bool:
     """Whether a filter holds for this thread."""
-    return prctl(_PR_GET_SECCOMP) == _MODE_FILTER
+    return kernel.prctl(_PR_GET_SECCOMP) == _MODE_FILTER

@@ -1,6 +1,7 @@
-"""Signals of a jail without a pid namespace, where Landlock cannot scope them (before ABI 6).
+"""Init's answers to calls that the filter hands over: signals, and calls that are recorded.
 
-The filter hands ``kill``, ``tkill`` and ``tgkill`` to init, which sends the signal when the
+In a jail without a pid namespace, where Landlock cannot scope signals (before ABI 6), the filter
+hands ``kill``, ``tkill`` and ``tgkill`` to init, which sends the signal when the
 target is a process of the jail. All of their arguments are numbers in registers, so nothing can
 change between the check and the act; a target is held by a pidfd before it is looked at, so no
 other process can take its pid. The kernel goes on with what a process sends to itself:
@@ -20,11 +21,10 @@ import struct
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
 
-from envhub_worker.lockdown.mechanisms import procfs
-from envhub_worker.lockdown.mechanisms.kernel import syscall
+from envhub_worker.lockdown.mechanisms import kernel, procfs
 from envhub_worker.lockdown.seccomp.policy import refusal
-from envhub_worker.lockdown.seccomp.syscalls import c_int, name_of, number
-from envhub_worker.lockdown.seccomp.targets import NAMING, OTHER, PRETENDED, is_another
+from envhub_worker.lockdown.seccomp.syscalls import c_int, syscall_name, syscall_number
+from envhub_worker.lockdown.seccomp.targets import NAMING, OTHER, PRETENDED, is_another_target
 
 _RECEIVE = 0xC0502100
 _SEND = 0xC0182101
@@ -99,7 +99,7 @@ def serve(
     caller = procfs.process_of(thread)
     request = Request(thread, caller, call, (first, second, third), tuple(words), still_waits)
     note(request)  # before the caller goes on: what it did is known when it is looked for
-    name = name_of(request.call)
+    name = syscall_name(request.call)
     if name in permitted:
         answer = _PROCEED
     elif name in _SIGNALS:
@@ -120,8 +120,8 @@ MOST_FILES = 32
 
 def detail(request: Request) -> str:
     """Of the arguments of a call what the kernel itself reads in a register."""
-    call = name_of(request.call)
-    if call in NAMING and is_another(call, request.arguments, request.caller, os.getpid()):
+    call = syscall_name(request.call)
+    if call in NAMING and is_another_target(call, request.arguments, request.caller, os.getpid()):
         return OTHER
     if call not in ("socket", "socketpair"):
         return ""
@@ -154,9 +154,9 @@ def decide(request: Request, inside: _Inside) -> Answer:
     first, second, third = request.arguments
     if request.caller == 0:
         return Answer(errno.ESRCH)
-    if request.call == number("kill"):
+    if request.call == syscall_number("kill"):
         return _kill(request.caller, first, second, inside)
-    if request.call == number("tkill"):
+    if request.call == syscall_number("tkill"):
         if first == request.thread:
             return _PROCEED
         return _send_to_thread(procfs.process_of(first), first, second, inside)
@@ -193,8 +193,8 @@ def _send(pid: int, signum: int, inside: _Inside) -> int:
 def _send_to_thread(pid: int, thread: int, signum: int, inside: _Inside) -> Answer:
     if pid <= 0 or thread <= 0:
         return Answer(errno.ESRCH)
-    tgkill = number("tgkill")
-    return Answer(_held(pid, inside, lambda _: syscall(tgkill, pid, thread, signum)))
+    tgkill = syscall_number("tgkill")
+    return Answer(_held(pid, inside, lambda _: kernel.syscall(tgkill, pid, thread, signum)))
 
 
 def _held(pid: int, inside: _Inside, act: Callable[[int], object]) -> int:

@@ -15,7 +15,7 @@ from collections.abc import Callable, Collection, Sequence
 from typing import BinaryIO
 
 from envhub_worker.lockdown.seccomp.syscalls import c_int
-from envhub_worker.lockdown.seccomp.targets import never_was
+from envhub_worker.lockdown.seccomp.targets import never_a_target
 from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.text import printable
 
@@ -226,7 +226,7 @@ def _addressed(memory: BinaryIO, place: int, size: int, thread: int, own: OwnPat
 
 def _may(deed: str, path: str, own: OwnPaths) -> bool:
     if deed == "read":
-        is_private = _PRIVATE.fullmatch(path) is not None or never_was(path)
+        is_private = _PRIVATE.fullmatch(path) is not None or never_a_target(path)
         return not is_private or _is_within(path, own.read)
     return _is_within(path, own.changed)
 

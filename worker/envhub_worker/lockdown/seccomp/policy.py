@@ -134,7 +134,7 @@ _PR_DENIED = (4, 8, 22, 24, 28, 35, 47, 59)
 _ARCH_PRCTLS = (0x1001, 0x1002, 0x1003, 0x1004, 0x1021, 0x1022, 0x1023)
 
 
-def table(
+def policy_table(
     *,
     namespaced: bool,
     network: str,
@@ -167,7 +167,7 @@ def table(
     return verdicts
 
 
-def recorded(verdicts: Mapping[str, Verdict], names: Iterable[str]) -> dict[str, Verdict]:
+def recorded_calls(verdicts: Mapping[str, Verdict], names: Iterable[str]) -> dict[str, Verdict]:
     """The same, where init answers what is denied, and so knows that it was tried.
 
     What is not there at all (ENOSYS), or only seems to work, is no attempt at anything: libraries
@@ -178,13 +178,13 @@ def recorded(verdicts: Mapping[str, Verdict], names: Iterable[str]) -> dict[str,
         names: Every call that there is.
     """
     denied = {name: _asking(name, verdicts.get(name, EPERM)) for name in names}
-    seen: dict[str, Verdict] = dict.fromkeys(watched(verdicts), ASK)
+    seen: dict[str, Verdict] = dict.fromkeys(watched_calls(verdicts), ASK)
     if "sendto" in seen:  # a connected socket names no other
         seen["sendto"] = ByArguments((((Check(4, 0, wide=True),), ALLOW),), ASK)
     return denied | {name: verdict for name, verdict in seen.items() if name in denied}
 
 
-def watched(verdicts: Mapping[str, Verdict]) -> frozenset[str]:
+def watched_calls(verdicts: Mapping[str, Verdict]) -> frozenset[str]:
     """What names files and processes, where nothing of it is denied: init lets the kernel go on.
 
     Not so where arguments decide: the kernel would make the call without looking at them again.

@@ -95,7 +95,9 @@ _COMMON = """
 
 
 def _numbered(names: str) -> dict[str, int]:
-    table = {name: number for number, name in enumerate(names.split()) if name != "-"}
+    table = {
+        name: syscall_number for syscall_number, name in enumerate(names.split()) if name != "-"
+    }
     return table | {name: _COMMON_FROM + n for n, name in enumerate(_COMMON.split())}
 
 
@@ -103,7 +105,7 @@ def _numbered(names: str) -> dict[str, int]:
 NUMBERS = {"x86_64": _numbered(_X86_64), "aarch64": _numbered(_AARCH64)}
 
 
-def number(name: str) -> int:
+def syscall_number(name: str) -> int:
     """The number of ``name`` on this machine.
 
     Raises:
@@ -113,7 +115,7 @@ def number(name: str) -> int:
 
 
 @functools.cache
-def name_of(call: int) -> str:
+def syscall_name(call: int) -> str:
     """The name of a call of this machine by its number."""
     numbers = NUMBERS[os.uname().machine]
     return next((name for name, one in numbers.items() if one == call), f"call {call}")

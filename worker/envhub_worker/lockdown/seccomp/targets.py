@@ -26,7 +26,7 @@ _FIRST = 1
 _ENTRY = re.compile(r"/proc/(\d{1,18})(/.*)?", re.DOTALL)
 
 
-def is_another(call: str, arguments: Sequence[int], caller: int, init: int) -> bool:
+def is_another_target(call: str, arguments: Sequence[int], caller: int, init: int) -> bool:
     """Whether a call is about a process outside of its jail, init among these.
 
     Args:
@@ -45,7 +45,7 @@ def is_another(call: str, arguments: Sequence[int], caller: int, init: int) -> b
     return _is_outside(number, caller, init)
 
 
-def never_was(path: str) -> bool:
+def never_a_target(path: str) -> bool:
     """Whether a path is below the entry of a process that the jail cannot have met."""
     entry = _ENTRY.fullmatch(path)
     return entry is not None and _never_was(int(entry[1]))

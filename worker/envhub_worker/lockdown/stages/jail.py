@@ -29,6 +29,15 @@ def enter(spec: JailSpec, common: Common, folder: str) -> tuple[Scratch, View]:
     Raises:
         LayerUnavailableError: The host lacks a layer that the profile names.
     """
+    # In this order. Without namespaces there is little to do here: this process gives up what it
+    # could regain, looks at the entry with the rights that are left, and cannot be traced from then
+    # on. Under ``strict`` everything is mounted first, which takes the rights in the user namespace
+    # that owns the mounts. The entry is looked at afterwards, as the jail sees it. Then this
+    # process leaves for a user namespace below: no process of the jail owns a mount any more, and
+    # none can be undone. What the kernel counts is forbidden with the rights that the new namespace
+    # gives; only then are these dropped. The change of credentials disarms the signal at the
+    # parent's death, so that is set again, last (``_leave_the_zygote``). Runners are forked after
+    # all of it.
     if not common.namespaced:
         process.set_no_new_privileges()
         _check_readable(spec)

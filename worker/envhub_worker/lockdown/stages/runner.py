@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping
 
 from envhub_worker.lockdown.context import JailContext
 from envhub_worker.lockdown.mechanisms import landlock, process
-from envhub_worker.lockdown.mechanisms.landlock import DEVICE, READ, READ_DIR, WRITE, Rule
+from envhub_worker.lockdown.mechanisms.landlock import DEVICE, READ, READ_DIR, WRITE, LandlockRule
 from envhub_worker.lockdown.seccomp import filter
 from envhub_worker.lockdown.seccomp.paths import OwnPaths
 from envhub_worker.lockdown.stages import selftest
@@ -87,7 +87,7 @@ def enter(
     selftest.run(jail, descriptors)
 
 
-def rules(jail: JailContext, pid: int) -> list[Rule]:
+def rules(jail: JailContext, pid: int) -> list[LandlockRule]:
     """What Landlock permits a runner; everything else it denies.
 
     Args:
@@ -100,10 +100,10 @@ def rules(jail: JailContext, pid: int) -> list[Rule]:
     readable += ["/proc", "/etc", "/dev"] if common.namespaced else [*_HOST_FILES, *own_files]
     writable = _writable(jail)
     return [
-        *(Rule(path, READ) for path in readable),
-        *([] if common.namespaced else [Rule(own, READ_DIR)]),
-        *(Rule(path, WRITE) for path in writable),
-        *(Rule(path, DEVICE) for path in common.devices),
+        *(LandlockRule(path, READ) for path in readable),
+        *([] if common.namespaced else [LandlockRule(own, READ_DIR)]),
+        *(LandlockRule(path, WRITE) for path in writable),
+        *(LandlockRule(path, DEVICE) for path in common.devices),
     ]
 
 
@@ -113,7 +113,7 @@ def _writable(jail: JailContext) -> list[str]:
     return [scratch.home, scratch.temporary, scratch.work, *shared, *jail.view.shared]
 
 
-def own(jail: JailContext, pid: int, thread: int) -> OwnPaths:
+def runner_paths(jail: JailContext, pid: int, thread: int) -> OwnPaths:
     """What a process may change and read, by the names that it has for it."""
     streams = ("/dev/fd", "/dev/stdin", "/dev/stdout", "/dev/stderr")
     itself = ("/proc/self", "/proc/thread-self", f"/proc/{pid}", f"/proc/{thread}")

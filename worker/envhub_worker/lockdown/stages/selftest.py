@@ -11,10 +11,9 @@ from functools import partial
 
 from envhub_worker.lockdown.context import JailContext
 from envhub_worker.lockdown.layers import LayerUnavailableError
-from envhub_worker.lockdown.mechanisms import process
-from envhub_worker.lockdown.mechanisms.kernel import CLONE_NEWUSER, mount, syscall, unshare
+from envhub_worker.lockdown.mechanisms import kernel, process
 from envhub_worker.lockdown.seccomp import filter
-from envhub_worker.lockdown.seccomp.syscalls import number
+from envhub_worker.lockdown.seccomp.syscalls import syscall_number
 
 _PTRACE_ATTACH = 16
 _RLIMIT_CORE = 4
@@ -40,11 +39,13 @@ def run(jail: JailContext, descriptors: Iterable[int]) -> None:
 def _denials(jail: JailContext) -> dict[str, Callable[[], object]]:
     init = os.getppid()
     denials: dict[str, Callable[[], object]] = {
-        "no user namespace can be made": lambda: unshare(CLONE_NEWUSER),
-        "nothing can be mounted": lambda: mount("none", "/tmp", "tmpfs"),
-        "init cannot be traced": lambda: syscall(number("ptrace"), _PTRACE_ATTACH, init, 0, 0),
-        "init's limits cannot be changed": lambda: syscall(
-            number("prlimit64"), init, _RLIMIT_CORE, 0, 0
+        "no user namespace can be made": lambda: kernel.unshare(kernel.CLONE_NEWUSER),
+        "nothing can be mounted": lambda: kernel.mount("none", "/tmp", "tmpfs"),
+        "init cannot be traced": lambda: kernel.syscall(
+            syscall_number("ptrace"), _PTRACE_ATTACH, init, 0, 0
+        ),
+        "init's limits cannot be changed": lambda: kernel.syscall(
+            syscall_number("prlimit64"), init, _RLIMIT_CORE, 0, 0
         ),
     }
     if jail.spec.snapshot in jail.view.refused:

@@ -20,11 +20,10 @@ import envhub_worker
 from envhub_worker.lockdown import gpus, root_plan
 from envhub_worker.lockdown.context import Common, ZygoteConfig
 from envhub_worker.lockdown.layers import LayerUnavailableError
-from envhub_worker.lockdown.mechanisms import landlock, mounts, namespaces, process, user
-from envhub_worker.lockdown.mechanisms.kernel import CLONE_NEWNS, unshare
+from envhub_worker.lockdown.mechanisms import kernel, landlock, mounts, namespaces, process, user
 from envhub_worker.lockdown.plan import needs_broker
 from envhub_worker.lockdown.seccomp.filter import compile_filter
-from envhub_worker.lockdown.seccomp.policy import table, watched
+from envhub_worker.lockdown.seccomp.policy import policy_table, watched_calls
 
 
 def enter(config: ZygoteConfig) -> Common:
@@ -74,7 +73,9 @@ def enter(config: ZygoteConfig) -> Common:
     )
     seen: frozenset[str] = frozenset()
     if config.record:  # the same for both filters: memory makes no difference to files and signals
-        seen = watched(table(namespaced=namespaced, network=config.network, brokered=brokered))
+        seen = watched_calls(
+            policy_table(namespaced=namespaced, network=config.network, brokered=brokered)
+        )
     return Common(
         config=config,
         pid=0 if namespaced else os.getpid(),
@@ -133,7 +134,7 @@ def _enter_namespaces(config: ZygoteConfig, plan: root_plan.RootPlan) -> None:
     # sight.
     try:
         if config.user is not None:
-            unshare(CLONE_NEWNS)
+            kernel.unshare(kernel.CLONE_NEWNS)
             enter_root()
             _become(config, signal.SIGKILL)
         namespaces.enter_user_namespace(os.getuid(), os.getgid())

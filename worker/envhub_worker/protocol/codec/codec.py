@@ -12,7 +12,7 @@ from collections.abc import Sequence
 
 from envhub_worker.protocol.codec.decoder import Decoder, TensorMaker, ThingReader, Unpickler
 from envhub_worker.protocol.codec.encoder import Describer, Encoder, Pickler
-from envhub_worker.protocol.codec.frames import check_outgoing, split
+from envhub_worker.protocol.codec.frames import check_outgoing_frames, split_frames
 from envhub_worker.protocol.codec.inert import RemoteEnum, RemoteObject
 from envhub_worker.protocol.codec.kinds import Buffer
 from envhub_worker.protocol.errors import LocalProtocolError
@@ -55,7 +55,7 @@ def encode(
         from envhub_worker.protocol.codec.explain import explain
 
         raise LocalProtocolError(explain(value, error, limits, pickler, names)) from error
-    check_outgoing(frames, limits)
+    check_outgoing_frames(frames, limits)
     return frames
 
 
@@ -87,5 +87,5 @@ def decode(
         MessageTooLargeError: Over one of ``limits``.
         RemoteProtocolError: Malformed in any other way.
     """
-    document, tail, buffers = split(frames, limits)
+    document, tail, buffers = split_frames(frames, limits)
     return Decoder(tail, buffers, limits, unpickler, tensors, things, copy).value(document)

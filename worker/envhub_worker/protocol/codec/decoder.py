@@ -15,7 +15,7 @@ from envhub_worker.protocol.codec.inert import (
     MAX_REPR_CHARS,
     RemoteEnum,
     RemoteObject,
-    describe,
+    inert_copy,
     one_line,
 )
 from envhub_worker.protocol.codec.kinds import Buffer
@@ -50,7 +50,7 @@ class _Head:
 class Decoder:
     """Rebuilds one value; msgpack calls its hooks in the order of the document.
 
-    The arguments are those of ``codec.decode``, with the parts of ``frames.split``; ``arrays``
+    The arguments are those of ``codec.decode``, with the parts of ``split_frames``; ``arrays``
     stands in for the ``ArrayReader`` of these.
     """
 
@@ -181,10 +181,10 @@ def _distinct(keys: list[Any]) -> list[Any]:
     lossy = _LOSSY | {getattr(sys.modules.get("numpy"), "ndarray", tuple)}
     for key in keys:
         if key.__class__ in lossy:
-            key = key if _is_hashable(key) else describe(key)
+            key = key if _is_hashable(key) else inert_copy(key)
             seen[key] += 1
             if seen[key] > 1:
-                same = key if isinstance(key, RemoteObject) else describe(key)
+                same = key if isinstance(key, RemoteObject) else inert_copy(key)
                 key = RemoteObject(same.type_name, f"{same.text} #{seen[key]}")
         made.append(key)
     return made
@@ -199,9 +199,9 @@ def _is_hashable(key: object) -> bool:
 
 
 def _read_scalar(decoder: Decoder, payload: bytes) -> object:
-    from envhub_worker.protocol.codec.numpy_forms import read_scalar
+    from envhub_worker.protocol.codec.numpy_forms import read_numpy_scalar
 
-    return read_scalar(payload)
+    return read_numpy_scalar(payload)
 
 
 def _read_integer(decoder: Decoder, payload: bytes) -> object:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import msgpack  # type: ignore[import-untyped]
 
 from envhub_worker.protocol.codec import kinds, structure
-from envhub_worker.protocol.codec.inert import RemoteEnum, RemoteObject, describe, describe_enum
+from envhub_worker.protocol.codec.inert import RemoteEnum, RemoteObject, inert_copy, inert_enum
 from envhub_worker.protocol.codec.kinds import Buffer
 from envhub_worker.protocol.errors import LocalProtocolError
 from envhub_worker.protocol.limits import WireLimits
@@ -84,7 +84,7 @@ class Encoder:
             found = None if self.describer is None else self.describer(value)
             if found is not None:
                 return [_HEADS[found[0]], found[1]]
-            return self.default(describe(value))
+            return self.default(inert_copy(value))
         try:
             data = self.pickler(value)
         except Exception as error:
@@ -116,7 +116,7 @@ def _write_pickled(encoder: Encoder, pickled: PickledValue) -> object:
 def _write_other(encoder: Encoder, value: Any) -> object:
     """Handles subclasses, arrays and tensors of other libraries, and the unknown."""
     if isinstance(value, Enum):
-        return [_HEADS[kinds.ENUM], *describe_enum(value), value.value]
+        return [_HEADS[kinds.ENUM], *inert_enum(value), value.value]
     if "numpy" in sys.modules:
         form = _numpy_writer()(encoder, value)
         if form is not NotImplemented:
@@ -136,7 +136,7 @@ def _numpy_writer() -> Callable[[Encoder, Any], object]:
     from envhub_worker.protocol.codec import numpy_forms
 
     _WRITERS.update(numpy_forms.WRITERS)
-    return numpy_forms.write_other
+    return numpy_forms.write_numpy
 
 
 def _headed(code: int) -> Callable[[Encoder, Any], object]:

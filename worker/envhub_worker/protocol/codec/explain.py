@@ -8,7 +8,7 @@ from enum import Enum
 import numpy as np
 
 from envhub_worker.protocol.codec.encoder import Encoder, Pickler
-from envhub_worker.protocol.codec.inert import describe, one_line, type_name
+from envhub_worker.protocol.codec.inert import inert_copy, one_line, type_name
 from envhub_worker.protocol.limits import WireLimits
 
 Path = tuple[object, ...]
@@ -125,4 +125,4 @@ def _path_text(path: tuple[object, ...]) -> str:
 
 
 def _step_text(step: object) -> str:
-    return describe(step).text
+    return inert_copy(step).text

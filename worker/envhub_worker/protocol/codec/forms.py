@@ -15,7 +15,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast
 
 from envhub_worker.protocol.codec.decoder import Decoder
-from envhub_worker.protocol.codec.frames import check_outgoing, split
+from envhub_worker.protocol.codec.frames import check_outgoing_frames, split_frames
 from envhub_worker.protocol.codec.kinds import DOCUMENT_BYTES, Buffer
 from envhub_worker.protocol.errors import MessageTooLargeError
 from envhub_worker.protocol.limits import WireLimits
@@ -86,7 +86,7 @@ class Outgoing:
     __slots__ = ("_head", "_in_header", "limits")
 
     def __init__(self, frames: list[Buffer], arrays: list[Array], limits: WireLimits) -> None:
-        document, tail, buffers = split(frames, limits)
+        document, tail, buffers = split_frames(frames, limits)
         self.limits = limits
         self._head = DOCUMENT_BYTES.pack(len(document)) + document
         longest = len(self._head) + len(tail)
@@ -110,7 +110,7 @@ class Outgoing:
         for array in arrays:
             writer.add(array)
         frames: list[Buffer] = [b"".join((self._head, *writer.tail)), *writer.frames]
-        check_outgoing(frames, self.limits)
+        check_outgoing_frames(frames, self.limits)
         return frames
 
 

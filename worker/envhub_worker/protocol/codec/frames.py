@@ -13,7 +13,7 @@ from envhub_worker.protocol.errors import (
 from envhub_worker.protocol.limits import WireLimits
 
 
-def check_outgoing(frames: Sequence[Buffer], limits: WireLimits) -> None:
+def check_outgoing_frames(frames: Sequence[Buffer], limits: WireLimits) -> None:
     """Raises ``LocalProtocolError`` for frames that the receiver will not accept."""
     try:
         _check_sizes(frames, limits)
@@ -21,7 +21,9 @@ def check_outgoing(frames: Sequence[Buffer], limits: WireLimits) -> None:
         raise LocalProtocolError(f"The message is too large to be sent: {error}") from None
 
 
-def split(frames: Sequence[Buffer], limits: WireLimits) -> tuple[bytes, Buffer, list[Buffer]]:
+def split_frames(
+    frames: Sequence[Buffer], limits: WireLimits
+) -> tuple[bytes, Buffer, list[Buffer]]:
     """Checks the frames' sizes; returns document, tail of the header, and the other frames.
 
     Raises:

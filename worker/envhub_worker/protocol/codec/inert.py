@@ -58,7 +58,7 @@ def one_line(text: str, max_chars: int = MAX_REPR_CHARS) -> str:
     return line if len(text) <= max_chars >= len(line) else line[:max_chars] + "..."
 
 
-def describe(value: object) -> RemoteObject:
+def inert_copy(value: object) -> RemoteObject:
     """Turns any object into its inert description. A ``__repr__`` that raises is reported."""
     try:
         # Addresses make equal things look different.
@@ -68,7 +68,7 @@ def describe(value: object) -> RemoteObject:
     return RemoteObject(type_name(type(value)), one_line(text))
 
 
-def describe_enum(member: Enum) -> tuple[str, str]:
+def inert_enum(member: Enum) -> tuple[str, str]:
     """Returns the qualified class name and the name of a member, both printable."""
     name = member.name if isinstance(member.name, str) else str(member)
     return type_name(type(member)), one_line(name, MAX_NAME_CHARS)

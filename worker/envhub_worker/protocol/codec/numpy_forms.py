@@ -55,7 +55,7 @@ def _write_tensor(encoder: Encoder, tensor: Any) -> object:
     return [msgpack.ExtType(kinds.TENSOR, name.encode()), array]
 
 
-def write_other(encoder: Encoder, value: Any) -> object:
+def write_numpy(encoder: Encoder, value: Any) -> object:
     """The form of a subclass, or of another library's array; NotImplemented of all else."""
     if isinstance(value, np.generic):
         return _write_scalar(encoder, value)
@@ -82,7 +82,7 @@ WRITERS: dict[type, Callable[[Encoder, Any], object]] = {
 """By the exact type."""
 
 
-def read_scalar(data: bytes) -> np.generic:
+def read_numpy_scalar(data: bytes) -> np.generic:
     """A numpy scalar. Trust: input from the worker.
 
     Raises:
@@ -128,10 +128,10 @@ def _build_tensor(payload: bytes, items: list[Any], tensors: Tensors) -> object:
         raise RemoteProtocolError("A tensor is not made of a fitting array.")
     if tensors is not None:
         return tensors(array, name)
-    return widened(array) if name == "bfloat16" else array
+    return widened_numpy(array) if name == "bfloat16" else array
 
 
-def widened(bits: Array) -> Array:
+def widened_numpy(bits: Array) -> Array:
     """The float32 of bfloat16 bits."""
     wide: Array = (bits.astype(np.uint32) << np.uint32(16)).view(np.float32)
     return wide

@@ -21,7 +21,7 @@ MAX_FPS = 1_000_000.0
 _NUMBERS = (int, float, np.integer, np.floating)
 
 
-def read_metadata(value: object) -> dict[str, Any]:
+def read_metadata_facts(value: object) -> dict[str, Any]:
     """Free data for people, except for the keys that Gymnasium acts on: those are typed."""
     metadata = string_keys(value, "metadata")
     _count(metadata, MAX_METADATA)
@@ -65,7 +65,7 @@ _METADATA_OF_GYMNASIUM: dict[str, Callable[[object], bool]] = {
 }
 
 
-def read_spec(value: object) -> dict[str, Any] | None:
+def read_spec_facts(value: object) -> dict[str, Any] | None:
     """The facts of an ``EnvSpec``. Whatever else a worker says there is left out.
 
     The rest of its fields are instructions: which code makes the environment, with which

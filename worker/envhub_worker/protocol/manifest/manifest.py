@@ -14,7 +14,7 @@ import gymnasium as gym
 
 from envhub_worker.protocol.errors import RemoteProtocolError
 from envhub_worker.protocol.limits import MAX_NUM_ENVS
-from envhub_worker.protocol.manifest.facts import read_metadata, read_spec
+from envhub_worker.protocol.manifest.facts import read_metadata_facts, read_spec_facts
 from envhub_worker.protocol.manifest.names import (
     MAX_NAMES,
     checked_key,
@@ -181,9 +181,9 @@ def _decode_env(value: object, reader: SpaceReader) -> EnvManifest:
         shardable=_typed(fields, "shardable", bool),
         sync=_typed(fields, "sync", bool),
         autoreset_mode=mode,
-        metadata=read_metadata(fields["metadata"]),
+        metadata=read_metadata_facts(fields["metadata"]),
         render_mode=optional_name(fields["render_mode"], "render_mode"),
-        spec=read_spec(fields["spec"]),
+        spec=read_spec_facts(fields["spec"]),
         attributes=_attributes(fields["attributes"]),
         type_name=checked_name(fields["type_name"], "type_name"),
         **spaces,

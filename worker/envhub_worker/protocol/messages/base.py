@@ -7,7 +7,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from envhub_worker.protocol.errors import RemoteProtocolError
-from envhub_worker.protocol.records import About, Frozen
+from envhub_worker.protocol.records import About, FrozenRecord
 
 if TYPE_CHECKING:
     from typing_extensions import dataclass_transform
@@ -44,7 +44,7 @@ KINDS: dict[int, type[Message]] = {}
 
 
 @dataclass_transform(frozen_default=True)
-class Message(Frozen):
+class Message(FrozenRecord):
     """Base of all messages; ``kind`` is its number on the wire and never changes.
 
     ``FIELDS`` are what a class annotates, in the order in which they travel. ``HANDED`` are those

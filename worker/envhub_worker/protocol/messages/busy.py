@@ -1,6 +1,6 @@
 """What a refusal for want of room says: which quota, how much is used, when to ask again.
 
-It travels in ``Refused``, whose ``error`` is then ``ServerBusyError``: ``missing`` is the quota's
+It travels in ``Refusal``, whose ``error`` is then ``ServerBusyError``: ``missing`` is the quota's
 name, ``fix`` three numbers. A client that knows nothing of it has a ``WorkerError`` with the text.
 """
 

@@ -1,7 +1,7 @@
 """Lossless compression of a message's large frames, where both sides have agreed on it.
 
-A ``Packed`` header goes in front of the frames and says how large each was. It is worth it on a
-network, for frames that shrink (rendered images do, noise does not): a sample tells.
+A ``CompressionHeader`` goes in front of the frames and says how large each was. It is worth it on
+a network, for frames that shrink (rendered images do, noise does not): a sample tells.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def pack_frames(frames: Sequence[Buffer], compression: str) -> list[Buffer]:
         return list(frames)
     sizes = [-1 if n is None else _size(f) for n, f in zip(packed, frames, strict=True)]
     bodies = [f if n is None else n for n, f in zip(packed, frames, strict=True)]
-    return [*m.pack_header(m.Packed(compression, tuple(sizes)), 0), *bodies]
+    return [*m.pack_header(m.CompressionHeader(compression, tuple(sizes)), 0), *bodies]
 
 
 def _packed(frame: Buffer, block: Any) -> bytes | None:
@@ -58,13 +58,13 @@ def unpack_frames(frames: Sequence[Buffer], limits: WireLimits) -> list[Buffer]:
 
     Raises:
         MessageTooLargeError: Over ``limits`` once unpacked.
-        RemoteProtocolError: What is there is not what ``Packed`` says.
+        RemoteProtocolError: What is there is not what ``CompressionHeader`` says.
     """
     if not frames or m.number_of(frames[0]) != 0:
         return list(frames)
     header = m.unpack([m.without_id(frames[0])], limits=limits)
-    if not isinstance(header, m.Packed):
-        raise RemoteProtocolError("the id 0 stands before Packed alone")
+    if not isinstance(header, m.CompressionHeader):
+        raise RemoteProtocolError("the id 0 stands before CompressionHeader alone")
     bodies = list(frames[1:])
     _check(header, bodies, limits)
     unpack = _unpacker(header.compression)
@@ -74,11 +74,11 @@ def unpack_frames(frames: Sequence[Buffer], limits: WireLimits) -> list[Buffer]:
     ]
 
 
-def _check(header: m.Packed, bodies: Sequence[Buffer], limits: WireLimits) -> None:
+def _check(header: m.CompressionHeader, bodies: Sequence[Buffer], limits: WireLimits) -> None:
     if len(header.sizes) != len(bodies):
-        raise RemoteProtocolError("Packed does not fit its frames")
+        raise RemoteProtocolError("CompressionHeader does not fit its frames")
     if any(type(size) is not int or size < -1 for size in header.sizes):
-        raise RemoteProtocolError("Packed has a size that is none")
+        raise RemoteProtocolError("CompressionHeader has a size that is none")
     total = sum(_size(b) if s == -1 else s for b, s in zip(bodies, header.sizes, strict=True))
     if max(header.sizes, default=0) > limits.frame_bytes or total > limits.message_bytes:
         raise MessageTooLargeError(f"{total} bytes when unpacked are over the limit.")

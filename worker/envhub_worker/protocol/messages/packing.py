@@ -18,7 +18,7 @@ from envhub_worker.protocol.codec import forms
 from envhub_worker.protocol.codec.codec import encode
 from envhub_worker.protocol.codec.decoder import Decoder, TensorMaker, ThingReader, Unpickler
 from envhub_worker.protocol.codec.encoder import Describer, Pickler
-from envhub_worker.protocol.codec.frames import split
+from envhub_worker.protocol.codec.frames import split_frames
 from envhub_worker.protocol.codec.kinds import Buffer
 from envhub_worker.protocol.errors import LocalProtocolError, RemoteProtocolError
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
@@ -26,7 +26,7 @@ from envhub_worker.protocol.messages.base import KINDS, Message, check_fields, v
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _NUMBER = struct.Struct(">Q")
-"""The id in front of a header between client and server. 0 stands before ``Packed`` alone."""
+"""The id in front of a header between client and server; 0 for ``CompressionHeader`` alone."""
 _MOST = (1 << 63) - 1
 _OUTGOING: forms.Forms[Any, forms.Outgoing] = forms.Forms()
 _INCOMING: forms.Forms[bytes, forms.Incoming[Message]] = forms.Forms()
@@ -117,7 +117,7 @@ def unpack(
         RemoteProtocolError: The peer broke the rules.
     """
     with UNTRUSTED:
-        document, tail, buffers = split(frames, limits)
+        document, tail, buffers = split_frames(frames, limits)
         form = _INCOMING.get(document)
         if form is not None and form.limits is limits:
             return form.message(tail, buffers)

@@ -14,7 +14,7 @@ from envhub_worker.protocol.codec.kinds import Buffer
 from envhub_worker.protocol.errors import MessageTooLargeError, RemoteProtocolError
 from envhub_worker.protocol.messages.base import Message, values_of
 from envhub_worker.protocol.messages.packing import pack, unpack
-from envhub_worker.protocol.messages.runner import Changed, Warned
+from envhub_worker.protocol.messages.runner import Changes, Warnings
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
 MAX_CATEGORY = 256
@@ -102,7 +102,7 @@ def _attribute(value: object) -> Attribute:
     return number, name
 
 
-WARNINGS = Prefix(Warned, 4 * (MAX_CATEGORY + MAX_TEXT), _warning)
+WARNINGS = Prefix(Warnings, 4 * (MAX_CATEGORY + MAX_TEXT), _warning)
 """What the repository has warned of."""
-CHANGES = Prefix(Changed, 4 * MAX_ATTRIBUTE, _attribute)
+CHANGES = Prefix(Changes, 4 * MAX_ATTRIBUTE, _attribute)
 """Attributes that have another value than the client was last given. They are watched no more."""

@@ -6,7 +6,7 @@ from envhub_worker.protocol.messages.base import Message
 
 
 class Load(Message, kind=64, asks="make_env", handed=("cfg", "env_kwargs")):
-    """Import the entry file and call its ``make_env``. Reply: ``Loaded`` or ``Raised``.
+    """Import the entry file and call its ``make_env``. Reply: ``LoadDone`` or ``RaisedException``.
 
     ``cfg`` holds the ``vars()`` of the caller's config object, or None.
     """
@@ -17,14 +17,14 @@ class Load(Message, kind=64, asks="make_env", handed=("cfg", "env_kwargs")):
     env_kwargs: dict[str, object]
 
 
-class Loaded(Message, kind=65):
+class LoadDone(Message, kind=65):
     """What the repository's ``make_env`` returned: see ``manifest.decode_manifest``."""
 
     manifest: dict[str, object]
 
 
 class Build(Message, kind=66):
-    """Build sub-environments ``start`` to ``stop`` of a task as ``env``. Reply: ``Built``.
+    """Build sub-environments ``start`` to ``stop`` of a task as ``env``. Reply: ``BuildDone``.
 
     The reply's manifest is that of the built slice.
     """
@@ -36,7 +36,7 @@ class Build(Message, kind=66):
     stop: int
 
 
-class Built(Message, kind=67):
+class BuildDone(Message, kind=67):
     """The slice is ready: see ``manifest.decode_env``."""
 
     manifest: dict[str, object]
@@ -199,7 +199,8 @@ class FetchInfosApart(Message, kind=85):
 class LoadTask(Message, kind=86, asks="make_env", handed=("cfg", "env_kwargs")):
     """As ``Load``, where the client knows what comes back: nothing is described, nor built for it.
 
-    Reply: ``Value`` of the task's ``(num_envs, shardable)``, None if there is none, or ``Raised``.
+    Reply: ``Value`` of the task's ``(num_envs, shardable)``, None if there is none, or
+    ``RaisedException``.
     """
 
     n_envs: int
@@ -216,7 +217,7 @@ class Value(Message, kind=87):
     value: object
 
 
-class Warned(Message, kind=88):
+class Warnings(Message, kind=88):
     """In front of the frames of a reply: what the repository has warned of. See ``warnings``.
 
     ``((category, text), ...)``.
@@ -228,21 +229,21 @@ class Warned(Message, kind=88):
 class Watch(Message, kind=89, asks="call"):
     """As ``Call`` without arguments; from now on the runner says when that is not true any more.
 
-    Reply: ``Watched``.
+    Reply: ``WatchDone``.
     """
 
     env: int
     name: str
 
 
-class Watched(Message, kind=90):
-    """What ``Call`` would have answered, and whether it stays so until a ``Changed`` says other."""
+class WatchDone(Message, kind=90):
+    """What ``Call`` would have answered, and whether it stays so until a ``Changes`` says other."""
 
     value: object
     watched: bool
 
 
-class Changed(Message, kind=91):
+class Changes(Message, kind=91):
     """In front of the frames of a reply: what is another now, and watched no more. See ``changed``.
 
     ``((env, name), ...)``.
@@ -251,7 +252,7 @@ class Changed(Message, kind=91):
     attributes: tuple[object, ...]
 
 
-class Raised(Message, kind=92):
+class RaisedException(Message, kind=92):
     """The repository's code raised. ``builtin`` is its nearest builtin ancestor."""
 
     builtin: str

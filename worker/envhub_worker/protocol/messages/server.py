@@ -8,7 +8,7 @@ from envhub_worker.protocol.runtime import Runtime
 
 
 class Hello(Message, kind=1):
-    """The first request on every connection. Reply: ``Welcome`` or ``Refused``."""
+    """The first request on every connection. Reply: ``Welcome`` or ``Refusal``."""
 
     version: int
     session: bytes
@@ -23,7 +23,7 @@ class Welcome(Message, kind=2):
     pid: int
 
 
-class Refused(Message, kind=3):
+class Refusal(Message, kind=3):
     """The server did not do it. ``error`` is a name out of a table in the client.
 
     ``missing`` is the layer of the confinement that cannot be had, or the quota under which there
@@ -38,7 +38,7 @@ class Refused(Message, kind=3):
 
 
 class OpenJail(Message, kind=4):
-    """Fork a jail for a snapshot. Reply: ``JailOpened``, ``Refused`` or ``Died``.
+    """Fork a jail for a snapshot. Reply: ``JailOpened``, ``Refusal`` or ``Death``.
 
     ``confinement`` holds the fields of ``Confinement``, with ``limits`` as a nested mapping.
     ``python`` is the interpreter that runs the repository; empty for the server's own.
@@ -79,7 +79,7 @@ class StartRunners(Message, kind=6):
 class Relay(Message, kind=7):
     """Hand the frames that follow to runners: ``parts`` is ``((runner, frames), ...)``.
 
-    Reply: ``Relayed`` once every runner has answered, or ``Died``.
+    Reply: ``RelayDone`` once every runner has answered, or ``Death``.
     """
 
     jail: int
@@ -89,13 +89,13 @@ class Relay(Message, kind=7):
     """Whether the descriptors of each runner's last ``Deposit`` go with its frames: ``Attach``."""
 
 
-class Relayed(Message, kind=8):
+class RelayDone(Message, kind=8):
     """The runners' replies: ``parts`` is the number of frames of each, in the request's order."""
 
     parts: tuple[int, ...]
 
 
-class Died(Message, kind=9):
+class Death(Message, kind=9):
     """A process of the jail ended. Trust: ``tail`` is the jail's own output, escaped.
 
     ``runner`` is -1 where it was all of the jail.
@@ -121,9 +121,9 @@ class Done(Message, kind=11):
 
 
 class ReadOutput(Message, kind=12):
-    """Ask for the last lines that a jail printed. Reply: ``Output``, or ``Died``.
+    """Ask for the last lines that a jail printed. Reply: ``Output``, or ``Death``.
 
-    ``operation`` is what ``Died`` then says the client was waiting for.
+    ``operation`` is what ``Death`` then says the client was waiting for.
     """
 
     jail: int
@@ -168,19 +168,19 @@ TAKEN, NOT_YET = b"k", b"w"
 
 
 class KeepJail(Message, kind=17):
-    """From now on a runner's death does not end the jail. Reply: ``Done``, or ``Died``.
+    """From now on a runner's death does not end the jail. Reply: ``Done``, or ``Death``.
 
     A ``Relay`` to a runner that has died, or dies before it answers, is then answered with
-    ``RelayedPartly``; further runners can be started in its place.
+    ``RelayDonePartly``; further runners can be started in its place.
     """
 
     jail: int
 
 
-class RelayedPartly(Message, kind=18):
-    """As ``Relayed``, of a jail that is kept, where some runners have died.
+class RelayDonePartly(Message, kind=18):
+    """As ``RelayDone``, of a jail that is kept, where some runners have died.
 
-    ``dead`` holds their places in the request; what stands there is the server's own ``Died``,
+    ``dead`` holds their places in the request; what stands there is the server's own ``Death``,
     in one frame. What runners send never counts as such, whatever it says.
     """
 
@@ -189,12 +189,12 @@ class RelayedPartly(Message, kind=18):
 
 
 class OfferSnapshot(Message, kind=19):
-    """A snapshot's files, each ``(path, size, sha256)``. Reply: ``Wanted``, or ``Refused``."""
+    """A snapshot's files, each ``(path, size, sha256)``. Reply: ``MissingBlobs`` or ``Refusal``."""
 
     files: tuple[object, ...]
 
 
-class Wanted(Message, kind=20):
+class MissingBlobs(Message, kind=20):
     """The hashes that the server does not have. None: ``OpenJail`` may name ``snapshot``."""
 
     snapshot: str
@@ -218,12 +218,12 @@ class KeepAlive(Message, kind=22):
 
 
 class Agree(Message, kind=23):
-    """The compressions that the client can read, best first. Reply: ``Agreed``."""
+    """The compressions that the client can read, best first. Reply: ``Agreement``."""
 
     compressions: tuple[object, ...]
 
 
-class Agreed(Message, kind=24):
+class Agreement(Message, kind=24):
     """The compression of both directions from here on, or ``""``; and the server's patience.
 
     Jails of a client that is not heard from for ``idle_s`` seconds are ended; 0 means never.
@@ -233,7 +233,7 @@ class Agreed(Message, kind=24):
     idle_s: int
 
 
-class Packed(Message, kind=25):
+class CompressionHeader(Message, kind=25):
     """In front of a message's frames: some of them are compressed.
 
     ``sizes`` has one number for each frame that follows: its size when unpacked, or -1 for a
@@ -276,9 +276,9 @@ class OutputBytes(Message, kind=29):
 
 
 class ExpireIdle(Message, kind=30):
-    """End a jail whose runners do nothing for so many milliseconds. Reply: ``Done``, or ``Died``.
+    """End a jail whose runners do nothing for so many milliseconds. Reply: ``Done``, or ``Death``.
 
-    Later requests to it are answered with ``Died``, whose reason is ``"idle"``.
+    Later requests to it are answered with ``Death``, whose reason is ``"idle"``.
     """
 
     jail: int
@@ -286,7 +286,7 @@ class ExpireIdle(Message, kind=30):
 
 
 class NeedPackages(Message, kind=31):
-    """Ask a server on another host for a repository's packages. Reply: ``Packages`` or ``Refused``.
+    """Ask a server on another host for a repository's packages. Reply: ``Packages`` or ``Refusal``.
 
     It makes them in its own time, and says at once how far it is: the client asks again.
     ``requirements`` has pairs, a plain requirement and where it stands; ``supports`` are the
@@ -312,11 +312,11 @@ class NeedPackages(Message, kind=31):
 class Packages(Message, kind=32):
     """How far they are. ``state`` is ``"making"``, ``"made"``, or ``"own"`` for the server's own.
 
-    ``name`` is what ``OpenJail`` may call them, ``told`` a line for people. ``facts`` are the
+    ``name`` is what ``OpenJail`` may call them, ``progress`` a line for people. ``facts`` are the
     lock's hash and the pins.
     """
 
     state: str
     name: str
     facts: dict[str, object]
-    told: str
+    progress: str

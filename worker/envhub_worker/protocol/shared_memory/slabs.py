@@ -66,8 +66,8 @@ HEADER_WORDS = DTYPES + MAX_LEAVES
 HEADER_BYTES = HEADER_WORDS * 8
 
 DONE, RAISED, FETCH, COLUMNS = 1, 2, 3, 4
-"""Results and encoded infos are in the slab; an encoded ``Raised`` is; the infos must be fetched;
-the infos are columns (see ``columns``)."""
+"""Results and encoded infos are in the slab; an encoded ``RaisedException`` is; the infos must be
+fetched; the infos are columns (see ``columns``)."""
 
 ACTION_DTYPES = tuple(
     np.dtype(name)

@@ -25,7 +25,7 @@ from envhub_worker.protocol.spaces.opaque import (
     is_charset,
     is_shape,
 )
-from envhub_worker.protocol.spaces.seeded import nodes
+from envhub_worker.protocol.spaces.seeded import seeded_nodes
 
 # Children of one Dict, Tuple or OneOf; a batch of custom spaces is a Tuple of as many.
 MAX_CHILDREN = 65_536
@@ -100,7 +100,7 @@ class SpaceReader:
 
     def _start(self, space: Space, states: object, generator: GeneratorMaker) -> None:
         """Have a space and its parts draw what those of the worker would."""
-        parts = list(nodes(space))
+        parts = list(seeded_nodes(space))
         if type(states) is not list or len(states) != len(parts):
             raise RemoteProtocolError("A space does not have one generator for each part.")
         for index, (part, state) in enumerate(zip(parts, states, strict=True)):

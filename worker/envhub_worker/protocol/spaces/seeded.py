@@ -29,14 +29,14 @@ BIT_GENERATORS = (
 )
 
 
-def nodes(space: Space) -> Iterator[Space]:
+def seeded_nodes(space: Space) -> Iterator[Space]:
     """A space and all that it is made of, in a fixed order."""
     yield space
     for child in _children(space):
-        yield from nodes(child)
+        yield from seeded_nodes(child)
 
 
-def states_of(space: Space, single: Space | None = None) -> States | None:
+def seeded_states(space: Space, single: Space | None = None) -> States | None:
     """What each node's generator is to begin with, None for those that were not seeded.
 
     A number says that it is the very generator of an earlier node.
@@ -49,11 +49,11 @@ def states_of(space: Space, single: Space | None = None) -> States | None:
     Returns:
         None if there is nothing to tell.
     """
-    if single is not None and not all(map(_may_be_batched, nodes(single))):
+    if single is not None and not all(map(_may_be_batched, seeded_nodes(single))):
         return None
     found: States = []
     first: dict[int, int] = {}
-    for index, node in enumerate(nodes(space)):
+    for index, node in enumerate(seeded_nodes(space)):
         state = _state(node)
         # one that several share: the place of the first
         place = first.setdefault(id(getattr(node, "_np_random", None)), index)

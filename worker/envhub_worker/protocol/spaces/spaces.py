@@ -1,4 +1,4 @@
-"""Gymnasium spaces as plain values, and back with every claim checked.
+"""Gymnasium spaces to plain values; ``reader.py`` reads them back.
 
 Works with Gymnasium 0.26 to 1.4, which may differ between the two ends.
 """
@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from envhub_worker.protocol.codec.inert import MAX_NAME_CHARS, describe, one_line
+from envhub_worker.protocol.codec.inert import MAX_NAME_CHARS, inert_copy, one_line
 from envhub_worker.protocol.errors import LocalProtocolError
 from envhub_worker.protocol.spaces.opaque import (
     ARRAY_SPACES,
@@ -27,7 +27,7 @@ from envhub_worker.protocol.spaces.opaque import (
     is_shape,
 )
 from envhub_worker.protocol.spaces.reader import GENERATORS
-from envhub_worker.protocol.spaces.seeded import states_of
+from envhub_worker.protocol.spaces.seeded import seeded_states
 
 __all__ = ["ARRAY_SPACES", "OpaqueSpace", "encode_space"]
 
@@ -51,7 +51,7 @@ def encode_space(
         LocalProtocolError: Spaces nested deeper than 12.
     """
     described = _encode(space, 0)
-    states = states_of(space, single) if seeded else None
+    states = seeded_states(space, single) if seeded else None
     return described if states is None else {**described, GENERATORS: states}
 
 
@@ -63,7 +63,7 @@ def _encode(space: Any, depth: int) -> dict[str, object]:
 @singledispatch
 def _fields(space: Any, depth: int) -> tuple[Any, ...]:
     """The kind of a space, and the values of that kind's ``FIELDS``."""
-    about = describe(space)
+    about = inert_copy(space)
     shape = getattr(space, "shape", None)
     dtype = getattr(space, "dtype", None)
     dtype_text = "" if dtype is None else one_line(str(dtype), MAX_NAME_CHARS)

@@ -33,7 +33,7 @@ def unpacked(archive: Path) -> Path:
     """Its one folder, in a folder beside it."""
     folder = archive.parent / "tree"
     folder.mkdir()
-    return trees.unpack(archive, folder, "x 1.0")
+    return trees.unpack_tree(archive, folder, "x 1.0")
 
 
 def test_the_files_of_a_source_distribution(tmp_path: Path) -> None:
@@ -105,7 +105,7 @@ def test_bounds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(trees, "MAX_BYTES", 1000)
     monkeypatch.setattr(trees, "MAX_FILES", 1)
     with pytest.raises(PackagesTooLargeError):
-        trees.unpack(archive, tmp_path / "tree", "x")
+        trees.unpack_tree(archive, tmp_path / "tree", "x")
 
 
 def test_a_header_that_is_a_bomb(tmp_path: Path) -> None:
@@ -164,7 +164,7 @@ def test_a_file_that_is_not_as_long_as_it_says(tmp_path: Path) -> None:
     for data in (b"12", b"1234"):
         member = trees.Member(f"{len(data)}", 3, False, partial(io.BytesIO, data))
         with pytest.raises(PackageIntegrityError, match="size"):
-            trees.lay_out([member], tmp_path, "x")
+            trees.write_tree([member], tmp_path, "x")
 
 
 @pytest.mark.parametrize("data", [b"", b"no archive", gzip.compress(b"neither", mtime=0)])
@@ -177,7 +177,7 @@ def test_what_is_no_archive(tmp_path: Path, data: bytes) -> None:
     path = tmp_path / "x-1.0.rar"
     path.write_bytes(data)
     with pytest.raises(PackageIntegrityError, match=r"\.tar\.gz, \.tar\.bz2 and \.zip are read"):
-        trees.unpack(path, tmp_path, "x")
+        trees.unpack_tree(path, tmp_path, "x")
 
 
 def test_more_than_one_top(tmp_path: Path) -> None:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 
-from envhub_worker.lockdown.seccomp.bpf import Instruction
+from envhub_worker.lockdown.seccomp.bpf import BpfInstruction
 
 
-def run(program: Sequence[Instruction], arch: int, number: int, args: Sequence[int] = ()) -> int:
+def run(program: Sequence[BpfInstruction], arch: int, number: int, args: Sequence[int] = ()) -> int:
     """The verdict for one system call. It ends: every jump goes forward."""
     words = [*args, *[0] * (6 - len(args))]
     masked = [word & (2**64 - 1) for word in words]
@@ -29,7 +29,7 @@ def run(program: Sequence[Instruction], arch: int, number: int, args: Sequence[i
             place += one.if_true if _holds(one, accumulator) else one.if_false
 
 
-def _holds(one: Instruction, accumulator: int) -> bool:
+def _holds(one: BpfInstruction, accumulator: int) -> bool:
     return {
         0x15: accumulator == one.k,
         0x25: accumulator > one.k,

@@ -11,9 +11,9 @@ from envhub_worker.lockdown.seccomp.bpf import (
     JUMP_GREATER,
     LOAD,
     RETURN,
+    BpfInstruction,
     Branch,
     Do,
-    Instruction,
     Label,
     assemble,
     listing,
@@ -34,21 +34,21 @@ def test_branch_skips_to_its_labels() -> None:
         ]
     )
     assert program == [
-        Instruction(LOAD, 0, 0, 0),
-        Instruction(JUMP_EQUAL, 1, 0, 7),
-        Instruction(RETURN, 0, 0, 1),
-        Instruction(RETURN, 0, 0, 2),
+        BpfInstruction(LOAD, 0, 0, 0),
+        BpfInstruction(JUMP_EQUAL, 1, 0, 7),
+        BpfInstruction(RETURN, 0, 0, 1),
+        BpfInstruction(RETURN, 0, 0, 2),
     ]
 
 
 def test_bytes_are_the_kernels_structure() -> None:
     """code u16, jt u8, jf u8, k u32, in this machine's order."""
-    assert to_bytes([Instruction(0x15, 1, 2, 0x04030201)]) == bytes([0x15, 0, 1, 2, 1, 2, 3, 4])
+    assert to_bytes([BpfInstruction(0x15, 1, 2, 0x04030201)]) == bytes([0x15, 0, 1, 2, 1, 2, 3, 4])
 
 
 def test_listing_names_absolute_targets() -> None:
     """Golden files are read by people."""
-    program = [Instruction(LOAD, 0, 0, 4), Instruction(JUMP_GREATER, 0, 3, 9)]
+    program = [BpfInstruction(LOAD, 0, 0, 4), BpfInstruction(JUMP_GREATER, 0, 3, 9)]
     assert listing(program) == "   0 load 0x4\n   1 greater 0x9 ? 2 : 5\n"
 
 

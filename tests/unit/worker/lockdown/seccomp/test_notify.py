@@ -16,8 +16,8 @@ import pytest
 
 import envhub_worker
 from envhub_worker.lockdown.seccomp import filter, notify
-from envhub_worker.lockdown.seccomp.policy import table, watched
-from envhub_worker.lockdown.seccomp.syscalls import number
+from envhub_worker.lockdown.seccomp.policy import policy_table, watched_calls
+from envhub_worker.lockdown.seccomp.syscalls import syscall_number
 from tests.support.processes import eventually
 
 _ROUNDS = 20
@@ -85,7 +85,7 @@ def _waits(request: notify.Request) -> bool:
 def _answer(listener: int, note: Callable[[notify.Request], None]) -> None:
     poller = select.poll()
     poller.register(listener, select.POLLIN)
-    permitted = watched(table(namespaced=True, network="none"))
+    permitted = watched_calls(policy_table(namespaced=True, network="none"))
     try:
         while any(events & select.POLLIN for _, events in poller.poll(120_000)):
             notify.serve(listener, permitted, note)
@@ -111,5 +111,5 @@ def test_a_caller_that_has_gone_since_ends_nobody(to: str) -> None:
     gone = subprocess.Popen([sys.executable, "-c", ""])
     gone.wait()
     target = -gone.pid if to == "its group" else 1
-    asked = notify.Request(gone.pid, gone.pid, number("kill"), (target, 15, 0))
+    asked = notify.Request(gone.pid, gone.pid, syscall_number("kill"), (target, 15, 0))
     assert notify.decide(asked, list) == notify.Answer(errno.ESRCH)

@@ -10,7 +10,7 @@ import pytest
 
 from envhub_worker.lockdown.layers import LayerUnavailableError
 from envhub_worker.lockdown.seccomp import bpf, filter
-from envhub_worker.lockdown.seccomp.bpf import Instruction
+from envhub_worker.lockdown.seccomp.bpf import BpfInstruction
 from envhub_worker.lockdown.seccomp.policy import (
     ALLOW,
     ASK,
@@ -21,10 +21,10 @@ from envhub_worker.lockdown.seccomp.policy import (
     PRETEND,
     SHARED_BYTES,
     ByArguments,
-    recorded,
+    policy_table,
+    recorded_calls,
     refusal,
-    table,
-    watched,
+    watched_calls,
 )
 from envhub_worker.lockdown.seccomp.syscalls import NUMBERS
 from tests.unit.worker.lockdown.seccomp.bpf_machine import run
@@ -45,8 +45,8 @@ class Filter:
 
     def __init__(self, machine: str, namespaced: bool, network: str = "none", **more: bool) -> None:
         self.machine = machine
-        self.program: Sequence[Instruction] = filter.program(
-            machine, table(namespaced=namespaced, network=network, **more)
+        self.program: Sequence[BpfInstruction] = filter.program(
+            machine, policy_table(namespaced=namespaced, network=network, **more)
         )
 
     def __call__(self, name: str, *args: int) -> int:
@@ -59,7 +59,7 @@ class Filter:
 def test_program_is_the_golden_one(machine: str, namespaced: bool, network: str) -> None:
     """Any change of the compiled program shows in a review."""
     name = f"seccomp-{machine}-{'namespaced' if namespaced else 'bare'}-{network}.txt"
-    program = filter.program(machine, table(namespaced=namespaced, network=network))
+    program = filter.program(machine, policy_table(namespaced=namespaced, network=network))
     assert bpf.listing(program) == (GOLDEN / name).read_text()
 
 
@@ -79,7 +79,7 @@ def test_every_number_gets_the_verdict_of_the_table(
     machine: str, namespaced: bool, network: str
 ) -> None:
     """The search tree agrees with the table for every number to well above the highest."""
-    verdicts = table(namespaced=namespaced, network=network)
+    verdicts = policy_table(namespaced=namespaced, network=network)
     program = filter.program(machine, verdicts)
     names = {number: name for name, number in NUMBERS[machine].items()}
     for number in range(600):
@@ -340,9 +340,11 @@ def test_what_is_recorded_is_denied_all_the_same(
 
     With one exception: what would have been permitted whatever its arguments, and is only seen.
     """
-    plain = table(namespaced=namespaced, network=network)
-    asking, seen = recorded(plain, NUMBERS[machine]), watched(plain)
-    assert seen == watched(table(namespaced=namespaced, network=network, measured=True))
+    plain = policy_table(namespaced=namespaced, network=network)
+    asking, seen = recorded_calls(plain, NUMBERS[machine]), watched_calls(plain)
+    assert seen == watched_calls(
+        policy_table(namespaced=namespaced, network=network, measured=True)
+    )
     first, second = filter.program(machine, plain), filter.program(machine, asking)
     refused = set()
     for name, call in NUMBERS[machine].items():

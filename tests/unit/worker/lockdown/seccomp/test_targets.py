@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from envhub_worker.lockdown.seccomp.targets import is_another, never_was
+from envhub_worker.lockdown.seccomp.targets import is_another_target, never_a_target
 
 _NOBODY = 1 << 30
 """Numbers end long before."""
@@ -49,7 +49,7 @@ def test_what_is_not_below_init_is_another(
     def about(number: int, *, init: int) -> bool:
         before = (1,) if call == "ioprio_set" else (0,) * place
         words = (*before, number, signal.SIGTERM, signal.SIGTERM)
-        return is_another(call, words[:3], first, init)
+        return is_another_target(call, words[:3], first, init)
 
     assert not about(first, init=os.getpid())
     assert not about(second, init=os.getpid())
@@ -62,34 +62,34 @@ def test_what_is_not_below_init_is_another(
 def test_who_only_looks_signals_nobody(children: tuple[int, int]) -> None:
     """Groups and everybody are named by numbers below zero; a group of one's own may have ended."""
     first, second = children
-    assert not is_another("kill", (second, 0, 0), first, first)
-    assert is_another("kill", (-1, 15, 0), first, os.getpid())
-    assert is_another("kill", (-_NOBODY, 15, 0), first, os.getpid())
-    assert not is_another("kill", (-second, 15, 0), first, os.getpid())
-    assert not is_another("setpriority", (1, _NOBODY, 0), first, os.getpid())
+    assert not is_another_target("kill", (second, 0, 0), first, first)
+    assert is_another_target("kill", (-1, 15, 0), first, os.getpid())
+    assert is_another_target("kill", (-_NOBODY, 15, 0), first, os.getpid())
+    assert not is_another_target("kill", (-second, 15, 0), first, os.getpid())
+    assert not is_another_target("setpriority", (1, _NOBODY, 0), first, os.getpid())
 
 
 def test_who_has_ended_may_have_been_its_own() -> None:
     """Nothing is said of a number that is nobody's any more."""
     ended = subprocess.Popen(["true"])
     ended.wait()
-    assert not is_another("kill", (ended.pid, 15, 0), os.getpid(), os.getpid())
-    assert not never_was(f"/proc/{ended.pid}/stat")
+    assert not is_another_target("kill", (ended.pid, 15, 0), os.getpid(), os.getpid())
+    assert not never_a_target(f"/proc/{ended.pid}/stat")
 
 
 def test_a_path_names_a_process_that_nobody_can_have_met() -> None:
     """What a list of processes shows, or a child's number is, was there."""
-    assert never_was(f"/proc/{_NOBODY}/cmdline")
-    assert never_was(f"/proc/{_NOBODY}")
+    assert never_a_target(f"/proc/{_NOBODY}/cmdline")
+    assert never_a_target(f"/proc/{_NOBODY}")
     for path in (f"/proc/{os.getpid()}/cmdline", "/proc/self/cmdline", f"/home/{_NOBODY}"):
-        assert not never_was(path)
-    assert not never_was(f"/proc/{'9' * 5000}/cmdline")
+        assert not never_a_target(path)
+    assert not never_a_target(f"/proc/{'9' * 5000}/cmdline")
 
 
 def test_a_namespace_of_ones_own_has_come_to_fewer_numbers(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its first process knows the last one; elsewhere they may have begun again since."""
     most = int(Path("/proc/sys/kernel/pid_max").read_text())
-    assert not never_was(f"/proc/{most - 1}/cmdline")
+    assert not never_a_target(f"/proc/{most - 1}/cmdline")
     monkeypatch.setattr(os, "getpid", lambda: 1)
-    assert never_was(f"/proc/{most}/cmdline")
-    assert not never_was("/proc/1/cmdline")
+    assert never_a_target(f"/proc/{most}/cmdline")
+    assert not never_a_target("/proc/1/cmdline")

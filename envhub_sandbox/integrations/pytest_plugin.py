@@ -42,7 +42,7 @@ def envhub_env(request: pytest.FixtureRequest) -> Iterator[Any]:
     ref = request.config.getoption("--envhub-ref")
     if ref is None:
         pytest.fail("the fixture envhub_env needs --envhub-ref REF, as in --envhub-ref .")
-    from envhub_sandbox.api import make_env
+    from envhub_sandbox.factory.make_env import make_env
 
     marks = request.node.iter_markers(_MARK)
     options: dict[str, Any] = {}

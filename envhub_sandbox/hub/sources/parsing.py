@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from envhub_sandbox.hub.snapshot import Snapshot
-from envhub_sandbox.sources import parser
+from envhub_sandbox.hub.sources import parser
 
 MOST_BYTES = 256 << 10
 """Of one file."""

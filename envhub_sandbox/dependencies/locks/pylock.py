@@ -26,7 +26,7 @@ from envhub_sandbox.dependencies.builds.sources import Source, WheelOrigin, of_g
 from envhub_sandbox.dependencies.resolve import Lock, Target, torch_options
 from envhub_sandbox.errors import LockError, PackageIntegrityError
 from envhub_sandbox.hub.logins import without_login
-from envhub_sandbox.sources import toml
+from envhub_sandbox.hub.sources import toml
 
 MAX_CHARACTERS = 16 * 1024 * 1024
 MAX_PACKAGES = 2000
@@ -56,7 +56,7 @@ class Wheel:
 
 
 @dataclass(frozen=True)
-class Package:
+class PylockPackage:
     """A package at one version, with the files that it may be installed from."""
 
     name: str
@@ -73,13 +73,13 @@ class Package:
         return " \\\n".join([f"{self.name}=={self.version}", *hashes]) + "\n"
 
 
-def pins(packages: Sequence[Package]) -> Lock:
+def pins(packages: Sequence[PylockPackage]) -> Lock:
     """What is installed for them."""
     lock = Lock("".join(package.pin for package in packages))
     return replace(lock, options=torch_options(lock))
 
 
-def described(lock: Lock, python: str) -> tuple[Package, ...]:
+def described(lock: Lock, python: str) -> tuple[PylockPackage, ...]:
     """The pins with their files, as the index has them now, for the interpreter at this path.
 
     Raises ``PackageIntegrityError`` where no file of a package is one that the pins permit.
@@ -92,7 +92,7 @@ def described(lock: Lock, python: str) -> tuple[Package, ...]:
     for package in found:
         origin = next((built[one.sha256] for one in package.wheels if one.sha256 in built), None)
         if origin is not None:
-            kept.append(Package(package.name, package.version, (), origin))
+            kept.append(PylockPackage(package.name, package.version, (), origin))
             continue
         wheels = tuple(wheel for wheel in package.wheels if wheel.sha256 in permitted)
         if not wheels:
@@ -100,13 +100,13 @@ def described(lock: Lock, python: str) -> tuple[Package, ...]:
                 f"the index has {package.name}=={package.version}, but no file of it for {python} "
                 "with a hash that was chosen. Choose again: envhub lock --upgrade"
             )
-        kept.append(Package(package.name, package.version, wheels))
+        kept.append(PylockPackage(package.name, package.version, wheels))
     return tuple(kept)
 
 
 def listed(
     versions: Sequence[str], python: str, options: Sequence[str] = (), *, refresh: bool = False
-) -> tuple[Package, ...]:
+) -> tuple[PylockPackage, ...]:
     """What the index has of each ``name==version``. Raises as ``uv.run``."""
     text = uv.run(
         [
@@ -131,7 +131,7 @@ def document(text: str, where: str) -> dict[str, Any]:
         raise LockError(f"{where} is no TOML of a lock file: {error}") from error
 
 
-def read(document: Mapping[str, Any], where: str) -> tuple[Package, ...]:
+def read(document: Mapping[str, Any], where: str) -> tuple[PylockPackage, ...]:
     """The packages in a lock file, sorted by name. Raises ``LockError``."""
     if document.get("lock-version") != "1.0":
         raise LockError(f"{where} is no lock file of version 1.0")
@@ -145,7 +145,7 @@ def read(document: Mapping[str, Any], where: str) -> tuple[Package, ...]:
     return tuple(sorted(found, key=lambda package: package.name))
 
 
-def _package(given: object, where: str) -> Package:
+def _package(given: object, where: str) -> PylockPackage:
     if not isinstance(given, dict):
         raise LockError(f"a package in {where} is no table")
     name, version = given.get("name"), given.get("version")
@@ -158,7 +158,7 @@ def _package(given: object, where: str) -> Package:
     except InvalidVersion as error:
         raise LockError(f"{name} in {where} has no version: {str(version)[:80]!r}") from error
     if origin := _origin(given, name, version, where):
-        return Package(name, version, (), origin)
+        return PylockPackage(name, version, (), origin)
     if others := sorted({"vcs", "directory", "archive", "marker"} & given.keys()):
         raise LockError(
             f"{name} in {where} has {', '.join(others)}; only wheels of an index are installed"
@@ -166,7 +166,9 @@ def _package(given: object, where: str) -> Package:
     wheels = given.get("wheels")
     if not isinstance(wheels, list) or not 1 <= len(wheels) <= MAX_WHEELS:
         raise LockError(f"{name} in {where} has no list of 1 to {MAX_WHEELS} wheels")
-    return Package(name, version, tuple(_wheel(wheel, f"{name} in {where}") for wheel in wheels))
+    return PylockPackage(
+        name, version, tuple(_wheel(wheel, f"{name} in {where}") for wheel in wheels)
+    )
 
 
 def _wheel(given: object, where: str) -> Wheel:
@@ -226,7 +228,7 @@ def _origins(lock: Lock) -> dict[str, WheelOrigin]:
     return {one.wheel: one for one in found}
 
 
-def written(packages: Sequence[Package]) -> str:
+def written(packages: Sequence[PylockPackage]) -> str:
     """The packages as the standard has them."""
     lines = []
     for package in packages:

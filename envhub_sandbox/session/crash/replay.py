@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from enum import Enum
 from typing import Any
 
-from envhub_sandbox.crash.bundle_reader import Bundle
-from envhub_sandbox.crash.bundle_writer import death_of
 from envhub_sandbox.errors import ActionError, RemoteEnvError, WorkerDiedError, WorkerTimeoutError
+from envhub_sandbox.session.crash.bundle_reader import Bundle
+from envhub_sandbox.session.crash.bundle_writer import death_of
 from envhub_worker.protocol import messages as m
 
 _UNFIT = (ActionError, TypeError, ValueError)

@@ -1,4 +1,4 @@
-"""What is going on while packages are chosen and installed: on a terminal or in a notebook.
+"""Progress lines while packages are chosen and installed: on a terminal or in a notebook.
 
 It is shown only if it takes a moment. Elsewhere (in CI, under a program) there is the log.
 """
@@ -21,7 +21,7 @@ _shown_by: list[Callable[[str], None]] = []
 
 
 @contextlib.contextmanager
-def shown_by(show: Callable[[str], None]) -> Iterator[None]:
+def progress_shown_by(show: Callable[[str], None]) -> Iterator[None]:
     """While it lasts, progress goes to ``show``, which has the terminal already."""
     _shown_by.append(show)
     try:
@@ -31,7 +31,7 @@ def shown_by(show: Callable[[str], None]) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def shown(title: str) -> Iterator[Callable[[str], None]]:
+def progress_shown(title: str) -> Iterator[Callable[[str], None]]:
     """Gives what takes a line for each thing that happens."""
     with contextlib.ExitStack() as stack:
         shows = list(_shown_by[-1:])

@@ -16,7 +16,7 @@ _SHOWN = 200
 
 
 @dataclass(frozen=True)
-class Task:
+class TaskFingerprint:
     """One environment.
 
     Attributes:
@@ -41,19 +41,19 @@ class Task:
         return f"{self.suite}/{self.task}"
 
 
-def task_of(
+def fingerprint_of_task(
     suite: str,
     task: int | str,
     mode: str | None,
     observations: gym.Space[Any],
     actions: gym.Space[Any],
-) -> Task:
+) -> TaskFingerprint:
     """What is to be remembered of an environment. Trust: input from the worker, already checked."""
-    spaces = spaces_of(observations, actions)
-    return Task(suite, task, mode or "", _shown(observations), _shown(actions), spaces)
+    spaces = fingerprint_of_spaces(observations, actions)
+    return TaskFingerprint(suite, task, mode or "", _shown(observations), _shown(actions), spaces)
 
 
-def spaces_of(*spaces: gym.Space[Any]) -> str:
+def fingerprint_of_spaces(*spaces: gym.Space[Any]) -> str:
     """A hash of spaces: of their kinds, shapes, dtypes and bounds, and of no generator's state."""
     digest = hashlib.sha256()
     for space in spaces:

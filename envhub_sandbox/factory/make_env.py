@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from envhub_sandbox.factory.make import make
-from envhub_sandbox.options import Options
-from envhub_sandbox.policy import Limits, Policy, Timeouts
 from envhub_sandbox.sandboxes.sandbox import Sandbox
+from envhub_sandbox.settings.options import Options
+from envhub_sandbox.settings.policy import Limits, Policy, Timeouts
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_sandbox.vector.tracebacks import short_traceback
 

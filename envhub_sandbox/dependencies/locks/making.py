@@ -1,4 +1,4 @@
-"""What is there now, as a lock file says it."""
+"""Makes lock files: what is there now, as a lock file says it."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from typing import Any
 
 from envhub_sandbox.dependencies import interpreters
 from envhub_sandbox.dependencies.declared import WantedPackage, parse_requirement
+from envhub_sandbox.dependencies.locks import lockfile, pylock
+from envhub_sandbox.dependencies.locks.drift import with_files
+from envhub_sandbox.dependencies.locks.fingerprint import TaskFingerprint, fingerprint_of_task
+from envhub_sandbox.dependencies.locks.lockfile import LockFile, Runner, Spaces
 from envhub_sandbox.dependencies.request import Choice, request_of
 from envhub_sandbox.dependencies.resolutions import resolution_for
 from envhub_sandbox.errors import LockError
 from envhub_sandbox.hub.snapshot import Snapshot
-from envhub_sandbox.locks import lockfile, pylock
-from envhub_sandbox.locks.drift import with_files
-from envhub_sandbox.locks.fingerprint import Task, task_of
-from envhub_sandbox.locks.lockfile import LockFile, Runner, Spaces
 
 
 def locked(
@@ -85,12 +85,12 @@ def with_spaces(
     return replace(lock, spaces=Spaces(arguments, tasks_of(suites)))
 
 
-def tasks_of(suites: Mapping[str, Mapping[Any, Any]]) -> tuple[Task, ...]:
+def tasks_of(suites: Mapping[str, Mapping[Any, Any]]) -> tuple[TaskFingerprint, ...]:
     """What a repository's ``make_env`` returned, in a form that can be compared."""
     found = []
     for suite, tasks in suites.items():
         for task, env in tasks.items():
             mode = env.metadata.get("autoreset_mode")
             spaces = env.single_observation_space, env.single_action_space
-            found.append(task_of(suite, task, getattr(mode, "value", mode), *spaces))
+            found.append(fingerprint_of_task(suite, task, getattr(mode, "value", mode), *spaces))
     return tuple(found)

@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 from envhub_sandbox.errors import DependencyError, LockError, PolicyError, name_source
 from envhub_sandbox.hub.snapshot import Snapshot
-from envhub_sandbox.option_names import option_name
+from envhub_sandbox.settings.options import option_name
 
 if TYPE_CHECKING:  # they cost time, and mostly there is no lock
     from envhub_sandbox.dependencies.builds.sources import WheelOrigin
     from envhub_sandbox.dependencies.interpreters import Interpreter
-    from envhub_sandbox.dependencies.pipeline import PackageSet
+    from envhub_sandbox.dependencies.locks.lockfile import LockFile
+    from envhub_sandbox.dependencies.packages import PackageSet
     from envhub_sandbox.dependencies.resolve import Lock
-    from envhub_sandbox.locks.lockfile import LockFile
     from envhub_worker.protocol.manifest.manifest import Manifest
 
 
@@ -36,7 +36,7 @@ def opened(
             f"{option_name('lock')} is for {option_name('sandbox', 'process')}; an image is locked "
             "by its digest, and on another host the operator of the server chooses its packages"
         )
-    from envhub_sandbox.locks import lockfile
+    from envhub_sandbox.dependencies.locks import lockfile
 
     return lockfile.read(path)
 
@@ -46,9 +46,10 @@ def provided(snapshot: Snapshot, lock: LockFile) -> PackageSet:
 
     Raises ``LockDriftError`` where the files or the interpreter are others.
     """
-    from envhub_sandbox.dependencies import environments, interpreters, progress
-    from envhub_sandbox.dependencies.pipeline import PackageSet
-    from envhub_sandbox.locks import drift, lockfile, pylock
+    from envhub_sandbox.dependencies import environments, interpreters
+    from envhub_sandbox.dependencies.locks import drift, lockfile, pylock
+    from envhub_sandbox.dependencies.packages import PackageSet
+    from envhub_sandbox.system import progress
 
     here = drift.with_files(lock, snapshot)
     drift.refuse(drift.differences(lock, here), snapshot.label)
@@ -56,7 +57,7 @@ def provided(snapshot: Snapshot, lock: LockFile) -> PackageSet:
         interpreter = interpreters.find(lock.runner.python)
         here = replace(here, runner=lockfile.Runner.of(interpreter))
         drift.refuse(drift.differences(lock, here), snapshot.label)
-        with progress.shown("packages") as tell:
+        with progress.progress_shown("packages") as tell:
             locked = [one.origin for one in lock.packages if one.origin is not None]
             pins = _with_wheels(pylock.pins(lock.packages), locked, interpreter, tell)
             made = environments.provide(pins, interpreter, tell)
@@ -106,17 +107,17 @@ def checker(
     def check(manifest: Manifest) -> None:
         if lock is None or lock.spaces is None or config is not None:
             return
-        from envhub_sandbox.locks import drift, lockfile
-        from envhub_sandbox.locks.fingerprint import task_of
+        from envhub_sandbox.dependencies.locks import drift, lockfile
+        from envhub_sandbox.dependencies.locks.fingerprint import fingerprint_of_task
 
         if lockfile.arguments_text(env_kwargs) == lock.spaces.arguments:
             now = [
-                task_of(
+                fingerprint_of_task(
                     *(env.suite, env.task, env.autoreset_mode),
                     *(env.single_observation_space, env.single_action_space),
                 )
                 for env in manifest.envs
             ]
-            drift.refuse(list(drift.of_tasks(lock.spaces.tasks, now)), label)
+            drift.refuse(list(drift.drift_of_tasks(lock.spaces.tasks, now)), label)
 
     return check

@@ -1,7 +1,7 @@
 """The counters of all environments of this process, for Prometheus.
 
     >>> import prometheus_client
-    >>> from envhub_sandbox.metrics import EnvHubCollector
+    >>> from envhub_sandbox.integrations.metrics import EnvHubCollector
     >>> prometheus_client.REGISTRY.register(EnvHubCollector())
 
 Needs ``pip install 'envhub-sandbox[metrics]'``. Nothing is counted for it that is not counted

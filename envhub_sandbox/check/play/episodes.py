@@ -16,8 +16,8 @@ import numpy as np
 from gymnasium.vector import VectorEnv
 from numpy.typing import NDArray
 
+from envhub_sandbox.check.play.zero_action import zero_action
 from envhub_sandbox.errors import EnvHubError
-from envhub_sandbox.rollouts.zero_action import zero_action
 from envhub_worker.protocol.manifest.manifest import AUTORESET_MODES
 
 MAX_COMPONENTS = 64

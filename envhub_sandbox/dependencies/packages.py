@@ -11,7 +11,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Protocol
 
-from envhub_sandbox.dependencies import progress
 from envhub_sandbox.dependencies.request import Choice, PackageRequest, request_of
 from envhub_sandbox.errors import (
     DependencyError,
@@ -20,6 +19,7 @@ from envhub_sandbox.errors import (
     name_source,
 )
 from envhub_sandbox.hub.snapshot import Snapshot
+from envhub_sandbox.system import progress
 from envhub_sandbox.system.log import DEPENDENCIES
 
 if TYPE_CHECKING:
@@ -97,7 +97,7 @@ def packages_for(
         request = request_of(snapshot, choice, gpu=gpu)
         if request is None or (not request.always and target.meets(request)):
             return None
-        with progress.shown("packages") as tell:
+        with progress.progress_shown("packages") as tell:
             try:
                 return target.make(request, tell)
             except (ResolutionError, IndexUnavailableError) as error:

@@ -1,15 +1,15 @@
-"""What is no longer as it was locked, in words."""
+"""Drift: what differs from a lock file, a line each, and the error for it."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
+from envhub_sandbox.dependencies.locks.fingerprint import TaskFingerprint
+from envhub_sandbox.dependencies.locks.lockfile import LOCAL, LockFile, repository_of
+from envhub_sandbox.dependencies.locks.pylock import PylockPackage
 from envhub_sandbox.errors import LockDriftError
 from envhub_sandbox.hub.snapshot import Snapshot
-from envhub_sandbox.locks.fingerprint import Task
-from envhub_sandbox.locks.lockfile import LOCAL, LockFile, repository_of
-from envhub_sandbox.locks.pylock import Package
 from envhub_worker.protocol.text import printable
 
 _SHOWN = 30
@@ -20,7 +20,7 @@ def differences(then: LockFile, now: LockFile) -> list[str]:
     runner = f"Python: {then.runner} was locked, this is {now.runner}"
     spaces: Iterator[str] = iter(())
     if then.spaces and now.spaces and then.spaces.arguments == now.spaces.arguments:
-        spaces = of_tasks(then.spaces.tasks, now.spaces.tasks)
+        spaces = drift_of_tasks(then.spaces.tasks, now.spaces.tasks)
     return [
         *_of_files(then, now),
         *([runner] if then.runner != now.runner else []),
@@ -72,7 +72,7 @@ def _of_files(then: LockFile, now: LockFile) -> Iterator[str]:
             yield f"file {shown}: other content"
 
 
-def _of_packages(then: Sequence[Package], now: Sequence[Package]) -> Iterator[str]:
+def _of_packages(then: Sequence[PylockPackage], now: Sequence[PylockPackage]) -> Iterator[str]:
     before, after = ({one.name: one for one in packages} for packages in (then, now))
     for name in sorted({*before, *after}):
         old, new = before.get(name), after.get(name)
@@ -84,7 +84,7 @@ def _of_packages(then: Sequence[Package], now: Sequence[Package]) -> Iterator[st
             yield from _of_package(old, new)
 
 
-def _of_package(then: Package, now: Package) -> Iterator[str]:
+def _of_package(then: PylockPackage, now: PylockPackage) -> Iterator[str]:
     if then.version != now.version:
         yield f"package {then.name}: {then.version} was locked, this is {now.version}"
         return
@@ -101,7 +101,9 @@ def _of_package(then: Package, now: Package) -> Iterator[str]:
             )
 
 
-def of_tasks(then: Sequence[Task], now: Sequence[Task]) -> Iterator[str]:
+def drift_of_tasks(
+    then: Sequence[TaskFingerprint], now: Sequence[TaskFingerprint]
+) -> Iterator[str]:
     """What differs in environments."""
     before, after = ({task.name: task for task in tasks} for tasks in (then, now))
     for name in sorted({*before, *after}):

@@ -13,7 +13,7 @@ from functools import cache
 from pathlib import Path
 
 from envhub_sandbox.hub.snapshot import Snapshot
-from envhub_sandbox.sources.parsing import ImportStatement, ParsedFile
+from envhub_sandbox.hub.sources.parsing import ImportStatement, ParsedFile
 
 Files = Mapping[str, ParsedFile | None]
 
@@ -37,19 +37,19 @@ def imports(snapshot: Snapshot, files: Files) -> list[Import]:
     A function's or class's own imports count if something that runs uses its name, as far as the
     text says. What may be missing does not count, nor what nothing leads to.
     """
-    found = _Reached(snapshot, files).imports
+    found = _ImportWalk(snapshot, files).imports
     return sorted(found, key=lambda one: (one.file, one.line, one.name))
 
 
 def ids(snapshot: Snapshot, files: Files) -> list[tuple[str, str, int]]:
     """Texts such as ``"Ant-v5"`` in the entry file and what it leads to, with file and line."""
-    reached = sorted(_Reached(snapshot, files).files)
+    reached = sorted(_ImportWalk(snapshot, files).files)
     return [
         (text, file, line) for file in reached if (one := files[file]) for text, line in one.ids
     ]
 
 
-class _Reached:
+class _ImportWalk:
     """What runs where ``make_env`` does, by the names that it uses."""
 
     def __init__(self, snapshot: Snapshot, files: Files) -> None:

@@ -1,8 +1,9 @@
 """One environment of a repository as an ordinary ``gymnasium.Env``, also by Gymnasium's registry.
 
     >>> env = SandboxEnv("org/repo@<commit>")
-    >>> env = gymnasium.make("envhub_sandbox.gym:Hub-v0", ref="org/repo@<commit>")
-    >>> envs = gymnasium.make_vec("envhub_sandbox.gym:Hub-v0", num_envs=4, ref="org/repo@<commit>")
+    >>> name = "envhub_sandbox.integrations.gym:Hub-v0"
+    >>> env = gymnasium.make(name, ref="org/repo@<commit>")
+    >>> envs = gymnasium.make_vec(name, num_envs=4, ref="org/repo@<commit>")
 
 What stands before the colon is imported by Gymnasium, which finds the id registered then.
 """
@@ -14,7 +15,7 @@ from typing import Any
 import gymnasium
 from gymnasium.vector import VectorEnv
 
-from envhub_sandbox.api import make_env
+from envhub_sandbox.factory.make_env import make_env
 from envhub_sandbox.vector.single_env import SingleEnv
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_sandbox.vector.tracebacks import short_traceback

@@ -1,17 +1,23 @@
 """Every option of ``make_env``, once: type, default, check, help, and its name for commands.
 
-The parameters of ``envhub``, the fields of LeRobot's configuration, ``docs/options.md`` and the
-names in errors (``option_names.py``) are made from this table. ``make_env`` has names and defaults
-in its signature too, for editors and readers; a test compares the two.
+The parameters of ``envhub``, the fields of LeRobot's configuration and ``docs/options.md`` are made
+from this table. ``make_env`` has names and defaults in its signature too, for editors and readers;
+a test compares the two.
+
+An error names an option by its key (``option_name``). What reads a command line calls
+``use_option_names``, so that errors use the words of that command line.
 """
 
 # ruff: noqa: RUF009  # _option() is dataclasses.field()
 
 from __future__ import annotations
 
+import contextlib
+import json
 import operator
 import os
-from collections.abc import Callable, Mapping
+import shlex
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field, fields, replace
 from keyword import iskeyword
 from pathlib import Path
@@ -324,3 +330,72 @@ def _table() -> dict[str, Option]:
 
 OPTIONS = _table()
 """By key: every argument of ``make_env``, and every key of those that are mappings."""
+
+Spelling = Callable[[Option, Any], str]
+"""How an option, with a value, is written where the user is."""
+_NO_VALUE = object()
+
+
+def in_python(option: Option, value: Any) -> str:
+    """``dependencies='host'``, ``policy={'profile': 'no-userns'}``."""
+    if value is _NO_VALUE:
+        return f"{option.argument}: {option.field}" if option.field else option.argument
+    return f"{option.argument}={ {option.field: value} if option.field else value!r}"
+
+
+def on_command_line(known: Collection[str]) -> Spelling:
+    """``--dependencies host``, ``--profile no-userns``; in Python what a command does not have.
+
+    Args:
+        known: The options of the command.
+    """
+
+    def spelling(option: Option, value: Any) -> str:
+        command = option.command.partition(" ")[0]
+        if not command or command not in known or value is False:
+            return f"{in_python(option, value)} in Python"
+        if value is _NO_VALUE or value is True:
+            return command
+        return f"{command} {shlex.quote(_text(value))}"
+
+    return spelling
+
+
+def on_lerobots_command_line(prefix: str = "--env.") -> Spelling:
+    """``--env.dependencies=host``, ``--env.policy='{"profile": "no-userns"}'``."""
+
+    def spelling(option: Option, value: Any) -> str:
+        if value is _NO_VALUE:
+            return f"{prefix}{in_python(option, value)}"
+        given = {option.field: value} if option.field else value
+        return f"{prefix}{option.argument}={shlex.quote(_text(given))}"
+
+    return spelling
+
+
+def _text(value: Any) -> str:
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+_spelling: Spelling = in_python
+
+
+def option_name(key: str, value: Any = _NO_VALUE) -> str:
+    """An option, with a value to give to it, as it is written where the user is.
+
+    Args:
+        key: Of ``OPTIONS``.
+        value: Plain data; none for the option's name alone.
+    """
+    return _spelling(OPTIONS[key], value)
+
+
+@contextlib.contextmanager
+def use_option_names(spelling: Spelling) -> Iterator[None]:
+    """Write options in this way while it lasts. One place for all threads of a process."""
+    global _spelling
+    before, _spelling = _spelling, spelling
+    try:
+        yield
+    finally:
+        _spelling = before

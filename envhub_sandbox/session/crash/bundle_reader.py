@@ -17,15 +17,15 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from envhub_sandbox.crash.bundle_writer import FORMAT
 from envhub_sandbox.errors import BundleError, EnvHubError
 from envhub_sandbox.hub.reference import HubRef
-from envhub_sandbox.policy import Limits, Policy
+from envhub_sandbox.session.crash.bundle_writer import FORMAT
+from envhub_sandbox.settings.policy import Limits, Policy
 from envhub_sandbox.transport.values.tensors import to_tensor
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.inert import one_line
 from envhub_worker.protocol.shared_memory.slabs import DTYPE_CODES
-from envhub_worker.protocol.stream import PacketReader
+from envhub_worker.protocol.stream import StreamReader
 from envhub_worker.protocol.text import printable
 from envhub_worker.protocol.untrusted import FAULTS
 
@@ -171,7 +171,7 @@ def _load(folder: Path) -> m.Load:
 
 
 def _packets(folder: Path, name: str) -> Iterator[m.Message]:
-    for packet in PacketReader().feed(_read(folder, name)):
+    for packet in StreamReader().feed(_read(folder, name)):
         yield m.unpack(packet.frames, tensors=to_tensor)
 
 

@@ -32,14 +32,14 @@ from typing import Any
 
 import numpy as np
 
-from envhub_sandbox.crash.history import RecordedRequest, Recording, Steps, encoded
 from envhub_sandbox.errors import WorkerDiedError, WorkerTimeoutError
 from envhub_sandbox.hub.logins import without_login
-from envhub_sandbox.policy import Policy, Timeouts
+from envhub_sandbox.session.crash.history import RecordedRequest, Recording, Steps, encoded
+from envhub_sandbox.settings.policy import Policy, Timeouts
 from envhub_sandbox.system import folders
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
-from envhub_worker.protocol.codec.inert import describe, one_line
+from envhub_worker.protocol.codec.inert import inert_copy, one_line
 from envhub_worker.protocol.stream import pack_packet
 from envhub_worker.protocol.text import printable
 
@@ -223,8 +223,10 @@ def _arguments(crash: Crash) -> dict[str, Any]:
         "n_envs": crash.load.n_envs,
         "use_async_envs": crash.load.use_async_envs,
         "exact": encoded(crash.load).exact,
-        "env_kwargs": {name: describe(value).text for name, value in crash.load.env_kwargs.items()},
-        "cfg": None if crash.load.cfg is None else describe(crash.load.cfg).text,
+        "env_kwargs": {
+            name: inert_copy(value).text for name, value in crash.load.env_kwargs.items()
+        },
+        "cfg": None if crash.load.cfg is None else inert_copy(crash.load.cfg).text,
     }
 
 

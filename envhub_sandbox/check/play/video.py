@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 
+from envhub_sandbox.check.play.pictures import Frame, even
 from envhub_sandbox.errors import EnvHubError, RemoteEnvError
-from envhub_sandbox.rollouts.pictures import Frame, even
 from envhub_worker.protocol.codec.inert import one_line
 
 MAX_SIDE = 4096

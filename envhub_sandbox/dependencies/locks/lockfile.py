@@ -16,13 +16,13 @@ from typing import Any
 
 from envhub_sandbox.dependencies.declared import parse_requirement
 from envhub_sandbox.dependencies.interpreters import Interpreter
+from envhub_sandbox.dependencies.locks import pylock
+from envhub_sandbox.dependencies.locks.fingerprint import TaskFingerprint
+from envhub_sandbox.dependencies.locks.pylock import PylockPackage, quoted, table
 from envhub_sandbox.dependencies.request import DATE
 from envhub_sandbox.errors import LockError, RequirementError
 from envhub_sandbox.hub.snapshot import Snapshot
-from envhub_sandbox.locks import pylock
-from envhub_sandbox.locks.fingerprint import Task
-from envhub_sandbox.locks.pylock import Package, quoted, table
-from envhub_sandbox.system.files import write_whole
+from envhub_sandbox.system.files import write_whole_file
 
 FORMAT = 1
 MAX_FILES = 20_000
@@ -60,7 +60,7 @@ class Spaces:
     """What a repository's ``make_env`` returned for arguments (as ``arguments_text`` writes)."""
 
     arguments: str
-    tasks: tuple[Task, ...]
+    tasks: tuple[TaskFingerprint, ...]
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class LockFile:
     entry: str
     files: Mapping[str, str]
     runner: Runner
-    packages: tuple[Package, ...]
+    packages: tuple[PylockPackage, ...]
     extra: tuple[str, ...] = ()
     exclude_newer: str | None = None
     spaces: Spaces | None = None
@@ -151,7 +151,7 @@ class _Reader:
         self._where = where
         self._ours = ours
 
-    def lock(self, packages: tuple[Package, ...]) -> LockFile:
+    def lock(self, packages: tuple[PylockPackage, ...]) -> LockFile:
         text = self._text
         newer = text(self._ours, "exclude-newer", DATE) if "exclude-newer" in self._ours else None
         return LockFile(
@@ -217,10 +217,10 @@ class _Reader:
             raise self._wrong("spaces")
         return Spaces(self._text(spaces, "env-kwargs"), tuple(map(self._task, tasks)))
 
-    def _task(self, given: object) -> Task:
+    def _task(self, given: object) -> TaskFingerprint:
         if not isinstance(given, dict) or type(given.get("task")) not in (int, str):
             raise self._wrong("tasks")
-        return Task(
+        return TaskFingerprint(
             self._text(given, "suite"),
             given["task"],
             self._text(given, "autoreset-mode"),
@@ -265,7 +265,7 @@ def written(lock: LockFile) -> str:
     return "\n".join([*head, pylock.written(lock.packages), *ours, ""])
 
 
-def _task_line(task: Task) -> str:
+def _task_line(task: TaskFingerprint) -> str:
     name = str(task.task) if isinstance(task.task, int) else quoted(task.task)
     return (
         f"    {{ suite = {quoted(task.suite)}, task = {name}, "
@@ -278,6 +278,6 @@ def _task_line(task: Task) -> str:
 def write(lock: LockFile, path: Path) -> None:
     """Write a lock file; meanwhile others read the old one. Raises ``LockError``."""
     try:
-        write_whole(path, written(lock).encode(), mode=0o666)
+        write_whole_file(path, written(lock).encode(), mode=0o666)
     except (OSError, UnicodeEncodeError) as error:
         raise LockError(f"the lock {path} cannot be written: {error}") from error

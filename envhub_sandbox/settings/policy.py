@@ -13,7 +13,7 @@ from numbers import Real
 from typing import Any, TypeVar
 
 from envhub_sandbox.errors import PolicyError
-from envhub_sandbox.option_names import option_name
+from envhub_sandbox.settings.options import option_name
 from envhub_worker.protocol.confinement import NETWORKS, PROFILES, Confinement, Limits
 from envhub_worker.protocol.text import parse_size
 
