@@ -35,7 +35,7 @@ class SandboxVecEnv(VecEnv):
         vector: What ``make_env`` made.
 
     Attributes:
-        vector: The same, for ``stats``, ``sandbox_report`` and the rest.
+        vector: The same, for ``sandbox`` and the rest.
     """
 
     def __init__(self, vector: VectorEnv[Any, Any, Any]) -> None:

@@ -110,7 +110,7 @@ def test_the_dead_come_back_and_the_others_go_on(lane: str, how: int) -> None:
         assert restarted(info)
         assert info["at"].tolist() == [2, 2, 0, 0]
         assert inside.state(env) is State.READY
-        assert env.stats()["deaths"] == env.stats()["restarts"] == 1
+        assert env.sandbox.stats()["deaths"] == env.sandbox.stats()["restarts"] == 1
 
 
 @lanes
@@ -223,7 +223,7 @@ def test_infos_that_differ_in_kind_survive_a_death(tmp_path: Path, lane: str, di
         assert {key: info[key] for key in expected}.keys() == expected.keys() > {"k", "_k"}
         assert list(info["n"]) == [0, 1, 2, 3]
         assert repr({key: info[key] for key in expected}) == repr(expected)
-        assert env.stats()["state"] == "READY"
+        assert env.sandbox.stats()["state"] == "READY"
         assert repr(env.step(ALL_LIVE)[4]) == repr(expected)
 
 

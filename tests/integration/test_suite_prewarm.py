@@ -91,12 +91,12 @@ def tasks(repository: Path) -> Iterator[Callable[..., Tasks]]:
 
 def states(tasks: Tasks) -> list[str]:
     """Where each is in its life."""
-    return [env.stats()["state"] for env in tasks]
+    return [env.sandbox.stats()["state"] for env in tasks]
 
 
 def ahead(tasks: Tasks) -> list[int]:
     """Which ones are up, and were never asked anything."""
-    found = [env.stats() for env in tasks]
+    found = [env.sandbox.stats() for env in tasks]
     return [
         index
         for index, one in enumerate(found)
