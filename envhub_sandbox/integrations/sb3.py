@@ -19,6 +19,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 from envhub_sandbox.api import make_env
 from envhub_sandbox.vector.infos import info_of
+from envhub_sandbox.vector.suites import choose
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _Indices = int | Iterable[int] | None
@@ -73,7 +74,7 @@ class SandboxVecEnv(VecEnv):
         """
         suites = make_env(ref, n_envs=n_envs, **options)
         try:
-            return cls(suites.choose(suite, task))
+            return cls(choose(suites, suite, task))
         except BaseException:
             suites.close()
             raise

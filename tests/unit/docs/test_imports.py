@@ -75,7 +75,7 @@ MAY_IMPORT = {
     },
     "envhub_sandbox.rollouts": set(),
     "envhub_sandbox.gym": {"api", "vector"},
-    "envhub_sandbox.pytest_plugin": {"api", "hub"},
+    "envhub_sandbox.pytest_plugin": {"api", "hub", "vector"},
     "envhub_sandbox.integrations": {"api", "hub", "vector"},
     "envhub_sandbox.vector": {"session", "transport"},
     "envhub_sandbox.metrics": {"session"},
