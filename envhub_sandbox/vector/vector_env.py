@@ -352,17 +352,8 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
     @property
     def envs(self) -> tuple[SubEnvironment, ...]:
         """A handle on each sub-environment, to read, to call, and to drive it by itself."""
-        return tuple(SubEnvironment(self, self._ask_one, i) for i in range(self.num_envs))
-
-    @property
-    def is_plain(self) -> bool:
-        """Whether the repository returned Gymnasium's own class, as it is."""
-        return self._manifest.shardable
-
-    @property
-    def is_sync(self) -> bool:
-        """Whether the sub-environments are at hand one by one, as in ``SyncVectorEnv``."""
-        return self._manifest.sync
+        which = range(self.num_envs)
+        return tuple(SubEnvironment(self, self._manifest, self._ask_one, i) for i in which)
 
     @property
     def sandbox(self) -> SandboxView:
