@@ -32,7 +32,7 @@ from envhub_sandbox.cli.shared.console import print_json, safe_line, say, show
 from envhub_sandbox.cli.shared.exits import Exit, UsageError
 from envhub_sandbox.cli.shared.findings import annotate, write_report
 from envhub_sandbox.cli.shared.memory import free_bytes
-from envhub_sandbox.cli.version import versions
+from envhub_sandbox.cli.shared.versions import versions
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.hub.snapshot import commit_of
 from envhub_sandbox.policy import policy_from
