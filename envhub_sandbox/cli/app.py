@@ -35,12 +35,11 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "push": push.push,
     "replay": replay.replay,
     "doctor": doctor,
-    "gc": cache.gc,
 }
 _GROUPS: dict[str, tuple[str, dict[str, Callable[..., None]]]] = {
     "cache": (
-        "List and remove what was downloaded, and made of it.",
-        {"list": cache.list_, "remove": cache.remove},
+        "List and remove what was downloaded and made of it, and what killed clients have left.",
+        {"list": cache.list_, "remove": cache.remove, "gc": cache.gc},
     ),
     "image": ("Container images for repositories.", {"build": image.build}),
 }
