@@ -243,7 +243,7 @@ def _gpu(value: object) -> bool | tuple[int, ...]:
     return tuple(sorted(set(indices)))
 
 
-_OPTIONAL_LIMITS = frozenset({"cpu_s", "file_bytes"})
+_OPTIONAL_LIMITS = frozenset({"cpu_time_s", "file_bytes"})
 
 
 def _texts(name: str, value: object) -> tuple[str, ...]:

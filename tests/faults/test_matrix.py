@@ -100,7 +100,7 @@ def _limits(fault: str) -> Limits:
     return Limits(
         memory_bytes=(512 if fault == "memory" else 4096) * MIB,
         disk_bytes=32 * MIB,
-        cpu_s=1 if fault == "cpu" else None,
+        cpu_time_s=1 if fault == "cpu" else None,
     )
 
 

@@ -456,7 +456,7 @@ def test_memory_of_all_takes_all_rows(lane: str) -> None:
 
 def test_the_cpu_limit_takes_one_process() -> None:
     """It is each process's own, and the fresh one has it from the start."""
-    with made(policy={"limits": {"cpu_s": 2}}) as suites:
+    with made(policy={"limits": {"cpu_time_s": 2}}) as suites:
         env = suites.env
         env.reset(seed=SEED)
         observation, _, _, truncated, info = env.step([LIVE, LIVE, LIVE, SPIN])
