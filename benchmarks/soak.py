@@ -110,7 +110,7 @@ class Soak:
         shards = [lost[start:stop] for start, stop in inside.bounds(self.env)]
         if any(shard.any() != shard.all() for shard in shards):
             self.counts["mismatches"] += 1
-        restart = self.env.stats()["restarts"]
+        restart = self.env.sandbox.stats()["restarts"]
         for row in np.flatnonzero(lost).tolist():
             self.counts["revived_rows"] += 1
             seed = derived_seed(self._seed + row, restart)
@@ -243,7 +243,7 @@ def run(arguments: argparse.Namespace, lane: str) -> dict[str, Any]:
                 print(lane, json.dumps(soak.counts), file=sys.stderr, flush=True)
         soak.reset()
         after = _settled(soak, before)
-        stats = soak.env.stats()
+        stats = soak.env.sandbox.stats()
     return {
         **soak.counts,
         "seconds": round(time.monotonic() - started, 1),

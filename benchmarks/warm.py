@@ -33,7 +33,7 @@ class Warm:
         self._suites.env.reset(seed=0)
         self._launcher: Any = inside.launcher(self._suites.env)
         self._server = inside.server(self._suites.env)
-        report = self._suites.env.sandbox_report
+        report = self._suites.env.sandbox.report()
         self.layers = [layer["layer"] for layer in report if layer["enforced"]]
 
     def __enter__(self) -> Warm:

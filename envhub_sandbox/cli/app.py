@@ -13,13 +13,14 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from envhub_sandbox.cli import cache, diff, image, lock, prefetch, push, replay, run, version
+from envhub_sandbox.cli import cache, diff, image, lock, prefetch, push, replay, run
 from envhub_sandbox.cli.check.check import check
 from envhub_sandbox.cli.doctor.doctor import doctor
 from envhub_sandbox.cli.init.init import init
 from envhub_sandbox.cli.inspect.inspect import inspect
-from envhub_sandbox.cli.shared.console import guarded
-from envhub_sandbox.cli.shared.exits import EXIT_CODES
+from envhub_sandbox.cli.shared.console import guarded, out
+from envhub_sandbox.cli.shared.exits import EXIT_CODES, reported
+from envhub_sandbox.cli.shared.versions import versions
 from envhub_sandbox.settings.options import on_command_line, use_option_names
 
 _COMMANDS: dict[str, Callable[..., None]] = {
@@ -34,13 +35,11 @@ _COMMANDS: dict[str, Callable[..., None]] = {
     "push": push.push,
     "replay": replay.replay,
     "doctor": doctor,
-    "gc": cache.gc,
-    "version": version.version,
 }
 _GROUPS: dict[str, tuple[str, dict[str, Callable[..., None]]]] = {
     "cache": (
-        "List and remove what was downloaded, and made of it.",
-        {"list": cache.list_, "remove": cache.remove},
+        "List and remove what was downloaded and made of it, and what killed clients have left.",
+        {"list": cache.list_, "remove": cache.remove, "gc": cache.gc},
     ),
     "image": ("Container images for repositories.", {"build": image.build}),
 }
@@ -102,7 +101,9 @@ for name, group in _GROUPS.items():
 
 def _print_versions(wanted: bool) -> None:
     if wanted:
-        version.version()
+        with reported(debug=False):
+            for name, text in versions().items():
+                out(f"{name:<16} {text or 'not installed'}")
         raise typer.Exit
 
 
@@ -114,7 +115,7 @@ def envhub(
             "--version",
             callback=_print_versions,
             is_eager=True,
-            help="Print versions, as the command does.",
+            help="Print versions: ours, the protocol's, Python's and of the packages that matter.",
         ),
     ] = False,
 ) -> None:

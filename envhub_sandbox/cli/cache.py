@@ -1,4 +1,4 @@
-"""``envhub cache``: the stores of snapshots and environments; ``envhub gc``: what was left."""
+"""``envhub cache``: the stores of snapshots and environments, and what killed clients have left."""
 
 from __future__ import annotations
 

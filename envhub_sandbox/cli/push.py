@@ -106,7 +106,7 @@ def _check(folder: str, snapshot: Snapshot, options: dict[str, Any]) -> None:
     from envhub_sandbox.factory.make_env import make_env
 
     with make_env(folder, n_envs=2, validate=True, **options) as suites:
-        for env in suites.envs():
+        for _, _, env in opt.select_envs(suites, None, None):
             env.reset(seed=0)
             env.action_space.seed(0)
             for _ in range(_STEPS):

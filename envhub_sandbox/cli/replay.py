@@ -116,7 +116,7 @@ class _Replay:
         if self._changed:
             say(f"The files have changed since: {safe_line(', '.join(self._changed))}.")
         if bundle.task is None:
-            next(iter(envs.envs())).np_random  # noqa: B018  # starts it, and changes nothing
+            opt.select_envs(envs, None, None)[0][2].np_random  # noqa: B018  # starts it, and changes nothing
             return None
         bar.begin(f"repeating {len(bundle.requests)} requests")
         return self._chosen(envs, bundle.task)

@@ -42,7 +42,7 @@ Verbose = Annotated[
 ]
 
 
-class PolicyName(str, Enum):
+class ActionSource(str, Enum):
     """Where actions come from."""
 
     RANDOM = "random"
@@ -56,9 +56,9 @@ def run(
     episodes: Annotated[
         int, typer.Option("--episodes", "-e", min=1, help="Episodes of each task, exactly.")
     ] = 10,
-    policy: Annotated[
-        PolicyName, typer.Option(help="Actions: sampled, or as near to zero as can be.")
-    ] = PolicyName.RANDOM,
+    actions: Annotated[
+        ActionSource, typer.Option(help="Sampled, or as near to zero as the space allows.")
+    ] = ActionSource.RANDOM,
     seed: Annotated[
         int, typer.Option("--seed", "-s", min=0, help="The same seed gives the same result.")
     ] = 0,
@@ -90,7 +90,7 @@ def run(
         _Run(
             make=make,
             episodes=episodes,
-            policy=policy.value,
+            actions=actions.value,
             seed=seed,
             steps=steps,
             video=video,
@@ -106,7 +106,7 @@ class _Run:
 
     make: opt.MakeOptions
     episodes: int
-    policy: str
+    actions: str
     seed: int
     steps: int | None
     video: Path | None
@@ -189,7 +189,7 @@ class _Run:
             env,
             episodes=self.episodes,
             seed=self.seed,
-            policy=self.policy,
+            actions=self.actions,
             max_steps=self.steps,
             observe=observe,
         )
@@ -204,7 +204,7 @@ class _Run:
         document: dict[str, Any] = {
             "reference": self.make.ref,
             "sandbox": self.make.given["sandbox"],
-            "policy": self.policy,
+            "actions": self.actions,
             "seed": self.seed,
             "episodes": self.episodes,
             "make_env_s": self.make_env_s,
@@ -233,7 +233,7 @@ class _Run:
         if self.provenance is not None:
             print_provenance(self.provenance, in_process=self.make.in_process)
         out(
-            f"{self.policy} actions, seed {self.seed}, --n-envs {self.make.given['n_envs']}; "
+            f"{self.actions} actions, seed {self.seed}, --n-envs {self.make.given['n_envs']}; "
             f"first step after {self._time_to_first_step():.2f} s",
             "dim",
         )

@@ -17,7 +17,7 @@ from gymnasium.vector import VectorEnv
 
 from envhub_sandbox.factory.make_env import make_env
 from envhub_sandbox.vector.single_env import SingleEnv
-from envhub_sandbox.vector.suites import EnvSuites
+from envhub_sandbox.vector.suites import choose
 from envhub_sandbox.vector.tracebacks import short_traceback
 
 ID = "Hub-v0"
@@ -50,7 +50,7 @@ class SandboxEnv(SingleEnv):
     ) -> None:
         suites = make_env(ref, n_envs=1, **_with_render_mode(options, render_mode))
         try:
-            super().__init__(suites.choose(suite, task), suites.close)
+            super().__init__(choose(suites, suite, task), suites.close)
         except BaseException:
             suites.close()
             raise
@@ -76,10 +76,9 @@ def make_vector(
         render_mode: Handed to the repository's ``make_env``, if given.
         options: ``make_env``'s.
     """
-    suites: EnvSuites = make_env(ref, n_envs=num_envs, **_with_render_mode(options, render_mode))
+    suites = make_env(ref, n_envs=num_envs, **_with_render_mode(options, render_mode))
     try:
-        vector: VectorEnv[Any, Any, Any] = suites.choose(suite, task)
-        return vector
+        return choose(suites, suite, task)
     except BaseException:
         suites.close()
         raise

@@ -43,6 +43,7 @@ def envhub_env(request: pytest.FixtureRequest) -> Iterator[Any]:
     if ref is None:
         pytest.fail("the fixture envhub_env needs --envhub-ref REF, as in --envhub-ref .")
     from envhub_sandbox.factory.make_env import make_env
+    from envhub_sandbox.vector.suites import choose
 
     marks = request.node.iter_markers(_MARK)
     options: dict[str, Any] = {}
@@ -50,7 +51,7 @@ def envhub_env(request: pytest.FixtureRequest) -> Iterator[Any]:
         options |= mark.kwargs
     chosen = options.pop("suite", None), options.pop("task", None)
     with make_env(_from_where_pytest_began(ref, request), **{"validate": True, **options}) as made:
-        yield made.choose(*chosen)
+        yield choose(made, *chosen)
 
 
 def _from_where_pytest_began(ref: str, request: pytest.FixtureRequest) -> str:

@@ -19,6 +19,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 from envhub_sandbox.factory.make_env import make_env
 from envhub_sandbox.vector.single_env import info_of
+from envhub_sandbox.vector.suites import choose
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _Indices = int | Iterable[int] | None
@@ -35,7 +36,7 @@ class SandboxVecEnv(VecEnv):
         vector: What ``make_env`` made.
 
     Attributes:
-        vector: The same, for ``stats``, ``sandbox_report`` and the rest.
+        vector: The same, for ``sandbox`` and the rest.
     """
 
     def __init__(self, vector: VectorEnv[Any, Any, Any]) -> None:
@@ -73,7 +74,7 @@ class SandboxVecEnv(VecEnv):
         """
         suites = make_env(ref, n_envs=n_envs, **options)
         try:
-            return cls(suites.choose(suite, task))
+            return cls(choose(suites, suite, task))
         except BaseException:
             suites.close()
             raise

@@ -285,7 +285,7 @@ _KEYS: dict[str, dict[str, Option]] = {
             "--readable", "A further absolute path that it may read (repeatable).", "PATH", list
         ),
         "environment": Option(
-            "--env", "An environment variable that it may see (repeatable).", "NAME", list
+            "--environment", "A variable that it may see (repeatable).", "NAME", list
         ),
         "output": Option(
             "--worker-output",
@@ -299,7 +299,7 @@ _KEYS: dict[str, dict[str, Option]] = {
         "memory_bytes": Option("--memory", "Memory, as in 512M or 4G.", "SIZE"),
         "disk_bytes": Option("--disk", "Scratch space on disk.", "SIZE"),
         "processes": Option("--processes", "Processes and threads alive at once.", kind=int),
-        "cpu_s": Option("--cpu-time", "CPU seconds of one process.", "SECONDS", int),
+        "cpu_time_s": Option("--cpu-time", "CPU seconds of one process.", "SECONDS", int),
     },
     "timeouts": dict.fromkeys(("startup_s", "reset_s", "step_s", "call_s"), _TIMEOUT),
 }

@@ -93,7 +93,7 @@ class Policy:
             ``"stderr"`` or ``"-"`` to this program's stderr.
         record_denials: Have the jail's first process, instead of the kernel alone, deny the system
             calls that are denied, and write down which were tried, and which files were asked for
-            that are not its own: ``env.jail_denials()``, and ``denied`` of the error that a jail
+            that are not its own: ``env.sandbox.denials()``, and ``denied`` of the error that a jail
             ends with. Each of them takes longer then, and so does opening a file.
         crash_history: How many requests since the last seeded reset are kept for a crash bundle
             (``docs/crashes.md``), within 8 MiB; 0 keeps none and writes no bundles.
@@ -243,7 +243,7 @@ def _gpu(value: object) -> bool | tuple[int, ...]:
     return tuple(sorted(set(indices)))
 
 
-_OPTIONAL_LIMITS = frozenset({"cpu_s", "file_bytes"})
+_OPTIONAL_LIMITS = frozenset({"cpu_time_s", "file_bytes"})
 
 
 def _texts(name: str, value: object) -> tuple[str, ...]:

@@ -73,10 +73,10 @@ class RemoteWarnings:
                 return
             words = one_line(category, MAX_CATEGORY), printable(text, MAX_TEXT)
             warning = RemoteEnvWarning(label, *words)
-            warnings.warn(warning, stacklevel=_level_of_the_caller())
+            warnings.warn(warning, stacklevel=level_of_the_caller())
 
 
-def _level_of_the_caller() -> int:
+def level_of_the_caller() -> int:
     """How far up the first frame lies that is none of this package, as ``warnings.warn`` counts."""
     frame, level = sys._getframe(1), 1
     while frame.f_back is not None and _is_ours(frame.f_globals.get("__name__")):

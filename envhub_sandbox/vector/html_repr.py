@@ -18,7 +18,7 @@ _HEAD = ("suite", "task", "environments", "observations", "actions")
 
 
 def environment_html(env: Any, layers: Iterable[Mapping[str, Any]]) -> str:
-    """A table of one environment: its spaces, and the ``sandbox_report`` that confines it."""
+    """A table of one environment: its spaces, and the layers that confine it."""
     names = [str(layer.get("layer")) for layer in layers if layer.get("enforced")]
     rows = [
         ("environments", env.num_envs),

@@ -17,6 +17,7 @@ from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
+from envhub_sandbox.vector.sandbox_view import SandboxView
 from envhub_sandbox.vector.tracebacks import short_traceback, shortened
 from envhub_worker.protocol.manifest.names import absent, is_servable
 from envhub_worker.protocol.untrusted import UNTRUSTED
@@ -62,8 +63,23 @@ class SingleEnv(gym.Env[Any, Any]):
 
     @property
     def vector(self) -> VectorEnv[Any, Any, Any]:
-        """The vector environment below, with ``stats``, ``sandbox_report`` and the rest."""
+        """The vector environment below."""
         return self._vector
+
+    @property
+    def sandbox(self) -> SandboxView:
+        """What confines it, and what that holds, was denied and has done.
+
+        An attribute of this name that the environment has itself is ``env.vector.envs[0].sandbox``:
+        what it says there must not pass for what holds.
+
+        Raises:
+            AttributeError: There is no sandbox: it was made with ``sandbox=None``.
+        """
+        view = getattr(self._vector, "sandbox", None)
+        if not isinstance(view, SandboxView):
+            raise AttributeError("there is no sandbox around it")
+        return view
 
     @short_traceback
     def reset(
@@ -151,7 +167,9 @@ class SingleEnv(gym.Env[Any, Any]):
 
     def __getattr__(self, name: str) -> Any:
         """An attribute or a method of the environment, whichever of its wrappers has it."""
-        if "_vector" not in self.__dict__ or not is_servable(name):
+        # where a property of ours raises AttributeError, Python calls this with its name
+        ours = not is_servable(name) or hasattr(type(self), name)
+        if "_vector" not in self.__dict__ or ours:
             raise absent(self, name, "get_wrapper_attr")
         return self._inner.get_wrapper_attr(name)
 

@@ -19,6 +19,7 @@ from envhub_sandbox.transport.values import generators
 from envhub_sandbox.vector.tracebacks import short_traceback
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.inert import RemoteObject
+from envhub_worker.protocol.manifest.manifest import EnvManifest
 from envhub_worker.protocol.manifest.names import is_servable
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.untrusted import UNTRUSTED
@@ -29,7 +30,7 @@ _SEARCHED = -1
 _MOST_WRAPPERS = 1000
 """Around one environment; otherwise a search for the innermost might never end. As many as Python's
 nested calls, which a step through the wrappers makes."""
-_OURS = frozenset({"_vector", "_ask", "_index", "_depth"})
+_OURS = frozenset({"_vector", "_manifest", "_ask", "_index", "_depth"})
 
 
 class SubEnvironment(gym.Env[Any, Any]):
@@ -40,6 +41,7 @@ class SubEnvironment(gym.Env[Any, Any]):
 
     Args:
         vector: Its ``SandboxVectorEnv``.
+        manifest: What that was described as.
         ask: Asks the worker about it.
         index: Which of the sub-environments it is.
         depth: How many wrappers are looked through; None for all.
@@ -48,11 +50,13 @@ class SubEnvironment(gym.Env[Any, Any]):
     def __init__(
         self,
         vector: Any,
+        manifest: EnvManifest,
         ask: Callable[[str, int, OneMessageFor], m.Message],
         index: int,
         depth: int | None = _OUTERMOST,
     ) -> None:
         self._vector = vector
+        self._manifest = manifest
         self._ask = ask
         self._index = index
         self._depth = depth
@@ -95,7 +99,7 @@ class SubEnvironment(gym.Env[Any, Any]):
         """The innermost environment."""
         if self._depth is None:
             return self
-        return SubEnvironment(self._vector, self._ask, self._index, None)
+        return SubEnvironment(self._vector, self._manifest, self._ask, self._index, None)
 
     @property
     @short_traceback
@@ -111,7 +115,7 @@ class SubEnvironment(gym.Env[Any, Any]):
         found = self._get("env")
         if self._depth is None or not (callable(found) or isinstance(found, RemoteObject)):
             return found
-        return SubEnvironment(self._vector, self._ask, self._index, self._depth + 1)
+        return SubEnvironment(self._vector, self._manifest, self._ask, self._index, self._depth + 1)
 
     @property
     def action_space(self) -> Any:  # type: ignore[override]
@@ -161,7 +165,7 @@ class SubEnvironment(gym.Env[Any, Any]):
     @property
     def _is_shown(self) -> bool:
         """Whether the vector environment shows this one's spaces and metadata as its own."""
-        return self._vector.is_plain and not self._index and self._depth == _OUTERMOST
+        return self._manifest.shardable and not self._index and self._depth == _OUTERMOST
 
     # --- what this one has ---------------------------------------------------------------------
 
@@ -251,7 +255,7 @@ class SubEnvironment(gym.Env[Any, Any]):
             return (batches.restore(space, result[0]), *result[1:])
 
     def _refuse_unless_sync(self, name: str) -> None:
-        if not self._vector.is_sync:
+        if not self._manifest.sync:
             raise ValueError(
                 f"cannot {name} one sub-environment of an AsyncVectorEnv: use `{name}` of the "
                 "vector environment, or have the repository return a SyncVectorEnv "

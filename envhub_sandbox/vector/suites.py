@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from types import TracebackType
 from typing import Any
 
@@ -11,7 +11,6 @@ from gymnasium.vector import VectorEnv
 
 from envhub_sandbox.session.recipe import Recipe
 from envhub_sandbox.vector.html_repr import suites_html
-from envhub_sandbox.vector.single_env import SingleEnv
 
 Envs = Mapping[str, Mapping[int | str, VectorEnv[Any, Any, Any]]]
 
@@ -68,60 +67,7 @@ class EnvSuites(dict[str, dict[Any, VectorEnv[Any, Any, Any]]]):
         Raises:
             ValueError: There are several; the text names them.
         """
-        return self.choose()
-
-    def choose(self, suite: str | None = None, task: int | str | None = None) -> Any:
-        """The one environment of this suite and this task; None is whichever there is.
-
-        Raises:
-            ValueError: There is not exactly one; the text names what there is.
-        """
-        found = self._named(suite, lambda one: task in (None, one))
-        if len(found) == 1:
-            return self[found[0][0]][found[0][1]]
-        if found:
-            raise ValueError(f"there are {len(found)} environments; choose one: {_names(found)}")
-        there = _names(self._named(None, lambda _: True))
-        raise ValueError(f"there is no suite {suite!r} with a task {task!r}; there are: {there}")
-
-    def _named(
-        self, suite: str | None, is_meant: Callable[[int | str], bool]
-    ) -> list[tuple[str, int | str]]:
-        suites = [(name, tasks) for name, tasks in self.items() if suite in (None, name)]
-        return [(name, task) for name, tasks in suites for task in tasks if is_meant(task)]
-
-    def single(self, suite: str | None = None, task: int | str | None = None) -> SingleEnv:
-        """One environment as an ordinary ``gymnasium.Env``; its ``close`` closes all of these.
-
-        Args:
-            suite: Which suite; needed where there are several.
-            task: Which task; likewise.
-
-        Raises:
-            ValueError: There is not exactly one such environment, or it has several
-                sub-environments.
-        """
-        return SingleEnv(self.choose(suite, task), self.close)
-
-    def keep(self, suite: str | None = None, task: int | str | None = None) -> None:
-        """Close and drop all but this suite and this task; a task is also found by its text.
-
-        Raises:
-            ValueError: Nothing would be left; the text names what there is.
-        """
-        chosen = self._named(suite, lambda one: task in (None, one, str(one)))
-        if not chosen:
-            self.choose(suite, task)
-        for a_suite, tasks in list(self.items()):
-            for a_task in [one for one in tasks if (a_suite, one) not in chosen]:
-                tasks.pop(a_task).close()
-            if not tasks:
-                del self[a_suite]
-
-    def envs(self) -> Iterator[VectorEnv[Any, Any, Any]]:
-        """All environments, suite by suite."""
-        for tasks in self.values():
-            yield from tasks.values()
+        return choose(self)
 
     @property
     def reference(self) -> str | None:
@@ -140,7 +86,7 @@ class EnvSuites(dict[str, dict[Any, VectorEnv[Any, Any, Any]]]):
         """Close every environment and end its processes. Idempotent."""
         with contextlib.ExitStack() as all_of_them:  # interruption.md, rule 9
             all_of_them.callback(self._on_close)
-            for env in list(self.envs())[::-1]:
+            for env in [env for tasks in self.values() for env in tasks.values()][::-1]:
                 all_of_them.callback(env.close)
 
     def __enter__(self) -> EnvSuites:
@@ -153,6 +99,46 @@ class EnvSuites(dict[str, dict[Any, VectorEnv[Any, Any, Any]]]):
         traceback: TracebackType | None,
     ) -> None:
         self.close()
+
+
+def choose(
+    suites: EnvSuites, suite: str | None = None, task: int | str | None = None
+) -> VectorEnv[Any, Any, Any]:
+    """The one environment of this suite and this task; None is whichever there is.
+
+    Raises:
+        ValueError: There is not exactly one; the text names what there is.
+    """
+    found = _named(suites, suite, lambda one: task in (None, one))
+    if len(found) == 1:
+        return suites[found[0][0]][found[0][1]]
+    if found:
+        raise ValueError(f"there are {len(found)} environments; choose one: {_names(found)}")
+    there = _names(_named(suites, None, lambda _: True))
+    raise ValueError(f"there is no suite {suite!r} with a task {task!r}; there are: {there}")
+
+
+def keep_only(suites: EnvSuites, suite: str | None = None, task: int | str | None = None) -> None:
+    """Close and drop all but this suite and this task; a task is also found by its text.
+
+    Raises:
+        ValueError: Nothing would be left; the text names what there is.
+    """
+    chosen = _named(suites, suite, lambda one: task in (None, one, str(one)))
+    if not chosen:
+        choose(suites, suite, task)
+    for a_suite, tasks in list(suites.items()):
+        for a_task in [one for one in tasks if (a_suite, one) not in chosen]:
+            tasks.pop(a_task).close()
+        if not tasks:
+            del suites[a_suite]
+
+
+def _named(
+    suites: EnvSuites, suite: str | None, is_meant: Callable[[int | str], bool]
+) -> list[tuple[str, int | str]]:
+    meant = [(name, tasks) for name, tasks in suites.items() if suite in (None, name)]
+    return [(name, task) for name, tasks in meant for task in tasks if is_meant(task)]
 
 
 def _names(found: list[tuple[str, int | str]]) -> str:

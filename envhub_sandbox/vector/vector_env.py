@@ -19,11 +19,13 @@ from gymnasium.vector import VectorEnv
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.requests import Bounds, MessageFor, OneMessageFor
+from envhub_sandbox.transport.remote_warnings import level_of_the_caller
 from envhub_sandbox.transport.replies import typed_reply
 from envhub_sandbox.transport.results import StepResult
 from envhub_sandbox.transport.values import generators
 from envhub_sandbox.vector import from_manifest
 from envhub_sandbox.vector.html_repr import environment_html
+from envhub_sandbox.vector.sandbox_view import SandboxView
 from envhub_sandbox.vector.sub_environment import SubEnvironment
 from envhub_sandbox.vector.tracebacks import short_traceback, shortened
 from envhub_worker.protocol import messages as m
@@ -32,6 +34,9 @@ from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _NOT_CALLED = frozenset({"reset", "step", "close"})
 """What ``AsyncVectorEnv.call`` refuses: it would take one sub-environment from under the others."""
+
+_OURS = frozenset({"prewarm", "sandbox"})
+"""Public names that Gymnasium's vector environments do not have."""
 
 
 class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
@@ -45,7 +50,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         num_envs: Number of sub-environments.
         closed: Whether ``close`` has been called.
         metadata: With ``"autoreset_mode"``, as in Gymnasium.
-        sandbox_report: What confines it: one mapping per layer, while it runs.
+        sandbox: What confines it, and what that holds, was denied and has done.
     """
 
     def __init__(self, session: EnvSession) -> None:
@@ -71,6 +76,19 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             self.observation_mode = "same"
         # processes end with the last reference to the proxy; interruption.md, rule 13
         weakref.finalize(self, session.close).atexit = False
+        self._warn_of_hidden_names()
+
+    def _warn_of_hidden_names(self) -> None:
+        """Where the repository's vector environment has attributes that are ours here."""
+        hidden = _OURS.intersection(self._manifest.attributes)
+        if hidden:
+            warnings.warn(
+                f"{self._session.repository.label}: its vector environment has attributes named "
+                f"{', '.join(sorted(hidden))}, which are not served: "
+                f"{self._requests.face} has its own",
+                UserWarning,
+                stacklevel=level_of_the_caller(),
+            )
 
     @property
     def closed(self) -> bool:  # type: ignore[override]  # there is nothing to set
@@ -334,55 +352,18 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
     @property
     def envs(self) -> tuple[SubEnvironment, ...]:
         """A handle on each sub-environment, to read, to call, and to drive it by itself."""
-        return tuple(SubEnvironment(self, self._ask_one, i) for i in range(self.num_envs))
+        which = range(self.num_envs)
+        return tuple(SubEnvironment(self, self._manifest, self._ask_one, i) for i in which)
 
     @property
-    def is_plain(self) -> bool:
-        """Whether the repository returned Gymnasium's own class, as it is."""
-        return self._manifest.shardable
+    def sandbox(self) -> SandboxView:
+        """What confines it, and what that holds, was denied and has done.
 
-    @property
-    def is_sync(self) -> bool:
-        """Whether the sub-environments are at hand one by one, as in ``SyncVectorEnv``."""
-        return self._manifest.sync
-
-    @property
-    def sandbox_report(self) -> list[dict[str, Any]]:
-        """One mapping per layer: ``layer``, ``enforced``, ``detail``. None unless it runs."""
-        return [dict(layer) for layer in self._session.lease.report()]
-
-    def jail_usage(self) -> dict[str, int]:
-        """What its jail holds right now, counted from outside of it by the worker server.
-
-        Returns:
-            ``processes`` and ``threads`` (beyond one for each process); of the processes that run
-            environments ``files``, which they have open, and ``memory_bytes``, what is theirs
-            alone. Empty unless it runs.
+        Also where the repository's own vector environment has an attribute of this name, which
+        making it warns of: what it says there must not pass for what holds. Behind a wrapper it
+        is ``env.unwrapped.sandbox``; a sub-environment's own is ``env.envs[0].sandbox``.
         """
-        return self._session.usage()
-
-    def jail_denials(self) -> tuple[str, ...] | None:
-        """Which system calls its jail has tried and was denied: ``("ptrace", "socket AF_INET")``.
-
-        And which files it has asked for that are not its own: ``"write /home/me/.profile"``, and
-        what it has tried with processes that are not: ``"kill OTHER_PROCESS"``. By the word of its
-        first process, which answers or sees them, and not by the repository's. Also which limits it
-        has used up when the server looks: ``"limit PROCESSES"``, ``OPEN_FILES``, ``DISK_BYTES`` or
-        ``DISK_FILES``. None unless it runs under a policy with ``record_denials``.
-        """
-        return self._session.lease.denials()
-
-    def stats(self) -> dict[str, Any]:
-        """Counters, at any moment, from any thread; asks nothing of the worker.
-
-        Returns:
-            ``requests``, ``steps``, ``timeouts``, ``deaths``, ``restarts`` (after deaths),
-            ``stale_replies``, ``sent_bytes`` and ``received_bytes`` (over both lanes; infos in
-            shared memory are not counted), ``state``, and ``step_latency_s``: from the request to
-            the reply in seconds, ``p50``, ``p90``, ``p99`` and ``max`` of the last 1024 steps, and
-            the ``total`` of all.
-        """
-        return self._session.stats()
+        return SandboxView(self._session)
 
     def close(self, **kwargs: Any) -> None:
         """Close the sub-environments and end their processes, in bounded time. Idempotent."""
@@ -431,7 +412,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         return f"SandboxVectorEnv({self._session.repository.label}, num_envs={self.num_envs})"
 
     def _repr_html_(self) -> str:
-        return environment_html(self, self.sandbox_report)
+        return environment_html(self, self.sandbox.report())
 
     __html__ = _repr_html_
 

@@ -181,7 +181,7 @@ class Arena:
         run = Run(new_alias(), True)
         with self.environment(policy, limits) as env:
             env.reset()
-            self.report = env.sandbox_report  # before the payload, which may be the jail's end
+            self.report = env.sandbox.report()  # before the payload, which may be the jail's end
             call(env, run, payload, arguments)
             yield run
 

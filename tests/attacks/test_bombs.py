@@ -290,7 +290,7 @@ def test_processor_time_runs_out(arena: Arena) -> None:
         "burn processor time",
         "spin",
         lambda run: sum(spent(pid) for pid in run.pids()) > (CPU_S + SPIN_S) / 2,
-        limits={"cpu_s": CPU_S},
+        limits={"cpu_time_s": CPU_S},
         seconds=SPIN_S,
     )
 

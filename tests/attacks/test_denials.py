@@ -78,12 +78,12 @@ def test_a_recorded_jail_is_refused_the_same(tmp_path: Path) -> None:
         with make_env(str(folder), policy={"record_denials": recorded}) as suites:
             env = suites.env
             env.reset(seed=0)
-            denied = env.jail_denials()
+            denied = env.sandbox.denials()
             assert (attempts(denied) if recorded else denied) == ([] if recorded else None)
             answers[recorded] = env.step([1])[0].tolist()
             env.step([0])
-            told = env.jail_denials()
-        assert env.jail_denials() is None, "it does not run any more"
+            told = env.sandbox.denials()
+        assert env.sandbox.denials() is None, "it does not run any more"
     assert 0 not in answers[True][0]
     assert answers[True] == answers[False]
     assert told is not None
@@ -156,9 +156,9 @@ def test_who_names_a_process_that_is_not_its_own_is_told(home: Path, profile: st
             env = suites.env
             env.reset(seed=0)
             own = env.call("own")
-            told[recorded] = env.jail_denials()
+            told[recorded] = env.sandbox.denials()
             answers[recorded] = own, env.call("others", _NOBODY)
-            after = env.jail_denials()
+            after = env.sandbox.denials()
     assert answers[True] == answers[False]
     assert told[False] is None
     assert attempts(told[True] or ()) == []
@@ -233,10 +233,10 @@ def test_limits_that_are_used_up_are_told(home: Path, profile: str) -> None:
             ("files", "DISK_FILES"),
             ("descriptors", "OPEN_FILES"),
         ):
-            assert set(attempts(env.jail_denials() or ())) == expected
+            assert set(attempts(env.sandbox.denials() or ())) == expected
             env.call(deed)
             expected.add(f"limit {limit}")
-        assert set(attempts(env.jail_denials() or ())) == expected
+        assert set(attempts(env.sandbox.denials() or ())) == expected
 
 
 _FILES = """
@@ -319,11 +319,11 @@ def test_files_that_are_asked_for_are_told(tmp_path: Path) -> None:
         with make_env(str(folder), policy={"record_denials": recorded}) as suites:
             env = suites.env
             env.reset(seed=0)
-            assert env.jail_denials() == (() if recorded else None)
+            assert env.sandbox.denials() == (() if recorded else None)
             answers[recorded] = env.call("attempts", "/home/other")
-            told = env.jail_denials()
+            told = env.sandbox.denials()
             env.call("flood", "/home/other")
-            after = env.jail_denials()
+            after = env.sandbox.denials()
     assert 0 not in answers[True][0]
     assert answers[True] == answers[False]
     assert told == (
@@ -427,7 +427,7 @@ def test_what_is_denied_while_a_known_environment_is_built_is_told(tmp_path: Pat
         with pytest.raises(WorkerDiedError) as raised:
             env.reset()
         assert raised.value.denied == ("write /home/other/file",)
-        assert env.jail_denials() is None
+        assert env.sandbox.denials() is None
 
 
 @pytest.mark.parametrize("profile", profiles("no-userns"))

@@ -169,7 +169,7 @@ def test_runners_cannot_speak_of_deaths(arena: Arena, home: Path, mode: str) -> 
         suites.env.reset()
         with pytest.raises(RemoteProtocolError):
             suites.env.step([0, 0])
-        assert suites.env.stats()["restarts"] == 0
+        assert suites.env.sandbox.stats()["restarts"] == 0
 
 
 @pytest.mark.parametrize("mode", ["twice", "sibling's"])
@@ -181,7 +181,7 @@ def test_liars_are_given_no_second_chance(arena: Arena, home: Path, mode: str) -
             suites.env.step([0, 0]) and suites.env.step([0, 0])
         assert isinstance(caught.value, WorkerDiedError)
         assert caught.value.reason == "protocol"
-        assert suites.env.stats()["restarts"] == 0
+        assert suites.env.sandbox.stats()["restarts"] == 0
 
 
 def test_a_torn_answer_is_nobodys(arena: Arena, home: Path) -> None:

@@ -62,11 +62,11 @@ def watching(liar: LyingServer, folder: str) -> Any:
 def test_values_are_kept_while_nothing_is_said(liar: LyingServer, folder: str) -> None:
     """The control: who is honest is believed, and asked no more."""
     with watching(liar, folder) as suites:
-        before = suites.env.stats()["requests"]
+        before = suites.env.sandbox.stats()["requests"]
         for _ in range(20):
             suites.env.step(ACTIONS)
             assert suites.env.get_attr("task") == TRUE
-        assert suites.env.stats()["requests"] == before + 20
+        assert suites.env.sandbox.stats()["requests"] == before + 20
 
 
 LIES: dict[str, m.Message] = {
@@ -96,11 +96,11 @@ def test_what_can_be_changed_is_not_kept(liar: LyingServer, folder: str) -> None
     """Who changes what he was given would change what the next one gets."""
     liar.lies[m.Watch] = answered(m.WatchDone(tuple([["reach"]] * NUM_ENVS), True))
     with watching(liar, folder) as suites:
-        before = suites.env.stats()["requests"]
+        before = suites.env.sandbox.stats()["requests"]
         for _ in range(5):
             suites.env.step(ACTIONS)
             suites.env.get_attr("task")
-        assert suites.env.stats()["requests"] == before + 10
+        assert suites.env.sandbox.stats()["requests"] == before + 10
 
 
 @pytest.mark.parametrize(

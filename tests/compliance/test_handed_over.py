@@ -229,5 +229,5 @@ def test_a_known_manifest_serves_again(folder: Path) -> None:
     for given, known in ((lasting, True), ({"a": VALUES["NamedTuple"]}, False)):
         make_env(folder, env_kwargs=given).close()
         again = made_of(folder, env_kwargs=given)
-        assert bool(again.sandbox_report) is not known  # it runs, where it has to be asked
+        assert bool(again.sandbox.report()) is not known  # it runs, where it has to be asked
         again.close()

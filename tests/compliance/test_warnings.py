@@ -145,5 +145,5 @@ def test_a_filter_may_make_an_error_of_it(way: str) -> None:
         with pytest.raises(RemoteEnvWarning, match=r"Own: one$"):
             env.step(np.array([1, 0]))
         assert env.step(np.array([1, 0]))[0].tolist() == [[1, 1], [0, 0]]
-    assert env.stats()["state"] == "READY"
+    assert env.sandbox.stats()["state"] == "READY"
     env.close()

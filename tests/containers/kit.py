@@ -25,7 +25,7 @@ IMAGE = os.environ.get("ENVHUB_TEST_IMAGE", "envhub-worker")
 
 def container_of(env: Any) -> str:
     """The name of the container that an environment runs in, out of its report."""
-    [detail] = [layer["detail"] for layer in env.sandbox_report if layer["layer"] == "container"]
+    [detail] = [layer["detail"] for layer in env.sandbox.report() if layer["layer"] == "container"]
     found = re.search(r"envhub-[0-9a-f]{12}", detail)
     assert found is not None
     return found[0]

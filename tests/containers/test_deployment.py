@@ -63,7 +63,7 @@ def goes_on(engine: Engine, container: str, port: int, restart: Callable[[], obj
             env.step(action)
         assert np.array_equal(env.reset(seed=1)[0], first)
         assert np.array_equal(env.step(action)[0], after)
-        held = {layer["layer"] for layer in env.sandbox_report if layer["enforced"]}
+        held = {layer["layer"] for layer in env.sandbox.report() if layer["enforced"]}
         assert {"user-namespace", "mount-namespace", "landlock", "seccomp"} <= held
 
 

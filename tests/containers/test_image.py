@@ -86,7 +86,7 @@ def test_a_hardened_container_gives_jails_every_layer(engine: Engine) -> None:
         make_env(SAMPLES / "counter", sandbox=remote) as suites,
     ):
         suites.env.reset(seed=0)
-        held = {layer["layer"] for layer in suites.env.sandbox_report if layer["enforced"]}
+        held = {layer["layer"] for layer in suites.env.sandbox.report() if layer["enforced"]}
         assert {"mount-namespace", "pid-namespace", "landlock", "seccomp"} <= held
 
 

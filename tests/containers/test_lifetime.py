@@ -52,7 +52,7 @@ suites = make_env(sys.argv[1], n_envs=2, sandbox=docker)
 env = suites.env
 env.reset(seed=0)
 env.step(env.action_space.sample())
-report = [layer["detail"] for layer in env.sandbox_report if layer["layer"] == "container"]
+report = [layer["detail"] for layer in env.sandbox.report() if layer["layer"] == "container"]
 print(json.dumps({"report": report}), flush=True)
 if sys.argv[4] == "exit":
     sys.exit(0)

@@ -48,7 +48,7 @@ def test_the_printed_line_drives_an_environment(engine: Engine, options: tuple[s
     ):
         pair = Pair(reference("counter", 3), suites.env)
         pair.drive(seed=1, steps=40)
-        layers = {layer["layer"] for layer in suites.env.sandbox_report if layer["enforced"]}
+        layers = {layer["layer"] for layer in suites.env.sandbox.report() if layer["enforced"]}
         assert {"landlock", "seccomp"} <= layers
         assert ("user-namespace" in layers) is ("policy" not in arguments)
 

@@ -116,7 +116,7 @@ waits for, and `python -m tests.faults.starts --rounds 200` at random ones. Noth
 remains, their temporary folders included. (If the *server* is killed its client removes the folder.
 If both are killed at once, or a client that has no server yet, a folder and empty control groups
 stay. The folder says whose it was: the next server that this user starts removes it, and
-`envhub gc` both.)
+`envhub cache gc` both.)
 
 - **Ctrl-C in a step** comes at once. The reply is then late: the next step (a notebook's next cell)
   says what was interrupted, `reset()` recovers.

@@ -25,7 +25,7 @@ FAULTS = {
     "kill": "gets `SIGKILL`",
     "segfault": "crashes (`SIGSEGV`)",
     "memory": "allocates without end",
-    "cpu": "spins, under `Limits(cpu_s=1)`",
+    "cpu": "spins, under `Limits(cpu_time_s=1)`",
     "flood": "prints 10 MB",
     "thread": "starts a thread that never ends",
     "atexit": "registers an exit handler that hangs",

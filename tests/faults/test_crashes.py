@@ -264,10 +264,10 @@ def test_a_death_that_is_hidden_leaves_a_bundle_too(
         env.action_space.seed(5)
         env.reset(seed=3)
         for _ in range(2000):
-            if env.stats()["restarts"]:
+            if env.sandbox.stats()["restarts"]:
                 break
             env.step(env.action_space.sample())
-        assert env.stats()["restarts"] == 1
+        assert env.sandbox.stats()["restarts"] == 1
     [folder] = tmp_path.iterdir()
     assert str(folder) in caplog.text
     assert replayed(str(folder), code=0)["verdict"] == "same"

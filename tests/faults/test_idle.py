@@ -100,7 +100,7 @@ def test_idle_processes_end_and_a_reset_starts_others(lane: str, restart: str) -
         assert observation.tolist() == oracle().reset(seed=SEED)[0].tolist()
         assert "worker_restarted" not in info
         assert played(env)
-        assert env.stats()["deaths"] == env.stats()["restarts"] == 0
+        assert env.sandbox.stats()["deaths"] == env.sandbox.stats()["restarts"] == 0
 
 
 @lanes

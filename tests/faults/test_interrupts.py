@@ -212,7 +212,7 @@ def test_close_ends_the_wait_before_a_restart(
         thread.join(60)
         assert [type(one) for one in raised] == [ClosedEnvironmentError]
         assert loaded.closed
-        assert env.stats()["restarts"] == 0
+        assert env.sandbox.stats()["restarts"] == 0
 
 
 def test_who_outlasts_a_close_gives_everything_back(monkeypatch: pytest.MonkeyPatch) -> None:

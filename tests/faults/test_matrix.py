@@ -100,13 +100,14 @@ def _limits(fault: str) -> Limits:
     return Limits(
         memory_bytes=(512 if fault == "memory" else 4096) * MIB,
         disk_bytes=32 * MIB,
-        cpu_s=1 if fault == "cpu" else None,
+        cpu_time_s=1 if fault == "cpu" else None,
     )
 
 
 def _use(suites: Any) -> Any:
     """The first use of the faulty environment builds all its sub-environments."""
-    first = next(iter(suites.envs()))
+    [tasks] = suites.values()
+    first = next(iter(tasks.values()))
     try:
         first.reset()
     except errors.EnvHubError:
@@ -116,7 +117,8 @@ def _use(suites: Any) -> Any:
 
 
 def _provoke(row: Row, suites: Any) -> tuple[Exception | None, float]:
-    env, *others = suites.envs()
+    [tasks] = suites.values()
+    env, *others = tasks.values()
     env.reset()
     env.step([0, 0])
     for other in others:
@@ -180,7 +182,8 @@ def _check_what_is_seen(row: Row, error: Exception | None) -> None:
 
 
 def _check_what_becomes_of_it(cell: Cell, suites: Any) -> None:
-    env, *others = suites.envs()
+    [tasks] = suites.values()
+    env, *others = tasks.values()
     for other in others:  # its siblings in the suite never noticed
         assert other.step([0, 0])[0].tolist() == [[2.0], [2.0]]
     if cell.row.then == CLOSED:

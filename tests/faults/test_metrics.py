@@ -71,7 +71,7 @@ def test_everything_is_exported(registry: Any, repository: Path, lane: str) -> N
         with pytest.raises(errors.WorkerDiedError):
             env.step([[1.0, -1.0]])
         env.reset()
-        found, told = scraped(registry, label), env.stats()
+        found, told = scraped(registry, label), env.sandbox.stats()
     assert found[key("envhub_requests_total")] == told["requests"] == 10
     assert found[key("envhub_steps_total")] == told["steps"] == 7
     assert found[key("envhub_worker_deaths_total")] == 1
@@ -113,10 +113,10 @@ def test_bytes_are_counted_over_both_lanes(lane: str) -> None:
     with make_env(sample("echo"), n_envs=4, lane=lane, policy=policy) as suites:
         env = suites.env
         env.reset()
-        before = env.stats()
+        before = env.sandbox.stats()
         for _ in range(10):
             env.step(np.ones((4, 2)) * [1.0, 0.0])
-        after = env.stats()
+        after = env.sandbox.stats()
         sent = after["sent_bytes"] - before["sent_bytes"]
         received = after["received_bytes"] - before["received_bytes"]
         assert 10 * 4 * 2 * 8 <= sent <= 10 * (4 * 2 * 8 + 500)
@@ -124,8 +124,8 @@ def test_bytes_are_counted_over_both_lanes(lane: str) -> None:
         with pytest.raises(errors.WorkerDiedError):
             env.step(np.ones((4, 2)) * [1.0, -1.0])
         env.reset()
-        assert env.stats()["sent_bytes"] > after["sent_bytes"]
-    assert env.stats()["received_bytes"] > after["received_bytes"]
+        assert env.sandbox.stats()["sent_bytes"] > after["sent_bytes"]
+    assert env.sandbox.stats()["received_bytes"] > after["received_bytes"]
 
 
 class Env:

@@ -138,7 +138,7 @@ def test_a_file_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
     with made(nowhere, "exit") as suites:
         with pytest.raises(errors.PolicyError, match="output"):
             suites.env.reset()
-        assert suites.env.sandbox_report == []
+        assert suites.env.sandbox.report() == []
     with pytest.raises(errors.PolicyError, match="output"):
         made(nowhere, "never met before")
     assert followers() == []

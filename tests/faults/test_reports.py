@@ -14,15 +14,15 @@ def test_a_task_that_does_not_run_is_not_confined() -> None:
     """Others of its repository may run, and may have run; the provenance still says how."""
     with make_env(sample("many_tasks"), prewarm=0) as suites:
         [first, second, *_] = [env for tasks in suites.values() for env in tasks.values()]
-        assert (first.sandbox_report, first.jail_usage()) == ([], {})
+        assert (first.sandbox.report(), first.sandbox.usage()) == ([], {})
         first.reset()
-        held = first.jail_usage()
+        held = first.sandbox.usage()
         assert held["processes"] >= 1
         assert held["memory_bytes"] > 0
-        assert {layer["layer"] for layer in first.sandbox_report} >= {"seccomp", "rlimits"}
-        assert second.sandbox_report == []
+        assert {layer["layer"] for layer in first.sandbox.report()} >= {"seccomp", "rlimits"}
+        assert second.sandbox.report() == []
         first.close()
-        assert first.sandbox_report == []
+        assert first.sandbox.report() == []
         assert suites.provenance["layers"]
 
 
@@ -34,17 +34,17 @@ def test_a_jail_that_was_lost_confines_nobody(lane: str) -> None:
     with make_env(sample("echo"), lane=lane, policy=policy) as suites:
         env = suites.env
         env.reset()
-        report = env.sandbox_report
+        report = env.sandbox.report()
         assert report
         with halted(inside.pids(env)):
             env.step_async([[1.0, 0.0]])
             with pytest.raises(errors.WorkerTimeoutError):
                 env.step_wait(timeout=0.02)
-        assert env.sandbox_report == report
+        assert env.sandbox.report() == report
         env.reset()
         with pytest.raises(errors.WorkerDiedError):
             env.step([[1.0, -1.0]])
-        assert env.sandbox_report == []
+        assert env.sandbox.report() == []
         env.reset()
-        assert env.sandbox_report == report
-    assert env.sandbox_report == []
+        assert env.sandbox.report() == report
+    assert env.sandbox.report() == []

@@ -26,13 +26,13 @@ def test_counters_follow_what_happens(lane: str, monkeypatch: pytest.MonkeyPatch
             env.step_async([[1.0, 0.0]])
             with pytest.raises(errors.WorkerTimeoutError):
                 env.step_wait(timeout=0.02)
-        assert env.stats()["state"] == "LATE"
+        assert env.sandbox.stats()["state"] == "LATE"
         env.reset()
         with pytest.raises(errors.WorkerDiedError):
             env.step([[1.0, -1.0]])
-        assert env.stats()["state"] == "DEAD"
+        assert env.sandbox.stats()["state"] == "DEAD"
         env.reset()
-        found = env.stats()
+        found = env.sandbox.stats()
         latency = found.pop("step_latency_s")
         assert found.pop("sent_bytes") > 6 * 8
         assert found.pop("received_bytes") > 6 * (8 + 8 + 1 + 1)
@@ -47,7 +47,7 @@ def test_counters_follow_what_happens(lane: str, monkeypatch: pytest.MonkeyPatch
         }
         assert latency["total"] >= latency["max"]
         assert 0 < latency["p50"] <= latency["p90"] <= latency["p99"] <= latency["max"]
-    assert env.stats()["state"] == "CLOSED"
+    assert env.sandbox.stats()["state"] == "CLOSED"
 
 
 def test_latencies_are_those_of_the_last_steps() -> None:

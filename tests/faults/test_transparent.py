@@ -110,7 +110,7 @@ def test_the_dead_come_back_and_the_others_go_on(lane: str, how: int) -> None:
         assert restarted(info)
         assert info["at"].tolist() == [2, 2, 0, 0]
         assert inside.state(env) is State.READY
-        assert env.stats()["deaths"] == env.stats()["restarts"] == 1
+        assert env.sandbox.stats()["deaths"] == env.sandbox.stats()["restarts"] == 1
 
 
 @lanes
@@ -223,7 +223,7 @@ def test_infos_that_differ_in_kind_survive_a_death(tmp_path: Path, lane: str, di
         assert {key: info[key] for key in expected}.keys() == expected.keys() > {"k", "_k"}
         assert list(info["n"]) == [0, 1, 2, 3]
         assert repr({key: info[key] for key in expected}) == repr(expected)
-        assert env.stats()["state"] == "READY"
+        assert env.sandbox.stats()["state"] == "READY"
         assert repr(env.step(ALL_LIVE)[4]) == repr(expected)
 
 
@@ -456,7 +456,7 @@ def test_memory_of_all_takes_all_rows(lane: str) -> None:
 
 def test_the_cpu_limit_takes_one_process() -> None:
     """It is each process's own, and the fresh one has it from the start."""
-    with made(policy={"limits": {"cpu_s": 2}}) as suites:
+    with made(policy={"limits": {"cpu_time_s": 2}}) as suites:
         env = suites.env
         env.reset(seed=SEED)
         observation, _, _, truncated, info = env.step([LIVE, LIVE, LIVE, SPIN])

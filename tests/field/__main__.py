@@ -109,7 +109,7 @@ def inside(python: Path, program: Program, profile: str, repository: Path) -> tu
         with make_env(str(repository), policy=policy, **options) as suites:
             suites.env.reset()
             [(status, printed, error)] = suites.env.call("go", program["code"])
-            denied = ", ".join(suites.env.jail_denials() or ())
+            denied = ", ".join(suites.env.sandbox.denials() or ())
     except EnvHubError as error:
         return False, str(error)
     if succeeded(status, printed):

@@ -63,7 +63,7 @@ def record() -> list[Frames]:
 def _run(name: str, lane: str, workers: int) -> None:
     options: dict[str, Any] = {"lane": lane, "num_workers": workers, "n_envs": 3}
     with make_env(str(SAMPLES / name), **options) as suites:
-        env = next(suites.envs())
+        env = next(iter(next(iter(suites.values())).values()))
         env.action_space.seed(0)
         asked: list[Callable[[], object]] = [
             lambda: env.reset(seed=1),

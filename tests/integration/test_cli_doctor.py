@@ -136,7 +136,7 @@ def test_a_user_without_a_home_is_told_so(monkeypatch: pytest.MonkeyPatch) -> No
     assert "no home" in disk["problem"]
 
 
-@pytest.mark.parametrize(("command", "code"), [("doctor", 6), ("gc --dry-run", 0)])
+@pytest.mark.parametrize(("command", "code"), [("doctor", 6), ("cache gc --dry-run", 0)])
 def test_nothing_can_be_written(command: str, code: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """In a read-only container there is no place for temporary files, and nothing is left there."""
 

@@ -57,11 +57,11 @@ def test_the_second_thread_waits(env: Any, monkeypatch: pytest.MonkeyPatch, asks
     """Nothing of it is sent before the first has its results; then both have theirs."""
     finish = held_between_the_halves(env, monkeypatch)
     arguments = {"step": (ACTIONS,), "get_attr": ("gravity",)}.get(asks, ())
-    sent, results = env.stats()["requests"], []
+    sent, results = env.sandbox.stats()["requests"], []
     second = threading.Thread(target=lambda: results.append(getattr(env, asks)(*arguments)))
     second.start()
     assert not getattr(*inside.use_lock(env)).acquire(blocking=False)
-    assert (env.stats()["requests"], results) == (sent, [])
+    assert (env.sandbox.stats()["requests"], results) == (sent, [])
     assert finish()[0].shape == (2, 4)
     second.join(DEADLINE_S)
     assert len(results) == 1

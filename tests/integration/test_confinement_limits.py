@@ -269,7 +269,7 @@ if not pid:
 _, status = os.waitpid(pid, 0)
 result = os.WTERMSIG(status)
 """
-    with limited(profile, cpu_s=1) as cell:
+    with limited(profile, cpu_time_s=1) as cell:
         assert cell.run(source) == {"result": 9}
 
 

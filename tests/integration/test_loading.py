@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+import shutil
 import sys
 import venv
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import VectorEnv
@@ -321,6 +323,19 @@ class TestWhatMakeEnvReturns:
             assert env.initialize(friction=0.25) == 0.25
             assert (env.initialized, env.friction) == (True, 0.25)
             assert not hasattr(env, "no_such_thing")
+
+    def test_an_own_attribute_that_is_not_served_is_warned_of(self, tmp_path: Path) -> None:
+        """``env.sandbox`` is the client's, behind wrappers too."""
+        folder = shutil.copytree(sample("custom_vector"), tmp_path / "swarm")
+        entry = folder / "env.py"
+        entry.write_text(entry.read_text().replace("self.friction = 0.0", "self.sandbox = 'best'"))
+        with pytest.warns(UserWarning, match="named sandbox, which are not served"):
+            suites = make_env(folder)
+        with suites:
+            suites.env.reset()
+            assert {layer["layer"] for layer in suites.env.sandbox.report()} >= {"seccomp"}
+            wrapped = gym.vector.VectorWrapper(suites.env)
+            assert wrapped.unwrapped.sandbox.stats()["state"] == "READY"
 
     @pytest.mark.parametrize(
         ("mistake", "named"),

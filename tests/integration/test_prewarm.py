@@ -22,15 +22,15 @@ def test_the_first_reset_finds_what_was_started() -> None:
     """One start, before any request; to prewarm what is warm does nothing."""
     with make_env(sample("counter"), n_envs=2) as suites:
         env = suites.env
-        assert env.stats()["state"] == "IDLE"
+        assert env.sandbox.stats()["state"] == "IDLE"
         env.prewarm()
         env.prewarm()
-        assert eventually(lambda: env.stats()["state"] == "READY")
+        assert eventually(lambda: env.sandbox.stats()["state"] == "READY")
         started = descendants()
         env.prewarm()
         env.reset(seed=0)
         assert descendants() <= started  # what others left to linger may end meanwhile
-        assert env.stats()["requests"] == 1
+        assert env.sandbox.stats()["requests"] == 1
 
 
 def test_a_reset_in_the_midst_waits_for_it() -> None:
@@ -39,7 +39,7 @@ def test_a_reset_in_the_midst_waits_for_it() -> None:
         suites.env.prewarm()
         observations, _ = suites.env.reset(seed=0)
         assert len(observations) == 2
-        assert suites.env.stats()["state"] == "READY"
+        assert suites.env.sandbox.stats()["state"] == "READY"
 
 
 def test_closed_in_the_midst_it_leaves_nothing() -> None:
@@ -49,7 +49,7 @@ def test_closed_in_the_midst_it_leaves_nothing() -> None:
         suites = make_env(sample("counter"), n_envs=2, timeouts={"server_idle_s": 0})
         suites.env.prewarm()
         suites.close()
-        assert suites.env.stats()["state"] == "CLOSED"
+        assert suites.env.sandbox.stats()["state"] == "CLOSED"
         with pytest.raises(ClosedEnvironmentError):
             suites.env.prewarm()
     assert eventually(lambda: descendants() <= before)
@@ -61,4 +61,4 @@ def test_what_fails_is_raised_by_the_first_request() -> None:
         suites.env.prewarm()
         with pytest.raises(WorkerError):
             suites.env.reset(seed=0)
-        assert suites.env.stats()["state"] == "IDLE"
+        assert suites.env.sandbox.stats()["state"] == "IDLE"

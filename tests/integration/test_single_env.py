@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from envhub_sandbox import SandboxEnv, make_env
+from envhub_sandbox import SandboxEnv
 from tests.support.samples import EXAMPLES
 
 _ID = "envhub_sandbox.integrations.gym:Hub-v0"
@@ -71,19 +71,9 @@ def test_a_task_is_chosen_by_name() -> None:
         SandboxEnv(EXAMPLES / "two_tasks", suite="house")
     env = SandboxEnv(EXAMPLES / "two_tasks", task=1)
     env.reset(seed=0)
-    env.close()
-
-
-def test_suites_give_one_as_a_single_environment() -> None:
-    """Its end is theirs."""
-    suites = make_env(EXAMPLES / "two_tasks")
-    env = suites.single("maze", 1)
-    env.reset(seed=0)
     assert env.step(env.action_space.sample())[0] in env.observation_space
     env.close()
-    assert all(one.closed for one in suites.envs())
-    with pytest.raises(ValueError, match="n_envs=1"), make_env(EXAMPLES / "catch", n_envs=2) as two:
-        two.single()
+    assert env.vector.closed
 
 
 def test_a_notebook_shows_its_spaces() -> None:

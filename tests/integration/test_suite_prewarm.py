@@ -80,7 +80,7 @@ def tasks(repository: Path) -> Iterator[Callable[..., Tasks]]:
         with make_env(repository, n_envs, env_kwargs=kwargs):
             pass  # its manifest is remembered
         made.append(make_env(repository, n_envs, env_kwargs=kwargs, **options))
-        return list(made[-1].envs())
+        return _of(made[-1])
 
     yield make
     for suites in made:
@@ -91,12 +91,12 @@ def tasks(repository: Path) -> Iterator[Callable[..., Tasks]]:
 
 def states(tasks: Tasks) -> list[str]:
     """Where each is in its life."""
-    return [env.stats()["state"] for env in tasks]
+    return [env.sandbox.stats()["state"] for env in tasks]
 
 
 def ahead(tasks: Tasks) -> list[int]:
     """Which ones are up, and were never asked anything."""
-    found = [env.stats() for env in tasks]
+    found = [env.sandbox.stats() for env in tasks]
     return [
         index
         for index, one in enumerate(found)
@@ -241,7 +241,7 @@ def test_while_one_is_waited_for_the_next_is_started(
     repository, opened, policy = gated
     elsewhere = descendants()
     with make_env(repository, policy=policy, prewarm=1) as suites:
-        envs = list(suites.envs())
+        envs = _of(suites)
         envs[0].reset()
         # the server, its zygote's two, and two jails of two: the second one is at the gate
         assert eventually(lambda: len(descendants() - elsewhere) == 7)
@@ -254,7 +254,11 @@ def test_while_the_first_is_started_the_next_is(
     """Nothing of it was up when it was asked."""
     repository, opened, policy = gated
     with make_env(repository, policy=policy, prewarm=1) as suites:
-        assert all(_begun_meanwhile(list(suites.envs()), opened))
+        assert all(_begun_meanwhile(_of(suites), opened))
+
+
+def _of(suites: Any) -> Tasks:
+    return [env for tasks in suites.values() for env in tasks.values()]
 
 
 def _begun_meanwhile(envs: Tasks, opened: Path) -> tuple[bool, bool]:
@@ -311,7 +315,7 @@ def test_closed_in_the_midst_it_leaves_nothing(repository: Path) -> None:
     before, bundles = descendants(), set(_bundles())
     for pause_s in (0.0, 0.02, 0.05, 0.1, 0.2, 0.4):
         suites = make_env(repository, prewarm=2, timeouts={"server_idle_s": 0})
-        envs = list(suites.envs())
+        envs = _of(suites)
         envs[0].reset()
         time.sleep(pause_s)
         suites.close()
@@ -337,7 +341,7 @@ def test_a_suite_that_nobody_holds_gives_up_what_it_started_ahead(repository: Pa
     stop_idle()
     before = descendants()
     suites = make_env(repository, prewarm=1, timeouts={"server_idle_s": 0})
-    envs = list(suites.envs())
+    envs = _of(suites)
     envs[0].reset()
     assert eventually(lambda: ahead(envs) == [1])
     envs.clear()

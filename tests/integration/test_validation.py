@@ -78,7 +78,7 @@ def test_an_observation_outside_of_its_space_is_told(
         assert caught.value.index == 2
         assert not holds(suites.env.single_observation_space, caught.value.observation)
         assert str(leaver) in str(caught.value)
-        assert suites.env.stats()["state"] == "READY"
+        assert suites.env.sandbox.stats()["state"] == "READY"
 
 
 def play(env: Any) -> None:
@@ -102,7 +102,7 @@ def test_an_action_outside_of_its_space_is_not_sent(leaver: Path) -> None:
         for bad in (1.5, float("nan")):
             with pytest.raises(ActionError, match="sub-environment 1 is outside"):
                 env.step(np.array([[0.0], [bad]], np.float32))
-        assert env.stats()["steps"] == 1
+        assert env.sandbox.stats()["steps"] == 1
 
 
 @pytest.mark.parametrize(
@@ -111,7 +111,7 @@ def test_an_action_outside_of_its_space_is_not_sent(leaver: Path) -> None:
 def test_what_keeps_to_its_spaces_passes(name: str) -> None:
     """Nested spaces, spaces that are not known here, classes of the repository's own."""
     with make_env(sample(name), 2, validate=True) as suites:
-        for env in suites.envs():
+        for env in [env for tasks in suites.values() for env in tasks.values()]:
             env.reset(seed=0)
             for _ in range(5):
                 try:
@@ -185,4 +185,4 @@ def test_what_is_no_batch_at_all_is_told(tmp_path: Path) -> None:
     with make_env(str(write_repository(tmp_path, _SHAPELESS)), 2, validate=True) as suites:
         with pytest.raises(ObservationError, match="no batch of observations"):
             suites.env.reset()
-        assert suites.env.stats()["state"] == "READY"
+        assert suites.env.sandbox.stats()["state"] == "READY"

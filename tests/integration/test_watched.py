@@ -153,7 +153,7 @@ def test_every_value_is_the_one_that_is_there(folder: Path, way: dict[str, Any])
         env = suites.env
         found = [done(env, what, number) for number, what in enumerate(requests)]
         assert_same(found, expected)
-        assert env.stats()["requests"] < len(requests) - 100  # many were not asked at all
+        assert env.sandbox.stats()["requests"] < len(requests) - 100  # many were not asked at all
 
 
 @pytest.mark.parametrize("way", WAYS, ids=str)
@@ -163,11 +163,11 @@ def test_an_evaluation_asks_for_its_task_but_twice(folder: Path, way: dict[str, 
         env = suites.env
         env.reset()
         env.get_attr("kind")
-        before = env.stats()["requests"]
+        before = env.sandbox.stats()["requests"]
         for _ in range(50):
             env.step(np.zeros(ENVS, np.int64))
             assert env.call("kind") == ("reacher",) * ENVS
-        assert env.stats()["requests"] - before == 50 + 1
+        assert env.sandbox.stats()["requests"] - before == 50 + 1
 
 
 def test_who_waits_for_a_change_sees_it(folder: Path) -> None:
@@ -194,11 +194,11 @@ def test_who_waits_for_a_signal_is_not_watched(folder: Path) -> None:
             for _ in range(3):
                 env.step(np.zeros(ENVS, np.int64))
                 env.get_attr("kind")
-            before = env.stats()["requests"]
+            before = env.sandbox.stats()["requests"]
             for _ in range(10):
                 env.step(np.zeros(ENVS, np.int64))
                 assert env.get_attr("kind") == ("reacher",) * ENVS
-            assert env.stats()["requests"] - before == (20 if listens else 10)
+            assert env.sandbox.stats()["requests"] - before == (20 if listens else 10)
 
 
 @pytest.mark.parametrize("way", ["late", "closed"])

@@ -123,7 +123,7 @@ def described() -> None:
     FOUND["pinned"] = f"robots/cameras@{COMMITS['cameras']}" in str(cfg.repo)
     chosen = ours.SandboxedEnvConfig(repo="robots/suites", suite="near", task="1")
     envs = make_env(chosen, n_envs=2)
-    FOUND["chosen"] = [list(env.get_attr("task")) for env in envs.envs()]
+    FOUND["chosen"] = [list(env.get_attr("task")) for env in envs["near"].values()]
     FOUND["chosen shape"] = shape(envs)
 
 

@@ -51,7 +51,7 @@ def test_another_host_serves_what_it_was_sent(
         suites.env.reset(seed=1)
         for count in range(1, 30):
             assert suites.env.step(np.zeros(2, int))[0].tolist() == [[count], [count]]
-        assert {layer["layer"] for layer in suites.env.sandbox_report} >= {"seccomp", "landlock"}
+        assert {layer["layer"] for layer in suites.env.sandbox.report()} >= {"seccomp", "landlock"}
     assert eventually(lambda: far_server.jails() == 0)
 
 

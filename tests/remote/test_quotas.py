@@ -199,16 +199,16 @@ def test_what_was_started_ahead_makes_room_under_a_quota(tmp_path: Path) -> None
     options: dict[str, Any] = {"env_kwargs": {"tasks": 4}, "prewarm": 1}
     with listening(tmp_path / "server", "--max-jails", "2") as server:
         with make_env(sample("many_tasks"), sandbox=server.sandbox(), **options) as suites:
-            envs = list(suites.envs())
+            envs = [env for tasks in suites.values() for env in tasks.values()]
             envs[0].reset(seed=0)
-            assert eventually(lambda: envs[1].stats()["state"] == "READY")
+            assert eventually(lambda: envs[1].sandbox.stats()["state"] == "READY")
             envs[3].reset(seed=0)  # would be the third jail
-            assert envs[1].stats()["state"] == "IDLE"
+            assert envs[1].sandbox.stats()["state"] == "IDLE"
             with pytest.raises(WorkerError, match="3 jails"):
                 envs[1].reset(seed=0)
             envs[3].close()
             envs[1].reset(seed=0)
             for env in (envs[0], envs[1]):
                 env.step(np.zeros(1, int))
-            assert envs[2].stats()["state"] == "IDLE"
+            assert envs[2].sandbox.stats()["state"] == "IDLE"
         assert eventually(lambda: server.jails() == 0)

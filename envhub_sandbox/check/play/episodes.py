@@ -226,9 +226,9 @@ def _on_cpu(values: Any) -> Any:
     return values.cpu() if callable(getattr(values, "cpu", None)) else values
 
 
-def _chooser(policy: str, space: gym.Space[Any], seed: int) -> Callable[[], Any]:
+def _chooser(actions: str, space: gym.Space[Any], seed: int) -> Callable[[], Any]:
     """A function that gives the next batch of actions."""
-    if policy == "zero":
+    if actions == "zero":
         action = zero_action(space)
         return lambda: action
     space.seed(seed)
@@ -240,7 +240,7 @@ def rollout(
     *,
     episodes: int,
     seed: int,
-    policy: str = "random",
+    actions: str = "random",
     max_steps: int | None = None,
     observe: Callable[[EpisodeCounter], None] = lambda counter: None,
 ) -> Rollout:
@@ -249,8 +249,8 @@ def rollout(
     Args:
         env: Is left open.
         episodes: How many to count.
-        seed: For ``reset`` and the policy: the same seed gives the same result.
-        policy: ``"random"`` samples from the space, seeded; ``"zero"`` does as little as the
+        seed: For ``reset`` and the actions: the same seed gives the same result.
+        actions: ``"random"`` samples from the space, seeded; ``"zero"`` does as little as the
             space allows.
         max_steps: Vector steps after which to give up; None for no bound.
         observe: Called after the reset and after every step.
@@ -262,7 +262,7 @@ def rollout(
     result = Rollout(episodes=counter.counted)
     begun, taken = time.perf_counter(), 0
     try:
-        choose = _chooser(policy, env.action_space, seed)
+        choose = _chooser(actions, env.action_space, seed)
         env.reset(seed=seed)
         observe(counter)
         while not counter.finished and (max_steps is None or taken < max_steps):

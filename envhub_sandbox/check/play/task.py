@@ -20,6 +20,7 @@ from envhub_sandbox.check.play.traces import Env, Trace
 from envhub_sandbox.check.settings import JudgeOptions
 from envhub_sandbox.errors import EnvHubError, RemoteEnvError
 from envhub_sandbox.vector.suites import EnvSuites
+from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol.text import printable, size_text
 
 _PICTURED = 12
@@ -61,6 +62,7 @@ class TaskJudge:
         takes_render_mode: bool,
     ) -> None:
         self._asked, self._report, self._make, self._env = asked, report, make, env
+        self._sandbox = env.sandbox if isinstance(env, SandboxVectorEnv) else None
         self._suite, self._task = key
         self._takes_render_mode = takes_render_mode
         self._name = f"{self._suite} / {self._task}"
@@ -84,10 +86,9 @@ class TaskJudge:
         wanted = self._asked.arguments.get("n_envs", 1)
         gave = f"make_env(n_envs={wanted}) gave {self._env.num_envs} sub-environments"
         self._holds("num-envs", self._env.num_envs == wanted, gave)
-        usage = getattr(self._env, "jail_usage", None)
         seen = {}
-        if usage is not None and self._pictured:
-            seen["observe"] = self._play.sampling(usage, self._asked.steps)
+        if self._sandbox is not None and self._pictured:
+            seen["observe"] = self._play.sampling(self._sandbox.usage, self._asked.steps)
         self._tell("first play")
         first = self._played(self._env, mode, **seen)
         self._play.episodes = first.counted
@@ -105,8 +106,7 @@ class TaskJudge:
 
     def denied(self) -> tuple[str, ...] | None:
         """What was refused so far: also where it ended in an error."""
-        ask = getattr(self._env, "jail_denials", None)
-        denied: tuple[str, ...] | None = None if ask is None else ask()
+        denied = None if self._sandbox is None else self._sandbox.denials()
         return self._denied if denied is None else denied
 
     def film(self) -> None:
@@ -237,10 +237,9 @@ class TaskJudge:
     # --- in the process that was played first --------------------------------------------------
 
     def _leaks(self) -> None:
-        usage = getattr(self._env, "jail_usage", None)
-        if usage is None or not self._asked.resets:
+        if self._sandbox is None or not self._asked.resets:
             return
-        resets, counting = self._asked.resets, self._play.counting(usage)
+        resets, counting = self._asked.resets, self._play.counting(self._sandbox.usage)
         steps = min(_BEGUN, self._asked.steps)
         begin = partial(self._ends, self._env, steps)
         seen = leaks.usage_per_round(begin, counting, resets, self._tell)

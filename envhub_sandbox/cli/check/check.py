@@ -119,7 +119,7 @@ def check(
     listed: own.File = None,
     output: own.Output = None,
     jobs: own.Jobs = None,
-    memory_budget: own.MemoryBudget = None,
+    max_memory: own.MaxMemory = None,
     deadline: own.Deadline = own.DEADLINE_S,
     again: own.Again = False,
     suite: opt.Suite = None,
@@ -157,7 +157,7 @@ def check(
                 file=listed,
                 output=output,
                 jobs=jobs,
-                memory_budget=memory_budget,
+                max_memory=max_memory,
                 deadline=deadline,
                 again=again,
                 make=make,
@@ -172,7 +172,7 @@ def check(
         if ref is None:
             raise UsageError("name a repository, or a list of them: --all FILE --output DIR")
         if any(opt.is_typed(ctx, name) for name in own.OF_A_LIST):
-            raise UsageError("--output, --jobs, --memory-budget and --again are for --all FILE")
+            raise UsageError("--output, --jobs, --max-memory and --again are for --all FILE")
         own.refuse_options_of_the_judged({"--settings": settings, "--policy": policy}, ref)
         report = _judge(
             make,

@@ -32,7 +32,7 @@ from envhub_sandbox.cli.shared.console import print_json, safe_line, say, show
 from envhub_sandbox.cli.shared.exits import Exit, UsageError
 from envhub_sandbox.cli.shared.findings import annotate, write_report
 from envhub_sandbox.cli.shared.memory import free_memory_bytes
-from envhub_sandbox.cli.version import versions
+from envhub_sandbox.cli.shared.versions import versions
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.hub.snapshot import commit_of
 from envhub_sandbox.settings.policy import policy_from
@@ -48,7 +48,7 @@ _JAILS = 2
 _COLOURS = {Verdict.PASSED: "green", Verdict.FAILED: "red", Verdict.UNJUDGED: "yellow"}
 OF_THE_LIST = frozenset(
     {
-        *("ref", "listed", "output", "jobs", "memory_budget", "deadline", "again"),
+        *("ref", "listed", "output", "jobs", "max_memory", "deadline", "again"),
         *("json", "junit", "sarif", "html", "github", "settings", "policy", "token", "debug"),
     }
 )
@@ -78,7 +78,7 @@ class ListRun:
     Attributes:
         file: The list.
         output: Where results go.
-        jobs, memory_budget, deadline, again: As the options.
+        jobs, max_memory, deadline, again: As the options.
         make: The options of ``make_env``, for whatever reference.
         settings, policy: The caller's files.
         arguments: Options for each judgement, as words.
@@ -89,7 +89,7 @@ class ListRun:
     file: str
     output: Path | None
     jobs: int | None
-    memory_budget: str | None
+    max_memory: str | None
     deadline: float
     again: bool
     make: opt.MakeOptions
@@ -251,20 +251,20 @@ class ListRun:
         given = self.make.arguments()["policy"]
         says = {} if self.policy is None else read_file(self.policy)
         one = policy_from(merged_settings(says, given), None).limits.memory_bytes
-        each, budget = _JAILS * one, opt.read_size("--memory-budget", self.memory_budget)
+        each, budget = _JAILS * one, opt.read_size("--max-memory", self.max_memory)
         needs = f"a judgement may take {size_text(each)}: {_JAILS} jails of {size_text(one)}"
         if budget is None:
             budget = max(each, free_memory_bytes() or 0)
         elif budget < each:
             raise UsageError(
-                f"--memory-budget {self.memory_budget} is too little: {needs}. "
+                f"--max-memory {self.max_memory} is too little: {needs}. "
                 "Give more, or less to each by --memory"
             )
         asked = self.jobs or max(1, len(os.sched_getaffinity(0)) // 2)
         jobs = min(asked, budget // each)
         if self.jobs is not None and jobs < self.jobs:
             of = f"{needs}, of {size_text(budget)}"
-            say(f"{jobs} at once: {of}; see --memory and --memory-budget.")
+            say(f"{jobs} at once: {of}; see --memory and --max-memory.")
         return jobs
 
     def _digest(self, policy: bytes) -> str:

@@ -13,10 +13,10 @@ from envhub_sandbox.cli.shared.exits import UsageError
 SETTINGS = (
     *("steps", "resets", "slow_step", "seed", "fail_on", "allow", "policy", "n_envs"),
     *("timeout", "memory", "disk", "processes", "cpu_time"),
-    *("jobs", "memory_budget", "deadline"),
+    *("jobs", "max_memory", "deadline"),
 )
 """What may stand in ``[check]`` of ``--settings FILE``, by the names in Python."""
-OF_A_LIST = ("output", "jobs", "memory_budget", "again")
+OF_A_LIST = ("output", "jobs", "max_memory", "again")
 """What means nothing for one repository; it may stand in a file that is for both."""
 _PANEL = "A list"
 
@@ -45,7 +45,7 @@ Jobs = Annotated[
         rich_help_panel=_PANEL,
     ),
 ]
-MemoryBudget = Annotated[
+MaxMemory = Annotated[
     str | None,
     typer.Option(
         metavar="SIZE",

@@ -28,7 +28,7 @@ from envhub_sandbox.cli.shared.console import out, print_json, safe_line, safe_t
 from envhub_sandbox.cli.shared.exits import Exit, UsageError, describe, reported
 from envhub_sandbox.cli.shared.memory import free_memory_bytes
 from envhub_sandbox.cli.shared.progress import ProgressBar
-from envhub_sandbox.cli.version import versions
+from envhub_sandbox.cli.shared.versions import versions
 from envhub_sandbox.errors import EnvHubError, SandboxUnavailableError, SnapshotError
 from envhub_worker.protocol.confinement import PROFILES
 

@@ -18,7 +18,7 @@ from envhub_worker.protocol.text import printable
 
 PROFILE_VARIABLE = "ENVHUB_BUILD_PROFILE"
 WALL_S = 1800.0
-LIMITS = {"memory_bytes": "8G", "disk_bytes": "6G", "disk_files": 400_000, "cpu_s": 7200}
+LIMITS = {"memory_bytes": "8G", "disk_bytes": "6G", "disk_files": 400_000, "cpu_time_s": 7200}
 _PROGRAM = "envhub_sandbox.factory.builder"
 _SHOWN = 6000
 _AROUND_S = 900.0

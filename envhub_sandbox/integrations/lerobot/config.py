@@ -23,7 +23,7 @@ from envhub_sandbox.factory.make_env import make_env
 from envhub_sandbox.hub.logins import without_login
 from envhub_sandbox.integrations.lerobot.features import features_of
 from envhub_sandbox.settings.options import OPTIONS, on_lerobots_command_line, use_option_names
-from envhub_sandbox.vector.suites import EnvSuites
+from envhub_sandbox.vector.suites import EnvSuites, keep_only
 
 ASKS_CONFIGS = hasattr(EnvConfig, "create_envs")
 """Whether this LeRobot asks a configuration for its environments: 0.6 does, 0.4 and 0.5 do not."""
@@ -173,14 +173,14 @@ class SandboxedEnvConfig(EnvConfig):
         with use_option_names(on_lerobots_command_line()):
             suites = make_env(self.repo, **asked)
         try:
-            suites.keep(self.suite, self.task)
+            keep_only(suites, self.suite, self.task)
         except BaseException:
             suites.close()
             raise
         return suites
 
     def _describe(self, suites: EnvSuites) -> None:
-        first, *others = suites.envs()
+        first, *others = [env for tasks in suites.values() for env in tasks.values()]
         spaces = (first.single_observation_space, first.single_action_space)
         for env in others:
             if (env.single_observation_space, env.single_action_space) != spaces:

@@ -1,4 +1,4 @@
-"""``envhub gc``, as a user runs it."""
+"""``envhub cache gc``, as a user runs it."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def gc(
     """Run it with a folder for temporary files of its own, and without an engine."""
     variables = {"TMPDIR": str(temporary), "PATH": str(temporary)}
     return subprocess.run(
-        [*before, *COMMAND, "gc", *options],
+        [*before, *COMMAND, "cache", "gc", *options],
         env=os.environ | variables,
         capture_output=True,
         text=True,

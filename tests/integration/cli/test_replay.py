@@ -21,7 +21,7 @@ def crashed(folder: Path, reference: Any, **options: Any) -> Path:
     """The bundle of an environment that dies in its third step."""
     policy = {"crash_folder": str(folder), **options.pop("policy", {})}
     with make_env(reference, env_kwargs=_KWARGS, policy=policy, **options) as suites:
-        env = next(iter(suites.envs()))
+        env = next(iter(next(iter(suites.values())).values()))
         env.reset(seed=1)
         env.step([0])
         env.step([0])

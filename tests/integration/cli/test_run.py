@@ -99,8 +99,8 @@ def test_the_seed_decides() -> None:
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
 def test_autoreset_modes_agree(mode: str) -> None:
-    """The zero policy earns the same in the same episodes, whatever resets them."""
-    arguments = ("--policy", "zero", "--episodes", "8", "-n", "2", "--env-kwargs")
+    """Actions of zero earn the same in the same episodes, whatever resets them."""
+    arguments = ("--actions", "zero", "--episodes", "8", "-n", "2", "--env-kwargs")
     found = document("run", sample("counter"), *arguments, f"autoreset_mode={mode}")
     default = document("run", sample("counter"), *arguments[:-1])
     [task], [expected] = found["tasks"], default["tasks"]
@@ -196,7 +196,7 @@ OVER = "return np.zeros(1, np.float32), 1.0, True, False, {}"
 FAILURES: list[tuple[str, Sequence[str], int, str]] = [
     ("raise ValueError('no such luck')", (), 1, "ValueError: no such luck"),
     (OVER, ("--task", "7"), 2, "hub_env/0"),
-    (OVER, ("--policy", "clever"), 2, "clever"),
+    (OVER, ("--actions", "clever"), 2, "clever"),
     (OVER, ("--sandbox", "none"), 2, "--trust-remote-code"),
     (OVER, ("--video", "/nowhere/out.mp4"), 2, "/nowhere"),
     ("import os; os._exit(3)", (), 5, "exit code 3"),

@@ -80,10 +80,10 @@ def test_a_file_says_what_one_may_type_about_a_list(
         yield from faked(orders, command, **more)
 
     monkeypatch.setattr(list_run, "judgements", judgements)
-    says = "[check]\njobs = 5\nmemory-budget = '6G'\ndeadline = 9\nmemory = '1G'\n"
+    says = "[check]\njobs = 5\nmax-memory = '6G'\ndeadline = 9\nmemory = '1G'\n"
     Path("settings.toml").write_text(says)
     arguments = ("--all", "list", "--output", "out", "--settings", "settings.toml")
-    for typed in ((), ("--jobs", "2"), ("--memory-budget", "2G"), ("--deadline", "8")):
+    for typed in ((), ("--jobs", "2"), ("--max-memory", "2G"), ("--deadline", "8")):
         done = called(*arguments, *typed)
         assert done.exit_code == Exit.UNJUDGED, done.output
     assert ([jobs for jobs, _ in started[::2]], seconds) == ([3, 2, 1, 3], [69, 69, 69, 68])
@@ -126,7 +126,7 @@ def test_every_option_is_handed_on_or_about_the_list() -> None:
         ("--all list --output out --fail-on never", "error, warning or note"),
         ("--all list --output out --allow nothing", "there are requirements"),
         ("--all list --output out --memory much", "takes a size"),
-        ("--all list --output out --memory-budget 4G", "is too little"),
+        ("--all list --output out --max-memory 4G", "is too little"),
         ("--all list --output out --policy nowhere.toml", "cannot be read"),
         ("--all list --output out --profile weak", "'weak'"),
         ("--all nowhere --output out", "cannot be read"),
@@ -163,7 +163,7 @@ def test_what_cannot_be_is_told_first(
     ("options", "jobs"),
     [
         ("--jobs 3 --memory 1G", 3),
-        ("--jobs 3 --memory 1G --memory-budget 5G", 2),
+        ("--jobs 3 --memory 1G --max-memory 5G", 2),
         ("--jobs 100 --memory 1G", 32),
         ("--jobs 100", 4),
         ("--jobs 2 --memory 1000G", 1),

@@ -107,7 +107,7 @@ def test_only_what_was_given_reaches_the_policy() -> None:
     assert options().arguments()["timeouts"] == {}
     given = options(
         memory_bytes="1G",
-        cpu_s=5,
+        cpu_time_s=5,
         network="loopback",
         gpu="all",
         readable=["/data"],
@@ -118,11 +118,11 @@ def test_only_what_was_given_reaches_the_policy() -> None:
         "gpu": True,
         "readable": ["/data"],
         "environment": ["A"],
-        "limits": {"memory_bytes": "1G", "cpu_s": 5},
+        "limits": {"memory_bytes": "1G", "cpu_time_s": 5},
     }
 
 
-@pytest.mark.parametrize("name", ["memory_bytes", "disk_bytes", "processes", "cpu_s"])
+@pytest.mark.parametrize("name", ["memory_bytes", "disk_bytes", "processes", "cpu_time_s"])
 def test_a_limit_of_nothing_is_refused(name: str) -> None:
     """And is not taken for the default."""
     given = options(**{name: "0" if name.endswith("_bytes") else 0}).arguments()
@@ -184,3 +184,12 @@ def test_a_servers_key_reaches_make_env_and_is_none_without_a_word() -> None:
     given = options(sandbox="tcp://127.0.0.1:5555", server_key="k").arguments()
     assert (given["sandbox"], given["server_key"]) == ("tcp://127.0.0.1:5555", "k")
     assert options().arguments()["server_key"] is None
+
+
+def test_an_option_is_named_as_its_key_is_in_python() -> None:
+    """Without the unit; several time limits share one, and --output is a command's own."""
+    named = {key: one for key, one in OPTIONS.items() if one.field and one.command}
+    others = {key for key, one in named.items() if one.argument == "timeouts"} | {"output"}
+    for key in named.keys() - others:
+        name = key.removesuffix("_bytes").removesuffix("_s").replace("_", "-")
+        assert named[key].command == f"--{name}"

@@ -101,7 +101,7 @@ def test_timeouts_take_seconds_or_none(value: float | None) -> None:
     assert Timeouts(step_s=value).step_s == value
 
 
-@pytest.mark.parametrize("name", ["cpu_s", "file_bytes"])
+@pytest.mark.parametrize("name", ["cpu_time_s", "file_bytes"])
 def test_some_limits_can_be_lifted(name: str) -> None:
     """None means no cap, where there may be none."""
     assert getattr(Policy(limits=Limits(**{name: None})).limits, name) is None

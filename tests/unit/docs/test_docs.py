@@ -150,6 +150,22 @@ def test_contributing_names_every_step_and_every_folder_of_tests() -> None:
     assert listed == {name for name in folders if "__pycache__" not in name}
 
 
+def test_contributing_names_twenty_modules_to_read_first() -> None:
+    """And for each symptom one that is there."""
+    first, symptoms = section((CHECKOUT / "CONTRIBUTING.md").read_text(), "Where to begin").split(
+        "From a symptom to a module:"
+    )
+    modules = [code_words(module)[0] for module, _ in rows(first)]
+    assert len(modules) == len(set(modules)) == 20
+    begins = [[word for word in code_words(cell) if "/" in word] for _, cell in rows(symptoms)]
+    assert len(begins) > 10
+    assert all(begins)
+    for name in [*modules, *(name for names in begins for name in names)]:
+        top, _, rest = name.removeprefix("worker/").partition("/")
+        root = CHECKOUT / top if top == "docs" else folder(top)
+        assert (root / rest).is_file(), name
+
+
 @pytest.mark.parametrize(
     ("document", "printed"), [("README.md", "local-"), ("docs/integrations.md", "")]
 )

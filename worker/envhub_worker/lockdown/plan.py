@@ -48,7 +48,7 @@ def plan(confinement: Confinement, facts: HostFacts) -> tuple[Layer, ...]:
     _check(confinement, facts)
     limits, namespaced = confinement.limits, confinement.profile == "strict"
     ignored = "" if namespaced else "; changes of mode, owner and time are accepted and ignored"
-    cpu = "" if limits.cpu_s is None else f", {limits.cpu_s} CPU seconds"
+    cpu = "" if limits.cpu_time_s is None else f", {limits.cpu_time_s} CPU seconds"
     rlimits = f"{limits.processes} processes, {limits.open_files} open files{cpu}, no core dumps"
     return (
         *_user_layers(facts, namespaced),

@@ -17,7 +17,7 @@ _MAX_ENVIRONMENT_BYTES = 64 << 10
 """All granted variables together: they travel in one packet between our own processes."""
 _MAX_READABLE = 64
 _MAX_GPUS = 64
-_LIFTABLE = frozenset({"cpu_s", "file_bytes"})
+_LIFTABLE = frozenset({"cpu_time_s", "file_bytes"})
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -46,7 +46,7 @@ class Limits:
     Attributes:
         memory_bytes: All memory of all processes of the jail, shared memory included.
         processes: Processes and threads alive at once.
-        cpu_s: CPU seconds that one process of the jail may burn, or None.
+        cpu_time_s: CPU seconds that one process of the jail may burn, or None.
         open_files: File descriptors of one process.
         disk_bytes: Bytes in the jail's scratch (home, temporary files, working directory).
         disk_files: Files and folders in that scratch.
@@ -59,7 +59,7 @@ class Limits:
 
     memory_bytes: int = 8 * GIB
     processes: int = 512
-    cpu_s: int | None = None
+    cpu_time_s: int | None = None
     open_files: int = 1024
     disk_bytes: int = 2 * GIB
     disk_files: int = 100_000

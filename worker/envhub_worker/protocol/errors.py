@@ -7,8 +7,8 @@ class EnvHubError(Exception):
     """Base of every error of this project.
 
     Attributes:
-        denied: What the jail was denied that it ends, in the words of ``env.jail_denials()``; None
-            where it is not recorded, or no jail has ended.
+        denied: What the jail was denied that it ends, in the words of
+            ``env.sandbox.denials()``; None where it is not recorded, or no jail has ended.
     """
 
     denied: tuple[str, ...] | None = None

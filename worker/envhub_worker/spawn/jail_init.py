@@ -292,5 +292,5 @@ class Init:
         if signum is None:
             return "exit", ""
         if signum == signal.SIGXCPU:
-            return "cpu-limit", f"{self._jail.spec.confinement.limits.cpu_s} CPU seconds used"
+            return "cpu-limit", f"{self._jail.spec.confinement.limits.cpu_time_s} CPU seconds used"
         return self._watchdog.killed_by_kernel() or ("signal", "")

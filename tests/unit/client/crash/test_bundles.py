@@ -241,7 +241,7 @@ def test_wishes_beyond_an_ordinary_run_are_told(tmp_path: Path) -> None:
         network="host",
         readable=("/data",),
         environment=("SECRET",),
-        limits=Limits(memory_bytes=64 << 30, processes=7, cpu_s=5),
+        limits=Limits(memory_bytes=64 << 30, processes=7, cpu_time_s=5),
     )
     found = load_bundle(
         bundle(tmp_path, policy=policy, python="/tmp/python", endpoint="https://evil.example")
@@ -253,7 +253,7 @@ def test_wishes_beyond_an_ordinary_run_are_told(tmp_path: Path) -> None:
     refused = replayed_arguments(found, granted=False)
     assert set(refused["policy"]) == {"limits", "crash_history"}
     assert refused["policy"]["limits"]["processes"] == 7
-    assert refused["policy"]["limits"]["cpu_s"] == 5
+    assert refused["policy"]["limits"]["cpu_time_s"] == 5
     assert "memory_bytes" not in refused["policy"]["limits"]
     assert not {"python", "endpoint"} & set(refused)
     granted = replayed_arguments(found, granted=True)

@@ -231,9 +231,9 @@ def test_an_unknown_action_space_is_explained() -> None:
 
     env: VectorEnv[Any, Any, Any] = scripted("NextStep", 1)
     env.action_space = env.single_action_space = Own()
-    for policy in ("random", "zero"):
+    for actions in ("random", "zero"):
         with pytest.raises(RolloutError, match="action space is its own"):
-            rollout(env, episodes=1, seed=0, policy=policy)
+            rollout(env, episodes=1, seed=0, actions=actions)
 
 
 def test_every_state_is_observed_once() -> None:

@@ -1,4 +1,4 @@
-"""What ``envhub gc`` takes for left behind, and what it leaves alone."""
+"""What ``envhub cache gc`` takes for left behind, and what it leaves alone."""
 
 from __future__ import annotations
 

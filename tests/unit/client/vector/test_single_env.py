@@ -11,6 +11,7 @@ from gymnasium import spaces
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
 from envhub_sandbox.errors import RemoteProtocolError
+from envhub_sandbox.vector.sandbox_view import SandboxView
 from envhub_sandbox.vector.single_env import SingleEnv
 
 _SPACES = (
@@ -132,6 +133,23 @@ def test_several_are_refused() -> None:
     """It says how to make one."""
     with pytest.raises(ValueError, match="n_envs=1"):
         SingleEnv(SyncVectorEnv([_Story, _Story]))
+
+
+class _Boasting(_Story):
+    """Has an attribute that is the client's name for the sandbox."""
+
+    sandbox = "the best"
+
+
+def test_its_sandbox_is_never_the_environments_own_word() -> None:
+    """Where there is none, an environment that says so is not asked."""
+    vector = SyncVectorEnv([_Boasting])
+    with pytest.raises(AttributeError, match="sandbox"):
+        _ = SingleEnv(vector).sandbox
+    vector.sandbox = "the best"  # type: ignore[attr-defined]
+    assert not hasattr(SingleEnv(vector), "sandbox")
+    vector.sandbox = view = SandboxView(None)  # type: ignore[arg-type, attr-defined]
+    assert SingleEnv(vector).sandbox is gym.Wrapper(SingleEnv(vector)).unwrapped.sandbox is view
 
 
 class _Numbered(_Story):

@@ -18,8 +18,9 @@ from envhub_worker.protocol.codec.inert import RemoteObject
 def one_of_two(value: object) -> SubEnvironment:
     """The first of two, of which everything is the same."""
     space = spaces.Discrete(2)
-    vector: Any = SimpleNamespace(num_envs=2, is_sync=True, single_observation_space=space)
-    return SubEnvironment(vector, lambda name, index, message: m.Value(value), 0)
+    vector: Any = SimpleNamespace(num_envs=2, single_observation_space=space)
+    manifest: Any = SimpleNamespace(sync=True, shardable=True)
+    return SubEnvironment(vector, manifest, lambda name, index, message: m.Value(value), 0)
 
 
 def test_wrappers_without_end_are_refused() -> None:

@@ -176,7 +176,7 @@ def test_landlock_write_includes_neither_devices_nor_more_than_abi_one_to_five()
 
 def test_rlimits_follow_the_limits() -> None:
     """Exactly these; a file may not be larger than the disk."""
-    limits = Limits(open_files=9, disk_bytes=77, cpu_s=5)
+    limits = Limits(open_files=9, disk_bytes=77, cpu_time_s=5)
     assert resource_limits(limits, 12) == {
         resource.RLIMIT_CORE: (0, 0),
         resource.RLIMIT_FSIZE: (77, 77),

@@ -20,7 +20,7 @@ def wire(**changes: Any) -> dict[str, Any]:
 def test_an_ordinary_one_is_what_it_was() -> None:
     """With lists for tuples, as JSON has them, and limits lifted that may be."""
     made = Confinement(
-        readable=("/data",), environment={"A": "b"}, limits=Limits(cpu_s=None, file_bytes=5)
+        readable=("/data",), environment={"A": "b"}, limits=Limits(cpu_time_s=None, file_bytes=5)
     )
     assert confinement_from_wire({**asdict(made), "readable": ["/data"]}) == made
     assert confinement_from_wire({**asdict(made), "gpu": [0, 2]}) == replace(made, gpu=(0, 2))

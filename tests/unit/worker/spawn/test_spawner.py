@@ -337,7 +337,7 @@ def alive(pid: int) -> bool:
 
 def test_cpu_limit_is_told(folder: Path, confinement: Confinement) -> None:
     """A runner that burns its CPU seconds ends with the reason cpu-limit."""
-    confinement = replace(confinement, limits=Limits(cpu_s=1))
+    confinement = replace(confinement, limits=Limits(cpu_time_s=1))
     with cell_in(folder, confinement) as cell:
         cell.run("while True: pass")
         assert cell.wait_for(RunnerExited).reason == "cpu-limit"

@@ -1,7 +1,7 @@
 """A folder of a server's own among the temporary files, locked for as long as the server lives.
 
 A server that is ended by SIGKILL leaves its folders behind. The kernel gives the lock back, so the
-next server, or ``envhub gc``, can tell and remove them.
+next server, or ``envhub cache gc``, can tell and remove them.
 """
 
 from __future__ import annotations

@@ -142,8 +142,8 @@ def resource_limits(limits: Limits, processes: int | None) -> dict[int, tuple[in
     }
     if processes is not None:
         rules[resource.RLIMIT_NPROC] = (processes, processes)
-    if limits.cpu_s is not None:
-        rules[resource.RLIMIT_CPU] = (limits.cpu_s, limits.cpu_s + _CPU_GRACE_S)
+    if limits.cpu_time_s is not None:
+        rules[resource.RLIMIT_CPU] = (limits.cpu_time_s, limits.cpu_time_s + _CPU_GRACE_S)
     return rules
 
 

@@ -1,26 +1,10 @@
-"""``envhub version``."""
+"""Versions of everything that matters: of ``envhub --version``, of reports and of kept results."""
 
 from __future__ import annotations
 
 import platform
 
-from envhub_sandbox.cli.shared import options as opt
-from envhub_sandbox.cli.shared.console import out, print_json
-
 _PACKAGES = ("gymnasium", "numpy", "huggingface_hub", "pyzmq", "msgpack", "imageio-ffmpeg")
-
-
-@opt.with_options()
-def version(
-    json: opt.Json = False,
-) -> None:
-    """Print versions: ours, the protocol's, Python's and of the packages that matter."""
-    found = versions()
-    if json:
-        print_json(found)
-    else:
-        for name, text in found.items():
-            out(f"{name:<16} {text or 'not installed'}")
 
 
 def versions() -> dict[str, str | int | None]:
