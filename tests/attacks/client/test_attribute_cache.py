@@ -2,56 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from envhub_sandbox import make_env
 from envhub_sandbox.errors import RemoteProtocolError
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
 from envhub_worker.protocol.messages.prefix import CHANGES
+from tests.attacks.client.lies import ACTIONS, opened, relayed
 from tests.attacks.client.lying_server import (
     NUM_ENVS,
-    Asked,
-    Frames,
-    LyingSandbox,
     LyingServer,
-    lying,
     step_done,
 )
-from tests.support.repositories import write_repository
 
-ACTIONS = [0] * NUM_ENVS
 TRUE = ("reach",) * NUM_ENVS
 
 
-@pytest.fixture
-def liar() -> Iterator[LyingServer]:
-    """A worker server that lies as told; of what it is to watch it says the truth."""
-    with lying() as server:
-        server.lies[m.Watch] = answered(m.Watched(TRUE, True))
-        yield server
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> str:
-    """A repository; nobody will ever read it."""
-    return str(write_repository(tmp_path / "repository", f"# {tmp_path}"))
-
-
-def answered(*messages: m.Message) -> Callable[[Asked], list[Frames]]:
-    """These messages as the frames of one reply."""
-    frames = [frame for message in messages for frame in m.pack(message)]
-    return lambda asked: [asked.answer(frames)]
+@pytest.fixture(autouse=True)
+def _honest(liar: LyingServer) -> None:
+    """Of what it is to watch the liar says the truth, unless a test has it lie."""
+    liar.lies[m.Watch] = relayed(m.Watched(TRUE, True))
 
 
 def watching(liar: LyingServer, folder: str) -> Any:
     """An environment after two rounds of an evaluation; its suites."""
-    suites = make_env(folder, sandbox=LyingSandbox(liar), n_envs=NUM_ENVS)
+    suites = opened(liar, folder)
     suites.env.reset()
     for _ in range(2):
         suites.env.step(ACTIONS)
@@ -84,7 +62,7 @@ def test_lies_about_changes_are_refused(liar: LyingServer, folder: str, lie: str
     for said, breaks in ((LIES[lie], True), (m.Changed(((1, "task"), (99, "other"))), False)):
         liar.lies.pop(m.Step, None)
         with watching(liar, folder) as suites:
-            liar.lies[m.Step] = answered(said, step_done())
+            liar.lies[m.Step] = relayed(said, step_done())
             if breaks:
                 with pytest.raises(RemoteProtocolError):
                     suites.env.step(ACTIONS)
@@ -94,7 +72,7 @@ def test_lies_about_changes_are_refused(liar: LyingServer, folder: str, lie: str
 
 def test_what_can_be_changed_is_not_kept(liar: LyingServer, folder: str) -> None:
     """Who changes what he was given would change what the next one gets."""
-    liar.lies[m.Watch] = answered(m.Watched(tuple([["reach"]] * NUM_ENVS), True))
+    liar.lies[m.Watch] = relayed(m.Watched(tuple([["reach"]] * NUM_ENVS), True))
     with watching(liar, folder) as suites:
         before = suites.env.stats()["requests"]
         for _ in range(5):
@@ -110,7 +88,7 @@ def test_what_can_be_changed_is_not_kept(liar: LyingServer, folder: str) -> None
 )
 def test_other_answers_are_refused(liar: LyingServer, folder: str, lie: m.Message) -> None:
     """As those of a call are."""
-    liar.lies[m.Watch] = answered(lie)
+    liar.lies[m.Watch] = relayed(lie)
     with pytest.raises(RemoteProtocolError):
         watching(liar, folder)
 
@@ -119,6 +97,6 @@ def test_a_flood_of_changes_is_one_reply(liar: LyingServer, folder: str) -> None
     """As many frames as one likes are no reply; and it is not read one by one."""
     with watching(liar, folder) as suites:
         front = [m.Changed(((1, "task"),))] * (DEFAULT_LIMITS.frames // 4)
-        liar.lies[m.Step] = answered(*front, step_done())
+        liar.lies[m.Step] = relayed(*front, step_done())
         with pytest.raises(RemoteProtocolError):
             suites.env.step(ACTIONS)

@@ -6,7 +6,6 @@ command runs, and what one message may cost is not what its parts cost one by on
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,27 +22,11 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import encode
 from envhub_worker.protocol.codec.kinds import GENERATOR, SPACE, SPEC
 from envhub_worker.protocol.limits import WireLimits
-from envhub_worker.protocol.spaces.spaces import encode_space
-from tests.attacks.client.lying_server import Frames, LyingServer, lying
-from tests.attacks.client.test_lies import opened, refuses, relayed
-from tests.attacks.client.test_values import spec_of
-from tests.support.repositories import write_repository
+from tests.attacks.client.lies import nested, opened, refuses, relayed, spec_of, started
+from tests.attacks.client.lying_server import Frames, LyingServer
 from tests.support.wire import ext, packed, value
 
 HUGE = 1 << 30
-
-
-@pytest.fixture
-def liar() -> Iterator[LyingServer]:
-    """A worker server that lies as told."""
-    with lying() as server:
-        yield server
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> str:
-    """A repository; nobody will ever read it. Each is another one, so nothing is cached."""
-    return str(write_repository(tmp_path / "repository", f"# {tmp_path}"))
 
 
 @dataclass
@@ -70,14 +53,6 @@ def box(shape: tuple[int, ...], dtype: str = "float32") -> dict[str, Any]:
     zero, one, no = (np.zeros((), dtype), np.ones((), dtype), np.zeros((), bool))
     bounds = {"low": zero, "high": one, "bounded_below": no, "bounded_above": no}
     return {"kind": "box", "dtype": dtype, "shape": shape, **bounds}
-
-
-def nested(levels: int) -> dict[str, Any]:
-    """Tuples in tuples."""
-    found = encode_space(spaces.Discrete(2))
-    for _ in range(levels):
-        found = {"kind": "tuple", "spaces": [found]}
-    return found
 
 
 def generator_state(kind: str = "MT19937", **changes: Any) -> dict[str, Any]:
@@ -175,9 +150,8 @@ def test_described_specs_make_nothing(liar: LyingServer, folder: str, tmp_path: 
     """Of a spec only facts are taken; the control makes the whole of it, and a command runs."""
     canary = tmp_path / "made"
     liar.lies[m.Call] = relayed(frames_of(Lie(SPEC, spec_of(canary))))
-    with opened(liar, folder) as suites:
-        suites.env.reset()
-        spec = suites.env.get_attr("spec")[0]
+    with started(liar, folder) as env:
+        spec = env.get_attr("spec")[0]
         assert (spec.id, spec.max_episode_steps) == ("Trap-v0", 7)
         with pytest.raises(gym.error.Error, match="sandbox"):
             gym.make(spec)
@@ -190,6 +164,5 @@ def test_described_specs_make_nothing(liar: LyingServer, folder: str, tmp_path: 
 def test_described_ids_import_nothing(liar: LyingServer, folder: str) -> None:
     """``gym.make(spec.id)`` imports what stands before a colon: such a spec is only told."""
     liar.lies[m.Call] = relayed(frames_of(Lie(SPEC, {"id": "antigravity:Trap-v0"})))
-    with opened(liar, folder) as suites:
-        suites.env.reset()
-        assert not hasattr(suites.env.get_attr("spec")[0], "id")
+    with started(liar, folder) as env:
+        assert not hasattr(env.get_attr("spec")[0], "id")

@@ -18,7 +18,6 @@ import pytest
 from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
 
-from envhub_sandbox import make_env
 from envhub_sandbox.errors import (
     EnvHubError,
     MessageTooLargeError,
@@ -26,16 +25,15 @@ from envhub_sandbox.errors import (
     WorkerDiedError,
 )
 from envhub_sandbox.transport import results
-from envhub_sandbox.vector.suites import EnvSuites
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol import untrusted
 from envhub_worker.protocol.manifest.manifest import Manifest, encode_env, encode_manifest
 from envhub_worker.protocol.spaces import batches
+from tests.attacks.client.lies import ACTIONS, opened, relayed, started
 from tests.attacks.client.lying_server import (
     NUM_ENVS,
     Asked,
     Frames,
-    LyingSandbox,
     LyingServer,
     env_manifest,
     lying,
@@ -44,8 +42,6 @@ from tests.attacks.client.lying_server import (
 from tests.support import inside
 from tests.support.repositories import write_repository
 
-ACTIONS = [0] * NUM_ENVS
-TIMEOUTS = {"startup_s": 20.0, "step_s": 20.0, "reset_s": 20.0, "call_s": 20.0, "close_s": 1.0}
 ERRORS = [
     AttributeError("a"),
     BlockingIOError(11, "full"),
@@ -64,30 +60,11 @@ ERRORS = [
 
 
 @pytest.fixture
-def liar() -> Iterator[LyingServer]:
-    """A worker server that lies as told."""
-    with lying() as server:
-        yield server
-
-
-@pytest.fixture
 def other(tmp_path: Path) -> Iterator[Any]:
     """Another environment of the same client, with an honest server."""
-    with lying() as honest, opened(honest, tmp_path / "other") as suites:
-        suites.env.reset()
-        yield suites.env
-
-
-def opened(liar: LyingServer, folder: Path, **options: Any) -> EnvSuites:
-    """``make_env`` by way of a liar; each folder is a repository that nobody knows yet."""
-    source = str(write_repository(folder, f"# {folder}"))
-    given = {"timeouts": TIMEOUTS, "n_envs": NUM_ENVS, **options}
-    return make_env(source, sandbox=LyingSandbox(liar), **given)
-
-
-def relayed(answer: m.Message) -> Callable[[Asked], list[Frames]]:
-    """A lie of a runner's: one answer under the right id."""
-    return lambda asked: [asked.answer(answer)]
+    repository = str(write_repository(tmp_path / "other", f"# other {tmp_path}"))
+    with lying() as honest, started(honest, repository) as env:
+        yield env
 
 
 def raising(error: BaseException) -> Callable[..., Any]:
@@ -115,7 +92,7 @@ def raising_here(error: BaseException, otherwise: Callable[..., Any]) -> Callabl
 @pytest.mark.parametrize("operation", ["step", "reset"])
 def test_what_handling_raises_is_the_workers_fault(
     liar: LyingServer,
-    tmp_path: Path,
+    folder: str,
     other: Any,
     monkeypatch: pytest.MonkeyPatch,
     error: Exception,
@@ -126,57 +103,53 @@ def test_what_handling_raises_is_the_workers_fault(
         "step": lambda env: env.step(ACTIONS),
         "reset": lambda env: env.reset(),
     }
-    with opened(liar, tmp_path / "it", policy={"restart": "on_reset"}) as suites:
-        suites.env.reset()
+    with started(liar, folder, policy={"restart": "on_reset"}) as env:
         with monkeypatch.context() as patched:
             patched.setattr(results.batches, "conforms", raising(error))
             with pytest.raises(RemoteProtocolError) as caught:
-                actions[operation](suites.env)
+                actions[operation](env)
         assert caught.value.__cause__ is error
         assert isinstance(caught.value, MessageTooLargeError) == isinstance(error, MemoryError)
         assert str(caught.value).isprintable()
         assert any(isinstance(asked, m.CloseJail) for asked in liar.asked)
         with pytest.raises(WorkerDiedError):
-            suites.env.step(ACTIONS)
+            env.step(ACTIONS)
         other.step(ACTIONS)
-        suites.env.reset()
-        suites.env.step(ACTIONS)
+        env.reset()
+        env.step(ACTIONS)
 
 
 @pytest.mark.parametrize("error", ERRORS, ids=lambda error: type(error).__name__)
 def test_what_decoding_raises_is_the_workers_fault(
     liar: LyingServer,
-    tmp_path: Path,
+    folder: str,
     other: Any,
     monkeypatch: pytest.MonkeyPatch,
     error: Exception,
 ) -> None:
     """The same, where the message is not even one yet."""
-    with opened(liar, tmp_path / "it", policy={"restart": "on_reset"}) as suites:
-        suites.env.reset()
+    with started(liar, folder, policy={"restart": "on_reset"}) as env:
         with monkeypatch.context() as patched:
             patched.setattr(*inside.DECODING, raising_here(error, getattr(*inside.DECODING)))
             liar.lies[m.Step] = relayed(m.Value({"never": "seen"}))
             with pytest.raises(RemoteProtocolError) as caught:
-                suites.env.step(ACTIONS)
+                env.step(ACTIONS)
         assert error in (caught.value.__cause__, getattr(caught.value.__cause__, "__cause__", None))
         other.step(ACTIONS)
         liar.lies.clear()
-        suites.env.reset()
-        suites.env.step(ACTIONS)
+        env.reset()
+        env.step(ACTIONS)
 
 
 def test_without_the_mechanism_it_comes_out(
-    liar: LyingServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    liar: LyingServer, folder: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The control: what stands around the handling is what turns it."""
     monkeypatch.setattr(untrusted, "FAULTS", ())
-    with opened(liar, tmp_path / "it") as suites:
-        suites.env.reset()
-        with monkeypatch.context() as patched:
-            patched.setattr(results.batches, "conforms", raising(TypeError("unhashable")))
-            with pytest.raises(TypeError, match="unhashable"):
-                suites.env.step(ACTIONS)
+    with started(liar, folder) as env, monkeypatch.context() as patched:
+        patched.setattr(results.batches, "conforms", raising(TypeError("unhashable")))
+        with pytest.raises(TypeError, match="unhashable"):
+            env.step(ACTIONS)
 
 
 class _AlarmError(Exception):
@@ -185,19 +158,18 @@ class _AlarmError(Exception):
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), _AlarmError()], ids=["Ctrl-C", "own"])
 def test_what_is_the_callers_own_passes(
-    liar: LyingServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException
+    liar: LyingServer, folder: str, monkeypatch: pytest.MonkeyPatch, error: BaseException
 ) -> None:
     """An interrupt in the midst of the handling is nobody's fault, and nothing is given up."""
-    with opened(liar, tmp_path / "it") as suites:
-        suites.env.reset()
+    with started(liar, folder) as env:
         with monkeypatch.context() as patched:
             patched.setattr(results.batches, "conforms", raising(error))
             with pytest.raises(type(error)):
-                suites.env.step(ACTIONS)
-        suites.env.step(ACTIONS)
+                env.step(ACTIONS)
+        env.step(ACTIONS)
 
 
-def test_what_a_signal_handler_raises_in_a_wait_passes(liar: LyingServer, tmp_path: Path) -> None:
+def test_what_a_signal_handler_raises_in_a_wait_passes(liar: LyingServer, folder: str) -> None:
     """Even where it is of a class that handling might raise: nobody had anything to handle."""
     caller = threading.get_ident()
 
@@ -211,28 +183,26 @@ def test_what_a_signal_handler_raises_in_a_wait_passes(liar: LyingServer, tmp_pa
     liar.lies[m.Step] = lie
     before = signal.signal(signal.SIGALRM, ring)
     try:
-        with opened(liar, tmp_path / "it") as suites:
-            suites.env.reset()
+        with started(liar, folder) as env:
             with pytest.raises(ValueError, match="own") as caught:
-                suites.env.step(ACTIONS)
+                env.step(ACTIONS)
             assert not isinstance(caught.value, EnvHubError)
             liar.lies.clear()
-            suites.env.reset()
-            suites.env.step(ACTIONS)
+            env.reset()
+            env.step(ACTIONS)
     finally:
         signal.signal(signal.SIGALRM, before)
 
 
 @pytest.mark.parametrize("key", [(1, 2), frozenset({1, 2}), range(3)], ids=repr)
 def test_keys_that_are_no_text_harm_nobody(
-    liar: LyingServer, tmp_path: Path, other: Any, key: object
+    liar: LyingServer, folder: str, other: Any, key: object
 ) -> None:
     """Infos with such a key come the third time as the first, and others step in between."""
     liar.lies[m.Step] = relayed(step_done(info={"visits": {key: 1}}))
-    with opened(liar, tmp_path / "it") as suites:
-        suites.env.reset()
+    with started(liar, folder) as env:
         for _ in range(4):
-            assert suites.env.step(ACTIONS)[4] == {"visits": {key: 1}}
+            assert env.step(ACTIONS)[4] == {"visits": {key: 1}}
             other.step(ACTIONS)
 
 
@@ -245,15 +215,15 @@ RUNNERS: dict[str, tuple[Any, ...]] = {
 
 
 @pytest.mark.parametrize("what", list(RUNNERS))
-def test_runners_without_numbers_are_refused(liar: LyingServer, tmp_path: Path, what: str) -> None:
+def test_runners_without_numbers_are_refused(liar: LyingServer, folder: str, what: str) -> None:
     """The server's own words are read as carefully."""
     liar.lies[m.OpenJail] = lambda asked: [asked.answer(m.JailOpened(1, RUNNERS[what], ()))]
     with pytest.raises(RemoteProtocolError):
-        opened(liar, tmp_path / "it")
+        opened(liar, folder)
 
 
 @pytest.mark.parametrize("parts", [1, 2, 3])
-def test_as_many_answers_as_runners(liar: LyingServer, tmp_path: Path, parts: int) -> None:
+def test_as_many_answers_as_runners(liar: LyingServer, folder: str, parts: int) -> None:
     """One runner was asked."""
     frames = m.pack(step_done())
 
@@ -263,13 +233,12 @@ def test_as_many_answers_as_runners(liar: LyingServer, tmp_path: Path, parts: in
         ]
 
     liar.lies[m.Step] = lie
-    with opened(liar, tmp_path / "it") as suites:
-        suites.env.reset()
+    with started(liar, folder) as env:
         if parts == 1:
-            suites.env.step(ACTIONS)
+            env.step(ACTIONS)
         else:
             with pytest.raises(RemoteProtocolError):
-                suites.env.step(ACTIONS)
+                env.step(ACTIONS)
 
 
 GRAPHS = spaces.Dict({"g": spaces.Graph(spaces.Box(0, 1, (2,)), None), "x": spaces.Discrete(2)})
@@ -290,7 +259,7 @@ ODD: dict[str, Any] = {
 @pytest.mark.parametrize("shardable", [False, True])
 @pytest.mark.parametrize("place", ["observation", "final_obs"])
 def test_odd_observations_of_graphs(
-    liar: LyingServer, tmp_path: Path, what: str, shardable: bool, place: str
+    liar: LyingServer, folder: str, what: str, shardable: bool, place: str
 ) -> None:
     """Where members get their class back, any value is taken as it is, or refused."""
     described = env_manifest(
@@ -308,7 +277,7 @@ def test_odd_observations_of_graphs(
     liar.lies[m.Step] = relayed(
         step_done(observation=odd if place == "observation" else good, info=info)
     )
-    with opened(liar, tmp_path / "it") as suites:
+    with opened(liar, folder) as suites:
         observation, _ = suites.env.reset()
         assert type(observation["g"][0]).__name__ == "GraphInstance"
         if shardable and place == "observation":

@@ -25,8 +25,8 @@ from envhub_sandbox.errors import (
 )
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
+from tests.attacks.client.lies import Canary, peak_growth
 from tests.attacks.client.lying_server import step_done
-from tests.attacks.client.test_lies import Canary, peak_growth
 from tests.attacks.harness import TIMEOUTS, Arena
 from tests.support.processes import most_grown, resident
 from tests.support.repositories import write_repository

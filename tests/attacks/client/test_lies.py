@@ -11,31 +11,39 @@ import os
 import pickle
 import struct
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import cloudpickle
 import numpy as np
-import psutil
 import pytest
 from gymnasium import spaces
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import EnvHubError, RemoteProtocolError, WorkerError, WorkerTimeoutError
-from envhub_sandbox.vector.suites import EnvSuites
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest.manifest import encode_env
 from envhub_worker.protocol.spaces.opaque import MAX_SPACE_DEPTH
 from envhub_worker.protocol.spaces.spaces import encode_space
+from tests.attacks.client.lies import (
+    ACTIONS,
+    MIB,
+    Canary,
+    nested,
+    opened,
+    peak_growth,
+    pickled,
+    refuses,
+    relayed,
+    started,
+)
 from tests.attacks.client.lying_server import (
     NUM_ENVS,
     Asked,
     Frames,
-    LyingSandbox,
     LyingServer,
     env_manifest,
-    lying,
     manifest,
     step_done,
 )
@@ -43,82 +51,11 @@ from tests.support import inside
 from tests.support.repositories import CARTPOLES, write_repository
 from tests.support.wire import decode_space, deep, ext, packed, value
 
-MIB = 1 << 20
-GROWTH = 192 * MIB
-"""What a lie may make the client take at its worst: the limits of the wire allow 8 MiB headers,
-whose decoding takes a multiple of that."""
-ACTIONS = [0] * NUM_ENVS
-
-
-@pytest.fixture
-def liar(tmp_path: Path) -> Iterator[LyingServer]:
-    """A worker server that lies as told; no manifest is remembered from another test."""
-    with lying() as server:
-        yield server
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> str:
-    """A repository; nobody will ever read it. Each is another one, so nothing is cached."""
-    return str(write_repository(tmp_path / "repository", f"# {tmp_path}"))
-
-
-def opened(liar: LyingServer, folder: str, **options: Any) -> EnvSuites:
-    """``make_env`` by way of the liar."""
-    timeouts = {"startup_s": 20.0, "step_s": 20.0, "reset_s": 20.0, "call_s": 20.0, "close_s": 1.0}
-    options = {"timeouts": timeouts, "n_envs": NUM_ENVS, **options}
-    return make_env(folder, sandbox=LyingSandbox(liar), **options)
-
-
-class Canary:
-    """Its pickle makes a folder when it is loaded, and so would code in its place."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = str(path)
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        return (os.mkdir, (self.path,))
-
 
 def test_canary_sings(tmp_path: Path) -> None:
     """The control: loading the pickle executes it."""
     pickle.loads(cloudpickle.dumps(Canary(tmp_path / "executed")))
     assert (tmp_path / "executed").exists()
-
-
-def relayed(answer: m.Message | Frames) -> Callable[[Asked], list[Frames]]:
-    """A lie of a runner's: one answer under the right id."""
-    return lambda asked: [asked.answer(answer)]
-
-
-def pickled(answer: m.Message) -> Frames:
-    """An answer in which every object that has no form of its own is a pickle."""
-    return m.pack(answer, pickler=cloudpickle.dumps)
-
-
-def peak_growth(action: Callable[[], object]) -> int:
-    """By how much resident memory grew at its highest while ``action`` ran."""
-    Path("/proc/self/clear_refs").write_text("5")
-    before = psutil.Process().memory_info().rss
-    action()
-    for line in Path("/proc/self/status").read_text().splitlines():
-        if line.startswith("VmHWM:"):
-            return int(line.split()[1]) * 1024 - before
-    raise AssertionError("there is no VmHWM")
-
-
-def refuses(action: Callable[[], object]) -> EnvHubError:
-    """The error of ours that an action ends in, within bounded memory."""
-    caught: list[EnvHubError] = []
-
-    def attempt() -> None:
-        with pytest.raises(EnvHubError) as info:
-            action()
-        caught.append(info.value)
-
-    grown = peak_growth(attempt)
-    assert grown < GROWTH, f"the client grew by {grown} bytes"
-    return caught[0]
 
 
 PLACES: dict[str, Callable[[Any], m.Message]] = {
@@ -143,9 +80,8 @@ def test_pickles_in_steps_are_never_loaded(
     """Wherever a step's result can hold a value, a pickle there is refused, and not loaded."""
     canary = tmp_path / "executed"
     liar.lies[m.Step] = relayed(pickled(PLACES[place](Canary(canary))))
-    with opened(liar, folder) as suites:
-        suites.env.reset()
-        error = refuses(lambda: suites.env.step(ACTIONS))
+    with started(liar, folder) as env:
+        error = refuses(lambda: env.step(ACTIONS))
     assert isinstance(error, RemoteProtocolError)
     assert not canary.exists()
 
@@ -227,9 +163,8 @@ WRONG: dict[str, dict[str, Any]] = {
 def test_wrong_arrays_are_refused(liar: LyingServer, folder: str, what: str) -> None:
     """A result that is not what was declared never reaches the caller."""
     liar.lies[m.Step] = relayed(step_done(**WRONG[what]))
-    with opened(liar, folder) as suites:
-        suites.env.reset()
-        error = refuses(lambda: suites.env.step(ACTIONS))
+    with started(liar, folder) as env:
+        error = refuses(lambda: env.step(ACTIONS))
     assert isinstance(error, RemoteProtocolError)
 
 
@@ -261,14 +196,6 @@ def wide(number: int) -> dict[str, Any]:
 def test_a_wide_box_is_accepted() -> None:
     """The control: one of those that are too many together."""
     assert decode_space(wide(1), max_elements=ELEMENTS).shape == (WIDE,)
-
-
-def nested(levels: int) -> dict[str, Any]:
-    """Tuples in tuples."""
-    space: Any = encode_space(spaces.Discrete(2))
-    for _ in range(levels):
-        space = {"kind": "tuple", "spaces": [space]}
-    return dict(space)
 
 
 MANIFESTS: dict[str, Callable[[], dict[str, Any]]] = {
@@ -372,8 +299,8 @@ def test_another_environment_than_remembered_is_refused(
 def test_what_is_remembered_is_not(liar: LyingServer, folder: str) -> None:
     """The control: the honest answers."""
     opened(liar, folder).close()
-    with opened(liar, folder) as suites:
-        suites.env.reset()
+    with started(liar, folder):
+        pass
 
 
 DISAGREEING: dict[str, dict[str, Any]] = {
@@ -481,9 +408,8 @@ def test_answers_of_another_kind_are_refused(
 ) -> None:
     """A runner that answers with another message, be it the server's, gets no further with it."""
     liar.lies[m.Step] = relayed(reply)
-    with opened(liar, folder) as suites:
-        suites.env.reset()
-        refuses(lambda: suites.env.step(ACTIONS))
+    with started(liar, folder) as env:
+        refuses(lambda: env.step(ACTIONS))
 
 
 def test_exceptions_choose_no_class(liar: LyingServer, folder: str) -> None:
@@ -503,15 +429,14 @@ def test_silence_ends_at_the_deadline(liar: LyingServer, folder: str) -> None:
     liar.lies[m.Step] = lambda asked: []
     liar.lies[m.Close] = lambda asked: []
     timeouts = {"startup_s": 60.0, "step_s": 60.0, "reset_s": 60.0, "close_s": 0.3}
-    with opened(liar, folder, timeouts=timeouts) as suites:
-        suites.env.reset()
-        with inside.hurried(suites.env, step_s=0.3):
-            error = refuses(lambda: suites.env.step(ACTIONS))
+    with started(liar, folder, timeouts=timeouts) as env:
+        with inside.hurried(env, step_s=0.3):
+            error = refuses(lambda: env.step(ACTIONS))
             assert isinstance(error, WorkerTimeoutError)
-            assert isinstance(refuses(lambda: suites.env.step(ACTIONS)), WorkerError)
+            assert isinstance(refuses(lambda: env.step(ACTIONS)), WorkerError)
         del liar.lies[m.Step]
-        suites.env.reset()
-        suites.env.step(ACTIONS)
+        env.reset()
+        env.step(ACTIONS)
 
 
 def test_stale_unasked_and_double_answers_are_dropped(liar: LyingServer, folder: str) -> None:
@@ -525,10 +450,9 @@ def test_stale_unasked_and_double_answers_are_dropped(liar: LyingServer, folder:
         return [*stale, asked.answer(good), asked.answer(evil), *stale]
 
     liar.lies[m.Step] = lie
-    with opened(liar, folder) as suites:
-        suites.env.reset()
+    with started(liar, folder) as env:
         for _ in range(20):
-            _, rewards, *_ = suites.env.step(ACTIONS)
+            _, rewards, *_ = env.step(ACTIONS)
             if (rewards == 666.0).any():
                 pytest.fail("an answer that nobody had asked for became a result")
 
@@ -544,9 +468,8 @@ def test_flood_of_unasked_answers_is_bounded(liar: LyingServer, folder: str) -> 
         ]
 
     liar.lies[m.Step] = lie
-    with opened(liar, folder) as suites:
-        suites.env.reset()
-        grown = peak_growth(lambda: suites.env.step(ACTIONS))
+    with started(liar, folder) as env:
+        grown = peak_growth(lambda: env.step(ACTIONS))
     assert grown < 500 * MIB, grown
 
 
@@ -561,9 +484,8 @@ def test_parts_that_do_not_add_up_are_refused(
     liar.lies[m.Step] = lambda asked: [
         [*m.pack_header(m.Relayed(parts), asked.request_id), *frames]
     ]
-    with opened(liar, folder) as suites:
-        suites.env.reset()
-        refuses(lambda: suites.env.step(ACTIONS))
+    with started(liar, folder) as env:
+        refuses(lambda: env.step(ACTIONS))
 
 
 @pytest.mark.parametrize(
@@ -596,7 +518,6 @@ def test_everything_else_works_on(liar: LyingServer, folder: str, tmp_path: Path
     with make_env(str(honest), n_envs=NUM_ENVS) as real:
         real.env.reset(seed=0)
         liar.lies[m.Step] = lambda asked: [[b"\xff" * 100]]
-        with opened(liar, folder) as suites:
-            suites.env.reset()
-            refuses(lambda: suites.env.step(ACTIONS))
+        with started(liar, folder) as env:
+            refuses(lambda: env.step(ACTIONS))
         real.env.step(ACTIONS)

@@ -13,7 +13,7 @@ import ctypes
 import gc
 import html
 import importlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -31,17 +31,14 @@ from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest.names import GYMNASIUMS, PROBED
 from envhub_worker.protocol.spaces.spaces import encode_space
+from tests.attacks.client.lies import SCRIPT, opened, relayed, spec_of
 from tests.attacks.client.lying_server import (
     ACTION,
     OBSERVATION,
-    Asked,
-    Frames,
+    Lie,
     LyingServer,
-    lying,
     manifest,
 )
-from tests.attacks.client.test_lies import opened, relayed
-from tests.attacks.client.test_values import SCRIPT, spec_of
 from tests.attacks.harness import Arena
 from tests.support import curious, inside
 from tests.support.curious import do
@@ -53,19 +50,6 @@ FAMILY = "The client, by what libraries do with any object"
 TOKEN = "hf_canary_of_the_caller_0123456789"
 HTML, ENSURE = "_repr_html_", "_ensure"
 NAMES = tuple(names_that_libraries_call())
-
-
-@pytest.fixture
-def liar() -> Iterator[LyingServer]:
-    """A worker server whose environment has every attribute that a library ever asks for."""
-    with lying() as server:
-        yield server
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> str:
-    """A repository; nobody will ever read it. Each is another one, so nothing is cached."""
-    return str(write_repository(tmp_path / "repository", f"# {tmp_path}"))
 
 
 def greedy(liar: LyingServer, folder: str, answer: Lie | None = None, **fields: Any) -> EnvSuites:
@@ -80,9 +64,6 @@ def greedy(liar: LyingServer, folder: str, answer: Lie | None = None, **fields: 
     liar.lies[m.GetOwn] = answer or relayed(m.Method())
     liar.lies[m.CallOwn] = relayed(m.Value(SCRIPT))
     return opened(liar, folder)
-
-
-Lie = Callable[[Asked], list[Frames]]
 
 
 OF_ONE: dict[str, Any] = {

@@ -12,7 +12,7 @@ import pickle
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -23,24 +23,8 @@ from gymnasium.envs.registration import EnvSpec
 
 from envhub_sandbox.errors import RemoteProtocolError
 from envhub_worker.protocol import messages as m
-from tests.attacks.client.lying_server import NUM_ENVS, LyingServer, lying, manifest
-from tests.attacks.client.test_lies import opened, refuses, relayed
-from tests.support.repositories import write_repository
-
-SCRIPT = "<script>steal()</script>"
-
-
-@pytest.fixture
-def liar() -> Iterator[LyingServer]:
-    """A worker server that lies as told."""
-    with lying() as server:
-        yield server
-
-
-@pytest.fixture
-def folder(tmp_path: Path) -> str:
-    """A repository; nobody will ever read it. Each is another one, so nothing is cached."""
-    return str(write_repository(tmp_path / "repository", f"# {tmp_path}"))
+from tests.attacks.client.lies import SCRIPT, opened, refuses, relayed, spec_of
+from tests.attacks.client.lying_server import NUM_ENVS, LyingServer, manifest
 
 
 def specified(liar: LyingServer, folder: str, spec: dict[str, Any]) -> Any:
@@ -52,23 +36,6 @@ def specified(liar: LyingServer, folder: str, spec: dict[str, Any]) -> Any:
 
 
 # --- specs ----------------------------------------------------------------------------------
-
-
-def system(command: str, **kwargs: Any) -> None:
-    """``os.system`` for whoever passes more."""
-    subprocess.run(command, shell=True, check=True)
-
-
-def spec_of(canary: Path) -> dict[str, Any]:
-    """What a worker calls the specification of its environment."""
-    return {
-        "id": "Trap-v0",
-        "entry_point": "os:system",
-        "vector_entry_point": f"{__name__}:system",
-        "kwargs": {"command": f"echo made > {canary}"},
-        "additional_wrappers": (),
-        "max_episode_steps": 7,
-    }
 
 
 MAKERS: dict[str, Callable[[EnvSpec], object]] = {
