@@ -21,7 +21,7 @@ from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
 from tests.attacks.harness import HOSTILE, token
 from tests.attacks.network.listeners import listening, sends
 from tests.attacks.processes.victim import victim
-from tests.attacks.resources.test_bombs import of_processes, tasks
+from tests.attacks.resources.accounts import of_processes, tasks
 from tests.containers.kit import Walls, container_of, pids_in
 
 MIB = 1 << 20

@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from tests.attacks.harness import USER, Arena, token
-from tests.attacks.network.listeners import listening
-from tests.attacks.network.test_network import sends
+from tests.attacks.network.listeners import listening, sends
 
 FAMILY = "AF_UNIX sockets"
 

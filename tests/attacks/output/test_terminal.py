@@ -18,6 +18,7 @@ import pytest
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import EnvHubError, WorkerDiedError
 from tests.attacks.harness import HOSTILE, USER, Arena, token
+from tests.attacks.output.painting import ESCAPES, paints
 from tests.support.repositories import write_repository
 
 FAMILY = "The terminal"
@@ -95,7 +96,6 @@ def in_terminal(arena: Arena, place: str, payload: str, text: str) -> str:
     return shown.decode("utf-8", "replace")
 
 
-ESCAPES = "\x1b]0;owned\x07\x1b[2J\x9b31m\r\u202e"
 _ENV = f"""
 import gymnasium as gym, numpy as np, os, sys
 
@@ -144,11 +144,6 @@ def test_errors_do_not_paint(arena: Arena, home: Path) -> None:
         shown.append(repr(suites.provenance))
     painted = [text for text in shown if paints(text)]
     arena.judge("escape sequences in errors and output", "succeeds", bool(painted), str(painted))
-
-
-def paints(text: str) -> bool:
-    """Whether a terminal that prints the text would do more than print."""
-    return any(not (char.isprintable() or char in "\n\t") for char in text)
 
 
 def test_the_control_paints() -> None:

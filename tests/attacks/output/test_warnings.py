@@ -25,7 +25,7 @@ from tests.attacks.client.lying_server import (
     lying,
     step_done,
 )
-from tests.attacks.output.test_terminal import ESCAPES, paints
+from tests.attacks.output.painting import ESCAPES, paints
 from tests.support.repositories import write_repository
 
 STEPS = 40

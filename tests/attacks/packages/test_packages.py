@@ -13,7 +13,7 @@ from envhub_sandbox import make_env
 from envhub_worker.protocol.runtime import Runtime
 from tests.attacks.harness import Arena, token
 from tests.attacks.packages import trapped_packages as traps
-from tests.attacks.processes.test_between_jails import neighbour
+from tests.attacks.processes.neighbour import neighbour
 from tests.attacks.processes.victim import victim
 from tests.support.environments import base_interpreter, install, running_on
 from tests.support.processes import eventually

@@ -10,9 +10,7 @@ import ctypes
 import fcntl
 import os
 import subprocess
-import termios
 import time
-from array import array
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -30,6 +28,7 @@ from tests.attacks.harness import (
     new_alias,
     start_control,
 )
+from tests.attacks.resources.accounts import figure, in_pipes, of_processes, tasks
 from tests.support.processes import eventually, most_grown, resident
 
 FAMILY = "Bombs"
@@ -57,52 +56,6 @@ def test_fork_bomb_stops_at_the_limit(arena: Arena, title: str, payload: str) ->
 def stays(run: Run, over: Callable[[Run], bool]) -> bool:
     """Whether a run stays over a limit: what is only measured is noticed a moment later."""
     return over(run) and not (run.inside and eventually(lambda: not over(run), 10.0))
-
-
-def tasks(run: Run) -> int:
-    """Live threads of all processes of a run."""
-    count = 0
-    for pid in run.pids():
-        with contextlib.suppress(OSError):
-            count += len(os.listdir(f"/proc/{pid}/task"))
-    return count
-
-
-def of_processes(run: Run, name: str, file: str = "smaps_rollup") -> int:
-    """A figure of the kernel's about each process of a run, added up."""
-    return sum(figure(f"/proc/{pid}/{file}", name) for pid in run.pids())
-
-
-def figure(path: str, name: str) -> int:
-    """One line of ``name: 123 kB``, in bytes; 0 where a process has ended."""
-    with contextlib.suppress(OSError):
-        for line in Path(path).read_text().splitlines():
-            if line.startswith(f"{name}:"):
-                return int(line.split()[1]) * 1024
-    return 0
-
-
-def in_pipes(run: Run) -> int:
-    """What waits in the pipes of a run."""
-    held = {}
-    for pid in run.pids():
-        with contextlib.suppress(OSError):
-            for fd in os.listdir(f"/proc/{pid}/fd"):
-                path = f"/proc/{pid}/fd/{fd}"
-                if os.readlink(path).startswith("pipe:"):
-                    held[os.readlink(path)] = waiting(path)
-    return sum(held.values())
-
-
-def waiting(path: str) -> int:
-    """What waits in one pipe."""
-    fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
-    try:
-        words = array("i", [0])
-        fcntl.ioctl(fd, termios.FIONREAD, words)
-        return words[0]
-    finally:
-        os.close(fd)
 
 
 def of_the_machine(name: str) -> Callable[[Run], int]:

@@ -20,6 +20,7 @@ import pytest
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.sandboxes.process import PROCESS
+from tests.attacks.expectations import SHARED
 from tests.attacks.harness import (
     TIMEOUTS,
     USER,
@@ -39,21 +40,6 @@ from tests.support.repositories import write_repository
 FAMILY = "Open files"
 PATIENCE = 3000
 """Requests in which the server must have noticed the noise."""
-SHARED = {
-    "stdin: /dev/null": {"init", "zygote"},
-    "stdout: pipe": {"init"},
-    "stderr: pipe": {"init"},
-    "stream: socket": set(),
-    "slab: request": {"client"},
-    "slab: reply": {"client"},
-    "slab: observations": {"client"},
-    "what it hears: socket": set(),
-    "what it rings: eventfd": {"client"},
-}
-"""Every descriptor of a jail, and who else holds its open file description.
-
-``docs/threat-model.md`` says of each what a jail can do to them with it.
-"""
 KEEPER = """
 import ctypes, gymnasium as gym, numpy as np, os
 from envhub_worker.runner import runner
