@@ -49,7 +49,7 @@ begin() {
   running+=($!)
 }
 begin 1 tests/integration
-third=(tests/attacks/{files,kernel,network,output,packages})
+third=(tests/attacks/{files,kernel,network,packages,resources})
 begin 2 "${third[@]/#/--ignore=}" tests/attacks
 begin 3 "${third[@]}"
 failed=0

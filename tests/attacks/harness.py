@@ -139,6 +139,10 @@ class Arena:
             through = bool(succeeded(run))
         self.judge(title, control, through, run.text, impossible, judged)
 
+    def steal(self, title: str, payload: str, wanted: str, /, **arguments: Any) -> None:
+        """``attack`` that succeeds where ``wanted`` comes back."""
+        self.attack(title, payload, lambda run: wanted in run.text, **arguments)
+
     def judge(
         self,
         title: str,
@@ -200,6 +204,51 @@ class Arena:
     def place(self, policy: Mapping[str, Any]) -> dict[str, Any]:
         """Where the jail is, as ``make_env`` takes it."""
         return {"policy": {"profile": self.profile, **policy}}
+
+
+@dataclass(frozen=True)
+class OpenJail:
+    """The same attacks in a jail that is open already.
+
+    Attributes:
+        arena: Where it is.
+        env: The hostile repository's environment in it.
+        prefix: Of the titles.
+    """
+
+    arena: Arena
+    env: Any
+    prefix: str = ""
+
+    def attack(
+        self,
+        title: str,
+        payload: str,
+        succeeded: Succeeded,
+        *,
+        inside: Mapping[str, Any] | None = None,
+        before: Callable[[], object] = lambda: None,
+        **arguments: Any,
+    ) -> None:
+        """As ``Arena.attack``."""
+        before()
+        with control_run(payload, arguments) as control:
+            assert succeeded(control), f"the control of {title!r} failed: {control.text}"
+        before()
+        run = run_in(self.env, payload, **{**arguments, **(inside or {})})
+        through = bool(succeeded(run))
+        self.arena.judge(self.prefix + title, "succeeds", through, run.text)
+
+    def steal(self, title: str, payload: str, wanted: str, /, **arguments: Any) -> None:
+        """As ``Arena.steal``."""
+        self.attack(title, payload, lambda run: wanted in run.text, **arguments)
+
+
+def run_in(env: Any, payload: str, **arguments: Any) -> Run:
+    """Run a payload in a jail that is open already."""
+    run = Run(new_alias(), True)
+    call(env, run, payload, arguments)
+    return run
 
 
 def call(env: Any, run: Run, payload: str, arguments: Mapping[str, Any]) -> None:

@@ -11,15 +11,16 @@ from pathlib import Path
 import pytest
 
 from envhub_sandbox.hub import snapshot, store
-from tests.attacks.harness import HOSTILE, USER, Arena, Run, call, control_run, new_alias, token
+from tests.attacks.harness import HOSTILE, USER, Arena, Run, call, control_run, run_in, token
 
 FAMILY = "Changing files"
 
 
 def open_file(path: Path, text: str) -> Path:
     """A file that everybody may write, in a folder that everybody may write."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.parent.chmod(0o777)
+    if not path.parent.exists():
+        path.parent.mkdir(parents=True)
+        path.parent.chmod(0o777)
     path.write_text(text)
     path.chmod(0o666)
     return path
@@ -32,35 +33,18 @@ def open_file(path: Path, text: str) -> Path:
         ("the Hub cache", ".cache/huggingface/hub/models--o--r/blobs/1234"),
         ("the Hub token", ".cache/huggingface/token"),
         ("a start-up file of Python", ".local/lib/python3/site-packages/usercustomize.py"),
+        ("/dev/shm", "/dev/shm/envhub-attack-{token}"),  # a jail has its own
     ],
 )
 def test_files_outside_cannot_be_written(arena: Arena, home: Path, title: str, place: str) -> None:
     """Appending, replacing, truncating: the bytes stay what they were."""
-    path = home / place
-    arena.attack(
-        f"write into {title}",
-        "write_file",
-        lambda run: path.read_text() != "as it was",
-        before=lambda: open_file(path, "as it was"),
-        path=str(path),
-        text="attacked",
-    )
-
-
-def test_shared_memory_of_the_host_cannot_be_written(arena: Arena) -> None:
-    """A jail's /dev/shm is its own."""
-    path = Path(f"/dev/shm/envhub-attack-{token()}")
-
-    def prepare() -> None:
-        path.write_text("as it was")
-        path.chmod(0o666)
-
+    path = home / place.format(token=token())
     try:
         arena.attack(
-            "write into /dev/shm",
+            f"write into {title}",
             "write_file",
             lambda run: path.read_text() != "as it was",
-            before=prepare,
+            before=lambda: open_file(path, "as it was"),
             path=str(path),
             text="attacked",
         )
@@ -129,12 +113,7 @@ def test_other_snapshots_cannot_be_written(arena: Arena, home: Path) -> None:
 def test_other_snapshots_cannot_be_read(arena: Arena, home: Path) -> None:
     """A repository may be private: the others do not see it."""
     path = stored(home / "private")
-    arena.attack(
-        "read another repository's snapshot",
-        "read_file",
-        lambda run: path.read_text() in run.text,
-        path=str(path),
-    )
+    arena.steal("read another repository's snapshot", "read_file", path.read_text(), path=str(path))
 
 
 @pytest.mark.parametrize("payload", ["write_file", "delete_file", "rename_file", "create_file"])
@@ -148,8 +127,7 @@ def test_own_snapshot_cannot_be_written(arena: Arena, home: Path, payload: str) 
     tree = snapshot.local(str(HOSTILE)).root
     was = fingerprint(tree)
     with arena.environment() as env:
-        run = Run(new_alias(), True)
-        call(env, run, "where_am_i", {})
+        run = run_in(env, "where_am_i")
         for folder in (run.value["root"], run.value["cwd"], str(tree)):
             path = f"{folder}/{outer.name}"
             call(env, run, payload, {"path": path, **text})
@@ -221,8 +199,7 @@ def test_scratch_of_another_jail_is_closed(arena: Arena) -> None:
     """A jail neither reads nor changes what another one keeps in its temporary files."""
     secret = token()
     with arena.environment() as victim:
-        owner = Run(new_alias(), True)
-        call(victim, owner, "plant", {"text": secret})
+        owner = run_in(victim, "plant", text=secret)
         [pid] = owner.pids()
         outer = Path(f"/proc/{pid}/root{owner.value}")
         assert outer.read_text() == secret

@@ -41,28 +41,6 @@ def user_namespace(pid: int) -> str:
     return os.readlink(f"/proc/{pid}/ns/user")
 
 
-def test_no_user_namespace_can_be_made(arena: Arena) -> None:
-    """unshare(CLONE_NEWUSER) leaves a process where it was."""
-    child_differs(
-        arena,
-        "user namespace: unshare",
-        "user_namespace",
-        lambda child, parent: user_namespace(child) != user_namespace(parent),
-    )
-
-
-@pytest.mark.parametrize("way", ["clone", "clone3"])
-def test_no_user_namespace_can_be_born_into(arena: Arena, way: str) -> None:
-    """Nor does a clone begin its life in another one."""
-    child_differs(
-        arena,
-        f"user namespace: {way}",
-        "clone_with_namespace",
-        lambda child, parent: user_namespace(child) != user_namespace(parent),
-        way=way,
-    )
-
-
 def mounts(pid: int) -> list[str]:
     """A process's mounts."""
     return Path(f"/proc/{pid}/mountinfo").read_text().splitlines()
@@ -80,32 +58,32 @@ def root_of(pid: int) -> tuple[int, int]:
     return status.st_dev, status.st_ino
 
 
-def test_nothing_can_be_mounted(arena: Arena) -> None:
-    """No new mount appears in any process of the jail."""
-    source = f"src-{new_alias()}"
-    child_differs(
-        arena,
-        "mount a tmpfs",
+def other(fact: Callable[[int], object]) -> Look:
+    """Whether a child differs from its parent in this."""
+    return lambda child, parent: fact(child) != fact(parent)
+
+
+SOURCE = f"src-{new_alias()}"
+CHILDREN: dict[str, tuple[str, dict[str, str], Look]] = {
+    "user namespace: unshare": ("user_namespace", {}, other(user_namespace)),
+    "user namespace: clone": ("clone_with_namespace", {"way": "clone"}, other(user_namespace)),
+    "user namespace: clone3": ("clone_with_namespace", {"way": "clone3"}, other(user_namespace)),
+    "mount a tmpfs": (
         "mount_tmpfs",
-        lambda child, parent: any(source in line for line in mounts(child)),
-        source=source,
-    )
+        {"source": SOURCE},
+        lambda child, parent: any(SOURCE in line for line in mounts(child)),
+    ),
+    "remount the root": ("remount_root", {}, other(root_options)),
+    "chroot": ("chroot", {}, other(root_of)),
+    "pivot_root": ("pivot_root", {}, other(root_of)),
+}
 
 
-def test_root_cannot_be_remounted(arena: Arena) -> None:
-    """The read-only root stays what it is."""
-    child_differs(
-        arena,
-        "remount the root",
-        "remount_root",
-        lambda child, parent: root_options(child) != root_options(parent),
-    )
-
-
-@pytest.mark.parametrize("call", ["chroot", "pivot_root"])
-def test_root_cannot_be_changed(arena: Arena, call: str) -> None:
-    """Nor can another folder take its place."""
-    child_differs(arena, call, call, lambda child, parent: root_of(child) != root_of(parent))
+@pytest.mark.parametrize("title", CHILDREN)
+def test_no_child_has_other_namespaces_mounts_or_roots(arena: Arena, title: str) -> None:
+    """No process of a jail leaves its user namespace, and none of its mounts can be changed."""
+    payload, arguments, look = CHILDREN[title]
+    child_differs(arena, title, payload, look, **arguments)
 
 
 def test_other_namespaces_cannot_be_entered(arena: Arena) -> None:
@@ -310,14 +288,9 @@ def test_other_numbering_schemes_are_closed(arena: Arena, abi: str) -> None:
 
 def test_setuid_programs_gain_nothing(arena: Arena) -> None:
     """su runs as whoever called it."""
-    arena.attack(
-        "run a set-user-id program (su)",
-        "setuid_program",
-        became_root,
-        command=["/usr/bin/su", "-c", "true"],
-        uid=None if USER == "user" else 65533,
-        inside={"uid": None},
-    )
+    uid = None if USER == "user" else 65533
+    arguments = {"command": ["/usr/bin/su", "-c", "true"], "uid": uid, "inside": {"uid": None}}
+    arena.attack("run a set-user-id program (su)", "setuid_program", became_root, **arguments)
 
 
 def test_setuid_copies_gain_nothing(arena: Arena, home: Path) -> None:

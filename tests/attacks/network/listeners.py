@@ -6,9 +6,11 @@ import contextlib
 import selectors
 import socket
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, Protocol
+
+import psutil
 
 from tests.attacks.harness import Run, token
 from tests.support.processes import eventually
@@ -34,6 +36,19 @@ class Listener:
     def port(self) -> int:
         """The port that it is bound to."""
         return int(self.socket.getsockname()[1])
+
+    @property
+    def where(self) -> dict[str, Any]:
+        """How a payload is given its address."""
+        name = self.socket.getsockname()
+        if self.socket.family == socket.AF_UNIX:
+            return {"path": f"@{name[1:].decode()}" if isinstance(name, bytes) else name}
+        if self.socket.family == socket.AF_PACKET:
+            return {"device": name[0]}
+        if self.socket.family == socket.AF_NETLINK:
+            return {"port": name[0]}
+        raw = self.socket.type == socket.SOCK_RAW
+        return {"host": name[0]} if raw else {"host": name[0], "port": name[1]}
 
     def heard(self, text: str, *, wait: bool) -> bool:
         """Whether ``text`` has come, waiting generously if it is expected to."""
@@ -67,9 +82,28 @@ class Listener:
         self.socket.close()
 
 
+TCP = {"family": socket.AF_INET, "kind": socket.SOCK_STREAM, "address": ("127.0.0.1", 0)}
+UDP = {**TCP, "kind": socket.SOCK_DGRAM}
+TCP6, UDP6 = ({**one, "family": socket.AF_INET6, "address": ("::1", 0)} for one in (TCP, UDP))
+NETLINK = {"family": socket.AF_NETLINK, "kind": socket.SOCK_RAW, "address": (0, 0), "protocol": 2}
+ICMP = {**TCP, "kind": socket.SOCK_RAW, "protocol": socket.IPPROTO_ICMP}
+_FRAME = 0x88B5
+FRAMES = {
+    "family": socket.AF_PACKET,
+    "kind": socket.SOCK_RAW,
+    "address": ("lo", _FRAME),
+    "protocol": socket.htons(_FRAME),
+}
+"""Arguments of ``listening``; only root can listen to the last two."""
+
+
 @contextmanager
 def listening(
-    family: int, kind: int, address: Any, *options: tuple[int, int, int], protocol: int = 0
+    family: int,
+    kind: int,
+    address: Any,
+    options: Sequence[tuple[int, int, int]] = (),
+    protocol: int = 0,
 ) -> Iterator[Listener]:
     """A listener bound to ``address``; ``options`` are for ``setsockopt``."""
     sock = socket.socket(family, kind, protocol)
@@ -104,4 +138,14 @@ def sends(place: Attacks, title: str, payload: str, listener: Listener, **argume
         return listener.heard(inside if run.inside else control, wait=not run.inside)
 
     halves = {"message": control, "inside": {"message": inside}}
-    place.attack(title, payload, heard, **halves, **arguments)
+    place.attack(title, payload, heard, **halves, **(listener.where | arguments))
+
+
+def network_addresses() -> list[str]:
+    """The hardware addresses of this host's network devices, without their colons."""
+    return [
+        address.address.replace(":", "")
+        for addresses in psutil.net_if_addrs().values()
+        for address in addresses
+        if address.family == psutil.AF_LINK and address.address.strip("0:")
+    ]

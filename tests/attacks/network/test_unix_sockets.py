@@ -31,7 +31,7 @@ def test_socket_files_cannot_be_connected_to(
         with listening(socket.AF_UNIX, socket.SOCK_STREAM, str(path)) as listener:
             path.parent.chmod(0o755)
             path.chmod(0o777)
-            sends(arena, f"connect to {title}", "unix_stream", listener, path=str(path))
+            sends(arena, f"connect to {title}", "unix_stream", listener)
     finally:
         path.unlink()
         if path.parent != home:
@@ -46,28 +46,25 @@ def run_folder() -> Path:
     return Path("/run" if USER == "root" else "/var/tmp") / f"envhub-{token()[:8]}"
 
 
-def test_abstract_sockets_cannot_be_connected_to(arena: Arena) -> None:
-    """A stream socket that has a name and no file."""
-    name = f"envhub-{token()}"
-    with listening(socket.AF_UNIX, socket.SOCK_STREAM, f"\0{name}") as listener:
-        sends(arena, "connect to an abstract socket", "unix_stream", listener, path=f"@{name}")
-
-
-@pytest.mark.parametrize("payload", ["unix_stream", "unix_datagram"])
-def test_abstract_sockets_are_not_part_of_the_hosts_network(arena: Arena, payload: str) -> None:
-    """Whoever grants the network grants TCP and UDP, and no service that has only a name."""
-    name = f"envhub-{token()}"
+@pytest.mark.parametrize(
+    ("title", "payload", "policy"),
+    [
+        ("connect to an abstract socket", "unix_stream", {}),
+        ("datagram to an abstract socket", "unix_datagram", {}),
+        # who grants the network grants TCP and UDP, and no service that has only a name
+        *(
+            (f"reach an abstract socket on the host's network: {one}", one, {"network": "host"})
+            for one in ("unix_stream", "unix_datagram")
+        ),
+    ],
+)
+def test_abstract_sockets_cannot_be_reached(
+    arena: Arena, title: str, payload: str, policy: dict[str, str]
+) -> None:
+    """A socket that has a name and no file."""
     kind = socket.SOCK_STREAM if payload == "unix_stream" else socket.SOCK_DGRAM
-    with listening(socket.AF_UNIX, kind, f"\0{name}") as listener:
-        title = f"reach an abstract socket on the host's network: {payload}"
-        sends(arena, title, payload, listener, policy={"network": "host"}, path=f"@{name}")
-
-
-def test_abstract_datagrams_do_not_arrive(arena: Arena) -> None:
-    """A datagram to a socket that has a name and no file."""
-    name = f"envhub-{token()}"
-    with listening(socket.AF_UNIX, socket.SOCK_DGRAM, f"\0{name}") as listener:
-        sends(arena, "datagram to an abstract socket", "unix_datagram", listener, path=f"@{name}")
+    with listening(socket.AF_UNIX, kind, f"\0envhub-{token()}") as listener:
+        sends(arena, title, payload, listener, policy=policy)
 
 
 @pytest.mark.parametrize(
@@ -82,4 +79,4 @@ def test_datagrams_do_not_arrive(arena: Arena, home: Path, title: str, payload: 
     path = home / "log"
     with listening(socket.AF_UNIX, socket.SOCK_DGRAM, str(path)) as listener:
         path.chmod(0o777)
-        sends(arena, title, payload, listener, path=str(path))
+        sends(arena, title, payload, listener)

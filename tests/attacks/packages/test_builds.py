@@ -6,7 +6,6 @@ plain interpreter.
 
 from __future__ import annotations
 
-import socket
 import subprocess
 import zipfile
 from pathlib import Path
@@ -19,7 +18,7 @@ from envhub_sandbox.dependencies.builds.build import build_wheels
 from envhub_sandbox.dependencies.resolutions import lock_for
 from envhub_sandbox.errors import DependencyError
 from tests.attacks.harness import Arena, kill_named, new_alias, pids_named, token
-from tests.attacks.network.listeners import listening
+from tests.attacks.network.listeners import TCP, listening
 from tests.support.processes import eventually
 from tests.support.sdists import backend, make_sdist
 
@@ -74,12 +73,13 @@ def _profile(arena: Arena, other_cache: Path, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setenv(jail.PROFILE_VARIABLE, arena.profile)
 
 
-def sources(further: str, name: str = "hostile") -> dict[str, str]:
-    """The files of a package that attacks while it is built."""
-    return backend(name, further=further)
+def control(folder: Path, files: dict[str, str]) -> Path:
+    """The folder with the wheel, after a build in a plain interpreter."""
+    assert building(folder / "control", files).wait(_CONTROL_S) == 0
+    return folder / "control"
 
 
-def control(folder: Path, files: dict[str, str]) -> subprocess.Popen[bytes]:
+def building(folder: Path, files: dict[str, str]) -> subprocess.Popen[bytes]:
     """Build them in a plain interpreter; the wheel comes to lie in the folder."""
     folder.mkdir()
     for name, text in files.items():
@@ -116,9 +116,8 @@ def test_the_token(
     file.parent.mkdir(parents=True)
     file.write_text(secrets[1])
     paths = [str(file), "/proc/1/environ", *(f"/proc/{n}/environ" for n in range(2, 50))]
-    files = sources(LOOT.format(paths=paths))
-    assert control(tmp_path / "control", files).wait(_CONTROL_S) == 0
-    stolen = read(tmp_path / "control" / "hostile-1.0-py3-none-any.whl")
+    files = backend("hostile", further=LOOT.format(paths=paths))
+    stolen = read(control(tmp_path, files) / "hostile-1.0-py3-none-any.whl")
     assert all(secret in stolen for secret in secrets), "the control failed"
     wheel, why = built(tmp_path, files)
     assert wheel is not None, why
@@ -128,16 +127,15 @@ def test_the_token(
 
 def test_the_network(arena: Arena, tmp_path: Path) -> None:
     """Nothing answers, not even on loopback."""
-    with listening(socket.AF_INET, socket.SOCK_STREAM, ("127.0.0.1", 0)) as listener:
-        words = {}
-        for name in ("control", "inside"):
-            words[name] = token()
-            files = sources(CALL.format(port=listener.port, secret=words[name]))
-            if name == "control":
-                assert control(tmp_path / "control", files).wait(_CONTROL_S) == 0
-            else:
-                wheel, why = built(tmp_path, files)
-                assert wheel is not None, why
+    with listening(**TCP) as listener:
+        words = {name: token() for name in ("control", "inside")}
+        sources = {
+            name: backend("hostile", further=CALL.format(port=listener.port, secret=word))
+            for name, word in words.items()
+        }
+        control(tmp_path, sources["control"])
+        wheel, why = built(tmp_path, sources["inside"])
+        assert wheel is not None, why
         assert listener.heard(words["control"], wait=True), "the control failed"
         through = listener.heard(words["inside"], wait=False)
         arena.judge("reach the network while it is built", "succeeds", through, "")
@@ -146,8 +144,8 @@ def test_the_network(arena: Arena, tmp_path: Path) -> None:
 def test_the_cache(arena: Arena, other_cache: Path, tmp_path: Path) -> None:
     """Neither wheels nor environments nor snapshots of others can be written."""
     places = [other_cache / name / "hostile" / "x" for name in ("wheels", "environments")]
-    files = sources(WRITE.format(paths=list(map(str, places))))
-    assert control(tmp_path / "control", files).wait(_CONTROL_S) == 0
+    files = backend("hostile", further=WRITE.format(paths=list(map(str, places))))
+    control(tmp_path, files)
     assert all(place.exists() for place in places), "the control failed"
     for place in places:
         place.unlink()
@@ -164,8 +162,8 @@ def test_a_build_that_never_ends(
 ) -> None:
     """It is ended with all its processes, and the error says so."""
     alias = new_alias()
-    files = sources(SPIN.format(alias=alias))
-    process = control(tmp_path / "control", files)
+    files = backend("hostile", further=SPIN.format(alias=alias))
+    process = building(tmp_path / "control", files)
     try:
         assert eventually(lambda: len(pids_named(alias)) == 2, _CONTROL_S), "the control failed"
     finally:
@@ -183,10 +181,8 @@ def test_a_build_that_never_ends(
 
 def test_a_wheel_of_another_name(arena: Arena, other_cache: Path, tmp_path: Path) -> None:
     """It would be installed as the package that it claims to be."""
-    files = sources("", name="numpy")
-    assert control(tmp_path / "control", files).wait(_CONTROL_S) == 0
-    taken = tmp_path / "control" / "numpy-1.0-py3-none-any.whl"
-    assert taken.exists(), "the control failed"
+    files = backend("numpy", further="")
+    assert (control(tmp_path, files) / "numpy-1.0-py3-none-any.whl").exists(), "the control failed"
     wheel, why = built(tmp_path, files)
     assert "it is numpy 1.0, and not hostile 1.0" in why
     through = wheel is not None or bool(list(other_cache.glob("wheels/**/*.whl")))

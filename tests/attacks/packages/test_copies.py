@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from envhub_worker.protocol.runtime import Runtime
-from tests.attacks.harness import Arena, Run, call, control_run, new_alias, token
+from tests.attacks.harness import Arena, control_run, run_in, token
 from tests.attacks.hostile.payloads.change_tree import WAYS
 from tests.attacks.packages import trapped_packages as traps
 from tests.support.environments import base_interpreter, running_on
@@ -68,27 +68,13 @@ def test_no_other_jail_sees_a_change(arena: Arena, home: Path, packages: Path, w
         assert secret in run.text
     found = ""
     with arena.environment() as first, arena.environment() as second:
-        place = str(packages) if what == "packages" else where(first)
-        inside = {"path": f"{place}/{name}"}
-        ask(first, "create_file", {**inside, "text": secret})
-        found += ask(second, "read_file", inside)
+        root = str(run_in(first, "where_am_i").value["root"])
+        path = f"{packages if what == 'packages' else root}/{name}"
+        run_in(first, "create_file", path=path, text=secret)
+        found += run_in(second, "read_file", path=path).text
     with arena.environment() as third:
-        found += ask(third, "read_file", inside)
+        found += run_in(third, "read_file", path=path).text
     arena.judge(f"plant a file for the next jail: the {what}", "succeeds", secret in found, found)
-
-
-def where(env: object) -> str:
-    """The root of the repository, as the jail sees it."""
-    run = Run(new_alias(), True)
-    call(env, run, "where_am_i", {})
-    return str(run.value["root"])
-
-
-def ask(env: object, payload: str, arguments: dict[str, str]) -> str:
-    """All that a payload answers."""
-    run = Run(new_alias(), True)
-    call(env, run, payload, arguments)
-    return run.text
 
 
 def test_nothing_leads_below_a_view(arena: Arena, packages: Path) -> None:
@@ -109,10 +95,5 @@ def test_no_attribute_leads_out_of_a_view(arena: Arena, home: Path, packages: Pa
     secret = token()
     (home / "private").mkdir()
     (home / "private" / "file").write_text(secret)
-    arena.attack(
-        "read a file outside by an overlay's own attributes",
-        "redirect",
-        lambda run: secret in run.text,
-        folder=str(packages),
-        path=str(home / "private" / "file"),
-    )
+    at = {"folder": str(packages), "path": str(home / "private" / "file")}
+    arena.steal("read a file outside by an overlay's own attributes", "redirect", secret, **at)

@@ -13,10 +13,9 @@ from envhub_sandbox import make_env
 from envhub_worker.protocol.runtime import Runtime
 from tests.attacks.harness import Arena, token
 from tests.attacks.packages import trapped_packages as traps
-from tests.attacks.processes.neighbour import neighbour
-from tests.attacks.processes.victim import victim
+from tests.attacks.processes.neighbour import Pair, neighbour
+from tests.attacks.processes.victim import READS, victim
 from tests.support.environments import base_interpreter, install, running_on
-from tests.support.processes import eventually
 from tests.support.repositories import write_repository
 
 FAMILY = "Packages of the repository's own"
@@ -118,29 +117,16 @@ def test_a_jail_of_another_environment_is_out_of_reach(arena: Arena, place: Path
     for name in ("one", "other"):
         traps.real_packages(place / name)
         runtimes.append(Runtime(base_interpreter(), str(place / name)))
-    secret = token()
     with (
-        victim(secret) as target,
+        victim(token()) as target,
         running_on(runtimes[1]),
-        neighbour(arena, secret) as other,
+        neighbour(arena, target.secret) as other,
         running_on(runtimes[0]),
     ):
+        pair = Pair(target, other)
         for way in ("kill", "pidfd"):
-            arena.attack(
-                f"signal a jail of another environment: {way}",
-                "signal_one",
-                lambda run: eventually(
-                    lambda: (other if run.inside else target).state()["signals"] > 0,
-                    0.5 if run.inside else 60.0,
-                ),
-                inside={"pid": other.pid},
-                pid=target.pid,
-                way=way,
-            )
-        arena.attack(
-            "read a jail of another environment: process_vm_readv",
-            "process_vm_read",
-            lambda run: secret in run.text,
-            inside={"pid": other.pid, "address": other.address, "size": other.size},
-            **{name: getattr(target, name) for name in ("pid", "address", "size")},
-        )
+            title = f"signal a jail of another environment: {way}"
+            pair.signal(arena, title, way=way, **pair.at("pid"))
+        payload, names = READS["process_vm_readv"]
+        title = "read a jail of another environment: process_vm_readv"
+        arena.steal(title, payload, pair.secret, **pair.at(*names))

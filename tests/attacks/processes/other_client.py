@@ -13,7 +13,7 @@ import sys
 
 from envhub_sandbox.hub import store
 from envhub_sandbox.sandboxes.process import PROCESS
-from tests.attacks.harness import Arena, Run, call, new_alias
+from tests.attacks.harness import Arena, run_in
 
 
 def become(user: int) -> None:
@@ -30,15 +30,13 @@ def main(profile: str, secret: str) -> int:
     use = PROCESS.acquire(cache / "snapshots")
     server = use.server
     with Arena(profile, "").environment() as env:
-        run = Run(new_alias(), True)
-        call(env, run, "create_file", {"path": f"/dev/shm/envhub-{os.getpid()}", "text": secret})
-        call(env, run, "be_victim", {"secret": secret})
+        run_in(env, "create_file", path=f"/dev/shm/envhub-{os.getpid()}", text=secret)
+        run = run_in(env, "be_victim", secret=secret)
         [pid] = run.pids()
         folders = {"server": str(server.folder), "cache": str(cache)}
         print(json.dumps({"pid": pid, **run.value, **folders}), flush=True)
         for _ in sys.stdin:
-            call(env, run, "be_victim", {"secret": None})
-            print(json.dumps(run.value), flush=True)
+            print(json.dumps(run_in(env, "be_victim", secret=None).value), flush=True)
     use.release()
     return 0
 

@@ -7,7 +7,7 @@ import signal
 
 import psutil
 
-from tests.attacks.harness import Arena, Run, call, control_run, new_alias
+from tests.attacks.harness import Arena, Run, call, control_run, run_in
 from tests.support.processes import eventually
 
 FAMILY = "Our own processes"
@@ -17,8 +17,7 @@ def test_what_watches_a_jail_cannot_be_stopped_by_it(arena: Arena) -> None:
     """SIGSTOP reaches none of the processes above a jail, by any pid that it may try."""
     with arena.environment() as env:
         env.reset()
-        run = Run(new_alias(), True)
-        call(env, run, "environment", {})
+        run = run_in(env, "environment")
         above = watchers(run)
         try:
             with control_run("stop_processes", {"pids": above, "own": False}) as control:

@@ -26,6 +26,8 @@ class Victim:
     """The tests' end.
 
     Attributes:
+        process: What answers for it.
+        secret: What it holds.
         pid: Its process.
         address: Where in its memory the secret lies.
         size: Length of the secret.
@@ -33,10 +35,15 @@ class Victim:
     """
 
     process: subprocess.Popen[str]
+    secret: str
     pid: int
     address: int
     size: int
     fd: int
+
+    def at(self, *names: str) -> dict[str, Any]:
+        """Some of these fields, as a payload takes them."""
+        return {name: getattr(self, name) for name in names}
 
     def state(self) -> dict[str, Any]:
         """``text``, what its memory holds now; ``signals`` and ``broadcasts``, how many have come.
@@ -48,6 +55,18 @@ class Victim:
         self.process.stdin.write("\n")
         self.process.stdin.flush()
         return dict(json.loads(self.process.stdout.readline()))
+
+
+READS = {
+    "process_vm_readv": ("process_vm_read", ("pid", "address", "size")),
+    "/proc/<pid>/mem": ("proc_mem_read", ("pid", "address", "size")),
+    "/proc/<pid>/fd": ("proc_fd", ("pid", "fd")),
+    "pidfd_getfd": ("pidfd_getfd", ("pid", "fd")),
+}
+"""Ways to read what another process keeps to itself: the payload, and what it has to know."""
+SIGNALS = ("kill", "sigqueue", "pidfd", "F_SETOWN")
+"""Ways to send one process a signal."""
+WORD = int.from_bytes(b"attacked", "little")
 
 
 @contextmanager
@@ -62,7 +81,7 @@ def victim(secret: str) -> Iterator[Victim]:
     )
     assert process.stdout is not None
     try:
-        yield Victim(process, **json.loads(process.stdout.readline()))
+        yield Victim(process, secret, **json.loads(process.stdout.readline()))
     finally:
         process.kill()
         process.communicate()

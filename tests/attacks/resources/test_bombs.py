@@ -187,53 +187,58 @@ def places(home: Path) -> list[str]:
     return [str(folder) for folder in folders]
 
 
-def test_disk_cannot_be_filled(arena: Arena, places: list[str]) -> None:
-    """All that a jail writes, in whatever folders, stays below its limit."""
+def left_by(run: Run, measure: Callable[[str], int]) -> int:
+    """What a run has left in its folders, as it sees them, added up."""
+    [pid, *_] = run.pids() or [0]
+    root = f"/proc/{pid}/root" if run.inside else ""
+    count = 0
+    for path, *_ in (run.value or {}).values():
+        with contextlib.suppress(OSError):
+            count += measure(f"{root}{path}") if path else 0
+    return count
 
-    def written(run: Run) -> int:
-        [pid, *_] = run.pids() or [0]
-        root = f"/proc/{pid}/root" if run.inside else ""
-        files = [entry[0] for entry in (run.value or {}).values()]
-        return sum(blocks(f"{root}{path}") for path in files)
 
+@pytest.mark.parametrize(
+    ("title", "payload", "limits", "most", "much", "measure"),
+    [
+        (
+            "fill the disk",
+            "fill_disk",
+            {"disk_bytes": DISK, "memory_bytes": 1024 * MIB},
+            2 * DISK,
+            {"size": FILL},
+            lambda path: os.stat(path).st_blocks * 512,
+        ),
+        (
+            "use up the inodes",
+            "fill_inodes",
+            {"disk_files": FILES},
+            2 * FILES,
+            {"count": INODES},
+            lambda path: len(os.listdir(path)),
+        ),
+    ],
+    ids=["bytes", "inodes"],
+)
+def test_disk_cannot_be_filled(
+    arena: Arena,
+    places: list[str],
+    title: str,
+    payload: str,
+    limits: dict[str, int],
+    most: int,
+    much: dict[str, int],
+    measure: Callable[[str], int],
+) -> None:
+    """All that a jail writes, in whatever folders, and empty files too, stay below its limits."""
     arena.attack(
-        "fill the disk",
-        "fill_disk",
-        lambda run: stays(run, lambda run: written(run) > 2 * DISK),
-        limits={"disk_bytes": DISK, "memory_bytes": 1024 * MIB},
+        title,
+        payload,
+        lambda run: stays(run, lambda run: left_by(run, measure) > most),
+        limits=limits,
         inside={"folders": []},
         folders=places,
-        size=FILL,
-    )
-
-
-def blocks(path: str) -> int:
-    """What a file takes up."""
-    with contextlib.suppress(OSError):
-        return os.stat(path).st_blocks * 512
-    return 0
-
-
-def test_inodes_cannot_be_used_up(arena: Arena, places: list[str]) -> None:
-    """Nor does a flood of empty files get further than its limit."""
-
-    def made(run: Run) -> int:
-        [pid, *_] = run.pids() or [0]
-        root = f"/proc/{pid}/root" if run.inside else ""
-        count = 0
-        for folder, *_ in (run.value or {}).values():
-            with contextlib.suppress(OSError):
-                count += len(os.listdir(f"{root}{folder}")) if folder else 0
-        return count
-
-    arena.attack(
-        "use up the inodes",
-        "fill_inodes",
-        lambda run: stays(run, lambda run: made(run) > 2 * FILES),
-        limits={"disk_files": FILES},
-        inside={"folders": []},
-        folders=places,
-        count=INODES,
+        **much,
     )
 
 
