@@ -28,8 +28,8 @@ from envhub_worker.protocol.codec.codec import Buffer
 from tests.attacks.client.lies import Canary, peak_growth
 from tests.attacks.client.lying_server import step_done
 from tests.attacks.harness import TIMEOUTS, Arena
+from tests.attacks.repositories import write_environment
 from tests.support.processes import most_grown, resident
-from tests.support.repositories import write_repository
 from tests.support.wire import value
 
 FAMILY = "The client, from inside a jail"
@@ -38,7 +38,7 @@ MIB = 1 << 20
 GROWTH = 192 * MIB
 
 _ENV = """
-import gymnasium as gym, numpy as np, os, socket, struct, time
+import os, socket, struct, time
 from envhub_worker.runner import runner
 from envhub_worker.protocol import messages as m
 
@@ -46,15 +46,8 @@ FRAMES = {frames!r}
 MODE = {mode!r}
 honest = runner.Runner.answer
 
-class Plain(gym.Env):
+class Three(Plain):
     observation_space = gym.spaces.Box(-1, 1, (3,), np.float32)
-    action_space = gym.spaces.Discrete(2)
-
-    def reset(self, *, seed=None, options=None):
-        return np.zeros(3, np.float32), {{}}
-
-    def step(self, action):
-        return np.zeros(3, np.float32), 0.0, False, False, {{}}
 
 def lie(self, packet):
     request = m.unpack(packet.frames)
@@ -89,16 +82,13 @@ def is_stream(fd):
         return False
 
 runner.Runner.answer = lie
-
-def make_env(n_envs=1, use_async_envs=False):
-    return gym.vector.SyncVectorEnv([Plain] * n_envs)
 """
 
 
 def liar(folder: Path, mode: str, frames: list[Buffer] | None = None) -> str:
     """A repository whose runner lies about steps."""
     raw = [bytes(frame) for frame in frames or []]
-    return str(write_repository(folder / "liar", _ENV.format(frames=raw, mode=mode)))
+    return str(write_environment(folder / "liar", _ENV.format(frames=raw, mode=mode)))
 
 
 def lies_to(arena: Arena, folder: str, **timeouts: float) -> tuple[Exception, int]:

@@ -11,6 +11,7 @@ import pytest
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import SnapshotError
 from tests.attacks.harness import HOSTILE, USER, Arena, token
+from tests.attacks.repositories import write_environment
 
 FAMILY = "Reading files"
 
@@ -35,36 +36,15 @@ def secret_file(path: Path) -> str:
 def test_private_files_cannot_be_read(arena: Arena, home: Path, what: str, place: str) -> None:
     """A file in the caller's home cannot be opened by its path."""
     secret = secret_file(home / place)
-    path = str(home / place)
-    arena.attack(f"read {what}", "read_file", lambda run: secret in run.text, path=path)
+    arena.steal(f"read {what}", "read_file", secret, path=str(home / place))
 
 
-def test_temporary_files_of_the_host_cannot_be_read(arena: Arena) -> None:
-    """A jail's /tmp is its own."""
-    path = Path(f"/tmp/envhub-attack-{token()}")
-    secret = secret_file(path)
+@pytest.mark.parametrize("folder", ["/tmp", "/dev/shm"])
+def test_shared_folders_of_the_host_cannot_be_read(arena: Arena, folder: str) -> None:
+    """A jail's /tmp and /dev/shm are its own."""
+    path = Path(f"{folder}/envhub-attack-{token()}")
     try:
-        arena.attack(
-            "read a file in /tmp",
-            "read_file",
-            lambda run: secret in run.text,
-            path=str(path),
-        )
-    finally:
-        path.unlink()
-
-
-def test_shared_memory_of_the_host_cannot_be_read(arena: Arena) -> None:
-    """A jail's /dev/shm is its own."""
-    path = Path(f"/dev/shm/envhub-attack-{token()}")
-    secret = secret_file(path)
-    try:
-        arena.attack(
-            "read a file in /dev/shm",
-            "read_file",
-            lambda run: secret in run.text,
-            path=str(path),
-        )
+        arena.steal(f"read a file in {folder}", "read_file", secret_file(path), path=str(path))
     finally:
         path.unlink()
 
@@ -74,13 +54,8 @@ def test_detours_lead_nowhere(arena: Arena, home: Path, way: str) -> None:
     """A link made at run time, or a way through another process, opens nothing more."""
     secret = secret_file(home / "private")
     more = {"folders": [str(home)]} if way == "hard_link" else {}
-    arena.attack(
-        f"read a file through a {way.replace('_', ' ')}" + (" entry" if way == "proc" else ""),
-        f"read_through_{way}",
-        lambda run: secret in run.text,
-        path=str(home / "private"),
-        **more,
-    )
+    title = f"read a file through a {way.replace('_', ' ')}" + (" entry" if way == "proc" else "")
+    arena.steal(title, f"read_through_{way}", secret, path=str(home / "private"), **more)
 
 
 def test_links_in_the_repository_do_not_leave_it(arena: Arena, home: Path) -> None:
@@ -101,7 +76,7 @@ def test_folders_cannot_be_listed(arena: Arena, home: Path) -> None:
     """Names of files are secrets too."""
     name = f"name-{token()}"
     (home / name).touch()
-    arena.attack("list the home", "list_folder", lambda run: name in run.text, path=str(home))
+    arena.steal("list the home", "list_folder", name, path=str(home))
 
 
 def test_files_cannot_be_probed_for(arena: Arena, home: Path) -> None:
@@ -120,10 +95,10 @@ def test_files_cannot_be_opened_by_handle(arena: Arena, home: Path) -> None:
     """A file handle goes around paths, mounts and chroots; only root's capability opens one."""
     secret = secret_file(home / "private")
     handle, kind = file_handle(home / "private")
-    arena.attack(
+    arena.steal(
         "open a file by its handle",
         "read_by_handle",
-        lambda run: secret in run.text,
+        secret,
         handle=handle,
         kind=kind,
         mounts=["/", "/usr", "/tmp", str(HOSTILE)],
@@ -156,22 +131,16 @@ def test_every_stage_is_confined(arena: Arena, home: Path) -> None:
 
 def loot_of(arena: Arena, stage: str, home: Path, sandbox: str | None) -> str:
     """What an env of a repository brings out that reads a file in one of its stages."""
-    repository = home / f"at-{stage}"
-    repository.mkdir(exist_ok=True)
-    (repository / "env.py").write_text(
-        STAGES.replace("STAGE", stage).replace("PRIVATE", str(home / "private"))
-    )
-    found = ""
-    options = {} if sandbox is None else {"policy": {"profile": arena.profile}}
-    with make_env(
-        str(repository), sandbox=sandbox, trust_remote_code=sandbox is None, **options
-    ) as suites:
-        env = suites.env
-        env.reset()
-        env.step([0])
-        env.render()
-        found += str(env.call("loot"))
-        leaked = home / "leaked"
+    source = STAGES.replace("STAGE", stage).replace("PRIVATE", str(home / "private"))
+    repository = str(write_environment(home / f"at-{stage}", source))
+    plain = {"trust_remote_code": True}
+    options = {"policy": {"profile": arena.profile}} if sandbox else plain
+    with make_env(repository, sandbox=sandbox, **options) as suites:
+        suites.env.reset()
+        suites.env.step([0])
+        suites.env.render()
+        found = str(suites.env.call("loot"))
+    leaked = home / "leaked"
     if leaked.exists():
         found += leaked.read_text()
         leaked.unlink()
@@ -179,8 +148,6 @@ def loot_of(arena: Arena, stage: str, home: Path, sandbox: str | None) -> str:
 
 
 STAGES = """
-import gymnasium as gym, numpy as np
-
 LOOT = []
 
 def at(stage):
@@ -192,11 +159,7 @@ def at(stage):
         except OSError as error:
             LOOT.append(str(error))
 
-at("import")
-
-class Thief(gym.Env):
-    observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
-    action_space = gym.spaces.Discrete(2)
+class Thief(Plain):
     render_mode = "rgb_array"
     metadata = {"render_modes": ["rgb_array"]}
 
@@ -204,13 +167,13 @@ class Thief(gym.Env):
     def loot(self):
         return list(LOOT)
 
-    def reset(self, *, seed=None, options=None):
+    def reset(self, **given):
         at("reset")
-        return np.zeros(2, np.float32), {}
+        return super().reset(**given)
 
     def step(self, action):
         at("step")
-        return np.zeros(2, np.float32), 0.0, False, False, {}
+        return super().step(action)
 
     def render(self):
         at("render")
@@ -219,9 +182,11 @@ class Thief(gym.Env):
     def close(self):
         at("close")
 
-def make_env(n_envs=1, use_async_envs=False):
+def VECTOR(makers):
     at("make_env")
-    return gym.vector.SyncVectorEnv([Thief])
+    return gym.vector.SyncVectorEnv(makers)
+
+at("import")
 """
 
 

@@ -12,14 +12,13 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import LoadError, MissingModuleError, WorkerDiedError
+from tests.attacks.repositories import PLAIN, write_environment
 from tests.support import inside
 from tests.support.interpreter import profiles
 from tests.support.repositories import write_repository
 
 _ATTEMPTS = """
 import ctypes, os, socket
-import gymnasium as gym
-import numpy as np
 
 LIBC = ctypes.CDLL(None, use_errno=True)
 
@@ -41,22 +40,14 @@ def attempts():
         answer(LIBC.mount, b"none", b"/tmp", b"tmpfs", 0, 0),
     ]
 
-class Attempts(gym.Env):
+class Attempts(Plain):
     observation_space = gym.spaces.Box(0, 200, (4,), np.int64)
-    action_space = gym.spaces.Discrete(2)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return np.zeros(4, np.int64), {}
 
     def step(self, action):
         if action == 0:
             for _ in range(2000):
                 inet()
         return np.array(attempts(), np.int64), 0.0, False, False, {}
-
-def make_env(n_envs=1, use_async_envs=False):
-    return gym.vector.SyncVectorEnv([Attempts] * n_envs)
 """
 
 
@@ -72,7 +63,7 @@ def test_a_recorded_jail_is_refused_the_same(tmp_path: Path) -> None:
     The control is the jail that records nothing, and the reset that tries nothing: the jail's own
     test of its denials is no attempt of the repository.
     """
-    folder = write_repository(tmp_path / "attempts", _ATTEMPTS)
+    folder = write_environment(tmp_path / "attempts", _ATTEMPTS)
     answers = {}
     for recorded in (False, True):
         with make_env(str(folder), policy={"record_denials": recorded}) as suites:
@@ -92,8 +83,6 @@ def test_a_recorded_jail_is_refused_the_same(tmp_path: Path) -> None:
 
 _PROCESSES = """
 import os, signal
-import gymnasium as gym
-import numpy as np
 
 def answer(act, *arguments):
     try:
@@ -102,14 +91,7 @@ def answer(act, *arguments):
         return error.errno
     return 0
 
-class Processes(gym.Env):
-    observation_space = gym.spaces.Box(0, 200, (4,), np.int64)
-    action_space = gym.spaces.Discrete(2)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return np.zeros(4, np.int64), {}
-
+class Processes(Plain):
     def own(self):
         child = os.fork()
         if child == 0:
@@ -132,12 +114,6 @@ class Processes(gym.Env):
             answer(os.setpriority, os.PRIO_PROCESS, os.getppid(), 5),
             answer(open, f"/proc/{number}/cmdline"),
         ]
-
-    def step(self, action):
-        return np.zeros(4, np.int64), 0.0, False, False, {}
-
-def make_env(n_envs=1, use_async_envs=False):
-    return gym.vector.SyncVectorEnv([Processes] * n_envs)
 """
 _NOBODY = 1 << 30
 
@@ -148,7 +124,7 @@ def test_who_names_a_process_that_is_not_its_own_is_told(home: Path, profile: st
 
     The controls are the jail that records nothing, and what the repository does with its own.
     """
-    folder = write_repository(home / "processes", _PROCESSES)
+    folder = write_environment(home / "processes", _PROCESSES)
     answers, told = {}, {}
     for recorded in (False, True):
         policy = {"profile": profile, "record_denials": recorded}
@@ -173,7 +149,6 @@ def test_who_names_a_process_that_is_not_its_own_is_told(home: Path, profile: st
 
 _GREEDY = """
 import os, threading
-import gymnasium as gym
 
 kept = []
 
@@ -184,16 +159,7 @@ def until_refused(take):
     except (OSError, RuntimeError):
         return len(kept)
 
-class Greedy(gym.Env):
-    observation_space = action_space = gym.spaces.Discrete(2)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return 0, {}
-
-    def step(self, action):
-        return 0, 0.0, False, False, {}
-
+class Greedy(Plain):
     def threads(self):
         def take():
             threading.Thread(target=threading.Event().wait, daemon=True).start()
@@ -211,9 +177,6 @@ class Greedy(gym.Env):
 
     def descriptors(self):
         return until_refused(lambda: os.open("env.py", os.O_RDONLY))
-
-def make_env(n_envs=1, use_async_envs=False):
-    return gym.vector.SyncVectorEnv([Greedy] * n_envs)
 """
 _FEW = {"processes": 64, "disk_bytes": 64 << 20, "disk_files": 2000, "open_files": 256}
 
@@ -221,7 +184,7 @@ _FEW = {"processes": 64, "disk_bytes": 64 << 20, "disk_files": 2000, "open_files
 @pytest.mark.parametrize("profile", profiles("strict"))
 def test_limits_that_are_used_up_are_told(home: Path, profile: str) -> None:
     """By what the kernel and the file system say; the control is the same jail before each."""
-    folder = write_repository(home / "greedy", _GREEDY)
+    folder = write_environment(home / "greedy", _GREEDY)
     expected: set[str] = set()
     policy = {"profile": profile, "record_denials": True}
     with make_env(str(folder), policy=policy, limits=_FEW) as suites:
@@ -241,8 +204,6 @@ def test_limits_that_are_used_up_are_told(home: Path, profile: str) -> None:
 
 _FILES = """
 import ctypes, os, threading
-import gymnasium as gym
-import numpy as np
 
 LIBC = ctypes.CDLL(None, use_errno=True)
 
@@ -272,17 +233,13 @@ def race(own, foreign, rounds):
     thread.join()
     return rounds
 
-class Files(gym.Env):
-    observation_space = gym.spaces.Box(0, 200, (4,), np.int64)
-    action_space = gym.spaces.Discrete(2)
-
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
+class Files(Plain):
+    def reset(self, **given):
         with open("own", "w") as file:
             file.write("x")
         os.rename("own", "mine")
         os.unlink("mine")
-        return np.zeros(4, np.int64), {}
+        return super().reset(**given)
 
     def attempts(self, folder):
         return [
@@ -299,12 +256,6 @@ class Files(gym.Env):
 
     def race(self, folder, rounds):
         return race(os.path.abspath("own"), f"{folder}/there", rounds)
-
-    def step(self, action):
-        return np.zeros(4, np.int64), 0.0, False, False, {}
-
-def make_env(n_envs=1, use_async_envs=False):
-    return gym.vector.SyncVectorEnv([Files] * n_envs)
 """
 
 
@@ -313,7 +264,7 @@ def test_files_that_are_asked_for_are_told(tmp_path: Path) -> None:
 
     The controls are the jail that records nothing, and what the repository does with its own.
     """
-    folder = write_repository(tmp_path / "files", _FILES)
+    folder = write_environment(tmp_path / "files", _FILES)
     answers = {}
     for recorded in (False, True):
         with make_env(str(folder), policy={"record_denials": recorded}) as suites:
@@ -439,12 +390,12 @@ def test_who_is_seen_asking_gets_no_further(home: Path, profile: str) -> None:
     foreign = home / "there"
     foreign.touch()
     foreign.chmod(0o666)
-    folder = write_repository(home / "files", _FILES)
+    folder = write_environment(home / "files", _FILES)
     policy = {"profile": profile, "record_denials": True}
     with make_env(str(folder), policy=policy) as suites:
         suites.env.reset()
         assert list(suites.env.call("race", str(home), 100)) == [100]
     assert foreign.read_text() == ""
-    outside = f"{_FILES}\nwhile not os.path.getsize({str(foreign)!r}):\n"
+    outside = f"{PLAIN}{_FILES}\nwhile not os.path.getsize({str(foreign)!r}):\n"
     outside += f"    race({str(home / 'own')!r}, {str(foreign)!r}, 100)\n"
     subprocess.run([sys.executable, "-c", outside], check=True, timeout=300)

@@ -19,7 +19,7 @@ from envhub_sandbox import make_env
 from envhub_sandbox.errors import EnvHubError, WorkerDiedError
 from tests.attacks.harness import HOSTILE, USER, Arena, token
 from tests.attacks.output.painting import ESCAPES, paints
-from tests.support.repositories import write_repository
+from tests.attacks.repositories import write_environment
 
 FAMILY = "The terminal"
 
@@ -97,14 +97,12 @@ def in_terminal(arena: Arena, place: str, payload: str, text: str) -> str:
 
 
 _ENV = f"""
-import gymnasium as gym, numpy as np, os, sys
+import os, sys
 
 EVIL = {ESCAPES!r}
 Evil = type("Evil" + EVIL, (Exception,), {{}})
 
-class Painter(gym.Env):
-    observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
-    action_space = gym.spaces.Discrete(2)
+class Painter(Plain):
     metadata = {{"render_modes": [], "note": EVIL}}
 
     def reset(self, *, seed=None, options=None):
@@ -120,15 +118,12 @@ class Painter(gym.Env):
     @property
     def painted(self):
         return type("Thing", (), {{"__repr__": lambda self: EVIL}})()
-
-def make_env(n_envs=1, use_async_envs=False):
-    return gym.vector.SyncVectorEnv([Painter])
 """
 
 
 def test_errors_do_not_paint(arena: Arena, home: Path) -> None:
     """Class names, messages, tracebacks and output arrive with their control characters spelt."""
-    folder = write_repository(home / "painter", _ENV)
+    folder = write_environment(home / "painter", _ENV)
     with make_env(str(folder), policy={"profile": arena.profile}) as suites:
         env = suites.env
         env.reset()
@@ -155,11 +150,10 @@ def test_the_control_paints() -> None:
 @pytest.mark.parametrize("where", ["suite", "task"])
 def test_names_do_not_paint(arena: Arena, home: Path, where: str) -> None:
     """Names of suites and tasks, which are printed all the time, cannot hold control characters."""
-    env = _ENV[: _ENV.index("def make_env")]
     result = {"suite": "{EVIL: {0: env}}", "task": "{'suite': {EVIL: env}}"}[where]
-    text = f"{env}def make_env(n_envs=1, use_async_envs=False):\n"
+    text = f"{_ENV}def make_env(n_envs=1, use_async_envs=False):\n"
     text += f"    env = gym.vector.SyncVectorEnv([Painter])\n    return {result}\n"
-    folder = write_repository(home / "painter", text)
+    folder = write_environment(home / "painter", text)
     try:
         with make_env(str(folder), policy={"profile": arena.profile}) as suites:
             names = [*suites, *(str(task) for suite in suites.values() for task in suite)]

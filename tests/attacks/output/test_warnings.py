@@ -26,34 +26,27 @@ from tests.attacks.client.lying_server import (
     step_done,
 )
 from tests.attacks.output.painting import ESCAPES, paints
+from tests.attacks.repositories import write_environment
 from tests.support.repositories import write_repository
 
 STEPS = 40
 EACH = 25
 GIANT = 1_000_000
 _ENV = f"""
-import gymnasium as gym, numpy as np, warnings
+import warnings
 
 EVIL = {ESCAPES!r}
 Evil = type("Evil" + EVIL, (UserWarning,), {{}})
 
-class Flooder(gym.Env):
-    observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
-    action_space = gym.spaces.Discrete(2)
+class Flooder(Plain):
     count = 0
-
-    def reset(self, *, seed=None, options=None):
-        return np.zeros(2, np.float32), {{}}
 
     def step(self, action):
         for _ in range({EACH}):
             Flooder.count += 1
             text = str(Flooder.count) + EVIL + "x" * {GIANT} * (Flooder.count == 3)
             warnings.warn_explicit(text, Evil, "/etc/passwd", 1, "sys")
-        return np.zeros(2, np.float32), 0.0, False, False, {{}}
-
-def make_env(n_envs=1, use_async_envs=False):
-    return gym.vector.SyncVectorEnv([Flooder])
+        return super().step(action)
 """
 
 
@@ -72,7 +65,7 @@ def told_by(make: Callable[[], Any]) -> list[warnings.WarningMessage]:
 @pytest.mark.parametrize("lane", ["auto", "frames"])
 def test_a_flood_of_warnings_is_small_plain_and_ours(home: Path, lane: str) -> None:
     """Here they flood, paint, and name a file, of which Python shows a line; there none does."""
-    folder = write_repository(home / "flooder", _ENV)
+    folder = write_environment(home / "flooder", _ENV)
     spec = importlib.util.spec_from_file_location("flooder", folder / "env.py")
     assert spec is not None
     assert spec.loader is not None

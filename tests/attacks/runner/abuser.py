@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from tests.attacks.harness import Arena
-from tests.support.repositories import write_repository
+from tests.attacks.repositories import write_environment
 
 WATCHDOG_S = 180
 """Far more than all timeouts of the client together."""
@@ -83,7 +83,7 @@ def push(fd):
                 socket.send_fds(ours, [ONE], [0] * 200)
 """
 ENV = """
-import gymnasium as gym, numpy as np, os, signal, time
+import signal, time
 from envhub_worker.runner import runner
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.shared_memory import slabs
@@ -120,13 +120,9 @@ def every():
             found.append(fd)
     return found
 
-class Abuser(gym.Env):
-    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
-    action_space = gym.spaces.Discrete(4)
+VECTOR = gym.vector.AsyncVectorEnv
 
-    def reset(self, *, seed=None, options=None):
-        return np.zeros(1), {{}}
-
+class Abuser(Plain):
     def step(self, action):
         lane = lanes[-1]
         if action == ABUSE_AND_ANSWER:
@@ -140,10 +136,7 @@ class Abuser(gym.Env):
         if action == DIE:
             time.sleep(0.5)
             os.kill(os.getpid(), signal.SIGKILL)
-        return np.zeros(1), 0.0, False, False, {{}}
-
-def make_env(n_envs=1, use_async_envs=False):
-    return gym.vector.AsyncVectorEnv([Abuser] * n_envs)
+        return super().step(action)
 """
 ANSWERS, HANGS, DIES = 1, 2, 3
 
@@ -160,7 +153,7 @@ def watched(
         every: Whether it is done to every descriptor of the jail, and not to the doorbells alone.
         **order: For ``held_client``.
     """
-    repository = write_repository(folder / "abuser", ABUSE + ENV.format(act=act, every=every))
+    repository = write_environment(folder / "abuser", ABUSE + ENV.format(act=act, every=every))
     whole = {
         "policy": {"profile": arena.profile, "crash_history": 0, **order.pop("policy", {})},
         "options": order.pop("options", {}),

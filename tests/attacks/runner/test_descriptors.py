@@ -26,22 +26,22 @@ from tests.attacks.harness import (
     USER,
     Arena,
     Run,
-    call,
     control_run,
     new_alias,
     pids_named,
+    run_in,
     start_control,
     token,
 )
+from tests.attacks.repositories import write_environment
 from tests.attacks.runner.abuser import watched
 from tests.support.processes import eventually, most_grown, resident
-from tests.support.repositories import write_repository
 
 FAMILY = "Open files"
 PATIENCE = 3000
 """Requests in which the server must have noticed the noise."""
 KEEPER = """
-import ctypes, gymnasium as gym, numpy as np, os
+import ctypes, os
 from envhub_worker.runner import runner
 from envhub_worker.protocol import messages as m
 
@@ -53,13 +53,7 @@ def keep(self, request):
 
 runner._HANDLERS[m.Attach] = keep
 
-class Keeper(gym.Env):
-    observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
-    action_space = gym.spaces.Discrete(2)
-
-    def reset(self, *, seed=None, options=None):
-        return np.zeros(2, np.float32), {}
-
+class Keeper(Plain):
     def name(self, alias):
         ctypes.CDLL(None).prctl(15, alias.encode(), 0, 0, 0)  # PR_SET_NAME
         return {str(fd): name for fd, name in zip(kept, NAMES)}
@@ -68,9 +62,6 @@ NAMES = (
     "slab: request", "slab: reply", "slab: observations",
     "what it hears: socket", "what it rings: eventfd",
 )
-
-def make_env(n_envs=1, use_async_envs=False):
-    return gym.vector.SyncVectorEnv([Keeper])
 """
 _KCMP = {"x86_64": 312, "aarch64": 272}
 _KCMP_FILE = 0
@@ -117,8 +108,7 @@ def test_descriptors_cannot_be_pushed_into_the_server(arena: Arena, home: Path) 
     with arena.environment() as other:
         other.reset()
         with arena.environment() as env:
-            run = Run(new_alias(), True)
-            call(env, run, "send_descriptor", {"name": name, "path": ""})
+            run = run_in(env, "send_descriptor", name=name, path="")
             held = [link for process in servers() for link in open_files(process)]
         other.reset()
     pushed = any(name in link for link in held)
@@ -126,18 +116,24 @@ def test_descriptors_cannot_be_pushed_into_the_server(arena: Arena, home: Path) 
 
 
 def open_files(pid: int) -> list[str]:
-    """What a process has open; nothing, if it has ended."""
+    """The files that a process has open; nothing, if it has ended."""
     links = []
-    with contextlib.suppress(FileNotFoundError, ProcessLookupError):
-        for fd in os.listdir(f"/proc/{pid}/fd"):
-            with contextlib.suppress(OSError):
-                links.append(os.readlink(f"/proc/{pid}/fd/{fd}"))
+    for fd in descriptors(pid):
+        with contextlib.suppress(OSError):
+            links.append(os.readlink(f"/proc/{pid}/fd/{fd}"))
     return links
+
+
+def descriptors(pid: int) -> list[int]:
+    """What a process has open; nothing, if it has ended, as a server does that has lingered."""
+    with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+        return sorted(map(int, os.listdir(f"/proc/{pid}/fd")))
+    return []
 
 
 def test_every_descriptor_of_a_jail_is_known(arena: Arena, home: Path) -> None:
     """There is none but these, and only they share them that are said to; asked of the kernel."""
-    repository, alias = write_repository(home / "keeper", KEEPER), new_alias()
+    repository, alias = write_environment(home / "keeper", KEEPER), new_alias()
     with make_env(repository, timeouts=TIMEOUTS, **arena.place({})) as suites:
         env = suites.env
         env.reset()
@@ -160,11 +156,6 @@ def test_every_descriptor_of_a_jail_is_known(arena: Arena, home: Path) -> None:
     # only root can look into init and the zygote: they have made themselves opaque to their user
     visible = {"client", "server"} | ({"init", "zygote"} if USER == "root" else set())
     assert found == {name: who & visible for name, who in SHARED.items()}
-
-
-def descriptors(pid: int) -> list[int]:
-    """What a process has open."""
-    return sorted(map(int, os.listdir(f"/proc/{pid}/fd")))
 
 
 def open_file(pid: int, fd: int) -> str:
@@ -190,16 +181,11 @@ def sharers(runner: int, fd: int, kind: str) -> set[str]:
             USER != "root" and process.pid not in {os.getpid(), *servers()}
         ):
             continue
-        if any(shares(runner, fd, kind, process.pid, theirs) for theirs in held_by(process.pid)):
+        if any(
+            shares(runner, fd, kind, process.pid, theirs) for theirs in descriptors(process.pid)
+        ):
             found.add(names.get(process.pid, "zygote"))
     return found
-
-
-def held_by(pid: int) -> list[int]:
-    """What a process has open; nothing, if it has ended, as a server does that has lingered."""
-    with contextlib.suppress(FileNotFoundError, ProcessLookupError):
-        return descriptors(pid)
-    return []
 
 
 def shares(runner: int, fd: int, kind: str, pid: int, theirs: int) -> bool:
@@ -220,29 +206,22 @@ def test_nobody_is_held_by_what_a_jail_does_to_its_descriptors(
     assert ended, (act, said)
 
 
-@pytest.mark.parametrize(
-    "noise",
-    [
-        pytest.param(b"\xff" * 4096, id="ff"),
-        pytest.param(b"\0" * 4096, id="zeros"),
-        pytest.param(b"GET / HTTP/1.1\r\n\r\n" * 100, id="http"),
-        pytest.param(
-            (1).to_bytes(4, "little") + b"\0" * 4 + (1).to_bytes(8, "little") + b"\xff" * 8,
-            id="endless-frame",
-        ),
-        pytest.param(
-            (4096).to_bytes(4, "little")
-            + b"\0" * 4
-            + (1).to_bytes(8, "little")
-            + (1 << 27).to_bytes(8, "little") * 4096,
-            id="huge-frames",
-        ),
-        pytest.param(
-            (1).to_bytes(4, "little") + b"\0" * 4 + (99).to_bytes(8, "little") + b"\1" + b"\0" * 8,
-            id="unasked-answer",
-        ),
-    ],
-)
+def words(*numbers: int, tail: bytes = b"") -> bytes:
+    """The head of a packet: how many frames it has, its number, their sizes."""
+    return b"".join(number.to_bytes(8, "little") for number in numbers) + tail
+
+
+NOISE = {
+    "ff": b"\xff" * 4096,
+    "zeros": b"\0" * 4096,
+    "http": b"GET / HTTP/1.1\r\n\r\n" * 100,
+    "endless-frame": words(1, 1, tail=b"\xff" * 8),
+    "huge-frames": words(4096, 1, *[1 << 27] * 4096),
+    "unasked-answer": words(1, 99, tail=b"\1" + b"\0" * 8),
+}
+
+
+@pytest.mark.parametrize("noise", NOISE.values(), ids=NOISE)
 def test_noise_on_the_stream_ends_only_its_jail(arena: Arena, noise: bytes) -> None:
     """A jail that writes past our code to its stream is killed; server and neighbours go on."""
     with arena.environment() as other:

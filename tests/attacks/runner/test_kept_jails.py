@@ -16,14 +16,14 @@ import pytest
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import EnvHubError, RemoteProtocolError, WorkerDiedError
 from tests.attacks.harness import TIMEOUTS, Arena, kill_named, new_alias, pids_named
+from tests.attacks.repositories import write_environment
 from tests.support.processes import eventually
-from tests.support.repositories import write_repository
 
 FAMILY = "The client, from inside a jail"
 FORGED = 666.0
 
 _ENV = """
-import ctypes, gymnasium as gym, numpy as np, os, stat, tempfile, time
+import ctypes, os, stat, tempfile, time
 from pathlib import Path
 from envhub_worker.runner import runner
 from envhub_worker.protocol import messages as m
@@ -33,14 +33,14 @@ MODE, ALIAS = {mode!r}, {alias!r}
 honest, attach = runner.Runner.answer, runner.Runner.attach
 state = {{"liar": False, "ghost": None}}
 
-class Plain(gym.Env):
-    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
-    action_space = gym.spaces.Discrete(2)
-    steps = 0
+VECTOR = gym.vector.AsyncVectorEnv
 
-    def reset(self, *, seed=None, options=None):
+class Counter(Plain):
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (1,), np.float64)
+
+    def reset(self, **given):
         self.steps = 0
-        return np.zeros(1), {{}}
+        return super().reset(**given)
 
     def step(self, action):
         self.steps += 1
@@ -135,9 +135,6 @@ def lie(self, received):
 runner.Runner.answer = lie
 runner.Runner.attach = remember
 runner._HANDLERS[m.Attach] = remember
-
-def make_env(n_envs=1, use_async_envs=False):
-    return gym.vector.AsyncVectorEnv([Plain] * n_envs)
 """
 
 
@@ -145,7 +142,7 @@ def stepping(arena: Arena, folder: Path, mode: str, alias: str = "", lane: str =
     """Two sub-environments in a runner each; the second one's runner lies."""
     text = _ENV.format(mode=mode, alias=alias, forged=FORGED)
     return make_env(
-        str(write_repository(folder / "liar", text)),
+        str(write_environment(folder / "liar", text)),
         n_envs=2,
         use_async_envs=True,
         num_workers=2,
