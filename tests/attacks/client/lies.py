@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import cloudpickle
+import numpy as np
 import psutil
 import pytest
 from gymnasium import spaces
@@ -121,3 +122,68 @@ def spec_of(canary: Path) -> dict[str, Any]:
         "additional_wrappers": (),
         "max_episode_steps": 7,
     }
+
+
+def mt19937(**changes: Any) -> dict[str, Any]:
+    """A state, changed."""
+    state = {"key": np.arange(624, dtype=np.uint32), "pos": 3, **changes}
+    return {"bit_generator": "MT19937", "state": state}
+
+
+def philox(**changes: Any) -> dict[str, Any]:
+    """A state, changed."""
+    four = np.zeros(4, np.uint64)
+    state = {"counter": four, "key": np.zeros(2, np.uint64)}
+    whole = {"state": state, "buffer": four, "buffer_pos": 4, "has_uint32": 0, "uinteger": 0}
+    return {"bit_generator": "Philox", **whole, **changes}
+
+
+def pcg64(inc: int = 1, **changes: Any) -> dict[str, Any]:
+    """A state, changed."""
+    whole = {"state": {"state": 0, "inc": inc}, "has_uint32": 0, "uinteger": 0}
+    return {"bit_generator": "PCG64", **whole, **changes}
+
+
+def sfc64(state: Any = None, **changes: Any) -> dict[str, Any]:
+    """A state, changed."""
+    words = np.zeros(4, np.uint64) if state is None else state
+    return {"bit_generator": "SFC64", "state": {"state": words}, "has_uint32": 0, "uinteger": 0,
+            **changes}  # fmt: skip
+
+
+STATES: dict[str, Any] = {
+    "an index far away": mt19937(pos=2**31 - 1),
+    "an index before the key": mt19937(pos=-1),
+    "an index just behind the key": mt19937(pos=625),
+    "an index that is a flag": mt19937(pos=True),
+    "an index that is a float": mt19937(pos=3.0),
+    "a short key": mt19937(key=np.arange(623, dtype=np.uint32)),
+    "a key of another dtype": mt19937(key=np.arange(624, dtype=np.uint64)),
+    "a key of objects": mt19937(key=np.array([None] * 624, object)),
+    "a key that is a list": mt19937(key=[0] * 624),
+    "a key that never yields anything but zero": mt19937(key=np.zeros(624, np.uint32)),
+    "a field more": mt19937(more=1),
+    "a buffer's index before it": philox(buffer_pos=-64),
+    "a buffer's index behind it": philox(buffer_pos=5),
+    "a buffer's index that it never has": philox(buffer_pos=0),
+    "a flag of two": philox(has_uint32=2),
+    "a word of 33 bits": philox(uinteger=2**32),
+    "a negative word": philox(uinteger=-1),
+    "a short buffer": philox(buffer=np.zeros(3, np.uint64)),
+    "a counter of another dtype": philox(state={"counter": np.zeros(4), "key": np.zeros(2)}),
+    "a state of 129 bits": pcg64(state={"state": 2**128, "inc": 1}),
+    "a negative state": pcg64(state={"state": -1, "inc": 1}),
+    "an increment with which it stands still": pcg64(inc=0),
+    "no increment": pcg64(state={"state": 1}),
+    "a word that is an array": pcg64(uinteger=np.zeros(2)),
+    "five words": sfc64(np.zeros(5, np.uint64)),
+    "words of two dimensions": sfc64(np.zeros((2, 2), np.uint64)),
+    "a flag that is a text": sfc64(has_uint32="1"),
+    "a state that is a list": {"bit_generator": "SFC64", "state": []},
+    "a generator by another name": {"bit_generator": "os.system"},
+    "a name that is an array": {"bit_generator": np.zeros(3)},
+    "no name": {},
+    "no mapping": 3,
+    "nothing": None,
+    "text": "PCG64",
+}

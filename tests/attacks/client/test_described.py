@@ -22,7 +22,15 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import encode
 from envhub_worker.protocol.codec.kinds import GENERATOR, SPACE, SPEC
 from envhub_worker.protocol.limits import WireLimits
-from tests.attacks.client.lies import nested, opened, refuses, relayed, spec_of, started
+from tests.attacks.client.lies import (
+    STATES,
+    nested,
+    pcg64,
+    refuses,
+    relayed,
+    spec_of,
+    started,
+)
 from tests.attacks.client.lying_server import Frames, LyingServer
 from tests.support.wire import ext, packed, value
 
@@ -53,12 +61,6 @@ def box(shape: tuple[int, ...], dtype: str = "float32") -> dict[str, Any]:
     zero, one, no = (np.zeros((), dtype), np.ones((), dtype), np.zeros((), bool))
     bounds = {"low": zero, "high": one, "bounded_below": no, "bounded_above": no}
     return {"kind": "box", "dtype": dtype, "shape": shape, **bounds}
-
-
-def generator_state(kind: str = "MT19937", **changes: Any) -> dict[str, Any]:
-    """A state, changed below its name."""
-    state: dict[str, Any] = dict(getattr(np.random, kind)(1).state)
-    return {**state, "state": {**state["state"], **changes}}
 
 
 def deep(levels: int) -> Frames:
@@ -92,10 +94,7 @@ LIES: dict[str, Frames] = {
     "a spec that is none": frames_of(Lie(SPEC, "CartPole-v1")),
     "a spec's steps as text": frames_of(Lie(SPEC, {"id": "A-v0", "max_episode_steps": "7"})),
     "a spec's name as code": frames_of(Lie(SPEC, {"id": ["A-v0"]})),
-    "a generator behind its key": frames_of(Lie(GENERATOR, generator_state(pos=(1 << 31) - 1))),
-    "a generator that stands still": frames_of(Lie(GENERATOR, generator_state("PCG64", inc=0))),
-    "a generator of its own": frames_of(Lie(GENERATOR, {"bit_generator": "Trap", "state": {}})),
-    "a generator that is none": frames_of(Lie(GENERATOR, None)),
+    **{f"a generator: {what}": frames_of(Lie(GENERATOR, lie)) for what, lie in STATES.items()},
     "two descriptions at once": packed([m.Value.kind, [ext(SPACE), {}, {}]]),
     "a description without one": packed([m.Value.kind, [ext(SPACE)]]),
     "a code that there is not": packed([m.Value.kind, [ext(29), {}]]),
@@ -108,9 +107,7 @@ def test_lies_about_things_are_refused(liar: LyingServer, folder: str, what: str
     """In what is asked for, and in infos; within bounded memory, and the jail is given up."""
     for ask in ("get_attr", "envs"):
         liar.lies = {m.Call: relayed(LIES[what]), m.GetOne: relayed(LIES[what])}
-        with opened(liar, folder) as suites:
-            env = suites.env
-            env.reset()
+        with started(liar, folder) as env:
             error = refuses(
                 lambda env=env, ask=ask: (
                     env.get_attr("space") if ask == "get_attr" else env.envs[0].space
@@ -125,19 +122,17 @@ def test_what_is_honest_is_taken(liar: LyingServer, folder: str) -> None:
         Lie(SPACE, box((2,))),
         Lie(SPACE, nested(12)),
         Lie(SPEC, {"id": "A-v0"}),
-        Lie(GENERATOR, generator_state()),
+        Lie(GENERATOR, pcg64()),
     ]
     kinds = [spaces.Box, spaces.Tuple, EnvSpec, np.random.Generator]
     for lie, kind in zip(honest, kinds, strict=True):
         liar.lies[m.Call] = relayed(frames_of(lie))
-        with opened(liar, folder) as suites:
-            suites.env.reset()
-            assert isinstance(suites.env.get_attr("thing")[0], kind)
+        with started(liar, folder) as env:
+            assert isinstance(env.get_attr("thing")[0], kind)
     one = Lie(SPACE, {"kind": "multi_binary", "n": 9_000_000})
     liar.lies[m.Call] = relayed(frames_of(one))
-    with opened(liar, folder) as suites:
-        suites.env.reset()
-        assert suites.env.get_attr("thing")[0].n == one.value["n"]  # type: ignore[index]
+    with started(liar, folder) as env:
+        assert env.get_attr("thing")[0].n == one.value["n"]  # type: ignore[index]
 
 
 def test_the_control_takes_the_memory() -> None:
