@@ -81,8 +81,20 @@ class StoppedNowError(AssertionError):
     """An attack did not get through that the documents say gets through, or its control did not."""
 
 
+class Attacks:
+    """Where a payload is run as a control and inside."""
+
+    def attack(self, title: str, payload: str, succeeded: Succeeded, **arguments: Any) -> None:
+        """Fail unless it succeeds as a control only."""
+        raise NotImplementedError
+
+    def steal(self, title: str, payload: str, wanted: str, /, **arguments: Any) -> None:
+        """``attack`` that succeeds where ``wanted`` comes back."""
+        self.attack(title, payload, lambda run: wanted in run.text, **arguments)
+
+
 @dataclass
-class Arena:
+class Arena(Attacks):
     """Where one test attacks: one profile, as the user that this process is.
 
     Attributes:
@@ -138,10 +150,6 @@ class Arena:
         with self.inside(payload, {**arguments, **(inside or {})}, policy, limits) as run:
             through = bool(succeeded(run))
         self.judge(title, control, through, run.text, impossible, judged)
-
-    def steal(self, title: str, payload: str, wanted: str, /, **arguments: Any) -> None:
-        """``attack`` that succeeds where ``wanted`` comes back."""
-        self.attack(title, payload, lambda run: wanted in run.text, **arguments)
 
     def judge(
         self,
@@ -207,7 +215,7 @@ class Arena:
 
 
 @dataclass(frozen=True)
-class OpenJail:
+class OpenJail(Attacks):
     """The same attacks in a jail that is open already.
 
     Attributes:
@@ -238,10 +246,6 @@ class OpenJail:
         run = run_in(self.env, payload, **{**arguments, **(inside or {})})
         through = bool(succeeded(run))
         self.arena.judge(self.prefix + title, "succeeds", through, run.text)
-
-    def steal(self, title: str, payload: str, wanted: str, /, **arguments: Any) -> None:
-        """As ``Arena.steal``."""
-        self.attack(title, payload, lambda run: wanted in run.text, **arguments)
 
 
 def run_in(env: Any, payload: str, **arguments: Any) -> Run:

@@ -8,11 +8,11 @@ import socket
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from typing import Any, Protocol
+from typing import Any
 
 import psutil
 
-from tests.attacks.harness import Run, token
+from tests.attacks.harness import Attacks, Run, token
 from tests.support.processes import eventually
 
 _POLL_S = 0.05
@@ -117,13 +117,6 @@ def listening(
         yield listener
     finally:
         listener.close()
-
-
-class Attacks(Protocol):
-    """Where a payload is run as a control and inside."""
-
-    def attack(self, title: str, payload: str, succeeded: Any, /, **arguments: Any) -> None:
-        """Fail unless it succeeds as a control only."""
 
 
 def sends(place: Attacks, title: str, payload: str, listener: Listener, **arguments: Any) -> None:

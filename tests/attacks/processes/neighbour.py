@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-from tests.attacks.harness import Arena, Run, run_in, token
+from tests.attacks.harness import Arena, Attacks, Run, run_in, token
 from tests.attacks.processes.victim import Victim, victim
 from tests.support.processes import eventually
 
@@ -29,8 +29,6 @@ class Neighbour:
     size: int
     fd: int
     path: str
-
-    at = Victim.at
 
     def state(self) -> dict[str, Any]:
         """``text``, what its memory holds now, ``signals`` and ``broadcasts`` that have come."""
@@ -60,7 +58,10 @@ class Pair:
 
     def at(self, *names: str) -> dict[str, Any]:
         """Where they are, as ``attack`` takes it for both halves."""
-        return {**self.outside.at(*names), "inside": self.inside.at(*names)}
+        outside, inside = (
+            {name: getattr(one, name) for name in names} for one in (self.outside, self.inside)
+        )
+        return {**outside, "inside": inside}
 
     @property
     def secret(self) -> str:
@@ -73,7 +74,7 @@ class Pair:
 
     def signal(
         self,
-        place: Any,
+        place: Attacks,
         title: str,
         payload: str = "signal_one",
         kind: str = "signals",

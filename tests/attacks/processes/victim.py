@@ -41,10 +41,6 @@ class Victim:
     size: int
     fd: int
 
-    def at(self, *names: str) -> dict[str, Any]:
-        """Some of these fields, as a payload takes them."""
-        return {name: getattr(self, name) for name in names}
-
     def state(self) -> dict[str, Any]:
         """``text``, what its memory holds now; ``signals`` and ``broadcasts``, how many have come.
 

@@ -134,36 +134,28 @@ for slab in (reply, observations):
         shard.outcome()
 
 
-@pytest.mark.parametrize(
-    ("outcome", "length"),
-    [(99, 0), (0, 0), (slabs.DONE, slabs.INFO_BYTES + 1), (slabs.DONE, 2**64 - 1)],
-)
-def test_an_impossible_header_is_refused(shard: LaneShard, outcome: int, length: int) -> None:
-    """Words out of range never become a slice or an allocation."""
-    shard.ask([np.zeros((2, 2), np.float32)], 0, 0)
-    words = f"struct.pack('QQ', {outcome}, {length})"
-    attack(shard, f"os.pwrite(reply, {words}, {slabs.OUTCOME * 8})")
-    with pytest.raises(RemoteProtocolError):
-        shard.outcome()
+BOTH = [(99, 0), (slabs.DONE, slabs.INFO_BYTES + 1), (slabs.DONE, 2**64 - 1)]
 
 
 @pytest.mark.parametrize(
-    ("outcome", "length"),
+    ("asked", "outcome", "length"),
     [
-        (99, 0),
-        (slabs.COLUMNS, 0),
-        (slabs.DONE, 0),
-        (slabs.DONE, slabs.INFO_BYTES + 1),
-        (slabs.DONE, 2**64 - 1),
+        *(("outcome", *words) for words in (*BOTH, (0, 0))),
+        *(("answer", *words) for words in (*BOTH, (slabs.COLUMNS, 0), (slabs.DONE, 0))),
     ],
 )
-def test_an_impossible_answer_is_refused(shard: LaneShard, outcome: int, length: int) -> None:
-    """A message has one answer, of a length that fits its area."""
-    shard.tell(b"".join(pack_packet(0, m.pack(m.Render(1)))), 0)
+def test_an_impossible_header_is_refused(
+    shard: LaneShard, asked: str, outcome: int, length: int
+) -> None:
+    """Words out of range never become a slice or an allocation, of steps or messages."""
+    if asked == "outcome":
+        shard.ask([np.zeros((2, 2), np.float32)], 0, 0)
+    else:
+        shard.tell(b"".join(pack_packet(0, m.pack(m.Render(1)))), 0)
     words = f"struct.pack('QQ', {outcome}, {length})"
     attack(shard, f"os.pwrite(reply, {words}, {slabs.OUTCOME * 8})")
     with pytest.raises(RemoteProtocolError):
-        shard.answer()
+        getattr(shard, asked)()
 
 
 def _packets(*frames: bytes) -> str:
