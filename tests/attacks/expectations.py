@@ -48,6 +48,23 @@ MEASURED_ATTACKS = frozenset({"fork bomb", "thread bomb"})
 looks gets through on a busy machine and is stopped on a quiet one, so neither is asserted there."""
 
 
+SHARED = {
+    "stdin: /dev/null": {"init", "zygote"},
+    "stdout: pipe": {"init"},
+    "stderr: pipe": {"init"},
+    "stream: socket": set(),
+    "slab: request": {"client"},
+    "slab: reply": {"client"},
+    "slab: observations": {"client"},
+    "what it hears: socket": set(),
+    "what it rings: eventfd": {"client"},
+}
+"""Every descriptor of a jail, and who else holds its open file description.
+
+``docs/threat-model.md`` says of each what a jail can do to them with it.
+"""
+
+
 def depends_on_load(attack: str, conditions: Collection[str]) -> bool:
     """Whether an attack is stopped here only if init looks in time."""
     needed = {"no-userns", MEASURED}

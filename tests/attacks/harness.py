@@ -81,8 +81,20 @@ class StoppedNowError(AssertionError):
     """An attack did not get through that the documents say gets through, or its control did not."""
 
 
+class Attacks:
+    """Where a payload is run as a control and inside."""
+
+    def attack(self, title: str, payload: str, succeeded: Succeeded, **arguments: Any) -> None:
+        """Fail unless it succeeds as a control only."""
+        raise NotImplementedError
+
+    def steal(self, title: str, payload: str, wanted: str, /, **arguments: Any) -> None:
+        """``attack`` that succeeds where ``wanted`` comes back."""
+        self.attack(title, payload, lambda run: wanted in run.text, **arguments)
+
+
 @dataclass
-class Arena:
+class Arena(Attacks):
     """Where one test attacks: one profile, as the user that this process is.
 
     Attributes:
@@ -200,6 +212,47 @@ class Arena:
     def place(self, policy: Mapping[str, Any]) -> dict[str, Any]:
         """Where the jail is, as ``make_env`` takes it."""
         return {"policy": {"profile": self.profile, **policy}}
+
+
+@dataclass(frozen=True)
+class OpenJail(Attacks):
+    """The same attacks in a jail that is open already.
+
+    Attributes:
+        arena: Where it is.
+        env: The hostile repository's environment in it.
+        prefix: Of the titles.
+    """
+
+    arena: Arena
+    env: Any
+    prefix: str = ""
+
+    def attack(
+        self,
+        title: str,
+        payload: str,
+        succeeded: Succeeded,
+        *,
+        inside: Mapping[str, Any] | None = None,
+        before: Callable[[], object] = lambda: None,
+        **arguments: Any,
+    ) -> None:
+        """As ``Arena.attack``."""
+        before()
+        with control_run(payload, arguments) as control:
+            assert succeeded(control), f"the control of {title!r} failed: {control.text}"
+        before()
+        run = run_in(self.env, payload, **{**arguments, **(inside or {})})
+        through = bool(succeeded(run))
+        self.arena.judge(self.prefix + title, "succeeds", through, run.text)
+
+
+def run_in(env: Any, payload: str, **arguments: Any) -> Run:
+    """Run a payload in a jail that is open already."""
+    run = Run(new_alias(), True)
+    call(env, run, payload, arguments)
+    return run
 
 
 def call(env: Any, run: Run, payload: str, arguments: Mapping[str, Any]) -> None:

@@ -6,9 +6,8 @@ import re
 from pathlib import Path
 
 from tests.attacks import table
-from tests.attacks.expectations import MEASURED_ATTACKS, NOT_STOPPED
+from tests.attacks.expectations import MEASURED_ATTACKS, NOT_STOPPED, SHARED
 from tests.attacks.harness import Row
-from tests.attacks.test_descriptors import SHARED
 
 DOCS = Path(__file__).parents[2] / "docs"
 

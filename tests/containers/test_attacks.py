@@ -19,9 +19,9 @@ from envhub_sandbox.hub.snapshot import local
 from envhub_sandbox.sandboxes.docker.engines import Engine
 from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
 from tests.attacks.harness import HOSTILE, token
-from tests.attacks.listeners import listening, sends
-from tests.attacks.test_bombs import of_processes, tasks
-from tests.attacks.victim import victim
+from tests.attacks.network.listeners import listening, sends
+from tests.attacks.processes.victim import victim
+from tests.attacks.resources.accounts import of_processes, tasks
 from tests.containers.kit import Walls, container_of, pids_in
 
 MIB = 1 << 20

@@ -15,7 +15,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.stream import pack_packet
 from envhub_worker.protocol.untrusted import UNTRUSTED
-from tests.attacks.lying_server import env_manifest
+from tests.attacks.client.lying_server import env_manifest
 from tests.fuzz.oracle import demand, fits, per_env, usable
 from tests.fuzz.targets import Dice, NotSentError, attempt, is_error, parts, spoiled_message
 

@@ -41,7 +41,7 @@ from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.spaces.spaces import OpaqueSpace, encode_space
 from envhub_worker.protocol.stream import StreamReader, pack_packet
 from envhub_worker.protocol.untrusted import UNTRUSTED
-from tests.attacks.lying_server import env_manifest
+from tests.attacks.client.lying_server import env_manifest
 from tests.fuzz.mutate import Spoiler, crossing
 from tests.fuzz.oracle import WrongError, alike, demand, fits, per_env, usable
 from tests.fuzz.traffic import Frames

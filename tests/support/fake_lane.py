@@ -19,7 +19,7 @@ from envhub_sandbox.transport.remote_warnings import RemoteWarnings
 from envhub_sandbox.transport.results import StepResult
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.lifecycle import State
-from tests.attacks.lying_server import NUM_ENVS, OBSERVATION, env_manifest
+from tests.attacks.client.lying_server import NUM_ENVS, OBSERVATION, env_manifest
 
 
 class FakeLane:

@@ -21,7 +21,7 @@ from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
 from envhub_worker.protocol.spaces.opaque import OpaqueSpace
 from envhub_worker.runner.described import described
-from tests.attacks.lying_server import env_manifest
+from tests.attacks.client.lying_server import env_manifest
 
 DIED = m.Death(2, "exit", 3, None, "", "last words", "step")
 ASKED = [(1, m.Render(1)), (2, m.Render(1))]

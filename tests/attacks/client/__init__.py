@@ -1,0 +1,1 @@
+"""What the client makes of a worker that lies: nothing runs here, and memory stays bounded."""

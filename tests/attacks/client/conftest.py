@@ -1,0 +1,24 @@
+"""A liar, and a repository that nobody ever reads."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.attacks.client.lying_server import LyingServer, lying
+from tests.support.repositories import write_repository
+
+
+@pytest.fixture
+def liar() -> Iterator[LyingServer]:
+    """A worker server that lies as a test says."""
+    with lying() as server:
+        yield server
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> str:
+    """A repository; nothing reads it. Each is another one, so nothing is cached."""
+    return str(write_repository(tmp_path / "repository", f"# {tmp_path}"))

@@ -1,0 +1,163 @@
+"""A hostile worker that describes spaces, specs and generators in its answers.
+
+The controls make of the same fields what they ask for: there memory is asked for without end, a
+command runs, and what one message may cost is not what its parts cost one by one.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import msgpack
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
+
+from envhub_sandbox.errors import RemoteProtocolError
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.codec.codec import encode
+from envhub_worker.protocol.codec.kinds import GENERATOR, SPACE, SPEC
+from envhub_worker.protocol.limits import WireLimits
+from tests.attacks.client.lies import (
+    STATES,
+    nested,
+    pcg64,
+    refuses,
+    relayed,
+    spec_of,
+    started,
+)
+from tests.attacks.client.lying_server import Frames, LyingServer
+from tests.support.wire import ext, packed, value
+
+HUGE = 1 << 30
+
+
+@dataclass
+class Lie:
+    """What a worker calls the description of a thing."""
+
+    code: int
+    value: object
+
+
+def frames_of(value: object, **limits: int) -> Frames:
+    """A result in which lies stand for things; by a worker that knows no limits."""
+
+    def write(thing: object) -> tuple[int, object] | None:
+        return (thing.code, thing.value) if isinstance(thing, Lie) else None
+
+    fields = [m.Value.kind, (value, None)]
+    found = encode(fields, describer=write, limits=WireLimits(**{"depth": 1000, **limits}))
+    return [bytes(frame) for frame in found]
+
+
+def box(shape: tuple[int, ...], dtype: str = "float32") -> dict[str, Any]:
+    """A Box of any size, in a few bytes."""
+    zero, one, no = (np.zeros((), dtype), np.ones((), dtype), np.zeros((), bool))
+    bounds = {"low": zero, "high": one, "bounded_below": no, "bounded_above": no}
+    return {"kind": "box", "dtype": dtype, "shape": shape, **bounds}
+
+
+def deep(levels: int) -> Frames:
+    """Descriptions in descriptions, as no encoder of ours makes them."""
+    document = (b"\x92" + msgpack.packb(ext(SPACE))) * levels + b"\xc0"
+    return [bytes(frame) for frame in value(document)]
+
+
+LIES: dict[str, Frames] = {
+    "2^60 elements": frames_of(Lie(SPACE, box((HUGE, HUGE)))),
+    "2^60 bits": frames_of(Lie(SPACE, {"kind": "multi_binary", "n": 1 << 60})),
+    "2^60 characters": frames_of(
+        Lie(SPACE, {"kind": "text", "min_length": 0, "max_length": 1 << 60, "characters": "a"})
+    ),
+    "more than the budget together": frames_of(
+        [Lie(SPACE, {"kind": "multi_binary", "n": 9_000_000})] * 8
+    ),
+    "too many": frames_of([Lie(SPACE, {"kind": "tuple", "spaces": []})] * 60_000, items=1 << 30),
+    "nested too deep": frames_of(Lie(SPACE, nested(13))),
+    "nested 10000 deep": deep(10_000),
+    "no description": frames_of(Lie(SPACE, 5)),
+    "of no kind": frames_of(Lie(SPACE, {"kind": "trap"})),
+    "with a field more": frames_of(Lie(SPACE, {**box((2,)), "sample": "trap"})),
+    "low above high": frames_of(Lie(SPACE, {**box((2,)), "low": np.full((), 2, np.float32)})),
+    "an endless Discrete": frames_of(
+        Lie(SPACE, {"kind": "discrete", "n": 1 << 63, "start": 0, "dtype": "int64"})
+    ),
+    "a key twice": frames_of(
+        Lie(SPACE, {"kind": "dict", "keys": ["a", "a"], "spaces": [box(())] * 2, "sort_keys": True})
+    ),
+    "a spec that is none": frames_of(Lie(SPEC, "CartPole-v1")),
+    "a spec's steps as text": frames_of(Lie(SPEC, {"id": "A-v0", "max_episode_steps": "7"})),
+    "a spec's name as code": frames_of(Lie(SPEC, {"id": ["A-v0"]})),
+    **{f"a generator: {what}": frames_of(Lie(GENERATOR, lie)) for what, lie in STATES.items()},
+    "two descriptions at once": packed([m.Value.kind, [ext(SPACE), {}, {}]]),
+    "a description without one": packed([m.Value.kind, [ext(SPACE)]]),
+    "a code that there is not": packed([m.Value.kind, [ext(29), {}]]),
+    "as a key": packed([m.Value.kind, {(ext(SPEC), 5): 1}]),
+}
+
+
+@pytest.mark.parametrize("what", LIES)
+def test_lies_about_things_are_refused(liar: LyingServer, folder: str, what: str) -> None:
+    """In what is asked for, and in infos; within bounded memory, and the jail is given up."""
+    for ask in ("get_attr", "envs"):
+        liar.lies = {m.Call: relayed(LIES[what]), m.GetOne: relayed(LIES[what])}
+        with started(liar, folder) as env:
+            error = refuses(
+                lambda env=env, ask=ask: (
+                    env.get_attr("space") if ask == "get_attr" else env.envs[0].space
+                )
+            )
+            assert isinstance(error, RemoteProtocolError), what
+
+
+def test_what_is_honest_is_taken(liar: LyingServer, folder: str) -> None:
+    """The control: the same way of telling, without the lie."""
+    honest = [
+        Lie(SPACE, box((2,))),
+        Lie(SPACE, nested(12)),
+        Lie(SPEC, {"id": "A-v0"}),
+        Lie(GENERATOR, pcg64()),
+    ]
+    kinds = [spaces.Box, spaces.Tuple, EnvSpec, np.random.Generator]
+    for lie, kind in zip(honest, kinds, strict=True):
+        liar.lies[m.Call] = relayed(frames_of(lie))
+        with started(liar, folder) as env:
+            assert isinstance(env.get_attr("thing")[0], kind)
+    one = Lie(SPACE, {"kind": "multi_binary", "n": 9_000_000})
+    liar.lies[m.Call] = relayed(frames_of(one))
+    with started(liar, folder) as env:
+        assert env.get_attr("thing")[0].n == one.value["n"]  # type: ignore[index]
+
+
+def test_the_control_takes_the_memory() -> None:
+    """Gymnasium builds what it is told to."""
+    with pytest.raises((MemoryError, ValueError)):
+        spaces.Box(0, 1, (HUGE, HUGE))
+
+
+def test_described_specs_make_nothing(liar: LyingServer, folder: str, tmp_path: Path) -> None:
+    """Of a spec only facts are taken; the control makes the whole of it, and a command runs."""
+    canary = tmp_path / "made"
+    liar.lies[m.Call] = relayed(frames_of(Lie(SPEC, spec_of(canary))))
+    with started(liar, folder) as env:
+        spec = env.get_attr("spec")[0]
+        assert (spec.id, spec.max_episode_steps) == ("Trap-v0", 7)
+        with pytest.raises(gym.error.Error, match="sandbox"):
+            gym.make(spec)
+    assert not canary.exists()
+    with pytest.raises(Exception):  # noqa: B017,PT011  # what it returns is no environment
+        gym.make(EnvSpec(**spec_of(canary)))
+    assert canary.exists(), "the control failed: the entry point was not called"
+
+
+def test_described_ids_import_nothing(liar: LyingServer, folder: str) -> None:
+    """``gym.make(spec.id)`` imports what stands before a colon: such a spec is only told."""
+    liar.lies[m.Call] = relayed(frames_of(Lie(SPEC, {"id": "antigravity:Trap-v0"})))
+    with started(liar, folder) as env:
+        assert not hasattr(env.get_attr("spec")[0], "id")

@@ -1,0 +1,297 @@
+"""Whatever the handling of a worker's input raises: one error of ours, and one jail given up.
+
+What is injected here stands for what nobody has thought of. The control is the same code without
+what stands around it: there the injected error comes out as it is.
+"""
+
+from __future__ import annotations
+
+import signal
+import struct
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.vector.utils import batch_space
+
+from envhub_sandbox.errors import (
+    EnvHubError,
+    MessageTooLargeError,
+    RemoteProtocolError,
+    WorkerDiedError,
+)
+from envhub_sandbox.transport import results
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol import untrusted
+from envhub_worker.protocol.manifest.manifest import Manifest, encode_env, encode_manifest
+from envhub_worker.protocol.spaces import batches
+from tests.attacks.client.lies import ACTIONS, opened, relayed, started
+from tests.attacks.client.lying_server import (
+    NUM_ENVS,
+    Asked,
+    Frames,
+    LyingServer,
+    env_manifest,
+    lying,
+    step_done,
+)
+from tests.support import inside
+from tests.support.repositories import write_repository
+
+ERRORS = [
+    AttributeError("a"),
+    BlockingIOError(11, "full"),
+    IndexError("i"),
+    KeyError("\x1b[2J" * 1000),
+    MemoryError(),
+    OverflowError("o"),
+    RecursionError("r"),
+    RuntimeWarning("w"),
+    StopIteration(),
+    struct.error("s"),
+    TypeError("unhashable"),
+    UnicodeDecodeError("utf-8", b"\xff", 0, 1, "u"),
+    ValueError("v"),
+]
+
+
+@pytest.fixture
+def other(tmp_path: Path) -> Iterator[Any]:
+    """Another environment of the same client, with an honest server."""
+    repository = str(write_repository(tmp_path / "other", f"# other {tmp_path}"))
+    with lying() as honest, started(honest, repository) as env:
+        yield env
+
+
+def raising(error: BaseException) -> Callable[..., Any]:
+    """Something that fails so."""
+
+    def fail(*_: object) -> Any:
+        raise error
+
+    return fail
+
+
+def raising_here(error: BaseException, otherwise: Callable[..., Any]) -> Callable[..., Any]:
+    """The same in this thread only: the liar has another."""
+    here = threading.get_ident()
+
+    def fail(*arguments: Any) -> Any:
+        if threading.get_ident() == here:
+            raise error
+        return otherwise(*arguments)
+
+    return fail
+
+
+@pytest.mark.parametrize("error", ERRORS, ids=lambda error: type(error).__name__)
+@pytest.mark.parametrize("operation", ["step", "reset"])
+def test_what_handling_raises_is_the_workers_fault(
+    liar: LyingServer,
+    folder: str,
+    other: Any,
+    monkeypatch: pytest.MonkeyPatch,
+    error: Exception,
+    operation: str,
+) -> None:
+    """It is told as such, printable and with the place; that jail ends, the others go on."""
+    actions: dict[str, Callable[[Any], object]] = {
+        "step": lambda env: env.step(ACTIONS),
+        "reset": lambda env: env.reset(),
+    }
+    with started(liar, folder, policy={"restart": "on_reset"}) as env:
+        with monkeypatch.context() as patched:
+            patched.setattr(results.batches, "conforms", raising(error))
+            with pytest.raises(RemoteProtocolError) as caught:
+                actions[operation](env)
+        assert caught.value.__cause__ is error
+        assert isinstance(caught.value, MessageTooLargeError) == isinstance(error, MemoryError)
+        assert str(caught.value).isprintable()
+        assert any(isinstance(asked, m.CloseJail) for asked in liar.asked)
+        with pytest.raises(WorkerDiedError):
+            env.step(ACTIONS)
+        other.step(ACTIONS)
+        env.reset()
+        env.step(ACTIONS)
+
+
+@pytest.mark.parametrize("error", ERRORS, ids=lambda error: type(error).__name__)
+def test_what_decoding_raises_is_the_workers_fault(
+    liar: LyingServer,
+    folder: str,
+    other: Any,
+    monkeypatch: pytest.MonkeyPatch,
+    error: Exception,
+) -> None:
+    """The same, where the message is not even one yet."""
+    with started(liar, folder, policy={"restart": "on_reset"}) as env:
+        with monkeypatch.context() as patched:
+            patched.setattr(*inside.DECODING, raising_here(error, getattr(*inside.DECODING)))
+            liar.lies[m.Step] = relayed(m.Value({"never": "seen"}))
+            with pytest.raises(RemoteProtocolError) as caught:
+                env.step(ACTIONS)
+        assert error in (caught.value.__cause__, getattr(caught.value.__cause__, "__cause__", None))
+        other.step(ACTIONS)
+        liar.lies.clear()
+        env.reset()
+        env.step(ACTIONS)
+
+
+def test_without_the_mechanism_it_comes_out(
+    liar: LyingServer, folder: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The control: what stands around the handling is what turns it."""
+    monkeypatch.setattr(untrusted, "FAULTS", ())
+    with started(liar, folder) as env, monkeypatch.context() as patched:
+        patched.setattr(results.batches, "conforms", raising(TypeError("unhashable")))
+        with pytest.raises(TypeError, match="unhashable"):
+            env.step(ACTIONS)
+
+
+class _AlarmError(Exception):
+    """Raised by the caller's own handler."""
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), _AlarmError()], ids=["Ctrl-C", "own"])
+def test_what_is_the_callers_own_passes(
+    liar: LyingServer, folder: str, monkeypatch: pytest.MonkeyPatch, error: BaseException
+) -> None:
+    """An interrupt in the midst of the handling is nobody's fault, and nothing is given up."""
+    with started(liar, folder) as env:
+        with monkeypatch.context() as patched:
+            patched.setattr(results.batches, "conforms", raising(error))
+            with pytest.raises(type(error)):
+                env.step(ACTIONS)
+        env.step(ACTIONS)
+
+
+def test_what_a_signal_handler_raises_in_a_wait_passes(liar: LyingServer, folder: str) -> None:
+    """Even where it is of a class that handling might raise: nobody had anything to handle."""
+    caller = threading.get_ident()
+
+    def lie(_: Asked) -> list[Frames]:
+        threading.Timer(0.3, signal.pthread_kill, (caller, signal.SIGALRM)).start()
+        return []
+
+    def ring(*_: object) -> None:
+        raise ValueError("the caller's own")
+
+    liar.lies[m.Step] = lie
+    before = signal.signal(signal.SIGALRM, ring)
+    try:
+        with started(liar, folder) as env:
+            with pytest.raises(ValueError, match="own") as caught:
+                env.step(ACTIONS)
+            assert not isinstance(caught.value, EnvHubError)
+            liar.lies.clear()
+            env.reset()
+            env.step(ACTIONS)
+    finally:
+        signal.signal(signal.SIGALRM, before)
+
+
+@pytest.mark.parametrize("key", [(1, 2), frozenset({1, 2}), range(3)], ids=repr)
+def test_keys_that_are_no_text_harm_nobody(
+    liar: LyingServer, folder: str, other: Any, key: object
+) -> None:
+    """Infos with such a key come the third time as the first, and others step in between."""
+    liar.lies[m.Step] = relayed(step_done(info={"visits": {key: 1}}))
+    with started(liar, folder) as env:
+        for _ in range(4):
+            assert env.step(ACTIONS)[4] == {"visits": {key: 1}}
+            other.step(ACTIONS)
+
+
+RUNNERS: dict[str, tuple[Any, ...]] = {
+    "a list": ([],),
+    "a text": ("1",),
+    "none": (None,),
+    "a float": (1.0,),
+}
+
+
+@pytest.mark.parametrize("what", list(RUNNERS))
+def test_runners_without_numbers_are_refused(liar: LyingServer, folder: str, what: str) -> None:
+    """The server's own words are read as carefully."""
+    liar.lies[m.OpenJail] = lambda asked: [asked.answer(m.JailOpened(1, RUNNERS[what], ()))]
+    with pytest.raises(RemoteProtocolError):
+        opened(liar, folder)
+
+
+@pytest.mark.parametrize("parts", [1, 2, 3])
+def test_as_many_answers_as_runners(liar: LyingServer, folder: str, parts: int) -> None:
+    """One runner was asked."""
+    frames = m.pack(step_done())
+
+    def lie(asked: Asked) -> list[Frames]:
+        return [
+            [*m.pack_header(m.RelayDone((len(frames),) * parts), asked.request_id), *frames * parts]
+        ]
+
+    liar.lies[m.Step] = lie
+    with started(liar, folder) as env:
+        if parts == 1:
+            env.step(ACTIONS)
+        else:
+            with pytest.raises(RemoteProtocolError):
+                env.step(ACTIONS)
+
+
+GRAPHS = spaces.Dict({"g": spaces.Graph(spaces.Box(0, 1, (2,)), None), "x": spaces.Discrete(2)})
+ODD: dict[str, Any] = {
+    "nothing": None,
+    "a number": 5,
+    "a text": "ab",
+    "a mapping": {"g": 1},
+    "numbers": np.zeros(NUM_ENVS),
+    "a tuple": (1, 2),
+    "another mapping": {"g": (1, 2), "x": 3},
+    "objects": np.array([{"g": (1, 2, 3)}, 4], object),
+    "a square of objects": np.full((2, 2), None, object),
+}
+
+
+@pytest.mark.parametrize("what", list(ODD))
+@pytest.mark.parametrize("shardable", [False, True])
+@pytest.mark.parametrize("place", ["observation", "final_obs"])
+def test_odd_observations_of_graphs(
+    liar: LyingServer, folder: str, what: str, shardable: bool, place: str
+) -> None:
+    """Where members get their class back, any value is taken as it is, or refused."""
+    described = env_manifest(
+        shardable=shardable,
+        single_observation_space=GRAPHS,
+        observation_space=batch_space(GRAPHS, NUM_ENVS),
+    )
+    liar.lies[m.Load] = relayed(m.LoadDone(encode_manifest(Manifest(envs=(described,), lazy=True))))
+    liar.lies[m.Build] = relayed(m.BuildDone(encode_env(described)))
+    graph = (np.zeros((1, 2), np.float32), None, None)
+    good = {"g": (graph,) * NUM_ENVS, "x": np.zeros(NUM_ENVS, np.int64)}
+    odd = ODD[what]
+    info = {"final_obs": odd} if place == "final_obs" else {}
+    liar.lies[m.Reset] = relayed(m.ResetDone(good, {}))
+    liar.lies[m.Step] = relayed(
+        step_done(observation=odd if place == "observation" else good, info=info)
+    )
+    with opened(liar, folder) as suites:
+        observation, _ = suites.env.reset()
+        assert type(observation["g"][0]).__name__ == "GraphInstance"
+        if shardable and place == "observation":
+            with pytest.raises(RemoteProtocolError):
+                suites.env.step(ACTIONS)
+        else:
+            for _ in range(3):
+                suites.env.step(ACTIONS)
+
+
+def test_masks_longer_than_their_values_are_refused() -> None:
+    """What one shard says of its rows cannot reach another's."""
+    honest = {"a": np.zeros(1), "_a": np.ones(1, bool)}
+    for mask in (np.ones(3, bool), np.ones((1, 1), bool), [True, True], None):
+        lie = {"a": np.zeros(1, np.int8), "_a": mask}
+        with pytest.raises(RemoteProtocolError):
+            batches.join_infos([honest, lie], [1, 1])

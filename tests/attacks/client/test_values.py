@@ -1,0 +1,184 @@
+"""A hostile worker against what the caller is given: specs, generators, seeds, infos.
+
+Each is used as programs use it. The controls take what the worker sent as it is: there a command
+runs, a process crashes, and memory becomes random numbers.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import pickle
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.envs.registration import EnvSpec
+
+from envhub_sandbox.errors import RemoteProtocolError
+from envhub_worker.protocol import messages as m
+from tests.attacks.client.lies import (
+    SCRIPT,
+    STATES,
+    opened,
+    pcg64,
+    philox,
+    refuses,
+    relayed,
+    spec_of,
+)
+from tests.attacks.client.lying_server import NUM_ENVS, LyingServer, manifest
+
+
+def specified(liar: LyingServer, folder: str, spec: dict[str, Any]) -> Any:
+    """``make_env`` of an environment with this specification."""
+    value = manifest()
+    value["envs"][0]["spec"] = spec
+    liar.lies[m.Load] = relayed(m.LoadDone(value))
+    return opened(liar, folder)
+
+
+# --- specs ----------------------------------------------------------------------------------
+
+
+MAKERS: dict[str, Callable[[EnvSpec], object]] = {
+    "make": gym.make,
+    "make_vec": gym.make_vec,
+    "its own make": lambda spec: spec.make(),
+    "a copy": lambda spec: gym.make(copy.deepcopy(spec)),
+    "a pickle": lambda spec: gym.make(pickle.loads(pickle.dumps(spec))),
+    "JSON": lambda spec: gym.make(EnvSpec.from_json(spec.to_json())),
+    "a vector by threads": lambda spec: gym.make_vec(spec, 2, vectorization_mode="sync"),
+}
+
+
+@pytest.mark.parametrize("how", list(MAKERS))
+def test_specs_make_nothing_here(liar: LyingServer, folder: str, tmp_path: Path, how: str) -> None:
+    """``gym.make(env.spec)`` runs no entry point that a worker names, and says why not."""
+    canary = tmp_path / "made"
+    with specified(liar, folder, spec_of(canary)) as suites:
+        spec = suites.env.spec
+        assert spec is not None
+        assert (spec.id, spec.max_episode_steps) == ("Trap-v0", 7)
+        with pytest.raises(gym.error.Error, match=r"sandbox.*make_env"):
+            MAKERS[how](spec)
+    assert not canary.exists()
+    naive = EnvSpec(**spec_of(canary))
+    with pytest.raises(Exception):  # noqa: B017,PT011  # what it returns is no environment
+        MAKERS[how](naive)
+    assert canary.exists(), "the control failed: the entry point was not called"
+
+
+@pytest.mark.parametrize("name", ["antigravity:Trap-v0", "a/b/c:d", "a b"])
+def test_spec_names_import_nothing(liar: LyingServer, folder: str, name: str) -> None:
+    """``gym.make(env.spec.id)`` imports the module before a colon: no id of ours has one."""
+    with specified(liar, folder, {"id": name}) as suites:
+        assert suites.env.spec is None
+
+
+def test_the_control_imports_what_an_id_names(tmp_path: Path) -> None:
+    """That is why."""
+    (tmp_path / "trap.py").write_text("open(__file__ + '.imported', 'w')")
+    code = "import gymnasium, sys; sys.path.insert(0, sys.argv[1]); gymnasium.make('trap:A-v0')"
+    subprocess.run([sys.executable, "-c", code, str(tmp_path)], capture_output=True, check=False)
+    assert (tmp_path / "trap.py.imported").exists()
+
+
+# --- random generators ----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("what", list(STATES))
+def test_generator_states_are_checked(liar: LyingServer, folder: str, what: str) -> None:
+    """numpy checks none of a state's fields, so the client does; one alone and one of several."""
+    with opened(liar, folder) as suites:
+        liar.lies[m.GetRandom] = relayed(m.Value((pcg64(), STATES[what])))
+        error = refuses(lambda: suites.env.np_random)
+        assert isinstance(error, RemoteProtocolError)
+        liar.lies[m.GetRandom] = relayed(m.Value((pcg64(), philox())))
+        assert [type(made.bit_generator) for made in suites.env.np_random] == [
+            np.random.PCG64,
+            np.random.Philox,
+        ]
+
+
+CRASH = """
+import numpy as np
+bits = np.random.MT19937()
+bits.state = {"bit_generator": "MT19937",
+              "state": {"key": np.arange(624, dtype=np.uint32), "pos": 2**31 - 1}}
+bits.random_raw()
+"""
+LEAK = """
+import numpy as np
+bits = np.random.Philox()
+bits.state = {**bits.state, "buffer_pos": -2}
+address = bits.random_raw()
+maps = [line.split()[0].split("-") for line in open("/proc/self/maps")]
+print(any(int(start, 16) <= address < int(end, 16) for start, end in maps))
+"""
+
+
+def test_the_control_crashes_on_an_index() -> None:
+    """Unchecked, the next draw of such a generator ends the process."""
+    done = subprocess.run([sys.executable, "-c", CRASH], capture_output=True, check=False)
+    assert done.returncode == -signal.SIGSEGV
+
+
+def test_the_control_draws_memory() -> None:
+    """Unchecked, what is drawn is a pointer of the process."""
+    done = subprocess.run([sys.executable, "-c", LEAK], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "True"
+
+
+@pytest.mark.parametrize("lie", [np.zeros(3), "1", 1.5, {"a": 1}, [1], (None, b"1")], ids=repr)
+def test_seeds_are_numbers(liar: LyingServer, folder: str, lie: Any) -> None:
+    """A seed is a number or None."""
+    liar.lies[m.GetOwn] = relayed(m.Value(lie))
+    with opened(liar, folder) as suites:
+        assert isinstance(refuses(lambda: suites.env.np_random_seed), RemoteProtocolError)
+        liar.lies[m.GetOwn] = relayed(m.Value((3, None)))
+        assert suites.env.np_random_seed == (3, None)
+
+
+# --- names of suites and tasks ---------------------------------------------------------------
+
+
+def write_videos(folder: Path, names: Iterable[tuple[str, int]]) -> None:
+    """As LeRobot's evaluation does, for each task."""
+    for suite, task in names:
+        (folder / f"{suite}_{task}").mkdir(parents=True, exist_ok=True)
+
+
+@pytest.mark.parametrize("up", ["absolute", "relative"])
+def test_names_of_suites_write_nothing_elsewhere(
+    liar: LyingServer, folder: str, tmp_path: Path, up: str
+) -> None:
+    """A suite named like a path has no caller write outside of the folder of its results."""
+    elsewhere = tmp_path / "home"
+    suite = str(elsewhere) if up == "absolute" else "../../home"
+    value = manifest()
+    value["envs"][0]["suite"] = suite
+    liar.lies[m.Load] = relayed(m.LoadDone(value))
+    assert isinstance(refuses(lambda: opened(liar, folder)), RemoteProtocolError)
+
+    results = tmp_path / "results" / "videos"
+    results.mkdir(parents=True)
+    write_videos(results, [(suite, 0)])
+    assert (tmp_path / "home_0").exists(), "the control failed: nothing was written elsewhere"
+
+
+def test_odd_infos_are_plain_data(liar: LyingServer, folder: str) -> None:
+    """Whatever stands in an info, copying, pickling and printing it stays here."""
+    odd = {"__class__": 1, "_repr_html_": SCRIPT, b"x": 2, 1.5: 3, ("a", 1): 4, None: 5}
+    liar.lies[m.Reset] = relayed(m.ResetDone(np.zeros((NUM_ENVS, 3), np.float32), odd))
+    with opened(liar, folder) as suites:
+        _, infos = suites.env.reset()
+        assert type(infos) is dict
+        assert pickle.loads(pickle.dumps(infos)) == copy.deepcopy(infos) == infos
+        assert json.loads(json.dumps({"a": infos["_repr_html_"]})) == {"a": SCRIPT}

@@ -1,0 +1,1 @@
+"""Files outside of the jail: read, listed, written, altered."""

@@ -1,0 +1,1 @@
+"""The kernel: namespaces, mounts, rare calls, devices, and what its denials tell."""

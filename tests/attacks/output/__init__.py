@@ -1,0 +1,1 @@
+"""What people read: the terminal, warnings, the server's log, pages."""

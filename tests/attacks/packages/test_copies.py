@@ -1,0 +1,99 @@
+"""What jails share is copied when it is written to: no change leaves the jail that makes it.
+
+Nothing here is saved by its mode: everybody may write to all of it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from envhub_worker.protocol.runtime import Runtime
+from tests.attacks.harness import Arena, control_run, run_in, token
+from tests.attacks.hostile.payloads.change_tree import WAYS
+from tests.attacks.packages import trapped_packages as traps
+from tests.support.environments import base_interpreter, running_on
+from tests.support.trees import fingerprint
+
+FAMILY = "Copies of what is shared"
+
+
+def fill(place: Path) -> Path:
+    """A folder for each way to change one, and files in it."""
+    for way in WAYS:
+        for name in ("file", "deeper/file"):
+            path = place / way / name
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text("as it was")
+    for path in [place, *place.rglob("*")]:
+        path.chmod(0o777 if path.is_dir() else 0o666)
+    return place
+
+
+@pytest.fixture
+def packages(home: Path) -> Iterator[Path]:
+    """Packages of the repository's own, shared by all jails here; what is attacked in them."""
+    folder = home / "packages"
+    traps.real_packages(folder)
+    folder.chmod(0o777)
+    with running_on(Runtime(base_interpreter(), str(folder))):
+        yield fill(folder / "robot")
+
+
+def test_no_change_of_the_packages_gets_out(arena: Arena, home: Path, packages: Path) -> None:
+    """Whatever is done to a file or a folder: content, modes, times, links and attributes stay."""
+    control = fill(home / "control")
+    before = {way: fingerprint(control / way) for way in WAYS}
+    with control_run("change_tree", {"place": str(control)}) as run:
+        same = [way for way in WAYS if fingerprint(control / way) == before[way]]
+        assert not same, run.text
+    before = {way: fingerprint(packages / way) for way in WAYS}
+    with arena.inside("change_tree", {"place": str(packages)}) as run:
+        after = {way: fingerprint(packages / way) for way in WAYS}
+    for way in WAYS:
+        title = f"change the packages that jails share: {way}"
+        arena.judge(title, "succeeds", after[way] != before[way], run.text)
+
+
+@pytest.mark.parametrize("what", ["packages", "repository"])
+def test_no_other_jail_sees_a_change(arena: Arena, home: Path, packages: Path, what: str) -> None:
+    """Neither one that runs at the same time, nor the next one."""
+    secret, name = token(), f"planted-{token()}"
+    outside = {"path": str(home / name)}
+    with control_run("create_file", {**outside, "text": secret}):
+        pass
+    with control_run("read_file", outside) as run:
+        assert secret in run.text
+    found = ""
+    with arena.environment() as first, arena.environment() as second:
+        root = str(run_in(first, "where_am_i").value["root"])
+        path = f"{packages if what == 'packages' else root}/{name}"
+        run_in(first, "create_file", path=path, text=secret)
+        found += run_in(second, "read_file", path=path).text
+    with arena.environment() as third:
+        found += run_in(third, "read_file", path=path).text
+    arena.judge(f"plant a file for the next jail: the {what}", "succeeds", secret in found, found)
+
+
+def test_nothing_leads_below_a_view(arena: Arena, packages: Path) -> None:
+    """Not a descriptor that was left open, not the layers of a mount, not the jail's init."""
+    path = packages / "planted"
+    arena.attack(
+        "write below the view of the packages",
+        "reach_below",
+        lambda run: path.exists(),
+        before=lambda: path.unlink(missing_ok=True),
+        folder=str(packages.parent),
+        name="robot/planted",
+    )
+
+
+def test_no_attribute_leads_out_of_a_view(arena: Arena, home: Path, packages: Path) -> None:
+    """An overlay keeps notes on its upper folders, where to look for what is below: not ours."""
+    secret = token()
+    (home / "private").mkdir()
+    (home / "private" / "file").write_text(secret)
+    at = {"folder": str(packages), "path": str(home / "private" / "file")}
+    arena.steal("read a file outside by an overlay's own attributes", "redirect", secret, **at)

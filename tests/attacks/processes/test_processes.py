@@ -1,0 +1,137 @@
+"""Doing something to the client's processes: reading, writing, signalling, slowing them."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import resource
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.attacks.harness import Arena
+from tests.attacks.processes.neighbour import Pair, victims
+from tests.attacks.processes.victim import SIGNALS, WORD
+
+FAMILY = "Other processes"
+
+_IDLE_CLASS = 3 << 13
+_ONE_CORE = {min(os.sched_getaffinity(0))}
+_SINGLE = "" if len(os.sched_getaffinity(0)) > 1 else "this machine has a single core"
+
+
+@pytest.fixture
+def pair() -> Iterator[Pair]:
+    """Two processes of the caller's."""
+    with victims() as made:
+        yield made
+
+
+@pytest.mark.parametrize(
+    ("title", "payload", "arguments"),
+    [
+        ("ptrace the client", "ptrace_poke", {"word": WORD}),
+        ("process_vm_writev into the client", "process_vm_write", {"message": "attacked"}),
+        ("write /proc/<client>/mem", "proc_mem_write", {"message": "attacked"}),
+    ],
+)
+def test_memory_cannot_be_written(
+    arena: Arena, pair: Pair, title: str, payload: str, arguments: dict[str, Any]
+) -> None:
+    """ptrace does not attach, nor do the two ways work that need no debugger."""
+    arena.attack(title, payload, pair.written, **pair.at("pid", "address"), **arguments)
+
+
+@pytest.mark.parametrize(
+    ("title", "payload", "names"),
+    [
+        ("process_vm_readv from the client", "process_vm_read", ("address", "size")),
+        ("read /proc/<client>/mem", "proc_mem_read", ("address", "size")),
+        ("read what the client has open (/proc/<client>/fd)", "proc_fd", ("fd",)),
+        ("take a descriptor of the client (pidfd_getfd)", "pidfd_getfd", ("fd",)),
+    ],
+)
+def test_memory_and_files_cannot_be_read(
+    arena: Arena, pair: Pair, title: str, payload: str, names: tuple[str, ...]
+) -> None:
+    """Nothing that another process keeps to itself comes back."""
+    arena.steal(title, payload, pair.secret, **pair.at("pid", *names))
+
+
+def test_maps_cannot_be_read(arena: Arena, pair: Pair) -> None:
+    """Where the client's libraries lie is not told: that would help other attacks."""
+    firsts = {
+        one.pid: Path(f"/proc/{one.pid}/maps").read_text().split()[0]
+        for one in (pair.outside, pair.inside)
+    }
+    arena.attack(
+        "read /proc/<client>/maps",
+        "proc_maps",
+        lambda run: firsts[pair.of(run).pid] in run.text,
+        **pair.at("pid"),
+    )
+
+
+@pytest.mark.usefixtures("broadcasting")
+def test_broadcast_signals_do_not_reach_the_client(arena: Arena, pair: Pair) -> None:
+    """kill(-1) ends at the jail's wall."""
+    pair.signal(arena, "signal everybody: kill(-1)", "signal_all", "broadcasts")
+
+
+@pytest.mark.parametrize("way", SIGNALS)
+def test_signals_do_not_reach_the_client(arena: Arena, pair: Pair, way: str) -> None:
+    """Nor does one that is meant for it, sent in any of the ways there are."""
+    pair.signal(arena, f"signal the client: {way}", way=way, **pair.at("pid"))
+
+
+def io_priority(pid: int) -> int:
+    """``ioprio_get``."""
+    numbers = (252, 31)
+    libc = ctypes.CDLL(None, use_errno=True)
+    return int(libc.syscall(numbers[os.uname().machine == "aarch64"], 1, pid))
+
+
+Look = Callable[[int], object]
+CHANGES: dict[str, tuple[str, dict[str, Any], Look]] = {
+    "prlimit on the client": (
+        "prlimit",
+        {"files": 7},
+        lambda pid: resource.prlimit(pid, resource.RLIMIT_NOFILE)[0] == 7,
+    ),
+    "setpriority on the client": (
+        "setpriority",
+        {"nice": 19},
+        lambda pid: os.getpriority(os.PRIO_PROCESS, pid) == 19,
+    ),
+    "sched_setaffinity on the client": (
+        "sched_setaffinity",
+        {"cpus": list(_ONE_CORE), "impossible": _SINGLE},
+        lambda pid: os.sched_getaffinity(pid) == _ONE_CORE,
+    ),
+    "sched_setscheduler on the client": (
+        "sched_setscheduler",
+        {},
+        lambda pid: os.sched_getscheduler(pid) == os.SCHED_IDLE,
+    ),
+    "ioprio_set on the client": (
+        "ioprio_set",
+        {"priority": _IDLE_CLASS},
+        lambda pid: io_priority(pid) == _IDLE_CLASS,
+    ),
+    # the score that the kernel picks by whom it ends for want of memory
+    "write /proc/<client>/oom_score_adj": (
+        "oom_score",
+        {"score": 777},
+        lambda pid: Path(f"/proc/{pid}/oom_score_adj").read_text().strip() == "777",
+    ),
+}
+
+
+@pytest.mark.parametrize("title", CHANGES)
+def test_limits_and_priorities_cannot_be_changed(arena: Arena, pair: Pair, title: str) -> None:
+    """Calls on another process of the same user are refused, or do nothing."""
+    payload, arguments, changed = CHANGES[title]
+    aimed = {**pair.at("pid"), **arguments}
+    arena.attack(title, payload, lambda run: changed(pair.of(run).pid), **aimed)

@@ -1,0 +1,346 @@
+"""The decoder against a peer that wants it to run code, hang, or eat all memory.
+
+Whatever comes, it either decodes or raises ``RemoteProtocolError``; it executes nothing, and
+stays within the memory and time of a message that is allowed.
+"""
+
+from __future__ import annotations
+
+import json
+import pickle
+import struct
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import msgpack
+import numpy as np
+import pytest
+from gymnasium import spaces
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+
+from envhub_worker.protocol.codec.codec import Buffer, RemoteObject, decode, encode
+from envhub_worker.protocol.errors import RemoteProtocolError
+from envhub_worker.protocol.spaces.spaces import encode_space
+from tests.attacks.protocol import decoder_bombs
+from tests.attacks.protocol.decoder_bombs import ACCEPTED, MIB, REFUSED
+from tests.support.wire import decode_space, ext, message, packed
+
+ROOT = Path(__file__).parents[3]
+FUZZ = settings(max_examples=500, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+PEAK_BYTES = 64 * MIB
+
+SAMPLE: list[Any] = [
+    "step", 17, {"a": 1.5, 2: (None, True), (3, "x"): b"bytes"}, {1, 2}, frozenset(["y"]),
+    range(3), slice(1, None), 2**80, 1 + 2j, np.float32(2.5), np.bool_(True), np.str_("text"),
+    np.arange(6, dtype="f4").reshape(2, 3), np.array([True, False]), np.array(["ab", "c"]),
+    np.array(["2020-01-01"], "M8[D]"), np.zeros((0, 4)), np.zeros(20_000, "u1"), np.ones(5000),
+    np.array([[1, "a"], [None, (2,)]], dtype=object), RemoteObject("a.B", "<b>"),
+    encode_space(spaces.Dict({"x": spaces.Box(0, 1, (2,)), "y": spaces.Text(3)})),
+]  # fmt: skip
+FRAMES = [bytes(frame) for frame in encode(SAMPLE)]
+DOCUMENT_BYTES = struct.unpack_from("<I", FRAMES[0])[0]
+
+
+def attempt(frames: list[Buffer]) -> None:
+    """Decodes; whatever is not decoded must be refused in the one way there is."""
+    try:
+        value = decode(frames)
+    except RemoteProtocolError:
+        return
+    # No half-built thing may leak: all that is decoded has a form on the wire, and a repr.
+    assert "_Head" not in repr(value)
+    encode(value)
+
+
+def attempt_space(value: object) -> None:
+    """Builds a space; as ``attempt``."""
+    try:
+        space = decode_space(value, max_elements=1000)
+    except RemoteProtocolError:
+        return
+    repr(space)
+    encode_space(space)
+
+
+def test_the_sample_itself_decodes() -> None:
+    """What the fuzzers spoil is a valid message with every kind of value in it."""
+    assert decode(FRAMES)[:2] == ["step", 17]  # type: ignore[index]
+
+
+# --- random and spoiled bytes -------------------------------------------------------------------
+
+
+@FUZZ
+@given(st.lists(st.binary(max_size=300), max_size=4))
+def test_random_frames_are_decoded_or_refused(frames: list[Buffer]) -> None:
+    """Arbitrary bytes in arbitrary frames."""
+    attempt(frames)
+
+
+@FUZZ
+@given(st.binary(max_size=300), st.binary(max_size=40), st.lists(st.binary(max_size=40)))
+def test_random_documents_are_decoded_or_refused(
+    document: bytes, tail: bytes, frames: list[bytes]
+) -> None:
+    """Arbitrary documents behind a valid prefix."""
+    attempt(message(document, tail, *frames))
+
+
+edits = st.lists(
+    st.tuples(
+        st.sampled_from(["set", "insert", "delete", "repeat"]),
+        st.integers(0, len(FRAMES[0]) - 1),
+        st.binary(min_size=1, max_size=9),
+    ),
+    min_size=1,
+    max_size=6,
+)
+
+
+def spoil(header: bytes, changes: list[tuple[str, int, bytes]]) -> bytes:
+    """Applies edits to bytes."""
+    spoiled = bytearray(header)
+    for kind, position, content in changes:
+        end = position + len(content)
+        if kind == "set":
+            spoiled[position:end] = content
+        elif kind == "insert":
+            spoiled[position:position] = content
+        elif kind == "delete":
+            del spoiled[position:end]
+        else:
+            spoiled[position:position] = spoiled[position:end]
+    return bytes(spoiled)
+
+
+@FUZZ
+@given(edits, st.permutations(range(len(FRAMES))), st.booleans())
+def test_spoiled_messages_are_decoded_or_refused(
+    changes: list[tuple[str, int, bytes]], order: list[int], mend: bool
+) -> None:
+    """A valid message with bytes changed, added, removed or doubled, and its frames shuffled.
+
+    With ``mend`` the length of the document is corrected, so that the edits are reached.
+    """
+    header = spoil(FRAMES[0], changes)
+    if mend:
+        size = DOCUMENT_BYTES + len(header) - len(FRAMES[0])
+        header = struct.pack("<I", max(0, size)) + header[4:]
+    frames = [header, *FRAMES[1:]]
+    attempt(frames)
+    attempt([frames[index] for index in order])
+
+
+# --- well-formed msgpack with hostile contents --------------------------------------------------
+
+
+class Pairs(list[tuple[Any, Any]]):
+    """A map whose keys may be anything, and may come twice."""
+
+
+codes = st.sampled_from([*range(8), *range(14, 30), 127])
+descriptors = st.builds(
+    lambda code, flags, parameter, shape: (
+        bytes((code, flags))
+        + (struct.pack("<I", parameter) if parameter is not None else b"")
+        + struct.pack(f"<{len(shape)}Q", *shape)
+    ),
+    st.integers(0, 20),
+    st.integers(0, 5) | st.integers(0x80, 0x85),
+    st.none() | st.integers(0, 2**32 - 1),
+    st.lists(st.integers(0, 4) | st.integers(0, 2**64 - 1), max_size=5),
+)
+payloads = st.binary(max_size=24) | descriptors | st.sampled_from([b"float32", b"bfloat16"])
+extensions = st.builds(msgpack.ExtType, codes, payloads)
+heads = st.builds(msgpack.ExtType, st.integers(16, 26), st.just(b"") | payloads)
+leaves = (
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**63), 2**64 - 1)
+    | st.floats()
+    | st.text(max_size=5)
+    | st.binary(max_size=5)
+    | extensions
+)
+documents = st.recursive(
+    leaves,
+    lambda children: (
+        st.lists(children, max_size=4)
+        | st.builds(lambda head, rest: [head, *rest], heads, st.lists(children, max_size=4))
+        | st.lists(st.tuples(children, children), max_size=3).map(Pairs)
+    ),
+    max_leaves=25,
+)
+
+
+def pack(value: Any) -> bytes:
+    """Packs what no dict can hold."""
+    if isinstance(value, Pairs):
+        return bytes((0x80 | len(value),)) + b"".join(pack(x) for pair in value for x in pair)
+    if isinstance(value, list):
+        return bytes((0x90 | len(value),)) + b"".join(map(pack, value))
+    return bytes(msgpack.packb(value))
+
+
+@FUZZ
+@given(documents, st.binary(max_size=64), st.lists(st.binary(max_size=32), max_size=3))
+@example([ext(16), ext(16)], b"", [])
+@example([ext(24), "a", "b", ext(17)], b"", [])
+def test_hostile_documents_are_decoded_or_refused(
+    document: Any, tail: bytes, frames: list[bytes]
+) -> None:
+    """Extensions with any payload in any place, maps with any keys, arrays with any descriptor."""
+    attempt(message(pack(document), tail, *frames))
+
+
+# --- spaces -------------------------------------------------------------------------------------
+
+described = st.sampled_from(
+    [
+        encode_space(space)
+        for space in (
+            spaces.Box(np.zeros(2), np.ones(2)),
+            spaces.Box(0, 255, (2, 2), np.uint8),
+            spaces.Discrete(3),
+            spaces.MultiDiscrete([2, 3]),
+            spaces.MultiBinary([2, 2]),
+            spaces.Text(3),
+            spaces.Dict({"a": spaces.Discrete(2), "b": spaces.Discrete(3)}),
+            spaces.Tuple([spaces.Discrete(2)]),
+            spaces.Sequence(spaces.Discrete(2)),
+            spaces.Graph(spaces.Box(0, 1, (2,)), spaces.Discrete(2)),
+        )
+    ]
+)
+junk = (
+    st.none()
+    | st.booleans()
+    | st.integers()
+    | st.floats()
+    | st.text(max_size=5)
+    | st.sampled_from(["int8", "float32", "object", "V2000000000", "box", "tuple"])
+    | st.lists(st.integers(-1, 3), max_size=3).map(tuple)
+    | st.lists(st.integers(-1, 3), max_size=3).map(np.array)
+    | st.sampled_from([np.array(2**62), np.array(np.nan), np.zeros((2, 2), "f4"), np.float32(1)])
+    | st.lists(st.text(max_size=2), max_size=3)
+)
+
+
+@FUZZ
+@given(st.data())
+def test_hostile_spaces_are_built_or_refused(data: st.DataObject) -> None:
+    """Descriptions of spaces with any attribute, at any depth, replaced by junk or each other."""
+    value = dict(data.draw(described))
+    target = value
+    for name in ("spaces", "space", "node"):
+        if name in target and data.draw(st.booleans()):
+            child = dict(data.draw(described))
+            target[name] = [child] if name == "spaces" else child
+            target = child
+            break
+    names = st.sampled_from(sorted(target))
+    for name in data.draw(st.lists(names, min_size=1, max_size=3)):
+        target[name] = data.draw(junk | described)
+    attempt_space(value)
+
+
+# --- bombs --------------------------------------------------------------------------------------
+
+
+def explode(name: str, *arguments: str) -> dict[str, Any]:
+    """Decodes a bomb in a process of limited memory and CPU time, and returns its report."""
+    run = subprocess.run(
+        [sys.executable, "-m", decoder_bombs.__name__, name, *arguments],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert run.returncode == 0, f"{name} killed its victim: {run.returncode} {run.stderr}"
+    report: dict[str, Any] = json.loads(run.stdout)
+    return report
+
+
+def test_bombs_explode_without_the_decoder() -> None:
+    """The control: msgpack alone, under the same limits, is blown up by the first bomb."""
+    report = explode(next(iter(REFUSED)), "plain")
+    assert report["outcome"].startswith("MemoryError") or report["peak"] > 4 * PEAK_BYTES
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_bombs_are_refused_in_bounded_memory(name: str) -> None:
+    """A bomb is refused for what it is, before it costs more than a message may cost."""
+    report = explode(name)
+    assert report["outcome"].startswith(("RemoteProtocolError", "MessageTooLargeError"))
+    assert "memory" not in report["outcome"]
+    assert report["peak"] < PEAK_BYTES
+
+
+@pytest.mark.parametrize("name", ACCEPTED)
+def test_the_largest_messages_that_pass_are_bounded_too(name: str) -> None:
+    """What stays just within the limits decodes, and costs what they promise."""
+    report = explode(name)
+    assert report["outcome"] == "decoded"
+    assert report["peak"] < PEAK_BYTES
+
+
+# --- code ---------------------------------------------------------------------------------------
+
+
+class Canary:
+    """An object whose unpickling writes a file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Path.write_text, (self.path, "sung")
+
+
+def smuggled(song: bytes) -> list[list[Buffer]]:
+    """Messages with a pickle in every place where bytes can be."""
+    flat = struct.pack("<Q", len(song))
+    singles = [packed(song), packed({song: song}), message(song), [song], [song, song]]
+    arrays = [
+        message(msgpack.packb(ext(1, bytes((code, flags)) + parameter + flat)), tail, *frames)
+        for code in (*range(20), 255)
+        for parameter in (b"", struct.pack("<I", 1), struct.pack("<I", len(song)))
+        for flags, tail, frames in ((1, song, []), (0x81, b"", [song]))
+    ]
+    alone = [packed(ext(code, song)) for code in range(128)]
+    heading = [packed([ext(code, song), song, song]) for code in range(128)]
+    headed = [packed([ext(code), *[song] * count]) for code in range(16, 27) for count in (1, 2, 3)]
+    objects = [packed([ext(21, struct.pack("<Q", 1)), ext(code, song)]) for code in range(30)]
+    negative = [message(b"\xc9" + struct.pack(">I", len(song)) + b"\xff" + song)]
+    return [*singles, *arrays, *alone, *heading, *headed, *objects, *negative]
+
+
+def test_pickles_never_execute(tmp_path: Path) -> None:
+    """A pickle in any extension, array, frame or text is data or an error, and never runs.
+
+    The control: the same bytes do run in ``pickle.loads``, before and after.
+    """
+    before, canary, after = (tmp_path / name for name in ("before", "canary", "after"))
+    pickle.loads(pickle.dumps(Canary(before)))
+    song = pickle.dumps(Canary(canary))
+    for frames in smuggled(song):
+        attempt(frames)
+    assert not canary.exists()
+    pickle.loads(pickle.dumps(Canary(after)))
+    assert before.exists()
+    assert after.exists()
+
+
+def test_pickled_spaces_never_execute(tmp_path: Path) -> None:
+    """A pickle in place of any attribute of a space is refused, and never runs."""
+    canary = tmp_path / "canary"
+    song = pickle.dumps(Canary(canary))
+    value = encode_space(spaces.Box(0, 1, (2,)))
+    for name in value:
+        for smuggled_value in (song, [song], np.frombuffer(song, "u1"), Canary(canary)):
+            with pytest.raises(RemoteProtocolError):
+                decode_space(value | {name: smuggled_value}, max_elements=1000)
+    assert not canary.exists()

@@ -1,0 +1,251 @@
+"""A jail holds the descriptors of the fast lane's slabs: what can it do to the client with them?
+
+The hostile side is another process with exactly those descriptors; the verdict is the client's
+own memory, and whether the client is still alive.
+"""
+
+from __future__ import annotations
+
+import mmap
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from envhub_sandbox.errors import RemoteProtocolError
+from envhub_sandbox.transport.shared_memory.observations import ObservationSlab
+from envhub_sandbox.transport.shared_memory.shard import LaneShard
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.shared_memory import slabs
+from envhub_worker.protocol.stream import pack_packet
+
+WAIT_S = 60
+
+
+@pytest.fixture
+def observations() -> Iterator[ObservationSlab]:
+    """The slab of boolean observations of two sub-environments."""
+    space = spaces.Box(0, 1, (8,), np.bool_)
+    layout = slabs.observation_layout(space, 2, 1)
+    assert layout is not None
+    made = ObservationSlab(space, layout)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def shard(observations: ObservationSlab) -> Iterator[LaneShard]:
+    """The client's side of the shard that has both of them."""
+    layout = slabs.layout_of(spaces.Box(-1, 1, (2,)), 2)
+    assert layout is not None
+    made = LaneShard(layout, observations.fd)
+    yield made
+    made.close()
+
+
+def attack(shard: LaneShard, code: str) -> str:
+    """Run code in a process that holds ``request``, ``reply`` and ``observations``."""
+    request, reply, observations = shard.fds[:3]
+    layout = shard.layout
+    head = f"""
+import ctypes, errno, mmap, os, struct
+request, reply, observations = {request}, {reply}, {observations}
+request_bytes, reply_bytes = {layout.request_bytes}, {layout.reply_bytes}
+def outcome(call, *arguments, **keywords):
+    try:
+        call(*arguments, **keywords)
+        print("done")
+    except OSError as error:
+        print(errno.errorcode[error.errno])
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", head + code],
+        pass_fds=(request, reply, observations),
+        capture_output=True,
+        text=True,
+        timeout=WAIT_S,
+        check=True,
+    )
+    return done.stdout.strip()
+
+
+def test_unsealed_memory_kills_its_reader() -> None:
+    """Control: without seals, whoever shares the memory can end the reader with SIGBUS."""
+    code = """
+import mmap, os
+fd = os.memfd_create("open", os.MFD_ALLOW_SEALING)
+os.ftruncate(fd, 1 << 16)
+mapped = mmap.mmap(fd, 1 << 16)
+os.ftruncate(fd, 0)
+mapped[0]
+"""
+    done = subprocess.run([sys.executable, "-c", code], timeout=WAIT_S, check=False)
+    assert done.returncode == -signal.SIGBUS
+
+
+@pytest.mark.parametrize("name", ["request", "reply", "observations"])
+@pytest.mark.parametrize("size", ["0", "1 << 30"])
+def test_a_slab_cannot_be_cut_or_grown(shard: LaneShard, name: str, size: str) -> None:
+    """No slab changes its size, so the client cannot be made to fault."""
+    before = [os.fstat(fd).st_size for fd in shard.fds[:3]]
+    assert attack(shard, f"outcome(os.ftruncate, {name}, {size})") == "EPERM"
+    assert [os.fstat(fd).st_size for fd in shard.fds[:3]] == before
+
+
+def test_the_seals_cannot_be_taken_off(shard: LaneShard) -> None:
+    """Nobody can add or remove a seal any more."""
+    for name in ("request", "reply", "observations"):
+        assert attack(shard, f"import fcntl; outcome(fcntl.fcntl, {name}, 1033, 8)") == "EPERM"
+
+
+def test_actions_cannot_be_rewritten(shard: LaneShard) -> None:
+    """The request slab is the client's alone: no write, and no writable map."""
+    assert attack(shard, "outcome(os.pwrite, request, b'x', 0)") == "EPERM"
+    assert attack(shard, "outcome(mmap.mmap, request, request_bytes)") == "EPERM"
+
+
+def test_the_reply_slab_is_theirs_to_write(shard: LaneShard) -> None:
+    """Control of the test above: the same calls succeed on the reply slab."""
+    assert attack(shard, "outcome(os.pwrite, reply, b'x', 4096)") == "done"
+    assert attack(shard, "outcome(mmap.mmap, reply, reply_bytes)") == "done"
+
+
+def test_a_punched_hole_is_zeros(shard: LaneShard, observations: ObservationSlab) -> None:
+    """Pages can be taken away, and read as zeros; nothing faults."""
+    os.pwrite(shard.fds[1], b"\xff" * mmap.PAGESIZE, 0)
+    os.pwrite(observations.fd, b"\xff" * observations.layout.total_bytes, 0)
+    code = """
+libc = ctypes.CDLL(None, use_errno=True)
+libc.fallocate.argtypes = [ctypes.c_int, ctypes.c_int, ctypes.c_long, ctypes.c_long]
+for slab in (reply, observations):
+    print(libc.fallocate(slab, 3, 0, 4096), errno.errorcode.get(ctypes.get_errno()))
+"""
+    assert attack(shard, code) == "0 None\n0 None"
+    rewards, terminations, truncations = observations.results()
+    assert rewards.tolist() == [0.0, 0.0]
+    assert not terminations.any()
+    assert not truncations.any()
+    with pytest.raises(RemoteProtocolError, match="impossible reply"):
+        shard.outcome()
+
+
+BOTH = [(99, 0), (slabs.DONE, slabs.INFO_BYTES + 1), (slabs.DONE, 2**64 - 1)]
+
+
+@pytest.mark.parametrize(
+    ("asked", "outcome", "length"),
+    [
+        *(("outcome", *words) for words in (*BOTH, (0, 0))),
+        *(("answer", *words) for words in (*BOTH, (slabs.COLUMNS, 0), (slabs.DONE, 0))),
+    ],
+)
+def test_an_impossible_header_is_refused(
+    shard: LaneShard, asked: str, outcome: int, length: int
+) -> None:
+    """Words out of range never become a slice or an allocation, of steps or messages."""
+    if asked == "outcome":
+        shard.ask([np.zeros((2, 2), np.float32)], 0, 0)
+    else:
+        shard.tell(b"".join(pack_packet(0, m.pack(m.Render(1)))), 0)
+    words = f"struct.pack('QQ', {outcome}, {length})"
+    attack(shard, f"os.pwrite(reply, {words}, {slabs.OUTCOME * 8})")
+    with pytest.raises(RemoteProtocolError):
+        getattr(shard, asked)()
+
+
+def _packets(*frames: bytes) -> str:
+    return repr(b"".join(b"".join(pack_packet(0, [frame])) for frame in frames))
+
+
+def answers(shard: LaneShard, answer: str) -> None:
+    """Tell the jail something; it answers with these bytes, a Python literal."""
+    shard.tell(b"".join(pack_packet(0, m.pack(m.Render(1)))), 0)
+    attack(
+        shard,
+        f"answer = {answer}\n"
+        f"os.pwrite(reply, answer, {shard.layout.answer})\n"
+        f"os.pwrite(reply, struct.pack('QQ', {slabs.DONE}, len(answer)), {slabs.OUTCOME * 8})",
+    )
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        repr(bytes(64)),
+        repr(b"\xff" * 64),
+        _packets(b"\x80\x04."),
+        _packets(*[bytes(m.pack(m.Value(1))[0])] * 2),
+        repr(b"\x01\0\0\0\0\0\0\0\0\0\0\0\0\0\0\0" + b"\xff" * 7 + b"\x0f"),
+    ],
+    ids=["zeros", "ones", "pickle", "two", "endless"],
+)
+def test_garbage_for_an_answer_is_refused(shard: LaneShard, answer: str) -> None:
+    """It is cut into frames and decoded by the same suspicious code as a message's reply."""
+    answers(shard, answer)
+    with pytest.raises(RemoteProtocolError):
+        shard.answer()
+
+
+def test_an_honest_answer_is_read(shard: LaneShard) -> None:
+    """The control of the two above."""
+    answer = _packets(bytes(m.pack(m.Value((1, "two")))[0]))
+    answers(shard, answer)
+    assert shard.answer() == m.Value((1, "two"))
+
+
+@pytest.mark.parametrize("bytes_", ["b'\\x80\\x04.'", "os.urandom(64)", "b'\\xff' * 64"])
+def test_garbage_for_infos_is_refused(shard: LaneShard, bytes_: str) -> None:
+    """What lies in the info area is decoded by the same suspicious code as a message."""
+    shard.ask([np.zeros((2, 2), np.float32)], 0, 0)
+    attack(
+        shard,
+        f"os.pwrite(reply, {bytes_}, {shard.layout.infos})\n"
+        f"os.pwrite(reply, struct.pack('QQ', {slabs.DONE}, 64), {slabs.OUTCOME * 8})",
+    )
+    with pytest.raises(RemoteProtocolError):
+        shard.outcome()
+
+
+def test_columns_without_a_schema_are_refused(shard: LaneShard) -> None:
+    """Columns are read by the client's own schema only, and there is none yet."""
+    shard.ask([np.zeros((2, 2), np.float32)], 0, 0)
+    attack(shard, f"os.pwrite(reply, struct.pack('QQ', {slabs.COLUMNS}, 0), {slabs.OUTCOME * 8})")
+    kind, message = shard.outcome()
+    assert (kind, message) == (slabs.COLUMNS, None)
+    with pytest.raises(RemoteProtocolError, match="before their schema"):
+        shard.columns()
+
+
+def test_bytes_that_are_no_booleans_become_booleans(
+    shard: LaneShard, observations: ObservationSlab
+) -> None:
+    """A flag or a boolean observation of 2 would be neither true nor false: it is made true."""
+    os.pwrite(observations.fd, b"\x02" * 4, observations.layout.results + 16)
+    os.pwrite(observations.fd, b"\x02" * 16, 0)
+    _, terminations, truncations = observations.results()
+    observation = observations.take()
+    for array in (terminations, truncations, observation):
+        assert array.dtype == np.bool_
+        assert set(array.tobytes()) == {1}
+
+
+def test_what_the_caller_has_is_not_rewritten(
+    shard: LaneShard, observations: ObservationSlab
+) -> None:
+    """Results are copies: a later write of the jail changes nothing that was handed out."""
+    rewards, terminations, _ = observations.results()
+    observation = observations.take()
+    attack(
+        shard,
+        "size = os.fstat(observations).st_size\n"
+        "m = mmap.mmap(observations, size); m[:] = b'\\x01' * size",
+    )
+    assert rewards.tolist() == [0.0, 0.0]
+    assert not terminations.any()
+    assert not observation.any()
+    assert observations.take().all()

@@ -1,0 +1,298 @@
+"""Taking more than the limits give: processes, memory, disk, processor time, output.
+
+The controls are tame: they take a little more than the limits of the jail, and no more.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import fcntl
+import os
+import subprocess
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+from envhub_sandbox.errors import WorkerDiedError
+from tests.attacks.harness import (
+    USER,
+    Arena,
+    Run,
+    StoppedNowError,
+    call,
+    control_run,
+    new_alias,
+    start_control,
+)
+from tests.attacks.resources.accounts import figure, in_pipes, of_processes, tasks
+from tests.support.processes import eventually, most_grown, resident
+
+FAMILY = "Bombs"
+
+MIB = 1 << 20
+MEMORY, BOMB = 128 * MIB, 224 * MIB
+PROCESSES, FORKS = 32, 80
+DISK, FILL = 16 * MIB, 64 * MIB
+FILES, INODES = 300, 1500
+CPU_S, SPIN_S = 1, 3.0
+
+
+@pytest.mark.parametrize(("title", "payload"), [("fork", "fork_bomb"), ("thread", "thread_bomb")])
+def test_fork_bomb_stops_at_the_limit(arena: Arena, title: str, payload: str) -> None:
+    """Processes and threads together never exceed the limit."""
+    arena.attack(
+        f"{title} bomb",
+        payload,
+        lambda run: tasks(run) > PROCESSES,
+        limits={"processes": PROCESSES},
+        count=FORKS,
+    )
+
+
+def stays(run: Run, over: Callable[[Run], bool]) -> bool:
+    """Whether a run stays over a limit: what is only measured is noticed a moment later."""
+    return over(run) and not (run.inside and eventually(lambda: not over(run), 10.0))
+
+
+def of_the_machine(name: str) -> Callable[[Run], int]:
+    """By how much a figure of the whole machine has grown since now, while a run is there."""
+    before = settled(name)
+    return lambda run: figure("/proc/meminfo", name) - before if run.pids() else 0
+
+
+def settled(name: str) -> int:
+    """A figure that no longer falls: the kernel frees what an earlier run held a while after it."""
+    for _ in range(60):
+        before = figure("/proc/meminfo", name)
+        time.sleep(0.5)
+        now = figure("/proc/meminfo", name)
+        if now > before - 2 * MIB:
+            break
+    return now
+
+
+SHARED = "Shmem"
+KERNEL = "SUnreclaim"
+"""Memory of the kernel's own objects."""
+
+# Each is judged by the kernel's account that shows it: of the run's processes, where one of
+# theirs does, else of the machine, since then it belongs to no process.
+KINDS: dict[str, str | Callable[[Run], int]] = {
+    "heap": lambda run: of_processes(run, "Pss"),
+    "children": lambda run: of_processes(run, "Pss"),
+    "copies of a file's pages": lambda run: of_processes(run, "Pss"),
+    "page tables": lambda run: of_processes(run, "VmPTE", "status"),
+    "pipes": in_pipes,
+    "shared": SHARED,
+    "shared, in small pieces": SHARED,
+    "shared, out of the page tables": SHARED,
+    "shared, unmapped but for a page": SHARED,
+    "memfd": SHARED,
+    "memfd in flight": SHARED,
+    "memfd without a descriptor": SHARED,
+    "System V": SHARED,
+    "mappings": KERNEL,
+    "semaphores": KERNEL,
+    "messages": KERNEL,
+    "sockets": KERNEL,
+    "sockets in flight": KERNEL,
+    "epoll watches": KERNEL,
+    "file locks": KERNEL,
+}
+
+
+@pytest.fixture
+def _machine() -> Iterator[None]:
+    """The machine's account belongs to one bomb at a time, whichever process tests it."""
+    with open(__file__) as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+@pytest.mark.usefixtures("_machine")
+@pytest.mark.parametrize("kind", KINDS)
+def test_memory_bomb_stops_at_the_limit(arena: Arena, kind: str) -> None:
+    """All memory counts: private, shared, without a name or an owner, of all processes together."""
+    no_pipes = "the kernel limits a plain user's pipes by itself"
+    measure = KINDS[kind]
+    grown: list[Callable[[Run], int]] = []
+    left: list[Run] = []
+
+    def begin() -> None:
+        grown[:] = [of_the_machine(measure) if isinstance(measure, str) else measure]
+
+    def over(run: Run) -> bool:
+        left.append(run)
+        return stays(run, lambda run: grown[0](run) > MEMORY + 16 * MIB)
+
+    def attack() -> None:
+        arena.attack(
+            f"memory bomb: {kind}",
+            "memory_bomb",
+            over,
+            before=begin,
+            limits={"memory_bytes": MEMORY, "processes": 128, "open_files": 65536},
+            impossible=no_pipes if kind == "pipes" and USER == "user" else "",
+            kind=kind,
+            size=BOMB,
+        )
+
+    try:
+        # the machine's account falls by what others free meanwhile: who was not seen growing is
+        # looked at again
+        for _ in range(2):
+            with contextlib.suppress(StoppedNowError):
+                return attack()
+            del arena.rows[-1:]
+        attack()
+    finally:
+        for run in left:
+            if not run.inside and isinstance(run.value, list):
+                remove(kind, run.value)
+
+
+def remove(kind: str, numbers: list[int]) -> None:
+    """End what outlives a control: System V objects."""
+    libc = ctypes.CDLL(None)
+    for number in numbers:
+        if kind == "messages":
+            libc.msgctl(number, 0, None)
+        else:
+            libc.semctl(number, 0, 0)
+
+
+def test_memory_bomb_does_not_hurt_the_neighbours(arena: Arena) -> None:
+    """The jail that takes too much dies with a clear reason; another one steps on."""
+    with arena.environment() as other:
+        other.reset()
+        with (
+            arena.environment(limits={"memory_bytes": MEMORY}) as env,
+            pytest.raises(WorkerDiedError, match="memory") as caught,
+        ):
+            env.call("attack", "memory_bomb", {"kind": "heap", "size": BOMB}, new_alias())
+        other.step([0])
+    assert caught.value.reason == "out-of-memory"
+
+
+@pytest.fixture
+def places(home: Path) -> list[str]:
+    """Folders for the controls to fill."""
+    folders = [home / name for name in ("one", "two")]
+    for folder in folders:
+        folder.mkdir()
+    return [str(folder) for folder in folders]
+
+
+def left_by(run: Run, measure: Callable[[str], int]) -> int:
+    """What a run has left in its folders, as it sees them, added up."""
+    [pid, *_] = run.pids() or [0]
+    root = f"/proc/{pid}/root" if run.inside else ""
+    count = 0
+    for path, *_ in (run.value or {}).values():
+        with contextlib.suppress(OSError):
+            count += measure(f"{root}{path}") if path else 0
+    return count
+
+
+@pytest.mark.parametrize(
+    ("title", "payload", "limits", "most", "much", "measure"),
+    [
+        (
+            "fill the disk",
+            "fill_disk",
+            {"disk_bytes": DISK, "memory_bytes": 1024 * MIB},
+            2 * DISK,
+            {"size": FILL},
+            lambda path: os.stat(path).st_blocks * 512,
+        ),
+        (
+            "use up the inodes",
+            "fill_inodes",
+            {"disk_files": FILES},
+            2 * FILES,
+            {"count": INODES},
+            lambda path: len(os.listdir(path)),
+        ),
+    ],
+    ids=["bytes", "inodes"],
+)
+def test_disk_cannot_be_filled(
+    arena: Arena,
+    places: list[str],
+    title: str,
+    payload: str,
+    limits: dict[str, int],
+    most: int,
+    much: dict[str, int],
+    measure: Callable[[str], int],
+) -> None:
+    """All that a jail writes, in whatever folders, and empty files too, stay below its limits."""
+    arena.attack(
+        title,
+        payload,
+        lambda run: stays(run, lambda run: left_by(run, measure) > most),
+        limits=limits,
+        inside={"folders": []},
+        folders=places,
+        **much,
+    )
+
+
+def test_processor_time_runs_out(arena: Arena) -> None:
+    """A process that burns more than its seconds is killed, ignore the warning as it may."""
+    arena.attack(
+        "burn processor time",
+        "spin",
+        lambda run: sum(spent(pid) for pid in run.pids()) > (CPU_S + SPIN_S) / 2,
+        limits={"cpu_time_s": CPU_S},
+        seconds=SPIN_S,
+    )
+
+
+def spent(pid: int) -> float:
+    """Seconds of the processor's time that a process has had."""
+    with contextlib.suppress(psutil.NoSuchProcess):
+        times = psutil.Process(pid).cpu_times()
+        return float(times.user + times.system)
+    return 0.0
+
+
+def test_output_flood_is_dropped(arena: Arena) -> None:
+    """What a jail prints is read and forgotten but for its last lines; nobody's memory grows."""
+    size = 96 * MIB
+    alias = new_alias()
+    process = start_control("flood", {"size": size}, alias, stderr=subprocess.DEVNULL)
+    assert process.stdout is not None
+    assert process.stdin is not None
+    process.stdin.write(b"\n")
+    process.stdin.flush()
+    kept = process.stdout.read(size // 2)
+    process.kill()
+    process.communicate()
+    assert len(kept) == size // 2, "the control of the flood failed"
+    with arena.environment() as env:
+        env.reset()
+        before = resident()
+        run = Run(alias, True)
+        call(env, run, "flood", {"size": size})
+        grown = most_grown(before)
+        env.reset()
+    assert run.value == size, run.error
+    arena.judge("flood the output", "succeeds", grown > 32 * MIB, f"grew by {grown} bytes")
+
+
+def test_bombs_leave_the_host_usable(arena: Arena) -> None:
+    """After a fork bomb and its end nothing of it is left, and the next jail starts."""
+    alias = new_alias()
+    with arena.environment(limits={"processes": PROCESSES}) as env:
+        call(env, Run(alias, True), "fork_bomb", {"count": FORKS})
+        assert Run(alias, True).pids()
+    assert eventually(lambda: not Run(alias, True).pids())
+    with control_run("where_am_i", {}) as run:
+        assert run.value["pid"] in run.pids()
+    with arena.environment() as env:
+        env.reset()

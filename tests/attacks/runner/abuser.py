@@ -1,0 +1,178 @@
+"""A repository whose environment turns on the descriptors that its jail holds, and its client.
+
+The client is a process of its own (``held_client``); whoever asks for it watches it from outside.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+from tests.attacks.harness import Arena
+from tests.attacks.repositories import write_environment
+
+WATCHDOG_S = 180
+"""Far more than all timeouts of the client together."""
+
+ABUSE = """
+import contextlib, os, socket, stat, threading
+
+ONE = (1).to_bytes(8, "little")
+MANY = 100_000  # more than any pipe or socket holds; /dev/null is never full
+
+def fill(fd):
+    os.set_blocking(fd, False)
+    with contextlib.suppress(OSError):
+        os.write(fd, (2**64 - 2).to_bytes(8, "little"))
+    with contextlib.suppress(OSError):
+        for _ in range(MANY):
+            os.write(fd, ONE)
+
+def block(fd):
+    fill(fd)
+    os.set_blocking(fd, True)
+
+def block_empty(fd):
+    os.set_blocking(fd, False)
+    with contextlib.suppress(OSError):
+        for _ in range(MANY):
+            os.read(fd, 8)
+    os.set_blocking(fd, True)
+
+def race(fd):
+    block_empty(fd)
+    def ring():
+        while True:
+            os.write(fd, ONE)
+    def drain():
+        while True:
+            os.read(fd, 8)
+    for act in (ring, drain):
+        threading.Thread(target=act, daemon=True).start()
+
+def truncate(fd):
+    with contextlib.suppress(OSError):
+        os.ftruncate(fd, 0)
+
+def seek(fd):
+    with contextlib.suppress(OSError):
+        os.lseek(fd, 1 << 40, os.SEEK_SET)
+
+def close(fd):
+    with contextlib.suppress(OSError):
+        os.close(fd)
+
+def a_socket(fd):
+    with contextlib.suppress(OSError):
+        if stat.S_ISSOCK(os.fstat(fd).st_mode):
+            return socket.socket(fileno=os.dup(fd))
+
+def shut(fd):
+    if ours := a_socket(fd):
+        with contextlib.suppress(OSError):
+            ours.shutdown(socket.SHUT_RDWR)
+
+def push(fd):
+    if ours := a_socket(fd):
+        ours.setblocking(False)
+        with contextlib.suppress(OSError):
+            while True:
+                socket.send_fds(ours, [ONE], [0] * 200)
+"""
+ENV = """
+import signal, time
+from envhub_worker.runner import runner
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.shared_memory import slabs
+
+ABUSE_AND_ANSWER, ABUSE_AND_HANG, DIE = 1, 2, 3
+lanes, kept = [], []
+honest = runner.Runner.attach
+
+def remember(self, request):
+    kept.extend(map(os.dup, self.descriptors))
+    reply = honest(self, request)
+    lanes.append(self.lane)
+    return reply
+
+runner._HANDLERS[m.Attach] = remember
+
+def answer(lane):
+    lane._told[slabs.OUTCOME], lane._told[slabs.LENGTH] = slabs.DONE, 0
+    lane._told[slabs.PARKED] = 1
+    lane._told[slabs.SEQUENCE] = lane._asked[slabs.SEQUENCE]
+    with contextlib.suppress(OSError):
+        os.set_blocking(lane._client_bell, False)
+        os.write(lane._client_bell, ONE)
+
+def turn_on(bells):
+    for fd in every() if {every!r} else bells:
+        globals()[{act!r}](fd)
+
+def every():
+    found = []
+    for fd in range(64):
+        with contextlib.suppress(OSError):
+            os.fstat(fd)
+            found.append(fd)
+    return found
+
+VECTOR = gym.vector.AsyncVectorEnv
+
+class Abuser(Plain):
+    def step(self, action):
+        lane = lanes[-1]
+        if action == ABUSE_AND_ANSWER:
+            turn_on([lane.bell])
+            answer(lane)
+            turn_on([lane._client_bell])
+            time.sleep(3600)
+        if action == ABUSE_AND_HANG:
+            turn_on([lane.bell, lane._client_bell])
+            time.sleep(3600)
+        if action == DIE:
+            time.sleep(0.5)
+            os.kill(os.getpid(), signal.SIGKILL)
+        return super().step(action)
+"""
+ANSWERS, HANGS, DIES = 1, 2, 3
+
+
+def watched(
+    arena: Arena, folder: Path, act: str, *, every: bool = False, **order: Any
+) -> tuple[bool, list[str]]:
+    """Whether a client whose environment does this came to its end, and what it said.
+
+    Args:
+        arena: Under which profile.
+        folder: For the repository.
+        act: A function of ``ABUSE``.
+        every: Whether it is done to every descriptor of the jail, and not to the doorbells alone.
+        **order: For ``held_client``.
+    """
+    repository = write_environment(folder / "abuser", ABUSE + ENV.format(act=act, every=every))
+    whole = {
+        "policy": {"profile": arena.profile, "crash_history": 0, **order.pop("policy", {})},
+        "options": order.pop("options", {}),
+        "close": "same",
+        "head_start_s": 1.0,
+        **order,
+    }
+    command = [sys.executable, "-m", "tests.attacks.runner.held_client", str(repository)]
+    client = subprocess.Popen(
+        [*command, json.dumps(whole)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        cwd=Path(__file__).parents[3],
+        text=True,
+    )
+    try:
+        said, _ = client.communicate(timeout=WATCHDOG_S)
+    except subprocess.TimeoutExpired:
+        client.kill()
+        said, _ = client.communicate()
+        return False, [*said.splitlines(), "held"]
+    return client.returncode == 0 and said.endswith("closed\n"), said.splitlines()
