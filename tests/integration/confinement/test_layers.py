@@ -21,7 +21,8 @@ import pytest
 
 from envhub_worker.protocol.confinement import Confinement
 from envhub_worker.spawn.jail import JailFailed
-from tests.integration.confinement_kit import (
+from tests.support import inside
+from tests.support.confinement_kit import (
     KIT,
     Cell,
     RunnerExited,
@@ -34,7 +35,6 @@ from tests.integration.confinement_kit import (
     unconfined,
     wait_until,
 )
-from tests.support import inside
 from tests.support.interpreter import can_run, needs, profiles, ways_to_it
 from tests.support.trees import fingerprint
 
@@ -684,7 +684,7 @@ seccomp.install(bpf.to_bytes(bpf.assemble([
 
 def on_restricted_host(restrict: str, profile: str) -> str:
     """What a jail says in a process that the host has restricted."""
-    kit = os.path.dirname(os.path.abspath(__file__))
+    kit = os.path.dirname(KIT)
     source = RESTRICTED.format(kit=kit, restrict=restrict, profile=profile)
     done = subprocess.run(
         [sys.executable, "-c", source], capture_output=True, text=True, timeout=120, check=False
@@ -773,7 +773,7 @@ victim.wait()
 @needs("container")
 def test_init_sends_signals_where_landlock_does_not_keep_them_inside() -> None:
     """To the jail's own processes in every way, and to none outside."""
-    kit = os.path.dirname(os.path.abspath(__file__))
+    kit = os.path.dirname(KIT)
     head = RESTRICTED.partition("with open_folder")[0]
     source = head.format(kit=kit, restrict=BROKERED.replace("SOURCE", repr(SIGNALS)))
     done = subprocess.run(

@@ -11,7 +11,7 @@ import pytest
 
 from envhub_worker.protocol.confinement import MIB, Confinement, Limits
 from envhub_worker.protocol.runtime import Runtime
-from tests.integration.confinement_kit import (
+from tests.support.confinement_kit import (
     Cell,
     RunnerStarted,
     cell_in,

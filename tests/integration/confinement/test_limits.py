@@ -10,7 +10,7 @@ import pytest
 
 from envhub_worker.lockdown.limits import cgroups
 from envhub_worker.protocol.confinement import MIB, Confinement, Limits
-from tests.integration.confinement_kit import (
+from tests.support.confinement_kit import (
     Cell,
     RunnerExited,
     RunnerStarted,

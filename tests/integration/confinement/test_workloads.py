@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import pytest
 
 from envhub_worker.protocol.confinement import Confinement, Limits
-from tests.integration.confinement_kit import Cell, cell_in, open_folder
+from tests.support.confinement_kit import Cell, cell_in, open_folder
 from tests.support.interpreter import needs, profiles
 
 STRICT = Confinement(limits=Limits(processes=256))
