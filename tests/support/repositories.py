@@ -10,6 +10,33 @@ import gymnasium as gym
 def cartpoles(n):
     return gym.vector.SyncVectorEnv([lambda: gym.make("CartPole-v1")] * n)
 """
+CARTPOLE = f"""{CARTPOLES}
+def make_env(n_envs=1, use_async_envs=False):
+    return cartpoles(n_envs)
+"""
+STILL = """
+import gymnasium as gym
+import numpy as np
+
+class Still(gym.Env):
+    observation_space = gym.spaces.Discrete(2)
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return 0, {}
+
+    def step(self, action):
+        return 0, 0.0, False, False, {}
+
+def vector(kind, n_envs):
+    return gym.vector.SyncVectorEnv([kind] * n_envs)
+
+def make_env(n_envs=1, use_async_envs=False):
+    return vector(Still, n_envs)
+
+"""
+"""An environment in which nothing happens; what follows may inherit from it and be made instead."""
 
 
 def write_repository(folder: Path, env_py: str, **files: str) -> Path:

@@ -16,33 +16,6 @@ from tests.support.compare import assert_same
 from tests.support.processes import descendants, eventually
 from tests.support.samples import make_env_of, reference, sample
 
-RUNNABLE = [
-    "cartpole",
-    "pendulum",
-    "lunar_lander",
-    "half_cheetah",
-    "minigrid",
-    "pusht",
-    "lerobot_pendulum",
-    "exotic_spaces",
-    "mo_gymnasium",
-    "torch_obs",
-    "lerobot_docs_single",
-    "counter",
-]
-
-
-@pytest.mark.parametrize("name", RUNNABLE)
-def test_sample_runs_in_one_line(name: str) -> None:
-    """Each sample steps with random actions of its own action space."""
-    with make_env(sample(name), n_envs=2) as suites:
-        env = suites.env
-        env.action_space.seed(0)
-        env.reset(seed=0)
-        for _ in range(20):
-            _, rewards, terminations, truncations, _ = env.step(env.action_space.sample())
-        assert len(rewards) == len(terminations) == len(truncations) == 2
-
 
 @pytest.mark.parametrize(
     ("name", "shape"),
@@ -59,13 +32,6 @@ def test_frames_are_the_reference_frames(name: str, shape: tuple[int, ...]) -> N
         assert [frame.shape for frame in frames] == [shape, shape]
         assert_same(expected.render(), frames)
     expected.close()
-
-
-def test_minigrid_mission_is_text() -> None:
-    """The mission crosses as text, one per sub-environment."""
-    with make_env(sample("minigrid"), n_envs=2) as suites:
-        observations, _ = suites.env.reset(seed=1)
-        assert all(text.startswith("go to the") for text in observations["mission"])
 
 
 def test_vector_rewards_of_async_envs() -> None:
@@ -236,11 +202,3 @@ class TestClosing:
         assert all(env.closed for tasks in suites.values() for env in tasks.values())
         # a worker server may stay for the next make_env; jails may not
         assert eventually(lambda: len(descendants() - before) <= 2)
-
-
-def test_provenance_names_what_ran() -> None:
-    """Provenance has the repository, its files' hashes, the interpreter and its packages."""
-    with make_env(sample("cartpole")) as suites:
-        text = repr(suites.provenance)
-    for expected in ("cartpole", "env.py", "gymnasium"):
-        assert expected in text
