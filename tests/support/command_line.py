@@ -26,7 +26,7 @@ def python(
         text=True,
         cwd=cwd,
         env={**os.environ, **variables},
-        timeout=280,
+        timeout=600,
         check=False,
     )
     assert code is None or done.returncode == code, done.stdout[-4000:] + done.stderr[-4000:]

@@ -39,6 +39,21 @@ def make_env(n_envs=1, use_async_envs=False):
 """An environment in which nothing happens; what follows may inherit from it and be made instead."""
 
 
+def importing(module: str, **answers: str) -> str:
+    """An ``env.py`` that imports a module, with methods that return these expressions."""
+    methods = "".join(f"    def {one}(self):\n        return {answers[one]}\n" for one in answers)
+    return f"""
+import sys
+import gymnasium as gym
+import {module}
+
+class Asked(gym.Wrapper):
+{methods}
+def make_env(n_envs=1, use_async_envs=False, name="CartPole-v1"):
+    return gym.vector.SyncVectorEnv([lambda: Asked(gym.make(name))] * n_envs)
+"""
+
+
 def write_repository(folder: Path, env_py: str, **files: str) -> Path:
     """Write a repository with an ``env.py`` and other files, named with ``__`` for a dot.
 

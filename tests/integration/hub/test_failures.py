@@ -7,14 +7,10 @@ import contextlib
 import copy
 import importlib
 import logging
-import os
 import pickle
 import re
-import subprocess
-import sys
 import time
 import traceback
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -23,25 +19,12 @@ import pytest
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import HubReferenceError, RepositoryUnavailableError
 from envhub_sandbox.hub.client import HubClient, Repository
-from envhub_sandbox.hub.reference import HubRef
-from envhub_sandbox.hub.snapshot import Snapshot, fetch
 from tests.hub.stub_hub import StubHub
-from tests.support.repositories import CARTPOLES
+from tests.integration.hub.conftest import Fetch
+from tests.support.command_line import python
+from tests.support.repositories import CARTPOLE
 
-Fetch = Callable[..., Snapshot]
 TOKEN = "hf_SECRETSECRETSECRET"
-
-
-@pytest.fixture
-def get(stub_hub: StubHub, hub_cache: Path) -> Fetch:
-    """``fetch`` from the stub, with caches of this test only."""
-    stub_hub.add("org/repo", {"env.py": "1", "data/a.txt": "a"})
-
-    def run(text: str = "models/org/repo", **rest: Any) -> Snapshot:
-        arguments = {"hub_cache_dir": hub_cache, "token": False, "endpoint": stub_hub.endpoint}
-        return fetch(HubRef.parse(text), **{**arguments, **rest})
-
-    return run
 
 
 def failure(get: Fetch, text: str = "models/org/repo", **rest: Any) -> RepositoryUnavailableError:
@@ -81,6 +64,7 @@ ANSWERS = [
     (API, 503, {"X-Error-Message": "over\x07loaded"}, ["(503)", '"over loaded"']),
     (API, 418, {}, ["Hub client failed", "endpoint"]),
     (API, 0, {}, ["cannot be reached", "proxy"]),
+    (API, 200, {}, ["Check the endpoint"]),  # of a server that is no Hub
     ("/tree/", 500, {}, ["has a problem (500)"]),
     ("/tree/", 403, {"X-Error-Code": "GatedRepo"}, ["gated"]),
     ("/resolve/", 403, {"X-Error-Code": "GatedRepo"}, ["gated", "Accept its terms"]),
@@ -111,8 +95,8 @@ def test_failed_download_leaves_nothing_in_the_store(
     stub_hub: StubHub, get: Fetch, snapshot_store: Path, code: str
 ) -> None:
     """After a failure in the middle there is no commit that could later be believed."""
-    stub_hub.fail("GET .*/resolve/.*a.txt", 403, headers={"X-Error-Code": code})
-    stub_hub.fail("HEAD .*/resolve/.*a.txt", 403, headers={"X-Error-Code": code})
+    stub_hub.fail("GET .*/resolve/.*mesh.bin", 403, headers={"X-Error-Code": code})
+    stub_hub.fail("HEAD .*/resolve/.*mesh.bin", 403, headers={"X-Error-Code": code})
     failure(get)
     assert not [path for path in snapshot_store.rglob("*") if path.is_file()]
 
@@ -124,19 +108,25 @@ def test_gated_model_is_not_searched_as_a_space(stub_hub: StubHub, get: Fetch) -
     assert not any("/api/spaces/" in request for request in stub_hub.requests)
 
 
-def test_missing_revision_in_both_types_is_told_for_both(stub_hub: StubHub, get: Fetch) -> None:
-    """Model and space are tried, and the error tells of each."""
-    stub_hub.add("org/repo", {"env.py": "s"}, "space")
-    message = str(failure(get, "org/repo@v9"))
-    assert "the model repository org/repo has no revision 'v9'" in message
-    assert "the space repository org/repo has no revision 'v9'" in message
-
-
-def test_an_empty_repository_has_no_revision(stub_hub: StubHub, get: Fetch) -> None:
-    """The error names the revision that was asked for, also where the caller named none."""
-    stub_hub.repositories["model", "org/repo"].refs.clear()
-    message = str(failure(get, "org/repo"))
-    assert "the model repository org/repo has no revision 'main' (is it empty?)" in message
+@pytest.mark.parametrize(
+    ("text", "types", "said"),
+    [
+        ("org/repo@v9", ("model", "space"), "has no revision 'v9'"),
+        ("org/repo", ("model",), "has no revision 'main' (is it empty?)"),
+    ],
+    ids=["missing", "empty"],
+)
+def test_a_revision_that_is_in_no_type_is_told_for_each(
+    stub_hub: StubHub, get: Fetch, text: str, types: tuple[str, ...], said: str
+) -> None:
+    """Also where the caller named none: of an empty repository."""
+    if "space" in types:
+        stub_hub.add("org/repo", {"env.py": "s"}, "space")
+    else:
+        stub_hub.repositories["model", "org/repo"].refs.clear()
+    message = str(failure(get, text))
+    for repo_type in types:
+        assert f"the {repo_type} repository org/repo {said}" in message
 
 
 @pytest.mark.parametrize(
@@ -178,12 +168,6 @@ def test_silent_hub_is_given_up(
     assert "HF_HUB_ETAG_TIMEOUT" in message
 
 
-def test_server_that_is_no_hub_is_reported(stub_hub: StubHub, get: Fetch) -> None:
-    """An endpoint that answers 200 with something else is named, not trusted."""
-    stub_hub.fail(API, 200)
-    assert "Check the endpoint" in str(failure(get))
-
-
 def test_offline_mode_fails_by_its_own_name(
     stub_hub: StubHub, hub_cache: Path, snapshot_store: Path
 ) -> None:
@@ -198,9 +182,7 @@ def test_offline_mode_fails_by_its_own_name(
     )
 
     def run(text: str, offline: str) -> str:
-        command = [sys.executable, "-c", code, text, str(hub_cache), stub_hub.endpoint]
-        environment = {**os.environ, "HF_HUB_OFFLINE": offline}
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
+        done = python("-c", code, text, hub_cache, stub_hub.endpoint, HF_HUB_OFFLINE=offline)
         return done.stdout.strip()
 
     assert run("org/repo", "0") == commit
@@ -298,10 +280,7 @@ def test_url_with_a_password_is_logged_by_others(
 
 def test_environments_do_not_keep_the_password(stub_hub: StubHub, hub_cache: Path) -> None:
     """Nor do their pickles, reprs and provenance; copies are made from what is here already."""
-    text = (
-        f"{CARTPOLES}\ndef make_env(n_envs=1, use_async_envs=False):\n    return cartpoles(n_envs)"
-    )
-    stub_hub.add("org/poles", {"env.py": text})
+    stub_hub.add("org/poles", {"env.py": CARTPOLE})
     endpoint = stub_hub.endpoint.replace("//", "//user:s3cret@")
     with make_env("models/org/poles", endpoint=endpoint, hub_cache_dir=hub_cache) as suites:
         kept = pickle.dumps(suites) + pickle.dumps(suites.env)

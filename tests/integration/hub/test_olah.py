@@ -14,7 +14,6 @@ import pytest
 from envhub_sandbox.errors import RepositoryUnavailableError
 from envhub_sandbox.hub.reference import HubRef
 from envhub_sandbox.hub.snapshot import Snapshot, commit_of, fetch
-from tests.hub.fixtures import olah_python
 from tests.hub.olah_server import GitRepository, OlahServer
 from tests.hub.stub_hub import git_blob_id
 
@@ -95,25 +94,27 @@ def test_each_repository_type_loads(olah: OlahServer, get: Fetch, repo_type: str
     assert contents(snapshot) == {"env.py": repo_type.encode()}
 
 
-def test_space_is_found_without_a_prefix(olah: OlahServer, get: Fetch) -> None:
-    """LeRobot's documentation has authors upload spaces: they load by plain name."""
-    make(olah, "only-space", "space").commit({"env.py": "s"})
-    assert get("org/only-space").repo_type == "space"
-
-
-def test_model_wins_over_a_space_of_the_same_name(olah: OlahServer, get: Fetch) -> None:
-    """Where both exist, the plain name means the model, as in LeRobot."""
-    make(olah, "both").commit({"env.py": "m"})
-    make(olah, "both", "space").commit({"env.py": "s"})
-    assert get("org/both").repo_type == "model"
-    assert get("spaces/org/both").repo_type == "space"
-
-
-def test_space_is_taken_where_the_model_lacks_the_entry(olah: OlahServer, get: Fetch) -> None:
-    """A model of weights beside a space of the same name does not hide the environment."""
-    make(olah, "weights").commit({"model.bin": "w"})
-    make(olah, "weights", "space").commit({"env.py": "s"})
-    assert get("org/weights").repo_type == "space"
+@pytest.mark.parametrize(
+    ("made", "found"),
+    [
+        # LeRobot's documentation has authors upload spaces
+        ({"space": "env.py"}, "space"),
+        # where both exist, the plain name means the model, as in LeRobot
+        ({"model": "env.py", "space": "env.py"}, "model"),
+        # a model of weights beside it does not hide the environment
+        ({"model": "model.bin", "space": "env.py"}, "space"),
+    ],
+    ids=["only a space", "both", "weights"],
+)
+def test_a_plain_name_finds_the_environment(
+    olah: OlahServer, get: Fetch, made: dict[str, str], found: str
+) -> None:
+    """The model where it has one, or else the space; a prefix finds what it names."""
+    name = f"plain-{len(made)}-{found}"
+    for repo_type, file in made.items():
+        make(olah, name, repo_type).commit({file: repo_type})
+    assert get(f"org/{name}").repo_type == found
+    assert get(f"spaces/org/{name}").repo_type == "space"
 
 
 def test_lfs_file_is_verified_by_its_sha256(olah: OlahServer, get: Fetch) -> None:
@@ -235,23 +236,3 @@ def test_processes_share_one_snapshot(
     assert [process.communicate()[0].strip() for process in running] == [commit] * 3
     homes = list(snapshot_store.glob("snapshots/*/model--org--processes/*"))
     assert [home.name for home in homes] == [commit]
-
-
-def test_stopped_hub_serves_pins_from_the_store_and_nothing_stale(
-    tmp_path: Path, hub_cache: Path
-) -> None:
-    """Without its Hub a pin still loads, and a branch fails with the pins that would load."""
-    (tmp_path / "olah").mkdir()
-    server = OlahServer(tmp_path / "olah", olah_python())
-    try:
-        commit = server.repository("org/gone").commit(FILES, tag="v1")
-        arguments = {"hub_cache_dir": hub_cache, "token": False, "endpoint": server.endpoint}
-        online = fetch(HubRef.parse("org/gone@v1"), **arguments)
-    finally:
-        server.stop()
-    assert fetch(HubRef.parse(f"org/gone@{commit}"), **arguments) == online
-    with pytest.raises(RepositoryUnavailableError) as caught:
-        fetch(HubRef.parse("org/gone@v1:pkg/maker.py"), **arguments)
-    assert "cannot be reached" in str(caught.value)
-    assert f"'org/gone@{commit}:pkg/maker.py' (v1, " in str(caught.value)
-    assert caught.value.__cause__ is not None
