@@ -24,35 +24,30 @@ from envhub_sandbox.sources import parser
 from tests.hub.stub_hub import StubHub
 from tests.support.command_line import envhub
 from tests.support.processes import descendants, eventually
-from tests.support.repositories import write_repository
+from tests.support.repositories import STILL, write_repository
 from tests.support.wheels import Index
 
 _LONG_S = 3600
 """So long that no test would wait for it."""
 _NAME = b"it-hangs"
-_ENV = """
+_ENV = f"""{STILL}
 import time
-import gymnasium as gym, numpy as np
 
 hung = []
 # LOAD
-class Slow(gym.Env):
-    observation_space = gym.spaces.Box(-1, 1, (2,), np.float32)
-    action_space = gym.spaces.Discrete(2)
+class Slow(Still):
     def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
         # RESET
-        return np.zeros(2, np.float32), {}
+        return super().reset(seed=seed)
     def step(self, action):
         # STEP
-        return np.zeros(2, np.float32), 0.0, False, False, {}
+        return super().step(action)
     def close(self):
         while hung:
             time.sleep(1)
 
 def make_env(n_envs=1, use_async_envs=False):
-    one = lambda: gym.vector.SyncVectorEnv([Slow] * n_envs)
-    return {"a": {0: one(), 1: one()}}
+    return {{"a": {{0: vector(Slow, n_envs), 1: vector(Slow, n_envs)}}}}
 """
 
 

@@ -17,10 +17,10 @@ from envhub_sandbox.check.judge import judge
 from envhub_sandbox.check.settings import JudgeOptions
 from envhub_sandbox.hub.snapshot import named
 from tests.hub.olah_server import GitRepository, OlahServer
+from tests.support.repositories import STILL
 
 _ENV = """
 import os, sys
-import gymnasium as gym
 
 HERE = os.path.dirname(os.path.abspath(__file__))
 sys.path[:0] = [os.path.join(HERE, folder) for folder in {folders!r}]
@@ -28,19 +28,12 @@ for name in {names!r}:
     __import__(name)
 import beside
 
-class Still(gym.Env):
-    observation_space = gym.spaces.Discrete(2)
-    action_space = gym.spaces.Discrete(2)
-
+class Telling(Still):
     def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return 0, {{"ran": ",".join(sorted(sys.ran))}}
-
-    def step(self, action):
-        return 0, 0.0, False, False, {{}}
+        return super().reset(seed=seed)[0], {{"ran": ",".join(sorted(sys.ran))}}
 
 def make_env(n_envs=1, use_async_envs=False):
-    return gym.vector.SyncVectorEnv([Still] * n_envs)
+    return vector(Telling, n_envs)
 """
 _PAYLOAD = """
 import os, sys
@@ -60,7 +53,7 @@ def hostile(olah: OlahServer, tmp_path: Path) -> tuple[GitRepository, str]:
     repository = olah.repository("org/hostile-places")
     where = repository.folder
     files = {f"{folder}/{name}.py": _PAYLOAD for folder, name in zip(_FOLDERS, _NAMES, strict=True)}
-    files |= {"env.py": _ENV.format(folders=_FOLDERS, names=(*_NAMES, "without_source"))}
+    files |= {"env.py": STILL + _ENV.format(folders=_FOLDERS, names=(*_NAMES, "without_source"))}
     files |= {"lib/pyvenv.cfg": "", "beside.py": "HARMLESS = 1\n", ".gitignore": "*.pyc\n__*__\n"}
     (where / "payload.py").write_text(_PAYLOAD)
     (where / "__pycache__").mkdir()

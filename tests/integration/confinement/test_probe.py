@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
 import sys
 from typing import Any
 
 from envhub_worker import bootstrap
+from tests.support.command_line import python
 
 FORBID = """
 import sys
@@ -20,15 +20,14 @@ os.execv(sys.executable, {command!r})
 """
 
 
-def probe(*command: str) -> dict[str, Any]:
+def probe(*arguments: str) -> dict[str, Any]:
     """The JSON that the program prints."""
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
-    return dict(json.loads(done.stdout))
+    return dict(json.loads(python(*arguments).stdout))
 
 
 def test_this_host_can_enforce_every_layer() -> None:
     """As root and as a plain user; control groups as root only."""
-    found = probe(*bootstrap.command(sys.executable, "probe"))
+    found = probe(*bootstrap.command(sys.executable, "probe")[1:])
     available = {entry["layer"]: entry["available"] for entry in found["layers"]}
     assert set(available) == {
         "unprivileged-user",
@@ -49,9 +48,7 @@ def test_this_host_can_enforce_every_layer() -> None:
 
 def test_all_missing_layers_are_told_with_a_fix() -> None:
     """A jail would stop at the first."""
-    command = bootstrap.command(sys.executable, "probe")
-    source = FORBID.format(command=command)
-    found = probe(sys.executable, "-c", source)
+    found = probe("-c", FORBID.format(command=bootstrap.command(sys.executable, "probe")))
     missing = {entry["layer"]: entry for entry in found["layers"] if not entry["available"]}
     assert {"user-namespace", "namespaces", "mount-namespace"} <= set(missing)
     assert missing["user-namespace"]["detail"] == "user.max_user_namespaces is 0"

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import re
-import subprocess
 import sys
 from pathlib import Path
 from types import FrameType
@@ -16,6 +14,7 @@ import envhub_sandbox
 import envhub_worker
 from envhub_sandbox import make_env
 from envhub_worker.protocol import messages as m
+from tests.support.command_line import python
 from tests.support.runner_here import RunnerHere
 from tests.support.samples import SAMPLES
 
@@ -67,17 +66,14 @@ def test_the_page_lists_the_files_of_a_step(checkout: Path) -> None:
 )
 def test_a_trace_names_each_message(lane: str, step: str) -> None:
     """On stderr, in their order; and without the variable nothing."""
-    program = [sys.executable, "-c", f"LANE = {lane!r}{PLAY}"]
-    variables = {**os.environ, "ENVHUB_TRACE": "1"}
-    traced = subprocess.run(program, env=variables, check=True, capture_output=True, text=True)
+    program = ("-c", f"LANE = {lane!r}{PLAY}")
+    traced = python(*program, ENVHUB_TRACE="1")
     lines = [re.sub(r"^\+\d+\.\d{6} MainThread ", "", line) for line in traced.stderr.splitlines()]
     said = "\n".join(re.sub(r" \([\d.]+ ms\)$", "", line) for line in lines)
     order = ["> WorkerClient.send Hello", "< WorkerClient.receive JailOpened", step, "CloseJail"]
     assert said == re.sub(r"[^\x20-\x7e\n]", "", said)
     assert [said.index(one) for one in order] == sorted(said.index(one) for one in order)
-    del variables["ENVHUB_TRACE"]
-    silent = subprocess.run(program, env=variables, check=True, capture_output=True, text=True)
-    assert silent.stderr == ""
+    assert python(*program).stderr == ""
 
 
 def test_a_runner_runs_here_for_a_debugger() -> None:

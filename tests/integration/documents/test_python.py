@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import os
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from tests.support import blocks
+from tests.support.command_line import python
 from tests.support.samples import EXAMPLES
 
 # No block may take a port that another program has.
@@ -37,16 +36,7 @@ def run(arguments: list[str], folder: Path) -> None:
     shutil.copytree(EXAMPLES / "cartpole", here / "my-env")
     (here / "examples").mkdir()
     shutil.copytree(EXAMPLES / "cartpole", here / "examples" / "cartpole")
-    done = subprocess.run(
-        [sys.executable, *arguments],
-        cwd=here,
-        env={**os.environ, "ENVHUB_CACHE": str(folder / "cache")},
-        capture_output=True,
-        text=True,
-        timeout=240,
-        check=False,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
+    python(*arguments, cwd=here, ENVHUB_CACHE=str(folder / "cache"))
 
 
 def python_of(document: str) -> list[str]:

@@ -38,6 +38,13 @@ def make_env(n_envs=1, use_async_envs=False, broken=False):
 MOTOR = "def turn(angle):\n    raise ZeroDivisionError('stuck')\n"
 
 
+def repository(folder: Path, text: str = ENV) -> Path:
+    """A repository with a part that breaks."""
+    (folder / "mine" / "parts").mkdir(parents=True)
+    (folder / "mine" / "parts" / "motor.py").write_text(MOTOR)
+    return write_repository(folder / "mine", text)
+
+
 def failure(reference: str, *, at: str, **options: Any) -> EnvHubError:
     """What is raised in loading or in a step."""
     broken = {"broken": True} if at == "make_env" else None
@@ -66,9 +73,7 @@ def play_one(reference: str, **options: Any) -> None:
 )
 def test_the_line_in_the_authors_own_folder(tmp_path: Path, at: str, lane: str) -> None:
     """And not the one in the copy that was run."""
-    folder = Path(write_repository(tmp_path / "mine", ENV))
-    (folder / "parts").mkdir()
-    (folder / "parts" / "motor.py").write_text(MOTOR)
+    folder = repository(tmp_path)
     error = failure(str(folder), at=at, lane=lane)
     where = f'  File "{folder}/parts/motor.py", line 2, in turn\n'
     assert str(error).endswith(f"{where}    raise ZeroDivisionError('stuck')")
@@ -96,9 +101,7 @@ def test_a_traceback_has_one_frame_of_ours(
 ) -> None:
     """Between the caller's last line and the author's; all of them, where that is asked for."""
     monkeypatch.setenv("ENVHUB_TRACEBACK", shown)
-    folder = Path(write_repository(tmp_path / "mine", ENV))
-    (folder / "parts").mkdir()
-    (folder / "parts" / "motor.py").write_text(MOTOR)
+    folder = repository(tmp_path)
     broken = {"broken": True} if at == "make_env" else None
     with pytest.raises(ZeroDivisionError) as caught:
         (play_one if at == "single" else play)(str(folder), env_kwargs=broken, lane=lane)
@@ -119,8 +122,7 @@ def test_a_traceback_has_one_frame_of_ours(
 )
 def test_a_syntax_error_is_shown_as_python_shows_it(tmp_path: Path, name: str, source: str) -> None:
     """File, line and caret: what the same file gives in this process, without a sandbox."""
-    folder = Path(write_repository(tmp_path / "mine", "import parts.motor\n"))
-    (folder / "parts").mkdir()
+    folder = repository(tmp_path, "import parts.motor\n")
     (folder / name).write_text(source)
     with pytest.raises(SyntaxError) as here:
         compile(source, str(folder / name), "exec")
