@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from html import unescape
 from pathlib import Path
 from typing import Any
@@ -20,43 +18,23 @@ from envhub_sandbox.check.judge import judge
 from envhub_sandbox.check.settings import JudgeOptions
 from envhub_sandbox.errors import SandboxUnavailableError, SnapshotError
 from envhub_sandbox.rollouts.pictures import png
+from tests.corpus.entries import Entry
 from tests.support import checks
 from tests.support.ci import obeyed
-from tests.support.command_line import envhub
+from tests.support.command_line import envhub, python
 from tests.support.repositories import write_repository
 from tests.support.samples import EXAMPLES
 
-_HONEST = """
-import gymnasium as gym
-import numpy as np
+_BODY = """
+length = 10
 
-class Walk(gym.Env):
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 10}
-    render_mode = "rgb_array"
-    observation_space = gym.spaces.Box(-100, 100, (2,), np.float32)
-    action_space = gym.spaces.Discrete(2)
-    count = 0
+def reward(self):
+    return 1.0
 
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        self.at = self.np_random.random()
-        self.count = 0
-        return self.observation(), {}
-
-    def observation(self):
-        return np.array([self.at, self.count], np.float32)
-
-    def step(self, action):
-        self.at += self.np_random.random() * (1 if action else -1)
-        self.count += 1
-        return self.observation(), 1.0, self.count >= 10, False, {}
-
-    def render(self):
-        return np.zeros((4, 6, 3), np.uint8)
-
-def make_env(n_envs=1, use_async_envs=False):
-    return gym.vector.SyncVectorEnv([Walk] * n_envs)
+def render(self):
+    return np.zeros((4, 6, 3), np.uint8)
 """
+_HONEST = Entry(group="honest", env=_BODY).source()
 _MODES = """
     def __init__(self, render_mode):
         self.render_mode = render_mode or "rgb_array"
@@ -127,8 +105,8 @@ def test_each_mode_that_is_declared_is_rendered(tmp_path: Path) -> None:
     """Where make_env takes one; an honest one passes, and who returns none of it does not."""
     text = _HONEST.replace('"rgb_array"]', '"human", "rgb_array", "ansi", "rgb_array_list"]')
     text = text.replace("def render(", "def frame(").replace("(n_envs", "(render_mode=None, n_envs")
-    text = text.replace("    count = 0\n", "    count = 0\n" + _MODES, 1)
-    text = text.replace("[Walk] * n_envs", "[lambda: Walk(render_mode)] * n_envs")
+    text = text.replace("    length = 12\n", "    length = 12\n" + _MODES, 1)
+    text = text.replace("[Env] * n_envs", "[lambda: Env(render_mode)] * n_envs")
     assert judged(repository(tmp_path / "honest", text), 2, resets=0).findings == []
     text = text.replace('"ansi": "."', '"ansi": None').replace("[self.frame()]", "self.frame()")
     [ansi, rgb] = judged(repository(tmp_path / "wrong", text), 2, resets=0).findings
@@ -234,9 +212,7 @@ def test_the_command_line_judges(tmp_path: Path) -> None:
     good = envhub("check", EXAMPLES / "cartpole", "--steps", "20", "--json")
     assert good.returncode == 0, good.stderr
     assert json.loads(good.stdout)["passed"] is True
-    folder = repository(
-        tmp_path / "walk", _HONEST.replace("1.0, self.count", "1.0, 1 / 0, self.count")
-    )
+    folder = repository(tmp_path / "walk", _HONEST.replace("self.reward()", "1 / 0"))
     files = [f"--{kind}={tmp_path / kind}" for kind in ("junit", "sarif", "html")]
     bad = envhub("check", folder, "--steps", "5", *files)
     assert bad.returncode == 1, bad.stderr
@@ -280,8 +256,8 @@ def test_a_repository_gives_github_no_commands(tmp_path: Path) -> None:
 def test_a_name_that_a_terminal_would_obey_is_a_finding(tmp_path: Path) -> None:
     """And no reason not to judge."""
     text = _HONEST.replace(
-        "return gym.vector.SyncVectorEnv([Walk] * n_envs)",
-        "return {'a\\x9b': {0: gym.vector.SyncVectorEnv([Walk] * n_envs)}}",
+        "return gym.vector.SyncVectorEnv([Env] * n_envs)",
+        "return {'a\\x9b': {0: gym.vector.SyncVectorEnv([Env] * n_envs)}}",
     )
     report = judged(repository(tmp_path / "walk", text))
     assert {one.id for one in report.findings} == {"loads"}
@@ -312,9 +288,7 @@ def test_a_host_without_user_namespaces_is_told_of(tmp_path: Path) -> None:
     """Nothing weaker is taken by itself; where one names it, each form says what is not there."""
     text = _HONEST.replace('["rgb_array"]', "[]").replace('= "rgb_array"', "= None")
     repository(tmp_path / "walk", text)
-    program = [sys.executable, "-c", _WITHOUT_NAMESPACES, str(tmp_path)]
-    done = subprocess.run(program, capture_output=True, text=True, timeout=300, check=False)
-    assert done.returncode == 0, done.stderr
+    python("-c", _WITHOUT_NAMESPACES, tmp_path)
     refused, shown, github = json.loads((tmp_path / "told").read_text())
     assert refused[:2] == [6, ""], refused
     for words in ("user.max_user_namespaces is 0", "sudo sysctl", "--profile no-userns"):

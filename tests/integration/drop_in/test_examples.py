@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
+from tests.support.command_line import python
 from tests.support.samples import EXAMPLES
 
 
@@ -24,13 +22,5 @@ def test_example_script(script: str, needs: str, printed: str, tmp_path: Path) -
     """Each ends well and prints what it promises."""
     pytest.importorskip("torch")
     pytest.importorskip(needs)
-    done = subprocess.run(
-        [sys.executable, str(EXAMPLES / script)],
-        env={**os.environ, "ENVHUB_CACHE": str(tmp_path / "cache")},
-        capture_output=True,
-        text=True,
-        timeout=240,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
+    done = python(EXAMPLES / script, ENVHUB_CACHE=str(tmp_path / "cache"))
     assert printed in done.stdout

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
-
 import pytest
 
+from tests.support.command_line import python
 from tests.support.samples import sample
 
 pytest.importorskip("torch")
@@ -41,13 +39,6 @@ if __name__ == "__main__":
 
 def test_its_wrapper_passes_its_own_check() -> None:
     """One environment, and vector environments in the modes that it takes; episodes end."""
-    done = subprocess.run(
-        [sys.executable, "-c", _SCRIPT, str(sample("cartpole"))],
-        capture_output=True,
-        text=True,
-        timeout=280,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
+    done = python("-c", _SCRIPT, sample("cartpole"))
     said = done.stdout.splitlines()  # it logs there, too
     assert {"one [120]", "SameStep [3, 120]", "Disabled [3, 120]"} <= set(said)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import signal
 import threading
 from pathlib import Path
 
@@ -107,15 +106,6 @@ def test_a_suite_that_is_not_closed_holds_it() -> None:
     suites.close()
 
 
-def test_a_suite_that_nobody_holds_lets_it_go() -> None:
-    """The garbage collector closes, and the time begins."""
-    suites = make_env(sample("counter"), n_envs=2, timeouts={"server_idle_s": 0.05})
-    suites.env.reset()
-    assert _servers()
-    del suites
-    assert eventually(lambda: not started())
-
-
 def test_a_hundred_times_open_and_closed_leaves_one_server_and_nothing_else() -> None:
     """No thread, no descriptor, no process more than after the first time."""
     used(600)
@@ -132,25 +122,6 @@ def test_a_hundred_times_open_and_closed_leaves_one_server_and_nothing_else() ->
     assert eventually(lambda: process.num_fds() <= its)
     assert eventually(lambda: len(started()) == _ONLY_SERVER)
     stop_idle()
-
-
-def test_opening_while_the_time_comes_works() -> None:
-    """Whichever comes first: there is a server, and it answers."""
-    for attempt in range(12):
-        used(0.001 * attempt)
-    assert eventually(lambda: not started())
-
-
-def test_a_server_that_dies_while_it_lingers_is_replaced() -> None:
-    """The next environment starts another, and the dead one leaves no zombie."""
-    used(600)
-    [server] = _servers()
-    os.kill(server, signal.SIGKILL)
-    assert eventually(lambda: not _servers())
-    used(0)
-    assert eventually(lambda: not psutil.pid_exists(server))
-    stop_idle()
-    assert not started()
 
 
 def test_ever_new_policies_do_not_fill_it_with_zygotes(tmp_path: Path) -> None:
@@ -193,32 +164,6 @@ say("lingers")
         assert line(client) == "lingers"
         said = finish(client)
         assert "Exception ignored" not in said
-        assert is_clean(folder), left(folder)
-
-
-def test_a_fork_gets_a_server_of_its_own() -> None:
-    """It neither uses nor ends what its parent left lingering."""
-    with temporary_root() as folder:
-        client = start(
-            folder,
-            """
-            def server():
-                import psutil
-                return [c.pid for c in psutil.Process().children() if "serve" in c.cmdline()]
-            suites = made(timeouts={"server_idle_s": 600})
-            suites.close()
-            before = server()
-            child = os.fork()
-            if child == 0:
-                suites = made(timeouts={"server_idle_s": 600})
-                suites.close()
-                sys.exit(0 if server() and server() != before else 1)
-            say(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
-            suites = made(timeouts={"server_idle_s": 600})
-            say(server() == before)
-            """,
-        )
-        assert finish(client).split() == ["0", "True"]
         assert is_clean(folder), left(folder)
 
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import gc
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -17,16 +15,13 @@ from envhub_sandbox.errors import ActionError, ObservationError, PolicyError
 from envhub_sandbox.vector.validated import holds
 from envhub_worker.protocol.lifecycle import State
 from tests.support import inside
-from tests.support.repositories import write_repository
+from tests.support.command_line import envhub
+from tests.support.repositories import STILL, write_repository
 from tests.support.samples import sample
 
 # told by the caller how it is to leave its space, and when
 _LEAVER = """
-import gymnasium as gym
-import numpy as np
-
-
-class Leaver(gym.Env):
+class Leaver(Still):
     observation_space = gym.spaces.Dict({"at": gym.spaces.Box(-1, 1, (2,), np.float32)})
     action_space = gym.spaces.Box(-1, 1, (1,), np.float32)
 
@@ -57,7 +52,7 @@ def make_env(n_envs=1, use_async_envs=False, value=0.5, moment="", mode="NextSte
 @pytest.fixture(scope="module")
 def leaver(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A repository whose last sub-environment leaves its observation space."""
-    return write_repository(tmp_path_factory.mktemp("leaver"), _LEAVER)
+    return write_repository(tmp_path_factory.mktemp("leaver"), STILL + _LEAVER)
 
 
 @pytest.mark.parametrize("lane", ["auto", "frames"])
@@ -145,15 +140,8 @@ def test_environments_in_this_process_are_not_validated() -> None:
 def test_envhub_run_validates(leaver: Path) -> None:
     """The environment broke the rules: exit code 1."""
     kwargs = ("--env-kwargs", "value=2.0", "--env-kwargs", "moment=step")
-    command = [sys.executable, "-I", "-m", "envhub_sandbox", "run", str(leaver), *kwargs]
     for validate, code in ((), 0), (("--validate",), 1):
-        done = subprocess.run(
-            [*command, "--episodes", "1", *validate],
-            capture_output=True,
-            text=True,
-            timeout=240,
-            check=False,
-        )
+        done = envhub("run", leaver, *kwargs, "--episodes", "1", *validate)
         assert done.returncode == code, done.stderr
     assert "outside of its space: sub-environment 0" in done.stderr
 

@@ -15,25 +15,21 @@ from envhub_sandbox import make_env
 from envhub_sandbox.errors import WorkerDiedError, WorkerTimeoutError
 from tests.support.compare import assert_same
 from tests.support.processes import eventually
+from tests.support.repositories import STILL
 
 ENVS = 3
-REPOSITORY = '''
+_TOLD = '''
 import os
 import signal
 import threading
 import time
 
-import gymnasium as gym
-import numpy as np
-
-
 ALL = []
 
 
-class Told(gym.Env):
+class Told(Still):
     """Some attributes stay, some change with each step, some with each episode."""
 
-    observation_space = gym.spaces.Discrete(100)
     action_space = gym.spaces.Discrete(3)
     kind = "reacher"
 
@@ -91,10 +87,11 @@ class Live(gym.vector.SyncVectorEnv):
 
 
 def make_env(n_envs=1, use_async_envs=False):
-    return gym.vector.SyncVectorEnv([Told] * n_envs)
+    return vector(Told, n_envs)
 '''
+REPOSITORY = STILL + _TOLD
 SUITE = REPOSITORY.replace(
-    "    return gym.vector.SyncVectorEnv([Told] * n_envs)\n",
+    "    return vector(Told, n_envs)\n",
     "    kinds = (gym.vector.SyncVectorEnv, gym.vector.SyncVectorEnv, Live)\n"
     "    return {'suite': {task: kind([Told] * n_envs) for task, kind in enumerate(kinds)}}\n",
 )
