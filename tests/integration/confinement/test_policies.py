@@ -10,23 +10,13 @@ from envhub_sandbox import make_env
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError
 from envhub_worker.lockdown.gpus import gpu_devices
 from envhub_worker.lockdown.root_plan import real_host
-
-REPOSITORY = """
-import os
-import gymnasium as gym
-
-
-def make_env(n_envs=1, use_async_envs=False):
-    print(os.environ["HOME"])
-    return gym.make_vec("CartPole-v1", n_envs, vectorization_mode="sync")
-"""
+from tests.support.repositories import STILL, write_repository
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """A repository that looks at its home."""
-    (tmp_path / "env.py").write_text(REPOSITORY)
-    return tmp_path
+    return write_repository(tmp_path, f"import os\nprint(os.environ['HOME'])\n{STILL}")
 
 
 @pytest.mark.parametrize("name", ["HOME", "TMPDIR"])

@@ -14,25 +14,10 @@ from envhub_sandbox import make_env
 from envhub_sandbox.errors import DependencyError, RequirementError, ResolutionError
 from envhub_sandbox.system.log import DEPENDENCIES
 from tests.support.compare import assert_same
-from tests.support.repositories import CARTPOLES, write_repository
+from tests.support.repositories import CARTPOLE, CARTPOLES, importing, write_repository
 from tests.support.wheels import Index, make_wheel
 
-ENV = """
-import sys
-import gymnasium as gym
-import not_here
-
-class Told(gym.Wrapper):
-    def version(self):
-        return not_here.VERSION
-    def where(self):
-        return not_here.__file__
-    def prefix(self):
-        return sys.prefix
-
-def make_env(n_envs=1, use_async_envs=False):
-    return gym.vector.SyncVectorEnv([lambda: Told(gym.make("CartPole-v1"))] * n_envs)
-"""
+ENV = importing("not_here", version="not_here.VERSION", where="not_here.__file__")
 
 
 @pytest.fixture(scope="module")
@@ -118,11 +103,9 @@ def test_nothing_is_made_where_nothing_is_missing(
     packages: Index, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     """A repository whose packages are all here runs in this interpreter, as fast as ever."""
-    env = (
-        CARTPOLES
-        + "\ndef make_env(n_envs=1, use_async_envs=False):\n    return cartpoles(n_envs)\n"
+    folder = write_repository(
+        tmp_path / "repo", CARTPOLE, requirements__txt="gymnasium\nnumpy>=1.26\n"
     )
-    folder = write_repository(tmp_path / "repo", env, requirements__txt="gymnasium\nnumpy>=1.26\n")
     asked = len(packages.asked)
     with caplog.at_level("INFO", DEPENDENCIES.name), make_env(folder) as suites:
         suites.env.reset(seed=0)

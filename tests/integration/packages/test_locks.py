@@ -14,21 +14,11 @@ from envhub_sandbox import make_env
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.dependencies import resolutions
 from envhub_sandbox.errors import LockDriftError, LockError, PackageIntegrityError, PolicyError
-from tests.support.repositories import write_repository
+from tests.support.repositories import importing, write_repository
 from tests.support.wheels import Index, make_wheel
 
 RUNNER = CliRunner()
-ENV = """
-import gymnasium as gym
-import not_here
-
-class Told(gym.Wrapper):
-    def version(self):
-        return not_here.VERSION
-
-def make_env(n_envs=1, use_async_envs=False, name="CartPole-v1"):
-    return gym.vector.SyncVectorEnv([lambda: Told(gym.make(name))] * n_envs)
-"""
+ENV = importing("not_here", version="not_here.VERSION")
 
 
 @pytest.fixture(scope="module")

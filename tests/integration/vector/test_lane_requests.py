@@ -15,16 +15,14 @@ from envhub_sandbox.transport.jail import JailHandle
 from envhub_worker.protocol.shared_memory import slabs
 from tests.support import inside
 from tests.support.compare import assert_same
+from tests.support.repositories import STILL, write_repository
 from tests.support.samples import sample
 
 REPOSITORY = '''
-import gymnasium as gym
-import numpy as np
-
 LARGE = 2 * 65536
 
 
-class Talker(gym.Env):
+class Talker(Still):
     """Counts what it is asked, says so in its infos, and some of these are large."""
 
     observation_space = gym.spaces.Box(0, 1e6, (2,), np.float32)
@@ -72,9 +70,7 @@ assert slabs.INFO_BYTES == 65536, "what is large has changed"
 @pytest.fixture(scope="module")
 def talker(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The repository."""
-    folder = tmp_path_factory.mktemp("talker")
-    (folder / "env.py").write_text(REPOSITORY)
-    return folder
+    return write_repository(tmp_path_factory.mktemp("talker"), STILL + REPOSITORY)
 
 
 def conversation(folder: Path, lane: str, num_workers: int) -> list[Any]:
