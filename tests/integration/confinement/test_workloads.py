@@ -36,9 +36,9 @@ def cell(request: pytest.FixtureRequest) -> Cell:
     return request.getfixturevalue(name)
 
 
-def outcome(cell: Cell, source: str) -> object:
+def outcome(cell: Cell, source: str, runner: int = 1) -> object:
     """What ``source`` leaves in ``result``; its error fails the test with the jail's output."""
-    answer = cell.run(source)
+    answer = cell.run(source, runner)
     cell.pump()
     assert "result" in answer, (answer, cell.output[-3000:].decode())
     return answer["result"]
@@ -47,11 +47,9 @@ def outcome(cell: Cell, source: str) -> object:
 def in_fresh_runner(cell: Cell, source: str) -> object:
     """Like ``outcome``, in a runner of its own: for what can be set once per process."""
     runner = cell.start()
-    answer = cell.run(source, runner)
-    cell.pump()
+    result = outcome(cell, source, runner)
     cell.hang_up(runner)
-    assert "result" in answer, (answer, cell.output[-3000:].decode())
-    return answer["result"]
+    return result
 
 
 def test_numpy_uses_blas_threads(cell: Cell) -> None:
@@ -262,21 +260,6 @@ result = [getpass.getuser(), multiprocessing.cpu_count() >= 1, psutil.virtual_me
     answers = outcome(cell, source)
     assert answers[0] == "sandbox"
     assert all(answers[1:])
-
-
-def test_mujoco_steps_and_renders(strict: Cell) -> None:
-    """EGL or OSMesa in software."""
-    pytest.importorskip("mujoco")
-    source = """
-import gymnasium
-env = gymnasium.make("HalfCheetah-v5", render_mode="rgb_array", width=64, height=64)
-env.reset(seed=1)
-env.step(env.action_space.sample())
-frame = env.render()
-result = [list(frame.shape), int(frame.max()) > 0]
-env.close()
-"""
-    assert in_fresh_runner(strict, source) == [[64, 64, 3], True]
 
 
 def test_pygame_draws_without_a_display(cell: Cell) -> None:

@@ -21,7 +21,7 @@ from envhub_sandbox.hub.store import cache_root, remove_tree
 from envhub_sandbox.locks import lockfile
 from envhub_sandbox.locks.making import locked
 from tests.support.git_server import git_served, make_repository
-from tests.support.repositories import write_repository
+from tests.support.repositories import importing, write_repository
 from tests.support.sdists import backend, make_sdist
 from tests.support.wheels import Index, make_wheel
 
@@ -126,17 +126,7 @@ def test_a_commit_of_git(packages: Index, tmp_path: Path, monkeypatch: pytest.Mo
     assert known.source.identity == f"git+{address}/repo@{commit}#subdirectory=python"
 
 
-ENV = """
-import gymnasium as gym
-import sourced
-
-class Told(gym.Wrapper):
-    def origin(self):
-        return sourced.FROM
-
-def make_env(n_envs=1, use_async_envs=False):
-    return gym.vector.SyncVectorEnv([lambda: Told(gym.make("CartPole-v1"))] * n_envs)
-"""
+ENV = importing("sourced", origin="sourced.FROM")
 
 
 def test_a_repository_whose_package_has_no_wheel(real_index: Index, tmp_path: Path) -> None:
