@@ -16,8 +16,11 @@ export PYTHON=/usr/bin/python3
 # makes of what it is told does not depend on who runs it, and has been run; the unit tests are
 # run by the plain user of the step "readme".
 elsewhere=(--ignore=tests/attacks/client)
-for kind in hub_ dropin_ sb3 torchrl loading borrowed lane_ concurrent_ validation decoder_ slabs; do
+for kind in loading borrowed lane_ concurrent_ validation decoder_ slabs; do
   elsewhere+=("--ignore-glob=*/test_$kind*")
+done
+for kind in hub/ drop_in/ documents/test_shell; do
+  elsewhere+=("--ignore-glob=*/integration/$kind*")
 done
 
 # part NUMBER ARGUMENT...: these tests, by one process of a user of their own: some limits count what a

@@ -16,9 +16,9 @@ from tests.corpus.honest import HONEST
 
 _ENTRIES = {**HONEST, **FAULTS}
 _ELSEWHERE = {
-    "card": "test_check.py",
-    "deadline": "test_check_deadline.py",
-    "licence": "test_check.py",
+    "card": "test_findings.py",
+    "deadline": "test_deadline.py",
+    "licence": "test_findings.py",
     "limits-reached": "test_judged.py",
     "pinned": "test_check_clones.py",
     "source-ignored": "test_check_checkouts.py",

@@ -107,7 +107,7 @@ for `timeouts={"server_idle_s": 30}` seconds; 0 ends it at once. It holds no jai
 has executed a repository's code: one server at most, and a warm interpreter for each kind of policy
 that was used last, at most three (a server and one of these are three processes, whose own memory
 was 60 MB when this was written). It ends with the client at the latest, however that ends;
-`tests/integration/test_lingering.py` looks from outside.
+`tests/integration/lifecycle/test_lingering.py` looks from outside.
 
 `tests/faults/test_nothing_left.py` ends clients: by return without `close()`, exceptions,
 `sys.exit`, `os._exit`, a crash, and by SIGINT, SIGTERM, SIGHUP and SIGKILL while idle, in a step

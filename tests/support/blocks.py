@@ -26,8 +26,8 @@ PARSED = "parsed, and held against what it is about"
 SHOWN = "what is printed, or a drawing: its commands are ones that there are"
 DRAWN = "the site's build takes it, and the browser draws it"
 
-# What executes blocks of shell and Python that tests/integration/test_hub_blocks.py and its like
-# do not: by document and beginning.
+# What executes blocks of shell and Python that the tests in tests/integration/documents do not: by
+# document and beginning.
 _CONTAINERS, _LEROBOT = "tests/containers/test_documents.py", "tests/lerobot/test_pages.py"
 APART = {
     ("README.md", "python3 -m venv .venv"): ".ci/steps/readme.sh",

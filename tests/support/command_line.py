@@ -16,6 +16,23 @@ import pytest
 COMMAND = [sys.executable, "-I", "-m", "envhub_sandbox"]
 
 
+def python(
+    *arguments: str | Path, cwd: Path | None = None, code: int | None = 0, **variables: str
+) -> subprocess.CompletedProcess[str]:
+    """Run this interpreter to its end, with this exit code unless that is None."""
+    done = subprocess.run(
+        [sys.executable, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        cwd=cwd,
+        env={**os.environ, **variables},
+        timeout=600,
+        check=False,
+    )
+    assert code is None or done.returncode == code, done.stdout[-4000:] + done.stderr[-4000:]
+    return done
+
+
 def envhub(*arguments: str | Path, **variables: str) -> subprocess.CompletedProcess[str]:
     """Run the command line to its end."""
     return subprocess.run(

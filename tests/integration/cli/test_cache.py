@@ -72,18 +72,14 @@ def test_hub_repositories_are_named_as_they_are_written(
     assert not found["org/a"].answers_to("org/b@ffff")
 
 
-def test_remove_takes_only_what_is_named(stored: list[str]) -> None:
-    """By the beginning of its commit."""
-    done = RUNNER.invoke(app, ["cache", "remove", stored[1][:20]])
+@pytest.mark.parametrize(("what", "left"), [("its commit", [0, 2]), ("its age", [0, 1])])
+def test_remove_takes_only_what_is_meant(stored: list[str], what: str, left: list[int]) -> None:
+    """By the beginning of a commit, or unused for so many days."""
+    words = [stored[1][:20]] if what == "its commit" else ["--unused-for", "1.5"]
+    done = RUNNER.invoke(app, ["cache", "remove", *words])
     assert done.exit_code == 0
     assert "Removed 1 snapshot" in done.stderr
-    assert [one.commit for one in stored_snapshots()] == [stored[0], stored[2]]
-
-
-def test_remove_takes_what_nobody_used(stored: list[str]) -> None:
-    """Older than so many days."""
-    RUNNER.invoke(app, ["cache", "remove", "--unused-for", "1.5"])
-    assert [one.commit for one in stored_snapshots()] == stored[:2]
+    assert [one.commit for one in stored_snapshots()] == [stored[index] for index in left]
 
 
 def test_remove_all_forgets_descriptions_too(stored: list[str]) -> None:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
+
+from tests.support.command_line import python
 
 _MARK = "import pathlib\npathlib.Path({marker!r}).write_text('')\n"
 # what the command line and its libraries import, and Python itself has not yet
@@ -25,9 +25,7 @@ def folder(tmp_path: Path) -> Path:
 
 def ran(folder: Path, *command: str) -> tuple[int, str, set[str]]:
     """Call it in the folder: exit code, what it said, and which of the modules were executed."""
-    done = subprocess.run(
-        [sys.executable, *command], cwd=folder, capture_output=True, text=True, check=False
-    )
+    done = python(*command, cwd=folder, code=None)
     found = {path.name.removesuffix(" ran") for path in folder.parent.glob("* ran")}
     return done.returncode, done.stderr, found
 

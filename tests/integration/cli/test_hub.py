@@ -37,14 +37,6 @@ def test_a_repository_of_the_hub_runs(
     assert commit in listed.stdout.replace("\n", "")
 
 
-def test_what_the_hub_has_not_is_a_message(olah: OlahServer, hub: list[str]) -> None:
-    """With the code for files that cannot be had, and no traceback."""
-    done = envhub("run", "org/cli-missing@main", *hub)
-    assert (done.returncode, done.stdout) == (3, "")
-    assert "org/cli-missing" in done.stderr
-    assert "Traceback" not in done.stderr
-
-
 def test_ctrl_c_ends_a_download_that_hangs(hub_cache: Path) -> None:
     """A Hub that accepts connections and never answers keeps nobody."""
     with socket.create_server(("127.0.0.1", 0)) as silent:

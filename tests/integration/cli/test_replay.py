@@ -11,7 +11,7 @@ import pytest
 from envhub_sandbox import errors, make_env
 from tests.hub.olah_server import OlahServer
 from tests.support.command_line import envhub
-from tests.support.repositories import write_repository
+from tests.support.repositories import STILL, write_repository
 from tests.support.samples import sample
 
 _KWARGS = {"moment": "step", "fault": "exit"}
@@ -76,29 +76,21 @@ def test_what_cannot_be_replayed_is_refused(tmp_path: Path) -> None:
     assert "\x1b" not in refused.stderr
 
 
-_FUSE = """
+_FUSE = f"""{STILL}
 import os
-import gymnasium as gym
-import numpy as np
 
-class Fuse(gym.Env):
-    observation_space = gym.spaces.Box(0, 100, (1,))
-    action_space = gym.spaces.Discrete(2)
+class Fuse(Still):
     def __init__(self, length):
         self.left = length
-    def reset(self, *, seed=None, options=None):
-        super().reset(seed=seed)
-        return np.zeros(1, np.float32), {}
     def step(self, action):
         self.left -= 1
         if not self.left:
             os._exit(3)
-        return np.zeros(1, np.float32), 0.0, False, False, {}
+        return super().step(action)
 
 def make_env(n_envs=1, use_async_envs=False, cfg=None, tasks=("a", "b")):
-    def one():
-        return gym.vector.SyncVectorEnv([lambda: Fuse(cfg.lengths["long"][1])] * n_envs)
-    return {"fuses": {task: one() for task in tasks}}
+    kind = lambda: Fuse(cfg.lengths["long"][1])
+    return {{"fuses": {{task: vector(kind, n_envs) for task in tasks}}}}
 """
 
 
@@ -118,13 +110,8 @@ def test_a_config_and_a_task_are_found_again(tmp_path: Path) -> None:
         env = suites["fuses"]["y"]
         env.reset(seed=1)
         with pytest.raises(errors.WorkerDiedError) as caught:
-            _burn(env)
+            _ = [env.step([0]) for _ in range(10)]
     done = envhub("replay", str(caught.value.bundle), "--json")
     assert done.returncode == 0, done.stderr
     document = json.loads(done.stdout)
     assert (document["doubts"], document["replayed"]["steps"]) == ([], 5)
-
-
-def _burn(env: Any) -> None:
-    for _ in range(10):
-        env.step([0])

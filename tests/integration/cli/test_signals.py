@@ -14,24 +14,19 @@ import pytest
 
 from tests.support.command_line import COMMAND, below, gone
 from tests.support.processes import eventually
+from tests.support.repositories import STILL
 from tests.support.samples import EXAMPLES, sample
 
-_STEPPING = """
-import gymnasium as gym
-import numpy as np
+_STEPPING = f"""{STILL}
 import time
 
-class Endless(gym.Env):
-    observation_space = gym.spaces.Box(-1, 1, (1,))
-    action_space = gym.spaces.Discrete(2)
-    def reset(self, *, seed=None, options=None):
-        return np.zeros(1, np.float32), {}
+class Endless(Still):
     def step(self, action):
         time.sleep(%s)
-        return np.zeros(1, np.float32), 1.0, False, False, {}
+        return super().step(action)
 
 def make_env(n_envs=1, use_async_envs=False):
-    return gym.vector.SyncVectorEnv([Endless] * n_envs)
+    return vector(Endless, n_envs)
 """
 
 

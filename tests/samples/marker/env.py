@@ -46,7 +46,6 @@ class Workshop(gym.Env):
         self.pid = os.getpid()
         self.asset_by_file = (HERE / "assets" / "hello.txt").read_text()
         self.asset_by_cwd = Path("assets/hello.txt").read_text()
-        self.visible_variables = sorted(os.environ)
 
     def reset(self, *, seed=None, options=None):
         super().reset(seed=seed)

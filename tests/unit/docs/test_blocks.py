@@ -25,10 +25,10 @@ _SHELL = "tests/support/shell.py"
 _RUN_BY = {
     "README.md": "tests/unit/docs/test_docs.py",
     "docs/integrations.md": "tests/unit/docs/test_docs.py",
-    "docs/authors.md": "tests/integration/test_documents.py",
+    "docs/authors.md": "tests/integration/documents/test_python.py",
     "docs/deployment.md": _SHELL,
-    "docs/observing.md": "tests/integration/test_documents.py",
-    "docs/quickstart.md": "tests/integration/test_documents.py",
+    "docs/observing.md": "tests/integration/documents/test_python.py",
+    "docs/quickstart.md": "tests/integration/documents/test_python.py",
 }
 
 
@@ -153,7 +153,7 @@ def test_examples_that_pages_show_are_executed(checkout: Any) -> None:
     """A link to one that stands by itself is the example on the site; RLlib's is run by command."""
     page = (checkout / "docs" / "integrations.md").read_text()
     shown = re.findall(r"^\[examples/([\w/]+\.py)\]\(\.\./examples/\1\)$", page, re.M)
-    executed = (checkout / "tests" / "integration" / "test_dropin_examples.py").read_text()
+    executed = (checkout / "tests" / "integration" / "drop_in" / "test_examples.py").read_text()
     assert len(shown) == 4
     assert [name for name in shown if f'"{name}"' not in executed] == ["with_rllib.py"]
     assert "`python -m tests.libraries rllib`" in page

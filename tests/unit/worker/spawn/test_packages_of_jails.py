@@ -16,14 +16,14 @@ from envhub_worker.protocol.runtime import RECORD, Runtime
 from envhub_worker.spawn.jail import JailFailed, RunnerExited, RunnerStarted
 from envhub_worker.spawn.spawner import RUNNER_TARGET
 from envhub_worker.spawn.zygote_process import ZygoteProcess
-from tests.integration.confinement_kit import (
+from tests.support import inside
+from tests.support.confinement_kit import (
     Cell,
     make_snapshot,
     new_cell,
     open_folder,
     spawner_in,
 )
-from tests.support import inside
 from tests.support.environments import base_interpreter
 from tests.support.interpreter import profiles
 from tests.support.trees import fingerprint

@@ -20,7 +20,8 @@ from envhub_worker.protocol.confinement import LACKS_PACKAGES, Confinement, Limi
 from envhub_worker.protocol.runtime import Runtime
 from envhub_worker.spawn.spawner import Spawner, ZygoteDied
 from envhub_worker.spawn.zygote_process import ZygoteProcess
-from tests.integration.confinement_kit import (
+from tests.support import inside
+from tests.support.confinement_kit import (
     Cell,
     JailExited,
     RunnerExited,
@@ -32,7 +33,6 @@ from tests.integration.confinement_kit import (
     spawner_in,
     wait_until,
 )
-from tests.support import inside
 from tests.support.interpreter import profiles
 from tests.support.processes import eventually
 
@@ -309,7 +309,7 @@ with spawner_in(Path({folder!r}), confinement) as spawner:
 def test_killed_server_leaves_no_process(folder: Path, confinement: Confinement) -> None:
     """SIGKILL of the server ends zygote, init, runner and a daemon of the jail."""
     mark = str(folder / "mark")
-    kit = str(Path(__file__).parents[3] / "integration")
+    kit = str(Path(__file__).parents[3] / "support")
     daemon = DAEMON.format(mark=mark)
     profile = confinement.profile
     source = SERVER.format(kit=kit, folder=str(folder), profile=profile, daemon=daemon)

@@ -1,0 +1,1 @@
+"""``envhub check`` of whole repositories."""

@@ -1,0 +1,255 @@
+"""``envhub check --deadline``: whatever takes too long, a report says what was not judged."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import pytest
+from typer.testing import CliRunner
+
+from envhub_sandbox.cli.app import app
+from envhub_sandbox.cli.check.deadline import DeadlineReached, deadline_alarm
+from envhub_sandbox.hub.sources import parser
+from tests.hub.stub_hub import StubHub
+from tests.support.command_line import envhub
+from tests.support.processes import descendants, eventually
+from tests.support.repositories import STILL, write_repository
+from tests.support.wheels import Index
+
+_LONG_S = 3600
+"""So long that no test would wait for it."""
+_NAME = b"it-hangs"
+_ENV = f"""{STILL}
+import time
+
+hung = []
+# LOAD
+class Slow(Still):
+    def reset(self, *, seed=None, options=None):
+        # RESET
+        return super().reset(seed=seed)
+    def step(self, action):
+        # STEP
+        return super().step(action)
+    def close(self):
+        while hung:
+            time.sleep(1)
+
+def make_env(n_envs=1, use_async_envs=False):
+    return {{"a": {{0: vector(Slow, n_envs), 1: vector(Slow, n_envs)}}}}
+"""
+
+
+def judged(
+    folder: Path, *arguments: str | Path, reached: Callable[[], bool]
+) -> tuple[int, dict[str, Any]]:
+    """The exit code and the document of a check, whose alarm rings once this is reached.
+
+    Its files are left in the folder.
+    """
+    files = [f"--{kind}={folder / kind}" for kind in ("junit", "sarif", "html")]
+    words = ["check", "--json", *files, "--steps", "5", "--deadline", _LONG_S, *arguments]
+    command = [sys.executable, "-I", "-m", "envhub_sandbox", *map(str, words)]
+    with (
+        (folder / "out").open("w+") as out,
+        subprocess.Popen(command, stdout=out, stderr=subprocess.PIPE, text=True) as process,
+    ):
+        try:
+            assert eventually(lambda: reached() or process.poll() is not None)
+            process.send_signal(signal.SIGALRM)
+            _, said = process.communicate(timeout=240)
+        finally:
+            process.kill()
+        out.seek(0)
+        assert process.returncode in (1, 10), said
+        return process.returncode, json.load(out)
+
+
+def says_so(folder: Path, document: dict[str, Any], *, at: str, lacks: set[str]) -> None:
+    """Assert that each form says that it was ended, where, and what was not judged."""
+    [finding] = [one for one in document["findings"] if one["check"] == "deadline"]
+    assert document["findings"][0] == finding, "the most severe comes first"
+    assert at in finding["message"]
+    assert set(document["unjudged"]["checks"]) >= lacks
+    assert all(check in finding["message"] for check in lacks)
+    assert document["passed"] is False
+    root = ElementTree.fromstring((folder / "junit").read_text())
+    skipped = {one.attrib["name"] for one in root if one.find("skipped") is not None}
+    assert skipped >= lacks
+    assert int(root.attrib["skipped"]) == sum(one.find("skipped") is not None for one in root)
+    [run] = json.loads((folder / "sarif").read_text())["runs"]
+    assert run["invocations"] == [{"executionSuccessful": False}]
+    assert run["results"][0]["ruleId"] == "deadline"
+    assert "not judged to its end" in (folder / "html").read_text()
+
+
+def hanging(folder: Path, place: str) -> Path:
+    """A repository that hangs there and when it is closed, in a process that has a name then."""
+    hangs = f"hung.append(1); ctypes.CDLL(None).prctl(15, {_NAME!r}); time.sleep({_LONG_S})"
+    return write_repository(folder / "slow", f"import ctypes\n{_ENV.replace(f'# {place}', hangs)}")
+
+
+def hangs_now() -> bool:
+    """Whether there is a process of that name."""
+    names = [Path(f"/proc/{pid}/comm") for pid in descendants()]
+    return any(name.exists() and name.read_bytes().strip() == _NAME for name in names)
+
+
+@pytest.mark.parametrize("place", ["LOAD", "RESET", "STEP"])
+def test_a_jail_that_hangs_is_ended(place: str, tmp_path: Path) -> None:
+    """While it loads, resets or steps; nothing of it is left, and what was read is reported."""
+    folder = hanging(tmp_path, place)
+    before = descendants()
+    code, document = judged(tmp_path, folder, reached=hangs_now)
+    assert code == 10
+    at = "loading it" if place == "LOAD" else "a / 0"
+    says_so(tmp_path, document, at=at, lacks={"runs", "seeding", "leaks-memory"})
+    assert {"card", "licence"} < {one["check"] for one in document["findings"]}
+    if place != "LOAD":
+        assert document["unjudged"]["tasks"] == ["a / 0", "a / 1"]
+        assert document["confinement"]["profile"] == "strict"
+    assert eventually(lambda: descendants() <= before)
+
+
+def test_what_fails_before_the_deadline_fails(tmp_path: Path) -> None:
+    """The exit code is that of a failure: it would not pass in any time."""
+    folder = hanging(tmp_path, "STEP")
+    (folder / "other.py").write_text("text = 'a\u202eb'\n", encoding="utf-8")
+    options = ["--fail-on", "warning"]
+    code, document = judged(tmp_path, folder, *options, reached=hangs_now)
+    assert code == 1
+    fails = {one["check"] for one in document["findings"] if one["fails"]}
+    assert fails == {"deadline", "source-hidden"}
+
+
+def test_a_deadline_comes_by_itself(tmp_path: Path) -> None:
+    """Wherever it finds the judgement."""
+    folder = hanging(tmp_path, "STEP")
+    done = envhub("check", folder, "--deadline", "1", "--json")
+    assert done.returncode == 10, done.stderr
+    document = json.loads(done.stdout)
+    assert document["findings"][0]["check"] == "deadline"
+    assert "ended after 1 s, at: " in document["findings"][0]["message"]
+    assert "runs" in document["unjudged"]["checks"]
+
+
+def trickle() -> Iterator[bytes]:
+    """A body without an end."""
+    for _ in itertools.count():
+        yield b"x"
+        time.sleep(0.05)
+
+
+@pytest.mark.parametrize("how", ["no answer", "no end"])
+def test_a_download_that_hangs_is_ended(
+    how: str, stub_hub: StubHub, snapshot_store: Path, tmp_path: Path
+) -> None:
+    """A Hub that does not answer, and one whose file has no end."""
+    stub_hub.add("org/slow", {"env.py": _ENV})
+    pattern = "/api/" if how == "no answer" else r"GET .*env\.py"
+    if how == "no answer":
+        stub_hub.fail(pattern, stall=True)
+    else:
+        stub_hub.fail(pattern, 200, pieces=trickle)
+    endpoint = ["--endpoint", stub_hub.endpoint]
+    code, document = judged(
+        tmp_path,
+        "org/slow",
+        *endpoint,
+        reached=lambda: any(re.search(pattern, one) for one in stub_hub.requests),
+    )
+    assert code == 10
+    says_so(tmp_path, document, at="reading org/slow", lacks={"loads", "licence", "requirements"})
+    assert document["reference"] == "org/slow"
+
+
+def test_packages_that_do_not_come_are_ended(index: Index, tmp_path: Path) -> None:
+    """An index that does not answer."""
+    index.hold("/simple")
+    folder = write_repository(tmp_path / "slow", _ENV, requirements__txt="not-here==1\n")
+    code, document = judged(tmp_path, folder, reached=index.held)
+    assert code == 10
+    at = "reading and installing what it declares"
+    says_so(tmp_path, document, at=at, lacks={"requirements", "imports", "loads"})
+
+
+def test_a_parser_that_hangs_is_ended(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It computes nothing, so that no bound of its own ends it."""
+    program = tmp_path / "parser.py"
+    program.write_text(f"import time\ntime.sleep({_LONG_S})\n")
+    monkeypatch.setattr(parser, "__file__", str(program))
+    folder = write_repository(tmp_path / "slow", _ENV)
+    before = descendants()
+    done = CliRunner().invoke(app, ["check", str(folder), "--deadline", "2", "--json"])
+    assert done.exit_code == 10, done.output
+    checks = json.loads(done.stdout)["unjudged"]["checks"]
+    assert {"source-hidden", "loads"} < set(checks)
+    assert eventually(lambda: descendants() <= before)
+
+
+def test_one_of_a_list_says_what_was_not_judged(tmp_path: Path) -> None:
+    """Its page is kept, and the next run judges it again."""
+    folder = hanging(tmp_path, "STEP")
+    (tmp_path / "list").write_text(f"{folder}\n")
+    command = ["check", "--all", tmp_path / "list", "--output", tmp_path / "out", "--steps", "5"]
+    done = envhub(*command, "--deadline", "1")
+    assert done.returncode == 10, done.stderr
+    assert "ended after 1 s, at: " in done.stdout
+    [row] = json.loads((tmp_path / "out" / "index.json").read_text())["results"]
+    assert (row["verdict"], row["fails"]) == ("not judged", [])
+    assert "not judged to its end" in (tmp_path / "out" / row["page"]).read_text()
+    write_repository(folder, _ENV)
+    again = envhub(*command, "--deadline", "200")
+    assert json.loads((tmp_path / "out" / "index.json").read_text())["counts"]["passed"] == 1
+    assert again.returncode == 0, again.stderr
+
+
+def wait_for_ever() -> None:
+    """Until something interrupts it."""
+    threading.Event().wait(_LONG_S)
+
+
+def test_the_alarm_rings_again_and_then_never() -> None:
+    """What closes after the first is interrupted too; after the end nothing is."""
+    rung = []
+
+    def closes() -> None:
+        try:
+            wait_for_ever()
+        finally:
+            rung.append("first")
+            signal.setitimer(signal.ITIMER_REAL, 0.05, 0.05)
+            wait_for_ever()
+
+    before = signal.getsignal(signal.SIGALRM)
+    with pytest.raises(DeadlineReached), deadline_alarm(0.05):
+        closes()
+    assert rung == ["first"]
+    assert signal.getsignal(signal.SIGALRM) is before
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
+
+
+def test_an_error_of_what_was_interrupted_is_the_deadlines() -> None:
+    """And one that comes by itself is its own."""
+
+    def breaks() -> None:
+        try:
+            wait_for_ever()
+        except DeadlineReached:
+            raise OSError("it broke") from None
+
+    with pytest.raises(DeadlineReached), deadline_alarm(0.05):
+        breaks()
+    with pytest.raises(OSError, match="it broke"), deadline_alarm(_LONG_S):
+        raise OSError("it broke")

@@ -1,0 +1,327 @@
+"""``envhub check``: an honest repository passes, and each fault is told by its check alone."""
+
+from __future__ import annotations
+
+import json
+from html import unescape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from envhub_sandbox import make_env
+from envhub_sandbox.check import judge as judging
+from envhub_sandbox.check.checks import CHECKS, Severity
+from envhub_sandbox.check.findings import Report
+from envhub_sandbox.check.judge import judge
+from envhub_sandbox.check.play.pictures import png
+from envhub_sandbox.check.settings import JudgeOptions
+from envhub_sandbox.errors import SandboxUnavailableError, SnapshotError
+from tests.corpus.entries import Entry
+from tests.support import checks
+from tests.support.ci import obeyed
+from tests.support.command_line import envhub, python
+from tests.support.repositories import write_repository
+from tests.support.samples import EXAMPLES
+
+_BODY = """
+length = 10
+
+def reward(self):
+    return 1.0
+
+def render(self):
+    return np.zeros((4, 6, 3), np.uint8)
+"""
+_HONEST = Entry(group="honest", env=_BODY).source()
+_MODES = """
+    def __init__(self, render_mode):
+        self.render_mode = render_mode or "rgb_array"
+
+    def render(self):
+        given = {"ansi": ".", "rgb_array": self.frame(), "rgb_array_list": [self.frame()]}
+        return given[self.render_mode]
+
+"""
+
+
+def repository(folder: Path, text: str = _HONEST, **files: str) -> Path:
+    """A repository with its papers."""
+    papers = {"README__md": "# Walk", "LICENSE": "MIT", **files}
+    return write_repository(folder, text, **papers)
+
+
+def judged(folder: Path, steps: int = 25, **more: Any) -> Report:
+    """What is found in it."""
+    asked = JudgeOptions(reference=str(folder), arguments={"n_envs": 2}, steps=steps, **more)
+    return judge(asked)
+
+
+def test_the_page_is_the_table() -> None:
+    """To write it again: ``python -m tests.support.checks``."""
+    assert checks.DOCUMENT.read_text() == checks.document()
+
+
+def test_an_honest_repository_passes(tmp_path: Path) -> None:
+    """Every check that can be made of it holds, and the figures are of what was played."""
+    report = judged(repository(tmp_path / "walk"), pictures=True)
+    assert report.findings == []
+    unasked = set(CHECKS) - {check for check, _ in report.passed}
+    assert unasked == set(), "every check is made"
+    assert report.figures["hub_env / 0"]["steps"] == 25
+    assert report.figures["hub_env / 0"]["episodes"] == 4
+    assert report.provenance is not None
+    assert report.provenance["layers"], "it ran confined"
+    play = report.plays["hub_env / 0"]
+    assert [(one.returns, one.length) for one in play.episodes] == [((10.0,), 10)] * 4
+    assert len(play.step_s) == 25
+    assert play.played >= 9, "memory, while it was played"
+    assert len(play.memory) == play.played + 4, "and after each round of resets"
+    assert play.film is not None
+    assert play.film.stills[0] == png(np.zeros((4, 6, 3), np.uint8))
+    assert play.facts["observations"].startswith("Box(-100.0, 100.0, (2,)")
+    assert report.asked["profile"] == "strict"
+
+
+_UNINSTALLED = "raise gym.error.DependencyNotInstalled('pygame is not installed')"
+
+
+@pytest.mark.parametrize(
+    ("check", "old"),
+    [("runs", "self.count += 1"), ("runs", "super().reset(seed=seed)"), ("loads", "class Walk")],
+)
+def test_advice_follows_from_the_error(check: str, old: str, tmp_path: Path) -> None:
+    """A package that Gymnasium misses is declared, whatever was asked for when it was missed."""
+    new = f"{_UNINSTALLED}\n\n{old}" if old == "class Walk" else _UNINSTALLED
+    report = judged(repository(tmp_path / "walk", _HONEST.replace(old, new, 1)), 2, resets=0)
+    [finding] = report.findings
+    assert finding.id == check
+    assert "pygame is not installed" in finding.message
+    assert "requirements.txt" in finding.cure
+
+
+def test_each_mode_that_is_declared_is_rendered(tmp_path: Path) -> None:
+    """Where make_env takes one; an honest one passes, and who returns none of it does not."""
+    text = _HONEST.replace('"rgb_array"]', '"human", "rgb_array", "ansi", "rgb_array_list"]')
+    text = text.replace("def render(", "def frame(").replace("(n_envs", "(render_mode=None, n_envs")
+    text = text.replace("    length = 12\n", "    length = 12\n" + _MODES, 1)
+    text = text.replace("[Env] * n_envs", "[lambda: Env(render_mode)] * n_envs")
+    assert judged(repository(tmp_path / "honest", text), 2, resets=0).findings == []
+    text = text.replace('"ansi": "."', '"ansi": None').replace("[self.frame()]", "self.frame()")
+    [ansi, rgb] = judged(repository(tmp_path / "wrong", text), 2, resets=0).findings
+    assert (ansi.id, rgb.id) == ("render", "render")
+    assert {ansi.message.split(":")[0], rgb.message.split(":")[0]} == {"ansi", "rgb_array_list"}
+
+
+def test_a_space_of_its_own_is_no_finding(tmp_path: Path) -> None:
+    """Its code is not here, and so nobody here says what is in it."""
+    space = "gym.spaces.Box(-100, 100, (2,), np.float32)"
+    own = f"gym.spaces.Dict({{'at': {space}, 'word': Words()}})"
+    words = "class Words(gym.spaces.Space):\n    shape, dtype = None, None\n\nclass Walk"
+    text = _HONEST.replace(space, own).replace("class Walk", words, 1)
+    given = "np.array([self.at, self.count], np.float32)"
+    text = text.replace(given, f"{{'at': {given}, 'word': 'left'}}")
+    assert judged(repository(tmp_path / "walk", text)).findings == []
+
+
+_TRYING = """
+os = gym.vector.async_vector_env.sys.modules["os"]
+libc = gym.vector.async_vector_env.sys.modules["ctypes"].CDLL(None)
+libc.socket(2, 1, 0)
+if not os.access(os.path.join(os.sep, "srv", "walk"), 0):
+    libc.unlink(os.path.join(os.sep, "srv", "walk").encode())
+"""
+_ENDS = {
+    "loads": "raise RuntimeError('it failed')",
+    "imports": "import nothing_of_this_name",
+    "survives": "os.kill(os.getpid(), 9)",
+}
+
+
+@pytest.mark.parametrize("check", _ENDS)
+def test_what_was_tried_is_told_of_what_does_not_load(check: str, tmp_path: Path) -> None:
+    """The control is a policy that permits the one, and a file of its own for the other."""
+    text = _HONEST.replace("class Walk", f"{_TRYING}\n{_ENDS[check]}\n\nclass Walk", 1)
+    report = judged(repository(tmp_path / "walk", text))
+    assert {one.id for one in report.findings} == {check, "denied-network", "denied-files"}
+    own = text.replace('os.sep, "srv"', '"."')
+    policy = {"policy": {"network": "loopback"}}
+    asked = JudgeOptions(reference=str(repository(tmp_path / "own", own)), arguments=policy)
+    assert {one.id for one in judge(asked).findings} == {check}
+
+
+def test_what_was_tried_is_told_of_what_dies(tmp_path: Path) -> None:
+    """Whatever the policy says of restarts: no death is hidden from who judges."""
+    text = _HONEST.replace("self.count += 1", "libc.socket(2, 1, 0); os.kill(os.getpid(), 9)")
+    text = text.replace("class Walk", f"{_TRYING.partition('libc.socket')[0]}\nclass Walk", 1)
+    folder = repository(tmp_path / "walk", text)
+    policy = {"policy": {"restart": "transparent"}}
+    report = judge(JudgeOptions(reference=str(folder), arguments=policy, steps=5, resets=0))
+    assert {one.id for one in report.findings} == {"survives", "denied-network"}
+
+
+def test_an_author_does_not_say_how_he_is_judged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What he would allow himself fails, wherever one stands; the caller's own file allows it."""
+    text = _HONEST.replace("self.count += 1", "raise RuntimeError('it broke')")
+    says = "[check]\nsteps = 5\nallow = ['runs']\n"
+    folder = repository(tmp_path / "walk", text, envhub__toml=says)
+    monkeypatch.chdir(folder)
+    assert envhub("check", "env.py", "--steps", "5").returncode == 1
+    refused = envhub("check", "env.py", "--settings", "envhub.toml")
+    assert (refused.returncode, "lies in what is judged" in refused.stderr) == (2, True)
+    (tmp_path / "envhub.toml").write_text(says)
+    allowed = envhub("check", ".", "--settings", "../envhub.toml")
+    assert allowed.returncode == 0, allowed.stderr
+    (tmp_path / "envhub.toml").write_text("[check]\nallwo = ['runs']\n")
+    misspelt = envhub("check", ".", "--settings", "../envhub.toml")
+    assert (misspelt.returncode, "knows no allwo" in misspelt.stderr) == (2, True), misspelt.stderr
+
+
+def test_what_changes_meanwhile_is_not_judged(tmp_path: Path) -> None:
+    """What was read is what is played, from the first play to the last, or there is no verdict."""
+    folder = repository(tmp_path / "walk")
+    plays = []
+
+    def change(what: str) -> None:
+        plays.append(what)
+        if what == "hub_env / 0":
+            (folder / "LICENSE").write_text("another")
+
+    with pytest.raises(SnapshotError, match="changed while it was judged"):
+        judge(JudgeOptions(reference=str(folder), arguments={"n_envs": 2}, steps=5, tell=change))
+    assert "hub_env / 0" in plays
+
+
+def test_missing_papers_are_told(tmp_path: Path) -> None:
+    """Notes, which fail nothing unless one asks for it; the head of a card may name a licence."""
+    report = judged(write_repository(tmp_path / "bare", _HONEST))
+    assert {one.id for one in report.findings} == {"licence", "card"}
+    assert report.failures(Severity.ERROR) == []
+    assert len(report.failures(Severity.NOTE)) == 2
+    assert [one.id for one in report.failures(Severity.NOTE, ["card"])] == ["licence"]
+    card = "---\nlicense: mit\n---\n# Walk"
+    report = judged(write_repository(tmp_path / "card", _HONEST, README__md=card))
+    assert report.findings == []
+
+
+def test_the_command_line_judges(tmp_path: Path) -> None:
+    """Exit codes, and the reports that were asked for."""
+    good = envhub("check", EXAMPLES / "cartpole", "--steps", "20", "--json")
+    assert good.returncode == 0, good.stderr
+    assert json.loads(good.stdout)["passed"] is True
+    folder = repository(tmp_path / "walk", _HONEST.replace("self.reward()", "1 / 0"))
+    files = [f"--{kind}={tmp_path / kind}" for kind in ("junit", "sarif", "html")]
+    bad = envhub("check", folder, "--steps", "5", *files)
+    assert bad.returncode == 1, bad.stderr
+    assert "ZeroDivisionError" in bad.stdout
+    told = (tmp_path / "html").read_text()
+    assert "ZeroDivisionError" in told
+    assert "data:image/png" in told, "what fails is shown, too"
+    assert 'failures="1"' in (tmp_path / "junit").read_text()
+    [result] = json.loads((tmp_path / "sarif").read_text())["runs"][0]["results"]
+    assert result["ruleId"] == "runs"
+    policy = tmp_path / "policy.toml"
+    policy.write_text('profile = "nothing"')
+    refused = envhub("check", folder, "--policy", policy)
+    assert (refused.returncode, "'nothing'" in refused.stderr) == (2, True), refused.stderr
+    allowed = envhub("check", folder, "--steps", "5", "--allow", "runs", "--github")
+    assert allowed.returncode == 0, allowed.stderr
+    [command] = obeyed(allowed.stdout)
+    assert command.startswith("::error title=envhub check%3A runs")
+    nowhere = envhub("check", tmp_path / "nowhere")
+    assert nowhere.returncode == 3, "it could not be judged"
+
+
+def test_a_repository_gives_github_no_commands(tmp_path: Path) -> None:
+    """What it warns of and raises is printed, and nothing of it obeyed; our findings are."""
+    forged = "x\\n::error::forged\\n::stop-commands::mine\\n##[error]forged"
+    text = _HONEST.replace(
+        "import numpy as np", f"import numpy as np\nimport warnings\nwarnings.warn('{forged}')", 1
+    )
+    folder = repository(
+        tmp_path / "walk", text.replace("self.count += 1", f"raise ValueError('{forged}')")
+    )
+    done = envhub("check", folder, "--steps", "5", "--github")
+    assert done.returncode == 1, done.stderr
+    assert "forged" in done.stdout, "the control: it is there"
+    assert obeyed(done.stderr) == []
+    commands = obeyed(done.stdout)
+    assert [one.partition(" ")[0] for one in commands] == ["::error"]
+    assert commands[0].startswith("::error title=envhub check%3A runs")
+
+
+def test_a_name_that_a_terminal_would_obey_is_a_finding(tmp_path: Path) -> None:
+    """And no reason not to judge."""
+    text = _HONEST.replace(
+        "return gym.vector.SyncVectorEnv([Env] * n_envs)",
+        "return {'a\\x9b': {0: gym.vector.SyncVectorEnv([Env] * n_envs)}}",
+    )
+    report = judged(repository(tmp_path / "walk", text))
+    assert {one.id for one in report.findings} == {"loads"}
+
+
+_WITHOUT_NAMESPACES = """
+import json, os, sys
+from pathlib import Path
+from typer.testing import CliRunner
+from envhub_sandbox.cli.app import app
+from envhub_worker.lockdown.mechanisms import namespaces
+
+namespaces.enter_user_namespace(os.getuid(), os.getgid())
+namespaces.forbid_what_is_counted()
+folder = Path(sys.argv[1])
+os.environ["GITHUB_STEP_SUMMARY"] = str(folder / "summary")
+check = ["check", str(folder / "walk"), "--steps=2", "--resets=0", "--n-envs=1"]
+chosen = [*check, "--profile=no-userns"]
+told = []
+for words in (check, [*chosen, f"--html={folder / 'html'}"], [*chosen, "--github", "--json"]):
+    done = CliRunner().invoke(app, words)
+    told.append((done.exit_code, done.stdout, done.stderr))
+(folder / "told").write_text(json.dumps(told))
+"""
+
+
+def test_a_host_without_user_namespaces_is_told_of(tmp_path: Path) -> None:
+    """Nothing weaker is taken by itself; where one names it, each form says what is not there."""
+    text = _HONEST.replace('["rgb_array"]', "[]").replace('= "rgb_array"', "= None")
+    repository(tmp_path / "walk", text)
+    python("-c", _WITHOUT_NAMESPACES, tmp_path)
+    refused, shown, github = json.loads((tmp_path / "told").read_text())
+    assert refused[:2] == [6, ""], refused
+    for words in ("user.max_user_namespaces is 0", "sudo sysctl", "--profile no-userns"):
+        assert words in refused[2]
+    assert (shown[0], github[0]) == (0, 0), (shown, github)
+    told, _, rest = github[1].partition("\n{")
+    found = json.loads("{" + rest.rpartition("\n}")[0] + "}")["confinement"]
+    assert (found["asked"], found["profile"], found["recorded"]) == ("no-userns", "no-userns", True)
+    missing = {one["layer"]: one["why"] for one in found["missing"]}
+    assert {"pid-namespace", "mount-namespace"} <= set(missing)
+    without = f"without pid-namespace: {missing['pid-namespace']}"
+    page, summary = (tmp_path / "html").read_text(), (tmp_path / "summary").read_text()
+    [notice] = obeyed(github[1])
+    for text in (shown[1], page, summary, notice, told.replace(notice, "")):
+        assert "profile no-userns, as asked for" in unescape(text)
+        assert without in unescape(text)
+
+
+def test_where_recording_is_refused_it_is_judged_and_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And what was tried is no finding then, as nobody has seen it."""
+
+    def refusing(**given: Any) -> Any:
+        if given["policy"].record_denials:
+            raise SandboxUnavailableError("this host cannot enforce seccomp: no\nlistener")
+        return make_env(**given)
+
+    monkeypatch.setattr(judging, "make_env", refusing)
+    text = _HONEST.replace("class Walk", f"{_TRYING}\n\nclass Walk", 1)
+    report = judged(repository(tmp_path / "walk", text), 2, resets=0)
+    assert report.findings == []
+    assert not [check for check, _ in report.passed if check.startswith("denied-")]
+    assert report.confinement is not None
+    last = [*report.confinement.lines()][-1]
+    assert last.endswith("is not recorded: this host cannot enforce seccomp: no listener")

@@ -1,0 +1,106 @@
+"""A folder is judged as its commit is: the same files and findings, and the same code runs."""
+
+from __future__ import annotations
+
+import py_compile
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from envhub_sandbox import make_env
+from envhub_sandbox.check.checks import Severity
+from envhub_sandbox.check.findings import Report
+from envhub_sandbox.check.judge import judge
+from envhub_sandbox.check.settings import JudgeOptions
+from envhub_sandbox.hub.snapshot import snapshot_named
+from tests.hub.olah_server import GitRepository, OlahServer
+from tests.support.repositories import STILL
+
+_ENV = """
+import os, sys
+
+HERE = os.path.dirname(os.path.abspath(__file__))
+sys.path[:0] = [os.path.join(HERE, folder) for folder in {folders!r}]
+for name in {names!r}:
+    __import__(name)
+import beside
+
+class Telling(Still):
+    def reset(self, *, seed=None, options=None):
+        return super().reset(seed=seed)[0], {{"ran": ",".join(sorted(sys.ran))}}
+
+def make_env(n_envs=1, use_async_envs=False):
+    return vector(Telling, n_envs)
+"""
+_PAYLOAD = """
+import os, sys
+os.popen("true").close()
+sys.ran = [*getattr(sys, "ran", ()), __name__]
+"""
+_FOLDERS = (
+    *("lib", ".cache", ".venv", ".tox", "node_modules", ".ipynb_checkpoints", ".hg", ".svn"),
+    *(".mypy_cache", ".pytest_cache", ".ruff_cache"),
+)
+_NAMES = tuple(f"payload{number}" for number in range(len(_FOLDERS)))
+
+
+@pytest.fixture
+def hostile(olah: OlahServer, tmp_path: Path) -> tuple[GitRepository, str]:
+    """A repository with code wherever a tool would leave it out; its commit."""
+    repository = olah.repository("org/hostile-places")
+    where = repository.folder
+    files = {f"{folder}/{name}.py": _PAYLOAD for folder, name in zip(_FOLDERS, _NAMES, strict=True)}
+    files |= {"env.py": STILL + _ENV.format(folders=_FOLDERS, names=(*_NAMES, "without_source"))}
+    files |= {"lib/pyvenv.cfg": "", "beside.py": "HARMLESS = 1\n", ".gitignore": "*.pyc\n__*__\n"}
+    (where / "payload.py").write_text(_PAYLOAD)
+    (where / "__pycache__").mkdir()
+    tag = sys.implementation.cache_tag
+    for place in (f"__pycache__/beside.{tag}.pyc", "without_source.pyc"):
+        mode = py_compile.PycInvalidationMode.UNCHECKED_HASH
+        py_compile.compile(where / "payload.py", where / place, invalidation_mode=mode)
+    (where / "payload.py").unlink()
+    repository.git("add", "--force", ".")
+    (where / "data.txt").symlink_to("beside.py")
+    return repository, repository.commit(files)
+
+
+def seen(report: Report) -> set[tuple[str, str, str, int]]:
+    """What was found, and where."""
+    return {(one.id, one.message, one.file, one.line) for one in report.findings}
+
+
+def content(root: Path) -> dict[str, bytes]:
+    """Every file, and its bytes."""
+    return {str(p.relative_to(root)): p.read_bytes() for p in root.rglob("*") if p.is_file()}
+
+
+def test_a_folder_is_judged_as_its_commit(
+    hostile: tuple[GitRepository, str], olah: OlahServer, hub_cache: Path, tmp_path: Path
+) -> None:
+    """The payload runs from both, wherever it lies, and both have the same findings."""
+    repository, commit = hostile
+    repository.git("clone", "--quiet", str(repository.folder), str(tmp_path / "clone"))
+    hub: Mapping[str, Any] = {"endpoint": olah.endpoint, "hub_cache_dir": hub_cache, "token": False}
+    places = {str(tmp_path / "clone"): {}, f"org/hostile-places@{commit}": hub}
+    here, there = (content(snapshot_named(ref, **given).root) for ref, given in places.items())
+    assert here == there
+    ran, reports = [], []
+    for ref, given in places.items():
+        with make_env(ref, **given) as suites:
+            ran.append(suites.env.reset(seed=0)[1]["ran"][0])
+        asked = JudgeOptions(reference=ref, arguments={"n_envs": 1, **given}, steps=3, resets=0)
+        reports.append(judge(asked))
+    assert ran[0] == ran[1]
+    assert set(ran[0].split(",")) == {*_NAMES, "beside", "without_source"}
+    assert seen(reports[0]) == seen(reports[1])
+    for report in reports:
+        found = {one.file for one in report.findings if one.id == "source-process"}
+        assert found == {
+            f"{folder}/{name}.py" for folder, name in zip(_FOLDERS, _NAMES, strict=True)
+        }
+        failing = {one.file for one in report.failures(Severity.ERROR)}
+        tag = sys.implementation.cache_tag
+        assert failing == {f"__pycache__/beside.{tag}.pyc", "without_source.pyc"}

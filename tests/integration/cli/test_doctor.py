@@ -1,0 +1,146 @@
+"""``envhub doctor`` says what this host can enforce, and its exit code decides."""
+
+from __future__ import annotations
+
+import json
+import os
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from envhub_sandbox import __version__
+from envhub_sandbox.cli.app import app
+from envhub_sandbox.cli.doctor import doctor as doctor_command
+from envhub_sandbox.errors import SandboxUnavailableError, WorkerStartupError
+from envhub_sandbox.settings.policy import PROFILES
+from envhub_worker.lockdown.gpus import gpu_devices
+from envhub_worker.lockdown.root_plan import real_host
+
+RUNNER = CliRunner()
+
+
+def test_the_strict_profile_is_tried_for_real() -> None:
+    """On a host that runs these tests it holds, layer by layer."""
+    done = RUNNER.invoke(app, ["doctor", "--json"])
+    assert done.exit_code == 0, done.stderr
+    found = json.loads(done.stdout)
+    profiles = {one["profile"]: one for one in found["profiles"]}
+    assert tuple(profiles) == PROFILES
+    strict = profiles["strict"]
+    assert strict["available"]
+    assert strict["first_step_s"] > 0
+    assert {"seccomp", "landlock", "pid-namespace"} <= {one["layer"] for one in strict["layers"]}
+    # what a plain user runs is counted together with the rest that he runs
+    counted = set() if os.getuid() == 0 else {"user-quotas"}
+    assert {layer["layer"] for layer in strict["layers"] if not layer["enforced"]} == counted
+    # each layer by itself, so that all that are missing can be named: a jail stops at the first
+    layers = {layer["layer"]: layer for layer in found["layers"]}
+    assert {"user-namespace", "mount-namespace", "landlock", "seccomp"} <= set(layers)
+    assert layers["seccomp"]["available"]
+    assert found["gpu"] == list(gpu_devices(real_host()))
+
+
+def test_what_else_explains_a_host_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Versions, the container engine or why there is none, free memory and disk."""
+    fail_with(monkeypatch, {})
+    monkeypatch.setenv("PATH", "/nowhere")
+    found = json.loads(RUNNER.invoke(app, ["doctor", "--json"]).stdout)
+    assert found["versions"]["envhub-sandbox"] == __version__
+    assert found["versions"]["numpy"]
+    assert found["engine"]["kind"] is None
+    assert "no docker on PATH" in found["engine"]["problem"]
+    assert found["free_memory_bytes"] > 0
+    assert found["disk"]["free_bytes"] > 0
+
+
+def test_all_missing_layers_are_named_with_their_fixes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two are missing: both are told, and the profile for AppArmor is printed as it is."""
+    layers = [
+        {"layer": "user-namespace", "available": False, "detail": "denied", "fix": "sysctl -w x=1"},
+        {"layer": "landlock", "available": False, "detail": "none\x1b[2J", "fix": "Linux 5.13"},
+        {"layer": "seccomp", "available": True, "detail": "", "fix": ""},
+    ]
+    profile = "profile x [/usr/bin/python3] { userns, }"
+    probed = {"layers": layers, "apparmor_profile": profile, "gpu": ["/dev/dri/\x1b[2J"]}
+    monkeypatch.setattr(doctor_command, "probe", lambda: probed)
+    fail_with(monkeypatch, {})
+    printed = RUNNER.invoke(app, ["doctor"]).stdout
+    assert "  user-namespace: denied\n    sysctl -w x=1\n" in printed
+    assert "  landlock: none\\x1b[2J\n    Linux 5.13\n" in printed
+    assert "  seccomp" not in printed
+    assert profile in printed
+    assert "GPU: /dev/dri/\\x1b[2J\n" in printed
+
+
+def fail_with(monkeypatch: pytest.MonkeyPatch, errors: dict[str, Exception]) -> None:
+    """Have ``make_env`` fail for some profiles, and the others not be tried."""
+
+    def make_env(folder: str, *, policy: dict[str, Any]) -> Any:
+        raise errors.get(policy["profile"], SandboxUnavailableError("not this either"))
+
+    monkeypatch.setattr("envhub_sandbox.factory.make_env.make_env", make_env)
+
+
+def test_what_is_missing_comes_with_its_fix(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the words of the layer, escaped, with the exit code for it."""
+    text = "this host cannot enforce user-namespace: \x1b[2J\nsysctl -w x=1"
+    fail_with(monkeypatch, {"strict": SandboxUnavailableError(text)})
+    done = RUNNER.invoke(app, ["doctor"])
+    assert done.exit_code == 6
+    assert "strict: not available here" in done.stdout
+    assert "  this host cannot enforce user-namespace: \\x1b[2J\n  sysctl -w x=1\n" in done.stdout
+
+
+def test_the_chosen_profile_decides(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever the others came to."""
+    fail_with(monkeypatch, {"container": WorkerStartupError("it did not come up")})
+    assert RUNNER.invoke(app, ["doctor", "--profile", "container"]).exit_code == 5
+    assert RUNNER.invoke(app, ["doctor", "--profile", "no-userns"]).exit_code == 6
+
+
+def test_an_unknown_profile_is_usage() -> None:
+    """Before anything is tried."""
+    done = RUNNER.invoke(app, ["doctor", "--profile", "lax"])
+    assert (done.exit_code, done.stdout) == (2, "")
+    assert "strict, no-userns, container" in done.stderr
+
+
+def test_a_cache_that_cannot_be_used_hides_no_layer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The layers are tried with a cache of its own, and what is wrong with the caller's is said."""
+    monkeypatch.setenv("ENVHUB_CACHE", "/dev/null/none")
+    done = RUNNER.invoke(app, ["doctor"])
+    assert "strict: available" in done.stdout
+    assert "The cache: /dev/null/none cannot be written: set ENVHUB_CACHE to another" in done.stdout
+    assert done.exit_code == 3
+    assert os.environ["ENVHUB_CACHE"] == "/dev/null/none"
+
+
+def test_a_user_without_a_home_is_told_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As any container's user may be."""
+
+    def none(*_: object, **__: object) -> str:
+        raise RuntimeError("could not determine the home directory")
+
+    fail_with(monkeypatch, {})
+    monkeypatch.delenv("ENVHUB_CACHE", raising=False)
+    monkeypatch.setattr("platformdirs.user_cache_dir", none)
+    assert "set ENVHUB_CACHE to a folder" in RUNNER.invoke(app, ["doctor"]).stdout
+    disk = json.loads(RUNNER.invoke(app, ["doctor", "--json"]).stdout)["disk"]
+    assert disk["folder"] is None
+    assert "no home" in disk["problem"]
+
+
+@pytest.mark.parametrize(("command", "code"), [("doctor", 6), ("cache gc --dry-run", 0)])
+def test_nothing_can_be_written(command: str, code: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In a read-only container there is no place for temporary files, and nothing is left there."""
+
+    def none() -> str:
+        raise FileNotFoundError(2, "No usable temporary directory found")
+
+    monkeypatch.setattr("tempfile.gettempdir", none)
+    monkeypatch.setenv("PATH", "/nowhere")
+    done = RUNNER.invoke(app, command.split())
+    assert done.exit_code == code
+    assert "bug" not in done.stderr
+    assert ("--tmpfs /tmp" in done.stderr) is (command == "doctor")

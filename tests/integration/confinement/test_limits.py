@@ -1,0 +1,286 @@
+"""Each limit of a jail stops what it names; the same source without a jail goes through."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import pytest
+
+from envhub_worker.lockdown.limits import cgroups
+from envhub_worker.protocol.confinement import MIB, Confinement, Limits
+from tests.support.confinement_kit import (
+    Cell,
+    RunnerExited,
+    RunnerStarted,
+    cell_in,
+    new_cell,
+    open_folder,
+    unconfined,
+)
+from tests.support.interpreter import needs, profiles
+
+MEMORY = 300 * MIB
+BOMB = 700 * MIB
+
+HEAP = f"b = bytearray({BOMB}); b[::4096] = b'x' * len(b[::4096]); result = 'filled'"
+SHARED = f"import mmap; m = mmap.mmap(-1, {BOMB}); m.write(bytes({BOMB})); result = 'filled'"
+MEMFD = f"""
+import os
+fd = os.memfd_create("bomb")
+for _ in range({BOMB // MIB}):
+    os.write(fd, bytes({MIB}))
+result = "filled"
+"""
+SYSTEM_V = f"""
+import ctypes
+libc = ctypes.CDLL(None, use_errno=True)
+libc.shmat.restype = ctypes.c_void_p
+key = libc.shmget(0, ctypes.c_size_t({BOMB}), 0o1600)
+if key < 0:
+    raise OSError(ctypes.get_errno(), "shmget")
+place = libc.shmat(key, None, 0)
+libc.shmctl(key, 0, None)
+ctypes.memset(place, 1, {BOMB})
+result = "filled"
+"""
+ABSENT = {SYSTEM_V: "OSError"}
+"""What no jail has."""
+UNMEASURABLE = {SHARED: "PermissionError", MEMFD: "OSError"}
+"""What cannot be had where init measures memory: it could be kept out of its sight."""
+MANY_PROCESSES = f"""
+import os, time
+for _ in range(7):
+    if os.fork() == 0:
+        b = bytearray({BOMB // 7}); b[::4096] = b'x' * len(b[::4096])
+        time.sleep(1000)
+time.sleep(1000)
+"""
+
+
+@contextmanager
+def limited(profile: str, **limits: int) -> Iterator[Cell]:
+    """A cell under ``limits``."""
+    confinement = Confinement(profile=profile, limits=Limits(**limits))
+    with open_folder() as folder, cell_in(folder, confinement) as cell:
+        cell.wait_for(RunnerStarted)
+        yield cell
+
+
+@pytest.fixture(params=profiles("strict", "no-userns"))
+def profile(request: pytest.FixtureRequest) -> str:
+    """Both ways to hold a jail."""
+    return str(request.param)
+
+
+@pytest.fixture(params=["cgroup", "watchdog"])
+def counted(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Who counts memory."""
+    if request.param == "watchdog":
+        monkeypatch.setattr(cgroups, "discover", lambda: None)
+    elif cgroups.discover() is None:
+        pytest.skip("this user may not make control groups")
+    return str(request.param)
+
+
+@pytest.mark.parametrize(
+    "bomb",
+    [HEAP, SHARED, MEMFD, SYSTEM_V],
+    ids=["heap", "shared-anonymous", "memfd", "system-v"],
+)
+def test_memory_bomb_ends_the_runner(bomb: str, profile: str, counted: str) -> None:
+    """Every kind of memory counts, or cannot be had: the runner ends as out of memory and knows."""
+    assert unconfined(bomb) == {"result": "filled"}
+    refused = ABSENT | (UNMEASURABLE if counted == "watchdog" else {})
+    with limited(profile, memory_bytes=MEMORY) as cell:
+        answer = cell.run(bomb)
+        if bomb in refused:
+            assert answer["error"] == refused[bomb]
+            return
+        assert answer == {"error": "the runner has gone"}
+        exited = cell.wait_for(RunnerExited)
+        assert exited.reason == "out-of-memory"
+        assert exited.detail
+
+
+def test_memory_of_all_processes_counts_together(profile: str, counted: str) -> None:
+    """Seven children that are each below the limit are over it together."""
+    with limited(profile, memory_bytes=MEMORY) as cell:
+        assert cell.run(MANY_PROCESSES) == {"error": "the runner has gone"}
+        assert cell.wait_for(RunnerExited).reason in ("out-of-memory", "signal")
+
+
+SHARED_BY_FORKS = """
+import os, time
+b = bytearray(150 * 2**20); b[::4096] = b'x' * len(b[::4096])
+for _ in range(4):
+    if os.fork() == 0:
+        time.sleep(1000)
+time.sleep(2)
+result = "alive"
+"""
+
+
+def test_memory_that_forks_share_counts_once(counted: str) -> None:
+    """Children that only share their parent's pages do not add up."""
+    with limited("strict", memory_bytes=MEMORY) as cell:
+        assert cell.run(SHARED_BY_FORKS) == {"result": "alive"}
+
+
+FORKS = """
+import os, time
+children = 0
+try:
+    while children < 300:
+        if os.fork() == 0:
+            time.sleep(1000)
+        children += 1
+except OSError as error:
+    result = [children, error.errno]
+else:
+    result = [children, 0]
+"""
+
+
+def test_fork_bomb_stops_at_the_limit(profile: str) -> None:
+    """A jail has as many processes as it may, and not one more.
+
+    Without a user namespace the kernel counts the user's other processes too.
+    """
+    with limited(profile, processes=60) as cell:
+        children, errno = cell.run(FORKS)["result"]
+        assert errno
+        assert children == 59 if profile == "strict" else children < 200  # and the runner
+
+
+def test_jails_of_one_zygote_do_not_share_the_process_limit() -> None:
+    """Another jail forks on while the first is at its limit."""
+    confinement = Confinement(limits=Limits(processes=60))
+    with open_folder() as folder, cell_in(folder, confinement) as first:
+        assert first.run(FORKS)["result"][1]
+        second = new_cell(first.spawner, first.jail.spec.snapshot, confinement)
+        second.start()
+        assert second.run("import os\npid = os.fork()\nif not pid: os._exit(3)\nresult = 1") == {
+            "result": 1
+        }
+
+
+FILL = """
+import os
+written = 0
+try:
+    with open(os.path.join({folder}, "big"), "wb") as file:
+        for _ in range({mib}):
+            file.write(bytes(2**20)); file.flush(); written += 1
+except OSError as error:
+    result = [written, error.errno]
+else:
+    result = [written, 0]
+"""
+HOME = "os.path.expanduser('~')"
+SCRATCH = [HOME, "os.environ['TMPDIR']", "os.getcwd()", "'/dev/shm'"]
+
+
+INODES = """
+import os
+written = 0
+try:
+    while written < 3000:
+        open(os.path.expanduser(f"~/{written}"), "w").close(); written += 1
+except OSError as error:
+    result = [written, error.errno]
+else:
+    result = [written, 0]
+"""
+ONE_FILE = FILL.format(folder=HOME, mib=5)
+QUOTAS = [
+    *(({"disk_bytes": 20 * MIB}, FILL.format(folder=one, mib=40), 10, 20) for one in SCRATCH),
+    ({"disk_files": 1000}, INODES, 801, 999),
+    ({"file_bytes": 3 * MIB}, ONE_FILE, 3, 3),
+]
+
+
+@pytest.mark.parametrize(
+    ("limits", "source", "least", "most"), QUOTAS, ids=[*SCRATCH, "empty files", "one file"]
+)
+def test_disk_fill_stops_at_the_quota(
+    limits: dict[str, int], source: str, least: int, most: int
+) -> None:
+    """Home, temporary files, work and shared memory have one; empty files count, and the size."""
+    with limited("strict", **limits) as cell:
+        written, errno = cell.run(source)["result"]
+        assert least <= written <= most
+        assert errno
+
+
+def test_scratch_folders_share_one_quota() -> None:
+    """What home took, temporary files have not."""
+    with limited("strict", disk_bytes=20 * MIB, file_bytes=12 * MIB) as cell:
+        cell.run(FILL.format(folder=HOME, mib=12))
+        written, errno = cell.run(FILL.format(folder="'/tmp'", mib=12))["result"]
+        assert written < 10
+        assert errno
+
+
+@needs("no-userns")
+def test_disk_fill_ends_the_runner_without_a_mount_namespace() -> None:
+    """There is no quota there; init counts and ends the runner."""
+    source = FILL.format(folder=HOME, mib=15) + "\nimport time\n"
+    more = source.replace('"big"', '"more"') + "time.sleep(1000)"
+    with limited("no-userns", disk_bytes=20 * MIB) as cell:
+        assert cell.run(source) == {"result": [15, 0]}
+        assert cell.run(more) == {"error": "the runner has gone"}
+        assert cell.wait_for(RunnerExited).reason == "disk-limit"
+
+
+def test_open_files_stop_at_the_limit(profile: str) -> None:
+    """One process holds as many descriptors as it may."""
+    source = """
+files = []
+try:
+    while len(files) < 500:
+        files.append(open("/dev/null"))
+except OSError as error:
+    result = len(files)
+"""
+    with limited(profile, open_files=100) as cell:
+        assert 80 < cell.run(source)["result"] < 100
+
+
+def test_cpu_time_of_children_does_not_outlast_the_limit(profile: str) -> None:
+    """A child has the limit too: a spinning one is ended by the kernel."""
+    source = """
+import os, signal
+pid = os.fork()
+if not pid:
+    signal.signal(signal.SIGXCPU, signal.SIG_IGN)
+    while True: pass
+_, status = os.waitpid(pid, 0)
+result = os.WTERMSIG(status)
+"""
+    with limited(profile, cpu_time_s=1) as cell:
+        assert cell.run(source) == {"result": 9}
+
+
+def test_limits_cannot_be_raised_again(profile: str) -> None:
+    """A runner is no more able to than any other process without privilege."""
+    source = """
+import resource
+soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+resource.setrlimit(resource.RLIMIT_NOFILE, (hard + 1, hard + 1))
+"""
+    with limited(profile) as cell:
+        assert cell.run(source)["error"] == "ValueError"
+
+
+def test_output_flood_does_not_block_the_runner(profile: str) -> None:
+    """Whoever reads the pipe keeps what it wants; the runner writes on."""
+    with limited(profile) as cell:
+        flood = "import os\nfor _ in range(64): os.write(1, b'x' * 65536)\nresult = 'done'"
+        stream = cell.streams[1]
+        stream.write(json.dumps(flood) + "\n")
+        stream.flush()
+        while len(cell.output) < 64 * 65536:
+            cell.pump()
+        assert json.loads(stream.readline()) == {"result": "done"}

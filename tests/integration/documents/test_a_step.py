@@ -1,0 +1,93 @@
+"""The pages for those who work on it are true: which files a step runs, and what a trace prints."""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+from types import FrameType
+
+import numpy as np
+import pytest
+
+import envhub_sandbox
+import envhub_worker
+from envhub_sandbox import make_env
+from envhub_worker.protocol import messages as m
+from tests.support.command_line import python
+from tests.support.runner_here import RunnerHere
+from tests.support.samples import SAMPLES
+
+ACTIONS = np.zeros(2, np.int64)
+PLAY = f"""
+import numpy as np
+from envhub_sandbox import make_env
+with make_env({str(SAMPLES / "cartpole")!r}, n_envs=2, lane=LANE) as suites:
+    suites.env.reset(seed=0)
+    suites.env.step(np.zeros(2, np.int64))
+"""
+
+
+def test_the_page_lists_the_files_of_a_step(checkout: Path) -> None:
+    """All that each step runs; and no file that there is not."""
+    page = (checkout / "docs" / "internals" / "a-step.md").read_text()
+    listed = set(re.findall(r"^\| `([^`]+\.py)`", page, re.MULTILINE))
+    assert [one for one in listed if not (checkout / one).is_file()] == []
+    roots = [Path(one.__file__ or "").parent for one in (envhub_sandbox, envhub_worker)]
+    steps: list[set[str]] = []
+
+    def note(frame: FrameType, event: str, _: object) -> None:
+        path = Path(frame.f_code.co_filename)
+        for root, prefix in zip(roots, ("", "worker/"), strict=True):
+            if event == "call" and path.is_relative_to(root):
+                steps[-1].add(f"{prefix}{path.relative_to(root.parent)}")
+
+    with make_env(str(SAMPLES / "cartpole"), n_envs=2, num_workers=1) as suites:
+        env = suites.env
+        env.reset(seed=0)
+        for _ in range(20):
+            steps.append(set())
+            sys.setprofile(note)
+            try:
+                env.step(ACTIONS)
+            finally:
+                sys.setprofile(None)
+    always = set.intersection(*steps)
+    assert "envhub_sandbox/session/requests.py" in always
+    assert always <= listed
+
+
+@pytest.mark.parametrize(
+    ("lane", "step"),
+    [
+        ("auto", "> SharedMemoryLane.send_step\n< SharedMemoryLane.wait"),
+        ("frames", "> RelayLane.send_step\n> WorkerConnection.send Relay step"),
+    ],
+)
+def test_a_trace_names_each_message(lane: str, step: str) -> None:
+    """On stderr, in their order; and without the variable nothing."""
+    program = ("-c", f"LANE = {lane!r}{PLAY}")
+    traced = python(*program, ENVHUB_TRACE="1")
+    lines = [re.sub(r"^\+\d+\.\d{6} MainThread ", "", line) for line in traced.stderr.splitlines()]
+    said = "\n".join(re.sub(r" \([\d.]+ ms\)$", "", line) for line in lines)
+    order = [
+        "> WorkerConnection.send Hello",
+        "< WorkerConnection.receive JailOpened",
+        step,
+        "CloseJail",
+    ]
+    assert said == re.sub(r"[^\x20-\x7e\n]", "", said)
+    assert [said.index(one) for one in order] == sorted(said.index(one) for one in order)
+    assert python(*program).stderr == ""
+
+
+def test_a_runner_runs_here_for_a_debugger() -> None:
+    """Without a jail, so that a breakpoint in it is met; the results are the same."""
+    runner = RunnerHere(SAMPLES / "cartpole")
+    runner.ask(m.Reset(1, [0, 1], None, None))
+    done = runner.ask(m.Step(1, ACTIONS))
+    with make_env(str(SAMPLES / "cartpole"), n_envs=2) as suites:
+        suites.env.reset(seed=0)
+        observation, *_ = suites.env.step(ACTIONS)
+    assert isinstance(done, m.StepDone)
+    assert np.array_equal(np.asarray(done.observation), observation)

@@ -1,0 +1,68 @@
+"""The Python of the documents does what they say, where it needs more than a repository here."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+from tests.support import blocks
+from tests.support.command_line import python
+from tests.support.samples import EXAMPLES
+
+# No block may take a port that another program has.
+_ANY_PORT = """
+import prometheus_client
+_start = prometheus_client.start_http_server
+prometheus_client.start_http_server = lambda port: _start(0, addr="127.0.0.1")
+"""
+_IMPORTED = "from envhub_sandbox import make_env\n"
+_TAKES_A_SIZE = """
+import gymnasium as gym
+
+
+def make_env(n_envs=1, use_async_envs=False, size=4):
+    assert size == 8
+    return gym.vector.SyncVectorEnv([lambda: gym.make("CartPole-v1")] * n_envs)
+"""
+
+
+def run(arguments: list[str], folder: Path) -> None:
+    """A program in a folder that has what the documents talk about."""
+    here = folder / "here"
+    shutil.copytree(EXAMPLES / "cartpole", here, dirs_exist_ok=True)
+    shutil.copytree(EXAMPLES / "cartpole", here / "my-env")
+    (here / "examples").mkdir()
+    shutil.copytree(EXAMPLES / "cartpole", here / "examples" / "cartpole")
+    python(*arguments, cwd=here, ENVHUB_CACHE=str(folder / "cache"))
+
+
+def python_of(document: str) -> list[str]:
+    """Its blocks that are executed, without those that are tests for pytest."""
+    there = [one for one in blocks.tested(blocks.RUN) if one.document == document]
+    texts = [one.text for one in there if one.language == "python"]
+    return [text for text in texts if "import pytest" not in text]
+
+
+@pytest.mark.parametrize("document", ["docs/observing.md", "docs/authors.md", "docs/quickstart.md"])
+def test_the_python_of_a_document_runs(document: str, tmp_path: Path) -> None:
+    """All of its blocks, one after the other."""
+    text = _IMPORTED + "\n".join(python_of(document))
+    if "prometheus_client" in text:
+        pytest.importorskip("prometheus_client")
+        text = _ANY_PORT + text
+    assert text != _IMPORTED
+    run(["-c", text], tmp_path)
+
+
+def test_the_test_of_an_author_passes(tmp_path: Path) -> None:
+    """The block of docs/authors.md that is one for pytest, as its next block runs it."""
+    [text] = [one.text for one in blocks.tested(blocks.RUN) if "import pytest" in one.text]
+    repository, test = tmp_path / "repository", tmp_path / "test_it.py"
+    repository.mkdir()
+    (repository / "env.py").write_text(_TAKES_A_SIZE)
+    test.write_text(text)
+    arguments = ["-p", "no:cacheprovider", "-c", os.devnull, "--rootdir", str(tmp_path)]
+    run(["-m", "pytest", *arguments, "--envhub-ref", str(repository), str(test)], tmp_path)

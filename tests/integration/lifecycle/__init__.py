@@ -1,0 +1,1 @@
+"""How servers and jails start, stay, are interrupted and end."""

@@ -1,0 +1,189 @@
+"""The worker server stays a while when the last environment is closed, and never outlives us."""
+
+from __future__ import annotations
+
+import os
+import threading
+from pathlib import Path
+
+import psutil
+import pytest
+
+from envhub_sandbox import make_env
+from envhub_sandbox.sandboxes.pool import stop_idle
+from tests.faults.clients import finish, is_clean, left, line, start
+from tests.faults.traces import temporary_root
+from tests.support.processes import descendants, eventually
+from tests.support.samples import sample
+
+_ONLY_SERVER = 3  # the server, and its zygote's two
+
+
+_BEFORE: set[int] = set()
+"""What ran below this process before the test: other tests' Hubs, say."""
+
+
+@pytest.fixture(autouse=True)
+def _known() -> None:
+    """Its manifest is remembered, and no server is there, when a test begins."""
+    with make_env(sample("counter"), n_envs=2, timeouts={"server_idle_s": 0}):
+        pass
+    stop_idle()
+    assert eventually(lambda: not _servers())
+    _BEFORE.clear()
+    _BEFORE.update(descendants())
+
+
+def started() -> set[int]:
+    """Pids of everything below this process that a test has started."""
+    return descendants() - _BEFORE
+
+
+def used(server_idle_s: float | None, **options: object) -> None:
+    """One environment, from its making to its end."""
+    timeouts = {"server_idle_s": server_idle_s}
+    with make_env(sample("counter"), n_envs=2, timeouts=timeouts, **options) as suites:  # type: ignore[arg-type]
+        suites.env.reset(seed=0)
+
+
+def _servers() -> set[int]:
+    """Pids of this process's worker servers, by the system's word."""
+    found = set()
+    for child in psutil.Process().children():
+        try:
+            if "serve" in child.cmdline() and child.status() != psutil.STATUS_ZOMBIE:
+                found.add(child.pid)
+        except psutil.NoSuchProcess:
+            continue
+    return found
+
+
+def test_the_next_environment_finds_the_same_server() -> None:
+    """After the first was closed: the same process, with no jail in it in between."""
+    used(600)
+    assert eventually(lambda: len(started()) == _ONLY_SERVER)
+    [server] = _servers()
+    used(600)
+    assert _servers() == {server}
+    assert eventually(lambda: len(started()) == _ONLY_SERVER)
+    stop_idle()
+    assert not started()
+
+
+def test_it_goes_when_its_time_has_come() -> None:
+    """With everything below it, and by itself."""
+    used(0.3)
+    assert eventually(lambda: not started())
+    used(600)
+    assert _servers()
+    stop_idle()
+
+
+def test_with_no_time_it_ends_with_the_last_environment() -> None:
+    """And every environment gets a server of its own."""
+    used(0)
+    assert not started()
+
+
+def test_a_suite_that_is_not_closed_holds_it() -> None:
+    """Between two of its tasks, for longer than a server lingers; the last close lets it go."""
+    tasks = {"tasks": 3}
+    with make_env(sample("many_tasks"), env_kwargs=tasks):
+        pass
+    stop_idle()
+    timeouts = {"server_idle_s": 0.05}
+    suites = make_env(sample("many_tasks"), env_kwargs=tasks, timeouts=timeouts)
+    first, second, third = suites["rooms"].values()
+    first.reset()
+    [server] = _servers()
+    first.close()
+    assert not eventually(lambda: not _servers(), 1.0)  # twenty times what it would linger
+    second.reset()
+    assert _servers() == {server}
+    second.close()
+    third.close()
+    assert eventually(lambda: not started())
+    suites.close()
+
+
+def test_a_hundred_times_open_and_closed_leaves_one_server_and_nothing_else() -> None:
+    """No thread, no descriptor, no process more than after the first time."""
+    used(600)
+    [server] = _servers()
+    process = psutil.Process(server)
+    assert eventually(lambda: len(started()) == _ONLY_SERVER)
+    ours, its = _descriptors(os.getpid()), process.num_fds()
+    threads = threading.active_count()
+    for _ in range(100):
+        used(600)
+    assert _servers() == {server}
+    assert eventually(lambda: threading.active_count() <= threads)
+    assert eventually(lambda: _descriptors(os.getpid()) <= ours)
+    assert eventually(lambda: process.num_fds() <= its)
+    assert eventually(lambda: len(started()) == _ONLY_SERVER)
+    stop_idle()
+
+
+def test_ever_new_policies_do_not_fill_it_with_zygotes(tmp_path: Path) -> None:
+    """Each kind of policy has a warm interpreter; of those without a jail few stay."""
+    for number in range(6):
+        folder = tmp_path / str(number)
+        folder.mkdir()
+        used(600, policy={"readable": (str(folder),)})
+    # two that were there already, the last one, and the server
+    assert eventually(lambda: len(started()) <= 1 + 3 * (_ONLY_SERVER - 1))
+    stop_idle()
+
+
+ENDS = {
+    "returns": "",
+    "raises": "raise KeyError('mine')",
+    "sys.exit": "sys.exit(3)",
+    "os._exit": "os._exit(4)",
+    "kills itself": "os.kill(os.getpid(), signal.SIGKILL)",
+    "exits in a fork, too": "if os.fork() == 0:\n    sys.exit(0)\nos.wait()",
+}
+
+
+@pytest.mark.parametrize("how", ENDS)
+def test_it_never_outlives_its_client(how: str) -> None:
+    """However that ends, at once: it has ten minutes left, and nobody waits for them."""
+    with temporary_root() as folder:
+        client = start(
+            folder,
+            f"""
+suites = made(timeouts={{"server_idle_s": 600}})
+suites.close()
+import psutil
+while len(psutil.Process().children(recursive=True)) != {_ONLY_SERVER}:
+    time.sleep(0.05)
+say("lingers")
+{ENDS[how]}
+""",
+        )
+        assert line(client) == "lingers"
+        said = finish(client)
+        assert "Exception ignored" not in said
+        assert is_clean(folder), left(folder)
+
+
+def test_a_run_of_the_command_line_does_not_wait_for_it() -> None:
+    """``envhub run`` ends with its last line, and its server with it."""
+    with temporary_root() as folder:
+        client = start(
+            folder,
+            """
+            from envhub_sandbox import Timeouts
+            from envhub_sandbox.cli import main
+            Timeouts.__init__.__kwdefaults__["server_idle_s"] = 600
+            sys.argv = ["envhub", "run", REPOSITORY, "--steps", "3"]
+            main()
+            """,
+        )
+        finish(client)  # long before a server would have ended by itself
+        assert client.returncode == 0
+        assert is_clean(folder), left(folder)
+
+
+def _descriptors(pid: int) -> int:
+    return len(os.listdir(f"/proc/{pid}/fd"))

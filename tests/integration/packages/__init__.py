@@ -1,0 +1,1 @@
+"""The packages that a repository declares: resolved, built, locked."""

@@ -1,0 +1,156 @@
+"""``make_env(lock=)``, ``envhub lock``, ``envhub verify``: what was locked runs, and only that."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from envhub_sandbox import make_env
+from envhub_sandbox.cli.app import app
+from envhub_sandbox.dependencies import resolutions
+from envhub_sandbox.errors import LockDriftError, LockError, PackageIntegrityError, PolicyError
+from tests.support.repositories import importing, write_repository
+from tests.support.wheels import Index, make_wheel
+
+RUNNER = CliRunner()
+ENV = importing("not_here", version="not_here.VERSION")
+
+
+@pytest.fixture(scope="module")
+def packages(real_index: Index) -> Index:
+    """An index with a package that is not installed here."""
+    make_wheel(real_index.folder, "not-here", "1.0")
+    return real_index
+
+
+@pytest.fixture
+def folder(packages: Index, tmp_path: Path) -> Path:
+    """A repository that needs it."""
+    return Path(write_repository(tmp_path / "repo", ENV, requirements__txt="not-here\n"))
+
+
+def lock(folder: Path, *options: str, code: int = 0) -> dict[str, Any]:
+    """Lock it, beside itself."""
+    arguments = ["lock", str(folder), "-o", str(path_of(folder)), "--json", *options]
+    done = RUNNER.invoke(app, arguments)
+    assert done.exit_code == code, done.output
+    return dict(json.loads(done.stdout)) if code == 0 else {"said": done.output}
+
+
+def path_of(folder: Path) -> Path:
+    """Where its lock is."""
+    return folder.parent / "pylock.repo.toml"
+
+
+def verify(folder: Path, *options: str, code: int) -> str:
+    """What ``envhub verify`` says."""
+    done = RUNNER.invoke(app, ["verify", str(path_of(folder)), str(folder), *options])
+    assert done.exit_code == code, done.output
+    return " ".join(done.output.split())
+
+
+def test_what_was_locked_runs_whatever_is_newer(packages: Index, folder: Path) -> None:
+    """Although the choice was forgotten, and the index has another by now."""
+    told = lock(folder)
+    assert "not-here==1.0" in told["packages"]
+    make_wheel(packages.folder, "not-here", "2.0")
+    shutil.rmtree(resolutions.root())
+    try:
+        with make_env(folder, lock=path_of(folder)) as suites:
+            assert suites.env.call("version") == ("1.0",)
+            assert "not-here==1.0" in suites.provenance["installed"]["packages"]
+        assert "as it was locked" in verify(folder, code=0)
+        assert "envhub lock --upgrade" in lock(folder, code=2)["said"]
+        changes = lock(folder, "--upgrade", "--no-spaces")["changes"]
+        assert changes == ["package not-here: 1.0 was locked, this is 2.0"]
+    finally:
+        (packages.folder / "not_here-2.0-py3-none-any.whl").unlink()
+        shutil.rmtree(resolutions.root())
+
+
+def test_a_file_that_changed_is_refused(folder: Path) -> None:
+    """Before anything is started; by the file's name."""
+    lock(folder, "--no-spaces")
+    (folder / "env.py").write_text(ENV + "\n# changed\n")
+    with pytest.raises(LockDriftError, match=r"file env\.py: other content") as caught:
+        make_env(folder, lock=path_of(folder))
+    assert str(caught.value).startswith(f"{folder}:env.py: ")
+    assert any(line.startswith("commit: local-") for line in caught.value.drifts)
+    assert "file env.py: other content" in verify(folder, code=7)
+
+
+def test_spaces_that_changed_are_refused(folder: Path) -> None:
+    """Of the same arguments: other arguments may make other environments."""
+    lock(folder)
+    text = path_of(folder).read_text()
+    before, _, after = text.partition('spaces = "sha256:')
+    path_of(folder).write_text(f'{before}spaces = "sha256:{"0" * 64}{after[64:]}')
+    with pytest.raises(LockDriftError, match="environment hub_env/0"):
+        make_env(folder, lock=path_of(folder))
+    assert "environment hub_env/0" in verify(folder, code=7)
+    assert "as it was locked" in verify(folder, "--no-spaces", code=0)
+    with make_env(folder, lock=path_of(folder), env_kwargs={"name": "Acrobot-v1"}) as suites:
+        assert suites.env.single_action_space.n == 3
+
+
+def test_another_python_is_refused(folder: Path) -> None:
+    """By implementation and machine; one that is not here is none to run in."""
+    lock(folder, "--no-spaces")
+    text = path_of(folder).read_text()
+    path_of(folder).write_text(text.replace('implementation = "cpython"', 'implementation = "x"'))
+    with pytest.raises(LockDriftError, match=r"Python: x 3\.\d+ on"):
+        make_env(folder, lock=path_of(folder))
+
+
+def test_a_package_that_was_replaced_is_refused(
+    packages: Index, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its version is there, its file is another; nothing of it is kept."""
+    lock(folder, "--no-spaces")
+    wheel = packages.folder / "not_here-1.0-py3-none-any.whl"
+    before = wheel.read_bytes()
+    monkeypatch.setenv("UV_CACHE_DIR", str(tmp_path / "empty"))
+    monkeypatch.setenv("ENVHUB_CACHE", str(tmp_path / "cache"))
+    make_wheel(packages.folder, "not-here", "1.0", {"not_here/__init__.py": "VERSION = 'evil'\n"})
+    try:
+        with pytest.raises(PackageIntegrityError, match="not-here"):
+            make_env(folder, lock=path_of(folder))
+        assert "package not-here==1.0: the file with SHA-256" in verify(folder, code=7)
+    finally:
+        wheel.write_bytes(before)
+
+
+def test_other_arguments_say_something_else(folder: Path) -> None:
+    """They are refused, and so is what is no lock."""
+    lock(folder, "--no-spaces")
+    for other in ({"python": "/usr/bin/python3"}, {"dependencies": "host"}, {"sandbox": "docker"}):
+        with pytest.raises(PolicyError, match="lock"):
+            make_env(folder, lock=path_of(folder), **other)
+    with pytest.raises(PolicyError, match="lock"):
+        make_env(folder, lock=path_of(folder), sandbox=None, trust_remote_code=True)
+    with pytest.raises(LockError, match="envhub lock REF"):
+        make_env(folder, lock=folder / "none.toml")
+
+
+def test_a_lock_does_not_lie_in_what_it_locks(folder: Path) -> None:
+    """It would be one of the files."""
+    done = RUNNER.invoke(app, ["lock", str(folder), "-o", str(folder / "pylock.repo.toml")])
+    assert done.exit_code == 2
+    assert "one of the files that it locks" in " ".join(done.output.split())
+    assert not (folder / "pylock.repo.toml").exists()
+
+
+def test_what_a_lock_needs_is_fetched_ahead(packages: Index, folder: Path) -> None:
+    """Afterwards the index is not asked."""
+    lock(folder, "--no-spaces")
+    done = RUNNER.invoke(app, ["prefetch", str(folder), "--lock", str(path_of(folder)), "--json"])
+    assert "not-here==1.0" in json.loads(done.stdout)["environment"]["packages"]
+    asked = len(packages.asked)
+    done = RUNNER.invoke(app, ["inspect", str(folder), "--lock", str(path_of(folder)), "--json"])
+    assert done.exit_code == 0, done.output
+    assert len(packages.asked) == asked

@@ -1,0 +1,1 @@
+"""The vector environment and the single one, beyond what ``tests/compliance`` compares."""

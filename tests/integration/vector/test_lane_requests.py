@@ -1,0 +1,198 @@
+"""Requests that go straight to the runners, and answers too large for that: nothing is mixed up."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from envhub_sandbox import make_env
+from envhub_sandbox.errors import RemoteEnvError
+from envhub_sandbox.transport.deadline import Deadline, StepDeadline
+from envhub_sandbox.transport.jail import JailHandle
+from envhub_worker.protocol.shared_memory import slabs
+from tests.support import inside
+from tests.support.compare import assert_same
+from tests.support.repositories import STILL, write_repository
+from tests.support.samples import sample
+
+REPOSITORY = '''
+LARGE = 2 * 65536
+
+
+class Talker(Still):
+    """Counts what it is asked, says so in its infos, and some of these are large."""
+
+    observation_space = gym.spaces.Box(0, 1e6, (2,), np.float32)
+    action_space = gym.spaces.Discrete(4)
+
+    def __init__(self):
+        self.asked = 0
+        self.small = "small"
+
+    def seen(self):
+        return np.full(2, self.asked, np.float32)
+
+    def said(self, what, large):
+        return {"what": (what, self.asked, "x" * (LARGE if large else 1))}
+
+    def reset(self, *, seed=None, options=None):
+        self.asked += 1
+        return self.seen(), self.said("reset", (options or {}).get("large", False))
+
+    def step(self, action):
+        self.asked += 1
+        if action == 2:
+            raise ValueError("no")
+        return self.seen(), 0.0, False, False, self.said("step", action == 1)
+
+    def tell(self, large, ignored=None):
+        self.asked += 1
+        return self.said("call", large)["what"]
+
+    def signal(self):
+        import os
+
+        os.kill(os.getpid(), 40)
+
+
+def make_env(n_envs=1, use_async_envs=False):
+    cls = gym.vector.AsyncVectorEnv if use_async_envs else gym.vector.SyncVectorEnv
+    return cls([Talker] * n_envs)
+'''
+
+
+assert slabs.INFO_BYTES == 65536, "what is large has changed"
+
+
+@pytest.fixture(scope="module")
+def talker(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The repository."""
+    return write_repository(tmp_path_factory.mktemp("talker"), STILL + REPOSITORY)
+
+
+def conversation(folder: Path, lane: str, num_workers: int) -> list[Any]:
+    """Large and small answers of every kind, one after the other."""
+    with make_env(folder, 4, use_async_envs=True, lane=lane, num_workers=num_workers) as suites:
+        env = suites.env
+        heard: list[Any] = []
+        for large in (True, False, True):
+            heard.append(env.reset(options={"large": large}))
+            for action in (1, 0, 1, 1):
+                heard += [env.step([action] * 4), env.call("tell", large), env.get_attr("small")]
+                heard.append(env.step([1, 0, 0, 1]))
+        return heard
+
+
+@pytest.mark.parametrize("num_workers", [1, 2])
+def test_large_and_small_answers_are_not_mixed_up(talker: Path, num_workers: int) -> None:
+    """Whatever did not fit the lane is fetched for the request that it belongs to."""
+    by_lane = conversation(talker, "auto", num_workers)
+    assert_same(conversation(talker, "frames", num_workers), by_lane)
+
+
+@pytest.mark.parametrize("lane", ["auto", "frames"])
+@pytest.mark.parametrize("restart", ["on_reset", "transparent"])
+def test_an_operation_has_one_deadline(
+    talker: Path, lane: str, restart: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However many shards have answers to be fetched: no fetch starts the clock anew.
+
+    Or else runners that answer at the last moment would make a step last as long as they please.
+    """
+    made: list[float | None] = []
+    initialize, running = Deadline.__init__, vars(StepDeadline)["running"]
+
+    def counted(self: Deadline, timeout_s: float | None) -> None:
+        made.append(timeout_s)
+        initialize(self, timeout_s)
+
+    def begin(self: StepDeadline, value: bool) -> None:
+        made.extend([] if value else [self.timeout_s])
+        running.__set__(self, value)
+
+    timeouts = {"step_s": 1001.0, "reset_s": 1002.0, "call_s": 1003.0}
+    options = {"lane": lane, "num_workers": 4, "policy": {"restart": restart}}
+    with make_env(talker, 4, use_async_envs=True, timeouts=timeouts, **options) as suites:
+        env = suites.env
+        env.reset()
+        monkeypatch.setattr(Deadline, "__init__", counted)
+        monkeypatch.setattr(StepDeadline, "running", property(running.__get__, begin))
+        for act, timeout_s in (
+            (lambda: env.step([1, 1, 1, 1]), 1001.0),
+            (lambda: env.reset(options={"large": True}), 1002.0),
+            (lambda: env.call("tell", True), 1003.0),
+        ):
+            made.clear()
+            act()
+            assert [one for one in made if one in timeouts.values()] == [timeout_s]
+        monkeypatch.undo()
+
+
+def test_a_reset_by_the_server_leaves_lent_batches_alone(talker: Path) -> None:
+    """Its options do not fit the lane, so it goes another way than what follows it."""
+    with make_env(talker, 4, copy=False) as suites:
+        env = suites.env
+        env.reset()
+        held = env.step([0] * 4)[0]
+        before = held.copy()
+        env.reset(options={"padding": "x" * 2 * slabs.INFO_BYTES})
+        env.get_attr("small")
+        env.step([0] * 4)
+        np.testing.assert_array_equal(held, before)
+
+
+@pytest.mark.parametrize("copy", [True, False])
+def test_a_masked_reset_after_a_failed_step_shows_the_last_observations(
+    talker: Path, copy: bool
+) -> None:
+    """Of those that the failed step did not reach, too."""
+    with make_env(talker, 2, copy=copy) as suites:
+        env = suites.env
+        held = [env.reset()[0]]
+        held += [env.step([0, 0])[0] for _ in range(3)]
+        with pytest.raises(RemoteEnvError, match="no"):
+            env.step([2, 0])
+        observation, _ = env.reset(options={"reset_mask": np.array([True, False])})
+        assert observation[1].tolist() == [4, 4]
+
+
+class Unknown:
+    """Of a module that is not to be had in a jail."""
+
+
+@pytest.mark.parametrize("lane", ["auto", "frames"])
+def test_an_argument_that_cannot_be_read_there_is_told(talker: Path, lane: str) -> None:
+    """The environment goes on."""
+    with make_env(talker, lane=lane) as suites:
+        env = suites.env
+        env.reset()
+        with pytest.raises(RemoteEnvError, match="tests"):
+            env.call("tell", False, ignored=Unknown())
+        assert env.get_attr("small") == ("small",)
+
+
+def test_a_signal_without_a_name_is_told(talker: Path) -> None:
+    """And ends nothing but its jail."""
+    with make_env(talker) as suites, make_env(talker) as others:
+        suites.env.reset()
+        others.env.reset()
+        with pytest.raises(Exception, match="signal 40"):
+            suites.env.call("signal")
+        others.env.step([0])
+
+
+def test_what_a_request_is_called_decides_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Descriptors go with the request that says so, whatever its label for people says."""
+    exchange = JailHandle.exchange
+
+    def renamed(jail: JailHandle, _: str, *rest: Any, **options: Any) -> Any:
+        return exchange(jail, "beginning", *rest, **options)
+
+    monkeypatch.setattr(JailHandle, "exchange", renamed)
+    with make_env(sample("counter"), n_envs=2, num_workers=2) as suites:
+        suites.env.reset(seed=0)
+        assert inside.lane(suites.env) is not None
+        suites.env.step(suites.env.action_space.sample())
