@@ -15,6 +15,7 @@ from envhub_sandbox.dependencies.resolve import Lock
 from tests.support.wheels import Index, make_wheel
 
 TORCH = PackageRequest("requirements.txt", (parse_requirement("vision", "line 1"),))
+CUDA = Lock("torch==2.5 \\\n    --hash=sha256:00\nnvidia-cublas==1 \\\n    --hash=sha256:00\n")
 
 
 @pytest.fixture
@@ -51,7 +52,7 @@ def test_an_index_without_stays_as_it_is(cuda: Path) -> None:
 @pytest.mark.parametrize("gpu", [True, False])
 def test_who_has_a_gpu_gets_cuda(gpu: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without a second look at the index; likewise who has told uv which build he wants."""
-    lock = Lock("torch==2.5 \\\n    --hash=sha256:00\nnvidia-cublas==1 \\\n    --hash=sha256:00\n")
+    lock = CUDA
     if not gpu:
         monkeypatch.setenv("UV_TORCH_BACKEND", "cu128")
 
@@ -65,7 +66,7 @@ def test_pytorchs_own_index_is_asked_only_by_who_has_chosen_none(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A mirror that was named is all that there is."""
-    lock = Lock("torch==2.5 \\\n    --hash=sha256:00\nnvidia-cublas==1 \\\n    --hash=sha256:00\n")
+    lock = CUDA
     without = Lock("torch==2.5+cpu \\\n    --hash=sha256:00\n")
     monkeypatch.delenv("UV_TORCH_BACKEND", raising=False)
     for chosen, asked in ((True, [()]), (False, [(), ("--torch-backend", "cpu")])):

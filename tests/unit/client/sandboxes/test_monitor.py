@@ -91,12 +91,6 @@ def test_the_container_ends_with_its_client(tmp_path: Path, how: str) -> None:
         assert made.ends()
 
 
-def test_the_monitor_ends_with_its_container(tmp_path: Path) -> None:
-    """Which is how the client learns of that end."""
-    with kept(tmp_path, f"{_ANNOUNCES}; sleep 0.2") as made:
-        assert made.ends()
-
-
 @pytest.mark.parametrize("code", [0, 1, 137])
 def test_the_monitor_ends_as_its_container_did(tmp_path: Path, code: int) -> None:
     """So that the client can tell how that was: 137 is SIGKILL inside."""

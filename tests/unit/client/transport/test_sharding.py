@@ -16,6 +16,8 @@ from tests.support.wire import env_manifest
 
 SHORT = Pace(Cost(10_000, 3_000), Cost(25_000, 3_000))
 LONG = Pace(Cost(10_000, 2e6), Cost(25_000, 2e6))
+SLOWER = Pace(Cost(10_000, 8_000), Cost(25_000, 14_000))
+EQUAL = Pace(Cost(10_000, 8_000), Cost(25_000, 8_000))
 environment = partial(env_manifest, Discrete(2), Discrete(2))
 
 
@@ -30,44 +32,25 @@ def sizes(*arguments: object) -> list[int]:
     return [stop - start for start, stop in bounds_for(*arguments)]  # type: ignore[arg-type]
 
 
-def test_the_first_use_is_shared_out_evenly() -> None:
-    """Nobody knows yet how long a step takes."""
-    assert sizes(environment(16), None, None) == [8, 8]
-
-
-def test_a_shard_that_sleeps_gets_less_of_short_steps() -> None:
-    """Its wake-up is worth four of these steps."""
-    assert sizes(environment(16), None, SHORT) == [10, 6]
-
-
-def test_a_shard_whose_steps_are_slower_gets_less() -> None:
-    """It shares a core, whose caches are somebody else's in between."""
-    pace = Pace(Cost(10_000, 8_000), Cost(25_000, 14_000))
-    assert sizes(environment(16), None, pace) == [11, 5]
-
-
-def test_long_steps_are_shared_out_evenly() -> None:
-    """A wake-up is nothing beside them."""
-    assert sizes(environment(16), None, LONG) == [8, 8]
-
-
-def test_a_shard_that_brings_nothing_is_not_started() -> None:
-    """Four short steps are done before the second shard is awake."""
-    assert sizes(environment(4), None, SHORT) == [4]
-
-
-def test_a_shard_that_saves_little_is_not_started() -> None:
-    """A process more has to be worth its memory and its start: these would save a step each."""
-    pace = Pace(Cost(10_000, 8_000), Cost(25_000, 8_000))
-    assert sizes(environment(4), 2, pace) == [3, 1]
-    assert sizes(environment(4), None, pace) == [4]
-    assert sizes(environment(16), None, pace) == [9, 7]
-
-
-def test_a_number_of_workers_is_kept() -> None:
-    """Who asks for two gets two, if there are two sub-environments."""
-    assert sizes(environment(4), 2, SHORT) == [3, 1]
-    assert sizes(environment(1), 2, SHORT) == [1]
+@pytest.mark.parametrize(
+    ("count", "workers", "pace", "expected"),
+    [
+        (16, None, None, [8, 8]),  # at first it is not known how long a step takes
+        (16, None, SHORT, [10, 6]),  # a wake-up is worth four of these steps
+        (16, None, SLOWER, [11, 5]),  # it shares a core, and so its caches
+        (16, None, LONG, [8, 8]),  # a wake-up is nothing beside them
+        (4, None, SHORT, [4]),  # these are done before a second shard is awake
+        # a process more has to be worth its memory and its start
+        *((4, 2, EQUAL, [3, 1]), (4, None, EQUAL, [4]), (16, None, EQUAL, [9, 7])),
+        # a number of workers is kept, if there are as many sub-environments
+        *((4, 2, SHORT, [3, 1]), (1, 2, SHORT, [1])),
+    ],
+)
+def test_a_shard_gets_what_its_pace_is_worth(
+    count: int, workers: int | None, pace: Pace | None, expected: list[int]
+) -> None:
+    """One that sleeps, or shares a core, gets less; one that brings little is not started."""
+    assert sizes(environment(count), workers, pace) == expected
 
 
 @pytest.mark.parametrize("pace", [None, SHORT, LONG])
