@@ -105,14 +105,8 @@ def test_every_option_is_handed_on_or_about_the_list() -> None:
     assert names > of_the_list
     assert names > set(SETTINGS)
     assert set(OF_A_LIST) < of_the_list
-    assert names - of_the_list > {
-        "steps",
-        "fail_on",
-        "allow",
-        "timeout",
-        "memory",
-        "profile",
-    }
+    handed_on = {"steps", "fail_on", "allow", "timeout", "memory", "profile"}
+    assert names - of_the_list > handed_on
     assert check.__doc__ is not None
 
 
@@ -132,10 +126,7 @@ def test_every_option_is_handed_on_or_about_the_list() -> None:
         ("--all nowhere --output out", "cannot be read"),
         ("--all list --output .", "has other things in it"),
         ("--all list --output env/out", "lies in what is judged, ./env (line 2"),
-        (
-            "--all list --output out --policy env/x",
-            "--policy env/x lies in what is judged",
-        ),
+        ("--all list --output out --policy env/x", "--policy env/x lies in what is judged"),
         ("./env --policy env/x", "--policy env/x lies in what is judged, ./env, and no"),
         ("./env --settings env/envhub.toml", "lies in what is judged, ./env, and no"),
         ("--all list --output out --deadline inf", "--deadline is inf"),

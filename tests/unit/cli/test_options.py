@@ -51,40 +51,19 @@ def test_every_option_of_a_command_reaches_make_env() -> None:
     assert given["step_s"] == given["startup_s"] == "<timeout>"
 
 
-@pytest.mark.parametrize(
-    ("text", "size"),
-    [
-        ("1048576", 2**20),
-        ("512M", 512 * 2**20),
-        ("4g", 4 * 2**30),
-        ("1.5GiB", 3 * 2**29),
-        ("2 KB", 2048),
-        (None, None),
-    ],
-)
+@pytest.mark.parametrize(("text", "size"), [("1.5GiB", 3 * 2**29), ("2 KB", 2048), (None, None)])
 def test_sizes_are_read(text: str | None, size: int | None) -> None:
-    """In the spellings that people use; units are powers of 1024."""
+    """In the spellings that people use; what is none is refused with the option's name."""
     assert read_size("--memory", text) == size
-
-
-@pytest.mark.parametrize("text", ["", "M", "-1G", "4 gigs", "1e9", "nan"])
-def test_what_is_no_size_is_refused(text: str) -> None:
-    """With the option's name."""
-    with pytest.raises(UsageError, match="--memory"):
-        read_size("--memory", text)
+    for wrong in ("4 gigs", "nan", ""):
+        with pytest.raises(UsageError, match="--memory"):
+            read_size("--memory", wrong)
 
 
 def test_env_kwargs_take_json_and_pairs() -> None:
     """Values are JSON where they can be; later ones win."""
-    texts = [
-        '{"size": 8, "name": "a"}',
-        "size=9",
-        "mode=rgb_array",
-        "on=true",
-        "path=a=b",
-        "empty=",
-    ]
-    assert read_env_kwargs(texts) == {
+    pairs = ("size=9", "mode=rgb_array", "on=true", "path=a=b", "empty=")
+    assert read_env_kwargs(['{"size": 8, "name": "a"}', *pairs]) == {
         "size": 9,
         "name": "a",
         "mode": "rgb_array",

@@ -72,11 +72,8 @@ def test_numpys_numbers_are_numbers() -> None:
 @pytest.mark.parametrize(
     "given",
     [
-        {"policy": {"network": "none"}},
-        {"limits": {"memory_bytes": MIB}},
-        {"timeouts": {"step_s": 1}},
-        {"python": "python3"},
-        {"num_workers": 2},
+        *({"policy": {"network": "none"}}, {"limits": {"memory_bytes": MIB}}),
+        *({"timeouts": {"step_s": 1}}, {"python": "python3"}, {"num_workers": 2}),
         {"validate": True},
     ],
     ids=lambda given: next(iter(given)),
@@ -118,12 +115,8 @@ class _Config:
 
 def test_properties_of_a_config_cross() -> None:
     """A repository that reads ``cfg.type`` works here as it does in LeRobot."""
-    assert plain_config(_Config()) == {
-        "hub_path": "org/repo",
-        "task": "push",
-        "inner": {"size": 3},
-        "type": "hub",
-    }
+    read = {"hub_path": "org/repo", "task": "push", "inner": {"size": 3}, "type": "hub"}
+    assert plain_config(_Config()) == read
 
 
 def test_a_folder_written_like_a_repository_gets_a_hint(

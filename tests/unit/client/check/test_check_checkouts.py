@@ -62,20 +62,26 @@ def test_what_git_ignores_is_a_note(repository: GitRepository) -> None:
     assert one.message.endswith("08.pyc, 3 more")
 
 
+def cloned_as_it_is(repository: GitRepository, folder: Path, name: str, text: str) -> Path:
+    """A clone of the repository with a file that no filter of git's has changed."""
+    (folder / "raw").write_text(text, newline="")
+    blob = repository.git("hash-object", "-w", "--no-filters", str(folder / "raw"))
+    repository.git("update-index", "--add", "--cacheinfo", f"100644,{blob},{name}")
+    repository.git("commit", "--quiet", "--message", "as it is")
+    repository.git("clone", "--quiet", str(repository.folder), str(folder / "clone"))
+    return folder / "clone"
+
+
 def test_what_a_checkout_turns_into_a_comment_is_reported(
     repository: GitRepository, tmp_path: Path
 ) -> None:
     """Git writes the id of a file into it, over what stood there: in the commit that is code."""
     code = "#$Id:\rimport\tos\ros.popen('true')\r$\n"
     repository.commit({"odd.py": code, ".gitattributes": "*.py ident\n"})
-    (tmp_path / "raw").write_text(code, newline="")
-    blob = repository.git("hash-object", "-w", "--no-filters", str(tmp_path / "raw"))
-    repository.git("update-index", "--cacheinfo", f"100644,{blob},odd.py")
-    repository.git("commit", "--quiet", "--message", "as it is")
-    repository.git("clone", "--quiet", str(repository.folder), str(tmp_path / "clone"))
+    clone = cloned_as_it_is(repository, tmp_path, "odd.py", code)
     assert "popen" in repository.git("cat-file", "blob", "HEAD:odd.py")
-    assert "popen" not in (tmp_path / "clone/odd.py").read_text()
-    assert failing(tmp_path / "clone") == {"env.py", "odd.py"}
+    assert "popen" not in (clone / "odd.py").read_text()
+    assert failing(clone) == {"env.py", "odd.py"}
 
 
 def test_what_is_encoded_anew_is_reported(repository: GitRepository, tmp_path: Path) -> None:
@@ -89,16 +95,12 @@ def test_what_is_encoded_anew_is_reported(repository: GitRepository, tmp_path: P
 
 def test_attributes_cannot_hide_themselves(repository: GitRepository, tmp_path: Path) -> None:
     """Git makes a folder by those of the commit, of which the folder then has another text."""
-    attributes = ".gitattributes working-tree-encoding=UTF-16\n*.py ident\n"
     repository.commit({"odd.py": "# $Id$\n"})
-    (tmp_path / "raw").write_text(attributes)
-    blob = repository.git("hash-object", "-w", "--no-filters", str(tmp_path / "raw"))
-    repository.git("update-index", "--add", "--cacheinfo", f"100644,{blob},.gitattributes")
-    repository.git("commit", "--quiet", "--message", "attributes")
-    repository.git("clone", "--quiet", str(repository.folder), str(tmp_path / "clone"))
-    assert b"ident" not in (tmp_path / "clone/.gitattributes").read_bytes()
-    assert (tmp_path / "clone/odd.py").read_text() != "# $Id$\n"
-    assert failing(tmp_path / "clone") == {".gitattributes", "env.py", "odd.py"}
+    attributes = ".gitattributes working-tree-encoding=UTF-16\n*.py ident\n"
+    clone = cloned_as_it_is(repository, tmp_path, ".gitattributes", attributes)
+    assert b"ident" not in (clone / ".gitattributes").read_bytes()
+    assert (clone / "odd.py").read_text() != "# $Id$\n"
+    assert failing(clone) == {".gitattributes", "env.py", "odd.py"}
 
 
 def test_attributes_that_cannot_be_read_are_an_error(

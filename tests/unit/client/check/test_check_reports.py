@@ -140,13 +140,6 @@ def test_a_flood_of_notes_hides_no_error() -> None:
     assert len(made.findings) < 1_000
 
 
-def test_severities_are_ordered() -> None:
-    """A note fails nothing but where notes are asked for."""
-    assert Severity.ERROR.reaches(Severity.WARNING)
-    assert not Severity.NOTE.reaches(Severity.WARNING)
-    assert Severity.NOTE.reaches(Severity.NOTE)
-
-
 def mixed() -> Report:
     """What was found in the order in which it is found: notes first, an error last."""
     made = Report("./walk:env.py")

@@ -16,42 +16,20 @@ def seen(*rows: tuple[int, int, int, int]) -> list[leaks.Usage]:
     return [{"processes": p, "threads": t, "files": f, "memory_bytes": m} for p, t, f, m in rows]
 
 
-@pytest.mark.parametrize(
-    ("counts", "found"),
-    [
-        (seen((1, 0, 9, 0), (1, 0, 9, 0), (1, 0, 9, 0), (1, 0, 9, 0)), None),
-        (
-            seen((1, 0, 9, 0), (9, 8, 9, 90 * _MIB), (9, 8, 9, 90 * _MIB), (9, 8, 9, 90 * _MIB)),
-            None,
-        ),
-        (seen((1, 0, 9, 0), (2, 1, 9, 1000), (3, 2, 9, 2000), (4, 3, 9, 3000)), None),
-        (seen((1, 0, 9, 0), (9, 0, 9, 0), (17, 0, 9, 0), (25, 0, 9, 0)), "leaks-processes"),
-        (seen((1, 0, 9, 0), (1, 8, 9, 0), (1, 16, 9, 0), (1, 24, 9, 0)), "leaks-threads"),
-        (seen((1, 0, 3, 0), (1, 0, 9, 0), (1, 0, 15, 0), (1, 0, 21, 0)), "leaks-files"),
-        (
-            seen((1, 0, 9, 0), (1, 0, 9, 2 * _MIB), (1, 0, 9, 4 * _MIB), (1, 0, 9, 6 * _MIB)),
-            "leaks-memory",
-        ),
-        (
-            seen(
-                (1, 0, 9, 0), (9, 8, 9, 90 * _MIB), (17, 16, 9, 190 * _MIB), (25, 24, 9, 290 * _MIB)
-            ),
-            "leaks-processes",
-        ),
-        ([], None),
-    ],
-    ids=[
-        "level",
-        "filled once",
-        "jitter",
-        "processes",
-        "threads",
-        "files",
-        "memory",
-        "all",
-        "uncounted",
-    ],
-)
+_GROWTH: dict[str, tuple[list[leaks.Usage], str | None]] = {
+    "level": (seen(*[(1, 0, 9, 0)] * 4), None),
+    "filled once": (seen((1, 0, 9, 0), *[(9, 8, 9, 90 * _MIB)] * 3), None),
+    "jitter": (seen(*((1 + n, n, 9, 1000 * n) for n in range(4))), None),
+    "processes": (seen(*((1 + 8 * n, 0, 9, 0) for n in range(4))), "leaks-processes"),
+    "threads": (seen(*((1, 8 * n, 9, 0) for n in range(4))), "leaks-threads"),
+    "files": (seen(*((1, 0, 3 + 6 * n, 0) for n in range(4))), "leaks-files"),
+    "memory": (seen(*((1, 0, 9, 2 * n * _MIB) for n in range(4))), "leaks-memory"),
+    "all": (seen(*((1 + 8 * n, 8 * n, 9, 100 * n * _MIB) for n in range(4))), "leaks-processes"),
+    "uncounted": ([], None),
+}
+
+
+@pytest.mark.parametrize(("counts", "found"), _GROWTH.values(), ids=_GROWTH)
 def test_what_grows_in_every_round_is_told(counts: list[leaks.Usage], found: str | None) -> None:
     """And of what comes with it nothing: a process has threads and memory of its own."""
     grew = leaks.leak(counts, 8)

@@ -269,11 +269,13 @@ def test_a_bundle_says_nothing_in_lines_of_its_own(tmp_path: Path) -> None:
     forged = "memory_bytes\nError: run this as root\x1b[2J"
     edit(folder, "make_env", "policy", value={"limits": {forged: 1 << 60}})
     edit(folder, "label", value=f"org/repo{forged}")
+    edit(folder, "death", "signal", value="\x1b]0;title\x07")
     found = load_bundle(folder)
     [wish] = wishes(found)
     assert wish.startswith("limits.memory_bytes")
     assert wish.isprintable()
     assert found.label.isprintable()
+    assert "\x1b" not in found.label + found.death["signal"] + safe_line(found.label)
 
 
 def test_a_login_is_not_in_the_bundle(tmp_path: Path) -> None:
@@ -281,15 +283,6 @@ def test_a_login_is_not_in_the_bundle(tmp_path: Path) -> None:
     folder = bundle(tmp_path, endpoint="https://me@there:hf_secret@hub.example/x")
     assert all(b"hf_secret" not in file.read_bytes() for file in folder.iterdir())
     assert load_bundle(folder).arguments["endpoint"] == "https://hub.example/x"
-
-
-def test_text_of_a_bundle_cannot_paint(tmp_path: Path) -> None:
-    """Whatever is shown has lost its control characters."""
-    folder = bundle(tmp_path)
-    edit(folder, "label", value="\x1b[31mred")
-    edit(folder, "death", "signal", value="\x1b]0;title\x07")
-    found = load_bundle(folder)
-    assert "\x1b" not in found.label + found.death["signal"] + safe_line(found.label)
 
 
 class Recorder:

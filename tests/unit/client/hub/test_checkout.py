@@ -19,13 +19,8 @@ from tests.hub.olah_server import GitRepository
 pytestmark = pytest.mark.skipif(shutil.which("git") is None, reason="needs git")
 PLACES = (
     *("__pycache__/env.cpython-311.pyc", ".cache/a.py", ".venv/b.py", ".tox/c.py", "d.pyc"),
-    *(
-        "node_modules/e.py",
-        "lib/pyvenv.cfg",
-        "lib/f.py",
-        ".ipynb_checkpoints/g.py",
-        "sub/.DS_Store",
-    ),
+    *("node_modules/e.py", "lib/pyvenv.cfg", "lib/f.py", ".ipynb_checkpoints/g.py"),
+    "sub/.DS_Store",
     *(".mypy_cache/h.py", ".pytest_cache/i.py", ".ruff_cache/j.py", ".hg/k.py", ".svn/l.py"),
 )
 """Where tools put what they make, and a repository can put what it likes."""
