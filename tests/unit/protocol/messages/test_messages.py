@@ -22,7 +22,7 @@ from envhub_worker.protocol.messages import compression
 from tests.support.compare import assert_same
 from tests.support.wire import deep
 
-GOLDEN = Path(__file__).parents[1] / "golden" / "messages"
+GOLDEN = Path(__file__).parents[2] / "golden" / "messages"
 REQUEST_ID = 7
 
 # One message of each class, with every kind of content that its fields may have.

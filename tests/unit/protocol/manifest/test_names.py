@@ -24,7 +24,7 @@ from envhub_worker.protocol.manifest.facts import MAX_METADATA, read_metadata, r
 from envhub_worker.protocol.manifest.names import GYMNASIUMS, PROBED, is_servable
 from tests.support.curious import names_asked_for
 from tests.support.protocol_names import names_that_libraries_call
-from tests.unit.protocol.test_manifest import an_env, read, with_env
+from tests.unit.protocol.manifest.test_manifest import an_env, read, with_env
 
 ASKED = {
     "pandas": {"toDict", "dtype", "ndim", "read", "write", "keys"},

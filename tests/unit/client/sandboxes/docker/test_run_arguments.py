@@ -276,7 +276,7 @@ def test_only_the_native_word_size_is_permitted() -> None:
 
 def test_the_profile_for_ones_own_containers_is_the_same() -> None:
     """The file that the documents name, for either machine."""
-    path = Path(__file__).resolve().parents[4] / "examples" / "deployment" / "seccomp.json"
+    path = Path(__file__).resolve().parents[5] / "examples" / "deployment" / "seccomp.json"
     architectures = sorted(seccomp_profile.ARCHITECTURES.values())
     assert json.loads(path.read_text()) == {
         **seccomp_profile.profile("x86_64"),

@@ -248,7 +248,7 @@ def test_killed_builder_leaves_nothing_that_is_believed(slot: store.Slot) -> Non
     """A process that dies in the middle leaves no commit, and its rest is swept up later."""
     code = (
         "import os, sys; from pathlib import Path\n"
-        "from tests.unit.client.hub import test_snapshot_store as t\n"
+        "from tests.unit.client.hub import test_store as t\n"
         "def die(record, target):\n"
         "    t.write(record, target)\n"
         "    if record.path == 'env.py': os.kill(os.getpid(), 9)\n"

@@ -13,7 +13,7 @@ from envhub_worker.protocol.codec.arrays import INLINE_BYTES
 from envhub_worker.protocol.codec.codec import Buffer, RemoteEnum, RemoteObject, decode, encode
 from tests.support.compare import assert_same
 
-GOLDEN = Path(__file__).parents[1] / "golden" / "values.json"
+GOLDEN = Path(__file__).parents[2] / "golden" / "values.json"
 
 GOLDEN_VALUES: dict[str, Any] = {
     "none": None,
