@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import pickle
 import struct
 from collections.abc import Callable
@@ -130,25 +131,17 @@ def _link(folder: Path) -> None:
     (folder / "bundle.json").symlink_to(folder.parent / "elsewhere.json")
 
 
-def _nested(folder: Path) -> None:
-    (folder / "bundle.json").write_text("[" * 200_000)
+HARM: dict[str, Callable[[Path], object]] = {
+    "claims more": _claims_more,
+    "a link": _link,
+    "nested": lambda folder: (folder / "bundle.json").write_text("[" * 200_000),
+    "huge": lambda folder: os.truncate(folder / "requests.bin", bundle_reader.MAX_FILE_BYTES + 1),
+    "noise": lambda folder: (folder / "requests.bin").write_bytes(bytes(range(256))),
+}
 
 
-def _huge(folder: Path) -> None:
-    with open(folder / "requests.bin", "r+b") as file:
-        file.truncate(bundle_reader.MAX_FILE_BYTES + 1)
-
-
-def _noise(folder: Path) -> None:
-    (folder / "requests.bin").write_bytes(bytes(range(256)))
-
-
-@pytest.mark.parametrize(
-    "harm",
-    [_claims_more, _link, _nested, _huge, _noise],
-    ids=lambda harm: harm.__name__.strip("_"),
-)
-def test_a_hostile_file_is_refused(tmp_path: Path, harm: Callable[[Path], None]) -> None:
+@pytest.mark.parametrize("harm", HARM.values(), ids=HARM)
+def test_a_hostile_file_is_refused(tmp_path: Path, harm: Callable[[Path], object]) -> None:
     """Nothing is followed, and nothing read beyond the bounds."""
     folder = bundle(tmp_path)
     harm(folder)
