@@ -45,7 +45,7 @@ from tests.attacks.client.lying_server import env_manifest
 from tests.fuzz.mutate import Spoiler, crossing
 from tests.fuzz.oracle import WrongError, alike, demand, fits, per_env, usable
 from tests.fuzz.traffic import Frames
-from tests.unit.protocol.test_batches import SINGLE_SPACES, parts_of
+from tests.unit.protocol.spaces.test_batches import SINGLE_SPACES, parts_of
 
 ELEMENTS = 2_000_000
 _SMALL = WireLimits(message_bytes=ELEMENTS)

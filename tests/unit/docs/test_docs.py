@@ -221,32 +221,6 @@ def test_readme_names_arguments_that_exist() -> None:
             assert set(re.findall(r'"(\w+)":', meaning)) <= known
 
 
-def command_line_options() -> set[str]:
-    """The options that ``envhub run`` takes, by its own help."""
-    done = subprocess.run(
-        [sys.executable, "-I", "-m", "envhub_sandbox", "run", "--help"],
-        capture_output=True,
-        text=True,
-        env={"COLUMNS": "200", "TERM": "dumb", "NO_COLOR": "1"},
-        check=True,
-        timeout=120,
-    )
-    return set(re.findall(r"--[a-z][a-z-]+", done.stdout))
-
-
-def test_readme_names_options_that_exist() -> None:
-    """Each option in a command of the README is one of ``envhub run``."""
-    lines = [line for block in fenced(README, "sh") for line in block.splitlines()]
-    used = {
-        option
-        for line in lines
-        if "envhub run" in line
-        for option in re.findall(r"--[a-z][a-z-]+", line.partition("envhub run")[2])
-    }
-    assert used
-    assert used <= command_line_options()
-
-
 def links(text: str) -> Iterator[str]:
     """The targets of all links that stay in the project."""
     for target in re.findall(r"\]\(([^)\s]+)\)", text):
@@ -344,14 +318,10 @@ def test_error_tree_is_the_tree() -> None:
     assert {name for name in errors.__all__ if name.endswith("Error")} <= shown
 
 
-def test_settings_are_written_from_the_docstrings() -> None:
-    """``python -m tests.support.settings`` writes them again."""
-    assert settings.DOCUMENT.read_text() == settings.document()
-
-
-def test_options_are_written_from_the_commands() -> None:
-    """``python -m tests.support.options`` writes them again."""
-    assert options.DOCUMENT.read_text() == options.document()
+@pytest.mark.parametrize("written", [settings, options])
+def test_what_is_written_from_the_source_is_up_to_date(written: Any) -> None:
+    """``python -m tests.support.settings``, or ``options``, writes them again."""
+    assert written.DOCUMENT.read_text() == written.document()
 
 
 def test_the_rules_of_interruption_are_those_that_the_source_names() -> None:

@@ -19,19 +19,8 @@ from tests.support.samples import sample
 WORKERS_OWN = {"cloudpickle", "envhub_worker", "gymnasium", "msgpack", "numpy", "zmq"}
 CLIENTS_OWN = {
     *("cloudpickle", "envhub_sandbox", "envhub_worker", "gymnasium", "huggingface_hub", "msgpack"),
-    *(
-        "numpy",
-        "packaging",
-        "platformdirs",
-        "psutil",
-        "pyproject_hooks",
-        "rich",
-        "tomli",
-        "tomllib",
-        "typer",
-        "uv",
-        "zmq",
-    ),
+    *("numpy", "packaging", "platformdirs", "psutil", "pyproject_hooks", "rich", "tomli"),
+    *("tomllib", "typer", "uv", "zmq"),
 }
 # used where they are installed, and only there
 OPTIONAL = {

@@ -19,11 +19,6 @@ def after(*events: Event) -> State:
     return lifecycle.state
 
 
-def test_life_begins_without_a_process() -> None:
-    """A proxy that nobody has used is idle."""
-    assert after() is State.IDLE
-
-
 @pytest.mark.parametrize(("state", "event"), list(itertools.product(State, Event)))
 def test_table_decides_every_move(state: State, event: Event) -> None:
     """What the table has, happens; what it has not is refused and changes nothing."""
@@ -52,7 +47,9 @@ def test_close_is_legal_at_every_moment_and_final(events: list[Event]) -> None:
 
 
 def test_a_late_reply_is_never_the_answer_to_a_new_request() -> None:
-    """After a timeout nothing can be submitted before the late reply has come or been given up."""
+    """After a timeout or an interrupt nothing is submitted before it has come or been given up."""
+    assert after() is State.IDLE
+    assert after(Event.START, Event.SUBMIT, Event.INTERRUPT) is State.LATE
     assert after(Event.START, Event.SUBMIT, Event.TIMEOUT) is State.LATE
     assert (State.LATE, Event.SUBMIT) not in TABLE
     assert after(Event.START, Event.SUBMIT, Event.TIMEOUT, Event.REPLY) is State.READY
@@ -72,11 +69,6 @@ def test_death_is_survived_by_forgetting() -> None:
     """A dead environment can only be given up or closed (and be forked along)."""
     dead = {event for state, event in TABLE if state is State.DEAD}
     assert dead == {Event.FORGET, Event.CLOSE, Event.FORK}
-
-
-def test_interruption_leaves_a_late_reply() -> None:
-    """Whoever was interrupted while waiting has a reply outstanding, as after a timeout."""
-    assert after(Event.START, Event.SUBMIT, Event.INTERRUPT) is State.LATE
 
 
 def test_fork_can_only_close() -> None:

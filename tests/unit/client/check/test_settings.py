@@ -87,14 +87,8 @@ def test_what_is_judged_has_no_say(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     monkeypatch.setenv("HOME", str(tmp_path))
     (tmp_path / "mine.toml").symlink_to(judged / "envhub.toml")
     for file in (judged / "envhub.toml", judged / "sub/envhub.toml", tmp_path / "mine.toml"):
-        for reference in (
-            str(judged),
-            str(link),
-            str(judged / "env.py"),
-            f"{link}:env.py",
-            "~/link",
-        ):
-            assert settings.is_judged(file, reference), (file, reference)
+        for reference in (judged, link, judged / "env.py", f"{link}:env.py", "~/link"):
+            assert settings.is_judged(file, str(reference)), (file, reference)
     (tmp_path / "with:colon").mkdir()
     for reference in (str(tmp_path / "with:colon"), f"{tmp_path / 'with:colon'}:env.py"):
         assert settings.is_judged(tmp_path / "with:colon" / "envhub.toml", reference)

@@ -140,15 +140,6 @@ def test_what_lost_its_content_is_made_again(index: Index, tmp_path: Path, damag
     assert left_behind() == []
 
 
-def test_what_is_still_being_made_is_not_listed(index: Index, tmp_path: Path) -> None:
-    """So that nobody removes it under its maker's hands."""
-    env = made(repository(tmp_path / "repo"))
-    draft = environments.root() / f".building-{env.key}-12345678"
-    (draft / "packages").mkdir(parents=True)
-    shutil.copy(env.home / "environment.json", draft)
-    assert environments.every() == [env]
-
-
 def test_two_repositories_that_need_the_same_share_it(index: Index, tmp_path: Path) -> None:
     """It is called by what is in it."""
     make_wheel(index.folder, "wanted")
@@ -283,7 +274,9 @@ def test_what_was_left_half_made_is_collected(index: Index, tmp_path: Path) -> N
     env = made(repository(tmp_path / "repo"))
     half = environments.root() / ".building-0123-x"
     (half / "packages").mkdir(parents=True)
+    shutil.copy(env.home / "environment.json", half)
     (half / "packages").chmod(0o555)
+    assert environments.every() == [env], "nobody removes it under its maker's hands"
     environments.remove_abandoned()
     assert left_behind() == []
     assert environments.every() == [env]

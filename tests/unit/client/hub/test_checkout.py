@@ -19,13 +19,8 @@ from tests.hub.olah_server import GitRepository
 pytestmark = pytest.mark.skipif(shutil.which("git") is None, reason="needs git")
 PLACES = (
     *("__pycache__/env.cpython-311.pyc", ".cache/a.py", ".venv/b.py", ".tox/c.py", "d.pyc"),
-    *(
-        "node_modules/e.py",
-        "lib/pyvenv.cfg",
-        "lib/f.py",
-        ".ipynb_checkpoints/g.py",
-        "sub/.DS_Store",
-    ),
+    *("node_modules/e.py", "lib/pyvenv.cfg", "lib/f.py", ".ipynb_checkpoints/g.py"),
+    "sub/.DS_Store",
     *(".mypy_cache/h.py", ".pytest_cache/i.py", ".ruff_cache/j.py", ".hg/k.py", ".svn/l.py"),
 )
 """Where tools put what they make, and a repository can put what it likes."""
@@ -216,38 +211,29 @@ def test_of_a_checkout_with_other_hashes_everything_counts(
     assert set(files(folder)) == {".gitignore", "env.py", "forced.pyc", "other.pyc"}
 
 
-def break_index(git: Path) -> None:
-    """A file that is no index."""
-    (git / "index").write_bytes(b"DIRC\0\0\0\x02\xff\xff\xff\xff" + b"x" * 64)
+NO_INDEX = b"DIRC\0\0\0\x02\xff\xff\xff\xff" + b"x" * 64
+SPOIL: dict[str, Callable[[Path], object]] = {
+    "no index": lambda git: (git / "index").write_bytes(
+        b"DIRC\0\0\0\x02\xff\xff\xff\xff" + b"x" * 64
+    ),
+    "a file that points nowhere": lambda git: git.write_text("gitdir: /nowhere\0\n"),
+    "an empty folder": lambda git: git.mkdir(),
+    "a pipe, which can never be read": lambda git: os.mkfifo(git),
+}
 
 
-def point_nowhere(git: Path) -> None:
-    """A file in place of the folder."""
-    shutil.rmtree(git)
-    git.write_text("gitdir: /nowhere\0\n")
-
-
-def empty(git: Path) -> None:
-    """A folder with nothing in it."""
-    shutil.rmtree(git)
-    git.mkdir()
-
-
-def make_pipe(git: Path) -> None:
-    """What can be opened, and never read."""
-    shutil.rmtree(git)
-    os.mkfifo(git)
-
-
-@pytest.mark.parametrize("spoil", [break_index, point_nowhere, empty, make_pipe])
+@pytest.mark.parametrize("spoil", SPOIL)
 def test_without_a_checkout_that_git_can_read_everything_counts(
-    repository: GitRepository, spoil: Callable[[Path], None]
+    repository: GitRepository, spoil: str
 ) -> None:
     """What names itself ``.git`` hides nothing."""
     repository.commit({".gitignore": "*.pyc\n"})
     (repository.folder / "a.pyc").write_text("payload")
     assert set(files(repository.folder)) == {".gitignore", "env.py"}
-    spoil(repository.folder / ".git")
+    git = repository.folder / ".git"
+    if spoil != "no index":
+        shutil.rmtree(git)
+    SPOIL[spoil](git)
     assert set(files(repository.folder)) == {".gitignore", "a.pyc", "env.py"}
 
 

@@ -84,12 +84,6 @@ def test_started_for_the_first_and_ended_by_the_last(pool: Pool) -> None:
     assert pool.acquire("key", Server).server is not first
 
 
-def test_each_key_has_its_own(pool: Pool) -> None:
-    """Two keys, two servers."""
-    one, two = pool.acquire(1, Server), pool.acquire(2, Server)
-    assert one.server is not two.server
-
-
 def test_a_dead_one_stays_with_its_users_and_others_get_a_fresh_one(pool: Pool) -> None:
     """The dead one is ended when its last user gives it back, and the fresh one is not."""
     dead = pool.acquire("key", Server)

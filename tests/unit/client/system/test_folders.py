@@ -227,17 +227,6 @@ def test_file_that_others_can_write_is_closed(slot: store.Slot) -> None:
     assert mode(slot.tree / "env.py") == 0o444
 
 
-@pytest.mark.parametrize("mask", UMASKS)
-def test_store_is_the_same_under_every_umask(snapshot_store: Path, mask: int) -> None:
-    """Shared folders, read-only trees, and a record of its owner's."""
-    made = store.Slot(store.local_folder(), COMMIT, "x")
-    with umask(mask):
-        _publish(made, GOOD)
-    assert [mode(path) for path in (*_above(snapshot_store)[1:], made.home)] == [0o755] * 4
-    assert (mode(made.tree), mode(made.tree / "env.py")) == (0o555, 0o444)
-    assert mode(made.record) == 0o600
-
-
 def test_nobody_gets_at_a_snapshot_before_it_is_complete(snapshot_store: Path) -> None:
     """While its files have the umask's modes, their folder is ours alone."""
     made, seen = store.Slot(store.local_folder(), COMMIT, "x"), []

@@ -1,4 +1,4 @@
-"""A process that ends with the one that started it."""
+"""A process that ends with the one that started it, and knows its forks."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from pathlib import Path
 import psutil
 import pytest
 
+from envhub_sandbox.system.processes import OwnerProcess, fork_error_text
 from tests.support.processes import eventually
 
 _PARENT = """
@@ -104,3 +105,15 @@ def test_who_is_started_by_another_thread_meanwhile_does_not_inherit_it() -> Non
 
     with processes.pidfd() as ourselves:
         assert not os.get_inheritable(ourselves)
+
+
+def test_a_fork_is_another_process() -> None:
+    """And is told whose it is, and which one it is itself."""
+    owner = OwnerProcess()
+    assert owner.is_here
+    child = os.fork()
+    if child == 0:  # pragma: no cover
+        os._exit(0 if not owner.is_here and str(os.getpid()) in fork_error_text(owner.pid) else 1)
+    assert os.waitpid(child, 0)[1] == 0
+    assert f"belongs to process {owner.pid}" in fork_error_text(owner.pid)
+    assert "belongs to another process" in fork_error_text()

@@ -29,26 +29,12 @@ def test_an_ordinary_one_is_what_it_was() -> None:
 @pytest.mark.parametrize(
     "changes",
     [
-        {"profile": "none"},
-        {"network": "anything"},
-        {"network": ["host"]},
-        {"gpu": 1},
-        {"gpu": []},
-        {"gpu": [True]},
-        {"gpu": [-1]},
-        {"gpu": "0"},
-        {"gpu": list(range(65))},
-        {"record_denials": 1},
-        {"readable": "/etc"},
-        {"readable": [b"/etc"]},
-        {"readable": ["/a"] * 65},
-        {"environment": {"A": b"b"}},
-        {"environment": {"A": "b" * (64 << 10)}},
-        {"environment": {"A": "b\0c"}},
-        {"environment": ["A"]},
-        {"limits": None},
-        {"limits": {"unknown": 1}},
-        {"surplus": 1},
+        *({"profile": "none"}, {"network": "anything"}, {"network": ["host"]}, {"surplus": 1}),
+        *({"gpu": lie} for lie in (1, [], [True], [-1], "0", list(range(65)))),
+        *({"readable": lie} for lie in ("/etc", [b"/etc"], ["/a"] * 65)),
+        *({"environment": {"A": lie}} for lie in (b"b", "b" * (64 << 10), "b\0c")),
+        *({"environment": ["A"]}, {"record_denials": 1}),
+        *({"limits": lie} for lie in (None, {"unknown": 1}, {"output_bytes": 1 << 30})),
     ],
     ids=lambda changes: next(iter(changes)),
 )
@@ -64,9 +50,3 @@ def test_a_limit_is_a_number_above_zero(name: str, value: object) -> None:
     """A negative one would make room for others in a sum, and a text would end the server."""
     with pytest.raises(RemoteProtocolError):
         confinement_from_wire(wire(limits={**asdict(Limits()), name: value}))
-
-
-def test_what_is_kept_of_the_output_is_bounded() -> None:
-    """It lies in the server's own memory."""
-    with pytest.raises(RemoteProtocolError, match="output_bytes"):
-        confinement_from_wire(wire(limits={"output_bytes": 1 << 30}))

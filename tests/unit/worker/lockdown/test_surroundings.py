@@ -43,38 +43,36 @@ def test_without_a_system_call_filter_there_is_no_profile() -> None:
     assert surroundings.profiles(layers("user-namespace", "landlock"), 7) == []
 
 
-def test_limits_are_read_from_either_kind_of_control_group(tmp_path: Path) -> None:
-    """Version 2 has one folder, version 1 one for each controller."""
-    two, one, none = tmp_path / "two", tmp_path / "one", tmp_path / "none"
-    for folder in (two, none, one / "memory", one / "pids", one / "cpu"):
-        folder.mkdir(parents=True)
-    for name, text in (("memory.max", "1000"), ("pids.max", "7"), ("cpu.max", "150000 100000")):
-        (two / name).write_text(text)
-    (one / "memory/memory.limit_in_bytes").write_text("1000\n")
-    (one / "pids/pids.max").write_text("7\n")
-    (one / "cpu/cpu.cfs_quota_us").write_text("150000\n")
-    (one / "cpu/cpu.cfs_period_us").write_text("100000\n")
-    for root in (two, one):
-        assert surroundings.memory_limit(root) == 1000
-        assert surroundings.pids_limit(root) == 7
-        assert surroundings.cpus_limit(root) == 1.5
-    for read in (surroundings.memory_limit, surroundings.pids_limit, surroundings.cpus_limit):
-        assert read(none) is None
-
-
-def test_no_limit_is_not_read_as_one(tmp_path: Path) -> None:
-    """Both versions have a word or a number for "none"."""
-    for folder in ("two", "one/memory", "one/pids", "one/cpu"):
-        (tmp_path / folder).mkdir(parents=True)
-    for name, text in (("memory.max", "max"), ("pids.max", "max"), ("cpu.max", "max 100000")):
-        (tmp_path / "two" / name).write_text(text)
-    (tmp_path / "one/memory/memory.limit_in_bytes").write_text("9223372036854771712")
-    (tmp_path / "one/pids/pids.max").write_text("max")
-    (tmp_path / "one/cpu/cpu.cfs_quota_us").write_text("-1")
-    (tmp_path / "one/cpu/cpu.cfs_period_us").write_text("100000")
-    for root in (tmp_path / "two", tmp_path / "one"):
-        for read in (surroundings.memory_limit, surroundings.pids_limit, surroundings.cpus_limit):
-            assert read(root) is None
+@pytest.mark.parametrize(
+    ("memory", "pids", "cpus", "quota", "found"),
+    [
+        ("1000", "7", "150000 100000", "150000", (1000, 7, 1.5)),
+        ("max", "max", "max 100000", "-1", (None, None, None)),
+    ],
+    ids=["limits", "none"],
+)
+def test_limits_are_read_from_either_kind_of_control_group(
+    tmp_path: Path, memory: str, pids: str, cpus: str, quota: str, found: object
+) -> None:
+    """Version 2 has one folder, version 1 one for each controller; for none a word or a number."""
+    files: dict[str, dict[str, str]] = {
+        "two": {"memory.max": memory, "pids.max": pids, "cpu.max": cpus},
+        "one": {
+            "memory/memory.limit_in_bytes": memory.replace("max", "9223372036854771712"),
+            "pids/pids.max": pids,
+            "cpu/cpu.cfs_quota_us": quota,
+            "cpu/cpu.cfs_period_us": "100000",
+        },
+        "empty": {},
+    }
+    for root, expected in (("two", found), ("one", found), ("empty", (None, None, None))):
+        folder = tmp_path / root
+        folder.mkdir()
+        for name, text in files[root].items():
+            (folder / name).parent.mkdir(exist_ok=True)
+            (folder / name).write_text(f"{text}\n")
+        readers = surroundings.memory_limit, surroundings.pids_limit, surroundings.cpus_limit
+        assert tuple(read(folder) for read in readers) == expected
 
 
 def test_the_network_is_what_the_kernel_lists() -> None:

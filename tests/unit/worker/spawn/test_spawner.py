@@ -179,24 +179,19 @@ if os.fork() == 0:
 """
 
 
-def test_killed_jail_leaves_no_daemon(cell: Cell, folder: Path) -> None:
-    """A double-forked daemon in its own session dies with its jail, and its files go."""
+@pytest.mark.parametrize("end", ["the jail is killed", "its last runner ends"])
+def test_no_daemon_outlives_its_jail(cell: Cell, folder: Path, end: str) -> None:
+    """A double-forked one in its own session dies with it, or with the last runner."""
     mark = str(folder / "mark")
     cell.run(DAEMON.format(mark=mark))
     wait_until(lambda: processes_that_mention(mark), "the daemon never came")
-    cell.jail.kill()
-    cell.jail.kill()
-    cell.wait_for(JailExited)
-    wait_until(lambda: not processes_that_mention(mark), "the daemon lived on")
-
-
-def test_last_runner_takes_daemons_along(cell: Cell, folder: Path) -> None:
-    """When no runner is left, nothing else of the jail runs on."""
-    mark = str(folder / "mark")
-    cell.run(DAEMON.format(mark=mark))
-    wait_until(lambda: processes_that_mention(mark), "the daemon never came")
-    cell.hang_up()
-    cell.wait_for(RunnerExited)
+    if end == "the jail is killed":
+        cell.jail.kill()
+        cell.jail.kill()
+        cell.wait_for(JailExited)
+    else:
+        cell.hang_up()
+        cell.wait_for(RunnerExited)
     wait_until(lambda: not processes_that_mention(mark), "the daemon lived on")
 
 

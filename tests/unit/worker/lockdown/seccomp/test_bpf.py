@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -74,22 +76,21 @@ def test_far_branch_becomes_a_pair_of_jumps(both: bool) -> None:
     assert run(program, 0, 8) == (3 if both else 1)
 
 
-def test_label_behind_its_branch_is_refused() -> None:
-    """The kernel would refuse a backward jump; we say which."""
-    with pytest.raises(ValueError, match="'back' lies behind"):
-        assemble([Label("back"), Do(LOAD, 0), Branch(JUMP_EQUAL, 1, "back", None)])
-
-
-def test_missing_label_is_refused() -> None:
-    """A typo is no jump to nowhere."""
-    with pytest.raises(KeyError, match="nowhere"):
-        assemble([Branch(JUMP_EQUAL, 1, "nowhere", None), Do(RETURN, 0)])
-
-
-def test_overlong_program_is_refused() -> None:
-    """The kernel takes 4096 instructions."""
-    with pytest.raises(ValueError, match="4097"):
-        assemble([Do(LOAD, 0)] * 4097)
+@pytest.mark.parametrize(
+    ("items", "error", "text"),
+    [
+        ([Label("back"), Do(LOAD, 0), Branch(JUMP_EQUAL, 1, "back", None)], ValueError, "behind"),
+        ([Branch(JUMP_EQUAL, 1, "nowhere", None), Do(RETURN, 0)], KeyError, "nowhere"),
+        ([Do(LOAD, 0)] * 4097, ValueError, "4097"),
+    ],
+    ids=["a label behind its branch", "a missing label", "too long"],
+)
+def test_what_the_kernel_would_refuse_is_refused(
+    items: list[Any], error: type[Exception], text: str
+) -> None:
+    """With the label, or the length, at fault."""
+    with pytest.raises(error, match=text):
+        assemble(items)
 
 
 @given(

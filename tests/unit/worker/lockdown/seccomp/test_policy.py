@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -61,16 +62,6 @@ def test_program_is_the_golden_one(machine: str, namespaced: bool, network: str)
     name = f"seccomp-{machine}-{'namespaced' if namespaced else 'bare'}-{network}.txt"
     program = filter.program(machine, policy_table(namespaced=namespaced, network=network))
     assert bpf.listing(program) == (GOLDEN / name).read_text()
-
-
-@machines
-def test_times_are_pretended_but_for_a_touch(machine: str) -> None:
-    """A touch that succeeds means that the file is there, and this one may not be."""
-    filtered = Filter(machine, namespaced=False)
-    path, times = 0x7F00_0000_0010, 0x7F00_0000_0020
-    assert filtered("utimensat", 3, path, times, 0) == PRETEND
-    assert filtered("utimensat", 3, 0, 0, 0) == PRETEND
-    assert filtered("utimensat", 3, path, 0, 0) == EPERM
 
 
 @machines
@@ -150,102 +141,120 @@ def test_what_no_library_needs_never_reaches_the_kernel(
             assert check(name, *arguments) == verdict, name
 
 
-@machines
-def test_clone3_falls_back_and_clone_makes_no_namespace(machine: str) -> None:
-    """The flags of clone3 lie in memory; those of clone are checked one by one."""
-    check = Filter(machine, True)
-    assert check("clone3") == ENOSYS
-    threads = 0x003D0F00
-    assert check("clone", threads) == ALLOW
-    assert check("clone", 17) == ALLOW  # SIGCHLD: a plain fork
-    for flag in (0x20000, 0x2000000, 0x4000000, 0x8000000, 0x10000000, 0x20000000, 0x40000000):
-        assert check("clone", threads | flag) == EPERM
+Row = tuple[dict[str, Any], int, list[tuple[Any, ...]]]
+THREADS = 0x003D0F00
+NAMESPACES = (0x20000, 0x2000000, 0x4000000, 0x8000000, 0x10000000, 0x20000000, 0x40000000)
+TCP_AND_UDP = ((1, 0), (1, 6), (2, 0), (2, 17), (1 | 0o2000000, 0))
+OTHERS = ((1, 262), (3, 0), (3, 1), (2, 1), (5, 0), (1, 132))  # MPTCP, raw, SCTP
+PATH, TIMES = 0x7F00_0000_0010, 0x7F00_0000_0020
+MODES = ("fchmod", "fchmodat", "fchmodat2", "fchown", "fchownat", "utimensat")
+XATTRS = ("setxattr", "fsetxattr", "lremovexattr")
+TO_AN_ADDRESS = [("sendto", 3, 0, 0, 0, 0x1000), ("sendto", 3, 0, 0, 0, 1 << 32)]
+
+
+def under(verdict: int, calls: list[tuple[Any, ...]], *namespaced: bool, **options: Any) -> Row:
+    """Calls that get this verdict; with namespaces and without, where nothing is said."""
+    return {"namespaced": namespaced or (True, False), **options}, verdict, calls
+
+
+def of(name: str, *first: int, last: Sequence[int]) -> list[tuple[Any, ...]]:
+    """Calls that differ in their last argument; the kernel reads 32 bits of some."""
+    return [(name, *first, one) for one in last]
+
+
+CLAIMS: dict[str, list[Row]] = {
+    "clone3's flags lie in memory, those of clone are checked one by one": [
+        under(ENOSYS, [("clone3",)], True),
+        under(ALLOW, of("clone", last=(THREADS, 17)), True),  # SIGCHLD: a plain fork
+        under(EPERM, of("clone", last=[THREADS | flag for flag in NAMESPACES]), True),
+    ],
+    "without network local sockets where no file of the host is in reach, and nothing else": [
+        under(ALLOW, [("socket", 1, 1), ("socketpair", 1, 2)], True),
+        under(NOT_SUPPORTED, [("socket", 1, 1), ("socketpair", 1, 2)], False),
+        under(NOT_SUPPORTED, [("socket", one, 1) for one in (2, 10, 16, 17, 40, 44, 1 << 32 | 2)]),
+        under(NOT_SUPPORTED, [("socketpair", 2, 1)]),
+        under(ALLOW, of("socketpair", 1, last=(1, 1 | 0o2000000 | 0o4000))),  # CLOEXEC, NONBLOCK
+    ],
+    "local sockets end where the host's abstract names begin and Landlock does not": [
+        under(NOT_SUPPORTED, of("socket", 1, last=(1, 2)), True, network="host", scoped=False),
+        under(NOT_SUPPORTED, [("socketpair", 1, 2)], True, network="host", scoped=False),
+        under(ALLOW, [("socketpair", 1, 1), ("socket", 2, 1)], True, network="host", scoped=False),
+        under(ALLOW, [("socket", 1, 1)], True, network="host"),
+    ],
+    "internet sockets are TCP and UDP only, even on the host's network": [
+        under(ALLOW, [("socket", f, *one) for f in (2, 10) for one in TCP_AND_UDP], network="host"),
+        under(
+            NOT_SUPPORTED,
+            [("socket", 16, 3), *(("socket", f, *one) for f in (2, 10) for one in OTHERS)],
+            network="host",
+        ),
+    ],
+    "sending to an address is denied without namespaces, and both halves of a pointer count": [
+        under(ALLOW, [("sendto", 3, 0, 0, 0, 0)], False),
+        under(EPERM, TO_AN_ADDRESS, False),
+        under(EPERM, [(name,) for name in ("bind", "connect", "listen", "accept4")], False),
+    ],
+    "only own limits and priority change": [
+        under(ALLOW, [*of("prlimit64", last=(0, 1 << 32)), ("setpriority", 0, 0)]),
+        under(
+            EPERM, [("prlimit64", 1), *(("setpriority", *one) for one in ((0, 1), (1, 0), (2, 0)))]
+        ),
+    ],
+    "terminal injection (TIOCSTI) and file flags (FS_IOC_SETFLAGS) are denied, FIOCLEX is not": [
+        under(EPERM, of("ioctl", 1, last=(0x5412, 0x541C, 0x541D, 0x5423, 1 << 32 | 0x5412)), True),
+        under(NOT_A_TTY, of("ioctl", 1, last=(0x40086602, 0x40806685, 0x401C5820)), True),
+        under(NOT_A_TTY, of("ioctl", 1, last=(0xC0045877, 0x40087602, 0x5000940E)), True),
+        under(ALLOW, of("ioctl", 1, last=(0x5401, 0x5451, 0x5421, 0x541B)), True),
+    ],
+    "prctl: no filters, no hiding from the watchdog; others are invalid": [
+        under(EPERM, [("prctl", one, 0) for one in (4, 8, 22, 24, 28, 35, 47, 59)], True),
+        under(EPERM, [("prctl", 1 << 32 | 22)], True),
+        under(ALLOW, of("prctl", last=(1, 15, 16, 21, 23, 36, 38, 39)), True),
+        under(EINVAL, of("prctl", last=(41, 53, 62, 67, 78)), True),
+        under(EINVAL, of("prctl", last=(0x53564D41, 0x59616D61, 1 << 31)), True),
+    ],
+    "modes and times are pretended without a mount namespace, where Landlock cannot stop them": [
+        under(PRETEND, [(name,) for name in MODES], False),
+        under(ALLOW, [(name,) for name in (*MODES, *XATTRS)], True),
+        under(EPERM, [(name,) for name in XATTRS], False),
+        under(ALLOW, [("sched_setaffinity", 0)], False),
+        under(PRETEND, [("sched_setaffinity", 1)], False),
+        under(PRETEND, [("utimensat", 3, PATH, TIMES, 0), ("utimensat", 3, 0, 0, 0)], False),
+        under(EPERM, [("utimensat", 3, PATH, 0, 0)], False),  # a touch says that the file is there
+    ],
+    "what reaches others through a readable file is denied: leases, notices, owners, pipes": [
+        under(EPERM, of("fcntl", 0, last=(8, 10, 15, 1024, 1026, 1031, 1036, 1038, 1040))),
+        under(EPERM, [("fcntl", 0, 1 << 32 | 1024), *of("ioctl", 0, last=(0x8901, 0x8902))]),
+        under(ALLOW, of("fcntl", 0, last=(0, 1, 2, 3, 4, 6, 7, 36, 1030, 1032, 1034))),
+        under(EINVAL, of("fcntl", 0, last=(12, 35, 1039, 1041, 1 << 31))),
+    ],
+    "buffers of sockets keep their size, which init counts; TCP's own options are free": [
+        under(PRETEND, of("setsockopt", 3, 1, last=(7, 8, 32, 33)), True, network="host"),
+        under(ALLOW, of("setsockopt", 3, 6, last=(7, 8, 32, 33)), True, network="host"),
+        under(EPERM, of("setsockopt", 3, 1, last=(26, 50, 51, 52)), True, network="host"),
+        under(ALLOW, [("setsockopt", 3, 1, 2)], True, network="host"),  # SO_REUSEADDR
+    ],
+    "signals are handed to init where it sends them; what has no broker is denied or falls back": [
+        under(ASK, [(one, 1, 15) for one in ("kill", "tkill", "tgkill")], False, brokered=True),
+        under(EPERM, [("rt_sigqueueinfo", 1, 15)], False, brokered=True),
+        under(ENOSYS, [("pidfd_send_signal", 1, 15)], False, brokered=True),
+    ],
+    "only fifos are made": [
+        under(ALLOW, [("mknodat", 0, 0, 0o10644)], True),
+        under(EPERM, of("mknodat", 0, 0, last=(0o100644, 0o644, 0o20644)), True),
+    ],
+}
 
 
 @machines
-@pytest.mark.parametrize("namespaced", [True, False])
-def test_socket_families_without_network(machine: str, namespaced: bool) -> None:
-    """Local sockets where no file of the host is in reach; nothing else, whatever the high bits."""
-    check = Filter(machine, namespaced)
-    assert check("socket", 1, 1) == (ALLOW if namespaced else NOT_SUPPORTED)
-    for family in (2, 10, 16, 17, 40, 44, 1 << 32 | 2):
-        assert check("socket", family, 1) == NOT_SUPPORTED
-    assert check("socketpair", 1, 1) == ALLOW
-    assert check("socketpair", 1, 1 | 0o2000000 | 0o4000) == ALLOW  # CLOEXEC, NONBLOCK
-    assert check("socketpair", 1, 2) == (ALLOW if namespaced else NOT_SUPPORTED)
-    assert check("socketpair", 2, 1) == NOT_SUPPORTED
-
-
-@machines
-def test_local_sockets_end_where_the_hosts_abstract_names_begin(machine: str) -> None:
-    """On the host's network, with a Landlock that does not keep them out of reach."""
-    verdict = Filter(machine, True, "host", scoped=False)
-    assert verdict("socket", 1, 1) == verdict("socket", 1, 2) == NOT_SUPPORTED
-    assert verdict("socketpair", 1, 2) == NOT_SUPPORTED
-    assert verdict("socketpair", 1, 1) == verdict("socket", 2, 1) == ALLOW
-    assert Filter(machine, True, "host")("socket", 1, 1) == ALLOW
-
-
-@machines
-@pytest.mark.parametrize("namespaced", [True, False])
-def test_internet_sockets_are_tcp_and_udp_only(machine: str, namespaced: bool) -> None:
-    """No raw, no MPTCP, no SCTP, no netlink, even on the host's network."""
-    check = Filter(machine, namespaced, "host")
-    for family in (2, 10):
-        for kind, protocol in ((1, 0), (1, 6), (2, 0), (2, 17), (1 | 0o2000000, 0)):
-            assert check("socket", family, kind, protocol) == ALLOW
-        for kind, protocol in ((1, 262), (3, 0), (3, 1), (2, 1), (5, 0), (1, 132)):
-            assert check("socket", family, kind, protocol) == NOT_SUPPORTED
-    assert check("socket", 16, 3) == NOT_SUPPORTED
-
-
-@machines
-def test_sending_to_an_address_is_denied_without_namespaces(machine: str) -> None:
-    """Both halves of the pointer count."""
-    check = Filter(machine, False)
-    assert check("sendto", 3, 0, 0, 0, 0) == ALLOW
-    assert check("sendto", 3, 0, 0, 0, 0x1000) == EPERM
-    assert check("sendto", 3, 0, 0, 0, 1 << 32) == EPERM
-    for name in ("bind", "connect", "listen", "accept4"):
-        assert check(name) == EPERM
-
-
-@machines
-@pytest.mark.parametrize("namespaced", [True, False])
-def test_only_own_limits_and_priority_change(machine: str, namespaced: bool) -> None:
-    """prlimit and setpriority of another process are denied."""
-    check = Filter(machine, namespaced)
-    assert check("prlimit64", 0) == ALLOW
-    assert check("prlimit64", 1) == EPERM
-    assert check("prlimit64", 1 << 32) == ALLOW  # the kernel reads 32 bits: that is 0
-    assert check("setpriority", 0, 0) == ALLOW
-    for which, who in ((0, 1), (1, 0), (2, 0)):
-        assert check("setpriority", which, who) == EPERM
-
-
-@machines
-def test_terminal_injection_and_file_flags_are_denied(machine: str) -> None:
-    """TIOCSTI and friends; FS_IOC_SETFLAGS and all of its kind; FIOCLEX and TCGETS go through."""
-    check = Filter(machine, True)
-    for request in (0x5412, 0x541C, 0x541D, 0x5423, 1 << 32 | 0x5412):
-        assert check("ioctl", 1, request) == EPERM
-    for request in (0x40086602, 0x40806685, 0x401C5820, 0xC0045877, 0x40087602, 0x5000940E):
-        assert check("ioctl", 1, request) == NOT_A_TTY
-    for request in (0x5401, 0x5451, 0x5421, 0x541B):
-        assert check("ioctl", 1, request) == ALLOW
-
-
-@machines
-def test_prctl_has_a_list_of_options(machine: str) -> None:
-    """No filters, whose memory nobody counts; no hiding from the watchdog; others are invalid."""
-    check = Filter(machine, True)
-    for option in (4, 8, 22, 24, 28, 35, 47, 59):
-        assert check("prctl", option, 0) == EPERM
-    for option in (1, 15, 16, 21, 23, 36, 38, 39):
-        assert check("prctl", option) == ALLOW
-    for option in (41, 53, 62, 67, 78, 0x53564D41, 0x59616D61, 1 << 31):
-        assert check("prctl", option) == EINVAL
-    assert check("prctl", 1 << 32 | 22) == EPERM  # the kernel reads 32 bits
+@pytest.mark.parametrize("claim", CLAIMS)
+def test_calls_are_judged_by_their_arguments(machine: str, claim: str) -> None:
+    """Each claim by all of its calls, in each profile that it is about."""
+    for options, verdict, calls in CLAIMS[claim]:
+        for namespaced in options["namespaced"]:
+            check = Filter(machine, **{**options, "namespaced": namespaced})
+            for name, *arguments in calls:
+                assert check(name, *arguments) == verdict, (namespaced, name, arguments)
 
 
 def test_arch_prctl_has_a_list_of_options() -> None:
@@ -255,49 +264,6 @@ def test_arch_prctl_has_a_list_of_options() -> None:
         assert check("arch_prctl", option) == ALLOW
     for option in (0x1012, 0x2001, 0x2003, 0x3001, 0x4001, 0x5001):
         assert check("arch_prctl", option) == EINVAL
-
-
-@machines
-def test_modes_and_times_are_pretended_without_a_mount_namespace(machine: str) -> None:
-    """Landlock cannot stop them there; programs that copy files go on."""
-    bare, namespaced = Filter(machine, False), Filter(machine, True)
-    for name in ("fchmod", "fchmodat", "fchmodat2", "fchown", "fchownat", "utimensat"):
-        assert bare(name) == PRETEND
-        assert namespaced(name) == ALLOW
-    for name in ("setxattr", "fsetxattr", "lremovexattr"):
-        assert bare(name) == EPERM
-        assert namespaced(name) == ALLOW
-    assert bare("sched_setaffinity", 0) == ALLOW
-    assert bare("sched_setaffinity", 1) == PRETEND
-
-
-@machines
-@pytest.mark.parametrize("namespaced", [True, False])
-def test_what_reaches_others_through_a_readable_file_is_denied(
-    machine: str, namespaced: bool
-) -> None:
-    """Leases, notices, owners, sizes of pipes; commands that nobody knows are invalid."""
-    check = Filter(machine, namespaced)
-    for command in (8, 10, 15, 1024, 1026, 1031, 1036, 1038, 1040, 1 << 32 | 1024):
-        assert check("fcntl", 0, command) == EPERM
-    for command in (0, 1, 2, 3, 4, 6, 7, 36, 1030, 1032, 1034):
-        assert check("fcntl", 0, command) == ALLOW
-    for command in (12, 35, 1039, 1041, 1 << 31):
-        assert check("fcntl", 0, command) == EINVAL
-    for request in (0x8901, 0x8902):
-        assert check("ioctl", 0, request) == EPERM
-
-
-@machines
-def test_buffers_of_sockets_keep_their_size(machine: str) -> None:
-    """Init counts a socket with what it may hold; programs that ask for more are told yes."""
-    check = Filter(machine, True, "host")
-    for option in (7, 8, 32, 33):
-        assert check("setsockopt", 3, 1, option) == PRETEND
-        assert check("setsockopt", 3, 6, option) == ALLOW  # TCP's own options
-    for option in (26, 50, 51, 52):
-        assert check("setsockopt", 3, 1, option) == EPERM
-    assert check("setsockopt", 3, 1, 2) == ALLOW  # SO_REUSEADDR
 
 
 @machines
@@ -320,14 +286,6 @@ def test_memory_out_of_sight_is_denied_where_it_is_measured(machine: str) -> Non
         assert measured("mmap", 0, size, 3, shared, 5) == ALLOW
     for filtered in (measured, counted):
         assert filtered("mmap", 0, 1 << 21, 3, private | anonymous | huge) == NO_MEMORY
-
-
-@machines
-def test_signals_are_handed_to_init_where_it_sends_them(machine: str) -> None:
-    """All that name a process; what has no broker is denied, or falls back."""
-    check = Filter(machine, False, brokered=True)
-    names = ("kill", "tkill", "tgkill", "rt_sigqueueinfo", "pidfd_send_signal")
-    assert [check(name, 1, 15) for name in names] == [ASK, ASK, ASK, EPERM, ENOSYS]
 
 
 @machines
@@ -365,14 +323,6 @@ def test_what_is_recorded_is_denied_all_the_same(
     assert "sched_setscheduler" in refused, "it only seems to work, and does so still"
     assert seen >= {"openat", "unlinkat", "renameat2", "kill", "pidfd_open"}
     assert ("fchmodat" in seen, "connect" in seen) == (namespaced, namespaced or network == "host")
-
-
-@machines
-def test_only_fifos_are_made(machine: str) -> None:
-    """No device, and no file in this way."""
-    check = Filter(machine, True)
-    for mode, verdict in ((0o10644, ALLOW), (0o100644, EPERM), (0o644, EPERM), (0o20644, EPERM)):
-        assert check("mknodat", 0, 0, mode) == verdict
 
 
 def test_unknown_machine_is_refused() -> None:

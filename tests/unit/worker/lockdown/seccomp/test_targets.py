@@ -29,15 +29,9 @@ def children() -> Iterator[tuple[int, int]]:
 @pytest.mark.parametrize(
     ("call", "place"),
     [
-        ("kill", 0),
-        ("tkill", 0),
-        ("tgkill", 0),
-        ("rt_sigqueueinfo", 0),
-        ("pidfd_open", 0),
-        ("sched_setscheduler", 0),
-        ("sched_setaffinity", 0),
-        ("setpriority", 1),
-        ("ioprio_set", 1),
+        *((name, 0) for name in ("kill", "tkill", "tgkill", "rt_sigqueueinfo", "pidfd_open")),
+        *(("sched_setscheduler", 0), ("sched_setaffinity", 0)),
+        *(("setpriority", 1), ("ioprio_set", 1)),
     ],
 )
 def test_what_is_not_below_init_is_another(

@@ -1,0 +1,191 @@
+"""``envhub check --all``: what is asked for is checked before anything is run."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+import typer
+from typer.testing import CliRunner, Result
+
+from envhub_sandbox.check.many.entries import ListEntry
+from envhub_sandbox.check.many.judgements import Outcome
+from envhub_sandbox.check.many.results import Result as Judgement
+from envhub_sandbox.check.many.results import Verdict
+from envhub_sandbox.cli.app import app
+from envhub_sandbox.cli.check import list_run
+from envhub_sandbox.cli.check.check import check
+from envhub_sandbox.cli.check.options import OF_A_LIST, SETTINGS
+from envhub_sandbox.cli.shared.exits import Exit
+
+_RUNNER = CliRunner()
+
+
+@pytest.fixture
+def started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, list[str]]]:
+    """How many may run at once, and what would be run; each could not be judged."""
+    found: list[tuple[int, list[str]]] = []
+
+    def judgements(orders, command, *, folder, jobs, **_):  # type: ignore[no-untyped-def]
+        for number, order in enumerate(orders):
+            found.append((jobs, command(order, folder / str(number), 7)))
+            yield Outcome(
+                order=order, folder=folder, code=3, seconds=1.0, out=b"", said="Error: not there"
+            )
+
+    monkeypatch.setattr(list_run, "judgements", judgements)
+    monkeypatch.setattr(list_run, "free_memory_bytes", lambda: 64 << 30)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "list").write_text("org/repo\n./env\n")
+    (tmp_path / "env").mkdir()
+    (tmp_path / "env" / "envhub.toml").touch()
+    return found
+
+
+def called(*arguments: str) -> Result:
+    """The command, in this process."""
+    return _RUNNER.invoke(app, ["check", *arguments])
+
+
+def test_each_is_told_what_holds_here(started: list[tuple[int, list[str]]]) -> None:
+    """From the command line, or a file; nothing that is about the list, and no secret."""
+    Path("settings.toml").write_text("[check]\nsteps = 7\nallow = ['card', 'licence']\n")
+    Path("policy.toml").write_text('network = "loopback"\n')
+    done = called(
+        *("--all", "list", "--output", "out", "--settings", "settings.toml", "--resets", "0"),
+        *("--policy", "policy.toml", "--token", "hf_secret", "--async", "--jobs", "1", "--json"),
+    )
+    assert done.exit_code == Exit.UNJUDGED, done.output
+    assert [jobs for jobs, _ in started] == [1, 1]
+    for (_, command), reference in zip(started, ("org/repo", "./env"), strict=True):
+        assert command[-2:] == ["--", reference]
+        words = {word for word in command if word.startswith("--")}
+        assert words > {"--steps=7", "--allow=card", "--allow=licence", "--resets=0", "--async"}
+        assert not any(word.startswith(("--all=", "--out", "--jobs", "--set")) for word in words)
+        assert "hf_secret" not in " ".join(command)
+        [policy] = [word for word in words if word.startswith("--policy=")]
+        assert policy.endswith(".running/policy.toml")
+
+
+def test_a_file_says_what_one_may_type_about_a_list(
+    started: list[tuple[int, list[str]]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And what is typed counts more. For one repository the same file is no mistake."""
+    seconds: list[float] = []
+    faked = list_run.judgements
+
+    def judgements(orders, command, *, most_s, **more):  # type: ignore[no-untyped-def]
+        seconds.append(most_s)
+        yield from faked(orders, command, **more)
+
+    monkeypatch.setattr(list_run, "judgements", judgements)
+    says = "[check]\njobs = 5\nmax-memory = '6G'\ndeadline = 9\nmemory = '1G'\n"
+    Path("settings.toml").write_text(says)
+    arguments = ("--all", "list", "--output", "out", "--settings", "settings.toml")
+    for typed in ((), ("--jobs", "2"), ("--max-memory", "2G"), ("--deadline", "8")):
+        done = called(*arguments, *typed)
+        assert done.exit_code == Exit.UNJUDGED, done.output
+    assert ([jobs for jobs, _ in started[::2]], seconds) == ([3, 2, 1, 3], [69, 69, 69, 68])
+    assert all("--memory=1G" in words for _, words in started)
+    assert not any(word.startswith("--jobs") for _, words in started for word in words)
+    assert [word for _, words in started[::2] for word in words if word.startswith("--dead")] == [
+        *("--deadline=9.0", "--deadline=9.0", "--deadline=9.0", "--deadline=8.0")
+    ]
+    alone = called("./nothing", "--settings", "settings.toml")
+    assert "there is no such folder" in alone.output
+
+
+def test_every_option_is_handed_on_or_about_the_list() -> None:
+    """A new one is handed on by itself."""
+    command = typer.main.get_command(app)
+    [found] = [one for name, one in command.commands.items() if name == "check"]  # type: ignore[attr-defined]
+    names = {one.name for one in found.params}
+    of_the_list = list_run.OF_THE_LIST
+    assert names > of_the_list
+    assert names > set(SETTINGS)
+    assert set(OF_A_LIST) < of_the_list
+    handed_on = {"steps", "fail_on", "allow", "timeout", "memory", "profile"}
+    assert names - of_the_list > handed_on
+    assert check.__doc__ is not None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        ("--all list", "needs --output DIR"),
+        ("--all list --output out org/repo", "not both"),
+        ("--all list --output out --sarif x", "--sarif is about one repository"),
+        ("--all list --output out --html x", "--html is about one repository"),
+        ("--all list --output out --fail-on never", "error, warning or note"),
+        ("--all list --output out --allow nothing", "there are requirements"),
+        ("--all list --output out --memory much", "takes a size"),
+        ("--all list --output out --max-memory 4G", "is too little"),
+        ("--all list --output out --policy nowhere.toml", "cannot be read"),
+        ("--all list --output out --profile weak", "'weak'"),
+        ("--all nowhere --output out", "cannot be read"),
+        ("--all list --output .", "has other things in it"),
+        ("--all list --output env/out", "lies in what is judged, ./env (line 2"),
+        ("--all list --output out --policy env/x", "--policy env/x lies in what is judged"),
+        ("./env --policy env/x", "--policy env/x lies in what is judged, ./env, and no"),
+        ("./env --settings env/envhub.toml", "lies in what is judged, ./env, and no"),
+        ("--all list --output out --deadline inf", "--deadline is inf"),
+        ("--all list --output out --settings env/x.toml", "cannot be read"),
+        ("--all wrong --output out", "wrong:2: "),
+        ("", "name a repository, or a list"),
+        ("org/repo --jobs 2", "are for --all FILE"),
+        ("org/repo --output out", "are for --all FILE"),
+        ("org/repo --deadline inf", "--deadline is inf"),
+    ],
+)
+def test_what_cannot_be_is_told_first(
+    arguments: str, says: str, started: list[tuple[int, list[str]]]
+) -> None:
+    """And nothing is run, or made."""
+    Path("wrong").write_text("org/repo\nrepo\n")
+    done = called(*arguments.split())
+    assert done.exit_code == Exit.USAGE, done.output
+    assert says in " ".join(done.output.split())
+    assert started == []
+    assert not Path("out").exists()
+
+
+@pytest.mark.parametrize(
+    ("options", "jobs"),
+    [
+        ("--jobs 3 --memory 1G", 3),
+        ("--jobs 3 --memory 1G --max-memory 5G", 2),
+        ("--jobs 100 --memory 1G", 32),
+        ("--jobs 100", 4),
+        ("--jobs 2 --memory 1000G", 1),
+    ],
+)
+def test_limits_stay_within_the_budget(
+    options: str, jobs: int, started: list[tuple[int, list[str]]]
+) -> None:
+    """Two jails each; the budget is what is free, or what is said."""
+    done = called("--all", "list", "--output", "out", *options.split())
+    assert done.exit_code == Exit.UNJUDGED, done.output
+    assert {found for found, _ in started} == {jobs}
+    assert ("at once: a judgement may take" in done.output) is (jobs != 3)
+
+
+@pytest.mark.parametrize(
+    ("verdicts", "code"),
+    [
+        ([Verdict.PASSED, Verdict.PASSED], Exit.OK),
+        ([Verdict.PASSED, Verdict.UNJUDGED], Exit.UNJUDGED),
+        ([Verdict.PASSED, Verdict.WAITING], Exit.UNJUDGED),
+        ([Verdict.UNJUDGED, Verdict.FAILED], Exit.ENVIRONMENT),
+    ],
+)
+def test_what_fails_counts_most(verdicts: list[Verdict], code: Exit) -> None:
+    """As docs/ci.md says."""
+    listed = [ListEntry(f"a/{number}", f"a/{number}", number) for number in range(2)]
+    results = [
+        Judgement(listed=one, verdict=verdict)
+        for one, verdict in zip(listed, verdicts, strict=True)
+    ]
+    given = dict.fromkeys(one.name for one in fields(list_run.ListRun) if one.init)
+    given |= {"of": dict(zip(listed, results, strict=True))}
+    assert list_run.ListRun(**given).exit is code

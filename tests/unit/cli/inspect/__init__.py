@@ -1,0 +1,1 @@
+"""Unit tests of ``envhub_sandbox/cli/inspect``."""

@@ -1,0 +1,256 @@
+"""Errors become one message and a documented exit code; strangers' text does no harm."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import typer
+
+from envhub_sandbox import errors
+from envhub_sandbox.check.play.episodes import Episode, Rollout, RolloutError
+from envhub_sandbox.check.play.video import VideoError
+from envhub_sandbox.cli.shared.console import plain, print_json, safe_line, say
+from envhub_sandbox.cli.shared.exits import (
+    Exit,
+    UsageError,
+    code_for,
+    describe,
+    reported,
+)
+from envhub_sandbox.cli.shared.results import TaskResult, returns_of, statistics, task_document
+from envhub_sandbox.errors import EnvHubError
+from envhub_worker.protocol.text import quoted
+
+CODES = {
+    errors.HubReferenceError: 2,
+    errors.PolicyError: 2,
+    UsageError: 2,
+    VideoError: 2,
+    errors.SnapshotError: 3,
+    errors.SnapshotTooLargeError: 3,
+    errors.SnapshotIntegrityError: 3,
+    errors.RepositoryUnavailableError: 3,
+    errors.LoadError: 4,
+    errors.DependencyError: 4,
+    errors.WorkerStartupError: 5,
+    errors.WorkerDiedError: 5,
+    errors.WorkerTimeoutError: 5,
+    errors.RemoteProtocolError: 5,
+    errors.SandboxUnavailableError: 6,
+    RolloutError: 1,
+}
+
+
+@pytest.mark.parametrize(("kind", "code"), CODES.items())
+def test_every_error_has_its_code(kind: type[EnvHubError], code: int) -> None:
+    """As the help and the documentation say."""
+    assert code_for(kind("text")) == code
+
+
+def test_what_the_environment_raises_is_told_from_bugs() -> None:
+    """A remote ValueError is the environment's; one of this process is ours."""
+    assert code_for(errors.remote_error("ValueError", "ValueError", "x")) == Exit.ENVIRONMENT
+    assert code_for(ValueError("x")) == Exit.BUG
+    assert code_for(KeyboardInterrupt()) == Exit.INTERRUPTED
+
+
+def test_every_code_is_in_the_documentation(checkout: Path) -> None:
+    """In the table of ``docs/cli.md``."""
+    table = re.findall(r"^\| (\d+) \|", (checkout / "docs" / "cli.md").read_text(), re.MULTILINE)
+    assert {int(code) for code in table} == {int(code) for code in Exit}
+
+
+def test_a_message_carries_no_traceback_and_no_escape_sequence() -> None:
+    """The worker's traceback is for --debug; the line that it ends in is in the text."""
+    error = errors.LoadError("repo: bad \x1b[31mred\n  File x, line 1")
+    vars(error)["__notes__"] = ["Traceback ..."]
+    assert describe(error) == "repo: bad \\x1b[31mred\n  File x, line 1"
+
+
+def test_the_end_of_the_output_is_kept_short() -> None:
+    """The last lines are those that help."""
+    tail = "\n".join(f"line {number}" for number in range(100))
+    error = errors.WorkerDiedError(f"it died\nIts last output:\n{quoted(tail)}", log_tail=tail)
+    lines = describe(error).splitlines()
+    assert lines[:2] == ["it died", "Its last output:"]
+    assert lines[2:] == [f"  | line {number}" for number in range(90, 100)]
+
+
+def fail(error: BaseException, *, debug: bool) -> int:
+    """What a command that raises exits with."""
+    with pytest.raises(typer.Exit) as caught, reported(debug=debug):
+        raise error
+    return caught.value.exit_code
+
+
+def test_a_failure_is_one_message(capsys: pytest.CaptureFixture[str]) -> None:
+    """On stderr, with a hint at --debug where there is more to see."""
+    assert fail(UsageError("say [red]this[/red]"), debug=False) == 2
+    assert capsys.readouterr() == ("", "Error: say [red]this[/red]\n")
+    assert fail(errors.remote_error("ValueError", "ValueError", "x", "trace"), debug=False) == 1
+    assert "(--debug shows the traceback)" in capsys.readouterr().err
+
+
+def test_debug_shows_both_tracebacks(capsys: pytest.CaptureFixture[str]) -> None:
+    """Ours and the worker's, which is escaped."""
+    fail(errors.remote_error("ValueError", "ValueError", "x", "far \x1b away"), debug=True)
+    shown = capsys.readouterr().err
+    assert "Traceback (most recent call last)" in shown
+    assert "far \\x1b away" in shown
+
+
+def test_a_bug_of_ours_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+    """Nothing is blamed on the environment."""
+    assert fail(KeyError("x"), debug=False) == 70
+    assert "a bug in envhub: KeyError" in capsys.readouterr().err
+
+
+_ENDS = """
+import sys, typer
+from envhub_sandbox.cli.shared.console import say
+from envhub_sandbox.cli.shared.exits import reported
+
+try:
+    with reported(debug=False):
+        if sys.argv[1] == "interrupted":
+            raise KeyboardInterrupt
+        say("a line about progress")
+        print("x" * 100_000)
+except typer.Exit as end:
+    sys.exit(end.exit_code)
+"""
+
+
+@pytest.mark.parametrize(
+    ("how", "to", "code"),
+    [
+        ("told", "full", Exit.USAGE),
+        ("told", "nobody", Exit.PIPE),
+        ("interrupted", "nobody", Exit.INTERRUPTED),
+        ("interrupted", "full", Exit.INTERRUPTED),
+    ],
+)
+def test_where_nothing_can_be_written_the_code_is_the_same(how: str, to: str, code: Exit) -> None:
+    """Both streams go to a full disk, or to a reader who has ended."""
+    if to == "full":
+        end = os.open("/dev/full", os.O_WRONLY)
+    else:
+        nobody, end = os.pipe()
+        os.close(nobody)
+    try:
+        command = [sys.executable, "-I", "-c", _ENDS, how]
+        done = subprocess.run(command, stdout=end, stderr=end, timeout=120)
+    finally:
+        os.close(end)
+    assert done.returncode == code
+
+
+def test_a_full_disk_is_no_bug() -> None:
+    """Of what is printed, or of a file."""
+    assert describe(OSError(errno.ENOSPC, "full")).startswith("no space is left for what is print")
+    assert "left for /x/y;" in describe(OSError(errno.EDQUOT, "full", "/x/y"))
+    assert code_for(OSError(errno.ENOSPC, "full")) is Exit.USAGE
+    assert code_for(OSError(errno.EBADF, "bad")) is Exit.BUG
+
+
+def test_nothing_is_cut_or_coloured_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    """A long paragraph stays one line for whoever reads the file."""
+    say("word " * 100, style="red")
+    assert capsys.readouterr().err == "word " * 100 + "\n"
+
+
+def test_a_line_stays_a_line() -> None:
+    """Escaped, on one line, and cut."""
+    assert safe_line("a\nb\tc\x1b[2J\u202e") == "a b c\\x1b[2J\\u202e"
+    assert len(safe_line("x" * 1_000_000, 50)) == 50
+
+
+def test_json_is_valid_whatever_is_in_it(capsys: pytest.CaptureFixture[str]) -> None:
+    """Arrays become lists, numbers that JSON lacks null, and anything else text."""
+    document: dict[Any, Any] = {
+        "nan": float("nan"),
+        "inf": [np.float32("inf"), -np.inf],
+        "array": np.arange(4).reshape(2, 2),
+        "scalar": np.float64(0.5),
+        "flag": np.bool_(True),
+        "tuple": (1, None),
+        "bytes": b"\x00",
+        3: object,
+    }
+    print_json(document)
+    read = json.loads(capsys.readouterr().out, parse_constant=lambda name: pytest.fail(name))
+    assert read["nan"] is None
+    assert read["inf"] == [None, None]
+    assert read["array"] == [[0, 1], [2, 3]]
+    assert (read["scalar"], read["flag"], read["tuple"]) == (0.5, True, [1, None])
+    assert read["3"] == "<class 'object'>"
+
+
+def test_plain_data_stays_as_it_is() -> None:
+    """Including text that is no ASCII."""
+    value = {"a": [1, 2.5, "ü", None, True]}
+    assert plain(value) == value
+
+
+def test_statistics_are_the_population_s() -> None:
+    """Of the episodes that were played; nothing of nothing."""
+    spread = pytest.approx(1.8708286)
+    assert statistics([1, 2, 3, 6]) == {"mean": 3.0, "std": spread, "min": 1.0, "max": 6.0}
+    assert statistics([]) is None
+
+
+def result(*returns: tuple[float, ...]) -> TaskResult:
+    """A task in which these returns were earned."""
+    episodes = [
+        Episode(sub_env=0, returns=value, length=3, terminated=True, success=None)
+        for value in returns
+    ]
+    return TaskResult(
+        suite="s",
+        task=0,
+        num_envs=1,
+        autoreset_mode=None,
+        rollout=Rollout(episodes=episodes),
+        video=None,
+    )
+
+
+def test_vector_returns_are_lists() -> None:
+    """One entry per component; a plain number otherwise."""
+    two = task_document(result((1.0, -1.0), (3.0, -3.0)))
+    assert [component["mean"] for component in two["return"]] == [2.0, -2.0]
+    assert [list(episode["return"]) for episode in two["episodes"]] == [[1.0, -1.0], [3.0, -3.0]]
+    one = task_document(result((1.0,), (3.0,)))
+    assert one["return"]["mean"] == 2.0
+    assert [episode["return"] for episode in one["episodes"]] == [1.0, 3.0]
+
+
+def test_no_finished_episode_is_no_failure() -> None:
+    """There is nothing to average."""
+    assert returns_of(result().rollout) == [None]
+    assert task_document(result())["success_rate"] is None
+
+
+def test_help_loads_nothing_heavy() -> None:
+    """In a fresh interpreter, ``envhub run --help`` imports no numpy, no Gymnasium, no ZeroMQ."""
+    code = (
+        "import sys\n"
+        "from envhub_sandbox.cli.app import app\n"
+        "app(['run', '--help'], standalone_mode=False)\n"
+        "heavy = {'numpy', 'gymnasium', 'zmq', 'huggingface_hub', 'msgpack', 'imageio_ffmpeg'}\n"
+        "sys.exit(f'loaded {heavy & set(sys.modules)}' if heavy & set(sys.modules) else 0)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=120
+    )
+    assert done.returncode == 0, done.stderr
+    assert "--episodes" in done.stdout

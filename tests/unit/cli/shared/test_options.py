@@ -1,0 +1,174 @@
+"""Options become arguments of ``make_env``, or a message that says what to write."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any
+
+import pytest
+
+from envhub_sandbox.cli.shared.exits import ForeignError, UsageError
+from envhub_sandbox.cli.shared.options import (
+    ALL,
+    MakeOptions,
+    read_env_kwargs,
+    read_gpu,
+    read_size,
+    select_envs,
+    with_options,
+)
+from envhub_sandbox.errors import PolicyError, RemoteEnvError
+from envhub_sandbox.settings.options import OPTIONS
+from envhub_sandbox.settings.policy import policy_from
+
+
+def options(**given: Any) -> MakeOptions:
+    """Options of ``envhub run``, by key; the others as if nothing was typed."""
+    return MakeOptions("org/repo", {**{key: OPTIONS[key].default for key in ALL}, **given})
+
+
+def test_gpus_are_all_or_named_by_number() -> None:
+    """Anything else is told in the words of the option."""
+    assert [read_gpu(text) for text in (None, "all", "0", "0,2")] == [None, True, [0], [0, 2]]
+    for text in ("", "true", "-1", "0,", "0 1"):
+        with pytest.raises(UsageError, match="it takes all, or indices"):
+            read_gpu(text)
+
+
+def test_every_option_of_a_command_reaches_make_env() -> None:
+    """Under its key, and under no other; ``--timeout`` is four of them."""
+    made: list[MakeOptions] = []
+
+    @with_options(*ALL)
+    def probe(*, ref: str, make: MakeOptions) -> None:
+        made.append(make)
+
+    names = set(inspect.signature(probe).parameters)
+    probe(**{**{name: f"<{name}>" for name in names}, "debug": False})
+    given = {key: f"<{OPTIONS[key].parameter}>" for key in ALL}
+    assert made == [MakeOptions("<ref>", given)]
+    assert names == {*(OPTIONS[key].parameter for key in ALL), "ref", "debug"}
+    assert given["step_s"] == given["startup_s"] == "<timeout>"
+
+
+@pytest.mark.parametrize(("text", "size"), [("1.5GiB", 3 * 2**29), ("2 KB", 2048), (None, None)])
+def test_sizes_are_read(text: str | None, size: int | None) -> None:
+    """In the spellings that people use; what is none is refused with the option's name."""
+    assert read_size("--memory", text) == size
+    for wrong in ("4 gigs", "nan", ""):
+        with pytest.raises(UsageError, match="--memory"):
+            read_size("--memory", wrong)
+
+
+def test_env_kwargs_take_json_and_pairs() -> None:
+    """Values are JSON where they can be; later ones win."""
+    pairs = ("size=9", "mode=rgb_array", "on=true", "path=a=b", "empty=")
+    assert read_env_kwargs(['{"size": 8, "name": "a"}', *pairs]) == {
+        "size": 9,
+        "name": "a",
+        "mode": "rgb_array",
+        "on": True,
+        "path": "a=b",
+        "empty": "",
+    }
+
+
+@pytest.mark.parametrize("text", ["size", "=3", "a b=3", "{", '{"a": }', "[1]"])
+def test_env_kwargs_that_are_neither_are_refused(text: str) -> None:
+    """With what to write instead, or what is wrong with the JSON."""
+    with pytest.raises(UsageError, match="--env-kwargs"):
+        read_env_kwargs([text])
+
+
+def test_only_what_was_given_reaches_the_policy() -> None:
+    """Defaults stay the library's."""
+    assert options().arguments()["policy"] == {}
+    assert options().arguments()["timeouts"] == {}
+    given = options(
+        memory_bytes="1G",
+        cpu_time_s=5,
+        network="loopback",
+        gpu="all",
+        readable=["/data"],
+        environment=["A"],
+    )
+    assert given.arguments()["policy"] == {
+        "network": "loopback",
+        "gpu": True,
+        "readable": ["/data"],
+        "environment": ["A"],
+        "limits": {"memory_bytes": "1G", "cpu_time_s": 5},
+    }
+
+
+@pytest.mark.parametrize("name", ["memory_bytes", "disk_bytes", "processes", "cpu_time_s"])
+def test_a_limit_of_nothing_is_refused(name: str) -> None:
+    """And is not taken for the default."""
+    given = options(**{name: "0" if name.endswith("_bytes") else 0}).arguments()
+    with pytest.raises(PolicyError, match="above 0"):
+        policy_from(given["policy"], None)
+
+
+def test_a_timeout_is_for_every_operation_but_close() -> None:
+    """Closing is bounded by itself."""
+    keys = {key for key in ALL if OPTIONS[key].command == "--timeout"}
+    assert keys == {"startup_s", "reset_s", "step_s", "call_s"}
+    given = dict.fromkeys(keys, 7.5)
+    assert options(**given).arguments()["timeouts"] == given
+
+
+def test_running_unprotected_needs_the_word() -> None:
+    """Before anything is fetched, and in the words of the command line."""
+    with pytest.raises(UsageError, match="--trust-remote-code"):
+        options(sandbox="none").arguments()
+    assert options(sandbox="none", trust_remote_code=True).arguments()["sandbox"] is None
+
+
+def test_only_without_a_sandbox_are_strange_errors_the_repositorys() -> None:
+    """In the sandbox they would be bugs of ours, and must stay visible as such."""
+    with pytest.raises(ForeignError, match="KeyError: 'x'"), options(sandbox="none").explained():
+        raise KeyError("x")
+    with pytest.raises(KeyError), options().explained():
+        raise KeyError("x")
+    with pytest.raises(RemoteEnvError), options(sandbox="none").explained():
+        raise RemoteEnvError("Oops", "text")
+
+
+SUITES: dict[str, dict[Any, Any]] = {"a": {0: "a0", 1: "a1"}, "b": {"x": "bx", 0: "b0"}}
+
+
+@pytest.mark.parametrize(
+    ("suites", "tasks", "expected"),
+    [
+        (None, None, ["a0", "a1", "bx", "b0"]),
+        (["b"], None, ["bx", "b0"]),
+        (None, ["0"], ["a0", "b0"]),
+        (["b"], ["x"], ["bx"]),
+        (["a", "b"], ["1", "x"], ["a1", "bx"]),
+    ],
+)
+def test_selection_keeps_the_order(suites: Any, tasks: Any, expected: list[str]) -> None:
+    """Task ids may be numbers or text; on the command line both are text."""
+    assert [env for _, _, env in select_envs(SUITES, suites, tasks)] == expected
+
+
+def test_a_selection_of_nothing_names_what_there_is() -> None:
+    """Escaped, since the names are the worker's."""
+    with pytest.raises(UsageError, match=r"a/0, .*evil\\x1b/0"):
+        select_envs({**SUITES, "evil\x1b": {0: 1}}, ["c"], None)
+
+
+def test_a_servers_key_reaches_make_env_and_is_none_without_a_word() -> None:
+    """For ``--sandbox tcp://...``; ``make_env`` says where it does not belong."""
+    given = options(sandbox="tcp://127.0.0.1:5555", server_key="k").arguments()
+    assert (given["sandbox"], given["server_key"]) == ("tcp://127.0.0.1:5555", "k")
+    assert options().arguments()["server_key"] is None
+
+
+def test_an_option_is_named_as_its_key_is_in_python() -> None:
+    """Without the unit; several time limits share one, and --output is a command's own."""
+    named = {key: one for key, one in OPTIONS.items() if one.field and one.command}
+    others = {key for key, one in named.items() if one.argument == "timeouts"} | {"output"}
+    for key in named.keys() - others:
+        name = key.removesuffix("_bytes").removesuffix("_s").replace("_", "-")
+        assert named[key].command == f"--{name}"

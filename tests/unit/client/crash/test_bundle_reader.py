@@ -1,0 +1,354 @@
+"""Bundles are untrusted: what is broken is refused, what is asked for is told, nothing is run."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+import struct
+from collections.abc import Callable
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+from unittest.mock import Mock
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from envhub_sandbox.cli.shared.console import safe_line
+from envhub_sandbox.errors import ActionError, BundleError, WorkerDiedError
+from envhub_sandbox.session.crash import bundle_reader, bundle_writer
+from envhub_sandbox.session.crash.bundle_reader import (
+    MAX_DOCUMENT_BYTES,
+    load_bundle,
+    replayed_arguments,
+    wishes,
+)
+from envhub_sandbox.session.crash.history import History
+from envhub_sandbox.session.crash.replay import Verdict, replay
+from envhub_sandbox.settings.policy import Limits, Policy, Timeouts
+from envhub_worker.protocol import messages as m
+from tests.support import inside
+from tests.support.wire import requested
+
+COMMIT = "0123456789abcdef0123456789abcdef01234567"
+
+
+def bundle(folder: Path, **options: Any) -> Path:
+    """A bundle of a reset and three steps, as ``bundle_writer`` writes it."""
+    manifest: Any = SimpleNamespace(single_action_space=spaces.Discrete(5), num_envs=2)
+    history = History(manifest, 100)
+    history.requested(requested(m.Reset(0, [1, 2], None, None)))
+    for number in range(3):
+        history.step(np.array([number, number]))
+    given = {"policy": Policy(), "timeouts": Timeouts(), "python": None, "endpoint": None}
+    crash = bundle_writer.Crash(
+        error=WorkerDiedError("it died", exit_code=7, request="step"),
+        label="org/repo",
+        provenance={
+            "repository": "org/repo",
+            "repo_type": "model",
+            "commit": COMMIT,
+            "path": "env.py",
+            "files": {"env.py": "git-sha1:00"},
+        },
+        load=m.Load(2, False, None, {"size": np.arange(3)}),
+        options=given | options,
+        task={"suite": "s", "task": 0, "num_envs": 2, "shards": 1, "lane": "frames"},
+        shared=False,
+        recording=history.recording(),
+    )
+    return bundle_writer.write_bundle(folder, crash)
+
+
+def edit(folder: Path, *path: Any, value: Any) -> None:
+    """Change one member of ``bundle.json``."""
+    file = folder / "bundle.json"
+    document = json.loads(file.read_text())
+    place = document
+    for key in path[:-1]:
+        place = place[key]
+    place[path[-1]] = value
+    file.write_text(json.dumps(document))
+
+
+def test_a_bundle_comes_back(tmp_path: Path) -> None:
+    """What was written is what is read."""
+    found = load_bundle(bundle(tmp_path))
+    assert found.reference == f"models/org/repo@{COMMIT}"
+    assert found.doubts == ()
+    assert found.steps == 3
+    assert [type(one).__name__ for one in found.requests] == ["Reset", "Step", "Step", "Step"]
+    assert found.load.env_kwargs["size"].tolist() == [0, 1, 2]  # type: ignore[attr-defined]
+    assert wishes(found) == []
+    arguments = replayed_arguments(found, granted=False)
+    assert arguments["policy"]["crash_history"] == 0
+    assert (arguments["num_workers"], arguments["lane"]) == (1, "frames")
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        (("format",), 2),
+        (("label",), 5),
+        (("provenance",), []),
+        (("provenance", "commit"), "main"),
+        (("provenance", "repository"), "../.."),
+        (("provenance", "repo_type"), "trap"),
+        (("provenance", "path"), "/etc/passwd"),
+        (("provenance", "files"), {"env.py": 5}),
+        (("death", "reason"), None),
+        (("task", "task"), 1.5),
+        (("task", "num_envs"), "2"),
+        (("history", "requests", 0), "reset"),
+        (("history", "requests", 1, "steps"), [0, 4]),
+        (("history", "requests", 1, "steps"), [-1, 2]),
+        (("history", "requests", 1, "steps"), [0, 1e9]),
+        (("history", "requests", 1, "of"), "../../../etc/passwd"),
+        (("history", "requests", 1, "of"), "actions-object.npy"),
+        (("history", "requests", 1, "of"), "actions-float32.npy"),
+        (("history", "requests"), [{"operation": "reset"}] * 2),
+        (("history", "requests"), []),
+        (("history", "dropped"), True),
+    ],
+)
+def test_a_broken_index_is_refused(tmp_path: Path, path: tuple[Any, ...], value: Any) -> None:
+    """Types, bounds, names of files: everything is checked before it is used."""
+    folder = bundle(tmp_path)
+    edit(folder, *path, value=value)
+    with pytest.raises(BundleError, match="no crash bundle that can be read"):
+        load_bundle(folder)
+
+
+def _claims_more(folder: Path) -> None:
+    data = (folder / "actions-int64.npy").read_bytes()
+    (folder / "actions-int64.npy").write_bytes(data.replace(b"(3, 2), }    ", b"(3, 2000), } "))
+
+
+def _link(folder: Path) -> None:
+    (folder / "bundle.json").rename(folder.parent / "elsewhere.json")
+    (folder / "bundle.json").symlink_to(folder.parent / "elsewhere.json")
+
+
+HARM: dict[str, Callable[[Path], object]] = {
+    "claims more": _claims_more,
+    "a link": _link,
+    "nested": lambda folder: (folder / "bundle.json").write_text("[" * 200_000),
+    "huge": lambda folder: os.truncate(folder / "requests.bin", bundle_reader.MAX_FILE_BYTES + 1),
+    "noise": lambda folder: (folder / "requests.bin").write_bytes(bytes(range(256))),
+}
+
+
+@pytest.mark.parametrize("harm", HARM.values(), ids=HARM)
+def test_a_hostile_file_is_refused(tmp_path: Path, harm: Callable[[Path], object]) -> None:
+    """Nothing is followed, and nothing read beyond the bounds."""
+    folder = bundle(tmp_path)
+    harm(folder)
+    with pytest.raises(BundleError):
+        load_bundle(folder)
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "{'descr': '<i8', 'fortran_order': False, 'shape': (",
+        f"{{'descr': '<i8', 'fortran_order': False, 'shape': ({10**30}, 2), }}\n",
+        "{'descr': '<i8', 'fortran_order': False, 'shape': (True, -2), }\n",
+        "{'descr': '<i8', 'fortran_order': False, 'shape': (3, 2), 5: 5, }\n",
+        "{[]: 1}\n",
+        "-" * 9_000 + "1",
+    ],
+    ids=["torn", "overflow", "type", "keys", "unhashable", "nested"],
+)
+def test_a_hostile_header_is_refused(tmp_path: Path, header: str) -> None:
+    """Whatever numpy makes of it, the user is told that the bundle is broken."""
+    folder = bundle(tmp_path)
+    size = struct.pack("<H", len(header))
+    (folder / "actions-int64.npy").write_bytes(b"\x93NUMPY\x01\x00" + size + header.encode())
+    with pytest.raises(BundleError, match="no file of actions"):
+        load_bundle(folder)
+
+
+class Bomb:
+    """Touches a file when it is unpickled."""
+
+    def __init__(self, canary: Path) -> None:
+        self.canary = canary
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Path.touch, (self.canary,)
+
+
+def test_nothing_in_a_bundle_is_executed(tmp_path: Path) -> None:
+    """Neither in an array nor in an argument. Control: whoever unpickles them, executes them."""
+    canary = tmp_path / "canary"
+    folder = bundle(tmp_path)
+    array = np.empty((3, 2), object)
+    array[:] = Bomb(canary)
+    np.save(folder / "actions-int64.npy", array, allow_pickle=True)
+    with pytest.raises(BundleError, match="Python objects"):
+        load_bundle(folder)
+    assert not canary.exists()
+    np.load(folder / "actions-int64.npy", allow_pickle=True)
+    assert canary.exists()
+    canary.unlink()
+    folder = bundle(tmp_path)
+    load = m.Load(1, False, None, {"a": Bomb(canary)})
+    frames = m.pack(load, pickler=pickle.dumps)
+    (folder / "arguments.bin").write_bytes(inside.packet(frames))
+    with pytest.raises(BundleError, match="no crash bundle"):
+        load_bundle(folder)
+    assert not canary.exists()
+    m.unpack(frames, unpickler=pickle.loads)
+    assert canary.exists()
+
+
+def test_repetition_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A small file cannot stand for an endless number of steps."""
+    monkeypatch.setattr(bundle_reader, "MAX_REQUESTS", 100)
+    folder = bundle(tmp_path)
+    again = {"steps": [0, 3], "of": "actions-int64.npy"}
+    edit(folder, "history", "requests", value=[{"operation": "reset"}, *[again] * 33])
+    assert load_bundle(folder).steps == 99
+    edit(folder, "history", "requests", value=[{"operation": "reset"}, *[again] * 34])
+    with pytest.raises(BundleError, match="more than 100 requests"):
+        load_bundle(folder)
+
+
+@pytest.mark.parametrize("given", [{"extra": ["scipy"], "python": "/tmp/python"}, "host"])
+def test_packages_of_a_bundles_choice_are_a_wish(tmp_path: Path, given: Any) -> None:
+    """They could be any; what every repository gets by itself is none."""
+    found = load_bundle(bundle(tmp_path / "a", dependencies=given))
+    [wish] = wishes(found)
+    assert wish.startswith("dependencies=")
+    assert "dependencies" not in replayed_arguments(found, granted=False)
+    assert replayed_arguments(found, granted=True)["dependencies"] == given
+    assert wishes(load_bundle(bundle(tmp_path / "b", dependencies="auto"))) == []
+
+
+def test_wishes_beyond_an_ordinary_run_are_told(tmp_path: Path) -> None:
+    """They are granted by the user, or left out."""
+    policy = Policy(
+        profile="no-userns",
+        network="host",
+        readable=("/data",),
+        environment=("SECRET",),
+        limits=Limits(memory_bytes=64 << 30, processes=7, cpu_time_s=5),
+    )
+    found = load_bundle(
+        bundle(tmp_path, policy=policy, python="/tmp/python", endpoint="https://evil.example")
+    )
+    assert [wish.partition("=")[0] for wish in wishes(found)] == [
+        *("profile", "network", "readable", "environment", "limits.memory_bytes"),
+        *("endpoint", "python"),
+    ]
+    refused = replayed_arguments(found, granted=False)
+    assert set(refused["policy"]) == {"limits", "crash_history"}
+    assert refused["policy"]["limits"]["processes"] == 7
+    assert refused["policy"]["limits"]["cpu_time_s"] == 5
+    assert "memory_bytes" not in refused["policy"]["limits"]
+    assert not {"python", "endpoint"} & set(refused)
+    granted = replayed_arguments(found, granted=True)
+    assert granted["policy"]["network"] == "host"
+    assert granted["policy"]["limits"]["memory_bytes"] == 64 << 30
+    assert granted["python"] == "/tmp/python"
+    assert Policy(**{**granted["policy"], "limits": Limits(**granted["policy"]["limits"])})
+
+
+def test_a_bundle_says_nothing_in_lines_of_its_own(tmp_path: Path) -> None:
+    """Whatever its names are: what is printed of it is one line each, and no terminal obeys it."""
+    folder = bundle(tmp_path)
+    forged = "memory_bytes\nError: run this as root\x1b[2J"
+    edit(folder, "make_env", "policy", value={"limits": {forged: 1 << 60}})
+    edit(folder, "label", value=f"org/repo{forged}")
+    edit(folder, "death", "signal", value="\x1b]0;title\x07")
+    found = load_bundle(folder)
+    [wish] = wishes(found)
+    assert wish.startswith("limits.memory_bytes")
+    assert wish.isprintable()
+    assert found.label.isprintable()
+    assert "\x1b" not in found.label + found.death["signal"] + safe_line(found.label)
+
+
+def test_a_login_is_not_in_the_bundle(tmp_path: Path) -> None:
+    """It may be sent to somebody: a URL's user and password are left out."""
+    folder = bundle(tmp_path, endpoint="https://me@there:hf_secret@hub.example/x")
+    assert all(b"hf_secret" not in file.read_bytes() for file in folder.iterdir())
+    assert load_bundle(folder).arguments["endpoint"] == "https://hub.example/x"
+
+
+class Recorder:
+    """An environment that writes down what it is asked, and dies at its fourth step."""
+
+    def __init__(self) -> None:
+        self.asked: list[str] = []
+        self.num_envs = 2
+
+    def reset(self, **arguments: Any) -> None:
+        """Note it."""
+        self.asked.append(f"reset {arguments['seed']}")
+
+    def step(self, actions: Any) -> None:
+        """Note it; the third is the last."""
+        self.asked.append(f"step {actions.tolist()}")
+        if len(self.asked) == 4:
+            raise WorkerDiedError("again", exit_code=7)
+
+    def close(self) -> None:
+        """Nothing that a bundle may ask for."""
+        self.asked.append("close")
+
+
+def test_a_replay_asks_the_same(tmp_path: Path) -> None:
+    """In order; the verdict compares how and where it ended."""
+    env = Recorder()
+    found = replay(lambda: env, load_bundle(bundle(tmp_path)))
+    assert env.asked == ["reset [1, 2]", "step [0, 0]", "step [1, 1]", "step [2, 2]"]
+    assert (found.verdict, found.requests, found.steps) == (Verdict.SAME, 4, 3)
+
+
+def test_a_bundle_cannot_call_the_proxy_itself(tmp_path: Path) -> None:
+    """Only names that the repository's environment has beyond ours."""
+    folder = bundle(tmp_path)
+    calls: list[m.Message] = [m.CallOwn(0, "close", (), {}), m.GetOwn(0, "__dict__")]
+    packets = b"".join(inside.packet(m.pack(call)) for call in calls)
+    (folder / "requests.bin").write_bytes(packets)
+    edit(folder, "history", "requests", value=[{"operation": "callown"}] * 2)
+    env = Recorder()
+    assert replay(lambda: env, load_bundle(folder)).verdict is Verdict.SURVIVED
+    assert env.asked == []
+
+
+def test_a_request_that_does_not_fit_is_said(tmp_path: Path) -> None:
+    """An environment that has become another one takes other actions."""
+    env: Any = Recorder()
+    env.step = lambda actions: np.zeros(3).reshape(2)
+    found = replay(lambda: env, load_bundle(bundle(tmp_path)))
+    assert found.verdict is Verdict.DIFFERENT
+    assert "request 2 does not fit" in found.note
+
+
+def test_what_was_set_before_and_does_not_fit_is_said(tmp_path: Path) -> None:
+    """It is an answer, not a traceback."""
+    folder = bundle(tmp_path)
+    setting = inside.packet(m.pack(m.SetAttr(0, "size", (1,))))
+    (folder / "requests.bin").write_bytes(setting + (folder / "requests.bin").read_bytes())
+    index = json.loads((folder / "bundle.json").read_text())["history"]["requests"]
+    edit(folder, "history", "requests", value=[{"operation": "set_attr"}, *index])
+    env: Any = Recorder()
+    for error in (ValueError("one value each"), TypeError("no"), ActionError("no")):
+        env.set_attr = Mock(side_effect=error)
+        found = replay(lambda: env, load_bundle(folder))
+        assert found.verdict is Verdict.DIFFERENT
+        assert f"does not fit this environment: {error}" in found.note
+    assert env.asked == []
+
+
+def test_a_document_of_millions_of_lists_is_not_read(tmp_path: Path) -> None:
+    """Its size decides, before any of it is a list."""
+    folder = bundle(tmp_path)
+    with open(folder / "bundle.json", "w") as file:
+        file.write("[" + "[]," * (MAX_DOCUMENT_BYTES // 3) + "[]]")
+    with pytest.raises(BundleError, match="bytes"):
+        load_bundle(folder)

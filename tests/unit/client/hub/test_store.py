@@ -1,0 +1,378 @@
+"""The store: complete or absent, read-only, and checked at every use."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import stat
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from envhub_sandbox.dependencies import bounds
+from envhub_sandbox.errors import SnapshotError, SnapshotIntegrityError
+from envhub_sandbox.hub import store as store
+from envhub_sandbox.hub.cache import cache_root, remove_tree
+from envhub_sandbox.hub.hashing import HashMismatch, copy_verified, digest_of
+from envhub_sandbox.hub.listing import FileRecord
+from tests.hub.stub_hub import git_blob_id
+
+CONTENT = {"env.py": b"print(1)\n", "pkg/deep/data.bin": b"\x00" * 3000, "empty": b""}
+COMMIT = "c" * 40
+
+
+@pytest.fixture
+def slot(snapshot_store: Path) -> store.Slot:
+    """A place in an empty store."""
+    folder = store.repository_folder("https://huggingface.co", "model", "org/repo")
+    assert snapshot_store in folder.parents
+    return store.Slot(folder, COMMIT, "model/org/repo@ccc")
+
+
+def records(content: dict[str, bytes] = CONTENT) -> tuple[FileRecord, ...]:
+    """The listing of the content."""
+    return tuple(
+        FileRecord(path, len(data), f"git-sha1:{git_blob_id(data)}")
+        for path, data in sorted(content.items())
+    )
+
+
+def write(record: FileRecord, target: Path) -> None:
+    """Lay out a file of the content."""
+    target.write_bytes(CONTENT[record.path])
+
+
+@pytest.fixture
+def published(slot: store.Slot) -> store.Slot:
+    """A snapshot in the store."""
+    store.publish(slot, records(), write, {"revision": "main"})
+    return slot
+
+
+def test_what_another_puts_there_meanwhile_is_not_damaged(
+    published: store.Slot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is not there when its record is read, and is when one asks whether it is."""
+    elsewhere, exists = published.home.with_name("elsewhere"), os.path.lexists
+    published.home.rename(elsewhere)
+
+    def appearing(path: Path) -> bool:
+        if elsewhere.exists():
+            elsewhere.rename(published.home)
+        return exists(path)
+
+    monkeypatch.setattr(os.path, "lexists", appearing)
+    found = store.load(published)
+    assert found is not None
+    assert [one.path for one in found] == sorted(CONTENT)
+
+
+def test_published_files_load(slot: store.Slot) -> None:
+    """What was never stored is absent, not damaged. What went in comes out.
+
+    The tree holds nothing else: the jail is given it, and the hashes that vouch for it are outside.
+    """
+    assert store.load(slot) is None
+    assert store.commits(slot.folder) == []
+    store.publish(slot, records(), write, {"revision": "main"})
+    assert store.load(slot) == records()
+    files = (path for path in slot.tree.rglob("*") if path.is_file())
+    assert {str(path.relative_to(slot.tree)): path.read_bytes() for path in files} == CONTENT
+    assert [stored.revision for stored in store.commits(slot.folder)] == ["main"]
+    assert slot.record.exists()
+    assert slot.tree not in slot.record.parents
+
+
+@pytest.mark.parametrize("mask", [0o000, 0o022, 0o027, 0o077])
+def test_tree_is_read_only_and_readable_for_every_user(
+    snapshot_store: Path, slot: store.Slot, mask: int
+) -> None:
+    """Files are 0444, folders 0555, and a worker of another uid can reach them, by any umask."""
+    before = os.umask(mask)
+    try:
+        store.publish(slot, records(), write, {})
+    finally:
+        os.umask(before)
+    for path in [slot.tree, *slot.tree.rglob("*")]:
+        mode = stat.S_IMODE(path.lstat().st_mode)
+        assert mode == (0o555 if path.is_dir() else 0o444), path
+    above = [path for path in slot.tree.parents if path.is_relative_to(snapshot_store)]
+    assert all(stat.S_IMODE(path.stat().st_mode) == 0o755 for path in above)
+    assert stat.S_IMODE(slot.record.stat().st_mode) == 0o600
+
+
+def edit(path: Path, data: bytes) -> None:
+    """Change a read-only file and put its times back, as somebody who hides would."""
+    times = path.stat()
+    path.chmod(0o644)
+    path.write_bytes(data)
+    os.utime(path, ns=(times.st_atime_ns, times.st_mtime_ns))
+    path.chmod(0o444)
+
+
+def _edit(slot: store.Slot) -> None:
+    edit(slot.tree / "env.py", b"print(2)\n")
+
+
+def _add(slot: store.Slot) -> None:
+    slot.tree.chmod(0o755)
+    (slot.tree / "sitecustomize.py").write_bytes(b"")
+
+
+def _remove(slot: store.Slot) -> None:
+    slot.tree.chmod(0o755)
+    (slot.tree / "empty").unlink()
+
+
+def _link(slot: store.Slot) -> None:
+    slot.tree.chmod(0o755)
+    (slot.tree / "env.py").unlink()
+    (slot.tree / "env.py").symlink_to("/etc/passwd")
+
+
+def _lose_record(slot: store.Slot) -> None:
+    slot.record.unlink()
+
+
+@pytest.mark.parametrize(
+    ("damage", "said"),
+    [
+        (_edit, r"'env\.py' was changed"),
+        (lambda slot: edit(slot.tree / "env.py", b"print(1)\n#"), r"'env\.py' was changed"),
+        (_add, r"'sitecustomize\.py' is extra"),
+        (_remove, "'empty' is missing"),
+        (_link, r"'env\.py' is not a regular file"),
+        (_lose_record, r"record\.json is missing"),
+        (lambda slot: slot.record.write_text('{"format": 1, "files": [[1]]}'), "cannot be read"),
+        (lambda slot: slot.record.write_text('{"format": 99, "files": []}'), "cannot be read"),
+    ],
+)
+def test_damage_is_refused_with_the_command_that_repairs(
+    published: store.Slot, damage: Callable[[store.Slot], object], said: str
+) -> None:
+    """Whatever was changed, nothing is returned, and the error's command makes room again."""
+    damage(published)
+    with pytest.raises(SnapshotIntegrityError, match=said) as caught:
+        store.load(published)
+    command = str(caught.value).rpartition("fetched again: ")[2]
+    subprocess.run(command, shell=True, check=True)
+    assert store.load(published) is None
+    store.publish(published, records(), write, {})
+    assert store.load(published) == records()
+
+
+def _empty(slot: store.Slot) -> None:
+    remove_tree(slot.tree)
+
+
+def _leave_a_name(slot: store.Slot) -> None:
+    remove_tree(slot.home)
+    slot.home.mkdir()
+
+
+@pytest.mark.parametrize("damage", [_remove, _lose_record, _empty, _leave_a_name])
+def test_what_is_half_deleted_is_made_again(
+    published: store.Slot, damage: Callable[[store.Slot], None]
+) -> None:
+    """By whoever has its source; a jail that has the rest of it open keeps that for a day."""
+    damage(published)
+    assert store.load_whole(published) is None
+    with pytest.raises(store.HalfDeletedError):
+        store.load(published)
+    store.publish(published, records(), write, {"revision": "main"})
+    assert store.load(published) == records()
+    [remains] = published.folder.glob(".building-*")
+    assert [one.commit for one in store.commits(published.folder)] == [COMMIT]  # none of these
+    os.utime(remains, (0, 0))
+    store.publish(published, records(), write, {"revision": "main"})
+    assert not list(published.folder.glob(".building-*"))
+
+
+def test_what_was_changed_is_not_taken_for_half_deleted(published: store.Slot) -> None:
+    """Also where something is missing besides: somebody shall look at it."""
+    _edit(published)
+    _remove(published)
+    with pytest.raises(SnapshotIntegrityError, match=r"'env\.py' was changed"):
+        store.load_whole(published)
+    with pytest.raises(SnapshotIntegrityError, match=r"'env\.py' was changed"):
+        store.publish(published, records(), write, {})
+
+
+def test_touched_but_equal_file_is_hashed_once(
+    published: store.Slot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Other times with the same content are accepted after a look, and then remembered."""
+    os.utime(published.tree / "env.py")
+    hashed: list[str] = []
+
+    def counting(path: Path, kind: str, size: int) -> str:
+        hashed.append(path.name)
+        return digest_of(path, kind, size)
+
+    monkeypatch.setattr(store, "digest_of", counting)
+    assert store.load(published) == records()
+    assert store.load(published) == records()
+    assert hashed == ["env.py"]
+
+
+def test_copied_store_is_verified_by_content(
+    published: store.Slot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A store that moved to another disk has other inodes: it is hashed, and then works."""
+    source = tmp_path / "envhub-cache"
+    subprocess.run(["cp", "-r", str(source), str(tmp_path / "moved")], check=True)
+    moved = store.Slot(
+        tmp_path / "moved" / published.folder.relative_to(source), COMMIT, published.title
+    )
+    assert store.load(moved) == records()
+
+
+def test_failing_copy_leaves_nothing(slot: store.Slot) -> None:
+    """A snapshot that could not be finished is not there, nor is any part of it."""
+
+    def fail(record: FileRecord, target: Path) -> None:
+        write(record, target)
+        if record.path == "env.py":
+            raise SnapshotIntegrityError("planted")
+
+    with pytest.raises(SnapshotIntegrityError, match="planted"):
+        store.publish(slot, records(), fail, {})
+    assert list(slot.folder.iterdir()) == []
+    assert store.load(slot) is None
+
+
+def test_killed_builder_leaves_nothing_that_is_believed(slot: store.Slot) -> None:
+    """A process that dies in the middle leaves no commit, and its rest is swept up later."""
+    code = (
+        "import os, sys; from pathlib import Path\n"
+        "from tests.unit.client.hub import test_store as t\n"
+        "def die(record, target):\n"
+        "    t.write(record, target)\n"
+        "    if record.path == 'env.py': os.kill(os.getpid(), 9)\n"
+        "slot = t.store.Slot(Path(sys.argv[1]), t.COMMIT, 'x')\n"
+        "t.store.publish(slot, t.records(), die, {})\n"
+    )
+    root = Path(__file__).parents[4]
+    done = subprocess.run([sys.executable, "-c", code, str(slot.folder)], cwd=root, check=False)
+    assert done.returncode == -9
+    (left,) = slot.folder.iterdir()
+    assert store.load(slot) is None
+    store.publish(slot, records(), write, {})
+    assert store.load(slot) == records()
+    assert left.exists()  # It might have been somebody who is still at work.
+    os.utime(left, (time.time() - 10**6,) * 2)
+    store.publish(store.Slot(slot.folder, "d" * 40, "x"), records(), write, {})
+    assert not left.exists()
+
+
+def test_second_builder_keeps_the_first_ones_copy(published: store.Slot) -> None:
+    """Who comes second with the same commit changes nothing and leaves nothing."""
+    inode = (published.tree / "env.py").stat().st_ino
+    store.publish(published, records(), write, {})
+    assert (published.tree / "env.py").stat().st_ino == inode
+    assert [path.name for path in published.folder.iterdir()] == [COMMIT]
+
+
+def test_store_that_cannot_be_made_says_where(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A file in the way of the store is named, with the variable that moves the store."""
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("ENVHUB_CACHE", str(tmp_path / "file" / "cache"))
+    slot = store.Slot(store.local_folder(), COMMIT, "x")
+    with pytest.raises(SnapshotError, match="set ENVHUB_CACHE to another folder"):
+        store.publish(slot, records(), write, {})
+
+
+def test_store_is_in_the_users_cache_unless_said_otherwise(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """$ENVHUB_CACHE moves the store; without it the platform's cache folder is used."""
+    monkeypatch.setenv("ENVHUB_CACHE", "~/x")
+    monkeypatch.setenv("HOME", str(tmp_path))
+    assert cache_root() == tmp_path / "x"
+    monkeypatch.delenv("ENVHUB_CACHE")
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
+    assert cache_root() == tmp_path / "xdg" / "envhub-sandbox"
+
+
+def test_endpoints_types_and_names_have_places_of_their_own(snapshot_store: Path) -> None:
+    """No two repositories share a folder, whatever their names and hosts look like."""
+    keys = [
+        ("https://huggingface.co", "model", "a/b"),
+        ("https://huggingface.co", "space", "a/b"),
+        ("https://huggingface.co:8443", "model", "a/b"),
+        ("http://huggingface.co", "model", "a/b"),
+        ("https://huggingface.co/mirror", "model", "a/b"),
+        ("https://huggingface.co", "model", "a-b/c"),
+        ("https://huggingface.co", "model", "a/b-c"),
+    ]
+    folders = {store.repository_folder(*key) for key in keys}
+    assert len(folders) == len(keys)
+    assert all(folder.parents[2] == snapshot_store for folder in folders)
+
+
+def test_unused_snapshots_are_removed(published: store.Slot) -> None:
+    """What nobody asked for in that time goes; what was used stays."""
+    other = store.Slot(published.folder, "d" * 40, "x")
+    store.publish(other, records(), write, {})
+    for slot in (published, other):
+        os.utime(slot.record, (time.time() - 10**6,) * 2)
+    store.mark_used(other)
+    store.remove_unused(published.folder, days=7)
+    assert store.load(published) is None
+    assert store.load(other) == records()
+
+
+def test_a_tree_of_any_depth_is_walked_and_removed(tmp_path: Path) -> None:
+    """A wheel may have as many folders in one another as a path has room for."""
+    top = tmp_path / "top"
+    deepest = str(top)
+    for _ in range(1200):
+        os.mkdir(deepest)
+        deepest += "/d"
+    Path(deepest).write_bytes(b"12345")
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    (top / "link").symlink_to(outside)
+    assert len(list(bounds.walk(top))) == 1201
+    top.chmod(0o555)
+    remove_tree(top)
+    assert not top.exists()
+    assert outside.exists()
+
+
+@pytest.mark.parametrize("kind", ["git-sha1", "sha256"])
+def test_copy_is_what_the_record_says_or_an_error(tmp_path: Path, kind: str) -> None:
+    """The copy is hashed on its way: equal bytes pass, others, more and fewer do not."""
+    source = tmp_path / "source"
+    data = os.urandom(2_500_000)
+    source.write_bytes(data)
+    record = FileRecord("x", len(data), digest_of(source, kind, len(data)))
+    copy_verified(source, tmp_path / "good", record)
+    assert (tmp_path / "good").read_bytes() == data
+    flipped = bytes([data[0] ^ 1]) + data[1:]
+    for number, other in enumerate([data + b"1", data[:-1], flipped]):
+        source.write_bytes(other)
+        with pytest.raises(HashMismatch):
+            copy_verified(source, tmp_path / str(number), record)
+
+
+@pytest.mark.skipif(shutil.which("git") is None, reason="needs git")
+def test_git_digest_is_gits_own(tmp_path: Path) -> None:
+    """The blob id agrees with the one that git computes."""
+    (tmp_path / "x").write_bytes(b"hello\n")
+    command = ["git", "hash-object", str(tmp_path / "x")]
+    expected = subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    assert digest_of(tmp_path / "x", "git-sha1", 6) == f"git-sha1:{expected}"
+
+
+def test_pipe_is_not_waited_for(tmp_path: Path) -> None:
+    """A pipe in place of a file is refused at once, where opening it would block."""
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(HashMismatch, match="not a regular file"):
+        copy_verified(tmp_path / "pipe", tmp_path / "x", FileRecord("x", 1, "sha256:0"))

@@ -1,0 +1,132 @@
+"""The monitor of a container, with a script for an engine."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import select
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from tests.support import inside
+from tests.support.processes import eventually
+
+_ENGINE = """#!/bin/sh
+cd {folder}
+echo "$@" >>{log}
+[ "$1" = run ] || exit 0
+echo $$ >{log}.pid
+{what}
+"""
+_ANNOUNCES = """echo '{"envhub-worker": "0"}'"""
+_SERVES = f"echo 'WARNING: something that engines say' >&2; {_ANNOUNCES}; cat >/dev/null"
+
+
+@dataclass
+class Kept:
+    """A monitor that runs, and its client.
+
+    Attributes:
+        said: The document that it wrote.
+        log: What the engine was called with, a line a call.
+    """
+
+    monitor: subprocess.Popen[bytes]
+    client: subprocess.Popen[bytes]
+    said: dict[str, object]
+    folder: Path
+    log: Path
+
+    def ends(self) -> bool:
+        """Whether it ends and cleans up."""
+        self.monitor.wait(60)
+        calls = self.log.read_text().splitlines()
+        return not self.folder.exists() and calls[-1] == "rm --force --volumes envhub-test"
+
+
+@contextlib.contextmanager
+def kept(tmp_path: Path, what: str) -> Iterator[Kept]:
+    """A monitor whose engine does ``what`` when it is to run a container."""
+    folder, log, engine = tmp_path / "folder", tmp_path / "calls", tmp_path / "engine"
+    folder.mkdir()
+    engine.write_text(_ENGINE.format(folder=tmp_path, log=log, what=what))
+    engine.chmod(0o755)
+    client = subprocess.Popen([sys.executable, "-S", "-c", "input()"], stdin=subprocess.PIPE)
+    pidfd, (ready, ready_end) = os.pidfd_open(client.pid), os.pipe()
+    words = [str(pidfd), str(ready_end), str(folder), "envhub-test", "--", str(engine), "run"]
+    monitor = subprocess.Popen(
+        [sys.executable, "-I", "-S", str(inside.monitor_script()), *words],
+        pass_fds=(pidfd, ready_end),
+    )
+    os.close(ready_end)
+    os.close(pidfd)
+    try:
+        assert select.select([ready], [], [], 60)[0]
+        yield Kept(monitor, client, json.loads(os.read(ready, 65536)), folder, log)
+    finally:
+        os.close(ready)
+        monitor.kill()
+        monitor.wait()
+        client.communicate()
+
+
+@pytest.mark.parametrize("how", ["the client exits", "the client is killed", "it is told to"])
+def test_the_container_ends_with_its_client(tmp_path: Path, how: str) -> None:
+    """Or at SIGTERM: its stdin ends, and nothing is left."""
+    with kept(tmp_path, _SERVES) as made:
+        assert made.said == {"envhub-worker": "0"}
+        if how == "it is told to":
+            made.monitor.terminate()
+        elif how == "the client is killed":
+            made.client.kill()
+        else:
+            made.client.communicate()
+        assert made.ends()
+
+
+@pytest.mark.parametrize("code", [0, 1, 137])
+def test_the_monitor_ends_as_its_container_did(tmp_path: Path, code: int) -> None:
+    """So that the client can tell how that was: 137 is SIGKILL inside."""
+    with kept(tmp_path, f"{_ANNOUNCES}; exit {code}") as made:
+        assert made.ends()
+        assert made.monitor.returncode == code
+
+
+def test_the_lifeline_is_cut_when_the_monitor_is_killed(tmp_path: Path) -> None:
+    """Nobody else holds the container's stdin."""
+    with kept(tmp_path, _SERVES) as made:
+        pid = int((tmp_path / "calls.pid").read_text())
+        made.monitor.send_signal(signal.SIGKILL)
+        assert eventually(lambda: not os.path.exists(f"/proc/{pid}"))
+
+
+def test_an_engine_that_fails_is_quoted(tmp_path: Path) -> None:
+    """With its exit code, and the end of what it said."""
+    with kept(tmp_path, "seq 5000; echo 'no such runtime' >&2; exit 125") as made:
+        assert made.said["ended"] == 125
+        assert str(made.said["tail"]).endswith("4999\n5000\nno such runtime\n")
+        assert len(str(made.said["tail"])) <= 8192
+        assert made.ends()
+
+
+def test_a_server_that_talks_much_does_not_wait_for_a_reader(tmp_path: Path) -> None:
+    """What it says after its announcement is read and dropped."""
+    talks = f"{_ANNOUNCES}; head -c 3000000 /dev/zero; echo done >{tmp_path / 'calls.talked'}; cat"
+    with kept(tmp_path, talks) as made:
+        assert eventually((tmp_path / "calls.talked").exists)
+        made.monitor.terminate()
+        assert made.ends()
+
+
+def test_a_container_that_ignores_the_end_of_its_stdin_is_removed(tmp_path: Path) -> None:
+    """By the engine's own means, after some patience."""
+    with kept(tmp_path, f"{_ANNOUNCES}; exec sleep 300") as made:
+        made.monitor.terminate()
+        assert made.ends()

@@ -1,0 +1,426 @@
+"""From a policy to an engine's command line, and from what a container says to what holds."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerStartupError
+from envhub_sandbox.sandboxes.docker import attestation, engines, run_arguments, seccomp_profile
+from envhub_sandbox.sandboxes.docker.engines import Engine
+from envhub_sandbox.sandboxes.docker.run_arguments import Container
+from envhub_sandbox.sandboxes.docker.sandbox import ContainerServer, DockerSandbox
+from envhub_sandbox.settings.policy import Limits, Policy
+from envhub_worker.lockdown.seccomp import policy as seccomp_policy
+from envhub_worker.protocol.messages.surroundings import Surroundings
+from envhub_worker.protocol.runtime import Runtime
+from tests.unit.docs.test_imports import folder, modules
+
+DOCKER = Engine("docker", "/usr/bin/docker", "28", rootless=False)
+PODMAN = Engine("podman", "/usr/bin/podman", "5", rootless=True)
+WANTED = Container(
+    name="envhub-0",
+    image="sha256:1",
+    labels={"dev.envhub.client": "1:2:3:4"},
+    sockets="/tmp/f/sockets",
+    snapshot="/store/tree",
+    readable=("/data",),
+    seccomp="/tmp/f/seccomp.json",
+    user=(1000, 1000),
+    network="none",
+    memory=1 << 30,
+    pids=99,
+    cpus=1.5,
+    scratch=1 << 20,
+    runtime=None,
+    gpus=None,
+)
+SAID: dict[str, Any] = {
+    "envhub-worker": "0.1.0",
+    "profiles": ["strict", "no-userns", "container"],
+    "landlock": 7,
+    "user": 1000,
+    "capabilities": 0,
+    "no_new_privileges": True,
+    "seccomp": True,
+    "read_only": True,
+    "devices": ["lo"],
+    "memory": 1 << 30,
+    "pids": 99,
+    "cpus": 1.5,
+    "python": "",
+}
+
+
+def found(**changes: Any) -> Surroundings:
+    """What a container's server said, with changes."""
+    return attestation.parse(json.dumps({**SAID, **changes}).encode())
+
+
+def test_the_command_line_is_this_one() -> None:
+    """Word for word: what stands here is what confines."""
+    assert run_arguments.run_arguments(DOCKER, WANTED) == [
+        *("run", "--rm", "--interactive", "--pull", "never", "--log-driver", "none"),
+        *("--no-healthcheck", "--name", "envhub-0", "--hostname", "sandbox", "--workdir", "/"),
+        *("--label", "dev.envhub.client=1:2:3:4"),
+        *("--network", "none", "--read-only", "--cap-drop", "ALL"),
+        *("--security-opt", "no-new-privileges", "--security-opt", "seccomp=/tmp/f/seccomp.json"),
+        *("--security-opt", "systempaths=unconfined", "--ipc", "private", "--user", "1000:1000"),
+        *("--ulimit", "core=0:0", "--memory", "1073741824", "--memory-swap", "1073741824"),
+        *("--pids-limit", "99", "--cpus", "1.5"),
+        *("--tmpfs", "/tmp:rw,nosuid,nodev,size=1048576,mode=1777", "--shm-size", "1073741824"),
+        *("--mount", '"type=bind","src=/tmp/f/sockets","dst=/run/envhub"'),
+        *("--mount", '"type=bind","src=/store/tree","dst=/snapshots/this","readonly"'),
+        *("--mount", '"type=bind","src=/data","dst=/data","readonly"'),
+        "sha256:1",
+        *("serve", "--endpoint", "ipc:///run/envhub/server", "--fd-path", "/run/envhub/fds"),
+        *("--runtime-dir", "/tmp/envhub-worker", "--readable-root", "/snapshots"),
+        *("--until-eof", "--announce"),
+    ]
+
+
+WITH_GPUS = {"runtime": "runsc", "gpus": "all"}
+
+
+@pytest.mark.parametrize(
+    ("engine", "changes", "expected"),
+    [
+        (
+            PODMAN,  # the same walls; a plain user keeps the id, and no writable folder is added
+            {},
+            {("--userns", "keep-id"), ("--security-opt", "unmask=ALL"), "--read-only-tmpfs=false"},
+        ),
+        (replace(DOCKER, remapped=True), {}, {("--userns", "host")}),  # the sockets are ours
+        (DOCKER, WITH_GPUS, {("--runtime", "runsc"), ("--gpus", "all")}),
+        (PODMAN, WITH_GPUS, {("--runtime", "runsc"), ("--device", "nvidia.com/gpu=all")}),
+        (
+            DOCKER,  # a comma in a path adds no option to a mount
+            {"snapshot": '/store/a,dst=/etc,"b"'},
+            {'"type=bind","src=/store/a,dst=/etc,""b""","dst=/snapshots/this","readonly"'},
+        ),
+    ],
+    ids=["podman", "users mapped", "docker's GPUs", "podman's GPUs", "a comma"],
+)
+def test_each_engine_gets_its_own_words(
+    engine: Engine, changes: dict[str, Any], expected: set[Any]
+) -> None:
+    """What is wanted is the same."""
+    words = run_arguments.run_arguments(engine, replace(WANTED, **changes))
+    assert expected <= {*words, *itertools.pairwise(words)}
+
+
+def test_without_control_groups_there_are_no_limits() -> None:
+    """They are left out altogether, by explicit choice."""
+    words = run_arguments.run_arguments(PODMAN, replace(WANTED, memory=None, pids=None, cpus=None))
+    assert "--cgroups=disabled" in words
+    assert not {"--memory", "--pids-limit", "--cpus"} & set(words)
+
+
+def test_limits_leave_room_for_the_server() -> None:
+    """One jail may use what its policy permits."""
+    policy = Policy(limits=Limits(memory_bytes=1 << 30, processes=10))
+    assert run_arguments.memory_for(policy) == 2 << 30
+    assert run_arguments.pids_for(policy) == 266
+
+
+@pytest.mark.parametrize("path", ["/", "/usr", "/proc/", "//etc", "/data/../etc"])
+def test_a_containers_own_folders_cannot_be_replaced(path: str) -> None:
+    """A path that is granted would cover the interpreter, or worse."""
+    with pytest.raises(PolicyError, match="readable"):
+        run_arguments.check_readable((path,))
+
+
+def test_every_wall_is_in_the_report() -> None:
+    """One line each, all of them enforced."""
+    report = attestation.layers(WANTED, found(), "docker 28")
+    assert all(layer["enforced"] for layer in report)
+    assert [layer["layer"] for layer in report] == [
+        *("container", "container-user", "container-capabilities", "container-privileges"),
+        *("container-files", "container-network", "container-seccomp", "container-memory"),
+        *("container-pids", "container-cpus"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("changes", "layer"),
+    [
+        ({"user": 0}, "user"),
+        ({"user": 1001}, "user"),
+        ({"capabilities": 1}, "capabilities"),
+        ({"no_new_privileges": False}, "privileges"),
+        ({"read_only": False}, "files"),
+        ({"devices": ["lo", "eth0"]}, "network"),
+        ({"seccomp": False}, "seccomp"),
+        ({"memory": None}, "memory"),
+        ({"memory": 2 << 30}, "memory"),
+        ({"pids": None}, "pids"),
+        ({"cpus": 2.0}, "cpus"),
+    ],
+)
+def test_a_wall_that_does_not_stand_is_refused(changes: dict[str, Any], layer: str) -> None:
+    """Whatever the engine's command line said."""
+    with pytest.raises(SandboxUnavailableError, match=f"container-{layer} does not hold"):
+        attestation.layers(WANTED, found(**changes), "docker 28")
+
+
+def test_what_the_caller_goes_without_is_in_the_report() -> None:
+    """Not enforced, and said so."""
+    wanted = replace(WANTED, network="host", runtime="runsc", memory=None, pids=None, cpus=None)
+    report = attestation.layers(wanted, found(devices=["eth0"], seccomp=False, memory=None), "x")
+    absent = {layer["layer"] for layer in report if not layer["enforced"]}
+    assert absent == {"container-network", "container-seccomp", "container-memory"}
+
+
+@pytest.mark.parametrize(
+    ("wanted", "profiles", "landlock", "chosen"),
+    [
+        ("strict", ["strict", "no-userns", "container"], 7, "strict"),
+        ("strict", ["no-userns", "container"], 7, "container"),
+        ("strict", ["container"], 1, "container"),
+        ("no-userns", ["strict", "no-userns", "container"], 7, "no-userns"),
+        ("container", ["container"], 0, "container"),
+    ],
+    ids=["all", "no mounts", "little", "one named", "the least named"],
+)
+def test_jails_get_the_strongest_profile_that_can_be_had(
+    wanted: str, profiles: list[str], landlock: int, chosen: str
+) -> None:
+    """The weaker ones by name only."""
+    assert attestation.profile_for(wanted, found(profiles=profiles, landlock=landlock)) == chosen
+
+
+@pytest.mark.parametrize(
+    ("wanted", "profiles", "landlock"),
+    [("strict", ["container"], 0), ("no-userns", ["container"], 2), ("strict", [], 7)],
+    ids=["no Landlock", "not the one named", "nothing"],
+)
+def test_a_jail_that_nothing_parts_from_the_server_is_refused(
+    wanted: str, profiles: list[str], landlock: int
+) -> None:
+    """Unless the policy says that the container's walls are enough."""
+    with pytest.raises(SandboxUnavailableError):
+        attestation.profile_for(wanted, found(profiles=profiles, landlock=landlock))
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        *(b"", b"{}", b"[]", b"hello", b'{"profiles": 3}', b"[" * 100_000),
+        json.dumps({**SAID, "pids": float("inf")}).encode(),
+    ],
+    ids=["nothing", "no field", "a list", "a word", "a number", "too deep", "no number"],
+)
+def test_an_announcement_that_is_none_is_refused(line: bytes) -> None:
+    """Another program, or another version."""
+    with pytest.raises(WorkerStartupError, match="build the image"):
+        attestation.parse(line)
+
+
+def test_the_profile_permits_what_jails_may_call() -> None:
+    """The container's filter lies around the jail's: it must not be the narrower one."""
+    inner = {
+        name
+        for namespaced in (True, False)
+        for network in ("none", "loopback", "host")
+        for name, verdict in seccomp_policy.policy_table(
+            namespaced=namespaced, network=network, brokered=not namespaced
+        ).items()
+        if verdict not in (seccomp_policy.EPERM, seccomp_policy.ENOSYS)
+    }
+    outer = {
+        name for rule in seccomp_profile.profile("x86_64")["syscalls"] for name in rule["names"]
+    }
+    assert len(inner) > 200
+    assert inner <= outer
+
+
+def test_the_profile_permits_what_lockdown_calls() -> None:
+    """Every system call that the worker makes by its number, but for what it tries in vain."""
+    tried = {"ptrace", "pidfd_getfd"}
+    called = set()
+    for name in modules():
+        if name.startswith("envhub_worker."):
+            path = folder("envhub_worker") / Path(*name.split(".")[1:]).with_suffix(".py")
+            words = path.read_text().split('number("') if path.exists() else []
+            called |= {word.partition('"')[0] for word in words[1:]}
+    assert {"landlock_create_ruleset", "open_tree", "seccomp"} <= called
+    assert called - tried <= seccomp_profile.ALLOWED
+
+
+def test_the_profile_denies_what_reaches_the_kernels_innards() -> None:
+    """And everything that it does not name."""
+    assert seccomp_profile.profile("aarch64")["defaultAction"] == "SCMP_ACT_ERRNO"
+    denied = """
+        acct add_key bpf delete_module fanotify_init finit_module init_module io_uring_enter
+        io_uring_setup ioperm iopl kcmp kexec_file_load kexec_load keyctl lookup_dcookie modify_ldt
+        name_to_handle_at open_by_handle_at perf_event_open pidfd_getfd process_madvise
+        process_vm_readv process_vm_writev ptrace quotactl reboot request_key setdomainname swapoff
+        swapon syslog userfaultfd vhangup
+    """
+    assert not set(denied.split()) & seccomp_profile.ALLOWED
+
+
+def test_only_the_native_word_size_is_permitted() -> None:
+    """The 32-bit calls have other numbers, which nothing here has looked at."""
+    assert seccomp_profile.profile("x86_64")["architectures"] == ["SCMP_ARCH_X86_64"]
+    with pytest.raises(SandboxUnavailableError, match="riscv64"):
+        seccomp_profile.profile("riscv64")
+
+
+def test_the_profile_for_ones_own_containers_is_the_same() -> None:
+    """The file that the documents name, for either machine."""
+    path = Path(__file__).resolve().parents[5] / "examples" / "deployment" / "seccomp.json"
+    architectures = sorted(seccomp_profile.ARCHITECTURES.values())
+    assert json.loads(path.read_text()) == {
+        **seccomp_profile.profile("x86_64"),
+        "architectures": architectures,
+    }
+
+
+@pytest.mark.parametrize(
+    "image", ["", "-it", "--format=x", "a b", "a\nRUN evil", "a\t", "a\u2028b", " envhub-worker"]
+)
+def test_what_is_no_name_of_an_image_reaches_no_engine(
+    image: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It would be an option, or a line of a recipe; a name is asked for as it stands."""
+    asked = list[str]()
+    monkeypatch.setattr(Engine, "run", lambda _, *words: asked.extend(words) or "sha256:1\n")
+    with pytest.raises(PolicyError, match="no name of an image"):
+        engines.find_image(DOCKER, image)
+    assert asked == []
+    assert engines.find_image(DOCKER, "reg.example:5000/a/b_c@sha256:0") == "sha256:1"
+    assert asked[-1] == "reg.example:5000/a/b_c@sha256:0"
+
+
+@pytest.mark.parametrize(
+    ("said", "advice"),
+    [
+        ("permission denied while trying to connect to the Docker daemon socket", "usermod"),
+        ("Cannot connect to the Docker daemon at unix:///x", "systemctl start docker"),
+        ("docker: Error response from daemon: Unknown runtime specified x.", "it failed"),
+        ("unknown or invalid runtime name: runsc", "runsc install"),
+        ('could not select device driver "" with capabilities: [[gpu]]', "nvidia-ctk"),
+        ("", "without a word"),
+    ],
+)
+def test_an_engines_complaint_becomes_advice(said: str, advice: str) -> None:
+    """With its own last line, for what we do not know."""
+    assert advice in engines.explained("docker", said)
+
+
+def test_nobody_is_advised_to_do_what_he_has_done() -> None:
+    """An engine that fails over control groups all the same, without any limit."""
+    said = "Error: OCI runtime error: writing file cgroup.procs: permission denied"
+    assert "cgroups=False" in engines.explained("podman", said)
+    advice = engines.explained("podman", said, limited=False)
+    assert "cgroups=False" not in advice
+    assert "containers.conf" in advice
+
+
+def test_without_an_engine_each_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """And how to get it."""
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(SandboxUnavailableError, match=r"docker\.io.*podman"):
+        engines.find_engine(None)
+
+
+def test_an_engine_on_another_machine_is_refused(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """It could share neither memory nor a socket."""
+    program = tmp_path / "docker"
+    program.write_text("#!/bin/sh\n")
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(tmp_path))
+    monkeypatch.setenv("DOCKER_HOST", "tcp://far.example:2376")
+    with pytest.raises(SandboxUnavailableError, match=r"tcp://far\.example"):
+        engines.find_engine("docker")
+
+
+def engine_that_says(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, version: str, facts: dict[str, Any]
+) -> Engine:
+    """What is made of a program called docker."""
+    program = folder / "docker"
+    program.write_text(
+        f"#!/bin/sh\n[ $1 = --version ] && echo '{version}' || echo '{json.dumps(facts)}'\n"
+    )
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", str(folder))
+    monkeypatch.delenv("DOCKER_HOST", raising=False)
+    return engines.find_engine("docker")
+
+
+@pytest.mark.parametrize(
+    ("program", "facts", "expected"),
+    [
+        ("Docker version 28", ["name=seccomp"], ("docker", "28.0", False, False)),
+        ("Docker version 28", ["name=seccomp", "name=rootless"], ("docker", "28.0", True, False)),
+        ("Docker version 28", ["name=userns"], ("docker", "28.0", False, True)),
+        # some systems have podman under docker's name; it takes podman's options
+        ("podman version 5.1", [], ("podman", "5.1", True, False)),
+    ],
+)
+def test_an_engine_says_what_it_is(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    program: str,
+    facts: list[str],
+    expected: tuple[str, str, bool, bool],
+) -> None:
+    """Rootless docker is refused; one that maps users gets an option against that."""
+    said = {
+        "ServerVersion": "28.0",
+        "SecurityOptions": facts,
+        "host": {"security": {"rootless": True}},
+        "version": {"Version": "5.1"},
+    }
+    engine = engine_that_says(tmp_path, monkeypatch, program, said)
+    assert (engine.kind, engine.version, engine.rootless, engine.remapped) == expected
+    if expected[0] == "docker" and expected[2]:
+        with pytest.raises(SandboxUnavailableError, match="podman"):
+            DockerSandbox(engine="docker").for_repository(tmp_path, Policy(), Runtime(""))
+
+
+def test_an_engine_without_a_server_is_not_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Docker's program answers without one too, and says what is wrong."""
+    facts = {"ServerErrors": ["Cannot connect to the Docker daemon at unix:///x"]}
+    with pytest.raises(SandboxUnavailableError, match="systemctl start docker"):
+        engine_that_says(tmp_path, monkeypatch, "Docker version 28", facts)
+
+
+def test_secrets_do_not_go_to_the_engine(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its program gets what it needs of our environment, and no more."""
+    monkeypatch.setenv("HF_TOKEN", "secret")
+    monkeypatch.setenv("DOCKER_CONFIG", "/somewhere")
+    assert "HF_TOKEN" not in engines.environment()
+    assert engines.environment()["DOCKER_CONFIG"] == "/somewhere"
+
+
+@pytest.mark.parametrize("options", [{"memory": 0}, {"pids": -1}, {"cpus": 0.0}])
+def test_impossible_limits_are_refused(options: dict[str, Any]) -> None:
+    """At once, without an engine."""
+    with pytest.raises(PolicyError, match="more than 0"):
+        DockerSandbox(**options)
+
+
+def test_a_container_whose_monitor_was_killed_leaves_no_folder() -> None:
+    """The monitor cannot remove it then; whoever gives the container up does."""
+    server = ContainerServer()
+    words = [sys.executable, "-S", "-c", "input()"]
+    with server.starting(lambda ready: subprocess.Popen(words, stdin=subprocess.PIPE)):
+        server.process.kill()
+        server.process.communicate()
+    assert not server.runs
+    server.stop()
+    assert not server.folder.exists()

@@ -1,0 +1,257 @@
+"""Arrays beside the header: every layout arrives as it was, and no lie about one is believed."""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from envhub_worker.protocol.codec import arrays
+from envhub_worker.protocol.codec.arrays import ArrayReader, ArrayWriter
+from envhub_worker.protocol.codec.codec import decode, encode
+from envhub_worker.protocol.codec.numpy_forms import read_numpy_scalar
+from envhub_worker.protocol.errors import (
+    LocalProtocolError,
+    MessageTooLargeError,
+    RemoteProtocolError,
+)
+from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
+
+LARGE = arrays.INLINE_BYTES + 8
+NUMBERS = ["?", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4", "f8", "c8", "c16"]
+DTYPES = [*NUMBERS, "U7", "S5", "M8[ns]", "m8[25s]", "M8", "m8"]
+TEXT = st.characters(exclude_categories=["Cs"], exclude_characters="\0")
+
+
+def through(array: np.ndarray[Any, Any], *, copy: bool = True) -> np.ndarray[Any, Any]:
+    """Writes an array and reads it back."""
+    writer = ArrayWriter()
+    descriptor = writer.add(array)
+    reader = ArrayReader(b"".join(writer.tail), writer.frames, DEFAULT_LIMITS, copy)
+    read = reader.take(descriptor)
+    reader.finish()
+    return read
+
+
+def read(
+    descriptor: bytes,
+    tail: bytes = b"",
+    frames: tuple[bytes, ...] = (),
+    limits: WireLimits = DEFAULT_LIMITS,
+) -> np.ndarray[Any, Any]:
+    """Reads one array out of hand-made bytes, to the end."""
+    reader = ArrayReader(tail, frames, limits, copy=True)
+    array = reader.take(descriptor)
+    reader.finish()
+    return array
+
+
+def descriptor(code: int, *shape: int, frame: bool = False, parameter: int | None = None) -> bytes:
+    """A descriptor by its document, independent of the writer."""
+    head = bytes((code, len(shape) | (0x80 if frame else 0)))
+    middle = b"" if parameter is None else struct.pack("<I", parameter)
+    return head + middle + struct.pack(f"<{len(shape)}Q", *shape)
+
+
+def assert_same(expected: np.ndarray[Any, Any], actual: np.ndarray[Any, Any]) -> None:
+    """Asserts equal dtype up to byte order, shape and bits."""
+    native = expected.astype(expected.dtype.newbyteorder("="))
+    assert actual.dtype == native.dtype
+    assert actual.shape == expected.shape
+    assert actual.tobytes() == native.tobytes()
+
+
+@given(
+    array=st.sampled_from(DTYPES).flatmap(
+        lambda name: hnp.arrays(
+            np.dtype(name),
+            hnp.array_shapes(min_dims=0, max_dims=4, min_side=0, max_side=5),
+            elements=st.text(TEXT, max_size=7) if name[0] == "U" else None,
+        )
+    ),
+    order=st.sampled_from("CF"),
+)
+def test_every_dtype_and_shape_arrives_as_it_was(array: np.ndarray[Any, Any], order: Any) -> None:
+    """Values, dtype and shape survive, also of 0-d and empty arrays, in either memory order."""
+    assert_same(array, through(np.array(array, order=order)))
+
+
+@pytest.mark.parametrize(
+    "view",
+    [
+        np.arange(24).reshape(4, 6)[::-1, ::2],
+        np.arange(24).reshape(2, 3, 4).transpose(2, 0, 1),
+        np.asfortranarray(np.arange(6000.0).reshape(60, 100)),
+        np.arange(6000.0)[::-1],
+        np.broadcast_to(np.float32(3), (50, 50)),
+        np.arange(5, dtype=">i4"),
+        np.arange(5000, dtype=">f8"),
+        np.array(["2020-01-01", "NaT"], dtype=">M8[D]"),
+        np.array(["é", "\U0001f600x"], dtype=">U2"),
+        np.array(2.5, dtype=">f4"),
+    ],
+)
+def test_layout_and_byte_order_do_not_matter(view: np.ndarray[Any, Any]) -> None:
+    """Views with negative or zero strides, Fortran order and big-endian arrays cross by value."""
+    assert_same(view, through(view))
+
+
+@pytest.mark.parametrize(
+    ("array", "arrived"),
+    [
+        (np.zeros(3, dtype=[("x", "U0")])["x"], ["", "", ""]),  # of width one: 0 has no bytes
+        (np.array(["a\udc80b", "c"]), ["a\ufffdb", "c"]),  # what no UTF-8 can carry
+    ],
+)
+def test_strings_that_cannot_arrive_as_they_are(array: Any, arrived: list[str]) -> None:
+    """Without a width, or with lone surrogates; the rest of the array is untouched."""
+    assert through(array).tolist() == arrived
+
+
+def test_large_contiguous_array_is_not_copied_when_written() -> None:
+    """The frame of a large array is a view of the array's memory."""
+    array = np.zeros(LARGE, np.uint8)
+    writer = ArrayWriter()
+    writer.add(array)
+    assert np.shares_memory(np.frombuffer(writer.frames[0], np.uint8), array)
+
+
+def test_tail_is_bounded() -> None:
+    """When the tail is full, small arrays get frames too."""
+    writer = ArrayWriter()
+    for _ in range(2 * arrays.MAX_TAIL_BYTES // arrays.INLINE_BYTES):
+        writer.add(np.zeros(arrays.INLINE_BYTES, np.uint8))
+    assert sum(map(len, writer.tail)) == arrays.MAX_TAIL_BYTES
+    assert len(writer.frames) == arrays.MAX_TAIL_BYTES // arrays.INLINE_BYTES
+
+
+@pytest.mark.parametrize("size", [3, LARGE])
+def test_copied_array_can_be_written_and_shares_nothing(size: int) -> None:
+    """With copy=True an array has its own aligned, writable memory."""
+    source = np.zeros(size, np.uint8)
+    array = through(source)
+    array[:] = 1
+    assert not source.any()
+    assert array.flags.aligned
+
+
+def test_misaligned_frames_give_aligned_arrays() -> None:
+    """A transport may cut frames out of one buffer anywhere; native code needs alignment."""
+    frame = memoryview(bytes(1 + 8 * LARGE))[1:]
+    reader = ArrayReader(b"", [frame], DEFAULT_LIMITS, copy=False)
+    array = reader.take(descriptor(11, LARGE, frame=True))
+    assert array.flags.aligned
+    assert not array.flags.writeable
+
+
+@pytest.mark.parametrize(
+    "dtype", [object, "V4", [("a", "f4")], np.longdouble, np.clongdouble, "U300000", "S2000000"]
+)
+def test_dtypes_off_the_list_are_refused_before_sending(dtype: Any) -> None:
+    """Objects, void, structures, long doubles and huge strings raise LocalProtocolError."""
+    with pytest.raises(LocalProtocolError):
+        ArrayWriter().add(np.zeros(1, dtype))
+
+
+def test_more_than_32_dimensions_are_refused_before_sending() -> None:
+    """numpy 2 allows 64 dimensions, numpy 1 only 32; the wire allows what both can hold."""
+    with pytest.raises(LocalProtocolError):
+        arrays.pack_shape((1,) * 33)
+
+
+F4, BOOL, TEXT_CODE, BYTES_CODE, TIME_CODE = 10, 0, 14, 15, 16
+
+
+def test_hand_made_descriptor_is_understood() -> None:
+    """The descriptors that the tests below spoil are what the reader reads."""
+    tail = np.arange(6, dtype="<f4").tobytes()
+    assert_same(np.arange(6, dtype="f4").reshape(2, 3), read(descriptor(F4, 2, 3), tail))
+
+
+@pytest.mark.parametrize(
+    ("spoiled", "tail", "frames"),
+    [
+        (b"", b"", ()),
+        (b"\x0a", b"", ()),
+        (descriptor(F4, 1)[:-1], bytes(4), ()),
+        (descriptor(F4, 1) + b"\0", bytes(4), ()),
+        (descriptor(F4, 1), bytes(3), ()),
+        (descriptor(F4, 1), bytes(5), ()),
+        (descriptor(F4, 1, frame=True), bytes(4), ()),
+        (descriptor(F4, 1, frame=True), b"", (bytes(3),)),
+        (descriptor(F4, 1, frame=True), b"", (bytes(5),)),
+        (descriptor(F4, 1, frame=True), b"", (bytes(4), bytes(4))),
+        (descriptor(F4, 0, frame=True), b"", (b"",)),
+        (descriptor(F4, 1), b"", (bytes(4),)),
+        (descriptor(F4, 2**62), bytes(4), ()),
+        (descriptor(F4, 2**62 + 1, 4), bytes(16), ()),
+        (descriptor(F4, 2**64 - 1), bytes(4), ()),
+        (descriptor(F4, 2**63, 2**63, 2), b"", ()),
+        (descriptor(F4, 0, 2**62), b"", ()),
+        (descriptor(F4, *(2,) * 40), b"", ()),
+        (bytes((F4, 33)) + bytes(8 * 33), b"", ()),
+        (bytes((F4, 2)) + bytes(8), b"", ()),
+        (descriptor(18, 1), bytes(4), ()),
+        (descriptor(255, 1), bytes(4), ()),
+        (descriptor(TEXT_CODE), b"", ()),
+        (descriptor(TEXT_CODE, 1, parameter=0), b"", ()),
+        (descriptor(TEXT_CODE, 1, parameter=2_000_000_000), b"", ()),
+        (descriptor(BYTES_CODE, 1, parameter=2**32 - 1), b"", ()),
+        (descriptor(TEXT_CODE, 1, parameter=1), struct.pack("<I", 0x110000), ()),
+        (descriptor(TEXT_CODE, 1, parameter=1), struct.pack("<I", 0xD800), ()),
+        (descriptor(TIME_CODE, 1, parameter=0x0000_0001), bytes(8), ()),
+        (descriptor(TIME_CODE, 1, parameter=0x0000_01FF), bytes(8), ()),
+        (descriptor(TIME_CODE, 1, parameter=0x0000_0200), bytes(8), ()),
+        (descriptor(BOOL, 2), b"\1\2", ()),
+        (descriptor(BOOL, 2000), bytes(1999) + b"\xff", ()),
+    ],
+)
+def test_a_lie_about_an_array_is_refused(
+    spoiled: bytes, tail: bytes, frames: tuple[bytes, ...]
+) -> None:
+    """Wrong lengths, shapes, dtypes and contents raise RemoteProtocolError, whatever they are."""
+    with pytest.raises(RemoteProtocolError):
+        read(spoiled, tail, frames)
+
+
+def test_array_larger_than_a_frame_may_be_is_refused() -> None:
+    """The cap holds for what is declared, not only for what came."""
+    with pytest.raises(MessageTooLargeError, match="frame_bytes"):
+        read(descriptor(F4, 2**30, frame=True), b"", (b"",))
+
+
+@pytest.mark.parametrize("name", DTYPES)
+def test_scalar_comes_back_as_the_same_numpy_type(name: str) -> None:
+    """A numpy scalar keeps its type and bits."""
+    # a time without a unit is none, but for the one that stands for no time
+    scalar = np.array(["NaT"], "M8")[0] if name == "M8" else np.ones(1, np.dtype(name))[0]
+    back = decode(encode(scalar))
+    assert (type(back), back.dtype, back.tobytes()) == (
+        type(scalar),
+        scalar.dtype,
+        scalar.tobytes(),
+    )
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"\x0a", b"\x0a" + bytes(3), b"\x0a" + bytes(5), b"\x00\x02", b"\xff\x00\x00"]
+)
+def test_malformed_scalar_is_refused(data: bytes) -> None:
+    """A scalar of a wrong length, value or dtype raises RemoteProtocolError."""
+    with pytest.raises(RemoteProtocolError):
+        read_numpy_scalar(data)
+
+
+def test_descriptors_are_stable() -> None:
+    """The bytes of a descriptor are part of the protocol."""
+    assert ArrayWriter().add(np.zeros((2, 3), "f4")) == descriptor(F4, 2, 3)
+    assert ArrayWriter().add(np.zeros((5, LARGE), "?")) == descriptor(BOOL, 5, LARGE, frame=True)
+    assert ArrayWriter().add(np.zeros(2, "U7")) == descriptor(TEXT_CODE, 2, parameter=7)
+    assert ArrayWriter().add(np.zeros(2, "M8[25s]")) == descriptor(
+        TIME_CODE, 2, parameter=25 << 8 | 7
+    )

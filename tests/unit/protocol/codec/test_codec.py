@@ -1,0 +1,376 @@
+"""Values there and back with their types; hostile bytes nowhere."""
+
+from __future__ import annotations
+
+import collections
+import dataclasses
+import enum
+import pickle
+import subprocess
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from envhub_worker.protocol.codec.arrays import INLINE_BYTES
+from envhub_worker.protocol.codec.codec import Buffer, RemoteEnum, RemoteObject, decode, encode
+from envhub_worker.protocol.errors import LocalProtocolError, RemoteProtocolError
+from envhub_worker.protocol.limits import DEFAULT_LIMITS
+from tests.support.compare import assert_same
+from tests.support.wire import deep, ext, packed
+
+
+class Colour(enum.Enum):
+    """An enumeration that the receiver does not have."""
+
+    RED = (1, "r")
+
+
+class Level(enum.IntEnum):
+    """An enumeration that is also an int."""
+
+    LOW = 1
+
+
+@dataclasses.dataclass
+class Point:
+    """A class that the receiver does not have."""
+
+    x: int
+
+
+class Unprintable:
+    """A class whose description fails."""
+
+    def __repr__(self) -> str:
+        raise RuntimeError("no")
+
+
+def through(value: object, **options: Any) -> Any:
+    """Encodes and decodes a value."""
+    return decode([bytes(frame) for frame in encode(value)], **options)
+
+
+def as_objects(items: list[Any]) -> np.ndarray[Any, Any]:
+    """A 2x2 object array of four values, whatever they are."""
+    array = np.empty(4, dtype=object)
+    for index, item in enumerate(items):
+        array[index] = item
+    return array.reshape(2, 2)
+
+
+# --- what arrives -------------------------------------------------------------------------------
+
+scalars = (
+    st.none()
+    | st.booleans()
+    | st.integers(-(2**200), 2**200)
+    | st.floats()
+    | st.complex_numbers(allow_nan=False)
+    | st.text(st.characters(exclude_categories=["Cs"]))
+    | st.binary()
+    | st.builds(range, st.integers(), st.integers(), st.integers(1, 5))
+    | hnp.from_dtype(np.dtype("f4"))
+    | hnp.from_dtype(np.dtype("?"))
+    | hnp.from_dtype(np.dtype("i8"))
+)
+keys = st.recursive(
+    st.text(st.characters(exclude_categories=["Cs"]), max_size=5)
+    | st.integers()
+    | st.booleans()
+    | st.none(),
+    lambda children: st.tuples(children, children) | st.frozensets(children, max_size=3),
+    max_leaves=3,
+)
+plain_arrays = hnp.arrays(
+    st.sampled_from(["f4", "f8", "u1", "?", "i8"]),
+    hnp.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=4),
+)
+values = st.recursive(
+    scalars | plain_arrays,
+    lambda children: (
+        st.lists(children, max_size=4)
+        | st.lists(children, max_size=4).map(tuple)
+        | st.dictionaries(keys, children, max_size=4)
+        | st.sets(keys, max_size=4)
+        | st.lists(children, min_size=4, max_size=4).map(as_objects)
+    ),
+    max_leaves=20,
+)
+
+
+@given(values)
+def test_nested_values_arrive_with_their_types(value: object) -> None:
+    """Whatever is built of plain values and arrays arrives the same, bit for bit."""
+    assert_same(value, through(value))
+
+
+@pytest.mark.parametrize(
+    "value",
+    [
+        2**63, 2**64 - 1, 2**64, -(2**63), -(2**63) - 1, 2**4000, -0.0, float("inf"), float("nan"),
+        complex("1-infj"), "", "\0", "\U0001f600", b"", [], (), {}, set(), frozenset(), ((),),
+        {(): {None: ()}}, {1: "a", "1": "b"}, {b"k": 1}, slice(None), slice(1, (2,), "x"),
+        range(0), range(5, -5, -2), np.float64(1.5), np.float16("nan"), np.bool_(False),
+        np.str_("é"), np.str_(""), np.bytes_(b"ab"), np.datetime64("2020-01-01T00", "h"),
+        np.timedelta64(5, "ms"), np.array(None), np.zeros((0, 3), dtype=object),
+        {"r": [np.array([1]), {"s": (np.float32(1), None)}]},
+        as_objects([[1, 2], np.zeros(3), np.array(5), (1,)]), deep(32),
+        [deep(31), ["x" * 100] * 400],
+    ],
+    ids=repr,
+)  # fmt: skip
+def test_corner_values_arrive_with_their_types(value: object) -> None:
+    """Extremes and empties of every kind, elements of object arrays, and the largest depth."""
+    assert_same(value, through(value))
+
+
+@pytest.mark.parametrize(
+    ("value", "plain"),
+    [
+        (collections.namedtuple("Pair", "a b")(1, 2), (1, 2)),
+        (collections.OrderedDict(b=1, a=2), {"b": 1, "a": 2}),
+        (collections.defaultdict(list, a=[1]), {"a": [1]}),
+        (collections.Counter("aab"), {"a": 2, "b": 1}),
+        (type("S", (str,), {})("x"), "x"),
+        (type("I", (int,), {})(2**70), 2**70),
+        (type("F", (float,), {})(0.5), 0.5),
+        (type("L", (list,), {})([1]), [1]),
+        (type("B", (bytes,), {})(b"x"), b"x"),
+        (type("C", (complex,), {})(1j), 1j),
+        (type("T", (set,), {})([1]), {1}),
+        (type("Z", (frozenset,), {})([1]), frozenset([1])),
+        (bytearray(b"x"), b"x"),
+        (memoryview(b"x"), b"x"),
+    ],
+    ids=lambda value: type(value).__name__,
+)
+def test_subclasses_arrive_as_what_they_extend(value: object, plain: object) -> None:
+    """A class of the sender's is not known to the receiver; what it extends is."""
+    assert_same(plain, through(value))
+
+
+def test_array_subclasses_arrive_as_arrays() -> None:
+    """Subclasses of ndarray are arrays; a masked array is not just its data."""
+    assert_same(np.arange(3), through(np.arange(3).view(type("Sub", (np.ndarray,), {}))))
+    assert isinstance(through(np.ma.masked_array([1, 2], [0, 1])), RemoteObject)
+
+
+def test_lone_surrogates_arrive_as_visible_escapes() -> None:
+    """Text that UTF-8 cannot carry crosses with its surrogates spelled out, and arrays with it."""
+    value = {"path\udcff": [np.zeros(2), "a\ud800b"]}
+    assert_same({"path\\udcff": [np.zeros(2), "a\\ud800b"]}, through(value))
+
+
+def test_large_arrays_are_frames_and_small_ones_are_not() -> None:
+    """Beside the header there is one frame for each large array, in the order of the value."""
+    big, small = np.zeros(INLINE_BYTES + 1, np.uint8), np.zeros(4)
+    frames = encode({"a": small, "b": [big, small], "c": big[:-1]})
+    assert [len(frame) for frame in frames[1:]] == [INLINE_BYTES + 1]
+
+
+def test_uncopied_values_are_views_of_the_frames() -> None:
+    """With copy=False large arrays cost no memory, and none can be written."""
+    frames = encode([np.zeros(INLINE_BYTES + 1, np.uint8), np.zeros(2)])
+    large, small = decode(frames, copy=False)
+    assert np.shares_memory(large, np.frombuffer(frames[1], np.uint8))
+    assert not large.flags.writeable
+    assert not small.flags.writeable
+
+
+# --- inert stand-ins ----------------------------------------------------------------------------
+
+
+def test_enum_member_arrives_as_inert_name_and_value() -> None:
+    """Members of enumerations arrive as text, with the value decoded, and can be keys."""
+    red = through(Colour.RED)
+    assert isinstance(red, RemoteEnum)
+    assert (red.type_name, red.text) == (f"{__name__}.Colour", "RED")
+    assert red.value == (1, "r")
+    assert through({Level.LOW: 1}) == {through(Level.LOW): 1}
+
+
+@pytest.mark.parametrize("value", [object(), Point(1), lambda: 0, sys, int, {}.keys()])
+def test_unknown_objects_arrive_as_their_description(value: object) -> None:
+    """Objects, dataclasses, functions, modules and classes arrive as type name and repr."""
+    remote = through(value)
+    assert isinstance(remote, RemoteObject)
+    assert remote.type_name.endswith(type(value).__qualname__)
+
+
+def test_keys_that_look_alike_are_numbered() -> None:
+    """Objects with one ``repr`` are different keys in the worker; a number tells them apart."""
+    objects = [Unprintable() for _ in range(100)]
+    mapping = through(dict(zip(objects, range(100), strict=True)))
+    assert list(mapping.values()) == list(range(100))
+    first, second, *_ = mapping
+    assert (second.type_name, second.text) == (first.type_name, f"{first.text} #2")
+    assert len(through(set(objects))) == 100
+    nested = through({(objects[0], 1): "a", (objects[1], 1): "b"})
+    assert list(nested.values()) == ["a", "b"]
+
+
+def test_keys_that_cannot_be_hashed_here_are_described() -> None:
+    """A tensor is a key to the worker, and arrives as an array, which is none."""
+    torch = pytest.importorskip("torch")
+    for key in (torch.zeros(2), (1, torch.zeros(2))):
+        assert [type(one) for one in through({key: 1})] == [RemoteObject]
+    assert [type(one) for one in through({torch.zeros(2)})] == [RemoteObject]
+
+
+def test_description_is_bounded_printable_and_without_addresses() -> None:
+    """A description never drives a terminal, never floods a log, and is the same every time."""
+    loud = type("Loud", (), {"__repr__": lambda self: "\x1b[2J\n\u202e" + "x" * 10_000})()
+    remote = through([loud, object()])
+    assert remote[0].text.startswith("\\x1b[2J\\n\\u202exx")
+    assert len(remote[0].text) < 1100
+    assert remote[0].text.isprintable()
+    assert remote[1].text == "<object object>"
+    assert through(Unprintable()).text == "<repr failed with RuntimeError>"
+
+
+def test_remote_objects_can_be_passed_on() -> None:
+    """A description that is sent again arrives unchanged."""
+    value = [RemoteObject("a.B", "<b>"), RemoteEnum("a.E", "X", 3)]
+    again = through(value)
+    assert again == value
+    assert again[1].value == 3
+
+
+# --- pickles, tensors, arrays of other libraries ------------------------------------------------
+
+
+def test_pickles_travel_only_where_both_ends_say_so() -> None:
+    """Unknown objects are pickled with a pickler, and loaded with an unpickler."""
+    frames = encode({"p": Point(3)}, pickler=pickle.dumps)
+    assert decode(frames, unpickler=pickle.loads) == {"p": Point(3)}
+    with pytest.raises(RemoteProtocolError, match="never loaded"):
+        decode(frames)
+
+
+def test_known_values_are_never_pickled() -> None:
+    """A pickler changes nothing for values that have a form on the wire."""
+    value = [1, (2.0, {"a": np.zeros(3)}), {None}, Level.LOW]
+    assert encode(value, pickler=pickle.dumps) == encode(value)
+
+
+def test_failures_of_pickler_and_unpickler_are_protocol_errors() -> None:
+    """What cannot be pickled is refused with its path; what cannot be loaded, with the reason."""
+    with pytest.raises(LocalProtocolError, match=r"kwargs\[.f.\]\[1\] cannot be sent"):
+        encode({"kwargs": {"f": [0, lambda: 0]}}, pickler=pickle.dumps)
+    with pytest.raises(RemoteProtocolError, match="cannot be loaded"):
+        decode(packed(ext(5, b"junk")), unpickler=pickle.loads)
+
+
+class Foreign:
+    """An array of another library, by its protocol."""
+
+    def __array__(self, *args: Any, **kwargs: Any) -> np.ndarray[Any, Any]:
+        return np.arange(3.0)
+
+    def __dlpack__(self) -> None: ...
+
+
+class Broken(Foreign):
+    """An array of another library that cannot be read any more."""
+
+    def __array__(self, *args: Any, **kwargs: Any) -> np.ndarray[Any, Any]:
+        raise RuntimeError("Array has been deleted.")
+
+
+def test_arrays_of_other_libraries_arrive_as_numpy_arrays() -> None:
+    """What speaks __array__ and __dlpack__ (jax, cupy) is an array; its failure names the path."""
+    assert_same({"x": np.arange(3.0)}, through({"x": Foreign()}))
+    with pytest.raises(LocalProtocolError, match=r"obs\[.x.\] cannot be sent: Array has been"):
+        encode({"obs": {"x": Broken()}})
+
+
+def test_torch_tensors_arrive_as_tensors_or_arrays() -> None:
+    """Tensors of every dtype cross, also with gradients, conjugated, 0-d or bfloat16."""
+    torch = pytest.importorskip("torch")
+    source = [
+        torch.arange(6.0, requires_grad=True).reshape(2, 3),
+        torch.tensor([1 + 2j]).conj(),
+        torch.tensor(True),
+        torch.tensor([1.5, -2.0], dtype=torch.bfloat16),
+        torch.nn.Parameter(torch.ones(2)),
+    ]
+    made = through(source, tensors=lambda array, name: (name, array))
+    names = [name for name, _ in made]
+    assert names == ["float32", "complex64", "bool", "bfloat16", "float32"]
+    arrays: Any = through(source)
+    for tensor, array in zip(source, arrays, strict=True):
+        wide = tensor.detach().resolve_conj()
+        expected = wide.float() if wide.dtype == torch.bfloat16 else wide
+        assert_same(expected.numpy(), array)
+    assert isinstance(through(torch.eye(2).to_sparse()), RemoteObject)
+
+
+# --- what cannot be sent ------------------------------------------------------------------------
+
+
+def cyclic() -> dict[str, Any]:
+    """A value that contains itself."""
+    value: dict[str, Any] = {"info": {"a": [0, 1, 2]}}
+    value["info"]["a"].append(value["info"])
+    return value
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [
+        (cyclic(), r"info\[.a.\]\[3\] cannot be sent: it contains itself"),
+        ({"info": deep(32)}, r"info\[0\].* cannot be sent: it is nested deeper than 32"),
+        (deep(1000), "nested deeper than 32"),
+        ([1, np.zeros(2, "f4,f4")], r"value\[1\] cannot be sent: dtype"),
+        ({"info": {"a": np.longdouble(1)}}, r"info\[.a.\] cannot be sent: dtype"),
+        ({"a": as_objects([1, 2, (np.void(b"x"),), 3])}, r"a\[2\]\[0\] cannot be sent: dtype"),
+        ({1: 2**10_000}, r"value\[1\] cannot be sent: an integer"),
+        (np.zeros(2, "V8"), "The value cannot be sent: dtype"),
+        ({("k", 2**10_000): 1}, "cannot be sent: an integer"),
+        (b"x" * DEFAULT_LIMITS.header_bytes, "header_bytes"),
+        ([None] * DEFAULT_LIMITS.items, "items"),
+        ("x" * (DEFAULT_LIMITS.text_bytes + 1), "text_bytes"),
+        (np.broadcast_to(np.uint8(0), (2**28 + 1,)), "frame_bytes"),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_what_cannot_be_sent_is_refused_with_its_path(value: object, text: str) -> None:
+    """Cycles, depth, dtypes and sizes raise LocalProtocolError that names the offender."""
+    with pytest.raises(LocalProtocolError, match=text):
+        encode(value)
+
+
+# --- transports ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("wrap", [bytes, memoryview, lambda frame: memoryview(bytearray(frame))])
+def test_frames_may_be_any_buffer(wrap: Callable[[Buffer], Buffer]) -> None:
+    """Transports hand over bytes or memoryviews."""
+    value = [np.arange(10.0), np.arange(10_000.0), "x"]
+    assert_same(value, decode([wrap(frame) for frame in encode(value)]))
+
+
+def test_decoded_arrays_do_not_alias_the_transport() -> None:
+    """A transport may reuse its buffers once a copied value is decoded."""
+    buffers = [bytearray(frame) for frame in encode([np.ones(10), np.ones(10_000)])]
+    small, large = decode([memoryview(buffer) for buffer in buffers])
+    for buffer in buffers:
+        buffer[:] = bytes(len(buffer))
+    assert small.all()
+    assert large.all()
+
+
+def test_the_value_layer_imports_little() -> None:
+    """Importing the codec loads no Gymnasium, no ZeroMQ, no Hub client and no torch."""
+    code = (
+        "import sys, envhub_worker.protocol.codec.codec;"
+        "print({'gymnasium', 'zmq', 'huggingface_hub', 'torch', 'pickle5'} & set(sys.modules))"
+    )
+    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert run.stdout.strip() == "set()"

@@ -1,0 +1,295 @@
+"""Messages: their bytes are kept, and only messages come out of bytes."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import envhub_worker
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.codec.codec import encode
+from envhub_worker.protocol.errors import LocalProtocolError, RemoteProtocolError
+from envhub_worker.protocol.limits import DEFAULT_LIMITS
+from envhub_worker.protocol.messages import compression
+from tests.support.compare import assert_same
+from tests.support.wire import deep
+
+GOLDEN = Path(__file__).parents[2] / "golden" / "messages"
+REQUEST_ID = 7
+
+# One message of each class, with every kind of content that its fields may have.
+SAMPLES: list[m.Message] = [
+    m.Hello(m.VERSION, bytes(range(16))),
+    m.Welcome(1, "0.1.0", 4242),
+    m.Refusal("SandboxUnavailableError", "no user namespaces", "user-namespace", "sysctl ..."),
+    m.OpenJail("org/repo@abc:env.py", "", "", "/s", "env.py", {"limits": {"processes": 5}}, 2),
+    m.JailOpened(3, (1, 2), ({"layer": "seccomp", "enforced": True, "detail": "x"},)),
+    m.StartRunners(3, 1),
+    m.Relay(3, "step", ((1, 2), (2, 1))),
+    m.RelayDone((2, 1)),
+    m.Death(1, "signal", None, "SIGKILL", "", "last words", "step"),
+    m.CloseJail(3),
+    m.Done(),
+    m.ReadOutput(3, "call"),
+    m.Output("printed"),
+    m.GetStatus(),
+    m.Status(({"jail": 3, "name": "a", "pids": (9,), "busy_s": 0.5, "operation": "step"},)),
+    m.Deposit(bytes(range(16)), 3, 1),
+    m.OfferSnapshot((("env.py", 3, bytes(32)),)),
+    m.MissingBlobs("sha256:00", (bytes(32),)),
+    m.PutBlob(bytes(32), 4096),
+    m.KeepAlive((3, 4)),
+    m.Agree(("lz4",)),
+    m.Agreement("lz4", 120),
+    m.CompressionHeader("lz4", (-1, 4096)),
+    m.GetSessions(),
+    m.Sessions(({"client": "a", "session": "b", "heard_s": 0.5, "jails": ()},), {"pid": 7}),
+    m.ExpireIdle(3, 60_000),
+    m.KeepJail(3),
+    m.NeedPackages(
+        (("scipy>=1.11", "line 1 of requirements.txt"),),
+        *(">=3.10", "3.12", "", True),
+        (("PyYAML", "env.py, line 1", "yaml", "pyyaml"),),
+        (("numpy<3", "line 1 of held.txt"),),
+        (("torch==2.5", "'torch==2.5' in dependencies"),),
+        ("lerobot",),
+        True,
+    ),
+    m.Packages("made", "00" * 20, {"lock": "sha256:00", "packages": ("scipy==1.11",)}, "made"),
+    m.RelayDonePartly((2, 1), (1,)),
+    m.Load(4, True, {"task": "pick"}, {"seed": 1}),
+    m.LoadTask(4, True, {"task": "pick"}, {"seed": 1}, "suite", "task"),
+    m.LoadDone({"envs": ()}),
+    m.Build(1, "suite", "task", 0, 2),
+    m.BuildDone({"num_envs": 2}),
+    m.Reset(1, [5, None], {"key": "value"}, np.array([True, False])),
+    m.ResetDone(np.zeros((2, 3), np.float32), {"a": np.array([1]), "_a": np.array([True])}),
+    m.Step(1, np.array([0, 1])),
+    m.StepDone(
+        {"image": np.zeros((2, 1), np.uint8), "text": ("a", "b")},
+        np.array([0.5, -1.0]),
+        np.array([False, True]),
+        np.array([False, False]),
+        {},
+    ),
+    m.Call(1, "task", (1, "x"), {"flag": True}),
+    m.SetAttr(1, "gravity", (9.81, None)),
+    m.Render(1),
+    m.GetOwn(1, "hub_config"),
+    m.Method(),
+    m.CallOwn(1, "describe", (), {}),
+    m.GetRandom(1),
+    m.GetOne(1, 0, None, "task"),
+    m.CallOne(1, None, 0, "add", (1, "x"), {"flag": True}),
+    m.Close(1),
+    m.Value((None, "a", 1.5)),
+    m.Attach(1, 2, 8, 5),
+    m.FetchInfos(1),
+    m.FetchInfosApart(1),
+    m.Revive(1, [5, None]),
+    m.FollowOutput(3, 4096),
+    m.OutputBytes(4096, b"caf\xc3\xa9\x1b"),
+    m.RaisedException("KeyError", "mypkg.Oops", "gone", "Traceback ...", "step"),
+    m.Warnings((("UserWarning", "slow"), ("mypkg.Own", "caf\u00e9"))),
+    m.Watch(1, "task"),
+    m.WatchDone(("reach", "lift"), True),
+    m.Changes(((1, "task"), (2, "x"))),
+]  # fmt: skip
+BY_NAME = {type(message).__name__: message for message in SAMPLES}
+
+
+def values_of(message: m.Message) -> dict[str, Any]:
+    """The fields of a message, since arrays have no ``==`` that compares."""
+    return {name: getattr(message, name) for name in message.FIELDS}
+
+
+def test_every_message_has_a_sample_and_a_golden_file() -> None:
+    """A message that is added, or goes, is noticed here."""
+    assert set(BY_NAME) == {cls.__name__ for cls in m.KINDS.values()}
+    assert {path.stem for path in GOLDEN.glob("*.hex")} == set(BY_NAME)
+
+
+@pytest.mark.parametrize("name", BY_NAME)
+def test_bytes_are_golden(name: str) -> None:
+    """The wire never changes by accident; ``ENVHUB_WRITE_GOLDEN=1`` writes it down anew."""
+    frames = m.pack(BY_NAME[name])
+    text = "".join(bytes(frame).hex() + "\n" for frame in frames)
+    path = GOLDEN / f"{name}.hex"
+    if "ENVHUB_WRITE_GOLDEN" in os.environ:
+        path.write_text(text)
+    assert path.read_text() == text
+
+
+@pytest.mark.parametrize("name", BY_NAME)
+def test_golden_bytes_are_read(name: str) -> None:
+    """What was once written is still understood, field by field."""
+    frames = [bytes.fromhex(line) for line in (GOLDEN / f"{name}.hex").read_text().split()]
+    message = m.unpack(frames)
+    assert type(message) is type(BY_NAME[name])
+    assert_same(values_of(BY_NAME[name]), values_of(message))
+
+
+@pytest.mark.parametrize("request_id", [1, 200, 2**62, 2**63 - 1])
+def test_request_ids_arrive(request_id: int) -> None:
+    """An id of any size comes back as it was."""
+    [frame] = m.pack_header(m.Done(), request_id)
+    assert m.unpack_header(frame) == (request_id, m.Done())
+    assert m.id_of(frame) == m.id_of(memoryview(frame)) == request_id
+
+
+def test_a_header_is_golden() -> None:
+    """The id, and the message."""
+    [frame] = m.pack_header(m.CloseJail(3), REQUEST_ID)
+    assert bytes(frame).hex() == "000000000000000703000000920a03"
+
+
+def test_the_id_of_a_header_that_cannot_be_read_is_known() -> None:
+    """So its sender need not wait for an answer."""
+    [frame] = m.pack_header(m.CloseJail(3), REQUEST_ID)
+    for spoiled in (bytes(frame[:8]), bytes(frame[:-1]), bytes(frame) + b"x"):
+        assert m.id_of(spoiled) == REQUEST_ID
+        with pytest.raises(RemoteProtocolError):
+            m.unpack_header(spoiled)
+
+
+@pytest.mark.parametrize("number", [0, 2**63, 2**64 - 1])
+def test_an_impossible_id_is_refused(number: int) -> None:
+    """A server that failed to pack its answer would end for everybody."""
+    [header] = m.pack(m.Done())
+    frame = number.to_bytes(8, "big") + bytes(header)
+    assert m.id_of(frame) is None
+    with pytest.raises(RemoteProtocolError, match="starts with the id"):
+        m.unpack_header(frame)
+
+
+@pytest.mark.parametrize("number", [1, 148 + 25 * 256, 2**63 - 1])
+def test_a_header_is_never_taken_for_packed(number: int) -> None:
+    """``CompressionHeader`` alone has the id 0."""
+    header = m.pack_header(m.Done(), number)
+    assert compression.unpack_frames(header, DEFAULT_LIMITS) == header
+
+
+@pytest.mark.parametrize(
+    ("value", "complaint"),
+    [
+        ({}, "is a list"),
+        ([], "is a list"),
+        ((11,), "is a list"),
+        ([999], "unknown message kind"),
+        ([True], "unknown message kind"),
+        ([11.0], "unknown message kind"),
+        (["Done"], "unknown message kind"),
+        ([11, None], "Done has 0 fields, the peer sent 1"),
+        ([10], "CloseJail has 1 fields, the peer sent 0"),
+        ([10, "3"], "CloseJail.jail cannot be of type str"),
+        ([10, True], "CloseJail.jail cannot be of type bool"),
+        ([10, np.int64(3)], "CloseJail.jail cannot be of type int64"),
+        ([8, [1]], "RelayDone.parts cannot be of type list"),
+        ([m.LoadDone.kind, None], "LoadDone.manifest cannot be of type NoneType"),
+        ([9, 1, "exit", None, None, b"", "", ""], "Death.detail cannot be of type bytes"),
+    ],
+)
+def test_what_is_no_message_is_refused(value: object, complaint: str) -> None:
+    """A kind, a count of fields or a type that does not fit is the peer's fault."""
+    with pytest.raises(RemoteProtocolError, match=complaint):
+        m.unpack(encode(value))
+
+
+@given(st.binary(max_size=64), st.booleans())
+def test_arbitrary_headers_raise_nothing_but_protocol_errors(noise: bytes, with_id: bool) -> None:
+    """Whatever arrives, it is a message with an id, or a RemoteProtocolError."""
+    frame = (7).to_bytes(8, "big") + noise if with_id else noise
+    try:
+        number, message = m.unpack_header(frame)
+    except RemoteProtocolError:
+        return
+    assert type(message) in m.KINDS.values()
+    assert number.bit_length() <= 63
+
+
+@given(st.lists(st.binary(max_size=64), max_size=3))
+def test_arbitrary_bytes_raise_nothing_but_protocol_errors(frames: list[bytes]) -> None:
+    """Whatever arrives, it is a message or a RemoteProtocolError."""
+    try:
+        message = m.unpack(frames)
+    except RemoteProtocolError:
+        return
+    assert type(message) in m.KINDS.values()
+
+
+@given(st.sampled_from(sorted(BY_NAME)), st.integers(0, 2**32), st.integers(0, 255))
+def test_one_changed_byte_raises_nothing_but_protocol_errors(
+    name: str, place: int, byte: int
+) -> None:
+    """A golden message with one byte changed is another message, or refused."""
+    frames = [bytearray(frame) for frame in m.pack(BY_NAME[name])]
+    frames[0][place % len(frames[0])] = byte
+    try:
+        message = m.unpack(frames)
+    except RemoteProtocolError:
+        return
+    assert type(message) in m.KINDS.values()
+
+
+def test_unsendable_fields_are_our_own_fault() -> None:
+    """What the wire cannot carry is refused before anything is sent."""
+    with pytest.raises(LocalProtocolError, match="nested deeper than 32"):
+        m.pack(m.Value(deep(100)))
+
+
+def test_messages_cannot_be_changed() -> None:
+    """A decoded message stays what was checked."""
+    with pytest.raises(AttributeError, match=r"CloseJail\.jail"):
+        m.CloseJail(3).jail = 4  # type: ignore[misc]
+    with pytest.raises(AttributeError, match=r"CloseJail\.jail"):
+        del m.CloseJail(3).jail
+
+
+def test_messages_are_made_like_dataclasses() -> None:
+    """By order, by name, with defaults; nothing missing, unknown or twice."""
+    expected = m.KeepJail(3)
+    assert m.KeepJail(jail=3) == m.replace(m.KeepJail(4), jail=3) == expected
+    assert expected != m.CloseJail(3)
+    assert hash(m.KeepJail(3)) == hash(expected)
+    assert repr(expected) == "KeepJail(jail=3)"
+    for values, named in (((), {}), ((3, 4), {}), ((3,), {"jail": 3}), ((3,), {"other": 1})):
+        with pytest.raises(TypeError, match="KeepJail"):
+            m.KeepJail(*values, **named)
+
+
+OF_A_SERVER = ("Hello", "OpenJail", "JailOpened", "Relay", "Death")
+WITHOUT_NUMPY = """
+import sys
+sys.path.insert(0, sys.argv[1])
+import envhub_worker.server
+import envhub_worker
+from envhub_worker.protocol import messages as m
+for golden in sys.argv[2:-1]:
+    for _ in range(3):
+        said = m.unpack([bytes.fromhex(golden)])
+        [frame] = m.pack(said)
+        assert frame.hex() == golden
+        [frame] = m.pack_header(said, 7)
+        assert m.unpack_header(frame) == (7, said)
+assert m.unpack(m.pack(m.Value({1, 2**70, 1j, "\\udc80"})))
+assert "numpy" not in sys.modules
+m.unpack([bytes.fromhex(sys.argv[-1])])
+assert "numpy" in sys.modules
+"""
+
+
+def test_a_server_does_without_numpy_until_it_is_sent_an_array() -> None:
+    """Its own conversation is the same bytes as with numpy."""
+    folder = envhub_worker.__file__.rsplit("/envhub_worker/", 1)[0]
+    golden = [(GOLDEN / f"{name}.hex").read_text().strip() for name in OF_A_SERVER]
+    array = bytes(m.pack(m.Value(np.zeros(2)))[0]).hex()
+    command = [sys.executable, "-I", "-c", WITHOUT_NUMPY, folder, *golden, array]
+    subprocess.run(command, capture_output=True, text=True, check=True)

@@ -1,0 +1,1 @@
+"""Unit tests of ``envhub_worker/access/store``."""

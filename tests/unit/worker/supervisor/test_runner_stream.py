@@ -1,0 +1,73 @@
+"""The stream to one runner: what was asked is answered in order, and nothing else is taken."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+
+import pytest
+
+from envhub_worker.protocol.errors import RemoteProtocolError
+from envhub_worker.protocol.limits import WireLimits
+from envhub_worker.protocol.stream import pack_packet
+from envhub_worker.supervisor.runner_stream import RunnerLink
+
+
+@pytest.fixture
+def ends() -> Iterator[tuple[RunnerLink, socket.socket]]:
+    """The server's end, and the runner's."""
+    ours, theirs = socket.socketpair()
+    with ours, theirs:
+        yield RunnerLink(ours, WireLimits()), theirs
+
+
+def packet(number: int) -> bytes:
+    """An answer."""
+    return b"".join(map(bytes, pack_packet(number, [b"said"])))
+
+
+def test_answers_find_who_asked(ends: tuple[RunnerLink, socket.socket]) -> None:
+    """In the order of the requests, also in pieces; then the stream ends."""
+    link, runner = ends
+    for number in (1, 2):
+        link.send(number, [b"asked"], f"owner {number}")
+    assert link.receive() == []
+    said = packet(1) + packet(2)
+    runner.sendall(said[:-1])
+    assert [owner for _, owner in link.receive() or ()] == ["owner 1"]
+    runner.sendall(said[-1:])
+    assert [owner for _, owner in link.receive() or ()] == ["owner 2"]
+    assert (link.received, list(link.pending)) == (len(said), [])
+    runner.close()
+    assert link.receive() is None
+    link.send(3, [b"asked"], "nobody")
+    assert not link.wants_write
+
+
+@pytest.mark.parametrize("lies", [(2,), (1, 1), (1, 7)])
+def test_an_answer_that_nobody_asked_for_is_refused(
+    ends: tuple[RunnerLink, socket.socket], lies: tuple[int, ...]
+) -> None:
+    """And whoever still waits is known, for that is told of the death."""
+    link, runner = ends
+    for number in (1, 2):
+        link.send(number, [b"asked"], f"owner {number}")
+    runner.sendall(b"".join(map(packet, lies)))
+    with pytest.raises(RemoteProtocolError, match="it owes"):
+        link.receive()
+    assert set(link.pending) == {1, 2}
+
+
+def test_a_runner_that_does_not_read_keeps_nobody_waiting(
+    ends: tuple[RunnerLink, socket.socket],
+) -> None:
+    """What does not fit waits here, and goes out as it is read."""
+    link, runner = ends
+    large = bytes(8 << 20)
+    link.send(1, [b"", large], "owner")
+    assert link.wants_write
+    seen = 0
+    while seen < link.sent:
+        seen += len(runner.recv(1 << 20))
+        link.flush()
+    assert not link.wants_write
