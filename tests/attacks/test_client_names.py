@@ -43,9 +43,10 @@ from tests.attacks.lying_server import (
 )
 from tests.attacks.test_client_lies import opened, relayed
 from tests.attacks.test_client_values import SCRIPT, spec_of
-from tests.support import curious, inside
-from tests.support.curious import do
-from tests.support.protocol_names import names_that_libraries_call
+from tests.support import inside
+from tests.support.objects import curious
+from tests.support.objects.curious import do
+from tests.support.objects.protocol_names import names_that_libraries_call
 from tests.support.repositories import write_repository
 
 FAMILY = "The client, by what libraries do with any object"

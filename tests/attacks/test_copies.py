@@ -14,7 +14,7 @@ from envhub_worker.protocol.runtime import Runtime
 from tests.attacks import trapped_packages as traps
 from tests.attacks.harness import Arena, Run, call, control_run, new_alias, token
 from tests.attacks.hostile.payloads.change_tree import WAYS
-from tests.support.environments import base_interpreter, running_on
+from tests.support.packages.environments import base_interpreter, running_on
 from tests.support.trees import fingerprint
 
 FAMILY = "Copies of what is shared"

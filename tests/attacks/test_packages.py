@@ -15,7 +15,7 @@ from tests.attacks import trapped_packages as traps
 from tests.attacks.harness import Arena, token
 from tests.attacks.test_between_jails import neighbour
 from tests.attacks.victim import victim
-from tests.support.environments import base_interpreter, install, running_on
+from tests.support.packages.environments import base_interpreter, install, running_on
 from tests.support.processes import eventually
 from tests.support.repositories import write_repository
 

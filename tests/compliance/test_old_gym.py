@@ -20,7 +20,7 @@ import pytest
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import RemoteEnvWarning
 from envhub_worker.protocol.runtime import Runtime
-from tests.support.environments import install, running_on
+from tests.support.packages.environments import install, running_on
 from tests.support.samples import SAMPLES
 
 REPOSITORY = SAMPLES / "old_gym"

@@ -23,7 +23,7 @@ from tests.compliance import test_parity
 from tests.compliance.pair import Pair
 from tests.compliance.vector_env import Case
 from tests.support.compare import assert_same
-from tests.support.environments import install, running_on
+from tests.support.packages.environments import install, running_on
 from tests.support.samples import reference, sample
 
 OLDEST = ("gymnasium==0.26.3", "numpy==1.26.4")

@@ -12,7 +12,7 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.sandboxes.pool import stop_idle
-from tests.faults.traces import Traces, temporary_root
+from tests.faults.remains.traces import Traces, temporary_root
 from tests.support.processes import eventually
 from tests.support.samples import sample
 

@@ -20,9 +20,9 @@ from envhub_sandbox.check.judge import judge
 from envhub_sandbox.check.settings import JudgeOptions
 from envhub_sandbox.errors import SandboxUnavailableError, SnapshotError
 from envhub_sandbox.rollouts.pictures import png
-from tests.support import checks
-from tests.support.ci import obeyed
 from tests.support.command_line import envhub
+from tests.support.documents import checks
+from tests.support.output.ci import obeyed
 from tests.support.repositories import write_repository
 from tests.support.samples import EXAMPLES
 
@@ -81,7 +81,7 @@ def judged(folder: Path, steps: int = 25, **more: Any) -> Report:
 
 
 def test_the_page_is_the_table() -> None:
-    """To write it again: ``python -m tests.support.checks``."""
+    """To write it again: ``python -m tests.support.documents.checks``."""
     assert checks.DOCUMENT.read_text() == checks.document()
 
 

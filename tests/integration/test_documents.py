@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support import blocks
+from tests.support.documents import blocks
 from tests.support.samples import EXAMPLES
 
 # No block may take a port that another program has.

@@ -10,8 +10,8 @@ import pytest
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import WorkerDiedError
 from envhub_sandbox.sandboxes import runtime_folder
+from tests.faults.remains.traces import temporary_root
 from tests.faults.test_idle import comes_off
-from tests.faults.traces import temporary_root
 from tests.remote.listening import Listening, listening
 from tests.support.processes import eventually
 from tests.support.repositories import write_repository

@@ -20,7 +20,7 @@ from envhub_sandbox.locks import drift, lockfile, making, pylock
 from envhub_sandbox.locks.fingerprint import spaces_of, task_of
 from envhub_sandbox.locks.lockfile import LockFile, Runner, Spaces
 from envhub_sandbox.locks.pylock import Package, Wheel
-from tests.support.wheels import WORKERS, Index, make_wheel, served
+from tests.support.packages.wheels import WORKERS, Index, make_wheel, served
 
 A, B = "a" * 64, "b" * 64
 BOX = gym.spaces.Box(-1, 1, (3,), np.float32)

@@ -16,12 +16,12 @@ from typer.testing import CliRunner
 
 from envhub_sandbox.cli.app import app
 from tests import libraries
-from tests.support import blocks, options, shell
-from tests.support.blocks import CHECKOUT, DRAWN, HELD, OWN, PARSED, RUN, SHOWN, Block
+from tests.support.documents import blocks, options, shell
+from tests.support.documents.blocks import CHECKOUT, DRAWN, HELD, OWN, PARSED, RUN, SHOWN, Block
 
 # Programs of others, whose options are theirs; and what begins a line that is no command.
 _OTHERS = {"docker", "pip", "lerobot-eval", "lerobot-train", "lerobot-eval-sandboxed", "ruff"}
-_SHELL = "tests/support/shell.py"
+_SHELL = "tests/support/documents/shell.py"
 _RUN_BY = {
     "README.md": "tests/unit/docs/test_docs.py",
     "docs/integrations.md": "tests/unit/docs/test_docs.py",
@@ -109,7 +109,7 @@ def held(words: list[str]) -> None:
     elif program in ("python", "python3") and rest[0] == "-m":
         assert importlib.util.find_spec(rest[1]) is not None, words
     elif program == "pytest":
-        ours = (CHECKOUT / "tests" / "support" / "selection.py").read_text()
+        ours = (CHECKOUT / "tests" / "support" / "plugins" / "selection.py").read_text()
         plugin = inspect.getsource(importlib.import_module("envhub_sandbox.pytest_plugin"))
         long = [word for word in rest if word.startswith("--")]
         assert all(f'"{word}"' in ours + plugin for word in long), words

@@ -19,7 +19,7 @@ from envhub_worker.protocol.lifecycle import TABLE, Event, State
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, MAX_NUM_ENVS
 from envhub_worker.protocol.manifest.manifest import MAX_ENVS
 from envhub_worker.protocol.manifest.names import MAX_NAME
-from tests.support import options, settings
+from tests.support.documents import options, settings
 from tests.unit.docs.test_imports import folder
 
 CHECKOUT = Path(__file__).resolve().parents[3]
@@ -329,12 +329,12 @@ def test_error_tree_is_the_tree() -> None:
 
 
 def test_settings_are_written_from_the_docstrings() -> None:
-    """``python -m tests.support.settings`` writes them again."""
+    """``python -m tests.support.documents.settings`` writes them again."""
     assert settings.DOCUMENT.read_text() == settings.document()
 
 
 def test_options_are_written_from_the_commands() -> None:
-    """``python -m tests.support.options`` writes them again."""
+    """``python -m tests.support.documents.options`` writes them again."""
     assert options.DOCUMENT.read_text() == options.document()
 
 

@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 
 CONFTEST = """
-from tests.support import selection
+from tests.support.plugins import selection
 selection.SHORT = ({start!r},)
-pytest_plugins = ["tests.support.selection", "tests.support.skips"]
+pytest_plugins = ["tests.support.plugins.selection", "tests.support.plugins.skips"]
 """
 TESTS = """
 import pytest

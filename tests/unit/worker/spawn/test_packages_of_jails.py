@@ -24,8 +24,8 @@ from tests.integration.confinement_kit import (
     spawner_in,
 )
 from tests.support import inside
-from tests.support.environments import base_interpreter
 from tests.support.interpreter import profiles
+from tests.support.packages.environments import base_interpreter
 from tests.support.trees import fingerprint
 
 MODULE = "mine = 'from the packages'\n"

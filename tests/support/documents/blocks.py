@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-CHECKOUT = Path(__file__).resolve().parents[2]
+CHECKOUT = Path(__file__).resolve().parents[3]
 DOCUMENTS = tuple(
     path.relative_to(CHECKOUT).as_posix()
     for pattern in ("*.md", "docs/*.md", "benchmarks/*.md", "examples/*.md", "plugins/*/*.md")

@@ -1,4 +1,4 @@
-"""Writes ``docs/faults.md`` from the table: ``python -m tests.faults.document``.
+"""Writes ``docs/faults.md`` from the table: ``python -m tests.faults.matrix.document``.
 
 The seconds are the median cell of a row in one full run, kept in ``measured.json``.
 """
@@ -8,16 +8,17 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from tests.faults.table import FAULTS, MOMENTS, ROWS, Row
+from tests.faults.matrix.table import FAULTS, MOMENTS, ROWS, Row
 
-DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "faults.md"
+DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "faults.md"
 _MEASURED = Path(__file__).with_name("measured.json")
 
 _HEAD = """\
 # When things go wrong
 
-This file is written from the table in `tests/faults/table.py` by `python -m tests.faults.document`.
-`tests/faults/test_matrix.py` tries the rows; with `ENVHUB_FAULTS=full` it tries each of them in a
+This file is written from the table in `tests/faults/matrix/table.py` by
+`python -m tests.faults.matrix.document`. `tests/faults/matrix/test_matrix.py` tries the rows; with
+`ENVHUB_FAULTS=full` it tries each of them in a
 `SyncVectorEnv`, in an `AsyncVectorEnv` of two shards and in a suite of two tasks, over the fast
 lane and over frames. Without it one combination of each row runs, and all endings of a step.
 
@@ -108,11 +109,12 @@ that was used last, at most three (a server and one of these are three processes
 was 60 MB when this was written). It ends with the client at the latest, however that ends;
 `tests/integration/test_lingering.py` looks from outside.
 
-`tests/faults/test_nothing_left.py` ends clients: by return without `close()`, exceptions,
+`tests/faults/remains/test_nothing_left.py` ends clients: by return without `close()`, exceptions,
 `sys.exit`, `os._exit`, a crash, and by SIGINT, SIGTERM, SIGHUP and SIGKILL while idle, in a step
-and in `make_env`; `tests/faults/test_starting.py` while their server starts, at moments that it
-waits for, and `python -m tests.faults.starts --rounds 200` at random ones. Nothing of theirs
-remains, their temporary folders included. (If the *server* is killed its client removes the folder.
+and in `make_env`; `tests/faults/remains/test_starting.py` while their server starts, at moments
+that it waits for, and `python -m tests.faults.remains.starts --rounds 200` at random ones. Nothing
+of theirs remains, their temporary folders included. (If the *server* is killed its client removes
+the folder.
 If both are killed at once, or a client that has no server yet, a folder and empty control groups
 stay. The folder says whose it was: the next server that this user starts removes it, and
 `envhub gc` both.)

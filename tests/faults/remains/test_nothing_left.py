@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.faults.clients import finish, is_clean, left, line, start
-from tests.faults.traces import Traces, temporary_root
+from tests.faults.remains.clients import finish, is_clean, left, line, start
+from tests.faults.remains.traces import Traces, temporary_root
 from tests.support.processes import eventually
 from tests.support.samples import sample
 

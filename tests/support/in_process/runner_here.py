@@ -1,6 +1,6 @@
 """A runner in this process, for a debugger: no server, no jail, no lane; the repository is trusted.
 
-    python -m pdb -m tests.support.runner_here tests/samples/cartpole
+    python -m pdb -m tests.support.in_process.runner_here tests/samples/cartpole
 
 loads the folder's ``env.py``, builds two sub-environments, resets and steps them. A breakpoint
 anywhere in ``worker/envhub_worker/runner`` or in the repository is met.

@@ -16,9 +16,9 @@ import pytest
 
 from envhub_sandbox import Limits, Timeouts, errors, make_env
 from tests.faults.conftest import Neighbour
-from tests.faults.document import DOCUMENT, document
-from tests.faults.table import CLOSED, LOADING, RESET, ROWS, USABLE, Cell, Row, cells
-from tests.faults.traces import Traces
+from tests.faults.matrix.document import DOCUMENT, document
+from tests.faults.matrix.table import CLOSED, LOADING, RESET, ROWS, USABLE, Cell, Row, cells
+from tests.faults.remains.traces import Traces
 from tests.support import inside
 from tests.support.processes import eventually, is_stopped
 from tests.support.samples import sample
@@ -203,7 +203,7 @@ def _write_down(cell: Cell, seconds: float) -> None:
 
 def test_every_moment_and_fault_is_in_the_table() -> None:
     """No fault and no moment is listed and never tried."""
-    from tests.faults.table import FAULTS, MOMENTS
+    from tests.faults.matrix.table import FAULTS, MOMENTS
 
     assert {row.fault for row in ROWS} == set(FAULTS)
     assert {row.moment for row in ROWS} == set(MOMENTS)

@@ -1,8 +1,8 @@
 """What ``envhub check`` says of honest samples with one fault in them: its check, and no other.
 
-``python -m tests.support.mutants [SAMPLE ...]`` puts each fault into each sample, one after the
-other (some ten minutes), prints what is told beyond what the sample itself is told, and ends with 1
-where that is not what stands here.
+``python -m tests.support.judging.mutants [SAMPLE ...]`` puts each fault into each sample, one after
+the other (some ten minutes), prints what is told beyond what the sample itself is told, and ends
+with 1 where that is not what stands here.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from pathlib import Path
 
 from envhub_sandbox.check.judge import judge
 from envhub_sandbox.check.settings import JudgeOptions
-from tests.support.judged import ENTRIES, HONEST
+from tests.support.judging.judged import ENTRIES, HONEST
 from tests.support.samples import sample
 
 _SLOW_S, _NEVER_S = 0.02, 600.0

@@ -1,7 +1,7 @@
 """Clients that are ended while their server starts, at a moment of one's choice.
 
-``python -m tests.faults.starts --rounds 200 --seed 1`` ends as many at random times, and says what
-was left; the tests end a handful, at moments that they wait for.
+``python -m tests.faults.remains.starts --rounds 200 --seed 1`` ends as many at random times, and
+says what was left; the tests end a handful, at moments that they wait for.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import time
 from pathlib import Path
 
 from envhub_sandbox.sandboxes import runtime_folder
-from tests.faults.clients import finish, left, line, start
-from tests.faults.traces import Traces, temporary_root
+from tests.faults.remains.clients import finish, left, line, start
+from tests.faults.remains.traces import Traces, temporary_root
 from tests.support.processes import eventually
 
 SIGNALS = (signal.SIGTERM, signal.SIGHUP, signal.SIGKILL)

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from envhub_sandbox.sandboxes import runtime_folder
-from tests.faults.clients import finish, is_clean, left
-from tests.faults.starts import SIGNALS, age, halted, is_removed_by_the_next
-from tests.faults.traces import temporary_root
+from tests.faults.remains.clients import finish, is_clean, left
+from tests.faults.remains.starts import SIGNALS, age, halted, is_removed_by_the_next
+from tests.faults.remains.traces import temporary_root
 from tests.support.processes import eventually
 
 

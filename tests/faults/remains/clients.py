@@ -8,7 +8,7 @@ import sys
 import textwrap
 from pathlib import Path
 
-from tests.faults.traces import Traces
+from tests.faults.remains.traces import Traces
 from tests.support.processes import eventually
 from tests.support.samples import sample
 

@@ -1,6 +1,6 @@
 """``docs/settings.md``, written from the docstrings and defaults of what it describes.
 
-Write it again with ``python -m tests.support.settings``.
+Write it again with ``python -m tests.support.documents.settings``.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 
 from envhub_sandbox import Limits, Policy, Timeouts, make_env
 
-DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "settings.md"
+DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "settings.md"
 _HEAD = """# Settings
 
 Every argument of `make_env`, and every field of what it takes as `policy`, `limits` and `timeouts`:

@@ -1,7 +1,8 @@
 """What ``envhub check`` says of the hostile payloads and of the samples, as it has to.
 
-``python -m tests.support.judged [NAME ...]`` gives each to it, one after the other (minutes),
-prints what is told, and ends with 1 where that is not what stands here. A few are in the tests.
+``python -m tests.support.judging.judged [NAME ...]`` gives each to it, one after the other
+(minutes), prints what is told, and ends with 1 where that is not what stands here. A few are in
+the tests.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """``docs/options.md``, written from the commands themselves.
 
-Write it again with ``python -m tests.support.options``.
+Write it again with ``python -m tests.support.documents.options``.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import typer
 from envhub_sandbox.cli.app import app
 from envhub_worker import cli
 
-DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "options.md"
+DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "options.md"
 _HEAD = """# Options
 
 Every command of `envhub` and of `envhub-worker`, and every option of each: what `--help` says, from

@@ -1,6 +1,6 @@
 """``docs/checks.md``, written from the table of checks, and that of settings.
 
-Write it again with ``python -m tests.support.checks``.
+Write it again with ``python -m tests.support.documents.checks``.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from tests.corpus.entries import Entry
 from tests.corpus.faults import FAULTS
 from tests.corpus.honest import HONEST
 
-DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "checks.md"
+DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "checks.md"
 _HEAD = """# Checks
 
 What `envhub check` asks of a repository, written from `envhub_sandbox/check/checks.py`. Its files

@@ -19,7 +19,7 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import ServerBusyError, WorkerDiedError
-from tests.remote.test_metrics import Watched, watched
+from tests.remote.monitoring.test_metrics import Watched, watched
 from tests.support.processes import eventually
 from tests.unit.docs.test_deployment import DASHBOARD, expressions
 

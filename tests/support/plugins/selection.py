@@ -50,7 +50,7 @@ SHORT = (
     # one of each family of attacks, and what a client is told by a liar
     *(f"tests/attacks/test_{start}" for start in _ATTACKS),
     # how environments end, and that nothing of them remains
-    "tests/faults/test_nothing_left.py::",
+    "tests/faults/remains/test_nothing_left.py::",
     "tests/faults/test_interrupts.py::",
     "tests/faults/test_late_replies.py::",
     "tests/faults/test_restarts.py::",
@@ -73,18 +73,18 @@ SHORT = (
     "tests/integration/test_confinement.py::test_host_without_landlock_is_refused",
     "tests/integration/test_confinement_limits.py::test_disk_fill_stops_at_the_quota",
     # another host: keys, the same results, strangers
-    "tests/remote/test_keys.py::",
+    "tests/remote/access/test_keys.py::",
     "tests/remote/test_parity.py::TestCounter::",
     "tests/remote/test_parity.py::TestExoticSpaces::",
-    "tests/remote/test_strangers.py::test_another_clients_key_is_refused_at_once",
-    "tests/remote/test_strangers.py::test_no_key_is_refused_at_once",
+    "tests/remote/access/test_strangers.py::test_another_clients_key_is_refused_at_once",
+    "tests/remote/access/test_strangers.py::test_no_key_is_refused_at_once",
 )
 """Beginnings of the ids of the tests that are in it. What names no test any more is an error."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """``--full``."""
-    text = "run every test, and not the short selection of tests/support/selection.py"
+    text = "run every test, and not the short selection of tests/support/plugins/selection.py"
     parser.addoption("--full", action="store_true", help=text)
 
 

@@ -19,7 +19,7 @@ from pathlib import Path
 
 from envhub_sandbox.cli.init.starter import starter
 from tests.hub.stub_hub import StubHub
-from tests.support.blocks import CHECKOUT, RUN, Block, tested
+from tests.support.documents.blocks import CHECKOUT, RUN, Block, tested
 
 NEW, APPROVED = "c0ffee" + "0" * 34, "decade" + "0" * 34
 _READ_AS = {

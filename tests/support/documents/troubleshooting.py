@@ -2,7 +2,7 @@
 
 A message is a text in the source of either package; it names a cure where a sentence of it, or a
 part behind a colon or a semicolon, tells somebody to do something. What varies in a message is an
-ellipsis on the page. Write it again with ``python -m tests.support.troubleshooting``.
+ellipsis on the page. Write it again with ``python -m tests.support.documents.troubleshooting``.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import envhub_sandbox
 import envhub_worker
 from envhub_sandbox.option_names import option_name
 
-DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "troubleshooting.md"
+DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "troubleshooting.md"
 _HEAD = """# Troubleshooting
 
 Search this page, or the site, for words of the error that are always the same: each message of

@@ -1,0 +1,1 @@
+"""Short forms of benchmarks that go on for hours."""
