@@ -42,6 +42,7 @@ FILES, INODES = 300, 1500
 CPU_S, SPIN_S = 1, 3.0
 
 
+@pytest.mark.short("strict-fork")
 @pytest.mark.parametrize(("title", "payload"), [("fork", "fork_bomb"), ("thread", "thread_bomb")])
 def test_fork_bomb_stops_at_the_limit(arena: Arena, title: str, payload: str) -> None:
     """Processes and threads together never exceed the limit."""
@@ -160,6 +161,7 @@ def _machine() -> Iterator[None]:
         yield
 
 
+@pytest.mark.short("strict-heap")
 @pytest.mark.usefixtures("_machine")
 @pytest.mark.parametrize("kind", KINDS)
 def test_memory_bomb_stops_at_the_limit(arena: Arena, kind: str) -> None:
@@ -234,6 +236,7 @@ def places(home: Path) -> list[str]:
     return [str(folder) for folder in folders]
 
 
+@pytest.mark.short("strict")
 def test_disk_cannot_be_filled(arena: Arena, places: list[str]) -> None:
     """All that a jail writes, in whatever folders, stays below its limit."""
 

@@ -43,6 +43,8 @@ from tests.support import inside
 from tests.support.repositories import CARTPOLES, write_repository
 from tests.support.wire import decode_space, deep, ext, packed, value
 
+pytestmark = pytest.mark.short
+
 MIB = 1 << 20
 GROWTH = 192 * MIB
 """What a lie may make the client take at its worst: the limits of the wire allow 8 MiB headers,

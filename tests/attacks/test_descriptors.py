@@ -103,6 +103,7 @@ def inherited(home: Path, other_cache: Path) -> Iterator[str]:
     os.close(fd)
 
 
+@pytest.mark.short("strict")
 def test_open_files_are_not_inherited(arena: Arena, inherited: str) -> None:
     """What the client has open, even for children to inherit, no jail is born with."""
     alias = new_alias()
@@ -234,6 +235,7 @@ def test_nobody_is_held_by_what_a_jail_does_to_its_descriptors(
     assert ended, (act, said)
 
 
+@pytest.mark.short("strict-ff")
 @pytest.mark.parametrize(
     "noise",
     [

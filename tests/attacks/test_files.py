@@ -24,6 +24,7 @@ def secret_file(path: Path) -> str:
     return secret
 
 
+@pytest.mark.short("strict")
 @pytest.mark.parametrize(
     ("what", "place"),
     [

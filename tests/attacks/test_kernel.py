@@ -41,6 +41,7 @@ def user_namespace(pid: int) -> str:
     return os.readlink(f"/proc/{pid}/ns/user")
 
 
+@pytest.mark.short("strict")
 def test_no_user_namespace_can_be_made(arena: Arena) -> None:
     """unshare(CLONE_NEWUSER) leaves a process where it was."""
     child_differs(
@@ -80,6 +81,7 @@ def root_of(pid: int) -> tuple[int, int]:
     return status.st_dev, status.st_ino
 
 
+@pytest.mark.short("strict")
 def test_nothing_can_be_mounted(arena: Arena) -> None:
     """No new mount appears in any process of the jail."""
     source = f"src-{new_alias()}"

@@ -19,6 +19,7 @@ _TCP_FASTOPEN = (socket.IPPROTO_TCP, 23, 16)
 _ETHERTYPE = 0x88B5
 
 
+@pytest.mark.short("strict")
 @pytest.mark.parametrize("host", ["127.0.0.1", "::1"])
 def test_tcp_does_not_get_out(arena: Arena, host: str) -> None:
     """A listener on the host never sees the connection."""
@@ -37,6 +38,7 @@ def test_udp_does_not_get_out(arena: Arena, host: str) -> None:
         sends(arena, title, "udp", listener, host=host, port=listener.port)
 
 
+@pytest.mark.short("strict")
 def test_dns_does_not_get_out(arena: Arena) -> None:
     """Nor a question to a name server, the classic way out of a closed network."""
     with listening(socket.AF_INET, socket.SOCK_DGRAM, ("127.0.0.1", 0)) as listener:

@@ -63,6 +63,7 @@ def test_memory_cannot_be_written(arena: Arena, title: str, payload: str) -> Non
         )
 
 
+@pytest.mark.short("strict-read /proc")
 @pytest.mark.parametrize(
     ("title", "payload", "names"),
     [
@@ -102,6 +103,7 @@ def test_broadcast_signals_do_not_reach_the_client(arena: Arena) -> None:
         arena.attack("signal everybody: kill(-1)", "signal_all", reach)
 
 
+@pytest.mark.short("strict-kill")
 @pytest.mark.parametrize("way", ["kill", "sigqueue", "pidfd", "F_SETOWN"])
 def test_signals_do_not_reach_the_client(arena: Arena, way: str) -> None:
     """Nor does one that is meant for it, sent in any of the ways there are."""

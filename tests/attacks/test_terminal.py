@@ -126,6 +126,7 @@ def make_env(n_envs=1, use_async_envs=False):
 """
 
 
+@pytest.mark.short("strict")
 def test_errors_do_not_paint(arena: Arena, home: Path) -> None:
     """Class names, messages, tracebacks and output arrive with their control characters spelt."""
     folder = write_repository(home / "painter", _ENV)

@@ -5,10 +5,14 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import pytest
+
 from tests.attacks import table
 from tests.attacks.expectations import MEASURED_ATTACKS, NOT_STOPPED
 from tests.attacks.harness import Row
 from tests.attacks.test_descriptors import SHARED
+
+pytestmark = pytest.mark.short
 
 DOCS = Path(__file__).parents[2] / "docs"
 

@@ -14,6 +14,7 @@ from tests.attacks.test_network import sends
 FAMILY = "AF_UNIX sockets"
 
 
+@pytest.mark.short("strict-a docker socket")
 @pytest.mark.parametrize(
     ("title", "place"),
     [

@@ -25,6 +25,7 @@ def open_file(path: Path, text: str) -> Path:
     return path
 
 
+@pytest.mark.short("strict-a file in the home")
 @pytest.mark.parametrize(
     ("title", "place"),
     [
@@ -68,6 +69,7 @@ def test_shared_memory_of_the_host_cannot_be_written(arena: Arena) -> None:
         path.unlink()
 
 
+@pytest.mark.short("strict-/tmp")
 @pytest.mark.parametrize(
     ("title", "folder"),
     [

@@ -105,6 +105,7 @@ def test_every_ending_and_every_action_comes_again(
     assert error.reason == ("signal" if ending == "segfault" else "out-of-memory")
 
 
+@pytest.mark.short
 def test_a_bundle_holds_what_is_promised(tmp_path: Path) -> None:
     """For its owner alone, whole, in plain formats, and readable by people."""
     with brittle(tmp_path, n_envs=2) as suites:

@@ -81,6 +81,7 @@ def denied(answer: dict[str, Any], *errors: str) -> bool:
     return "error" in answer and (not errors or answer["error"] in errors)
 
 
+@pytest.mark.short
 def test_files_outside_are_out_of_reach(cell: Cell, outside: Path) -> None:
     """A file of the same user that its mode lets everybody read."""
     canary = outside / "secret"
@@ -98,6 +99,7 @@ def test_folders_outside_cannot_be_listed(cell: Cell, outside: Path) -> None:
     assert denied(cell.run(source), "PermissionError", "FileNotFoundError")
 
 
+@pytest.mark.short
 def test_files_outside_cannot_be_made_changed_or_removed(cell: Cell, outside: Path) -> None:
     """Every way to write: the canary folder stays as it is."""
     outside.chmod(0o777)
@@ -251,6 +253,7 @@ LISTENERS = {
 }
 
 
+@pytest.mark.short("strict")
 @pytest.mark.parametrize("kind", LISTENERS)
 def test_listener_outside_is_not_reached(cell: Cell, outside: Path, kind: str) -> None:
     """TCP, UDP, local sockets by name and by file; the listener says who came."""
@@ -440,6 +443,7 @@ def test_jail_sees_only_its_own_processes(cells: dict[str, Cell]) -> None:
     assert max(cells["strict"].run(source)["result"]) < 100
 
 
+@pytest.mark.short
 def test_strict_jail_has_no_network_device(cells: dict[str, Cell]) -> None:
     """Only a loopback device, which is down."""
     source = "result = open('/proc/net/dev').read()"
@@ -464,6 +468,7 @@ result = [found for top in TOPS for found in strange(top)]
 """
 
 
+@pytest.mark.short
 def test_strict_root_shows_of_homes_the_way_to_the_interpreter(cells: dict[str, Cell]) -> None:
     """Wherever that lies, below /root or in a home: its neighbours are not there."""
     tops = ["/home", "/root", "/run", "/var", "/boot", "/mnt", "/opt", "/srv"]
@@ -473,6 +478,7 @@ def test_strict_root_shows_of_homes_the_way_to_the_interpreter(cells: dict[str, 
     assert cells["strict"].run(source) == {"result": []}
 
 
+@pytest.mark.short
 def test_strict_root_holds_nothing_of_the_host(cells: dict[str, Cell]) -> None:
     """No secret, no mounts; devices that are harmless; nothing of /proc that tells."""
     source = """
@@ -548,6 +554,7 @@ result = "came back"
     assert (ended[0].signal, ended[0].reason) == (31, "signal")
 
 
+@pytest.mark.short
 def test_capabilities_and_privileges_are_gone(cell: Cell) -> None:
     """As the kernel says it of the runner; an exec brings nothing back."""
     source = """
@@ -632,6 +639,7 @@ socket.create_connection({listener.getsockname()!r}).sendall(b"hello")
             assert denied(cell.run("import socket; socket.socket(socket.AF_NETLINK, 3)"))
 
 
+@pytest.mark.short
 @pytest.mark.parametrize("profile", profiles("strict", "no-userns"))
 def test_denial_that_does_not_hold_aborts(profile: str) -> None:
     """The self-test finds that the canary can be read, and nothing of the repository runs."""
@@ -711,6 +719,7 @@ def test_weaker_profile_runs_on_a_host_without_user_namespaces() -> None:
     assert said == "started ['pid-namespace', 'mount-namespace', 'user-quotas']\n"
 
 
+@pytest.mark.short
 @pytest.mark.parametrize("profile", profiles("strict", "no-userns"))
 def test_host_without_landlock_is_refused(profile: str) -> None:
     """By every profile that promises files."""

@@ -188,6 +188,7 @@ HOME = "os.path.expanduser('~')"
 SCRATCH = [HOME, "os.environ['TMPDIR']", "os.getcwd()", "'/dev/shm'"]
 
 
+@pytest.mark.short
 @pytest.mark.parametrize("folder", SCRATCH)
 def test_disk_fill_stops_at_the_quota(folder: str) -> None:
     """Home, temporary files, work and shared memory share one quota."""

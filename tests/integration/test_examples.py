@@ -11,6 +11,8 @@ import pytest
 from envhub_sandbox import make_env
 from tests.support.samples import EXAMPLES
 
+pytestmark = pytest.mark.short
+
 
 @pytest.mark.parametrize(
     ("name", "tasks", "frame"),

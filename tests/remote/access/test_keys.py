@@ -29,6 +29,8 @@ from tests.remote.listening import WORKER, Listening, listening
 from tests.support import inside
 from tests.support.processes import eventually
 
+pytestmark = pytest.mark.short
+
 
 def test_keys_are_read_in_both_forms() -> None:
     """Ours, and ZeroMQ's own."""

@@ -71,6 +71,7 @@ def ends(connection: socket.socket) -> bool:
     return True
 
 
+@pytest.mark.short
 def test_another_clients_key_is_refused_at_once(server: Listening, repository: Path) -> None:
     """The error names our public key, which the server's operator has to add; so does its log."""
     pair = keys.generate()
@@ -108,6 +109,7 @@ def test_another_servers_key_is_refused_at_once(server: Listening, repository: P
     assert eventually(lambda: "handshake_failed" in server.said())
 
 
+@pytest.mark.short
 def test_no_key_is_refused_at_once(server: Listening, repository: Path) -> None:
     """A client without keys does not get to say anything."""
     with pytest.raises(SandboxUnavailableError, match="does not speak ZeroMQ with CURVE"):
