@@ -12,34 +12,27 @@ import re
 import typing
 from collections.abc import Callable, Iterator
 from enum import Enum
-from pathlib import Path
 from typing import Any, Literal
 
 import typer
 
 from envhub_sandbox.cli.app import app
 from envhub_worker import cli
+from tests.support.documents.written import DOCS, filled
 
-DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "options.md"
-_HEAD = """# Options
-
-Every command of `envhub` and of `envhub-worker`, and every option of each: what `--help` says, from
-which this page is written. What they do together is in [cli.md](cli.md), and a server's are
-explained in [deployment.md](deployment.md#servers-on-other-hosts). `envhub-worker serve` is not
-among them: the client starts it.
-"""
+DOCUMENT = DOCS / "options.md"
 Row = tuple[str, str, str]
 
 
 def document() -> str:
     """What the file has to hold."""
-    parts = [_HEAD, *_commands("envhub", app)]
+    parts = [*_commands("envhub", app)]
     for name in sorted(module.name for module in pkgutil.iter_modules(cli.__path__)):
         module = importlib.import_module(f"{cli.__name__}.{name}")
         if hasattr(module, "add_arguments") and name != "serve":
             module.add_arguments(told := _Told())
             parts += _part(f"envhub-worker {name}", module.run.__doc__, told.rows)
-    return "\n".join(parts)
+    return filled(DOCUMENT, written="\n".join(parts))
 
 
 def _commands(name: str, tree: typer.Typer) -> Iterator[str]:

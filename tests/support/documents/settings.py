@@ -9,29 +9,23 @@ import dataclasses
 import inspect
 import re
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 from envhub_sandbox import Limits, Policy, Timeouts, make_env
+from tests.support.documents.written import DOCS, filled
 
-DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "settings.md"
-_HEAD = """# Settings
-
-Every argument of `make_env`, and every field of what it takes as `policy`, `limits` and `timeouts`:
-as a mapping, `policy={"network": "loopback"}`, or as `Policy(network="loopback")`. A name that is
-not here is refused. The text is that of the docstrings.
-"""
+DOCUMENT = DOCS / "settings.md"
 _UNITS = ((1 << 30, "GiB"), (1 << 20, "MiB"), (1 << 10, "KiB"))
 
 
 def document() -> str:
     """What the file has to hold."""
-    parts = [_HEAD, "## `make_env`\n", *_table(make_env, "Args", _arguments())]
+    parts = ["## `make_env`\n", *_table(make_env, "Args", _arguments())]
     for kind in (Policy, Limits, Timeouts):
         summary = (inspect.getdoc(kind) or "").partition("\n\n")[0]
         parts += [f"## `{kind.__name__}`\n", f"{_markdown(summary)}\n"]
         parts += _table(kind, "Attributes", _defaults(kind))
-    return "\n".join(parts)
+    return filled(DOCUMENT, written="\n".join(parts))
 
 
 def _arguments() -> dict[str, str]:

@@ -17,17 +17,9 @@ from typing import Any
 import envhub_sandbox
 import envhub_worker
 from envhub_sandbox.option_names import option_name
+from tests.support.documents.written import DOCS, filled
 
-DOCUMENT = Path(__file__).resolve().parents[3] / "docs" / "troubleshooting.md"
-_HEAD = """# Troubleshooting
-
-Search this page, or the site, for words of the error that are always the same: each message of
-this project that names a cure is here with it, written from the source. What is different each time
-(names, paths, numbers) is `…`. Most errors begin with the repository and its commit, which are left
-out. What is met most often is explained in [the README](../README.md#troubleshooting), questions
-that are no error are in the [FAQ](faq.md), what a dying environment looks like is in
-[faults.md](faults.md), and what `envhub check` finds in [checks.md](checks.md).
-"""
+DOCUMENT = DOCS / "troubleshooting.md"
 # title, where it is said, what more there is about it
 _PARTS = (
     ("References, the Hub and local folders", ("envhub_sandbox/hub",), "snapshots.md"),
@@ -146,7 +138,7 @@ class Message:
 
 def document() -> str:
     """What the file has to hold."""
-    parts, left = [_HEAD], list(messages())
+    parts, left = list[str](), list(messages())
     for title, places, more in _PARTS:
         mine = [one for one in left if one.place.startswith(places)]
         left = [one for one in left if one not in mine]
@@ -154,7 +146,7 @@ def document() -> str:
         parts += [f"## {title}\n\nMore in [{more.partition('#')[0]}]({more}).\n"]
         parts += ["| The error says | What to do |\n| --- | --- |"]
         parts += [*(f"| {says} | {cure} |" for says, cure in rows), ""]
-    return "\n".join(parts)
+    return filled(DOCUMENT, written="\n".join(parts))
 
 
 def messages() -> Iterator[Message]:
