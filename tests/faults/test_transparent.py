@@ -20,16 +20,26 @@ from envhub_sandbox.factory import env_factory
 from envhub_sandbox.session.survival.seeds import derived_seed
 from envhub_sandbox.transport.shared_memory.sharding import bounds_for
 from envhub_worker.protocol.lifecycle import State
+from tests.faults.mortal import (
+    ALL_LIVE,
+    CRASH,
+    EXIT,
+    KILL,
+    LIVE,
+    MEMORY,
+    RAISE,
+    SEED,
+    SLOW,
+    SPIN,
+    oracle,
+)
 from tests.support import inside
 from tests.support.processes import eventually, halted
 from tests.support.repositories import write_repository
 from tests.support.samples import reference, sample
 
-LIVE, EXIT, KILL, CRASH, RAISE, SLOW, MEMORY, SPIN = range(8)
-ALL_LIVE = [LIVE] * 4
 LAST_DIES = [LIVE, LIVE, LIVE, EXIT]
 DEAD = slice(2, 4)
-SEED = 11
 
 pytestmark = pytest.mark.usefixtures("neighbour", "_evenly")
 
@@ -57,11 +67,6 @@ def made(
         env_kwargs=env_kwargs or {},
         **more,
     )
-
-
-def oracle(mode: str = "NextStep") -> Any:
-    """The same without a sandbox, where nobody dies."""
-    return reference("mortal", n_envs=4, mode=mode)
 
 
 def same(got: Any, expected: Any) -> bool:

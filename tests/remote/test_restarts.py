@@ -10,29 +10,26 @@ import pytest
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import WorkerDiedError
 from envhub_sandbox.sandboxes import runtime_folder
+from tests.faults.mortal import EXIT, LIVE, comes_off
 from tests.faults.remains.traces import temporary_root
-from tests.faults.test_idle import comes_off
 from tests.remote.listening import Listening, listening
 from tests.support.processes import eventually
 from tests.support.repositories import write_repository
 from tests.support.samples import sample
-
-LIVE, EXIT = 0, 1
+from tests.support.started import started
 
 
 def test_what_dies_over_there_comes_back(server: Listening) -> None:
     """The rows of the dead are fresh and truncated; the others' results have crossed."""
     policy = {"restart": "transparent", "crash_history": 0}
-    with make_env(
+    with started(
         sample("mortal"),
         n_envs=2,
         use_async_envs=True,
         num_workers=2,
         policy=policy,
         sandbox=server.sandbox(),
-    ) as suites:
-        env = suites.env
-        env.reset(seed=1)
+    ) as env:
         observation, _, _, truncated, info = env.step([LIVE, EXIT])
         assert observation[:, 1].tolist() == [1, 0]
         assert truncated.tolist() == [False, True]
@@ -55,9 +52,7 @@ def test_what_a_jail_was_denied_over_there_is_told(server: Listening, tmp_path: 
 
 def test_idle_jails_end_over_there(server: Listening) -> None:
     """Their memory is another's; a reset has another jail."""
-    with make_env(sample("mortal"), timeouts={"idle_s": 0.5}, sandbox=server.sandbox()) as suites:
-        env = suites.env
-        env.reset(seed=1)
+    with started(sample("mortal"), timeouts={"idle_s": 0.5}, sandbox=server.sandbox()) as env:
         assert eventually(lambda: server.jails() == 0)
         with pytest.raises(WorkerDiedError, match="idle"):
             env.step([LIVE])

@@ -21,8 +21,9 @@ from envhub_worker.access.places import Line
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.messages.busy import LONGEST_S, Busy
 from tests.remote.listening import Listening, listening
-from tests.remote.test_clients import peer
+from tests.remote.peers import peer
 from tests.support.processes import eventually
+from tests.support.started import started
 
 
 @pytest.fixture(scope="module")
@@ -62,8 +63,7 @@ def test_what_is_no_answer_of_ours_says_nothing(quota: str, words: str) -> None:
 
 def test_a_full_server_says_which_quota_and_how_much(narrow: Listening, repository: Path) -> None:
     """As attributes; what would never fit is another error, for which no waiting helps."""
-    with make_env(repository, sandbox=narrow.sandbox()) as first:
-        first.env.reset(seed=1)
+    with started(repository, sandbox=narrow.sandbox()):
         with pytest.raises(ServerBusyError, match=r"2 jails .* \(--max-jails\)") as caught:
             make_env(repository, n_envs=2, sandbox=narrow.sandbox())
         said = caught.value
@@ -105,11 +105,10 @@ def test_who_waits_gets_the_place_once_it_is_free(
 
 def test_who_waits_in_vain_is_told_so(narrow: Listening, repository: Path) -> None:
     """After ``retry_s``; the other one goes on."""
-    with make_env(repository, sandbox=narrow.sandbox()) as first:
-        first.env.reset(seed=1)
+    with started(repository, sandbox=narrow.sandbox()) as first:
         with pytest.raises(ServerBusyError):
             make_env(repository, n_envs=4, sandbox=narrow.sandbox(retry_s=1.5))
-        assert first.env.step(np.array([0]))[0].tolist() == [[1.0]]
+        assert first.step(np.array([0]))[0].tolist() == [[1.0]]
 
 
 def test_a_wait_counts_neither_against_the_start_nor_after_a_close() -> None:

@@ -13,34 +13,23 @@ from typing import Any
 import numpy as np
 import pytest
 
-from envhub_sandbox import make_env
 from tests.remote.listening import Listening
 from tests.remote.relay import relay
+from tests.remote.strangers import ends, greeting, knock, say
+from tests.support.started import started
 
 _MIB = 1 << 20
-_CURVE_GREETING = (
-    b"\xff" + bytes(8) + b"\x7f\x03\x01" + b"CURVE".ljust(20, b"\0") + b"\0" + bytes(31)
-)
+_CURVE_GREETING = greeting(b"CURVE")
 _HELLO_BYTES = 200
 _PEERS = 150
-
-
-@pytest.fixture
-def good(server: Listening, repository: Path) -> Iterator[Any]:
-    """A client's environment, which must go on; afterwards it is still the same one."""
-    with make_env(repository, sandbox=server.sandbox()) as suites:
-        suites.env.reset(seed=1)
-        yield suites.env
-        assert suites.env.step(np.array([0]))[0].tolist() == [[1.0]]
 
 
 @pytest.fixture
 def captured(server: Listening, repository: Path) -> bytes:
     """All that a client with a key sent on one connection, from the greeting to its last step."""
     with relay(server.port) as wire:
-        with make_env(repository, sandbox=server.sandbox(endpoint=wire.endpoint)) as suites:
-            suites.env.reset(seed=1)
-            suites.env.step(np.array([0]))
+        with started(repository, sandbox=server.sandbox(endpoint=wire.endpoint)) as env:
+            env.step(np.array([0]))
         return max((bytes(kept) for kept in wire.captured), key=len)
 
 
@@ -48,25 +37,7 @@ def captured(server: Listening, repository: Path) -> bytes:
 def peers(server: Listening, count: int) -> Iterator[list[socket.socket]]:
     """Connections to the server."""
     with contextlib.ExitStack() as stack:
-        yield [
-            stack.enter_context(socket.create_connection(("127.0.0.1", server.port), 10))
-            for _ in range(count)
-        ]
-
-
-def say(connection: socket.socket, data: bytes) -> None:
-    """Send, whether anybody listens any more or not."""
-    with contextlib.suppress(OSError):
-        connection.sendall(data)
-
-
-def ends(connection: socket.socket) -> bool:
-    """Whether the server ends a connection; what it says before is not ours to read."""
-    connection.settimeout(60)
-    with contextlib.suppress(ConnectionError):
-        while connection.recv(1 << 16):
-            pass
-    return True
+        yield [stack.enter_context(knock(server.port)) for _ in range(count)]
 
 
 def hello(noise: bytes) -> bytes:

@@ -9,7 +9,6 @@ import os
 import signal
 import socket
 import stat
-import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +24,10 @@ from envhub_worker.access.keys import AuthorizedClients
 from envhub_worker.cli import identity as identities
 from envhub_worker.cli import listen_options, state_folder, status
 from envhub_worker.protocol.keys import key_text, parse_key
-from tests.remote.listening import WORKER, Listening, listening
+from tests.remote.listening import Listening, listening, worker
 from tests.support import inside
 from tests.support.processes import eventually
+from tests.support.started import started
 
 pytestmark = pytest.mark.short
 
@@ -51,8 +51,9 @@ def test_what_is_no_key_is_refused_without_being_repeated(text: str) -> None:
 
 def test_keygen_writes_a_secret_that_nobody_else_reads(tmp_path: Path) -> None:
     """0600 from the start, the public key printed, the secret not; nothing is overwritten."""
-    command = [*WORKER, "keygen", "--out", str(tmp_path / "new")]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
+    command = ("keygen", "--out", tmp_path / "new")
+    done = worker(*command)
+    assert done.returncode == 0, done.stderr
     secret = tmp_path / "new" / "client.key"
     pair = keys.load(secret)
     assert stat.S_IMODE(secret.stat().st_mode) == 0o600
@@ -60,13 +61,13 @@ def test_keygen_writes_a_secret_that_nobody_else_reads(tmp_path: Path) -> None:
     assert key_text(pair.secret) not in done.stdout
     assert (tmp_path / "new" / "client.pub").read_text().strip() == key_text(pair.public)
     assert "secret" not in repr(pair).replace("KeyPair", "")
-    again = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    again = worker(*command)
     assert again.returncode == 1
     assert "client.key is there already" in again.stderr
     assert "Errno" not in again.stderr
     assert keys.load(secret) == pair
     secret.unlink()
-    again = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    again = worker(*command)
     assert "client.pub is there already" in again.stderr
     assert not secret.exists()
 
@@ -159,8 +160,8 @@ def test_a_server_says_what_its_client_has_to_write(
     assert set(words) == {"ENVHUB_SERVER_KEY", "ENVHUB_CLIENT_KEY"}
     for name, value in words.items():
         monkeypatch.setenv(name, value.strip("'"))
-    with make_env(repository, sandbox=server.endpoint) as suites:
-        suites.env.reset(seed=1)
+    with started(repository, sandbox=server.endpoint):
+        pass
 
 
 def test_the_line_names_the_profile_where_the_default_cannot_be_had() -> None:
@@ -196,8 +197,8 @@ def test_keys_are_found_in_the_configuration_folder(
     with pytest.raises(SandboxUnavailableError, match="envhub-worker keygen"):
         make_env(repository, sandbox=server.endpoint)
     (tmp_path / "client.key").write_text(f"{server.client_key}\n")
-    with make_env(repository, sandbox=server.endpoint) as suites:
-        suites.env.reset(seed=1)
+    with started(repository, sandbox=server.endpoint):
+        pass
 
 
 @pytest.mark.parametrize(
@@ -220,16 +221,13 @@ def test_what_cannot_be_reached_is_refused_at_once(
 
 def test_status_says_what_jails_do(server: Listening, repository: Path) -> None:
     """For people, as its operator; a client sees itself."""
-    with make_env(repository, sandbox=server.sandbox()) as suites:
-        suites.env.reset(seed=1)
-        command = [*WORKER, "status", "--state-dir", str(server.state)]
-        done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
+    with started(repository, sandbox=server.sandbox()):
+        done = worker("status", "--state-dir", server.state)
         assert "the one client" in done.stdout
         assert "1 session" in done.stdout  # nor is whoever asks one of them
         assert "repository:env.py: waiting" in done.stdout
-        client = [*WORKER, "status", "--endpoint", server.endpoint, "--server-key", server.public]
-        command = [*client, "--key", str(server.state / "client.key")]
-        done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
+        done = worker("status", *server.as_client())
+        assert done.returncode == 0, done.stderr
         assert "operator" not in done.stdout
         assert "1 session" in done.stdout
 
@@ -238,10 +236,9 @@ def test_health_asks_the_server_and_not_only_its_port(tmp_path: Path) -> None:
     """0 while it answers requests by key, 1 when it is stopped; refusals are no part of that."""
     own = keys.save(keys.generate(), tmp_path / "own", "mine")[0]
     with listening(tmp_path / "server", "--key", str(own)) as server:
-        command = [*WORKER, "health", "--state-dir", str(server.state)]
 
         def is_healthy() -> bool:
-            return subprocess.run(command, timeout=60, check=False).returncode == 0
+            return worker("health", "--state-dir", server.state).returncode == 0
 
         # who is asked while the machine stands still has no answer in time
         assert eventually(is_healthy)
@@ -254,8 +251,7 @@ def test_health_asks_the_server_and_not_only_its_port(tmp_path: Path) -> None:
 
 def test_status_without_a_server_says_so(tmp_path: Path) -> None:
     """It fails, for scripts, and at once."""
-    command = [*WORKER, "status", "--state-dir", str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    done = worker("status", "--state-dir", tmp_path)
     assert done.returncode == 1
     assert "no 'envhub-worker listen'" in done.stderr
 
@@ -326,8 +322,7 @@ def test_an_address_that_cannot_be_had_is_said_in_a_line(bind: str, tmp_path: Pa
     with contextlib.closing(socket.create_server(("127.0.0.1", 0))) as taken:
         if bind == "a taken port":
             bind = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
-        command = [*WORKER, "listen", "--bind", bind, "--state-dir", str(tmp_path / "state")]
-        done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+        done = worker("listen", "--bind", bind, "--state-dir", tmp_path / "state")
     assert done.returncode == 2
     assert "Traceback" not in done.stderr
     assert f"--bind {bind}: " in done.stderr

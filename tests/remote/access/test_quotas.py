@@ -176,24 +176,6 @@ def test_this_machines_paths_are_refused_before_anything_is_sent(
         make_env(repository, sandbox=server.sandbox(), **options)
 
 
-def test_a_second_jail_over_the_quota_is_refused_and_the_first_goes_on(
-    tmp_path: Path, repository: Path
-) -> None:
-    """The error names the quota; closing the first makes room."""
-    with listening(tmp_path / "server", "--max-jails", "1") as server:
-        sandbox = server.sandbox()
-        with make_env(repository, sandbox=sandbox) as first:
-            first.env.reset(seed=1)
-            with pytest.raises(WorkerError, match=r"2 jails .* \(--max-jails\)"):
-                make_env(repository, n_envs=2, sandbox=sandbox)
-            assert first.env.step(np.array([0]))[0].tolist() == [[1.0]]
-        with make_env(repository, n_envs=2, sandbox=sandbox) as second:
-            second.env.reset(seed=1)
-        with pytest.raises(PolicyError, match="--allow-network"):
-            make_env(repository, n_envs=3, sandbox=sandbox, policy={"network": "host"})
-        assert eventually(lambda: server.jails() == 0)
-
-
 def test_what_was_started_ahead_makes_room_under_a_quota(tmp_path: Path) -> None:
     """A task that somebody uses comes first; where there is no room nothing is started ahead."""
     options: dict[str, Any] = {"env_kwargs": {"tasks": 4}, "prewarm": 1}

@@ -13,8 +13,8 @@ import pytest
 
 from envhub_worker.access import keys
 from envhub_worker.protocol import messages as m
-from tests.remote.listening import WORKER, Listening, listening
-from tests.remote.test_clients import peer
+from tests.remote.listening import Listening, listening, worker
+from tests.remote.peers import peer
 from tests.support.processes import eventually
 
 _SHORT = """
@@ -104,13 +104,11 @@ def test_connections_that_have_gone_take_no_session(narrow: Listening) -> None:
 
 def test_status_takes_no_place_of_a_client(narrow: Listening, repository: Path) -> None:
     """Asked with the client's own key, while its one place is in use; nor does it hold one then."""
-    words = ("--endpoint", narrow.endpoint, "--server-key", narrow.public)
-    command = [*WORKER, "status", *words, "--key", str(narrow.state / "client.key")]
     client = program(narrow, repository, "waits")
     assert client.stdout is not None
     assert client.stdout.readline() == b"ready\n"
     for _ in range(2):
-        asked = subprocess.run(command, capture_output=True, text=True, timeout=60)
+        asked = worker("status", *narrow.as_client())
         assert asked.returncode == 0, asked.stderr
         assert "1 jail" in asked.stdout
     client.communicate(timeout=120)

@@ -9,7 +9,6 @@ import resource
 import socket
 import struct
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -39,36 +38,14 @@ from envhub_worker.supervisor.records import Asker, RefusedError
 from envhub_worker.supervisor.witness import Witness
 from tests.remote.listening import Listening, listening
 from tests.remote.relay import relay
+from tests.remote.strangers import ends, greeting, knock, say
 from tests.support import inside
 from tests.support.processes import eventually
+from tests.support.started import started
 
 _MIB = 1 << 20
 _PATIENCE_S = 120.0
-# ZMTP 3.1, as a client that has no keys: signature, version, mechanism NULL, no server, filler
-_GREETING = b"\xff" + bytes(8) + b"\x7f\x03\x01" + b"NULL".ljust(20, b"\0") + b"\0" + bytes(31)
-
-
-@pytest.fixture
-def good(server: Listening, repository: Path) -> Iterator[Any]:
-    """A client's environment, which must go on; afterwards it is still the same one."""
-    with make_env(repository, sandbox=server.sandbox()) as suites:
-        suites.env.reset(seed=1)
-        yield suites.env
-        assert suites.env.step(np.array([0]))[0].tolist() == [[1.0]]
-
-
-def knock(server: Listening) -> socket.socket:
-    """A TCP connection to the server."""
-    return socket.create_connection(("127.0.0.1", server.port), 10)
-
-
-def ends(connection: socket.socket) -> bool:
-    """Whether the server ends a connection; what it says before is not ours to read."""
-    connection.settimeout(_PATIENCE_S)
-    with contextlib.suppress(ConnectionError):
-        while connection.recv(1 << 16):
-            pass
-    return True
+_GREETING = greeting(b"NULL")
 
 
 @pytest.mark.short
@@ -184,15 +161,14 @@ def test_a_message_without_a_proved_key_is_refused(tmp_path: Path) -> None:
 def test_captured_bytes_are_worth_nothing(server: Listening, repository: Path, good: Any) -> None:
     """What a client once sent, sent again: the server's keys of the connection are others."""
     with relay(server.port) as wire:
-        with make_env(repository, sandbox=server.sandbox(endpoint=wire.endpoint)) as suites:
-            suites.env.reset(seed=1)
+        with started(repository, sandbox=server.sandbox(endpoint=wire.endpoint)):
+            pass
         captured = [bytes(kept) for kept in wire.captured if len(kept) > len(_GREETING)]
     assert captured
     jails = server.open_jails()
     for data in captured:
-        with knock(server) as connection:
-            with contextlib.suppress(ConnectionError):
-                connection.sendall(data)
+        with knock(server.port) as connection:
+            say(connection, data)
             assert ends(connection)
     assert eventually(lambda: "handshake_failed" in server.said())
     assert server.open_jails() <= jails
@@ -211,7 +187,7 @@ def flood(server: Listening) -> int:
     """Send 256 MiB of frames that are never the last one; by how much the server grows."""
     before = server.memory()
     frame = b"\x03" + _MIB.to_bytes(8, "big") + bytes(_MIB)
-    with knock(server) as connection:
+    with knock(server.port) as connection:
         with contextlib.suppress(ConnectionError):
             connection.sendall(_GREETING + b"\x04\x1c\x05READY\x0bSocket-Type\0\0\0\x06DEALER")
             for _ in range(256):
@@ -223,7 +199,7 @@ def test_a_port_scan_is_a_few_lines_in_the_log(server: Listening, good: Any) -> 
     """Hundreds of connections that say nothing, or noise, and go."""
     before = server.memory()
     for number in range(300):
-        with knock(server) as connection, contextlib.suppress(ConnectionError):
+        with knock(server.port) as connection, contextlib.suppress(ConnectionError):
             connection.sendall([b"", b"GET / HTTP/1.0\r\n\r\n", bytes(range(256))][number % 3])
     good.call("count")
     assert server.memory() - before < 64 * _MIB
@@ -233,7 +209,7 @@ def test_a_port_scan_is_a_few_lines_in_the_log(server: Listening, good: Any) -> 
 
 def test_slow_strangers_are_shown_the_door(server: Listening, good: Any) -> None:
     """Whoever does not finish a handshake in a few seconds is disconnected."""
-    connections = [knock(server) for _ in range(100)]
+    connections = [knock(server.port) for _ in range(100)]
     try:
         for connection in connections:
             connection.sendall(_GREETING[:3])
@@ -282,8 +258,8 @@ def test_too_many_connections_stay_outside(tmp_path: Path, repository: Path) -> 
 
 def _gets_in(server: Listening, repository: Path) -> bool:
     try:
-        with make_env(repository, n_envs=2, sandbox=server.sandbox()) as suites:
-            suites.env.reset(seed=1)
+        with started(repository, n_envs=2, sandbox=server.sandbox()):
+            pass
     except SandboxUnavailableError:
         return False
     return True
@@ -326,8 +302,8 @@ def test_without_keys_it_listens_on_loopback_only(tmp_path: Path, repository: Pa
     """``--insecure-loopback`` serves on 127.0.0.1, and refuses every other address."""
     with listening(tmp_path / "open", "--insecure-loopback") as open_server:
         sandbox = open_server.sandbox(server_key=None, client_key=None, insecure_loopback=True)
-        with make_env(repository, sandbox=sandbox) as suites:
-            suites.env.reset(seed=1)
+        with started(repository, sandbox=sandbox):
+            pass
     for address in ("0.0.0.0", "*", "10.0.0.1", "localhost"):
         with (
             pytest.raises(AssertionError, match="needs a loopback address"),
@@ -345,11 +321,10 @@ def test_a_key_that_is_taken_off_the_list_is_out(tmp_path: Path, repository: Pat
     authorized.write_text(f"# who may come in\n{key_text(pair.public)} alice\n")
     with listening(tmp_path / "server", "--authorized-clients", str(authorized)) as server:
         sandbox = server.sandbox(client_key=key_text(pair.secret))
-        with make_env(repository, sandbox=sandbox) as suites:
-            suites.env.reset(seed=1)
+        with started(repository, sandbox=sandbox) as env:
             assert [one["client"] for one in server.sessions()] == ["alice"]
             authorized.write_text(f"{key_text(other.public)} bob\n")
-            assert eventually(lambda: _is_refused(suites.env))
+            assert eventually(lambda: _is_refused(env))
             assert eventually(lambda: server.jails() == 0)
         with pytest.raises(SandboxUnavailableError, match="does not know our key"):
             make_env(repository, n_envs=2, sandbox=sandbox)

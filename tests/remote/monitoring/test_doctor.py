@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner
 
-from envhub_sandbox import make_env
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.sandboxes import server_facts
 from envhub_sandbox.sandboxes.server_facts import ServerFacts
@@ -19,6 +18,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.keys import key_text
 from tests.remote.listening import Listening, listening
 from tests.support.processes import eventually
+from tests.support.started import started
 
 RUNNER = CliRunner()
 
@@ -34,8 +34,7 @@ def test_a_server_says_what_it_can_and_what_we_may_take(
     server: Listening, repository: Path
 ) -> None:
     """Versions, profiles and quotas; to look takes no place."""
-    with make_env(repository, sandbox=server.sandbox()) as suites:
-        suites.env.reset(seed=1)
+    with started(repository, sandbox=server.sandbox()):
         code, out, _ = doctor(server, "--profile", "container", "--json")
         told = json.loads(out)["server"]
         assert told["protocol"] == m.VERSION
@@ -85,9 +84,8 @@ def test_a_server_that_drains_is_no_place_to_go(tmp_path: Path, repository: Path
     """It still answers whoever asks."""
     with (
         listening(tmp_path / "server", "--drain-s", "600") as server,
-        make_env(repository, sandbox=server.sandbox()) as suites,
+        started(repository, sandbox=server.sandbox()),
     ):
-        suites.env.reset(seed=1)
         server.process.terminate()
         assert eventually(lambda: doctor(server)[0] == 5)
         assert "about to end" in doctor(server)[1]

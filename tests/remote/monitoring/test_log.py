@@ -22,6 +22,7 @@ from envhub_worker.protocol.keys import key_text
 from tests.remote.listening import Listening, listening
 from tests.support.processes import eventually
 from tests.support.samples import sample
+from tests.support.started import started
 
 LIVE, EXIT = 0, 1
 # under nohup all that we start ignores the end of a terminal
@@ -67,15 +68,12 @@ def test_the_life_of_two_clients_can_be_read(tmp_path: Path) -> None:
     names = {"alice": keys.generate(), "bob the builder": keys.generate()}
     with logging_server(tmp_path, names, "--log-format", "json", "--max-jails", "1") as server:
         alice, bob = (server.sandbox(client_key=key_text(one.secret)) for one in names.values())
-        with make_env(sample("counter"), n_envs=2, sandbox=alice) as suites:
-            suites.env.reset(seed=1)
-            suites.env.step(suites.env.action_space.sample())
-            with pytest.raises(ServerBusyError), make_env(sample("mortal"), sandbox=alice) as more:
-                more.env.reset(seed=1)
-            with make_env(sample("mortal"), sandbox=bob) as others:
-                others.env.reset(seed=1)
-                with pytest.raises(WorkerDiedError):
-                    others.env.step([EXIT])
+        with started(sample("counter"), n_envs=2, sandbox=alice) as env:
+            env.step(env.action_space.sample())
+            with pytest.raises(ServerBusyError), started(sample("mortal"), sandbox=alice):
+                pass
+            with started(sample("mortal"), sandbox=bob) as others, pytest.raises(WorkerDiedError):
+                others.step([EXIT])
             with pytest.raises(PolicyError):
                 make_env(sample("mortal"), sandbox=bob, policy={"network": "host"})
         assert eventually(lambda: of(server, "jail_closed", client="alice"))
@@ -112,8 +110,8 @@ def test_no_secret_is_in_a_log(tmp_path: Path) -> None:
     alice = keys.generate()
     with logging_server(tmp_path, {"alice": alice}, "--log-level", "debug") as server:
         secret = key_text(alice.secret)
-        with make_env(sample("mortal"), sandbox=server.sandbox(client_key=secret)) as suites:
-            suites.env.reset(seed=1)
+        with started(sample("mortal"), sandbox=server.sandbox(client_key=secret)):
+            pass
         assert eventually(lambda: "jail_closed" in server.said())
     lines = [line for line in server.said().splitlines() if _TEXT.match(line)]
     assert any(" jail_opened client=alice " in line for line in lines)
@@ -128,8 +126,7 @@ def test_the_end_of_a_server_is_the_end_of_what_it_has(
     alice = keys.generate()
     with logging_server(tmp_path, {"alice": alice}, "--log-format", "json") as server:
         remote = server.sandbox(client_key=key_text(alice.secret))
-        with make_env(sample("mortal"), sandbox=remote) as suites:
-            suites.env.reset(seed=1)
+        with started(sample("mortal"), sandbox=remote):
             server.process.send_signal(_HANGS_UP)
             assert server.process.wait(60) == 0
             wait_no_more()
@@ -149,8 +146,8 @@ def test_a_broken_list_of_clients_is_told_once(tmp_path: Path) -> None:
         replace(tmp_path / "clients", f"{line}no key\n")
         assert eventually(lambda: of(server, "clients_kept_as_they_were"))
         remote = server.sandbox(client_key=key_text(alice.secret))
-        with make_env(sample("mortal"), sandbox=remote) as suites:  # takes a while: seconds pass
-            suites.env.reset(seed=1)
+        with started(sample("mortal"), sandbox=remote):  # takes a while: seconds pass
+            pass
         replace(tmp_path / "clients", line)
         assert eventually(lambda: of(server, "clients_read", clients=1))
     [wrong] = of(server, "clients_kept_as_they_were")
@@ -164,8 +161,8 @@ def test_less_can_be_asked_for(tmp_path: Path) -> None:
     options = ("--log-format", "json", "--log-level", "warning")
     with logging_server(tmp_path, {"alice": alice}, *options) as server:
         remote = server.sandbox(client_key=key_text(alice.secret))
-        with make_env(sample("mortal"), sandbox=remote) as suites:
-            suites.env.reset(seed=1)
+        with started(sample("mortal"), sandbox=remote):
+            pass
         assert eventually(lambda: server.jails() == 0)
     assert server.said() == ""
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import http.client
-import json
 import os
 import re
 import socket
@@ -15,7 +14,6 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -29,59 +27,13 @@ from envhub_worker.access.audit import figures, usage
 from envhub_worker.cli import http_port
 from envhub_worker.cli.http_port import MAX_CONNECTIONS, MAX_REQUEST_BYTES, HttpPort, parse_address
 from envhub_worker.cli.metrics import STALE_S, MetricsPage
-from tests.remote.listening import WORKER, Listening, listening
+from tests.remote.listening import listening, worker
+from tests.remote.monitoring.watched import Watched, get, watched
+from tests.remote.strangers import hears, knock
 from tests.support.processes import eventually
+from tests.support.started import started
 
-parser = pytest.importorskip("prometheus_client.parser", reason="prometheus-client is missing")
 _MIB = 1 << 20
-
-
-@dataclass
-class Watched:
-    """A server, and the port of its figures."""
-
-    server: Listening
-    port: int
-
-    def get(self, path: str) -> tuple[int, str]:
-        """The status and the text of a page."""
-        return get(self.port, path)
-
-    def values(self) -> dict[tuple[str, ...], float]:
-        """Every sample: its name and the values of its labels, in the labels' order."""
-        status, text = self.get("/metrics")
-        assert status == 200, text
-        return {
-            (one.name, *(one.labels[label] for label in sorted(one.labels))): one.value
-            for family in parser.text_string_to_metric_families(text)
-            for one in family.samples
-        }
-
-    def shows(self, *name: str, value: float) -> bool:
-        """Whether a sample comes to have that value."""
-        return eventually(lambda: self.values().get(name) == value)
-
-
-def get(port: int, path: str) -> tuple[int, str]:
-    """The status and the text of a page."""
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=60)
-    try:
-        connection.request("GET", path)
-        answer = connection.getresponse()
-        return answer.status, answer.read().decode()
-    finally:
-        connection.close()
-
-
-@contextlib.contextmanager
-def watched(folder: Path, *options: str) -> Iterator[Watched]:
-    """A server with a port of figures."""
-    with listening(folder, "--metrics", "0", *options) as server:
-        found = re.search(r"metrics url=http://127\.0\.0\.1:(\d+)/metrics", server.said())
-        assert found is not None, server.said()
-        one = Watched(server, int(found[1]))
-        assert eventually(lambda: one.get("/readyz")[0] == 200)
-        yield one
 
 
 @pytest.fixture(scope="module")
@@ -95,10 +47,9 @@ def test_a_client_is_seen_with_what_it_uses(one: Watched, repository: Path) -> N
     """By name, against its quota; what it did is counted, and stays when it has gone."""
     who = "the one client"
     before = one.values()
-    with make_env(repository, sandbox=one.server.sandbox()) as suites:
-        suites.env.reset(seed=1)
+    with started(repository, sandbox=one.server.sandbox()) as env:
         for _ in range(5):
-            suites.env.step(np.array([0]))
+            env.step(np.array([0]))
         assert one.shows("envhub_server_jails", who, value=1)
         assert one.shows("envhub_server_sessions", who, value=1)
         steps = before.get(("envhub_server_requests_total", who, "step"), 0)
@@ -108,37 +59,27 @@ def test_a_client_is_seen_with_what_it_uses(one: Watched, repository: Path) -> N
         assert now["envhub_server_memory_limit_bytes", who] == 8 << 30
         assert now["envhub_server_upload_bytes", who] > 0
         assert eventually(lambda: one.values()["envhub_server_memory_bytes", who] > _MIB)
-        with make_env(repository, n_envs=2, sandbox=one.server.sandbox()) as second:
-            second.env.reset(seed=1)
-            with pytest.raises(ServerBusyError):
-                make_env(repository, n_envs=3, sandbox=one.server.sandbox())
+        sandbox = one.server.sandbox()
+        with started(repository, n_envs=2, sandbox=sandbox), pytest.raises(ServerBusyError):
+            make_env(repository, n_envs=3, sandbox=sandbox)
         refused = before["envhub_server_refusals_total", "jails"] + 1
         assert one.shows("envhub_server_refusals_total", "jails", value=refused)
-        told = _status(one.server)
+        told = one.server.status()["server"]
         assert told["clients"][who]["sessions"] == 1
         assert told["refusals"]["jails"] == refused
         pid = one.server.sessions()[0]["jails"][0]["pids"][0]
         os.kill(pid, 9)
         with pytest.raises(WorkerDiedError):
-            suites.env.step(np.array([0]))
+            env.step(np.array([0]))
     deaths = before["envhub_server_deaths_total", "signal"] + 1
     assert one.shows("envhub_server_deaths_total", "signal", value=deaths)
     assert one.values()["envhub_server_jails_opened_total", who] >= 2
     assert eventually(lambda: one.values().get(("envhub_server_sessions", who), 0) == 0)
 
 
-def _status(server: Listening) -> Any:
-    command = [*WORKER, "status", "--state-dir", str(server.state), "--json"]
-    done = subprocess.run(command, capture_output=True, check=True, timeout=60)
-    return json.loads(done.stdout)["server"]
-
-
 def test_a_client_is_told_of_itself_only(one: Watched, repository: Path) -> None:
     """Quotas and versions, and nobody else's figures."""
-    server = one.server
-    words = ["--endpoint", server.endpoint, "--server-key", server.public]
-    command = [*WORKER, "status", *words, "--key", str(server.state / "client.key"), "--json"]
-    done = subprocess.run(command, capture_output=True, check=True, timeout=60, text=True)
+    done = worker("status", *one.server.as_client(), "--json")
     assert '"quotas"' in done.stdout
     for word in ("refusals", "deaths", "disk", "pid", "operator"):
         assert f'"{word}"' not in done.stdout
@@ -146,8 +87,7 @@ def test_a_client_is_told_of_itself_only(one: Watched, repository: Path) -> None
 
 def test_no_secret_is_in_a_label(one: Watched, repository: Path) -> None:
     """Neither a key nor a session's name, which lets a connection be one of its client's."""
-    with make_env(repository, sandbox=one.server.sandbox()) as suites:
-        suites.env.reset(seed=1)
+    with started(repository, sandbox=one.server.sandbox()):
         text = one.get("/metrics")[1]
         names = [found["session"] for found in one.server.sessions()]
     assert names
@@ -160,15 +100,14 @@ def test_readiness_is_red_in_a_drain(tmp_path: Path, repository: Path) -> None:
     """And health is not: it answers those that it has."""
     with (
         watched(tmp_path / "server", "--drain-s", "600") as one,
-        make_env(repository, sandbox=one.server.sandbox()) as suites,
+        started(repository, sandbox=one.server.sandbox()),
     ):
-        suites.env.reset(seed=1)
         one.server.process.terminate()
         assert eventually(lambda: one.get("/readyz")[0] == 503)
         assert "drains" in one.get("/readyz")[1]
         assert one.get("/healthz")[0] == 200
         assert one.values()["envhub_server_draining",] == 1
-        assert _status(one.server)["draining_s"] > 0
+        assert one.server.status()["server"]["draining_s"] > 0
 
 
 def test_a_server_that_is_stuck_is_not_healthy(one: Watched) -> None:
@@ -247,31 +186,15 @@ def test_without_the_library_the_error_names_the_extra(tmp_path: Path) -> None:
 @pytest.fixture
 def good(one: Watched, repository: Path) -> Iterator[Any]:
     """A client's environment and a reader of figures, which both must go on."""
-    with make_env(repository, sandbox=one.server.sandbox()) as suites:
-        suites.env.reset(seed=1)
-        yield suites.env
-        assert suites.env.step(np.array([0]))[0].tolist() == [[1.0]]
+    with started(repository, sandbox=one.server.sandbox()) as env:
+        yield env
+        assert env.step(np.array([0]))[0].tolist() == [[1.0]]
         assert one.get("/healthz")[0] == 200
-
-
-def knock(one: Watched) -> socket.socket:
-    """A connection to the port."""
-    return socket.create_connection(("127.0.0.1", one.port), 30)
-
-
-def hears(connection: socket.socket) -> bytes:
-    """All that comes until the other end closes."""
-    connection.settimeout(60)
-    heard = b""
-    with contextlib.suppress(ConnectionError):
-        while piece := connection.recv(1 << 16):
-            heard += piece
-    return heard
 
 
 def test_slow_readers_and_writers_are_shown_the_door(one: Watched, good: Any) -> None:
     """A request that does not end, and an answer that nobody reads."""
-    silent, slow, deaf = knock(one), knock(one), knock(one)
+    silent, slow, deaf = knock(one.port), knock(one.port), knock(one.port)
     slow.sendall(b"GET /metrics HTTP/1.1\r\n")
     deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1)
     deaf.sendall(b"GET /metrics HTTP/1.1\r\n\r\n")
@@ -299,7 +222,7 @@ def test_a_huge_request_is_not_kept(one: Watched, good: Any) -> None:
     """It is answered, or ended, once it is larger than any of ours."""
     before = one.server.memory()
     for data in (b"x" * 64 * _MIB, b"GET /" + b"a" * 16 * _MIB, b"GET / HTTP/1.1\r\n" * 1_000_000):
-        with knock(one) as connection, contextlib.suppress(ConnectionError):
+        with knock(one.port) as connection, contextlib.suppress(ConnectionError):
             connection.sendall(data)
             heard = hears(connection)
             assert heard == b"" or heard.startswith(b"HTTP/1.1 4"), heard[:100]
@@ -326,7 +249,7 @@ def test_only_whole_requests_for_a_page_are_answered(
     one: Watched, request_: bytes, status: int
 ) -> None:
     """Whatever else is sent; ``HEAD`` without the page."""
-    with knock(one) as connection:
+    with knock(one.port) as connection:
         with contextlib.suppress(ConnectionError):
             connection.sendall(request_)
         heard = hears(connection)

@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from envhub_sandbox import make_env
 from envhub_sandbox.errors import ServerBusyError, WorkerDiedError
-from tests.remote.monitoring.test_metrics import Watched, watched
+from tests.remote.monitoring.watched import Watched, watched
 from tests.support.processes import eventually
+from tests.support.started import started
 from tests.unit.docs.test_deployment import DASHBOARD, expressions
 
 pytestmark = pytest.mark.skipif(
@@ -102,16 +102,15 @@ def test_every_panel_of_the_dashboard_shows_something(tmp_path: Path, repository
     ):
         # an increase is one between two scrapes: the first has to come before what is counted
         assert eventually(lambda: bool(prometheus.query("envhub_server_ready == 1")))
-        with make_env(repository, sandbox=one.server.sandbox()) as suites:
-            suites.env.reset(seed=1)
+        with started(repository, sandbox=one.server.sandbox()) as env:
             assert eventually(lambda: bool(prometheus.query("envhub_server_requests_total > 0")))
             for _ in range(5):
-                suites.env.step(np.array([0]))
+                env.step(np.array([0]))
             with (
                 pytest.raises(ServerBusyError),
-                make_env(repository, sandbox=one.server.sandbox()) as second,
+                started(repository, sandbox=one.server.sandbox()),
             ):
-                second.env.reset(seed=1)
+                pass
             empty = [
                 expression
                 for expression in asked
@@ -121,7 +120,7 @@ def test_every_panel_of_the_dashboard_shows_something(tmp_path: Path, repository
             assert not empty, empty
             os.kill(one.server.sessions()[0]["jails"][0]["pids"][0], 9)
             with pytest.raises(WorkerDiedError):
-                suites.env.step(np.array([0]))
+                env.step(np.array([0]))
         [deaths] = [expression for expression in asked if "deaths" in expression]
         assert eventually(lambda: bool(prometheus.query(deaths)))
 
@@ -130,9 +129,8 @@ def test_promtool_finds_no_fault_with_the_page(tmp_path: Path, repository: Path)
     """Names, types, units and helps are as Prometheus wants them."""
     with (
         watched(tmp_path / "server") as one,
-        make_env(repository, sandbox=one.server.sandbox()) as suites,
+        started(repository, sandbox=one.server.sandbox()),
     ):
-        suites.env.reset(seed=1)
         assert eventually(lambda: "envhub_server_sessions{" in _page_of(one))  # each second anew
         command = ["promtool", "check", "metrics"]
         done = subprocess.run(

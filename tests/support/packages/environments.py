@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import functools
+import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+import tempfile
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -42,6 +45,21 @@ def install(folder: Path, *requirements: str, built: str | None = None) -> Runti
     where = index.environment()
     subprocess.run([*command, *NEEDED, *requirements], check=True, timeout=300, env=where)
     return Runtime(python, str(folder))
+
+
+@contextmanager
+def installed_once(built: str | None = None) -> Iterator[Callable[[tuple[str, ...]], Runtime]]:
+    """Gives the runtime with some requirements; each is installed once, and in the end removed."""
+    folder = Path(tempfile.mkdtemp(prefix="envhub-environments-"))
+    folder.chmod(0o755)
+
+    @functools.cache
+    def runtime(requirements: tuple[str, ...]) -> Runtime:
+        number = len(list(folder.iterdir()))
+        return install(folder / str(number), *requirements, built=built)
+
+    yield runtime
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 @contextmanager
