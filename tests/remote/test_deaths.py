@@ -1,4 +1,4 @@
-"""Deaths and idleness on another host: as here."""
+"""Deaths, what was printed before them, and idleness on another host: as here."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from envhub_sandbox.sandboxes import runtime_folder
 from tests.faults.mortal import EXIT, LIVE, comes_off
 from tests.faults.remains.traces import temporary_root
 from tests.remote.listening import Listening, listening
+from tests.support.command_line import envhub
 from tests.support.processes import eventually
 from tests.support.repositories import write_repository
 from tests.support.samples import sample
@@ -48,6 +49,26 @@ def test_what_a_jail_was_denied_over_there_is_told(server: Listening, tmp_path: 
         with pytest.raises(WorkerDiedError, match="SIGKILL") as raised:
             make_env(str(folder), policy=policy, sandbox=server.sandbox())
         assert raised.value.denied == denied
+
+
+def test_output_and_bundle_of_a_death_on_another_host(server: Listening, tmp_path: Path) -> None:
+    """The file has the last words; the replay, on this host, dies in the same way."""
+    path, crashes = tmp_path / "worker.log", tmp_path / "crashes"
+    with started(
+        sample("faulty"),
+        n_envs=2,
+        env_kwargs={"moment": "step", "fault": "exit"},
+        sandbox=server.sandbox(),
+        policy={"output": str(path), "crash_folder": str(crashes)},
+    ) as env:
+        env.step(np.array([0, 0]))
+        with pytest.raises(WorkerDiedError) as caught:
+            env.step(np.array([0, 1]))
+    assert path.read_text() == "about to exit\n"
+    done = envhub("replay", str(caught.value.bundle))
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("exit (exit code 7), at request 3 (step 2)") == 2
+    assert "sandbox" in done.stderr
 
 
 def test_idle_jails_end_over_there(server: Listening) -> None:

@@ -1,1 +1,0 @@
-"""Short forms of benchmarks that go on for hours."""
