@@ -15,8 +15,8 @@ from hypothesis import HealthCheck, settings
 from envhub_sandbox.system import folders
 
 pytest_plugins = [
-    *("tests.hub.fixtures", "tests.support.selection", "tests.support.skips"),
-    "tests.support.wheels",
+    *("tests.hub.fixtures", "tests.support.plugins.selection", "tests.support.plugins.skips"),
+    "tests.support.packages.wheels",
 ]
 
 # A loaded machine is slow at random; what may be slow is bounded by pytest-timeout instead.

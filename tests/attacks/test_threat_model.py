@@ -5,9 +5,13 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+import pytest
+
 from tests.attacks import table
 from tests.attacks.expectations import MEASURED_ATTACKS, NOT_STOPPED, SHARED
 from tests.attacks.harness import Row
+
+pytestmark = pytest.mark.short
 
 DOCS = Path(__file__).parents[2] / "docs"
 

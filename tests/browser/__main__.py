@@ -31,7 +31,7 @@ from tests.browser.chromium import NAMES, Browser, program
 from tests.browser.hostile import SHAPE, declares, judged, unescaped, walks
 from tests.browser.listener import Listener
 from tests.browser.texts import ALONE, IDLE, TOGETHER, written
-from tests.support.pages import report_of, results_of
+from tests.support.output.pages import report_of, results_of
 from tests.support.samples import EXAMPLES
 
 

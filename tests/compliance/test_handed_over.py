@@ -15,8 +15,8 @@ import pytest
 
 from envhub_sandbox import SandboxVectorEnv, make_env
 from envhub_sandbox.errors import EnvHubError, LocalProtocolError
-from tests.support import handed
 from tests.support.compare import assert_identical
+from tests.support.objects import handed
 
 REPOSITORY = """
 import cloudpickle

@@ -6,12 +6,9 @@ The oracle is a plain process that has the same packages, and uses ``gym`` as it
 from __future__ import annotations
 
 import json
-import shutil
 import subprocess
-import tempfile
 import warnings
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,7 +17,7 @@ import pytest
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import RemoteEnvWarning
 from envhub_worker.protocol.runtime import Runtime
-from tests.support.environments import install, running_on
+from tests.support.packages.environments import installed_once, running_on
 from tests.support.samples import SAMPLES
 
 REPOSITORY = SAMPLES / "old_gym"
@@ -75,18 +72,9 @@ json.dump(found, sys.stdout)
 @pytest.fixture(scope="module")
 def runtimes() -> Iterator[Any]:
     """Gives the runtime with some requirements; each is installed once."""
-    folder = Path(tempfile.mkdtemp(prefix="envhub-environments-"))
-    folder.chmod(0o755)
-    made: dict[tuple[str, ...], Runtime] = {}
-
-    def runtime(requirements: tuple[str, ...]) -> Runtime:
-        if requirements not in made:
-            # gym has no wheels: its releases are a source distribution of pure Python
-            made[requirements] = install(folder / str(len(made)), *requirements, built="gym")
-        return made[requirements]
-
-    yield runtime
-    shutil.rmtree(folder, ignore_errors=True)
+    # gym has no wheels: its releases are a source distribution of pure Python
+    with installed_once("gym") as runtime:
+        yield runtime
 
 
 def by_hand(runtime: Runtime, kind: str, seed: int, actions: list[Any]) -> Any:

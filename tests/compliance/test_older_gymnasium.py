@@ -6,12 +6,9 @@ on 0.29 gives is what the same repository would give here with ``SAME_STEP``.
 
 from __future__ import annotations
 
-import shutil
-import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,7 +20,7 @@ from tests.compliance import test_parity
 from tests.compliance.pair import Pair
 from tests.compliance.vector_env import Case
 from tests.support.compare import assert_same
-from tests.support.environments import install, running_on
+from tests.support.packages.environments import installed_once, running_on
 from tests.support.samples import reference, sample
 
 OLDEST = ("gymnasium==0.26.3", "numpy==1.26.4")
@@ -35,17 +32,8 @@ NEW = ("gymnasium>=1.1", "numpy>=2")
 @pytest.fixture(scope="session")
 def runtimes() -> Iterator[Any]:
     """Gives the runtime with some requirements; each is installed once."""
-    folder = Path(tempfile.mkdtemp(prefix="envhub-environments-"))
-    folder.chmod(0o755)
-    made: dict[tuple[str, ...], Runtime] = {}
-
-    def runtime(requirements: tuple[str, ...]) -> Runtime:
-        if requirements not in made:
-            made[requirements] = install(folder / str(len(made)), *requirements)
-        return made[requirements]
-
-    yield runtime
-    shutil.rmtree(folder, ignore_errors=True)
+    with installed_once() as runtime:
+        yield runtime
 
 
 @dataclass(frozen=True)

@@ -89,6 +89,7 @@ class TestCounter(VectorEnvCompliance):
             pair.step(actions)
 
 
+@pytest.mark.short
 class TestCounterInUnevenShards(VectorEnvCompliance):
     """Four sub-environments over three processes."""
 
@@ -97,6 +98,7 @@ class TestCounterInUnevenShards(VectorEnvCompliance):
     steps = 100
 
 
+@pytest.mark.short
 class TestCartPole(VectorEnvCompliance):
     """Discrete actions, float32 observations, thousands of steps."""
 
@@ -127,6 +129,7 @@ class TestPendulum(VectorEnvCompliance):
         pair.step([[1 / 3]] * pair.num_envs)
 
 
+@pytest.mark.short
 class TestLeRobotPendulum(VectorEnvCompliance):
     """Dict observations and ``is_success`` in every info."""
 

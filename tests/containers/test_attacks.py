@@ -14,7 +14,6 @@ from pathlib import Path
 import psutil
 import pytest
 
-from envhub_sandbox import make_env
 from envhub_sandbox.hub.snapshot import local
 from envhub_sandbox.sandboxes.docker.engines import Engine
 from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
@@ -23,6 +22,7 @@ from tests.attacks.network.listeners import listening, sends
 from tests.attacks.processes.victim import victim
 from tests.attacks.resources.accounts import of_processes, tasks
 from tests.containers.kit import Walls, container_of, pids_in
+from tests.support.started import started
 
 MIB = 1 << 20
 MEMORY, BOMB = 512 * MIB, 896 * MIB
@@ -157,9 +157,8 @@ def test_processes_stop_at_the_containers_limit(walls: Walls) -> None:
 
 def test_no_process_in_a_container_has_a_capability(docker: DockerSandbox, engine: Engine) -> None:
     """Read from outside, of the server, the zygote and the runners alike; none is root."""
-    with make_env(str(HOSTILE), sandbox=docker) as suites:
-        suites.env.reset(seed=0)
-        found = pids_in(engine, container_of(suites.env))
+    with started(str(HOSTILE), sandbox=docker, seed=0) as env:
+        found = pids_in(engine, container_of(env))
         assert len(found) >= 4
         for pid in found:
             text = Path(f"/proc/{pid}/status").read_text()

@@ -13,8 +13,8 @@ from envhub_sandbox.sandboxes.docker import packages
 from envhub_sandbox.sandboxes.docker.engines import Engine, find_image
 from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
 from tests.containers.kit import IMAGE
+from tests.support.packages.wheels import Index, make_wheel
 from tests.support.repositories import write_repository
-from tests.support.wheels import Index, make_wheel
 
 ENV = """
 import os

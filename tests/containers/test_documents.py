@@ -11,9 +11,9 @@ from pathlib import Path
 from envhub_sandbox.sandboxes.docker.engines import Engine
 from tests.containers.kit import IMAGE
 from tests.hub.stub_hub import StubHub
-from tests.support import blocks
-from tests.support.blocks import Block
-from tests.support.shell import execute
+from tests.support.documents import blocks
+from tests.support.documents.blocks import Block
+from tests.support.documents.shell import execute
 
 # The engine itself. The documents' image is the one under test, which is built already: the words
 # of a build are held against the engine's own. A server has whichever port is free, and a name.

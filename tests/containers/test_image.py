@@ -20,6 +20,7 @@ from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
 from tests.containers.kit import IMAGE
 from tests.support.processes import eventually
 from tests.support.samples import SAMPLES
+from tests.support.started import started
 
 
 def inspected(engine: Engine, image: str) -> dict[str, Any]:
@@ -69,10 +70,11 @@ def test_the_image_serves_at_once(engine: Engine) -> None:
     """As everybody would first try it: over TCP, with the keys that it prints."""
     with (
         served(engine) as remote,
-        make_env(SAMPLES / "counter", sandbox=remote, policy={"profile": "container"}) as suites,
+        started(
+            SAMPLES / "counter", sandbox=remote, policy={"profile": "container"}, seed=0
+        ) as env,
     ):
-        suites.env.reset(seed=0)
-        suites.env.step(suites.env.action_space.sample())
+        env.step(env.action_space.sample())
 
 
 def test_a_hardened_container_gives_jails_every_layer(engine: Engine) -> None:
@@ -83,10 +85,9 @@ def test_a_hardened_container_gives_jails_every_layer(engine: Engine) -> None:
         hardened += ("--security-opt", option)
     with (
         served(engine, *hardened) as remote,
-        make_env(SAMPLES / "counter", sandbox=remote) as suites,
+        started(SAMPLES / "counter", sandbox=remote, seed=0) as env,
     ):
-        suites.env.reset(seed=0)
-        held = {layer["layer"] for layer in suites.env.sandbox.report() if layer["enforced"]}
+        held = {layer["layer"] for layer in env.sandbox.report() if layer["enforced"]}
         assert {"mount-namespace", "pid-namespace", "landlock", "seccomp"} <= held
 
 

@@ -28,6 +28,7 @@ from tests.containers.kit import IMAGE, container_of, containers_of, folders, no
 from tests.support.processes import descendants, eventually
 from tests.support.repositories import write_repository
 from tests.support.samples import sample
+from tests.support.started import started
 
 _HOG = """
 import gymnasium as gym
@@ -107,8 +108,7 @@ def client(engine: Engine, then: str = "wait") -> Iterator[Client]:
 def test_closing_leaves_nothing(docker: DockerSandbox, engine: Engine) -> None:
     """No container, no process, no folder."""
     assert nothing_left(engine)  # of others that linger
-    with make_env(sample("counter"), sandbox=docker) as suites:
-        suites.env.reset(seed=0)
+    with started(sample("counter"), sandbox=docker, seed=0):
         assert len(containers_of(engine, os.getpid())) == 1
         assert len(folders()) == 1
     assert nothing_left(engine)
@@ -167,16 +167,14 @@ def test_client_and_monitor_killed_together_leave_no_container(engine: Engine) -
 
 def test_a_killed_container_is_a_dead_worker(docker: DockerSandbox, engine: Engine) -> None:
     """A step that waits is told; the next ``make_env`` starts another."""
-    with make_env(sample("counter"), sandbox=docker) as suites:
-        env = suites.env
-        env.reset(seed=0)
+    with started(sample("counter"), sandbox=docker, seed=0) as env:
         engine.run("kill", container_of(env))
         actions = env.action_space.sample()
         with pytest.raises(WorkerDiedError, match="counter"):
             collections.deque((env.step(actions) for _ in range(1000)), maxlen=0)
     assert nothing_left(engine)
-    with make_env(sample("counter"), sandbox=docker) as suites:
-        suites.env.reset(seed=0)
+    with started(sample("counter"), sandbox=docker, seed=0):
+        pass
 
 
 def test_tasks_of_a_repository_share_a_container(docker: DockerSandbox, engine: Engine) -> None:
@@ -186,9 +184,8 @@ def test_tasks_of_a_repository_share_a_container(docker: DockerSandbox, engine: 
         for env in envs:
             env.reset(seed=0)
         assert len({container_of(env) for env in envs}) == 1
-        with make_env(sample("counter"), sandbox=docker) as other:
-            other.env.reset(seed=0)
-            assert container_of(other.env) != container_of(envs[0])
+        with started(sample("counter"), sandbox=docker, seed=0) as other:
+            assert container_of(other) != container_of(envs[0])
 
 
 def test_environments_are_made_in_threads_at_once(docker: DockerSandbox) -> None:
@@ -196,9 +193,8 @@ def test_environments_are_made_in_threads_at_once(docker: DockerSandbox) -> None
     done = []
 
     def drive() -> None:
-        with make_env(sample("counter"), sandbox=docker) as suites:
-            suites.env.reset(seed=0)
-            done.append(suites.env.step(suites.env.action_space.sample()))
+        with started(sample("counter"), sandbox=docker, seed=0) as env:
+            done.append(env.step(env.action_space.sample()))
 
     threads = [threading.Thread(target=drive) for _ in range(3)]
     for thread in threads:
@@ -250,10 +246,9 @@ def test_a_containers_own_limit_is_said_to_be_one(engine: Engine, tmp_path: Path
     """The policy permits the jail more than the container has: no signal out of nowhere."""
     write_repository(tmp_path / "hog", _HOG)
     sandbox = DockerSandbox(image=IMAGE, engine=engine.kind, memory=512 << 20)
-    with make_env(tmp_path / "hog", sandbox=sandbox) as suites:
-        suites.env.reset(seed=1)
+    with started(tmp_path / "hog", sandbox=sandbox) as env:
         with pytest.raises(WorkerDiedError, match="memory limit around the server") as caught:
-            suites.env.step([1])
+            env.step([1])
         assert caught.value.reason == "out-of-memory"
 
 

@@ -13,6 +13,7 @@ from envhub_sandbox.sandboxes.docker.engines import Engine
 from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
 from tests.containers.kit import IMAGE, folders, nothing_left
 from tests.support.samples import sample
+from tests.support.started import started
 
 
 def test_a_missing_image_says_how_to_build_it(engine: Engine) -> None:
@@ -94,7 +95,7 @@ def test_a_path_that_is_granted_is_there_and_no_other(
     """``policy.readable`` is mounted where it is, read-only; a container's own folders are not."""
     (open_ground / "given").write_text("of the caller's")
     policy = {"readable": [str(open_ground)]}
-    with make_env(sample("counter"), sandbox=docker, policy=policy) as suites:
-        suites.env.reset(seed=0)
+    with started(sample("counter"), sandbox=docker, policy=policy, seed=0):
+        pass
     with pytest.raises(PolicyError, match="/usr"):
         make_env(sample("counter"), sandbox=docker, policy={"readable": ["/usr"]})

@@ -71,309 +71,240 @@ _STEP = "def step(self, action):\n    "
 _STEPPED = "\n    return super().step(action)"
 
 _OBSERVATIONS = {
-    "64 bits for 32": ("observation-dtype", _SEEN + "np.array([self.at, self.count])"),
-    "whole numbers for floats": ("observation-dtype", _SEEN + "np.array([0, self.count])"),
-    "a list for an array": ("observation-dtype", _SEEN + "[self.at, self.count]"),
-    "a tuple for an array": ("observation-dtype", _SEEN + "(self.at, self.count)"),
-    "64 bits after the reset": (
-        "observation-dtype",
-        _STEP + "_, *rest = super().step(action)\n    return np.array([self.at, 0.0]), *rest",
-    ),
-    "another shape": ("runs", _SEEN + "np.zeros(3, np.float32)"),
-    "channels in front": (
-        "runs",
-        "observation_space = gym.spaces.Box(0, 255, (8, 9, 3), np.uint8)\n"
+    "observation-dtype": {
+        "64 bits for 32": _SEEN + "np.array([self.at, self.count])",
+        "whole numbers for floats": _SEEN + "np.array([0, self.count])",
+        "a list for an array": _SEEN + "[self.at, self.count]",
+        "a tuple for an array": _SEEN + "(self.at, self.count)",
+        "64 bits after the reset": _STEP
+        + "_, *rest = super().step(action)\n    return np.array([self.at, 0.0]), *rest",
+    },
+    "runs": {
+        "another shape": _SEEN + "np.zeros(3, np.float32)",
+        "channels in front": "observation_space = gym.spaces.Box(0, 255, (8, 9, 3), np.uint8)\n"
         + (_SEEN + "np.zeros((3, 8, 9), np.uint8)"),
-    ),
-    "nothing": ("runs", _SEEN + "None"),
-    "nothing at the end": (
-        "runs",
-        _SEEN + "None if self.count >= 12 else super().observation()",
-    ),
-    "beyond the bounds": (
-        "observation-space",
-        _SEEN + "np.array([self.at, 30 * self.count], np.float32)",
-    ),
-    "beyond the bounds in each reset": (
-        "observation-space",
-        _RESET + "super().reset(**kwargs)\n    return np.full(2, 101, np.float32), {}",
-    ),
-    "pixels of 255 in a space of 1": (
-        "observation-space",
-        "observation_space = gym.spaces.Box(0, 1, (4, 4, 3), np.float32)\n"
+        "nothing": _SEEN + "None",
+        "nothing at the end": _SEEN + "None if self.count >= 12 else super().observation()",
+        "a key too few": "observation_space = gym.spaces.Dict({'a': Walk.observation_space, 'b': "
+        + ("gym.spaces.Discrete(3)})\n" + _SEEN + "{'a': super().observation()}"),
+    },
+    "observation-space": {
+        "beyond the bounds": _SEEN + "np.array([self.at, 30 * self.count], np.float32)",
+        "beyond the bounds in each reset": _RESET
+        + "super().reset(**kwargs)\n    return np.full(2, 101, np.float32), {}",
+        "pixels of 255 in a space of 1": "observation_space = "
+        "gym.spaces.Box(0, 1, (4, 4, 3), np.float32)\n"
         + (_SEEN + "np.full((4, 4, 3), 9 * self.count, np.float32)"),
-    ),
-    "no number, within bounds": ("observation-space", _SEEN + "np.full(2, np.nan, np.float32)"),
-    "no number, without bounds": (
-        "observation-space",
-        _WIDE + _SEEN + "np.full(2, np.nan, np.float32)",
-    ),
-    "infinite, without bounds": (
-        "observation-finite",
-        _WIDE + _SEEN + "np.array([self.at, np.inf if self.count > 4 else 0], np.float32)",
-    ),
-    "infinite in a dict": (
-        "observation-finite",
-        "far = gym.spaces.Box(0, np.inf, (1,), np.float32)\n"
+        "no number, within bounds": _SEEN + "np.full(2, np.nan, np.float32)",
+        "no number, without bounds": _WIDE + _SEEN + "np.full(2, np.nan, np.float32)",
+        "a number that is none of them": "observation_space = gym.spaces.Discrete(5)\n"
+        + _SEEN
+        + "self.count",
+        "one of several that is too large": "observation_space = gym.spaces.MultiDiscrete([3, 3])\n"
+        + (_SEEN + "np.array([self.count, 0])"),
+    },
+    "observation-finite": {
+        "infinite, without bounds": _WIDE
+        + _SEEN
+        + "np.array([self.at, np.inf if self.count > 4 else 0], np.float32)",
+        "infinite in a dict": "far = gym.spaces.Box(0, np.inf, (1,), np.float32)\n"
         "observation_space = gym.spaces.Dict({'far': far})\n"
         + (_SEEN + "{'far': np.full(1, 9 if self.at > 0 else np.inf, np.float32)}"),
-    ),
-    "a key too few": (
-        "runs",
-        "observation_space = gym.spaces.Dict({'a': Walk.observation_space, 'b': "
-        + ("gym.spaces.Discrete(3)})\n" + _SEEN + "{'a': super().observation()}"),
-    ),
-    "a number that is none of them": (
-        "observation-space",
-        "observation_space = gym.spaces.Discrete(5)\n" + _SEEN + "self.count",
-    ),
-    "one of several that is too large": (
-        "observation-space",
-        "observation_space = gym.spaces.MultiDiscrete([3, 3])\n"
-        + (_SEEN + "np.array([self.count, 0])"),
-    ),
+    },
 }
 _STEPS = {
-    "a reward that is no number": ("rewards", _REWARD + "float('nan')"),
-    "a reward that is no number at the end": (
-        "rewards",
-        _REWARD + "np.float64(0) / 0 if self.count >= 12 else 0.0",
-    ),
-    "an infinite reward": ("rewards", _REWARD + "np.inf if self.count > 5 else 1.0"),
-    "a reward of minus infinity": ("rewards", _REWARD + "-np.inf if self.count > 5 else 1.0"),
-    "a reward in an array": ("step-types", _REWARD + "np.array(self.at)"),
-    "a reward as text": ("step-types", _REWARD + "'1.0'"),
-    "an end in an array": ("step-types", _LATE + "np.array([self.count >= 12])"),
-    "an end that is None": ("step-types", _LATE + "True if self.count >= 12 else None"),
-    "an end that is a number": ("step-types", _LATE + "int(self.count >= 12)"),
-    "infos that are None": ("step-types", _INFO + "None"),
-    "infos that are a list": ("runs", _INFO + "[1]"),
-    "four things of a step": (
-        "runs",
-        _STEP + "one, two, three, _, five = super().step(action)\n    return one, two, three, five",
-    ),
-    "a step that raises": ("runs", _STEP + "raise RuntimeError('it broke')"),
-    "a step that raises late": (
-        "runs",
-        _STEP + "assert self.count < 8, 'it broke'" + _STEPPED,
-    ),
-    "an action that it does not take": (
-        "runs",
-        _STEP + "assert action < 2, 'unknown action'" + _STEPPED,
-    ),
-    "a discrete action taken for an array": ("runs", _STEP + "action[0]" + _STEPPED),
-    "actions that do nothing": (
-        "actions-ignored",
-        "def move(self, action):\n    self.at += float(self.np_random.uniform())",
-    ),
-    "actions of an array that do nothing": (
-        "actions-ignored",
-        "action_space = gym.spaces.Box(-1, 1, (3,), np.float32)\n"
+    "rewards": {
+        "a reward that is no number": _REWARD + "float('nan')",
+        "a reward that is no number at the end": _REWARD
+        + "np.float64(0) / 0 if self.count >= 12 else 0.0",
+        "an infinite reward": _REWARD + "np.inf if self.count > 5 else 1.0",
+        "a reward of minus infinity": _REWARD + "-np.inf if self.count > 5 else 1.0",
+    },
+    "step-types": {
+        "a reward in an array": _REWARD + "np.array(self.at)",
+        "a reward as text": _REWARD + "'1.0'",
+        "an end in an array": _LATE + "np.array([self.count >= 12])",
+        "an end that is None": _LATE + "True if self.count >= 12 else None",
+        "an end that is a number": _LATE + "int(self.count >= 12)",
+        "infos that are None": _INFO + "None",
+    },
+    "runs": {
+        "infos that are a list": _INFO + "[1]",
+        "four things of a step": _STEP
+        + "one, two, three, _, five = super().step(action)\n    return one, two, three, five",
+        "a step that raises": _STEP + "raise RuntimeError('it broke')",
+        "a step that raises late": _STEP + "assert self.count < 8, 'it broke'" + _STEPPED,
+        "an action that it does not take": _STEP + "assert action < 2, 'unknown action'" + _STEPPED,
+        "a discrete action taken for an array": _STEP + "action[0]" + _STEPPED,
+    },
+    "actions-ignored": {
+        "actions that do nothing": "def move(self, action):\n"
+        "    self.at += float(self.np_random.uniform())",
+        "actions of an array that do nothing": "action_space = "
+        "gym.spaces.Box(-1, 1, (3,), np.float32)\n"
         "def move(self, action):\n    self.at += 0.1",
-    ),
-    "a mebibyte of info": ("large-infos", _INFO + "{'map': np.zeros(1 << 20, np.uint8)}"),
-    "a mebibyte of text": ("large-infos", _INFO + "{'log': 'x' * (1 << 20)}"),
-    "no end": (
-        "endless",
-        _SEEN + "np.zeros(2, np.float32)\n" + _LATE + "False\n"
-        "def move(self, action):\n    self.at = float(self.np_random.uniform()) * int(action)",
-    ),
+    },
+    "large-infos": {
+        "a mebibyte of info": _INFO + "{'map': np.zeros(1 << 20, np.uint8)}",
+        "a mebibyte of text": _INFO + "{'log': 'x' * (1 << 20)}",
+    },
+    "endless": {
+        "no end": _SEEN + "np.zeros(2, np.float32)\n" + _LATE + "False\n"
+        "def move(self, action):\n    self.at = float(self.np_random.uniform()) * int(action)"
+    },
 }
 _RESETS = {
-    "a reset without info": (
-        "runs",
-        _RESET + "super().reset(**kwargs)\n    return self.observation()",
-    ),
-    "a reset that takes no seed": (
-        "runs",
-        "def reset(self):\n    return super().reset()",
-    ),
-    "a reset that takes no options": (
-        "runs",
-        "def reset(self, seed=None):\n    return super().reset(seed=seed)",
-    ),
-    "a reset that wants options": (
-        "runs",
-        "def reset(self, *, seed=None, options=None):\n    options['level']\n    "
+    "runs": {
+        "a reset without info": _RESET + "super().reset(**kwargs)\n    return self.observation()",
+        "a reset that takes no seed": "def reset(self):\n    return super().reset()",
+        "a reset that takes no options": "def reset(self, seed=None):\n"
+        "    return super().reset(seed=seed)",
+        "a reset that wants options": "def reset(self, *, seed=None, options=None):\n"
+        "    options['level']\n    "
         "return super().reset(seed=seed)",
-    ),
-    "a close that raises": ("runs", "def close(self):\n    raise RuntimeError('twice')"),
-    "a second reset that raises": (
-        "runs",
-        _RESET + "assert not hasattr(self, 'at'), 'only once'" + _RESULT,
-    ),
-    "a reset without a seed that raises": (
-        "runs",
-        _RESET + "kwargs['seed'] + 1" + _RESULT,
-    ),
+        "a close that raises": "def close(self):\n    raise RuntimeError('twice')",
+        "a second reset that raises": _RESET
+        + "assert not hasattr(self, 'at'), 'only once'"
+        + _RESULT,
+        "a reset without a seed that raises": _RESET + "kwargs['seed'] + 1" + _RESULT,
+    }
 }
 _SEEDS = {
-    "a seed that is ignored": (
-        "seed-ignored",
-        "def __init__(self):\n    self.random = np.random.default_rng(3)\n"
+    "seed-ignored": {
+        "a seed that is ignored": "def __init__(self):\n"
+        "    self.random = np.random.default_rng(3)\n"
         "def move(self, action):\n    self.at += self.random.normal() * int(action)",
-    ),
-    "a seed that is ignored at the reset": (
-        "seed-ignored",
-        "def __init__(self):\n    self.random = np.random.default_rng(3)\n"
+        "a seed that is ignored at the reset": "def __init__(self):\n"
+        "    self.random = np.random.default_rng(3)\n"
         + (_RESET + "super().reset(**kwargs)\n    self.at = float(self.random.normal())")
         + "\n    return self.observation(), {}",
-    ),
-    "a seed of 0 that is ignored": (
-        "seed-ignored",
-        "random = np.random.default_rng(3)\n"
+        "a seed of 0 that is ignored": "random = np.random.default_rng(3)\n"
         "def reset(self, *, seed=None, options=None):\n    super().reset(seed=seed)\n"
         "    if seed:\n        self.random = np.random.default_rng(seed)\n"
         "    self.at = float(self.random.normal())\n    return self.observation(), {}",
-    ),
-    "a generator for resets without a seed": (
-        "seed-ignored",
-        "random = np.random.default_rng(3)\n"
+        "a generator for resets without a seed": "random = np.random.default_rng(3)\n"
         "def reset(self, *, seed=None, options=None):\n    super().reset(seed=seed)\n"
         "    self.at = float((self.np_random if seed is not None else self.random).normal())\n"
         "    return self.observation(), {}\nlength = 100",
-    ),
-    "one seed for all seeds": (
-        "seed-constant",
-        "def reset(self, *, seed=None, options=None):\n    return super().reset(seed=3)",
-    ),
-    "running statistics": (
-        "seed-ignored",
-        "total, seen = 0.0, 0\n"
+        "running statistics": "total, seen = 0.0, 0\n"
         + _SEEN.replace("return ", "")
         + "self.total, self.seen = self.total + self.at, self.seen + 1\n"
         "    return np.array([self.at - self.total / self.seen, self.count], np.float32)",
-    ),
-    "a curriculum": (
-        "seed-ignored",
-        "episodes = 0\n" + _RESET + "self.episodes += 1\n    super().reset(**kwargs)\n"
+        "a curriculum": "episodes = 0\n"
+        + _RESET
+        + "self.episodes += 1\n    super().reset(**kwargs)\n"
         "    self.at *= self.episodes\n    return self.observation(), {}",
-    ),
-    "speed that a reset keeps": (
-        "seed-ignored",
-        "speed = 0.0\ndef move(self, action):\n    self.speed += 0.1 * (int(action) - 0.5)\n"
+        "speed that a reset keeps": "speed = 0.0\ndef move(self, action):\n"
+        "    self.speed += 0.1 * (int(action) - 0.5)\n"
         "    self.at += self.speed",
-    ),
-    "numpy's global generator": (
-        "seeding",
-        "def move(self, action):\n    self.at += np.random.normal() * int(action)",
-    ),
-    "Python's global generator": (
-        "seeding",
-        _RESET + "super().reset(**kwargs)\n    self.at = random.random()\n"
+    },
+    "seed-constant": {
+        "one seed for all seeds": "def reset(self, *, seed=None, options=None):\n"
+        "    return super().reset(seed=3)"
+    },
+    "seeding": {
+        "numpy's global generator": "def move(self, action):\n"
+        "    self.at += np.random.normal() * int(action)",
+        "Python's global generator": _RESET
+        + "super().reset(**kwargs)\n    self.at = random.random()\n"
         "    return self.observation(), {}",
-    ),
-    "Python's global generator without a seed": (
-        "seeding",
-        "def reset(self, *, seed=None, options=None):\n    super().reset(seed=seed)\n"
+        "Python's global generator without a seed": "def reset(self, *, seed=None, options=None):\n"
+        "    super().reset(seed=seed)\n"
         "    self.at = self.at if seed is not None else random.random()\n"
         "    return self.observation(), {}",
-    ),
-    "a new generator each time": (
-        "seeding",
-        "def move(self, action):\n    self.at += np.random.default_rng().normal() * int(action)",
-    ),
-    "the time of day": (
-        "seeding",
-        "def move(self, action):\n    self.at += int(action) + time.time() % 1",
-    ),
-    "an identifier by lot": ("seeding", _REWARD + "uuid.uuid4().int % 1000 / 1000"),
-    "the hash of a text": ("seeding", _REWARD + "float(hash('walk'))"),
-    "the order of a set": (
-        "seeding",
-        _REWARD + "sum(7.0**at * ord(one) for at, one in enumerate(set('abcdefghijkl')))",
-    ),
-    "always the same without a seed": (
-        "seed-fixed",
-        "def reset(self, *, seed=None, options=None):\n"
-        "    return super().reset(seed=42 if seed is None else seed)\nlength = 100",
-    ),
-    "a global generator that is seeded": (
-        "workers",
-        "def reset(self, *, seed=None, options=None):\n    super().reset(seed=seed)\n"
+        "a new generator each time": "def move(self, action):\n"
+        "    self.at += np.random.default_rng().normal() * int(action)",
+        "the time of day": "def move(self, action):\n    self.at += int(action) + time.time() % 1",
+        "an identifier by lot": _REWARD + "uuid.uuid4().int % 1000 / 1000",
+        "the hash of a text": _REWARD + "float(hash('walk'))",
+        "the order of a set": _REWARD
+        + "sum(7.0**at * ord(one) for at, one in enumerate(set('abcdefghijkl')))",
+    },
+    "seed-fixed": {
+        "always the same without a seed": "def reset(self, *, seed=None, options=None):\n"
+        "    return super().reset(seed=42 if seed is None else seed)\nlength = 100"
+    },
+    "workers": {
+        "a global generator that is seeded": "def reset(self, *, seed=None, options=None):\n"
+        "    super().reset(seed=seed)\n"
         "    if seed is not None:\n        np.random.seed(seed)\n"
         "    self.at = float(np.random.normal())\n    return self.observation(), {}\n"
         "def move(self, action):\n    self.at += np.random.normal() * int(action)",
-    ),
-    "a list that all share": (
-        "workers",
-        "made = []\ndef __init__(self):\n    self.made.append(self)\n"
+        "a list that all share": "made = []\ndef __init__(self):\n    self.made.append(self)\n"
         + (_REWARD + "self.at + len(self.made)"),
-    ),
+    },
 }
 _LEFT = {
-    "a program in each reset": (
-        "leaks-processes",
-        _RESET + "subprocess.Popen(['sleep', '3600'])" + _RESULT,
-    ),
-    "a fork in each reset": (
-        "leaks-processes",
-        _RESET + "os.fork() or time.sleep(3600)" + _RESULT,
-    ),
-    "a thread in each reset": (
-        "leaks-threads",
-        _RESET + "threading.Thread(target=threading.Event().wait, daemon=True).start()" + _RESULT,
-    ),
-    "a pool in each reset": (
-        "leaks-threads",
-        "pools = []\n"
+    "leaks-processes": {
+        "a program in each reset": _RESET + "subprocess.Popen(['sleep', '3600'])" + _RESULT,
+        "a fork in each reset": _RESET + "os.fork() or time.sleep(3600)" + _RESULT,
+    },
+    "leaks-threads": {
+        "a thread in each reset": _RESET
+        + "threading.Thread(target=threading.Event().wait, daemon=True).start()"
+        + _RESULT,
+        "a pool in each reset": "pools = []\n"
         + _RESET
         + "pool = concurrent.futures.ThreadPoolExecutor()\n    pool.submit(int)\n"
         "    self.pools.append(pool)" + _RESULT,
-    ),
-    "a file in each reset": (
-        "leaks-files",
-        "files = []\n" + _RESET + "self.files.append(tempfile.TemporaryFile())" + _RESULT,
-    ),
-    "a pipe in each reset": ("leaks-files", _RESET + "os.pipe()" + _RESULT),
-    "sockets in each reset": (
-        "leaks-files",
-        "pairs = []\n" + _RESET + "self.pairs.append(socket.socketpair())" + _RESULT,
-    ),
-    "a file in each step": ("leaks-files", _STEP + "os.pipe()" + _STEPPED),
-    "a thread in each step": (
-        "leaks-threads",
-        _STEP + "threading.Thread(target=threading.Event().wait, daemon=True).start()" + _STEPPED,
-    ),
-    "a list that grows in each step": (
-        "leaks-memory",
-        "kept = []\n" + _STEP + "self.kept.append(np.ones(1 << 17))" + _STEPPED,
-    ),
-    "a list that grows": (
-        "leaks-memory",
-        "kept = []\n" + _RESET + "self.kept.append(np.ones(1 << 18))" + _RESULT,
-    ),
-    "a cache that grows": (
-        "leaks-memory",
-        "@functools.lru_cache(None)\ndef built(self, number):\n    return bytearray(1 << 21)\n"
+        "a thread in each step": _STEP
+        + "threading.Thread(target=threading.Event().wait, daemon=True).start()"
+        + _STEPPED,
+    },
+    "leaks-files": {
+        "a file in each reset": "files = []\n"
+        + _RESET
+        + "self.files.append(tempfile.TemporaryFile())"
+        + _RESULT,
+        "a pipe in each reset": _RESET + "os.pipe()" + _RESULT,
+        "sockets in each reset": "pairs = []\n"
+        + _RESET
+        + "self.pairs.append(socket.socketpair())"
+        + _RESULT,
+        "a file in each step": _STEP + "os.pipe()" + _STEPPED,
+    },
+    "leaks-memory": {
+        "a list that grows in each step": "kept = []\n"
+        + _STEP
+        + "self.kept.append(np.ones(1 << 17))"
+        + _STEPPED,
+        "a list that grows": "kept = []\n"
+        + _RESET
+        + "self.kept.append(np.ones(1 << 18))"
+        + _RESULT,
+        "a cache that grows": "@functools.lru_cache(None)\ndef built(self, number):\n"
+        "    return bytearray(1 << 21)\n"
         + _RESET
         + "Env.episodes = getattr(Env, 'episodes', 0) + 1\n"
         "    self.built(Env.episodes)[:] = b'x' * (1 << 21)" + _RESULT,
-    ),
+    },
 }
 _ENDS = {
-    "an exit": ("survives", _STEP + "os._exit(3)"),
-    "a signal": ("survives", _STEP + "os.kill(os.getpid(), 9)"),
-    "a step without an end": ("survives", _STEP + "time.sleep(3600)"),
-    "a reset without an end": ("survives", _RESET + "time.sleep(3600)"),
-    "a step that takes long": ("slow-steps", _STEP + "time.sleep(0.03)" + _STEPPED),
-    "a reset that takes long": ("slow-resets", _RESET + "time.sleep(0.05)" + _RESULT),
+    "survives": {
+        "an exit": _STEP + "os._exit(3)",
+        "a signal": _STEP + "os.kill(os.getpid(), 9)",
+        "a step without an end": _STEP + "time.sleep(3600)",
+        "a reset without an end": _RESET + "time.sleep(3600)",
+    },
+    "slow-steps": {"a step that takes long": _STEP + "time.sleep(0.03)" + _STEPPED},
+    "slow-resets": {"a reset that takes long": _RESET + "time.sleep(0.05)" + _RESULT},
 }
 _RENDERS = {
-    "no frame": ("render", _RENDER + "None"),
-    "no rate of frames": ("render-fps", "metadata = {'render_modes': ['rgb_array']}"),
-    "a rate that is a text": ("render-fps", "metadata = {'render_fps': '25'}"),
-    "a frame of floats": ("render", _RENDER + "np.zeros((8, 8, 3), np.float32)"),
-    "a frame with four channels": ("render", _RENDER + "np.zeros((8, 8, 4), np.uint8)"),
-    "a frame without channels": ("render", _RENDER + "np.zeros((8, 8), np.uint8)"),
-    "a frame with channels in front": ("render", _RENDER + "np.zeros((3, 8, 8), np.uint8)"),
-    "a frame for a text": ("render", "render_mode = 'ansi'"),
-    "a frame for a list": ("render", "render_mode = 'rgb_array_list'"),
-    "a rendering that raises": ("render", "def render(self):\n    raise ValueError('no display')"),
-    "a rendering that is not there": (
-        "render",
-        "def render(self):\n    raise NotImplementedError",
-    ),
+    "render": {
+        "no frame": _RENDER + "None",
+        "a frame of floats": _RENDER + "np.zeros((8, 8, 3), np.float32)",
+        "a frame with four channels": _RENDER + "np.zeros((8, 8, 4), np.uint8)",
+        "a frame without channels": _RENDER + "np.zeros((8, 8), np.uint8)",
+        "a frame with channels in front": _RENDER + "np.zeros((3, 8, 8), np.uint8)",
+        "a frame for a text": "render_mode = 'ansi'",
+        "a frame for a list": "render_mode = 'rgb_array_list'",
+        "a rendering that raises": "def render(self):\n    raise ValueError('no display')",
+        "a rendering that is not there": "def render(self):\n    raise NotImplementedError",
+    },
+    "render-fps": {
+        "no rate of frames": "metadata = {'render_modes': ['rgb_array']}",
+        "a rate that is a text": "metadata = {'render_fps': '25'}",
+    },
 }
 _DENIED = {
     "a connection": (
@@ -521,7 +452,8 @@ def _all() -> dict[str, Entry]:
     found = {
         name: _fault(group, told, env, head=_imports(env), **_PARTICULAR.get(name, {}))
         for group, table in groups.items()
-        for name, (told, env) in table.items()
+        for told, faults in table.items()
+        for name, env in faults.items()
     }
     for name, (told, env, also) in _DENIED.items():
         head = "import ctypes\nfrom pathlib import Path\n"

@@ -10,11 +10,11 @@ from typing import Any
 
 import pytest
 
-from envhub_sandbox import make_env
 from envhub_sandbox.sandboxes.pool import stop_idle
-from tests.faults.traces import Traces, temporary_root
+from tests.faults.remains.traces import Traces, temporary_root
 from tests.support.processes import eventually
 from tests.support.samples import sample
+from tests.support.started import started
 
 
 @dataclass
@@ -50,6 +50,5 @@ def _left(folder: Path, before: Traces) -> list[str]:
 @pytest.fixture(scope="package")
 def neighbour(place: Path) -> Iterator[Neighbour]:
     """Keeps the server, and is there to be disturbed."""
-    with make_env(sample("faulty")) as suites:
-        suites.env.reset()
-        yield Neighbour(suites.env)
+    with started(sample("faulty"), seed=None) as env:
+        yield Neighbour(env)

@@ -5,8 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 import stat
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -17,29 +15,12 @@ from envhub_sandbox import errors, make_env
 from envhub_sandbox.session.crash import bundle_writer
 from envhub_sandbox.session.crash.bundle_reader import load_bundle
 from envhub_worker.protocol import messages as m
+from tests.support.command_line import document, envhub
 from tests.support.processes import eventually
 from tests.support.samples import sample
+from tests.support.started import started
 
 pytestmark = pytest.mark.usefixtures("neighbour")
-
-
-def envhub(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    """Run the command line to its end."""
-    return subprocess.run(
-        [sys.executable, "-I", "-m", "envhub_sandbox", *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=240,
-        check=False,
-    )
-
-
-def replayed(bundle: str, *arguments: str | Path, code: int) -> dict[str, Any]:
-    """The document of ``envhub replay --json``."""
-    done = envhub("replay", bundle, *arguments, "--json")
-    assert done.returncode == code, done.stderr
-    document: dict[str, Any] = json.loads(done.stdout)
-    return document
 
 
 def brittle(folder: Path, actions: str = "array", ending: str = "exit", **options: Any) -> Any:
@@ -80,7 +61,7 @@ def test_a_replay_dies_at_the_same_step(
         env.reset(options={"reset_mask": mask, "toll": 1.5})
         error = play(env)
     assert f"envhub replay {error.bundle}" in str(error)
-    found = replayed(str(error.bundle), code=0)
+    found = document("replay", str(error.bundle))
     assert found["verdict"] == "same"
     assert found["doubts"] == found["changed_files"] == []
     assert found["replayed"]["requests"] == found["recorded"]["requests"] > 10
@@ -99,12 +80,13 @@ def test_every_ending_and_every_action_comes_again(
     with brittle(tmp_path, actions, ending, n_envs=2, policy={"limits": limits}) as suites:
         suites.env.reset(seed=11)
         error = play(suites.env)
-    found = replayed(str(error.bundle), code=0)
+    found = document("replay", str(error.bundle))
     assert found["verdict"] == "same"
     assert found["recorded"]["reason"] == error.reason
     assert error.reason == ("signal" if ending == "segfault" else "out-of-memory")
 
 
+@pytest.mark.short
 def test_a_bundle_holds_what_is_promised(tmp_path: Path) -> None:
     """For its owner alone, whole, in plain formats, and readable by people."""
     with brittle(tmp_path, n_envs=2) as suites:
@@ -152,17 +134,16 @@ def test_a_mended_repository_survives(tmp_path: Path) -> None:
     repository = tmp_path / "repository"
     shutil.copytree(sample("brittle"), repository, ignore=shutil.ignore_patterns("__pycache__"))
     policy = {"crash_folder": str(tmp_path / "crashes")}
-    with make_env(repository, policy=policy) as suites:
-        suites.env.reset(seed=1)
-        error = play(suites.env)
+    with started(repository, policy=policy) as env:
+        error = play(env)
     entry = repository / "env.py"
     entry.write_text(entry.read_text().replace("os._exit(9)", "None"))
-    found = replayed(str(error.bundle), code=8)
+    found = document("replay", str(error.bundle), code=8)
     assert (found["verdict"], found["changed_files"]) == ("survived", ["env.py"])
     entry.write_text(entry.read_text().replace('"exit": lambda: None', '"exit": lambda: 1 / 0'))
-    assert replayed(str(error.bundle), code=8)["replayed"]["death"] is None
+    assert document("replay", str(error.bundle), code=8)["replayed"]["death"] is None
     entry.write_text(entry.read_text().replace("lambda: 1 / 0", "lambda: os._exit(10)"))
-    found = replayed(str(error.bundle), code=7)
+    found = document("replay", str(error.bundle), code=7)
     assert found["verdict"] == "different"
     assert found["replayed"]["death"]["exit_code"] == 10
 
@@ -173,7 +154,7 @@ def test_a_death_in_make_env_is_repeated_too(tmp_path: Path) -> None:
     policy = {"crash_folder": str(tmp_path)}
     with pytest.raises(errors.WorkerDiedError) as caught:
         make_env(sample("exits"), env_kwargs=kwargs, policy=policy)
-    found = replayed(str(caught.value.bundle), code=0)
+    found = document("replay", str(caught.value.bundle))
     assert (found["verdict"], found["replayed"]["requests"]) == ("same", 0)
 
 
@@ -182,14 +163,13 @@ def test_a_process_that_was_given_up_leaves_a_bundle(tmp_path: Path) -> None:
     kwargs = {"moment": "step", "fault": "hang"}
     policy = {"crash_folder": str(tmp_path)}
     timeouts = {"step_s": 0.5}
-    with make_env(sample("faulty"), env_kwargs=kwargs, policy=policy, timeouts=timeouts) as suites:
-        suites.env.reset(seed=1)
+    with started(sample("faulty"), env_kwargs=kwargs, policy=policy, timeouts=timeouts) as env:
         with pytest.raises(errors.WorkerTimeoutError):
-            suites.env.step([1])
-        suites.env.reset(seed=1)
+            env.step([1])
+        env.reset(seed=1)
     [folder] = tmp_path.iterdir()
     assert load_bundle(folder).death["reason"] == "timeout"
-    assert replayed(str(folder), code=0)["verdict"] == "same"
+    assert document("replay", str(folder))["verdict"] == "same"
 
 
 def test_what_was_forgotten_is_said(tmp_path: Path) -> None:
@@ -197,7 +177,7 @@ def test_what_was_forgotten_is_said(tmp_path: Path) -> None:
     with brittle(tmp_path, policy={"crash_history": 10}) as suites:
         suites.env.reset(seed=1)
         error = play(suites.env)
-    found = replayed(str(error.bundle), code=7)
+    found = document("replay", str(error.bundle), code=7)
     assert found["replayed"]["requests"] < found["recorded"]["requests"]
     assert "had been forgotten" in found["doubts"][0]
 
@@ -270,7 +250,7 @@ def test_a_death_that_is_hidden_leaves_a_bundle_too(
         assert env.sandbox.stats()["restarts"] == 1
     [folder] = tmp_path.iterdir()
     assert str(folder) in caplog.text
-    assert replayed(str(folder), code=0)["verdict"] == "same"
+    assert document("replay", str(folder))["verdict"] == "same"
 
 
 def test_a_granted_secret_is_not_in_the_bundle(

@@ -8,10 +8,11 @@ from typing import Any
 import psutil
 import pytest
 
-from envhub_sandbox import errors, make_env
+from envhub_sandbox import errors
 from tests.support import inside
 from tests.support.processes import eventually, halted
 from tests.support.samples import sample
+from tests.support.started import started
 
 
 @pytest.mark.usefixtures("neighbour")
@@ -31,14 +32,15 @@ def test_timeout_tells_what_the_worker_does(
     fails: dict[str, Any] = {"moment": "step", "fault": fault}
     output = tmp_path / "output"
     policy = {"output": str(output)}
-    with make_env(sample("faulty"), n_envs=2, env_kwargs=fails, lane=lane, policy=policy) as suites:
-        suites.env.reset()
-        [runner] = inside.pids(suites.env)
-        suites.env.step_async([0, 1])
+    with started(
+        sample("faulty"), n_envs=2, env_kwargs=fails, lane=lane, policy=policy, seed=None
+    ) as env:
+        [runner] = inside.pids(env)
+        env.step_async([0, 1])
         assert eventually(lambda: f"about to {fault}" in output.read_text())
         assert eventually(lambda: psutil.Process(runner).status() in there)
         with pytest.raises(errors.WorkerTimeoutError, match=state) as caught:
-            suites.env.step_wait(timeout=0.5)
+            env.step_wait(timeout=0.5)
         assert caught.value.worker == (state,)
 
 
@@ -46,9 +48,7 @@ def test_timeout_tells_what_the_worker_does(
 def test_late_reply_survives_the_question(monkeypatch: pytest.MonkeyPatch) -> None:
     """Asking how it is does not lose the reply: the same process is recovered by ``reset``."""
     monkeypatch.setattr(*inside.LATE_REPLY_GRACE, 120.0)
-    with make_env(sample("echo"), lane="frames") as suites:
-        env = suites.env
-        env.reset()
+    with started(sample("echo"), lane="frames", seed=None) as env:
         before = inside.loaded(env)
         with halted(inside.pids(env)):
             env.step_async([[1.0, 0.0]])

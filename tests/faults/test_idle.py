@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import psutil
@@ -11,7 +12,7 @@ import pytest
 
 from envhub_sandbox import errors, make_env
 from envhub_worker.protocol.lifecycle import State
-from tests.faults.test_transparent import ALL_LIVE, SEED, SLOW, oracle
+from tests.faults.mortal import ALL_LIVE, SEED, SLOW, comes_off, oracle
 from tests.support.inside import pids, state
 from tests.support.processes import eventually
 from tests.support.samples import sample
@@ -24,11 +25,12 @@ lanes = pytest.mark.parametrize("lane", ["auto", "frames"])
 policies = pytest.mark.parametrize("restart", ["never", "transparent"])
 
 
+@contextmanager
 def made(
     lane: str = "auto", restart: str = "never", idle_s: float | None = IDLE_S, shards: int = 2
-) -> Any:
+) -> Iterator[Any]:
     """Four sub-environments in two processes, which do not live long without work."""
-    return make_env(
+    with make_env(
         sample("mortal"),
         n_envs=4,
         use_async_envs=True,
@@ -36,7 +38,8 @@ def made(
         lane=lane,
         timeouts={"idle_s": idle_s},
         policy={"restart": restart, "restart_budget": 0},
-    )
+    ) as suites:
+        yield suites.env
 
 
 def ended(runners: list[int]) -> bool:
@@ -47,17 +50,6 @@ def ended(runners: list[int]) -> bool:
 def gone(runners: list[int]) -> bool:
     """Whether none of them is there any more. A jail whose server is asked about it is in use."""
     return not any(map(psutil.pid_exists, runners))
-
-
-def comes_off(act: Callable[[], object]) -> bool:
-    """Whether it did: a loaded machine holds us up between two requests, and that is idleness."""
-    try:
-        act()
-    except (errors.WorkerDiedError, StopIteration) as error:
-        if isinstance(error, errors.WorkerDiedError) and error.reason != "idle":
-            raise
-        return False
-    return True
 
 
 def played(env: Any) -> list[int]:
@@ -93,8 +85,7 @@ def works(env: Any, action: Any, enough: Callable[[], bool]) -> bool:
 @policies
 def test_idle_processes_end_and_a_reset_starts_others(lane: str, restart: str) -> None:
     """It is no death: no policy and no budget is asked, and the same seeds give the same."""
-    with made(lane, restart) as suites:
-        env = suites.env
+    with made(lane, restart) as env:
         assert ended(played(env))
         observation, info = env.reset(seed=SEED)
         assert observation.tolist() == oracle().reset(seed=SEED)[0].tolist()
@@ -107,8 +98,7 @@ def test_idle_processes_end_and_a_reset_starts_others(lane: str, restart: str) -
 @policies
 def test_a_step_after_that_says_that_a_reset_is_needed(lane: str, restart: str) -> None:
     """Its episodes have gone with it; so it is, until there was a reset."""
-    with made(lane, restart) as suites:
-        env = suites.env
+    with made(lane, restart) as env:
         assert ended(played(env))
         for ask in (lambda: env.step(ALL_LIVE), lambda: env.call("hello")):
             with pytest.raises(errors.WorkerDiedError, match=r"idle.*reset\(\)") as caught:
@@ -122,11 +112,11 @@ def test_a_step_after_that_says_that_a_reset_is_needed(lane: str, restart: str) 
 @lanes
 def test_who_works_is_not_idle(lane: str) -> None:
     """Steps count, by whichever way they go."""
-    with made(lane, idle_s=WORKING_S) as suites:
+    with made(lane, idle_s=WORKING_S) as env:
 
         def works_on() -> bool:
             until = time.monotonic() + 3 * WORKING_S  # the server looks once a second
-            return works(suites.env, ALL_LIVE, lambda: time.monotonic() > until)
+            return works(env, ALL_LIVE, lambda: time.monotonic() > until)
 
         assert eventually(works_on, 200)
 
@@ -134,8 +124,7 @@ def test_who_works_is_not_idle(lane: str) -> None:
 @lanes
 def test_a_long_step_is_not_idleness(lane: str) -> None:
     """Whoever owes an answer is busy, even asleep."""
-    with made(lane, shards=1) as suites:
-        env = suites.env
+    with made(lane, shards=1) as env:
 
         def play() -> None:
             env.reset()
@@ -148,8 +137,7 @@ def test_a_long_step_is_not_idleness(lane: str) -> None:
 
 def test_without_it_nothing_ends() -> None:
     """The default leaves everybody alone."""
-    with made(idle_s=None) as suites:
-        env = suites.env
+    with made(idle_s=None) as env:
         env.reset()
         runners = pids(env)
         time.sleep(2.0)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from typing import Any
 
@@ -18,7 +19,7 @@ from tests.support import inside
 from tests.support.processes import descendants, eventually
 from tests.support.samples import sample
 
-pytestmark = pytest.mark.usefixtures("neighbour")
+pytestmark = [pytest.mark.short, pytest.mark.usefixtures("neighbour")]
 
 lanes = pytest.mark.parametrize("lane", ["auto", "frames"])
 
@@ -29,6 +30,13 @@ def made(lane: str = "auto", **options: Any) -> Any:
     suites = make_env(sample("faulty"), n_envs=2, lane=lane, env_kwargs=fails, **options)
     suites.env.reset()
     return suites
+
+
+@contextmanager
+def begun(lane: str = "auto", **options: Any) -> Iterator[Any]:
+    """The environment of these, until it is closed."""
+    with made(lane, **options) as suites:
+        yield suites.env
 
 
 def interrupted(*arguments: Any, **options: Any) -> Any:
@@ -55,8 +63,7 @@ def test_a_second_ctrl_c_in_recovery_leaves_a_usable_environment(
 ) -> None:
     """The jail that was given up is given back, and the next reset has another."""
     monkeypatch.setattr(*inside.LATE_REPLY_GRACE, 0.05)
-    with made(lane, timeouts={"step_s": 0.05}) as suites:
-        env = suites.env
+    with begun(lane, timeouts={"step_s": 0.05}) as env:
         with pytest.raises(TimeoutError):
             env.step([0, 1])
         first = inside.loaded(env)
@@ -100,8 +107,7 @@ def test_ctrl_c_in_sending_a_step_leaves_a_late_reply(
     moment: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It is not known whether it was done, so the next request is refused."""
-    with made("frames") as suites:
-        env = suites.env
+    with begun("frames") as env:
         jail = inside.jail(env)
         with monkeypatch.context() as patch:
             if moment == "amid the frames":
@@ -198,8 +204,7 @@ def test_close_ends_the_wait_before_a_restart(
     waiting = Inside(lambda *_: 3600.0)
     waiting.leave()
     policy = {"restart": restart, "crash_history": 0}
-    with made(policy=policy, fails={"moment": "step", "fault": "kill"}) as suites:
-        env = suites.env
+    with begun(policy=policy, fails={"moment": "step", "fault": "kill"}) as env:
         if restart == "on_reset":
             with pytest.raises(errors.WorkerDiedError):
                 env.step([0, 1])
@@ -219,8 +224,7 @@ def test_who_outlasts_a_close_gives_everything_back(monkeypatch: pytest.MonkeyPa
     """``close`` does not wait for ever for a thread that holds the environment."""
     monkeypatch.setattr(*inside.CLOSE_PATIENCE, 0.0)
     policy = {"restart": "on_reset", "crash_history": 0}
-    with made(policy=policy, fails={"moment": "step", "fault": "kill"}) as suites:
-        env = suites.env
+    with begun(policy=policy, fails={"moment": "step", "fault": "kill"}) as env:
         with pytest.raises(errors.WorkerDiedError):
             env.step([0, 1])
         found: list[list[bool]] = []
@@ -325,8 +329,7 @@ OPERATIONS: dict[str, tuple[Event, Callable[[Any], object]]] = {
 def test_closed_in_the_midst_says_closed(lane: str, before: bool, operation: str) -> None:
     """A signal handler that closes while a request is on its way out, or looked after."""
     event, ask = OPERATIONS[operation]
-    with made(lane) as suites:
-        env = suites.env
+    with begun(lane) as env:
         loaded = inside.loaded(env)
         assert loaded is not None
         inside.live_by(env, Closing(env, event, before=before))
@@ -339,8 +342,7 @@ def test_closed_in_the_midst_says_closed(lane: str, before: bool, operation: str
 @lanes
 def test_what_was_interrupted_is_said(lane: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """In a notebook the next cell names what the stopped one did; a late reply is named as late."""
-    with made(lane) as suites:
-        env = suites.env
+    with begun(lane) as env:
         lane_in_use = inside.session(env).lease.lane
         with monkeypatch.context() as patch:
             patch.setattr(lane_in_use, "wait", interrupted)

@@ -18,6 +18,8 @@ from envhub_sandbox.transport.deadline import Deadline
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
 
+pytestmark = pytest.mark.short
+
 _SOON_S = 0.02
 
 

@@ -13,13 +13,14 @@ prometheus_client = pytest.importorskip("prometheus_client")
 
 from prometheus_client.parser import text_string_to_metric_families  # noqa: E402
 
-from envhub_sandbox import errors, make_env  # noqa: E402
+from envhub_sandbox import errors  # noqa: E402
 from envhub_sandbox.integrations.metrics import EnvHubCollector  # noqa: E402
 from envhub_sandbox.session import counters  # noqa: E402
 from envhub_sandbox.session.counters import Counters, Labels, Ledger  # noqa: E402
 from envhub_worker.protocol.lifecycle import Lifecycle  # noqa: E402
 from tests.support import inside  # noqa: E402
 from tests.support.samples import sample  # noqa: E402
+from tests.support.started import started  # noqa: E402
 
 pytestmark = pytest.mark.usefixtures("neighbour")
 
@@ -63,9 +64,7 @@ def repository(tmp_path: Path) -> Path:
 def test_everything_is_exported(registry: Any, repository: Path, lane: str) -> None:
     """Under standard names, with the numbers of ``stats()``."""
     label = f"{repository}:env.py"
-    with make_env(repository, lane=lane, policy={"restart": "on_reset"}) as suites:
-        env = suites.env
-        env.reset()
+    with started(repository, lane=lane, policy={"restart": "on_reset"}, seed=None) as env:
         for _ in range(7):
             env.step([[1.0, 0.0]])
         with pytest.raises(errors.WorkerDiedError):
@@ -94,11 +93,10 @@ def test_counts_outlive_their_environments(registry: Any, repository: Path) -> N
     label = f"{repository}:env.py"
     counts = []
     for _ in range(3):
-        with make_env(repository) as suites:
-            suites.env.reset()
-            suites.env.step([[1.0, 0.0]])
+        with started(repository, seed=None) as env:
+            env.step([[1.0, 0.0]])
             counts.append(scraped(registry, label)[key("envhub_steps_total")])
-        del suites
+        del env
         gc.collect()
     assert counts == [1, 2, 3]
     found = scraped(registry, label)
@@ -110,9 +108,7 @@ def test_counts_outlive_their_environments(registry: Any, repository: Path) -> N
 def test_bytes_are_counted_over_both_lanes(lane: str) -> None:
     """At least the arrays that went, at most a little more; also after a restart."""
     policy = {"restart": "on_reset", "restart_backoff_s": 0}
-    with make_env(sample("echo"), n_envs=4, lane=lane, policy=policy) as suites:
-        env = suites.env
-        env.reset()
+    with started(sample("echo"), n_envs=4, lane=lane, policy=policy, seed=None) as env:
         before = env.sandbox.stats()
         for _ in range(10):
             env.step(np.ones((4, 2)) * [1.0, 0.0])

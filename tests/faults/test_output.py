@@ -13,6 +13,7 @@ from envhub_sandbox import errors, make_env
 from tests.support.processes import eventually
 from tests.support.repositories import write_repository
 from tests.support.samples import sample
+from tests.support.started import started
 
 pytestmark = pytest.mark.usefixtures("neighbour")
 
@@ -50,12 +51,13 @@ def test_a_plain_print_is_not_lost_in_a_buffer(tmp_path: Path, how: str) -> None
     """Nobody writes ``flush=True``; what came before a death is in the error, too."""
     path = tmp_path / "worker.log"
     repository = write_repository(tmp_path / "repository", _CHATTY)
-    with make_env(str(repository), env_kwargs={"how": how}, policy={"output": str(path)}) as suites:
-        suites.env.reset()
-        suites.env.step([0])
+    with started(
+        str(repository), env_kwargs={"how": how}, policy={"output": str(path)}, seed=None
+    ) as env:
+        env.step([0])
         if how != "close":
             with pytest.raises(errors.WorkerDiedError, match="step 2") as caught:
-                suites.env.step([1])
+                env.step([1])
             assert "step 1" in caught.value.log_tail
     last = "closed" if how == "close" else "step 2"
     assert path.read_text().splitlines()[:3] == ["reset", "step 1", last]

@@ -8,6 +8,7 @@ from envhub_sandbox import errors, make_env
 from tests.support import inside
 from tests.support.processes import halted
 from tests.support.samples import sample
+from tests.support.started import started
 
 
 def test_a_task_that_does_not_run_is_not_confined() -> None:
@@ -31,9 +32,7 @@ def test_a_task_that_does_not_run_is_not_confined() -> None:
 def test_a_jail_that_was_lost_confines_nobody(lane: str) -> None:
     """Until a reset has brought another; while it is merely late it is still the same one."""
     policy = {"restart": "on_reset"}
-    with make_env(sample("echo"), lane=lane, policy=policy) as suites:
-        env = suites.env
-        env.reset()
+    with started(sample("echo"), lane=lane, policy=policy, seed=None) as env:
         report = env.sandbox.report()
         assert report
         with halted(inside.pids(env)):

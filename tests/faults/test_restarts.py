@@ -10,6 +10,8 @@ from envhub_sandbox import errors, make_env
 from envhub_sandbox.settings.policy import Policy
 from tests.support.samples import sample
 
+pytestmark = pytest.mark.short
+
 
 def made(**policy: Any) -> Any:
     """Two sub-environments, of which the last ends its process when it is told to."""

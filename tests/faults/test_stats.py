@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from envhub_sandbox import errors, make_env
+from envhub_sandbox import errors
 from envhub_sandbox.session.counters import KEPT, Counters
 from tests.support import inside
 from tests.support.processes import halted
 from tests.support.samples import sample
+from tests.support.started import started
 
 
 @pytest.mark.usefixtures("neighbour")
@@ -17,9 +18,7 @@ def test_counters_follow_what_happens(lane: str, monkeypatch: pytest.MonkeyPatch
     """Steps, timeouts, deaths and restarts are counted once each, over both lanes."""
     monkeypatch.setattr(*inside.LATE_REPLY_GRACE, 120.0)
     policy = {"restart": "on_reset"}
-    with make_env(sample("echo"), lane=lane, policy=policy) as suites:
-        env = suites.env
-        env.reset()
+    with started(sample("echo"), lane=lane, policy=policy, seed=None) as env:
         for _ in range(5):
             env.step([[1.0, 0.0]])
         with halted(inside.pids(env)):

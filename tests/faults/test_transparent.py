@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import signal
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -18,16 +20,26 @@ from envhub_sandbox.factory import env_factory
 from envhub_sandbox.session.survival.seeds import derived_seed
 from envhub_sandbox.transport.shared_memory.sharding import bounds_for
 from envhub_worker.protocol.lifecycle import State
+from tests.faults.mortal import (
+    ALL_LIVE,
+    CRASH,
+    EXIT,
+    KILL,
+    LIVE,
+    MEMORY,
+    RAISE,
+    SEED,
+    SLOW,
+    SPIN,
+    oracle,
+)
 from tests.support import inside
 from tests.support.processes import eventually, halted
 from tests.support.repositories import write_repository
 from tests.support.samples import reference, sample
 
-LIVE, EXIT, KILL, CRASH, RAISE, SLOW, MEMORY, SPIN = range(8)
-ALL_LIVE = [LIVE] * 4
 LAST_DIES = [LIVE, LIVE, LIVE, EXIT]
 DEAD = slice(2, 4)
-SEED = 11
 
 pytestmark = pytest.mark.usefixtures("neighbour", "_evenly")
 
@@ -57,11 +69,6 @@ def made(
     )
 
 
-def oracle(mode: str = "NextStep") -> Any:
-    """The same without a sandbox, where nobody dies."""
-    return reference("mortal", n_envs=4, mode=mode)
-
-
 def same(got: Any, expected: Any) -> bool:
     """Whether two results of a step are equal, all infos included."""
     *arrays, infos = got
@@ -86,56 +93,61 @@ def restarted(info: dict[str, Any], rows: slice = DEAD) -> bool:
     return all(np.array_equal(one, expected) for one in both)
 
 
+@contextmanager
+def begun(lane: str = "auto", **options: Any) -> Iterator[Any]:
+    """The same, reset with SEED."""
+    with made(lane, **options) as suites:
+        suites.env.reset(seed=SEED)
+        yield suites.env
+
+
+@pytest.fixture(params=["auto", "frames"])
+def env(request: pytest.FixtureRequest) -> Iterator[Any]:
+    """The same, over either lane."""
+    with begun(request.param) as found:
+        yield found
+
+
 lanes = pytest.mark.parametrize("lane", ["auto", "frames"])
 
 
-@lanes
 @pytest.mark.parametrize("how", [EXIT, KILL, CRASH])
-def test_the_dead_come_back_and_the_others_go_on(lane: str, how: int) -> None:
+def test_the_dead_come_back_and_the_others_go_on(env: Any, how: int) -> None:
     """The rows of the dead are fresh and truncated, all others are what they would have been."""
     beside = oracle()
-    with made(lane) as suites:
-        env = suites.env
-        env.reset(seed=SEED)
-        beside.reset(seed=SEED)
-        assert same(env.step(ALL_LIVE), beside.step(ALL_LIVE))
-        got, expected = env.step([LIVE, LIVE, how, LIVE]), beside.step(ALL_LIVE)
-        for mine, other in zip(got[:4], expected[:4], strict=True):
-            assert np.array_equal(mine[:2], other[:2])
-        observation, rewards, terminated, truncated, info = got
-        assert np.array_equal(observation[DEAD], fresh(1))
-        assert rewards[DEAD].tolist() == [0, 0]
-        assert truncated.tolist() == [False, False, True, True]
-        assert not terminated.any()
-        assert restarted(info)
-        assert info["at"].tolist() == [2, 2, 0, 0]
-        assert inside.state(env) is State.READY
-        assert env.sandbox.stats()["deaths"] == env.sandbox.stats()["restarts"] == 1
+    beside.reset(seed=SEED)
+    assert same(env.step(ALL_LIVE), beside.step(ALL_LIVE))
+    got, expected = env.step([LIVE, LIVE, how, LIVE]), beside.step(ALL_LIVE)
+    for mine, other in zip(got[:4], expected[:4], strict=True):
+        assert np.array_equal(mine[:2], other[:2])
+    observation, rewards, terminated, truncated, info = got
+    assert np.array_equal(observation[DEAD], fresh(1))
+    assert rewards[DEAD].tolist() == [0, 0]
+    assert truncated.tolist() == [False, False, True, True]
+    assert not terminated.any()
+    assert restarted(info)
+    assert info["at"].tolist() == [2, 2, 0, 0]
+    assert inside.state(env) is State.READY
+    assert env.sandbox.stats()["deaths"] == env.sandbox.stats()["restarts"] == 1
 
 
-@lanes
-def test_next_step_resets_what_came_back_truncated(lane: str) -> None:
+def test_next_step_resets_what_came_back_truncated(env: Any) -> None:
     """As after any truncation in this mode: the action after it resets, the next one counts."""
     beside = oracle()
-    with made(lane) as suites:
-        env = suites.env
-        env.reset(seed=SEED)
-        env.step(LAST_DIES)
-        beside.reset(seed=[0, 0, *[derived_seed(SEED + row, 1) for row in (2, 3)]])
-        beside._autoreset_envs[DEAD] = True
-        for _ in range(7):
-            mine, other = env.step(ALL_LIVE), beside.step(ALL_LIVE)
-            for got, expected in zip(mine[:4], other[:4], strict=True):
-                assert np.array_equal(got[DEAD], expected[DEAD])
-            assert "worker_restarted" not in mine[4]
+    env.step(LAST_DIES)
+    beside.reset(seed=[0, 0, *[derived_seed(SEED + row, 1) for row in (2, 3)]])
+    beside._autoreset_envs[DEAD] = True
+    for _ in range(7):
+        mine, other = env.step(ALL_LIVE), beside.step(ALL_LIVE)
+        for got, expected in zip(mine[:4], other[:4], strict=True):
+            assert np.array_equal(got[DEAD], expected[DEAD])
+        assert "worker_restarted" not in mine[4]
 
 
 @lanes
 def test_same_step_has_begun_the_next_episode(lane: str) -> None:
     """The fresh observation is the next episode's first, and stands for the lost final one."""
-    with made(lane, env_kwargs={"mode": "SameStep"}) as suites:
-        env = suites.env
-        env.reset(seed=SEED)
+    with begun(lane, env_kwargs={"mode": "SameStep"}) as env:
         observation, _, _, truncated, info = env.step(LAST_DIES)
         assert truncated.tolist() == [False, False, True, True]
         assert info["_final_obs"].tolist() == info["_final_info"].tolist() == truncated.tolist()
@@ -148,9 +160,7 @@ def test_same_step_has_begun_the_next_episode(lane: str) -> None:
 @lanes
 def test_disabled_wants_a_reset_of_what_came_back(lane: str) -> None:
     """A step is refused as after any episode's end, and a masked reset goes on with the others."""
-    with made(lane, env_kwargs={"mode": "Disabled"}) as suites:
-        env = suites.env
-        env.reset(seed=SEED)
+    with begun(lane, env_kwargs={"mode": "Disabled"}) as env:
         assert env.step(LAST_DIES)[3].tolist() == [False, False, True, True]
         with pytest.raises(errors.RemoteEnvError):
             env.step(ALL_LIVE)
@@ -161,9 +171,7 @@ def test_disabled_wants_a_reset_of_what_came_back(lane: str) -> None:
 @lanes
 def test_the_only_process_comes_back_whole(lane: str) -> None:
     """With one shard all rows are its own."""
-    with made(lane, shards=1) as suites:
-        env = suites.env
-        env.reset(seed=SEED)
+    with begun(lane, shards=1) as env:
         jail = inside.jail(env).number
         for restart in (1, 2):
             observation, rewards, _, truncated, info = env.step(LAST_DIES)
@@ -179,9 +187,7 @@ def test_seeded_runs_with_the_same_deaths_are_the_same() -> None:
     """Seeds after a death derive from those before it: chance has no part in it."""
 
     def run() -> list[Any]:
-        with made() as suites:
-            env = suites.env
-            env.reset(seed=SEED)
+        with begun() as env:
             return [env.step(LAST_DIES if at % 3 == 1 else ALL_LIVE)[0] for at in range(9)]
 
     assert all(np.array_equal(a, b) for a, b in zip(run(), run(), strict=True))
@@ -258,22 +264,18 @@ def make_env(n_envs=1, use_async_envs=False):
 """
 
 
-@lanes
-def test_a_masked_reset_brings_back_whom_it_does_not_name(lane: str) -> None:
+def test_a_masked_reset_brings_back_whom_it_does_not_name(env: Any) -> None:
     """A shard that dies in it has lost all its rows: the others begin anew, and are marked."""
-    with made(lane) as suites:
-        env = suites.env
-        env.reset(seed=SEED)
-        env.step(ALL_LIVE)
-        mask = np.array([False, False, True, False])
-        seeds = [None, None, 99, None]
-        options = {"reset_mask": mask, "exit_once": True}
-        observation, info = env.reset(seed=seeds, options=options)
-        assert restarted(info)
-        assert observation[:, 1].tolist()[2:] == [0, 0]
-        assert np.array_equal(observation[2], reference("mortal").reset(seed=99)[0][0])
-        assert np.array_equal(observation[3], fresh(1)[1])
-        assert env.step(ALL_LIVE)[0][:, 1].tolist() == [2, 2, 1, 1]
+    env.step(ALL_LIVE)
+    mask = np.array([False, False, True, False])
+    seeds = [None, None, 99, None]
+    options = {"reset_mask": mask, "exit_once": True}
+    observation, info = env.reset(seed=seeds, options=options)
+    assert restarted(info)
+    assert observation[:, 1].tolist()[2:] == [0, 0]
+    assert np.array_equal(observation[2], reference("mortal").reset(seed=99)[0][0])
+    assert np.array_equal(observation[3], fresh(1)[1])
+    assert env.step(ALL_LIVE)[0][:, 1].tolist() == [2, 2, 1, 1]
 
 
 @lanes
@@ -291,52 +293,42 @@ def test_who_dies_again_in_coming_back_is_dead(lane: str) -> None:
         assert env.step(ALL_LIVE)[0][:, 1].tolist() == [1, 1, 1, 1]
 
 
-@lanes
-def test_a_call_is_not_repeated(lane: str) -> None:
+def test_a_call_is_not_repeated(env: Any) -> None:
     """It says how they died; the next step brings them back, and the others have not moved."""
-    with made(lane) as suites:
-        env = suites.env
-        env.reset(seed=SEED)
-        env.step(ALL_LIVE)
-        for _ in range(2):
-            with pytest.raises(errors.WorkerDiedError) as caught:
-                env.call("last_words")
-            assert caught.value.exit_code == 5
-            assert caught.value.request == "call"
-            assert inside.state(env) is State.READY
-        observation, _, _, truncated, info = env.step(ALL_LIVE)
-        assert truncated.all()
-        assert restarted(info, slice(4))
-        assert observation[:, 1].tolist() == [0, 0, 0, 0]
-        assert env.call("hello") == ("hello",) * 4
+    env.step(ALL_LIVE)
+    for _ in range(2):
+        with pytest.raises(errors.WorkerDiedError) as caught:
+            env.call("last_words")
+        assert caught.value.exit_code == 5
+        assert caught.value.request == "call"
+        assert inside.state(env) is State.READY
+    observation, _, _, truncated, info = env.step(ALL_LIVE)
+    assert truncated.all()
+    assert restarted(info, slice(4))
+    assert observation[:, 1].tolist() == [0, 0, 0, 0]
+    assert env.call("hello") == ("hello",) * 4
 
 
-@lanes
-def test_attributes_that_were_set_are_set_again(lane: str) -> None:
+def test_attributes_that_were_set_are_set_again(env: Any) -> None:
     """In the fresh process, before anything else is asked of it: the last value of each."""
-    with made(lane) as suites:
-        env = suites.env
-        env.reset(seed=SEED)
-        env.set_attr("weight", 1)
-        env.set_attr("colour", ["red", "green", "blue", "white"])
-        env.set_attr("weight", [5, 6, 7, 8])
-        with pytest.raises(errors.RemoteEnvError):
-            env.set_attr("fixed", 3)
-        *_, truncated, info = env.step(LAST_DIES)
-        assert truncated.tolist() == [False, False, True, True]
-        assert restarted(info)
-        assert env.get_attr("weight") == (5, 6, 7, 8)
-        assert env.get_attr("colour") == ("red", "green", "blue", "white")
-        os.kill(inside.pids(env)[1], signal.SIGKILL)
-        env.reset(seed=SEED)
-        assert env.get_attr("weight") == (5, 6, 7, 8)
+    env.set_attr("weight", 1)
+    env.set_attr("colour", ["red", "green", "blue", "white"])
+    env.set_attr("weight", [5, 6, 7, 8])
+    with pytest.raises(errors.RemoteEnvError):
+        env.set_attr("fixed", 3)
+    *_, truncated, info = env.step(LAST_DIES)
+    assert truncated.tolist() == [False, False, True, True]
+    assert restarted(info)
+    assert env.get_attr("weight") == (5, 6, 7, 8)
+    assert env.get_attr("colour") == ("red", "green", "blue", "white")
+    os.kill(inside.pids(env)[1], signal.SIGKILL)
+    env.reset(seed=SEED)
+    assert env.get_attr("weight") == (5, 6, 7, 8)
 
 
 def test_attributes_are_set_again_as_they_were_sent() -> None:
     """Whatever the caller has done with the values since."""
-    with made() as suites:
-        env = suites.env
-        env.reset(seed=SEED)
+    with begun() as env:
         goals = {"goal": np.zeros(2)}
         env.set_attr("goals", [goals] * 4)
         goals["goal"][:] = 9
@@ -349,9 +341,7 @@ def test_an_attribute_that_cannot_be_set_again_is_left_out(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     """Its setter wants a reset to have been; the rows come back without it, and the log says so."""
-    with made() as suites:
-        env = suites.env
-        env.reset(seed=SEED)
+    with begun() as env:
         env.set_attr("drawn_so_far", 0.5)
         with caplog.at_level("WARNING", "envhub_sandbox.worker"):
             *_, truncated, _ = env.step(LAST_DIES)
@@ -359,15 +349,11 @@ def test_an_attribute_that_cannot_be_set_again_is_left_out(
         assert "'drawn_so_far' could not be set again" in caplog.text
 
 
-@lanes
-def test_a_death_that_is_mended_is_logged(lane: str, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_death_that_is_mended_is_logged(env: Any, caplog: pytest.LogCaptureFixture) -> None:
     """How it died and whose rows begin anew: the caller sees it in the infos only."""
-    with made(lane) as suites:
-        env = suites.env
-        env.reset(seed=SEED)
-        with caplog.at_level("INFO", "envhub_sandbox.worker"):
-            env.step(LAST_DIES)
-        told = [one for one in caplog.messages if "begin anew" in one]
+    with caplog.at_level("INFO", "envhub_sandbox.worker"):
+        env.step(LAST_DIES)
+    told = [one for one in caplog.messages if "begin anew" in one]
     assert len(told) == 1
     assert "the worker process died during step: it exited (exit code" in told[0]
     assert "sub-environments [2, 3]" in told[0]
@@ -376,9 +362,7 @@ def test_a_death_that_is_mended_is_logged(lane: str, caplog: pytest.LogCaptureFi
 @lanes
 def test_a_fresh_jail_has_no_attributes_of_the_last(lane: str) -> None:
     """What was set in a jail that was given up, no row of the next one gets."""
-    with made(lane, timeouts={"step_s": 0.05}) as suites:
-        env = suites.env
-        env.reset(seed=SEED)
+    with begun(lane, timeouts={"step_s": 0.05}) as env:
         env.set_attr("weight", 7)
         with pytest.raises(errors.WorkerTimeoutError):
             env.step([SPIN, LIVE, LIVE, LIVE])
@@ -391,61 +375,47 @@ def test_a_fresh_jail_has_no_attributes_of_the_last(lane: str) -> None:
             env.get_attr("weight")
 
 
-@lanes
-def test_a_death_between_requests_is_met_by_the_next(lane: str) -> None:
+def test_a_death_between_requests_is_met_by_the_next(env: Any) -> None:
     """Killed from outside while nothing is asked: a call says so, a step brings it back."""
-    with made(lane) as suites:
-        env = suites.env
-        env.reset(seed=SEED)
-        victim = inside.pids(env)[1]
-        os.kill(victim, signal.SIGKILL)
-        assert eventually(lambda: not psutil.pid_exists(victim))
-        with pytest.raises(errors.WorkerDiedError, match="SIGKILL"):
-            env.get_attr("steps")
-        observation, _, _, truncated, info = env.step(ALL_LIVE)
-        assert truncated.tolist() == [False, False, True, True]
-        assert observation[:, 1].tolist() == [1, 1, 0, 0]
-        assert restarted(info)
+    victim = inside.pids(env)[1]
+    os.kill(victim, signal.SIGKILL)
+    assert eventually(lambda: not psutil.pid_exists(victim))
+    with pytest.raises(errors.WorkerDiedError, match="SIGKILL"):
+        env.get_attr("steps")
+    observation, _, _, truncated, info = env.step(ALL_LIVE)
+    assert truncated.tolist() == [False, False, True, True]
+    assert observation[:, 1].tolist() == [1, 1, 0, 0]
+    assert restarted(info)
 
 
-@lanes
-def test_a_reset_brings_back_who_died_between_requests(lane: str) -> None:
+def test_a_reset_brings_back_who_died_between_requests(env: Any) -> None:
     """It is a reset as any other; the infos say what happened."""
-    with made(lane) as suites:
-        env = suites.env
-        env.reset(seed=SEED)
-        os.kill(inside.pids(env)[1], signal.SIGKILL)
-        observation, info = env.reset(seed=SEED)
-        assert np.array_equal(observation, oracle().reset(seed=SEED)[0])
-        assert restarted(info)
+    os.kill(inside.pids(env)[1], signal.SIGKILL)
+    observation, info = env.reset(seed=SEED)
+    assert np.array_equal(observation, oracle().reset(seed=SEED)[0])
+    assert restarted(info)
 
 
-@lanes
-def test_the_end_of_the_jail_takes_all_rows(lane: str) -> None:
+def test_the_end_of_the_jail_takes_all_rows(env: Any) -> None:
     """Its first process holds the others: all come back, in another jail."""
-    with made(lane) as suites:
-        env = suites.env
-        env.reset(seed=SEED)
-        jail = inside.jail(env).number
-        runners = inside.pids(env)
-        init = psutil.Process(runners[0]).parent()
-        assert init is not None
-        init.kill()
-        assert eventually(lambda: not any(map(psutil.pid_exists, runners)))
-        observation, _, _, truncated, info = env.step(ALL_LIVE)
-        assert truncated.all()
-        assert restarted(info, slice(4))
-        assert np.array_equal(observation, fresh(1, slice(4)))
-        assert inside.jail(env).number != jail
+    jail = inside.jail(env).number
+    runners = inside.pids(env)
+    init = psutil.Process(runners[0]).parent()
+    assert init is not None
+    init.kill()
+    assert eventually(lambda: not any(map(psutil.pid_exists, runners)))
+    observation, _, _, truncated, info = env.step(ALL_LIVE)
+    assert truncated.all()
+    assert restarted(info, slice(4))
+    assert np.array_equal(observation, fresh(1, slice(4)))
+    assert inside.jail(env).number != jail
 
 
 @lanes
 def test_memory_of_all_takes_all_rows(lane: str) -> None:
     """The limit is the jail's: where it cannot be told who has broken it, all shards come back."""
     limits = {"memory_bytes": 400 << 20}
-    with made(lane, policy={"limits": limits}) as suites:
-        env = suites.env
-        env.reset(seed=SEED)
+    with begun(lane, policy={"limits": limits}) as env:
         _, _, _, truncated, info = env.step([LIVE, LIVE, LIVE, MEMORY])
         assert truncated[DEAD].all()
         assert info["worker_restarted"][DEAD].all()
@@ -456,52 +426,38 @@ def test_memory_of_all_takes_all_rows(lane: str) -> None:
 
 def test_the_cpu_limit_takes_one_process() -> None:
     """It is each process's own, and the fresh one has it from the start."""
-    with made(policy={"limits": {"cpu_time_s": 2}}) as suites:
-        env = suites.env
-        env.reset(seed=SEED)
+    with begun(policy={"limits": {"cpu_time_s": 2}}) as env:
         observation, _, _, truncated, info = env.step([LIVE, LIVE, LIVE, SPIN])
         assert truncated.tolist() == [False, False, True, True]
         assert observation[:, 1].tolist() == [1, 1, 0, 0]
         assert restarted(info)
 
 
-@lanes
-def test_one_that_raises_beside_a_death_is_told_first(lane: str) -> None:
+def test_one_that_raises_beside_a_death_is_told_first(env: Any) -> None:
     """The exception is the step's; the death is met by the next step."""
-    with made(lane) as suites:
-        env = suites.env
-        env.reset(seed=SEED)
-        with pytest.raises(errors.RemoteEnvError, match="as told"):
-            env.step([LIVE, RAISE, LIVE, EXIT])
-        assert inside.state(env) is State.READY
-        assert restarted(env.step(ALL_LIVE)[4])
+    with pytest.raises(errors.RemoteEnvError, match="as told"):
+        env.step([LIVE, RAISE, LIVE, EXIT])
+    assert inside.state(env) is State.READY
+    assert restarted(env.step(ALL_LIVE)[4])
 
 
-@lanes
-def test_a_late_sibling_is_a_timeout_all_the_same(lane: str) -> None:
+def test_a_late_sibling_is_a_timeout_all_the_same(env: Any) -> None:
     """The dead do not make the living answer; a reset brings everybody back."""
-    with made(lane) as suites:
-        env = suites.env
-        env.reset(seed=SEED)
-        with halted(inside.pids(env)[:1]):
-            env.step_async([LIVE, LIVE, LIVE, EXIT])
-            with pytest.raises(errors.WorkerTimeoutError):
-                env.step_wait(timeout=0.1)
-        assert inside.state(env) is State.LATE
-        observation, _ = env.reset(seed=SEED)
-        assert np.array_equal(observation, oracle().reset(seed=SEED)[0])
-        assert env.step(ALL_LIVE)[0][:, 1].tolist() == [1, 1, 1, 1]
+    with halted(inside.pids(env)[:1]):
+        env.step_async([LIVE, LIVE, LIVE, EXIT])
+        with pytest.raises(errors.WorkerTimeoutError):
+            env.step_wait(timeout=0.1)
+    assert inside.state(env) is State.LATE
+    observation, _ = env.reset(seed=SEED)
+    assert np.array_equal(observation, oracle().reset(seed=SEED)[0])
+    assert env.step(ALL_LIVE)[0][:, 1].tolist() == [1, 1, 1, 1]
 
 
-@lanes
-def test_a_slow_sibling_is_waited_for(lane: str) -> None:
+def test_a_slow_sibling_is_waited_for(env: Any) -> None:
     """Its row is its real result."""
-    with made(lane) as suites:
-        env = suites.env
-        env.reset(seed=SEED)
-        observation, _, _, truncated, _ = env.step([SLOW, LIVE, LIVE, EXIT])
-        assert observation[:, 1].tolist() == [1, 1, 0, 0]
-        assert truncated.tolist() == [False, False, True, True]
+    observation, _, _, truncated, _ = env.step([SLOW, LIVE, LIVE, EXIT])
+    assert observation[:, 1].tolist() == [1, 1, 0, 0]
+    assert truncated.tolist() == [False, False, True, True]
 
 
 @lanes
@@ -523,9 +479,7 @@ def test_budget_ends_in_the_death_itself(lane: str) -> None:
 
 def test_lent_observations_come_back_too() -> None:
     """Rows that are lent out are nobody's to overwrite."""
-    with made(copy=False) as suites:
-        env = suites.env
-        env.reset(seed=SEED)
+    with begun(copy=False) as env:
         before = env.step(ALL_LIVE)[0]
         kept = before.copy()
         observation = env.step(LAST_DIES)[0]
@@ -537,9 +491,7 @@ def test_lent_observations_come_back_too() -> None:
 
 def test_an_environment_with_a_step_of_its_own_comes_back_whole() -> None:
     """It is reset, all rows are truncated, and its next step is a step."""
-    with made(shards=1, env_kwargs={"form": "whole"}) as suites:
-        env = suites.env
-        env.reset(seed=SEED)
+    with begun(shards=1, env_kwargs={"form": "whole"}) as env:
         observation, rewards, _, truncated, info = env.step(LAST_DIES)
         assert truncated.all()
         assert not rewards.any()
@@ -563,9 +515,7 @@ def test_environments_of_one_jail_come_back_each_on_its_own() -> None:
 
 def test_close_does_not_wait_for_who_is_coming_back() -> None:
     """From another thread, while ``make_env`` hangs in the fresh process."""
-    with made(env_kwargs={"form": "slow"}, shards=1) as suites:
-        env = suites.env
-        env.reset(seed=SEED)
+    with begun(env_kwargs={"form": "slow"}, shards=1) as env:
         closing = threading.Timer(0.3, env.close)
         closing.start()
         with pytest.raises(ClosedEnvironmentError):
@@ -576,9 +526,7 @@ def test_close_does_not_wait_for_who_is_coming_back() -> None:
 
 def test_coming_back_has_a_deadline() -> None:
     """A fresh process that does not load in time is a timeout; a reset starts afresh."""
-    with made(env_kwargs={"form": "slow"}, shards=1) as suites:
-        env = suites.env
-        env.reset(seed=SEED)
+    with begun(env_kwargs={"form": "slow"}, shards=1) as env:
         with (
             inside.hurried(env, startup_s=2.0),
             pytest.raises(errors.WorkerTimeoutError, match="make_env"),
@@ -599,9 +547,7 @@ def test_interrupted_in_coming_back_it_starts_afresh(tmp_path: Path) -> None:
 
     try:
         policy = {"output": str(output)}
-        with made(env_kwargs={"form": "slow"}, shards=1, policy=policy) as suites:
-            env = suites.env
-            env.reset(seed=SEED)
+        with begun(env_kwargs={"form": "slow"}, shards=1, policy=policy) as env:
             coming = threading.Thread(target=interrupt)
             with pytest.raises(KeyboardInterrupt):
                 coming.start(), env.step(LAST_DIES)

@@ -9,6 +9,8 @@ from envhub_sandbox import make_env
 from tests.support.command_line import python
 from tests.support.samples import EXAMPLES
 
+pytestmark = pytest.mark.short
+
 
 @pytest.mark.parametrize(
     ("name", "tasks", "frame"),

@@ -11,7 +11,7 @@ import pytest
 from tests.hub.olah_server import OlahServer
 from tests.lerobot.kit import run
 from tests.lerobot.repositories import publish
-from tests.support import blocks
+from tests.support.documents import blocks
 
 pytest.importorskip("torch")
 

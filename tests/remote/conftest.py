@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
 from tests.remote.listening import Listening, counting, listening
 from tests.support import inside
+from tests.support.started import started
 
 IMPATIENT_S = 8
 
@@ -42,3 +45,11 @@ def wait_no_more(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
 def repository(tmp_path: Path) -> Path:
     """A repository whose action says how long a step takes."""
     return counting(tmp_path / "repository")
+
+
+@pytest.fixture
+def good(server: Listening, repository: Path) -> Iterator[Any]:
+    """A client's environment, which must go on; afterwards it is still the same one."""
+    with started(repository, sandbox=server.sandbox()) as env:
+        yield env
+        assert env.step(np.array([0]))[0].tolist() == [[1.0]]

@@ -20,6 +20,13 @@ from tests.support.processes import eventually
 _BOOTSTRAP = Path(envhub_worker.protocol.__file__).parent.parent / "bootstrap.py"
 WORKER = (sys.executable, "-I", str(_BOOTSTRAP), "worker")
 
+
+def worker(*words: object, timeout_s: float = 120) -> subprocess.CompletedProcess[str]:
+    """What ``envhub-worker`` says to these words, and how it ends."""
+    command = [*WORKER, *map(str, words)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)
+
+
 # counts its steps, so that everybody sees whether it is still the same one
 COUNTING = """
 import time
@@ -93,15 +100,21 @@ class Listening:
         return int(psutil.Process(self.process.pid).memory_info().rss)
 
     def sessions(self) -> list[dict[str, Any]]:
-        """What ``envhub-worker status`` says; the asker is not among them."""
-        done = subprocess.run(
-            [*WORKER, "status", "--state-dir", str(self.state), "--json"],
-            capture_output=True,
-            check=True,
-            timeout=60,
-        )
-        found: list[dict[str, Any]] = json.loads(done.stdout)["sessions"]
+        """Those that it has; the asker's is not among them."""
+        found: list[dict[str, Any]] = self.status()["sessions"]
         return found
+
+    def status(self) -> dict[str, Any]:
+        """What ``envhub-worker status`` says to its operator."""
+        done = worker("status", "--state-dir", self.state, "--json")
+        assert done.returncode == 0, done.stderr
+        found: dict[str, Any] = json.loads(done.stdout)
+        return found
+
+    def as_client(self) -> tuple[str, ...]:
+        """Options by which ``envhub-worker`` asks this server with its client's key."""
+        key = str(self.state / "client.key")
+        return "--endpoint", self.endpoint, "--server-key", self.public, "--key", key
 
     def jails(self) -> int:
         """How many are open, of whomever."""

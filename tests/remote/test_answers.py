@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import msgpack
-import numpy as np
 import pytest
 
-from envhub_sandbox import make_env
 from envhub_worker.access import keys
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
 from tests.remote.listening import Listening
-from tests.remote.test_clients import Peer, peer
+from tests.remote.peers import Peer, peer
 
 MIB = 1 << 20
 
@@ -26,15 +23,6 @@ def client(server: Listening) -> Iterator[Peer]:
     with peer(server, keys.load(server.state / "client.key")) as found:
         assert isinstance(found.ask(m.Hello(m.VERSION, b"unruly")), m.Welcome)
         yield found
-
-
-@pytest.fixture
-def good(server: Listening, repository: Path) -> Iterator[Any]:
-    """Another client's environment; afterwards it is still the same one."""
-    with make_env(repository, sandbox=server.sandbox()) as suites:
-        suites.env.reset(seed=1)
-        yield suites.env
-        assert suites.env.step(np.array([0]))[0].tolist() == [[1.0]]
 
 
 def raw(client: Peer, number: int, *fields: object) -> list[bytes]:

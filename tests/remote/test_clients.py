@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import zmq
 
-from envhub_sandbox import make_env
 from envhub_sandbox.transport.connection import remote_session_id
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_worker.access import keys
-from envhub_worker.access.keys import KeyPair
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import Confinement
 from envhub_worker.protocol.keys import key_text
 from tests.remote.listening import Listening, listening
+from tests.remote.peers import Peer, peer
 from tests.support import inside
+from tests.support.started import started
 
 ALICE, MALLORY = keys.generate(), keys.generate()
 
@@ -41,49 +39,9 @@ def shared(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Listening]:
 @pytest.fixture
 def alice(shared: Listening, repository: Path) -> Iterator[Any]:
     """Her environment, which goes on whatever Mallory does."""
-    with make_env(repository, sandbox=shared.sandbox(client_key=key_text(ALICE.secret))) as suites:
-        suites.env.reset(seed=1)
-        yield suites.env
-        assert suites.env.step(np.array([0]))[0].tolist() == [[1.0]]
-
-
-class Peer:
-    """A socket with a key, that says what it likes."""
-
-    def __init__(self, socket: zmq.Socket[bytes]) -> None:
-        self.socket = socket
-        self.number = 0
-
-    def tell(self, message: m.Message, *payload: bytes) -> None:
-        """Send a request."""
-        self.number += 1
-        self.socket.send_multipart([*m.pack_header(message, self.number), *payload])
-
-    def ask(self, message: m.Message, *payload: bytes) -> m.Message:
-        """Send a request; its reply."""
-        self.tell(message, *payload)
-        assert self.socket.poll(30_000)
-        return m.unpack_header(self.socket.recv_multipart()[0])[1]
-
-    def refused(self, message: m.Message, *payload: bytes) -> m.Refusal:
-        """The refusal of a request."""
-        reply = self.ask(message, *payload)
-        assert isinstance(reply, m.Refusal), reply
-        return reply
-
-
-@contextmanager
-def peer(server: Listening, pair: KeyPair, *, routing_id: bytes = b"") -> Iterator[Peer]:
-    """A socket with the keys of somebody."""
-    with zmq.Context() as context, context.socket(zmq.DEALER) as socket:
-        socket.setsockopt(zmq.LINGER, 0)
-        socket.setsockopt(zmq.CURVE_SERVERKEY, bytes.fromhex(server.public))
-        socket.setsockopt(zmq.CURVE_PUBLICKEY, pair.public)
-        socket.setsockopt(zmq.CURVE_SECRETKEY, pair.secret)
-        if routing_id:
-            socket.setsockopt(zmq.ROUTING_ID, routing_id)
-        socket.connect(server.endpoint)
-        yield Peer(socket)
+    with started(repository, sandbox=shared.sandbox(client_key=key_text(ALICE.secret))) as env:
+        yield env
+        assert env.step(np.array([0]))[0].tolist() == [[1.0]]
 
 
 @pytest.fixture

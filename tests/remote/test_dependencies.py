@@ -32,9 +32,10 @@ from envhub_worker.access.quotas import BusyError, Quotas
 from envhub_worker.protocol import messages as m
 from envhub_worker.supervisor.records import RefusedError
 from tests.remote.listening import Listening, listening
+from tests.support.command_line import below, gone
+from tests.support.packages.wheels import Index, make_wheel
 from tests.support.processes import eventually
 from tests.support.repositories import write_repository
-from tests.support.wheels import Index, make_wheel
 
 ENV = """
 import sys
@@ -294,31 +295,15 @@ def test_the_program_and_its_uv_end_with_who_started_them(killed: str, tmp_path:
                 found = psutil.Process(server.pid)
                 stack.callback(index.accept()[0].close)  # from here on uv waits for an answer
                 [watcher] = found.children()
-                rest = below(watcher)
+                rest = below(watcher.pid)
                 assert len(rest) >= 2  # one that works, and its uv
                 (found if killed == "the server" else watcher).kill()
-                assert eventually(lambda: not any(is_alive(one) for one in rest))
-                assert killed != "the server" or eventually(lambda: not is_alive(watcher))
+                assert eventually(lambda: gone(rest))
+                assert killed != "the server" or eventually(lambda: gone([watcher]))
             finally:
-                for one in below(found):
+                for one in below(server.pid):
                     one.kill()
                 server.kill()
-
-
-def below(process: psutil.Process) -> list[psutil.Process]:
-    """What it has started, and what that has."""
-    try:
-        return process.children(recursive=True)
-    except psutil.NoSuchProcess:
-        return []
-
-
-def is_alive(process: psutil.Process) -> bool:
-    """Whether it is there, and not only its entry."""
-    try:
-        return process.status() != psutil.STATUS_ZOMBIE
-    except psutil.NoSuchProcess:
-        return False
 
 
 def test_a_program_that_cannot_be_started_is_not_tried_for_ever(

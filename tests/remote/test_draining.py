@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import signal
-import subprocess
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -20,10 +19,11 @@ from envhub_worker.access.audit.log import Log
 from envhub_worker.access.drain import Drain
 from envhub_worker.access.quotas import BusyError
 from envhub_worker.protocol import messages as m
-from tests.remote.listening import WORKER, Listening, listening
-from tests.remote.test_clients import peer
+from tests.remote.listening import Listening, listening, worker
+from tests.remote.peers import peer
 from tests.support.ports import lasting_port
 from tests.support.processes import eventually
+from tests.support.started import started
 
 _LONG = ("--drain-s", "600")
 
@@ -47,8 +47,7 @@ def test_what_runs_goes_on_and_nothing_new_comes_in(tmp_path: Path, repository: 
     """The refusal is typed; with the last jail the server ends, long before its time is up."""
     with listening(tmp_path / "server", *_LONG) as server:
         pair = keys.load(server.state / "client.key")
-        with make_env(repository, sandbox=server.sandbox()) as suites:
-            suites.env.reset(seed=1)
+        with started(repository, sandbox=server.sandbox()) as env:
             server.process.terminate()
             assert draining(server)
             with pytest.raises(ServerBusyError, match="about to end") as caught:
@@ -57,7 +56,7 @@ def test_what_runs_goes_on_and_nothing_new_comes_in(tmp_path: Path, repository: 
             with peer(server, pair) as stranger:
                 refused = stranger.refused(m.Hello(m.VERSION, b"new"))
                 assert (refused.error, refused.missing) == ("ServerBusyError", "draining")
-            assert suites.env.step(np.array([0]))[0].tolist() == [[1.0]]
+            assert env.step(np.array([0]))[0].tolist() == [[1.0]]
             assert server.process.poll() is None
         assert ends(server)
         assert server.process.returncode == 0
@@ -66,14 +65,13 @@ def test_what_runs_goes_on_and_nothing_new_comes_in(tmp_path: Path, repository: 
 def test_whose_time_is_up_is_told_why(tmp_path: Path, repository: Path) -> None:
     """Its jail is ended before the server is, and not with a connection that is lost."""
     with listening(tmp_path / "server", "--drain-s", "1") as server:
-        with make_env(repository, sandbox=server.sandbox()) as suites:
-            suites.env.reset(seed=1)
-            suites.env.step_async(np.array([6000]))
+        with started(repository, sandbox=server.sandbox()) as env:
+            env.step_async(np.array([6000]))
             # else a machine that stands still meanwhile has nobody left who could be told
             assert eventually(lambda: "step" in operations(server))
             server.process.terminate()
             with pytest.raises(WorkerDiedError, match="the server ends") as caught:
-                suites.env.step_wait()
+                env.step_wait()
             assert caught.value.reason == "idle"
         assert ends(server)
 
@@ -92,32 +90,29 @@ def test_a_second_signal_ends_at_once(
     """So does the first, if no time was given to what runs, and Ctrl-C always."""
     with (
         listening(tmp_path / "server", *options) as server,
-        make_env(repository, sandbox=server.sandbox()) as suites,
+        started(repository, sandbox=server.sandbox()) as env,
     ):
-        suites.env.reset(seed=1)
         for number in numbers[:-1]:
             server.process.send_signal(number)
             assert draining(server)
         server.process.send_signal(numbers[-1])
         assert ends(server)
         with pytest.raises(WorkerDiedError):
-            suites.env.step(np.array([0]))
+            env.step(np.array([0]))
 
 
 def test_drain_is_told_to_the_server_of_the_state_folder(tmp_path: Path) -> None:
     """``envhub-worker drain`` waits for its end, and says so where there is none to be told."""
     with listening(tmp_path / "server", *_LONG) as server:
-        command = [*WORKER, "drain", "--state-dir", str(server.state)]
-        done = subprocess.run(command, capture_output=True, timeout=120)
+        done = worker("drain", "--state-dir", server.state)
         assert done.returncode == 0, done.stderr
         assert server.process.wait(60) == 0
         assert "info draining " in server.said()
-        done = subprocess.run(command, capture_output=True, timeout=120, text=True)
+        done = worker("drain", "--state-dir", server.state)
         assert done.returncode == 1
         assert "is running here" in done.stderr
     with listening(tmp_path / "open", "--insecure-loopback") as server:
-        command[-1] = str(server.state)
-        done = subprocess.run(command, capture_output=True, timeout=120, text=True)
+        done = worker("drain", "--state-dir", server.state)
         assert done.returncode == 1
         assert "SIGTERM" in done.stderr
 
@@ -125,13 +120,12 @@ def test_drain_is_told_to_the_server_of_the_state_folder(tmp_path: Path) -> None
 def test_a_second_drain_only_waits(tmp_path: Path, repository: Path) -> None:
     """It is no second signal, which would end what runs."""
     with listening(tmp_path / "server", *_LONG) as server:
-        command = [*WORKER, "drain", "--state-dir", str(server.state), "--no-wait"]
-        with make_env(repository, sandbox=server.sandbox()) as suites:
-            suites.env.reset(seed=1)
+        with started(repository, sandbox=server.sandbox()) as env:
             for _ in range(2):
-                subprocess.run(command, check=True, timeout=60, capture_output=True)
+                done = worker("drain", "--state-dir", server.state, "--no-wait")
+                assert done.returncode == 0, done.stderr
                 assert draining(server)
-            assert suites.env.step(np.array([0]))[0].tolist() == [[1.0]]
+            assert env.step(np.array([0]))[0].tolist() == [[1.0]]
             assert server.process.poll() is None
         assert ends(server)
 

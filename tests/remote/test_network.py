@@ -23,6 +23,7 @@ from tests.remote.listening import Listening, counting, listening
 from tests.remote.relay import relay
 from tests.support import inside
 from tests.support.processes import eventually
+from tests.support.started import started
 
 HEARTBEAT_S = 1.0
 
@@ -47,11 +48,10 @@ def test_another_host_serves_what_it_was_sent(
 ) -> None:
     """With packets lost on the way, steps are the ones of the one environment over there."""
     far.disturb(delay_ms=5, loss_percent=2)
-    with make_env(repository, n_envs=2, sandbox=far_server.sandbox()) as suites:
-        suites.env.reset(seed=1)
+    with started(repository, n_envs=2, sandbox=far_server.sandbox()) as env:
         for count in range(1, 30):
-            assert suites.env.step(np.zeros(2, int))[0].tolist() == [[count], [count]]
-        assert {layer["layer"] for layer in suites.env.sandbox.report()} >= {"seccomp", "landlock"}
+            assert env.step(np.zeros(2, int))[0].tolist() == [[count], [count]]
+        assert {layer["layer"] for layer in env.sandbox.report()} >= {"seccomp", "landlock"}
     assert eventually(lambda: far_server.jails() == 0)
 
 
@@ -61,30 +61,28 @@ def test_a_partition_ends_a_step_and_a_reset_begins_anew(
     """Who waits hears of it by the heartbeat; with the cable in again, reset() has a fresh jail."""
     sandbox = far_server.sandbox(heartbeat_s=HEARTBEAT_S)
     options = {"timeouts": {"step_s": 120.0}, "policy": {"restart": "on_reset"}}
-    with make_env(repository, sandbox=sandbox, **options) as suites:
-        suites.env.reset(seed=1)
-        suites.env.step_async(np.array([50]))
+    with started(repository, sandbox=sandbox, **options) as env:
+        env.step_async(np.array([50]))
         far.unplug()
         with pytest.raises(WorkerDiedError, match=r"connection to tcp://.* was lost") as caught:
-            suites.env.step_wait()
+            env.step_wait()
         assert caught.value.reason == "connection"
         far.plug()
-        suites.env.reset(seed=1)
-        assert suites.env.step(np.array([0]))[0].tolist() == [[1.0]]
+        env.reset(seed=1)
+        assert env.step(np.array([0]))[0].tolist() == [[1.0]]
 
 
 def test_a_client_that_comes_back_finds_its_jail_again(
     far_server: Listening, far: OtherHost, repository: Path
 ) -> None:
     """A connection that was lost between two steps is made anew; the episode goes on."""
-    with make_env(repository, sandbox=far_server.sandbox(heartbeat_s=HEARTBEAT_S)) as suites:
-        suites.env.reset(seed=1)
-        suites.env.step(np.array([0]))
-        link = inside.link(suites.env)
+    with started(repository, sandbox=far_server.sandbox(heartbeat_s=HEARTBEAT_S)) as env:
+        env.step(np.array([0]))
+        link = inside.link(env)
         far.unplug()
         assert eventually(lambda: link.drain() or not inside.link_is_up(link))
         far.plug()
-        assert suites.env.step(np.array([0]))[0].tolist() == [[2.0]]
+        assert env.step(np.array([0]))[0].tolist() == [[2.0]]
 
 
 def test_nobody_at_the_other_end_is_said_to_be_so(
@@ -104,12 +102,11 @@ def test_a_connection_that_breaks_between_steps_is_made_anew(
     """Without another host: the wire breaks, the session is found again."""
     with (
         relay(server.port) as wire,
-        make_env(repository, sandbox=server.sandbox(endpoint=wire.endpoint)) as suites,
+        started(repository, sandbox=server.sandbox(endpoint=wire.endpoint)) as env,
     ):
-        suites.env.reset(seed=1)
         for count in range(1, 4):
-            assert suites.env.step(np.array([0]))[0].tolist() == [[count]]
-            link = inside.link(suites.env)
+            assert env.step(np.array([0]))[0].tolist() == [[count]]
+            link = inside.link(env)
             before = inside.link_losses(link)
             wire.cut()
             assert eventually(lambda: link.drain() or inside.link_losses(link) > before)  # noqa: B023
@@ -119,21 +116,19 @@ def test_a_slow_wire_changes_no_result(server: Listening, repository: Path) -> N
     """Each piece is delayed; a step is one round trip, and step_async waits for nothing."""
     with (
         relay(server.port, delay_s=0.02) as wire,
-        make_env(repository, sandbox=server.sandbox(endpoint=wire.endpoint)) as suites,
+        started(repository, sandbox=server.sandbox(endpoint=wire.endpoint)) as env,
     ):
-        suites.env.reset(seed=1)
         for count in range(1, 5):
-            suites.env.step_async(np.array([0]))
-            assert suites.env.step_wait()[0].tolist() == [[count]]
+            env.step_async(np.array([0]))
+            assert env.step_wait()[0].tolist() == [[count]]
 
 
 def test_a_long_step_is_no_lost_connection(server: Listening, repository: Path) -> None:
     """Heartbeats are answered while the environment computes for several of them."""
 
     def steps() -> bool:
-        with make_env(repository, sandbox=server.sandbox(heartbeat_s=0.4)) as suites:
-            suites.env.reset(seed=1)
-            return bool(suites.env.step(np.array([20]))[0].tolist() == [[1.0]])
+        with started(repository, sandbox=server.sandbox(heartbeat_s=0.4)) as env:
+            return bool(env.step(np.array([20]))[0].tolist() == [[1.0]])
 
     # a machine that takes its core from the server for so long does lose a connection
     for _ in range(9):
@@ -147,16 +142,15 @@ def test_a_client_that_was_silent_for_too_long_is_told_so(
     impatient: Listening, repository: Path
 ) -> None:
     """Its jail was ended; when it comes back it hears why."""
-    with make_env(repository, sandbox=impatient.sandbox()) as suites:
-        suites.env.reset(seed=1)
-        inside.fall_silent(suites.env)
+    with started(repository, sandbox=impatient.sandbox()) as env:
+        inside.fall_silent(env)
         # the last that is heard says what is held: else that could count as given up before
-        held = m.KeepAlive((inside.jail(suites.env).number,))
-        inside.client(suites.env).request(held, deadline=Deadline(60))
+        held = m.KeepAlive((inside.jail(env).number,))
+        inside.client(env).request(held, deadline=Deadline(60))
         assert eventually(lambda: impatient.jails() == 0)
         said = f"nothing was heard of its client for {IMPATIENT_S} s"
         with pytest.raises(WorkerDiedError, match=said):
-            suites.env.step(np.array([0]))
+            env.step(np.array([0]))
 
 
 def test_a_restarted_server_says_that_the_jail_is_gone(tmp_path: Path) -> None:

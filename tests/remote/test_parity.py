@@ -19,6 +19,7 @@ def pair(request: pytest.FixtureRequest, case: Case, server: Listening) -> Itera
         yield both
 
 
+@pytest.mark.short
 class TestCounter(VectorEnvCompliance):
     """Every kind of value in the infos, over two processes."""
 
@@ -35,6 +36,7 @@ class TestCartPole(VectorEnvCompliance):
     steps = 300
 
 
+@pytest.mark.short
 class TestExoticSpaces(VectorEnvCompliance):
     """Spaces that have no fixed layout."""
 

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from envhub_sandbox import make_env
 from envhub_sandbox.sandboxes import upload
 from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
@@ -22,6 +21,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.supervisor.records import RefusedError
 from tests.remote.listening import Listening, counting
 from tests.support import inside
+from tests.support.started import started
 
 ALICE, BOB = b"a" * 32, b"b" * 32
 OWNER = ALICE + b"session"
@@ -293,10 +293,9 @@ def test_only_the_edited_file_travels_to_a_real_server(server: Listening, tmp_pa
     """A large file goes once; after an edit of another one it stays where it is."""
     data = os.urandom(3 * upload.PIECE_BYTES + 17)
     repository = counting(tmp_path / "large", files={"weights.bin": data, "empty": b""})
-    with make_env(repository, sandbox=server.sandbox()) as suites:
-        suites.env.reset(seed=1)
-        suites.env.step(np.array([0]))
-        remote = inside.server(suites.env)
+    with started(repository, sandbox=server.sandbox()) as env:
+        env.step(np.array([0]))
+        remote = inside.server(env)
         client = WorkerConnection(remote.endpoint, remote.process_fd, far=remote.far)
         client.hello(Deadline(30))
         (repository / "empty").write_bytes(b"no more")

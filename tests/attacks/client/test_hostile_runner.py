@@ -114,6 +114,7 @@ def neighbour(arena: Arena) -> Any:
         env.step([0])
 
 
+@pytest.mark.short("strict")
 @pytest.mark.parametrize(
     "place", ["observation", "rewards", "info"], ids=["observation", "rewards", "info"]
 )
@@ -146,6 +147,7 @@ BOMBS: dict[str, list[Buffer]] = {
 }
 
 
+@pytest.mark.short("strict")
 @pytest.mark.parametrize("what", list(BOMBS))
 def test_bombs_from_a_jail_are_refused(arena: Arena, neighbour: Any, home: Path, what: str) -> None:
     """Whatever frames a jail sends, client and server refuse them in bounded memory."""

@@ -51,6 +51,8 @@ from tests.support import inside
 from tests.support.repositories import CARTPOLES, write_repository
 from tests.support.wire import decode_space, deep, ext, packed, value
 
+pytestmark = pytest.mark.short
+
 
 def test_canary_sings(tmp_path: Path) -> None:
     """The control: loading the pickle executes it."""

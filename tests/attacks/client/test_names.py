@@ -40,9 +40,10 @@ from tests.attacks.client.lying_server import (
     manifest,
 )
 from tests.attacks.harness import Arena
-from tests.support import curious, inside
-from tests.support.curious import do
-from tests.support.protocol_names import names_that_libraries_call
+from tests.support import inside
+from tests.support.objects import curious
+from tests.support.objects.curious import do
+from tests.support.objects.protocol_names import names_that_libraries_call
 from tests.support.repositories import write_repository
 
 FAMILY = "The client, by what libraries do with any object"

@@ -25,6 +25,7 @@ def secret_file(path: Path) -> str:
     return secret
 
 
+@pytest.mark.short("strict")
 @pytest.mark.parametrize(
     ("what", "place"),
     [

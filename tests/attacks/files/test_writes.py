@@ -27,6 +27,7 @@ def open_file(path: Path, text: str) -> Path:
     return path
 
 
+@pytest.mark.short("strict-a file in the home")
 @pytest.mark.parametrize(
     ("title", "place"),
     [
@@ -53,6 +54,7 @@ def test_files_outside_cannot_be_written(arena: Arena, home: Path, title: str, p
         path.unlink()
 
 
+@pytest.mark.short("strict-/tmp")
 @pytest.mark.parametrize(
     ("title", "folder"),
     [

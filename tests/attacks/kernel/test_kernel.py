@@ -79,6 +79,7 @@ CHILDREN: dict[str, tuple[str, dict[str, str], Look]] = {
 }
 
 
+@pytest.mark.short("strict-user", "strict-mount")
 @pytest.mark.parametrize("title", CHILDREN)
 def test_no_child_has_other_namespaces_mounts_or_roots(arena: Arena, title: str) -> None:
     """No process of a jail leaves its user namespace, and none of its mounts can be changed."""

@@ -46,6 +46,7 @@ ROOTS: dict[str, tuple[str, dict[str, Any], dict[str, Any], str]] = {
 }
 
 
+@pytest.mark.short("strict-TCP", "strict-DNS")
 @pytest.mark.parametrize("title", WAYS)
 def test_nothing_gets_out(arena: Arena, title: str) -> None:
     """A listener on the host never hears what is sent."""

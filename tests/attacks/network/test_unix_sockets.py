@@ -13,6 +13,7 @@ from tests.attacks.network.listeners import listening, sends
 FAMILY = "AF_UNIX sockets"
 
 
+@pytest.mark.short("strict-a docker socket")
 @pytest.mark.parametrize(
     ("title", "place"),
     [

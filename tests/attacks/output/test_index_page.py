@@ -6,7 +6,7 @@ import html
 from pathlib import Path
 
 from tests.support.command_line import envhub
-from tests.support.pages import Page
+from tests.support.output.pages import Page
 
 _SCRIPT = "<script>alert(1)<!--"
 _IMAGE = "<img src=x onerror='alert(1)'>.py"

@@ -16,7 +16,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import Confinement
 from envhub_worker.protocol.keys import key_text
 from tests.remote.listening import Listening, listening
-from tests.remote.test_clients import Peer, peer
+from tests.remote.peers import Peer, peer
 from tests.support.processes import eventually
 
 MALLORY = keys.generate()

@@ -121,6 +121,7 @@ class Painter(Plain):
 """
 
 
+@pytest.mark.short("strict")
 def test_errors_do_not_paint(arena: Arena, home: Path) -> None:
     """Class names, messages, tracebacks and output arrive with their control characters spelt."""
     folder = write_environment(home / "painter", _ENV)

@@ -19,8 +19,8 @@ from envhub_sandbox.dependencies.resolutions import lock_for
 from envhub_sandbox.errors import DependencyError
 from tests.attacks.harness import Arena, kill_named, new_alias, pids_named, token
 from tests.attacks.network.listeners import TCP, listening
+from tests.support.packages.sdists import backend, make_sdist
 from tests.support.processes import eventually
-from tests.support.sdists import backend, make_sdist
 
 FAMILY = "Sources that are built"
 _CONTROL_S = 120.0

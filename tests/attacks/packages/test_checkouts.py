@@ -15,7 +15,10 @@ from envhub_sandbox.hub.checkout import read_checkout
 from envhub_sandbox.hub.snapshot import snapshot_named
 from tests.hub.olah_server import GitRepository
 
-pytestmark = pytest.mark.skipif(shutil.which("git") is None, reason="needs git")
+pytestmark = [
+    pytest.mark.short,
+    pytest.mark.skipif(shutil.which("git") is None, reason="needs git"),
+]
 
 
 @pytest.fixture

@@ -14,7 +14,7 @@ from envhub_worker.protocol.runtime import Runtime
 from tests.attacks.harness import Arena, control_run, run_in, token
 from tests.attacks.hostile.payloads.change_tree import WAYS
 from tests.attacks.packages import trapped_packages as traps
-from tests.support.environments import base_interpreter, running_on
+from tests.support.packages.environments import base_interpreter, running_on
 from tests.support.trees import fingerprint
 
 FAMILY = "Copies of what is shared"

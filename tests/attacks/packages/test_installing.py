@@ -28,9 +28,9 @@ from envhub_worker.access.quotas import Quotas
 from envhub_worker.protocol import messages as m
 from envhub_worker.supervisor.records import RefusedError
 from tests.remote.listening import listening
+from tests.support.packages.wheels import Index, make_wheel
 from tests.support.processes import eventually
 from tests.support.repositories import write_repository
-from tests.support.wheels import Index, make_wheel
 
 ENV = """
 import sys

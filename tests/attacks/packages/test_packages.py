@@ -15,7 +15,7 @@ from tests.attacks.harness import Arena, token
 from tests.attacks.packages import trapped_packages as traps
 from tests.attacks.processes.neighbour import Pair, neighbour
 from tests.attacks.processes.victim import READS, victim
-from tests.support.environments import base_interpreter, install, running_on
+from tests.support.packages.environments import base_interpreter, install, running_on
 from tests.support.repositories import write_repository
 
 FAMILY = "Packages of the repository's own"

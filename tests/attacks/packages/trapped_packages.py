@@ -14,7 +14,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from tests.support.environments import base_interpreter
+from tests.support.packages.environments import base_interpreter
 
 REAL = ("cloudpickle", "farama_notifications", "gymnasium", "msgpack", "numpy", "typing_extensions")
 STANDARD = ("ctypes", "encodings", "json")

@@ -38,6 +38,7 @@ time.sleep(600)
 """
 
 
+@pytest.mark.short("strict-a daemon")
 @pytest.mark.parametrize(
     ("title", "payload", "more"),
     [

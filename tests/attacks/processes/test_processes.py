@@ -44,6 +44,7 @@ def test_memory_cannot_be_written(
     arena.attack(title, payload, pair.written, **pair.at("pid", "address"), **arguments)
 
 
+@pytest.mark.short("strict-read /proc")
 @pytest.mark.parametrize(
     ("title", "payload", "names"),
     [
@@ -80,6 +81,7 @@ def test_broadcast_signals_do_not_reach_the_client(arena: Arena, pair: Pair) -> 
     pair.signal(arena, "signal everybody: kill(-1)", "signal_all", "broadcasts")
 
 
+@pytest.mark.short("strict-kill")
 @pytest.mark.parametrize("way", SIGNALS)
 def test_signals_do_not_reach_the_client(arena: Arena, pair: Pair, way: str) -> None:
     """Nor does one that is meant for it, sent in any of the ways there are."""

@@ -36,12 +36,14 @@ def fresh_server(hub_token: str, home: Path, other_cache: Path) -> Iterator[None
     use.release()
 
 
+@pytest.mark.short("strict")
 @pytest.mark.usefixtures("fresh_server")
 def test_token_is_not_in_the_environment(arena: Arena, hub_token: str) -> None:
     """Neither os.environ nor what the kernel kept of it holds the client's token."""
     arena.steal("find the token in the environment", "environment", hub_token)
 
 
+@pytest.mark.short("strict")
 @pytest.mark.usefixtures("fresh_server")
 def test_token_is_not_in_memory(arena: Arena, hub_token: str) -> None:
     """No page of the worker was ever the client's: it is executed afresh, never forked off."""

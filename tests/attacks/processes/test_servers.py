@@ -6,9 +6,12 @@ import os
 import signal
 
 import psutil
+import pytest
 
 from tests.attacks.harness import Arena, Run, call, control_run, run_in
 from tests.support.processes import eventually
+
+pytestmark = pytest.mark.short
 
 FAMILY = "Our own processes"
 

@@ -24,6 +24,8 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.stream import pack_packet
 
+pytestmark = pytest.mark.short
+
 WAIT_S = 60
 
 

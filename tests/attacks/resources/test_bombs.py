@@ -41,6 +41,7 @@ FILES, INODES = 300, 1500
 CPU_S, SPIN_S = 1, 3.0
 
 
+@pytest.mark.short("strict-fork")
 @pytest.mark.parametrize(("title", "payload"), [("fork", "fork_bomb"), ("thread", "thread_bomb")])
 def test_fork_bomb_stops_at_the_limit(arena: Arena, title: str, payload: str) -> None:
     """Processes and threads together never exceed the limit."""
@@ -113,6 +114,7 @@ def _machine() -> Iterator[None]:
         yield
 
 
+@pytest.mark.short("strict-heap")
 @pytest.mark.usefixtures("_machine")
 @pytest.mark.parametrize("kind", KINDS)
 def test_memory_bomb_stops_at_the_limit(arena: Arena, kind: str) -> None:
@@ -198,6 +200,7 @@ def left_by(run: Run, measure: Callable[[str], int]) -> int:
     return count
 
 
+@pytest.mark.short("strict")
 @pytest.mark.parametrize(
     ("title", "payload", "limits", "most", "much", "measure"),
     [

@@ -80,6 +80,7 @@ def inherited(home: Path, other_cache: Path) -> Iterator[str]:
     os.close(fd)
 
 
+@pytest.mark.short("strict")
 def test_open_files_are_not_inherited(arena: Arena, inherited: str) -> None:
     """What the client has open, even for children to inherit, no jail is born with."""
     alias = new_alias()
@@ -221,6 +222,7 @@ NOISE = {
 }
 
 
+@pytest.mark.short("strict-ff")
 @pytest.mark.parametrize("noise", NOISE.values(), ids=NOISE)
 def test_noise_on_the_stream_ends_only_its_jail(arena: Arena, noise: bytes) -> None:
     """A jail that writes past our code to its stream is killed; server and neighbours go on."""

@@ -50,6 +50,7 @@ def test_a_shared_description_holds_its_writer(tmp_path: Path) -> None:
             os.close(bell)
 
 
+@pytest.mark.short("strict-fill")
 @pytest.mark.parametrize("act", ACTS)
 def test_a_client_that_is_answered_is_not_held(arena: Arena, home: Path, act: str) -> None:
     """It rings for the next step, has its timeout, and closes: all in one thread."""

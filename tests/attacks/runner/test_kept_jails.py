@@ -159,6 +159,7 @@ def test_forged_rows_are_the_forgers_own(arena: Arena, home: Path) -> None:
         assert suites.env.step([0, 0])[1].tolist() == [1.0, FORGED]
 
 
+@pytest.mark.short("strict")
 @pytest.mark.parametrize("mode", ["died", "partly"])
 def test_runners_cannot_speak_of_deaths(arena: Arena, home: Path, mode: str) -> None:
     """Only the server says who has died: a runner that does is a liar, and nothing is reset."""

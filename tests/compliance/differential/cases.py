@@ -17,8 +17,8 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from tests.compliance.differential.scripted import Scripted
 from tests.compliance.differential.spaces import space
 from tests.compliance.theirs.through_sandbox import by_value, vector
-from tests.support import handed
 from tests.support.compare import differences
+from tests.support.objects import handed
 
 Call = tuple[str, tuple[Any, ...], dict[str, Any]]
 

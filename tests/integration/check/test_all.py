@@ -16,7 +16,7 @@ import pytest
 
 from tests.corpus.entries import Entry
 from tests.support.command_line import COMMAND, below, envhub, gone
-from tests.support.pages import Page
+from tests.support.output.pages import Page
 from tests.support.processes import eventually
 from tests.support.repositories import write_repository
 

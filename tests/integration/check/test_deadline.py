@@ -23,9 +23,9 @@ from envhub_sandbox.cli.check.deadline import DeadlineReached, deadline_alarm
 from envhub_sandbox.hub.sources import parser
 from tests.hub.stub_hub import StubHub
 from tests.support.command_line import envhub
+from tests.support.packages.wheels import Index
 from tests.support.processes import descendants, eventually
 from tests.support.repositories import STILL, write_repository
-from tests.support.wheels import Index
 
 _LONG_S = 3600
 """So long that no test would wait for it."""

@@ -19,9 +19,9 @@ from envhub_sandbox.check.play.pictures import png
 from envhub_sandbox.check.settings import JudgeOptions
 from envhub_sandbox.errors import SandboxUnavailableError, SnapshotError
 from tests.corpus.entries import Entry
-from tests.support import checks
-from tests.support.ci import obeyed
 from tests.support.command_line import envhub, python
+from tests.support.documents import checks
+from tests.support.output.ci import obeyed
 from tests.support.repositories import write_repository
 from tests.support.samples import EXAMPLES
 
@@ -59,7 +59,7 @@ def judged(folder: Path, steps: int = 25, **more: Any) -> Report:
 
 
 def test_the_page_is_the_table() -> None:
-    """To write it again: ``python -m tests.support.checks``."""
+    """To write it again: ``python -m tests.support.documents.checks``."""
     assert checks.DOCUMENT.read_text() == checks.document()
 
 

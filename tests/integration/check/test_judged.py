@@ -1,6 +1,6 @@
 """Some of the hostile payloads, samples and mutants, judged.
 
-``tests.support.judged`` and ``tests.support.mutants`` have them all.
+``tests.support.judging.judged`` and ``tests.support.judging.mutants`` have them all.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.support import judged, mutants
+from tests.support.judging import judged, mutants
 from tests.support.samples import SAMPLES
 
 

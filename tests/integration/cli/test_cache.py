@@ -18,8 +18,8 @@ from envhub_sandbox.hub import snapshot
 from envhub_sandbox.hub.cache import cache_root
 from envhub_sandbox.system.locks import SharedLock
 from envhub_worker.protocol.runtime import RECORD
+from tests.support.packages.wheels import Index, make_wheel
 from tests.support.repositories import write_repository
-from tests.support.wheels import Index, make_wheel
 
 RUNNER = CliRunner()
 

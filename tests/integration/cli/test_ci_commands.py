@@ -16,7 +16,7 @@ from envhub_sandbox.cli.doctor import remote
 from envhub_sandbox.cli.shared.console import guarded
 from envhub_sandbox.errors import WorkerDiedError
 from envhub_sandbox.sandboxes.server_facts import ServerFacts
-from tests.support.ci import log_of, obeyed
+from tests.support.output.ci import log_of, obeyed
 from tests.support.repositories import write_repository
 
 FORGED = (

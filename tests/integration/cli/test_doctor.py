@@ -17,6 +17,8 @@ from envhub_sandbox.settings.policy import PROFILES
 from envhub_worker.lockdown.gpus import gpu_devices
 from envhub_worker.lockdown.root_plan import real_host
 
+pytestmark = pytest.mark.short
+
 RUNNER = CliRunner()
 
 

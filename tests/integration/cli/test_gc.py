@@ -13,7 +13,7 @@ import psutil
 import pytest
 
 from envhub_sandbox import make_env
-from tests.faults.traces import temporary_root
+from tests.faults.remains.traces import temporary_root
 from tests.support.command_line import COMMAND
 from tests.support.samples import sample
 

@@ -41,6 +41,7 @@ def one_env(folder: Path, step: str, render: str = "return None") -> Path:
     return write_repository(folder, _ONE_ENV % (step, render))
 
 
+@pytest.mark.short
 def test_a_run_prints_results_and_nothing_else() -> None:
     """The table and the provenance on stdout, nothing on stderr, no escape sequences."""
     done = envhub("run", EXAMPLES / "cartpole", "--episodes", "4", "--n-envs", "2")
@@ -138,6 +139,7 @@ FAILURES: list[tuple[str, Sequence[str], int, str]] = [
 ]
 
 
+@pytest.mark.short
 @pytest.mark.parametrize(("step", "arguments", "code", "says"), FAILURES)
 def test_failures_have_a_code_and_a_message(
     tmp_path: Path, step: str, arguments: Sequence[str], code: int, says: str

@@ -22,8 +22,8 @@ from tests.support.confinement_kit import (
     unconfined,
     wait_until,
 )
-from tests.support.environments import base_interpreter
 from tests.support.interpreter import can_run, needs
+from tests.support.packages.environments import base_interpreter
 from tests.support.trees import fingerprint
 
 pytestmark = needs("strict")

@@ -91,6 +91,7 @@ SECRETS = {
 """How each is read, and what is in it. Programs are given secrets as arguments."""
 
 
+@pytest.mark.short
 @pytest.mark.parametrize("secret", SECRETS)
 def test_files_outside_are_out_of_reach(cell: Cell, outside: Path, secret: str) -> None:
     """What the same user could read, as the mode lets everybody, by path and through /proc."""
@@ -107,6 +108,7 @@ def test_files_outside_are_out_of_reach(cell: Cell, outside: Path, secret: str) 
         assert denied(cell.run(source), "PermissionError", "FileNotFoundError")
 
 
+@pytest.mark.short
 def test_files_outside_cannot_be_made_changed_or_removed(cell: Cell, outside: Path) -> None:
     """Every way to write: the canary folder stays as it is."""
     outside.chmod(0o777)
@@ -248,6 +250,7 @@ ours.sendto(b"hello", {name!r})
 """
 
 
+@pytest.mark.short("strict")
 @pytest.mark.parametrize("kind", LISTENERS)
 def test_listener_outside_is_not_reached(cell: Cell, outside: Path, kind: str) -> None:
     """TCP, UDP, local sockets by name and by file; the listener says who came."""
@@ -409,6 +412,7 @@ def test_jail_sees_only_its_own_processes(cells: dict[str, Cell]) -> None:
     assert max(cells["strict"].run(source)["result"]) < 100
 
 
+@pytest.mark.short
 def test_strict_jail_has_no_network_device(cells: dict[str, Cell]) -> None:
     """Only a loopback device, which is down."""
     source = "result = open('/proc/net/dev').read()"
@@ -433,6 +437,7 @@ result = [found for top in TOPS for found in strange(top)]
 """
 
 
+@pytest.mark.short
 def test_strict_root_shows_of_homes_the_way_to_the_interpreter(cells: dict[str, Cell]) -> None:
     """Wherever that lies, below /root or in a home: its neighbours are not there."""
     tops = ["/home", "/root", "/run", "/var", "/boot", "/mnt", "/opt", "/srv"]
@@ -442,6 +447,7 @@ def test_strict_root_shows_of_homes_the_way_to_the_interpreter(cells: dict[str, 
     assert cells["strict"].run(source) == {"result": []}
 
 
+@pytest.mark.short
 def test_strict_root_holds_nothing_of_the_host(cells: dict[str, Cell]) -> None:
     """No secret, no mounts; devices that are harmless; nothing of /proc that tells."""
     source = """
@@ -517,6 +523,7 @@ result = "came back"
     assert (ended[0].signal, ended[0].reason) == (31, "signal")
 
 
+@pytest.mark.short
 def test_capabilities_and_privileges_are_gone(cell: Cell) -> None:
     """As the kernel says it of the runner; an exec brings nothing back."""
     source = """
@@ -601,6 +608,7 @@ socket.create_connection({listener.getsockname()!r}).sendall(b"hello")
             assert denied(cell.run("import socket; socket.socket(socket.AF_NETLINK, 3)"))
 
 
+@pytest.mark.short
 @pytest.mark.parametrize("profile", profiles("strict", "no-userns"))
 def test_denial_that_does_not_hold_aborts(profile: str) -> None:
     """The self-test finds that the canary can be read, and nothing of the repository runs."""
@@ -676,6 +684,7 @@ def test_weaker_profile_runs_on_a_host_without_user_namespaces() -> None:
     assert said == "started ['pid-namespace', 'mount-namespace', 'user-quotas']\n"
 
 
+@pytest.mark.short
 @pytest.mark.parametrize("profile", profiles("strict", "no-userns"))
 def test_host_without_landlock_is_refused(profile: str) -> None:
     """By every profile that promises files."""

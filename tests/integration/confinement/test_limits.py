@@ -201,6 +201,7 @@ QUOTAS = [
 ]
 
 
+@pytest.mark.short
 @pytest.mark.parametrize(
     ("limits", "source", "least", "most"), QUOTAS, ids=[*SCRATCH, "empty files", "one file"]
 )

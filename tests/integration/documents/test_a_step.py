@@ -15,7 +15,7 @@ import envhub_worker
 from envhub_sandbox import make_env
 from envhub_worker.protocol import messages as m
 from tests.support.command_line import python
-from tests.support.runner_here import RunnerHere
+from tests.support.in_process.runner_here import RunnerHere
 from tests.support.samples import SAMPLES
 
 ACTIONS = np.zeros(2, np.int64)

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from tests.support import blocks
 from tests.support.command_line import python
+from tests.support.documents import blocks
 from tests.support.samples import EXAMPLES
 
 # No block may take a port that another program has.

@@ -14,9 +14,9 @@ from typing import Any
 import pytest
 
 from tests.hub.stub_hub import StubHub
-from tests.support import blocks
-from tests.support.blocks import Block
-from tests.support.shell import execute, executed
+from tests.support.documents import blocks
+from tests.support.documents.blocks import Block
+from tests.support.documents.shell import execute, executed
 
 # What is about a repository is run within one.
 _WITHIN = {"docs/ci.md": "my-env"}

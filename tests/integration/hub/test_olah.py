@@ -85,6 +85,7 @@ def test_branch_tag_and_short_commit_name_the_full_commit(olah: OlahServer, get:
     assert contents(found["dev"]) == {"env.py": b"3"}
 
 
+@pytest.mark.short
 @pytest.mark.parametrize("repo_type", ["model", "space", "dataset"])
 def test_each_repository_type_loads(olah: OlahServer, get: Fetch, repo_type: str) -> None:
     """Models, spaces and datasets load by their prefix."""

@@ -14,7 +14,7 @@ import pytest
 
 from envhub_sandbox import make_env
 from tests.support import inside
-from tests.support.interrupts import at_call
+from tests.support.in_process.interrupts import at_call
 from tests.support.processes import eventually
 from tests.support.samples import sample
 

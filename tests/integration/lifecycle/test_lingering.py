@@ -11,8 +11,8 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.sandboxes.pool import stop_idle
-from tests.faults.clients import finish, is_clean, left, line, start
-from tests.faults.traces import temporary_root
+from tests.faults.remains.clients import finish, is_clean, left, line, start
+from tests.faults.remains.traces import temporary_root
 from tests.support.processes import descendants, eventually
 from tests.support.samples import sample
 

@@ -115,6 +115,7 @@ class TestLeRobotDocs:
                         assert_same(expected.step(actions), env.step(actions))
 
 
+@pytest.mark.short
 class TestManyTasks:
     """Forty tasks of four environments with ``use_async_envs``: processes only while in use."""
 

@@ -20,10 +20,10 @@ from envhub_sandbox.dependencies.resolutions import lock_for
 from envhub_sandbox.errors import DependencyError, PackageIntegrityError, ResolutionError
 from envhub_sandbox.hub.cache import cache_root, remove_tree
 from envhub_sandbox.hub.snapshot import local
-from tests.support.git_server import git_served, make_repository
+from tests.support.packages.git_server import git_served, make_repository
+from tests.support.packages.sdists import backend, make_sdist
+from tests.support.packages.wheels import Index, make_wheel
 from tests.support.repositories import importing, write_repository
-from tests.support.sdists import backend, make_sdist
-from tests.support.wheels import Index, make_wheel
 
 OWN = interpreters.own()
 IMPORTS = """

@@ -14,8 +14,8 @@ from envhub_sandbox import make_env
 from envhub_sandbox.errors import DependencyError, RequirementError, ResolutionError
 from envhub_sandbox.system.log import DEPENDENCIES
 from tests.support.compare import assert_same
+from tests.support.packages.wheels import Index, make_wheel
 from tests.support.repositories import CARTPOLE, CARTPOLES, importing, write_repository
-from tests.support.wheels import Index, make_wheel
 
 ENV = importing("not_here", version="not_here.VERSION", where="not_here.__file__")
 

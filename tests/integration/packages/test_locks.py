@@ -14,8 +14,8 @@ from envhub_sandbox import make_env
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.dependencies import resolutions
 from envhub_sandbox.errors import LockDriftError, LockError, PackageIntegrityError, PolicyError
+from tests.support.packages.wheels import Index, make_wheel
 from tests.support.repositories import importing, write_repository
-from tests.support.wheels import Index, make_wheel
 
 RUNNER = CliRunner()
 ENV = importing("not_here", version="not_here.VERSION")

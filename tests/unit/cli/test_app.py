@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 import envhub_sandbox.cli
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.cli.shared.console import neutralised, out, say, show_rows
-from tests.support.ci import obeyed
+from tests.support.output.ci import obeyed
 
 _WIDTH = 80
 

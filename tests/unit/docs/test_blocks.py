@@ -16,12 +16,12 @@ from typer.testing import CliRunner
 
 from envhub_sandbox.cli.app import app
 from tests import libraries
-from tests.support import blocks, options, shell
-from tests.support.blocks import CHECKOUT, DRAWN, HELD, OWN, PARSED, RUN, SHOWN, Block
+from tests.support.documents import blocks, options, shell
+from tests.support.documents.blocks import CHECKOUT, DRAWN, HELD, OWN, PARSED, RUN, SHOWN, Block
 
 # Programs of others, whose options are theirs; and what begins a line that is no command.
 _OTHERS = {"docker", "pip", "lerobot-eval", "lerobot-train", "lerobot-eval-sandboxed", "ruff"}
-_SHELL = "tests/support/shell.py"
+_SHELL = "tests/support/documents/shell.py"
 _RUN_BY = {
     "README.md": "tests/unit/docs/test_docs.py",
     "docs/integrations.md": "tests/unit/docs/test_docs.py",

@@ -19,7 +19,7 @@ from envhub_worker.protocol.lifecycle import TABLE, Event, State
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, MAX_NUM_ENVS
 from envhub_worker.protocol.manifest.manifest import MAX_ENVS
 from envhub_worker.protocol.manifest.names import MAX_NAME
-from tests.support import options, settings
+from tests.support.documents import options, settings
 from tests.unit.docs.test_imports import folder
 
 CHECKOUT = Path(__file__).resolve().parents[3]
@@ -320,7 +320,7 @@ def test_error_tree_is_the_tree() -> None:
 
 @pytest.mark.parametrize("written", [settings, options])
 def test_what_is_written_from_the_source_is_up_to_date(written: Any) -> None:
-    """``python -m tests.support.settings``, or ``options``, writes them again."""
+    """``python -m tests.support.documents.settings``, or ``options``, writes them again."""
     assert written.DOCUMENT.read_text() == written.document()
 
 

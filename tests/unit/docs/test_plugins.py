@@ -8,18 +8,17 @@ from pathlib import Path
 
 import pytest
 
-CONFTEST = """
-from tests.support import selection
-selection.SHORT = ({start!r},)
-pytest_plugins = ["tests.support.selection", "tests.support.skips"]
-"""
+PLUGINS = 'pytest_plugins = ["tests.support.plugins.selection", "tests.support.plugins.skips"]'
 TESTS = """
 import pytest
 
+@pytest.mark.short
 def test_one():
     pass
 
-def test_two():
+@pytest.mark.short("few")
+@pytest.mark.parametrize("which", ["few", "many"])
+def test_two(which):
     pass
 
 @pytest.mark.parametrize("which", range(3))
@@ -33,10 +32,10 @@ def test_imports():
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A suite of its own, of which the short selection has one test."""
+    """A suite of its own, of which the short selection has two tests."""
     (tmp_path / "test_it.py").write_text(TESTS)
     (tmp_path / "pytest.ini").write_text("[pytest]\n")
-    (tmp_path / "conftest.py").write_text(CONFTEST.format(start="test_it.py::test_one"))
+    (tmp_path / "conftest.py").write_text(PLUGINS)
     return tmp_path
 
 
@@ -57,7 +56,7 @@ def run(folder: Path, checkout: Path, *arguments: str) -> str:
 def test_who_names_nothing_gets_the_short_selection(folder: Path, checkout: Path) -> None:
     """And is told so, and how to have all."""
     said = run(folder, checkout)
-    assert "1 passed, 5 deselected" in said
+    assert "2 passed, 5 deselected" in said
     assert "--full runs every test" in said
 
 
@@ -65,23 +64,25 @@ def test_who_names_nothing_gets_the_short_selection(folder: Path, checkout: Path
 def test_what_is_asked_for_is_run(folder: Path, checkout: Path, argument: str) -> None:
     """All of it, or a path, or an expression."""
     said = run(folder, checkout, argument)
-    assert "2 passed, 4 skipped" in said
+    assert "3 passed, 4 skipped" in said
     assert "short selection" not in said
 
 
-def test_a_selection_that_names_nothing_is_an_error(folder: Path, checkout: Path) -> None:
-    """A test that was renamed does not fall out of it silently."""
-    (folder / "conftest.py").write_text(CONFTEST.format(start="test_it.py::test_gone"))
-    assert "the short selection names no test by test_it.py::test_gone" in run(folder, checkout)
+@pytest.mark.parametrize("where", ["unit", "other"])
+def test_unit_tests_need_no_marker(folder: Path, checkout: Path, where: str) -> None:
+    """All that lies in ``tests/unit`` is in it."""
+    there = folder / "tests" / where
+    there.mkdir(parents=True)
+    (there / "test_more.py").write_text("def test_three():\n    pass\n")
+    expected = {"unit": "3 passed, 5 deselected", "other": "2 passed, 6 deselected"}
+    assert expected[where] in run(folder, checkout)
 
 
-def test_a_folder_that_is_ignored_is_not_missed(folder: Path, checkout: Path) -> None:
-    """The rest of the selection is run."""
-    (folder / "gone").mkdir()
-    (folder / "conftest.py").write_text(CONFTEST.format(start="gone/test_other.py::"))
-    said = run(folder, checkout, "--ignore=gone/")
-    assert "names no test" not in said
-    assert "6 deselected" in said
+def test_a_marker_that_names_no_case_is_an_error(folder: Path, checkout: Path) -> None:
+    """A case that was renamed does not fall out of the selection silently."""
+    (folder / "test_it.py").write_text(TESTS.replace('short("few")', 'short("gone", "few")'))
+    said = run(folder, checkout)
+    assert "the short selection names no case by 'gone' of test_it.py::test_two" in said
 
 
 @pytest.mark.parametrize("arguments", [(), ("-n", "2")])

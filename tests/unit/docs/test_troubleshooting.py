@@ -11,7 +11,7 @@ import pytest
 
 from envhub_sandbox import Policy, Timeouts, make_env
 from envhub_sandbox.errors import EnvHubError
-from tests.support import troubleshooting
+from tests.support.documents import troubleshooting
 
 _PAGE = troubleshooting.DOCUMENT.read_text()
 
@@ -22,7 +22,7 @@ def as_shown(page: str) -> str:
 
 
 def test_the_page_is_written_from_the_messages() -> None:
-    """``python -m tests.support.troubleshooting`` writes it again."""
+    """``python -m tests.support.documents.troubleshooting`` writes it again."""
     assert troubleshooting.document() == _PAGE
 
 

@@ -17,7 +17,7 @@ from envhub_sandbox.cli.app import app
 from envhub_sandbox.hub.hashing import GIT_SHA1, digest_of
 from envhub_sandbox.hub.listing import FileRecord, Snapshot
 from envhub_sandbox.hub.snapshot import local
-from tests.support.ci import obeyed
+from tests.support.output.ci import obeyed
 from tests.support.repositories import write_repository
 
 _ENTRY = """import gymnasium as gym

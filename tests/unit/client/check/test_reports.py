@@ -14,7 +14,7 @@ from envhub_sandbox.check.findings import Finding, Report
 from envhub_sandbox.check.page.page import page
 from envhub_sandbox.check.play.confinement import Confinement
 from envhub_worker.protocol.text import printable
-from tests.support.pages import HOSTILE
+from tests.support.output.pages import HOSTILE
 
 
 def report(text: str) -> Report:

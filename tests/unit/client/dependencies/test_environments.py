@@ -31,8 +31,8 @@ from envhub_sandbox.hub.snapshot import local
 from envhub_sandbox.system.locks import SharedLock
 from envhub_worker.protocol.runtime import RECORD
 from tests.support import inside
+from tests.support.packages.wheels import Index, make_wheel
 from tests.support.processes import eventually
-from tests.support.wheels import Index, make_wheel
 
 OWN = chosen({}, None)[0]
 CHECKOUT = Path(__file__).resolve().parents[4]

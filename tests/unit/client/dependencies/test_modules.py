@@ -26,7 +26,7 @@ from envhub_sandbox.errors import ResolutionError
 from envhub_sandbox.hub.snapshot import Snapshot, local
 from envhub_sandbox.hub.sources import parsing
 from tests.support import inside
-from tests.support.wheels import Index, make_wheel
+from tests.support.packages.wheels import Index, make_wheel
 
 MAKE = "\ndef make_env(n_envs=1, use_async_envs=False): ..."
 

@@ -26,7 +26,7 @@ from envhub_sandbox.dependencies.request import (
 )
 from envhub_sandbox.errors import InterpreterUnavailableError, PolicyError, RequirementError
 from envhub_sandbox.hub.snapshot import Snapshot, local
-from tests.support.wheels import make_wheel
+from tests.support.packages.wheels import make_wheel
 
 NUMPY = metadata.version("numpy")
 

@@ -16,7 +16,7 @@ from envhub_sandbox.dependencies.declared import parse_requirement
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.dependencies.request import PackageRequest
 from envhub_sandbox.errors import RequirementError, ResolutionError
-from tests.support.wheels import Index, make_wheel
+from tests.support.packages.wheels import Index, make_wheel
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 

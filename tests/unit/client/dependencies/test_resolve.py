@@ -26,7 +26,7 @@ from envhub_sandbox.errors import (
     PackageIntegrityError,
     ResolutionError,
 )
-from tests.support.wheels import WORKERS, Index, make_wheel
+from tests.support.packages.wheels import WORKERS, Index, make_wheel
 from tests.unit.docs.test_image import project
 
 __all__ = ["project"]

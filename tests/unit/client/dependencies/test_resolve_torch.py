@@ -12,7 +12,7 @@ from envhub_sandbox.dependencies.declared import parse_requirement
 from envhub_sandbox.dependencies.request import PackageRequest
 from envhub_sandbox.dependencies.resolutions import resolution_for
 from envhub_sandbox.dependencies.resolve import Lock
-from tests.support.wheels import Index, make_wheel
+from tests.support.packages.wheels import Index, make_wheel
 
 TORCH = PackageRequest("requirements.txt", (parse_requirement("vision", "line 1"),))
 CUDA = Lock("torch==2.5 \\\n    --hash=sha256:00\nnvidia-cublas==1 \\\n    --hash=sha256:00\n")

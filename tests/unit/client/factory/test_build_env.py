@@ -8,7 +8,7 @@ from pathlib import Path
 from envhub_sandbox.dependencies import interpreters
 from envhub_sandbox.dependencies.builds import wheels
 from envhub_sandbox.factory.build_env import mend
-from tests.support.wheels import make_wheel
+from tests.support.packages.wheels import make_wheel
 
 OLD = ("opencv-python (>=3.) ; extra == 'all'", "b (>=1.,<2.)", "c>=4.", "d (==1.*)")
 NEW = ("opencv-python (>=3) ; extra == 'all'", "b (>=1,<2)", "c>=4", "d (==1.*)")

@@ -20,7 +20,7 @@ from envhub_sandbox.dependencies.locks.pylock import PylockPackage, Wheel
 from envhub_sandbox.dependencies.request import chosen
 from envhub_sandbox.errors import EnvHubError, LockDriftError, LockError, PackageIntegrityError
 from envhub_sandbox.hub.snapshot import local
-from tests.support.wheels import WORKERS, Index, make_wheel, served
+from tests.support.packages.wheels import WORKERS, Index, make_wheel, served
 
 A, B = "a" * 64, "b" * 64
 BOX = gym.spaces.Box(-1, 1, (3,), np.float32)

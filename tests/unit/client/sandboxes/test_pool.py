@@ -16,7 +16,7 @@ from envhub_sandbox.sandboxes.docker.engines import Engine
 from envhub_sandbox.sandboxes.pool import ServerPool, ServerUse, WorkerServer
 from envhub_sandbox.settings.policy import Policy, timeouts_from
 from tests.support import inside
-from tests.support.interrupts import before_line
+from tests.support.in_process.interrupts import before_line
 from tests.support.processes import eventually
 
 Pool = ServerPool["Server"]

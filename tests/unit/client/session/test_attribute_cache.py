@@ -6,7 +6,7 @@ import pytest
 
 from envhub_sandbox.session.attribute_cache import AttributeCache
 from envhub_sandbox.session.env_session import EnvSession
-from tests.support.fake_lane import FakeLane, session_over
+from tests.support.in_process.fake_lane import FakeLane, session_over
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from envhub_sandbox.session import lease as lease_module
 from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.transport.deadline import StartupDeadline
 from envhub_worker.protocol.lifecycle import Event, State
-from tests.support.fake_lane import FakeLane, session_over
+from tests.support.in_process.fake_lane import FakeLane, session_over
 
 
 class _Jails:

@@ -20,7 +20,7 @@ from envhub_sandbox.errors import (
 from envhub_sandbox.session.env_session import EnvSession
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.lifecycle import State
-from tests.support.fake_lane import FakeLane, session_over
+from tests.support.in_process.fake_lane import FakeLane, session_over
 
 ACTIONS = np.zeros(2, np.int64)
 

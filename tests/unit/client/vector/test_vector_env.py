@@ -17,8 +17,8 @@ from envhub_sandbox.vector import vector_env
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol.shared_memory import slabs
 from tests.support import inside
-from tests.support.fake_lane import FakeLane, session_over
-from tests.support.interrupts import before_line
+from tests.support.in_process.fake_lane import FakeLane, session_over
+from tests.support.in_process.interrupts import before_line
 
 
 @pytest.mark.parametrize(

@@ -15,8 +15,8 @@ from envhub_sandbox.transport.values.pickles import framed
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.arrays import INLINE_BYTES
 from envhub_worker.protocol.errors import LocalProtocolError, RemoteProtocolError
-from tests.support import handed
 from tests.support.compare import assert_identical
+from tests.support.objects import handed
 
 
 def frames_of(value: object) -> list[Any]:

@@ -23,8 +23,8 @@ from envhub_worker.protocol.codec.codec import decode, encode
 from envhub_worker.protocol.codec.inert import RemoteEnum, RemoteObject
 from envhub_worker.protocol.manifest.facts import MAX_METADATA, read_metadata_facts, read_spec_facts
 from envhub_worker.protocol.manifest.names import GYMNASIUMS, PROBED, is_servable
-from tests.support.curious import names_asked_for
-from tests.support.protocol_names import names_that_libraries_call
+from tests.support.objects.curious import names_asked_for
+from tests.support.objects.protocol_names import names_that_libraries_call
 from tests.unit.protocol.manifest.test_manifest import an_env, read, with_env
 
 ASKED = {

@@ -24,8 +24,8 @@ from tests.support.confinement_kit import (
     open_folder,
     spawner_in,
 )
-from tests.support.environments import base_interpreter
 from tests.support.interpreter import profiles
+from tests.support.packages.environments import base_interpreter
 from tests.support.trees import fingerprint
 
 MODULE = "mine = 'from the packages'\n"

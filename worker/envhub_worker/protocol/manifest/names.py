@@ -39,8 +39,9 @@ PROBED = frozenset(
     }
 )
 """Names without an underscore that libraries look for in any object, found by having some forty
-convert, print, plot, log, copy and compare one that listens (``tests/support/curious.py``). Such
-an attribute can be had by name: ``get_attr`` and ``get_wrapper_attr``."""
+convert, print, plot, log, copy and compare one that listens
+(``tests/support/objects/curious.py``). Such an attribute can be had by name: ``get_attr`` and
+``get_wrapper_attr``."""
 
 GYMNASIUMS = frozenset(dir(VectorEnv)) | {
     *getattr(VectorEnv, "__annotations__", ()),

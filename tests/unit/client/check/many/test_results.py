@@ -25,7 +25,7 @@ from envhub_sandbox.check.many.results import (
     link,
 )
 from envhub_worker.protocol.text import printable
-from tests.support.pages import HOSTILE, Page, results_of
+from tests.support.output.pages import HOSTILE, Page, results_of
 
 _ONE = ListEntry("org/repo", "org/repo@main", 1)
 

@@ -13,7 +13,7 @@ from envhub_sandbox.check.page.page import page
 from envhub_sandbox.check.play.pictures import png
 from envhub_sandbox.check.play.plays import Film, Play
 from envhub_worker.protocol.text import printable
-from tests.support.pages import FRAME, HOSTILE, Page, report_of
+from tests.support.output.pages import FRAME, HOSTILE, Page, report_of
 
 _QUIET = "walk"
 _DRAWN = frozenset({"svg", "rect", "line", "polyline", "polygon", "text"})

@@ -15,8 +15,8 @@ from envhub_sandbox.errors import (
     PackagesTooLargeError,
     RequirementError,
 )
-from tests.support.git_server import commit, git_served, make_repository
-from tests.support.git_server import git as run_git
+from tests.support.packages.git_server import commit, git_served, make_repository
+from tests.support.packages.git_server import git as run_git
 
 
 @pytest.fixture

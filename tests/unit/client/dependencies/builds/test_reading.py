@@ -14,7 +14,7 @@ from envhub_sandbox.errors import (
     PackagesTooLargeError,
     RequirementError,
 )
-from tests.support.wheels import served
+from tests.support.packages.wheels import served
 
 LEGACY = "setuptools.build_meta:__legacy__"
 

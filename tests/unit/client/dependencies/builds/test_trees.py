@@ -17,7 +17,7 @@ import pytest
 
 from envhub_sandbox.dependencies.builds import trees
 from envhub_sandbox.errors import DependencyError, PackageIntegrityError, PackagesTooLargeError
-from tests.support.sdists import add, make_sdist
+from tests.support.packages.sdists import add, make_sdist
 
 
 def packed(tmp_path: Path, *members: tuple[str, bytes, bytes], **options: Any) -> Path:

@@ -12,7 +12,7 @@ import pytest
 from envhub_sandbox.dependencies import interpreters
 from envhub_sandbox.dependencies.builds import wheels
 from envhub_sandbox.errors import PackageIntegrityError
-from tests.support.wheels import make_wheel
+from tests.support.packages.wheels import make_wheel
 
 OWN = interpreters.own()
 

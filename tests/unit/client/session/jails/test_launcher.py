@@ -14,7 +14,7 @@ from envhub_sandbox.session.jails import launcher as launcher_module
 from envhub_sandbox.session.jails.launcher import Launcher, read_denials
 from envhub_sandbox.session.jails.loaded import LoadedJail
 from envhub_worker.protocol import messages as m
-from tests.support.fake_lane import FakeLane, session_over
+from tests.support.in_process.fake_lane import FakeLane, session_over
 
 _SERVER: Any = SimpleNamespace(endpoint="", process_fd=0, far=None)
 

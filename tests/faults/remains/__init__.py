@@ -1,0 +1,1 @@
+"""How clients and servers end, and that nothing of them remains."""

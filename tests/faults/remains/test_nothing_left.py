@@ -1,0 +1,318 @@
+"""However a client ends, nothing of ours remains on the machine; a fork of it ends nothing."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.faults.remains.clients import finish, left, line, start
+from tests.faults.remains.traces import Traces
+from tests.support.processes import eventually
+from tests.support.samples import sample
+
+pytestmark = pytest.mark.short
+
+
+ENDS = {
+    "returns without close": "made()",
+    "raises": "suites = made()\nraise KeyError('mine')",
+    "sys.exit in a thread's presence": (
+        "suites = made()\n"
+        "threading.Thread(target=lambda: suites.env.step([0, 0])).start()\nsys.exit(3)"
+    ),
+    "os._exit": "suites = made()\nos._exit(4)",
+    "kills itself": "suites = made()\nos.kill(os.getpid(), signal.SIGKILL)",
+    "crashes": "suites = made()\nos.kill(os.getpid(), signal.SIGSEGV)",
+    "never used it": "make_env(REPOSITORY)",
+    "two shards, an env each": (
+        "one = made(use_async_envs=True, num_workers=2)\n"
+        "two = made(use_async_envs=True, num_workers=2, lane='frames')\nos._exit(5)"
+    ),
+    "dies with daemons in the jail": (
+        "suites = made('step', 'children')\nsuites.env.step([0, 1])\nos._exit(6)"
+    ),
+}
+
+
+@pytest.mark.parametrize("body", [pytest.param(body, id=name) for name, body in ENDS.items()])
+def test_nothing_remains_of_a_client_that(body: str, folder: Path) -> None:
+    """Its server, zygote and jails, its sockets, folders and groups go with it."""
+    said = finish(start(folder, body))
+    assert "Exception ignored" not in said
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL, signal.SIGHUP])
+@pytest.mark.parametrize("moment", ["idle", "step", "make"])
+def test_nothing_remains_after(number: signal.Signals, moment: str, folder: Path) -> None:
+    """A signal ends the client, whatever it was doing, and everything of ours with it."""
+    client = start(
+        folder,
+        f"""
+        moment = {moment!r}
+        if moment == "make":
+            say("there")
+            made("make", "hang")
+        suites = made("step", "hang")
+        say("there")
+        if moment == "step":
+            suites.env.step([0, 1])
+        time.sleep(600)
+        """,
+    )
+    assert line(client) == "there"
+    if moment == "make":
+        assert eventually(lambda: len(Traces.of(folder).processes) >= 4)  # init and runner
+    client.send_signal(number)
+    finish(client)
+
+
+def test_ctrl_c_in_a_step_leaves_a_usable_client(folder: Path, tmp_path: Path) -> None:
+    """KeyboardInterrupt comes at once; then a step says what to do, and reset() does it."""
+    client = start(
+        folder,
+        f"""
+        for lane in ("auto", "frames"):
+            output = {str(tmp_path)!r} + "/" + lane
+            suites = made("step", "hang", lane=lane, policy={{"output": output}})
+            try:
+                say(output)
+                suites.env.step([0, 1])
+            except KeyboardInterrupt:
+                pass
+            try:
+                suites.env.step([0, 0])
+            except errors.WorkerTimeoutError as error:
+                say("reset()" in str(error))
+            suites.env.reset()
+            say(suites.env.step([0, 0])[0].tolist())
+            suites.close()
+        """,
+    )
+    for _ in range(2):
+        output = Path(line(client))
+        assert eventually(lambda: "about to hang" in output.read_text())  # noqa: B023
+        client.send_signal(signal.SIGINT)
+        assert line(client) == "True"
+        assert line(client) == "[[1.0], [1.0]]"
+    finish(client)
+    assert client.returncode == 0
+
+
+@pytest.mark.parametrize("lane", ["auto", "frames"])
+def test_fork_refuses_and_ends_nothing(lane: str, folder: Path) -> None:
+    """In a fork old environments refuse and new ones work; the parent's go on throughout."""
+    client = start(
+        folder,
+        f"""
+        suites = made(lane={lane!r})
+        env = suites.env
+        env.step_async([0, 0])  # a reply is under way while we fork
+        child = os.fork()
+        if child == 0:
+            code = 1
+            try:
+                for operation in (lambda: env.step_wait(), lambda: env.step([0, 0]), env.render):
+                    try:
+                        operation()
+                    except errors.WorkerError as error:
+                        assert "fork" in str(error), error
+                env.close()
+                suites.close()
+                with make_env(REPOSITORY) as own:
+                    own.env.reset()
+                    assert own.env.step([0])[0].tolist() == [[1.0]]
+                made()  # and one that is never closed
+                code = 0
+            finally:
+                sys.exit(code)
+        say(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+        say(env.step_wait()[0].tolist())
+        say(env.step([0, 0])[0].tolist())
+        """,
+    )
+    said = finish(client)
+    assert said.split("\n")[:3] == ["0", "[[2.0], [2.0]]", "[[3.0], [3.0]]"], said
+
+
+def test_multiprocessing_fork_ends_nothing(folder: Path) -> None:
+    """A pool of forks, as torch's DataLoader makes, comes and goes; the environment stays."""
+    client = start(
+        folder,
+        """
+        import multiprocessing
+        suites = made()
+        with multiprocessing.get_context("fork").Pool(2) as pool:
+            say(pool.map(abs, [-1, -2]))
+        say(suites.env.step([0, 0])[0].tolist())
+        """,
+    )
+    assert finish(client).split("\n")[:2] == ["[1, 2]", "[[2.0], [2.0]]"]
+
+
+@pytest.mark.parametrize("lane", ["auto", "frames"])
+def test_close_under_a_running_step_returns(lane: str, folder: Path) -> None:
+    """``close`` from another thread ends the step with Gymnasium's error, soon."""
+    client = start(
+        folder,
+        f"""
+        from gymnasium.error import ClosedEnvironmentError
+        suites = made("step", "hang", lane={lane!r})
+        seen = []
+
+        def step():
+            try:
+                suites.env.step([0, 1])
+            except ClosedEnvironmentError as error:
+                seen.append(type(error).__name__)
+
+        stepping = threading.Thread(target=step)
+        stepping.start()
+        time.sleep(0.5)
+        suites.close()
+        stepping.join()
+        say(seen)
+        """,
+    )
+    said = finish(client)
+    assert said.startswith("['ClosedEnvironmentError']"), said
+
+
+def test_signal_handler_may_close_what_its_own_thread_waits_for(folder: Path) -> None:
+    """A handler that closes the environment ends the step, without a deadlock."""
+    client = start(
+        folder,
+        """
+        from gymnasium.error import ClosedEnvironmentError
+        for lane in ("auto", "frames"):
+            suites = made("step", "hang", lane=lane)
+            signal.signal(signal.SIGALRM, lambda *_: suites.close())
+            signal.setitimer(signal.ITIMER_REAL, 0.5)
+            try:
+                suites.env.step([0, 1])
+            except ClosedEnvironmentError:
+                say("closed")
+        """,
+    )
+    assert finish(client).split() == ["closed", "closed"]
+
+
+def test_proxy_that_nobody_holds_ends_its_processes(folder: Path) -> None:
+    """Garbage collection closes, in a cycle too, while the client goes on."""
+    client = start(
+        folder,
+        """
+        import gc
+        keeper = made()
+        for _ in range(3):
+            suites = made()
+            suites.env.reset(seed=1)
+            suites.env.me = suites.env  # a cycle
+            del suites
+        gc.collect()
+        say("collected")
+        sys.stdin.readline()
+        """,
+    )
+    said = line(client)
+    assert said == "collected", said + finish(client)
+    jails = 5  # the server, its zygote's two, and keeper's init and runner
+    assert eventually(lambda: len(Traces.of(folder).processes) <= jails), left(folder)
+    client.kill()
+    finish(client)
+
+
+def test_dead_server_is_told_and_replaced(folder: Path) -> None:
+    """When the server itself is killed the step says so, and ``reset`` starts another."""
+    client = start(
+        folder,
+        """
+        from tests.support import inside
+        for lane in ("auto", "frames"):
+            suites = made(lane=lane, policy={"restart": "on_reset"})
+            inside.server(suites.env).process.kill()
+            try:
+                while True:  # the jail may live a moment longer
+                    suites.env.step([0, 0])
+            except errors.WorkerDiedError as error:
+                say(error.reason)
+            suites.env.reset()
+            say(suites.env.step([0, 0])[0].tolist())
+            suites.close()
+        """,
+    )
+    assert finish(client).splitlines() == ["server", "[[1.0], [1.0]]"] * 2
+
+
+def test_many_clients_at_once_do_not_meet(folder: Path) -> None:
+    """Under pytest-xdist each worker has its own server, and none is left."""
+    test = folder / "test_one.py"
+    test.write_text(
+        "import pytest\nfrom envhub_sandbox import make_env\n"
+        f"@pytest.mark.parametrize('n', range(4))\ndef test_one(n):\n"
+        f"    env = make_env({str(sample('faulty'))!r}).env\n    env.reset()\n"
+        "    assert env.step([0])[0].tolist() == [[1.0]]\n"
+    )
+    command = ["-m", "pytest", "-q", "-n", "2", "-p", "no:cacheprovider", str(test)]
+    client = subprocess.Popen(
+        [sys.executable, *command],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        env={**os.environ, "TMPDIR": str(folder)},
+        cwd=folder,
+    )
+    out, _ = client.communicate(timeout=240)
+    assert "4 passed" in out, out
+    for path in [*folder.rglob("__pycache__"), test]:
+        shutil.rmtree(path) if path.is_dir() else path.unlink()
+    pytest_of = [path for path in folder.iterdir() if path.name.startswith("pytest-of")]
+    for path in pytest_of:
+        shutil.rmtree(path)
+
+
+def test_close_under_a_starting_worker_returns(folder: Path) -> None:
+    """``close`` does not wait for a constructor that hangs, and nor does the first ``reset``."""
+    client = start(
+        folder,
+        """
+        from gymnasium.error import ClosedEnvironmentError
+        fails = {"moment": "init", "fault": "hang", "tasks": 2}
+        suites = make_env(
+            REPOSITORY, n_envs=2, env_kwargs=fails, timeouts={"server_idle_s": 0}
+        )
+        env = suites["suite"][0]
+        threading.Timer(1.0, env.close).start()
+        try:
+            env.reset()
+        except ClosedEnvironmentError:
+            say("closed")
+        time.sleep(600)
+        """,
+    )
+    assert line(client) == "closed"
+    assert eventually(lambda: not Traces.of(folder).processes), left(folder)
+    client.kill()
+    finish(client)
+
+
+def test_sockets_that_a_cleaner_removed_cost_one_server(folder: Path) -> None:
+    """Open environments go on with theirs; the next one gets a new server at once."""
+    body = """
+import pathlib, shutil
+one = made(timeouts={"startup_s": 600})
+shutil.rmtree(next(pathlib.Path(os.environ["TMPDIR"]).glob("envhub-*")))
+two = made(timeouts={"startup_s": 600})
+one.env.step([0, 0])
+two.env.step([0, 0])
+two.close()
+one.env.step([0, 0])
+one.close()
+say("well")
+"""
+    assert finish(start(folder, body), 300.0).strip() == "well"

@@ -1,0 +1,1 @@
+"""Who may come in on a TCP port, and what a client may have there."""

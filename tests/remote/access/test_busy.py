@@ -1,0 +1,155 @@
+"""A server without room says so as data, and clients that are told to wait do so in order."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from envhub_sandbox import make_env
+from envhub_sandbox.errors import PolicyError, ServerBusyError, WorkerError
+from envhub_sandbox.sandboxes.remote import RemoteSandbox
+from envhub_sandbox.session.jails.retry_while_busy import retry_while_busy
+from envhub_sandbox.transport.deadline import StartupDeadline
+from envhub_worker.access import keys
+from envhub_worker.access.places import Line
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.messages.busy import LONGEST_S, Busy
+from tests.remote.listening import Listening, listening
+from tests.remote.peers import peer
+from tests.support.processes import eventually
+from tests.support.started import started
+
+
+@pytest.fixture(scope="module")
+def narrow(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Listening]:
+    """A server with room for one jail of a key."""
+    with listening(tmp_path_factory.mktemp("narrow"), "--max-jails", "1") as server:
+        yield server
+
+
+def test_the_first_who_came_is_the_first_who_is_let_in() -> None:
+    """Among those who go on asking; who asked once, or has given up, stands in nobody's way."""
+    now = [0.0]
+    line = Line(lambda: now[0])
+    for _ in range(2):
+        line.wait(b"key", b"one")
+        line.wait(b"key", b"two")
+    line.wait(b"key", b"once")
+    assert [line.ahead(b"key", name) for name in (b"one", b"two", b"once", b"new")] == [0, 1, 2, 2]
+    assert line.ahead(b"another", b"new") == 0
+    line.leave(b"key", b"one")
+    assert line.ahead(b"key", b"two") == 0
+    now[0] = 60.0
+    assert line.ahead(b"key", b"new") == 0
+
+
+@pytest.mark.parametrize(
+    ("quota", "words"),
+    [("", ""), ("jails", "1 2"), ("jails", "-1 2 3"), ("\x1b[2J", "1 2 3"), ("jails", "9" * 99)],
+)
+def test_what_is_no_answer_of_ours_says_nothing(quota: str, words: str) -> None:
+    """It is a server's, and is looked at before anybody sleeps for it."""
+    assert Busy.read(quota, words) == Busy("", 0, 0, 1.0)
+    assert Busy.read("jails", "1 2 9999.0").retry_s == LONGEST_S
+    busy = Busy("jails", 3, 4, 1.5)
+    assert Busy.read(busy.quota, busy.words()) == busy
+
+
+def test_a_full_server_says_which_quota_and_how_much(narrow: Listening, repository: Path) -> None:
+    """As attributes; what would never fit is another error, for which no waiting helps."""
+    with started(repository, sandbox=narrow.sandbox()):
+        with pytest.raises(ServerBusyError, match=r"2 jails .* \(--max-jails\)") as caught:
+            make_env(repository, n_envs=2, sandbox=narrow.sandbox())
+        said = caught.value
+        assert (said.quota, said.used, said.limit) == ("jails", 1, 1)
+        assert said.retry_s > 0
+    policy = {"limits": {"memory_bytes": 1 << 50}}
+    with pytest.raises(WorkerError) as never:
+        make_env(repository, n_envs=3, sandbox=narrow.sandbox(retry_s=60.0), policy=policy)
+    assert type(never.value) is WorkerError
+
+
+def test_who_waits_gets_the_place_once_it_is_free(
+    narrow: Listening, repository: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """With a notice, for a new repository and for a known one; nothing else has changed."""
+    sandbox = narrow.sandbox(retry_s=300.0)
+    for seed in (1, 2):
+        first = make_env(repository, sandbox=narrow.sandbox())
+        first.env.reset(seed=seed)
+        made = list[Any]()
+
+        def make(into: list[Any] = made) -> None:
+            suites = make_env(repository, n_envs=3, sandbox=sandbox)
+            suites.env.reset(seed=1)
+            into.append(suites)
+
+        caplog.clear()
+        with caplog.at_level(logging.WARNING, "envhub_sandbox.worker"):
+            waiting = threading.Thread(target=make)
+            waiting.start()
+            assert eventually(lambda: "waiting for up to" in caplog.text)
+            assert not made
+            assert first.env.step(np.array([0]))[0].tolist() == [[1.0]]
+            first.close()
+            waiting.join(120)
+        assert made[0].env.step(np.zeros(3, int))[0].tolist() == [[1.0]] * 3
+        made[0].close()
+
+
+def test_who_waits_in_vain_is_told_so(narrow: Listening, repository: Path) -> None:
+    """After ``retry_s``; the other one goes on."""
+    with started(repository, sandbox=narrow.sandbox()) as first:
+        with pytest.raises(ServerBusyError):
+            make_env(repository, n_envs=4, sandbox=narrow.sandbox(retry_s=1.5))
+        assert first.step(np.array([0]))[0].tolist() == [[1.0]]
+
+
+def test_a_wait_counts_neither_against_the_start_nor_after_a_close() -> None:
+    """The deadline moves along; who gives it up is not asked for any more."""
+    deadline, asked = StartupDeadline(1000.0), list[float]()
+
+    def ask() -> str:
+        asked.append(deadline.left_s() or 0.0)
+        if len(asked) < 3:
+            raise ServerBusyError("full", retry_s=0.2)
+        return "in"
+
+    assert retry_while_busy(ask, 600.0, deadline, "it") == "in"
+    assert len(asked) == 3
+    deadline.postpone(5000.0)
+    assert (deadline.left_s() or 0.0) > 5000.0
+    asked.clear()
+    deadline.give_up()
+    deadline.postpone(5000.0)
+    assert deadline.passed
+    with pytest.raises(ServerBusyError):
+        retry_while_busy(ask, 600.0, deadline, "it")
+    assert len(asked) == 1
+
+
+def test_a_session_is_waited_for_like_a_jail(tmp_path: Path) -> None:
+    """The refusal names that quota; who asks again is let in once the other has gone."""
+    with listening(tmp_path / "server", "--max-sessions", "1") as server:
+        pair = keys.load(server.state / "client.key")
+        with peer(server, pair) as waiting:
+            with peer(server, pair) as first:
+                assert isinstance(first.ask(m.Hello(m.VERSION, b"first")), m.Welcome)
+                refused = waiting.refused(m.Hello(m.VERSION, b"waiting"))
+                assert (refused.error, refused.missing) == ("ServerBusyError", "sessions")
+                assert Busy.read(refused.missing, refused.fix).used == 1
+            hello = m.Hello(m.VERSION, b"waiting")
+            assert eventually(lambda: isinstance(waiting.ask(hello), m.Welcome))
+
+
+@pytest.mark.parametrize("retry_s", [-1.0, float("inf"), float("nan")])
+def test_a_wait_without_end_is_refused(retry_s: float) -> None:
+    """As any other number that cannot be."""
+    with pytest.raises(PolicyError, match="retry_s"):
+        RemoteSandbox("tcp://127.0.0.1:5555", retry_s=retry_s)

@@ -1,0 +1,196 @@
+"""What a client on another host may have, and how much of it."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from envhub_sandbox import make_env
+from envhub_sandbox.errors import PolicyError, WorkerError
+from envhub_sandbox.sandboxes.remote import check_policy as check_place
+from envhub_sandbox.settings.policy import Policy
+from envhub_worker.access.quotas import (
+    InFlight,
+    Permissions,
+    Quotas,
+    RefusedError,
+    Use,
+    check_jail,
+    check_policy,
+)
+from envhub_worker.access.sessions import MAX_HELD, Sessions
+from envhub_worker.cli import listen_options
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.confinement import Confinement
+from envhub_worker.protocol.runtime import Runtime
+from envhub_worker.supervisor.records import Asker
+from tests.remote.listening import Listening, listening
+from tests.support.processes import eventually
+from tests.support.samples import sample
+
+
+def order(python: str = "", **policy: Any) -> tuple[m.OpenJail, Confinement]:
+    """What a client asks for."""
+    confinement = Confinement(**policy)
+    return m.OpenJail("x", python, "", "sha256:0", "env.py", asdict(confinement), 1), confinement
+
+
+@pytest.mark.parametrize(
+    ("asked", "permitted"),
+    [
+        ({"python": "/usr/bin/python3"}, None),
+        ({"readable": ("/etc",)}, None),
+        ({"network": "host"}, {"network": True}),
+        ({"gpu": True}, {"gpu": True}),
+        ({"profile": "no-userns"}, {"weakest_profile": "no-userns"}),
+        ({"profile": "container"}, {"weakest_profile": "container"}),
+    ],
+)
+def test_a_policy_needs_the_operators_permission(
+    asked: dict[str, Any], permitted: dict[str, Any] | None
+) -> None:
+    """Refused by default; paths and interpreters of the server always."""
+    with pytest.raises(RefusedError) as caught:
+        check_policy(*order(**asked), Permissions())
+    assert caught.value.error == "PolicyError"
+    if permitted is not None:
+        check_policy(*order(**asked), Permissions(**permitted))
+
+
+def test_packages_of_the_repositorys_own_are_not_for_other_hosts() -> None:
+    """A folder there cannot be named, however it is asked for; the text says what to do."""
+    asked, confinement = order()
+    wanted = m.replace(asked, packages="/packages")
+    with pytest.raises(RefusedError, match="folders of the remote server") as caught:
+        check_policy(wanted, confinement, Permissions())
+    assert caught.value.error == "PolicyError"
+    with pytest.raises(PolicyError, match="--dependencies"):
+        check_place(Policy(), Runtime("", "/packages"))
+
+
+def test_the_sums_of_a_key_are_bounded() -> None:
+    """Jails, runners and memory limits of everything that is open, and the new one."""
+    quotas = Quotas(jails=2, runners=4, memory_bytes=100)
+    check_jail([Use(40, 2)], Use(60, 2), quotas)
+    for uses, more, what in (
+        ([Use(1, 1), Use(1, 1)], Use(1, 1), "jails"),
+        ([Use(1, 2)], Use(1, 3), "runners"),
+        ([Use(1, 4)], Use(0, 1), "runners"),
+        ([Use(50, 1)], Use(51, 1), "memory"),
+    ):
+        with pytest.raises(RefusedError, match=what):
+            check_jail(uses, more, quotas)
+
+
+@pytest.mark.parametrize("name", ["--max-runners", "--max-hosts"])
+def test_the_quota_of_runners_has_its_former_name_too(name: str) -> None:
+    """Who wrote the option down when runners were called hosts is understood."""
+    parser = argparse.ArgumentParser()
+    listen_options.add_options(parser)
+    assert parser.parse_args([name, "3"]).max_runners == 3
+
+
+def test_bytes_in_flight_are_bounded_until_they_are_answered() -> None:
+    """Of one key; another's are its own."""
+    flying = InFlight()
+    first = Asker(b"one", 1)
+    flying.add(b"a", first, 60, 100)
+    flying.add(b"b", Asker(b"two", 1), 60, 100)
+    with pytest.raises(RefusedError, match="not answered yet"):
+        flying.add(b"a", Asker(b"one", 2), 60, 100)
+    flying.answered(first)
+    flying.answered(first)
+    flying.add(b"a", Asker(b"one", 3), 60, 100)
+
+
+def test_an_id_that_is_used_again_hides_no_bytes() -> None:
+    """Neither the second request nor the answer to it makes the first one forgotten."""
+    flying = InFlight()
+    first, again = Asker(b"one", 1), Asker(b"one", 1)
+    flying.add(b"a", first, 60, 100)
+    with pytest.raises(RefusedError, match="with this id"):
+        flying.add(b"a", again, 1, 100)
+    flying.answered(again)
+    with pytest.raises(RefusedError, match="60 bytes"):
+        flying.add(b"a", Asker(b"one", 2), 60, 100)
+    flying.answered(first)
+    flying.add(b"a", again, 100, 100)
+
+
+def test_a_session_belongs_to_its_key() -> None:
+    """The same name or the same routing id under another key is another session."""
+    sessions = Sessions()
+    mine = sessions.connect(b"id", b"a" * 32, b"name")
+    theirs = sessions.connect(b"id", b"b" * 32, b"name")
+    assert mine.owner != theirs.owner
+    assert sessions.find(b"id", b"a" * 32) is mine
+    assert sessions.find(b"id", b"c" * 32) is None
+
+
+def test_what_a_client_says_it_holds_is_bounded() -> None:
+    """It may list what it likes, as often as it likes: the latest are remembered."""
+    sessions = Sessions()
+    session = sessions.connect(b"id", b"", b"name")
+    for start in range(0, 3 * MAX_HELD, 4096):
+        sessions.keep(session, tuple(range(start, start + 4096)))
+    assert session.held is not None
+    assert len(session.held) == MAX_HELD
+    assert 3 * MAX_HELD - 1 in session.held
+
+
+def test_jails_that_nobody_holds_are_found() -> None:
+    """Held once is held until it is no longer listed for as long as it takes."""
+    now = [0.0]
+    sessions = Sessions(lambda: now[0])
+    session = sessions.connect(b"id", b"", b"name")
+    assert not sessions.unheld(session, 1, 5)
+    sessions.keep(session, (1, 2))
+    now[0] = 4
+    sessions.keep(session, (2,))
+    assert not sessions.unheld(session, 3, 5)
+    now[0] = 6
+    assert sessions.unheld(session, 1, 5)
+    assert not sessions.unheld(session, 2, 5)
+    assert not sessions.unheld(session, 3, 5)
+    now[0] = 10
+    assert sessions.unheld(session, 3, 5)
+
+
+@pytest.mark.parametrize(
+    ("options", "what"),
+    [
+        ({"python": "/usr/bin/python3"}, "python="),
+        ({"policy": {"readable": ("/etc",)}}, "readable"),
+    ],
+)
+def test_this_machines_paths_are_refused_before_anything_is_sent(
+    server: Listening, repository: Path, options: dict[str, Any], what: str
+) -> None:
+    """They would mean other things there."""
+    with pytest.raises(PolicyError, match=what):
+        make_env(repository, sandbox=server.sandbox(), **options)
+
+
+def test_what_was_started_ahead_makes_room_under_a_quota(tmp_path: Path) -> None:
+    """A task that somebody uses comes first; where there is no room nothing is started ahead."""
+    options: dict[str, Any] = {"env_kwargs": {"tasks": 4}, "prewarm": 1}
+    with listening(tmp_path / "server", "--max-jails", "2") as server:
+        with make_env(sample("many_tasks"), sandbox=server.sandbox(), **options) as suites:
+            envs = [env for tasks in suites.values() for env in tasks.values()]
+            envs[0].reset(seed=0)
+            assert eventually(lambda: envs[1].sandbox.stats()["state"] == "READY")
+            envs[3].reset(seed=0)  # would be the third jail
+            assert envs[1].sandbox.stats()["state"] == "IDLE"
+            with pytest.raises(WorkerError, match="3 jails"):
+                envs[1].reset(seed=0)
+            envs[3].close()
+            envs[1].reset(seed=0)
+            for env in (envs[0], envs[1]):
+                env.step(np.zeros(1, int))
+            assert envs[2].sandbox.stats()["state"] == "IDLE"
+        assert eventually(lambda: server.jails() == 0)

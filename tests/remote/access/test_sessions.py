@@ -1,0 +1,119 @@
+"""A client's place on a server: whose it is, and that whoever has gone takes none."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from envhub_worker.access import keys
+from envhub_worker.protocol import messages as m
+from tests.remote.listening import Listening, listening, worker
+from tests.remote.peers import peer
+from tests.support.processes import eventually
+
+_SHORT = """
+import sys
+from envhub_sandbox import RemoteSandbox, make_env
+from tests.support import inside
+for module, patience in inside.WAITS_FOR_A_SERVER:
+    setattr(module, patience, 90.0)  # a busy machine takes longer than a user would wait
+endpoint, server_key, client_key, repository, end = sys.argv[1:]
+suites = make_env(repository, sandbox=RemoteSandbox(endpoint, server_key, client_key))
+suites.env.reset()
+print("ready", flush=True)
+if end == "closes":
+    suites.close()
+if end == "waits":
+    sys.stdin.read()
+"""
+
+
+@pytest.fixture(scope="module")
+def narrow(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Listening]:
+    """A server with one place for each key, which waits for ever for whoever says nothing."""
+    quotas = ("--max-sessions", "1", "--max-jails", "1", "--idle-s", "0")
+    with listening(tmp_path_factory.mktemp("narrow"), *quotas) as server:
+        yield server
+
+
+def program(server: Listening, repository: Path, end: str) -> subprocess.Popen[bytes]:
+    """A short program that uses an environment there."""
+    words = server.endpoint, server.public, server.client_key, str(repository), end
+    return subprocess.Popen(
+        [sys.executable, "-c", _SHORT, *words],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+    )
+
+
+@pytest.mark.parametrize("end", ["closes", "returns"])
+def test_the_place_of_a_program_that_ends_is_free_at_once(
+    end: str, narrow: Listening, repository: Path
+) -> None:
+    """Of one that closes, and of one that leaves that to its end: one after the other come in."""
+    for _ in range(3):
+        client = program(narrow, repository, end)
+        said, _ = client.communicate(timeout=120)
+        assert client.returncode == 0, said
+        assert eventually(lambda: not narrow.sessions())
+
+
+def test_the_place_of_a_killed_program_is_for_whoever_needs_it(
+    narrow: Listening, repository: Path
+) -> None:
+    """Its jail stays, for it may be cut off only; the next of its key gets the place of both."""
+    killed = program(narrow, repository, "waits")
+    assert killed.stdout is not None
+    assert killed.stdout.readline() == b"ready\n"
+    os.kill(killed.pid, signal.SIGKILL)
+    killed.communicate()
+    assert eventually(lambda: [one["connections"] for one in narrow.sessions()] == [0])
+    assert narrow.jails() == 1
+    said, _ = program(narrow, repository, "closes").communicate(timeout=120)
+    assert said == b"ready\n"
+    assert eventually(lambda: not narrow.sessions())
+
+
+def test_a_place_that_is_in_use_is_kept(narrow: Listening, repository: Path) -> None:
+    """The control: nobody is pushed out who is still there."""
+    first = program(narrow, repository, "waits")
+    assert first.stdout is not None
+    assert first.stdout.readline() == b"ready\n"
+    said, _ = program(narrow, repository, "closes").communicate(timeout=120)
+    assert b"which is the server's quota" in said
+    assert narrow.jails() == 1
+    first.communicate(timeout=120)
+    assert first.returncode == 0
+
+
+def test_connections_that_have_gone_take_no_session(narrow: Listening) -> None:
+    """One after the other, each under a name of its own."""
+    pair = keys.load(narrow.state / "client.key")
+
+    def is_welcome(name: bytes) -> bool:
+        with peer(narrow, pair) as found:
+            return isinstance(found.ask(m.Hello(m.VERSION, name)), m.Welcome)
+
+    for name in (b"one", b"two", b"three"):
+        assert eventually(lambda: is_welcome(name))  # noqa: B023
+
+
+def test_status_takes_no_place_of_a_client(narrow: Listening, repository: Path) -> None:
+    """Asked with the client's own key, while its one place is in use; nor does it hold one then."""
+    client = program(narrow, repository, "waits")
+    assert client.stdout is not None
+    assert client.stdout.readline() == b"ready\n"
+    for _ in range(2):
+        asked = worker("status", *narrow.as_client())
+        assert asked.returncode == 0, asked.stderr
+        assert "1 jail" in asked.stdout
+    client.communicate(timeout=120)
+    assert client.returncode == 0
+    assert program(narrow, repository, "closes").communicate(timeout=120)[0] == b"ready\n"

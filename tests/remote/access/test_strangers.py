@@ -1,0 +1,338 @@
+"""Who has no key, or the wrong one: refused, bounded and logged, while a client's work goes on."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import errno
+import resource
+import socket
+import struct
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+import zmq
+
+from envhub_sandbox import make_env
+from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerError
+from envhub_sandbox.transport.tcp import TcpLink
+from envhub_worker.access import keys
+from envhub_worker.access.audit.log import LINES, PERIOD_S, Log
+from envhub_worker.access.gate import ClientRequest, Incoming
+from envhub_worker.access.keys import AuthorizedClients
+from envhub_worker.access.packages import Packages
+from envhub_worker.access.port.connection_limit import ConnectionLimiter
+from envhub_worker.access.quotas import Permissions, Quotas
+from envhub_worker.access.remote_gate import RemoteGate, Rules
+from envhub_worker.access.sessions import Sessions
+from envhub_worker.access.store.uploads import Uploads
+from envhub_worker.cli import listen
+from envhub_worker.loop import Loop
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.keys import key_text
+from envhub_worker.supervisor.records import Asker, RefusedError
+from envhub_worker.supervisor.witness import Witness
+from tests.remote.listening import Listening, listening
+from tests.remote.relay import relay
+from tests.remote.strangers import ends, greeting, knock, say
+from tests.support import inside
+from tests.support.processes import eventually
+from tests.support.started import started
+
+_MIB = 1 << 20
+_PATIENCE_S = 120.0
+_GREETING = greeting(b"NULL")
+
+
+@pytest.mark.short
+def test_another_clients_key_is_refused_at_once(server: Listening, repository: Path) -> None:
+    """The error names our public key, which the server's operator has to add; so does its log."""
+    pair = keys.generate()
+
+    def knocks() -> bool:
+        with pytest.raises(SandboxUnavailableError, match=key_text(pair.public)):
+            make_env(repository, sandbox=server.sandbox(client_key=key_text(pair.secret)))
+        return key_text(pair.public) in server.said()
+
+    # again and again: the log has a few lines a minute, and other tests have refused knocks too
+    assert eventually(knocks)
+
+
+def test_a_refusal_between_looking_and_sending_is_no_wait(
+    server: Listening, repository: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The socket has nowhere to put the request then, and libzmq would wait for that for ever."""
+    whole = TcpLink.next_number
+
+    def slowly(link: TcpLink) -> int:
+        monkeypatch.setattr(TcpLink, "next_number", whole)
+        assert eventually(lambda: not inside.can_send(link))
+        return 1  # as if it had looked just before
+
+    monkeypatch.setattr(TcpLink, "next_number", slowly)
+    with pytest.raises(SandboxUnavailableError, match="does not know our key"):
+        make_env(repository, sandbox=server.sandbox(client_key=key_text(keys.generate().secret)))
+
+
+def test_another_servers_key_is_refused_at_once(server: Listening, repository: Path) -> None:
+    """Nobody but the server that was meant can answer."""
+    other = key_text(keys.generate().public)
+    with pytest.raises(SandboxUnavailableError, match=r"is another than the\s+server_key"):
+        make_env(repository, sandbox=server.sandbox(server_key=other))
+    assert eventually(lambda: "handshake_failed" in server.said())
+
+
+@pytest.mark.short
+def test_no_key_is_refused_at_once(server: Listening, repository: Path) -> None:
+    """A client without keys does not get to say anything."""
+    with pytest.raises(SandboxUnavailableError, match="does not speak ZeroMQ with CURVE"):
+        make_env(repository, sandbox=server.sandbox(insecure_loopback=True))
+
+
+def test_a_peer_without_keys_hears_nothing(server: Listening) -> None:
+    """A plain ZeroMQ socket gets no reply; the control, with keys, does."""
+    with zmq.Context() as context:
+        assert not _greets(context, server, with_keys=False)
+        assert _greets(context, server, with_keys=True)
+
+
+def _greets(context: zmq.Context[Any], server: Listening, *, with_keys: bool) -> bool:
+    with context.socket(zmq.DEALER) as peer:
+        peer.setsockopt(zmq.LINGER, 0)
+        if with_keys:
+            pair = keys.load(server.state / "client.key")
+            peer.setsockopt(zmq.CURVE_SERVERKEY, bytes.fromhex(server.public))
+            peer.setsockopt(zmq.CURVE_SECRETKEY, pair.secret)
+            peer.setsockopt(zmq.CURVE_PUBLICKEY, pair.public)
+        peer.connect(server.endpoint)
+        peer.send_multipart(m.pack_header(m.Hello(m.VERSION, b"stranger"), 1))
+        return bool(peer.poll(60_000 if with_keys else 1_000))
+
+
+def _gate(folder: Path) -> RemoteGate:
+    """One with keys and nobody on its list."""
+    rules = Rules(
+        keys=keys.generate(),
+        authorized=AuthorizedClients(None, {}),
+        operators=frozenset(),
+        quotas=Quotas(),
+        permissions=Permissions(),
+        idle_s=0,
+    )
+    return RemoteGate(rules, Uploads(folder, Quotas()), Packages(None, Quotas()), Log())
+
+
+def test_nobody_comes_in_while_nobody_can_be_asked(tmp_path: Path) -> None:
+    """Without its handler libzmq refuses whoever has a key of his own; the control answers."""
+    for enforced in (True, False):
+        gate, pair = _gate(tmp_path), keys.generate()
+        with zmq.Context() as context:
+            router, peer = context.socket(zmq.ROUTER), context.socket(zmq.DEALER)
+            gate.secure(router, Loop(Witness().failed))
+            gate.close(Sessions())
+            if not enforced:
+                router.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 0)
+            port = router.bind_to_random_port("tcp://127.0.0.1")
+            peer.setsockopt(zmq.LINGER, 0)
+            peer.setsockopt(zmq.CURVE_SERVERKEY, inside.public_key(gate))
+            peer.setsockopt(zmq.CURVE_SECRETKEY, pair.secret)
+            peer.setsockopt(zmq.CURVE_PUBLICKEY, pair.public)
+            peer.connect(f"tcp://127.0.0.1:{port}")
+            peer.send(b"hello")
+            assert bool(router.poll(500 if enforced else 60_000)) is not enforced
+            peer.close()
+            router.close(0)
+
+
+def test_a_message_without_a_proved_key_is_refused(tmp_path: Path) -> None:
+    """Where keys are needed an empty one is nobody's: neither a session nor a request."""
+    gate, sessions = _gate(tmp_path), Sessions()
+    with pytest.raises(RefusedError, match="not authorised"):
+        gate.greet(Incoming(b"id", b"", []), b"name", sessions, None)  # type: ignore[arg-type]
+    asker = Asker(b"id", 1, b"x" * 40, b"")
+    with pytest.raises(RefusedError, match="not authorised"):
+        gate.authorize(ClientRequest(asker, m.GetSessions(), (), sessions, None))  # type: ignore[arg-type]
+
+
+def test_captured_bytes_are_worth_nothing(server: Listening, repository: Path, good: Any) -> None:
+    """What a client once sent, sent again: the server's keys of the connection are others."""
+    with relay(server.port) as wire:
+        with started(repository, sandbox=server.sandbox(endpoint=wire.endpoint)):
+            pass
+        captured = [bytes(kept) for kept in wire.captured if len(kept) > len(_GREETING)]
+    assert captured
+    jails = server.open_jails()
+    for data in captured:
+        with knock(server.port) as connection:
+            say(connection, data)
+            assert ends(connection)
+    assert eventually(lambda: "handshake_failed" in server.said())
+    assert server.open_jails() <= jails
+
+
+def test_a_flood_of_frames_without_keys_costs_no_memory(
+    server: Listening, good: Any, tmp_path: Path
+) -> None:
+    """Endless MORE frames fill the memory of a peer that takes them, as the control does."""
+    assert flood(server) < 64 * _MIB
+    with listening(tmp_path / "control", "--insecure-loopback") as control:
+        assert flood(control) > 128 * _MIB
+
+
+def flood(server: Listening) -> int:
+    """Send 256 MiB of frames that are never the last one; by how much the server grows."""
+    before = server.memory()
+    frame = b"\x03" + _MIB.to_bytes(8, "big") + bytes(_MIB)
+    with knock(server.port) as connection:
+        with contextlib.suppress(ConnectionError):
+            connection.sendall(_GREETING + b"\x04\x1c\x05READY\x0bSocket-Type\0\0\0\x06DEALER")
+            for _ in range(256):
+                connection.sendall(frame)
+        return server.memory() - before
+
+
+def test_a_port_scan_is_a_few_lines_in_the_log(server: Listening, good: Any) -> None:
+    """Hundreds of connections that say nothing, or noise, and go."""
+    before = server.memory()
+    for number in range(300):
+        with knock(server.port) as connection, contextlib.suppress(ConnectionError):
+            connection.sendall([b"", b"GET / HTTP/1.0\r\n\r\n", bytes(range(256))][number % 3])
+    good.call("count")
+    assert server.memory() - before < 64 * _MIB
+    periods = 1 + int((time.time() - psutil.Process(server.process.pid).create_time()) / PERIOD_S)
+    assert server.said().count("warning handshake_failed") <= LINES * periods < 300
+
+
+def test_slow_strangers_are_shown_the_door(server: Listening, good: Any) -> None:
+    """Whoever does not finish a handshake in a few seconds is disconnected."""
+    connections = [knock(server.port) for _ in range(100)]
+    try:
+        for connection in connections:
+            connection.sendall(_GREETING[:3])
+        good.call("count")
+        assert all(map(ends, connections))
+    finally:
+        for connection in connections:
+            connection.close()
+
+
+def may_filter() -> bool:
+    """Whether this user may have the kernel drop who knocks: some kernels ask for privilege."""
+    program = ctypes.create_string_buffer(struct.pack("=HBBI", 0x06, 0, 0, 0xFFFF))
+    with socket.socket() as door:
+        try:
+            door.setsockopt(socket.SOL_SOCKET, 26, struct.pack("@HP", 1, ctypes.addressof(program)))
+        except PermissionError:
+            return False
+    return True
+
+
+needs_a_filter = pytest.mark.skipif(
+    not may_filter(), reason="this user may not filter what a TCP socket gets"
+)
+
+
+@needs_a_filter
+def test_too_many_connections_stay_outside(tmp_path: Path, repository: Path) -> None:
+    """Who is in goes on, descriptors are left for jails, and afterwards the door is open again."""
+    with (
+        listening(tmp_path / "server", "--max-connections", "40") as server,
+        make_env(repository, sandbox=server.sandbox()) as suites,
+        contextlib.ExitStack() as crowd,
+    ):
+        suites.env.reset(seed=1)
+        for _ in range(400):
+            stranger = crowd.enter_context(socket.socket())
+            stranger.setblocking(False)
+            stranger.connect_ex(("127.0.0.1", server.port))
+        assert eventually(lambda: "no more for the moment" in server.said(), _PATIENCE_S)
+        assert suites.env.step(np.array([0]))[0].tolist() == [[1.0]]
+        assert psutil.Process(server.process.pid).num_fds() < 300
+        crowd.close()
+        assert eventually(lambda: _gets_in(server, repository), _PATIENCE_S)
+
+
+def _gets_in(server: Listening, repository: Path) -> bool:
+    try:
+        with started(repository, n_envs=2, sandbox=server.sandbox()):
+            pass
+    except SandboxUnavailableError:
+        return False
+    return True
+
+
+@needs_a_filter
+def test_a_door_that_cannot_be_shut_ends_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a descriptor left the server goes on, says so, and tries again."""
+    said = list[str]()
+    with zmq.Context() as context, context.socket(zmq.ROUTER) as router:
+        doorman = ConnectionLimiter(router, Loop(Witness().failed), Log(said.append), 1)
+        router.bind("tcp://127.0.0.1:*")
+        for broken in ("os.listdir", "os.dup"):
+            with monkeypatch.context() as patch:
+                patch.setattr(broken, _no_descriptors)
+                inside.happen(doorman, zmq.EVENT_ACCEPTED)
+            assert not inside.door_is_shut(doorman)
+        assert "and no end" in said[0]
+        inside.happen(doorman, zmq.EVENT_ACCEPTED)
+        assert inside.door_is_shut(doorman)
+        for _ in range(3):
+            inside.happen(doorman, zmq.EVENT_DISCONNECTED)
+        doorman.tick()
+        assert not inside.door_is_shut(doorman)
+        doorman.close()
+
+
+def _no_descriptors(*_: object) -> None:
+    raise OSError(errno.EMFILE, "Too many open files")
+
+
+def test_connections_leave_half_of_the_descriptors(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever was asked for: jails need the others."""
+    for limit, most in ((100, 50), (1, 1), (resource.RLIM_INFINITY, 1024), (65_536, 1024)):
+        monkeypatch.setattr("resource.getrlimit", lambda _, soft=limit: (soft, soft))
+        assert listen.most_connections(1024) == most
+
+
+def test_without_keys_it_listens_on_loopback_only(tmp_path: Path, repository: Path) -> None:
+    """``--insecure-loopback`` serves on 127.0.0.1, and refuses every other address."""
+    with listening(tmp_path / "open", "--insecure-loopback") as open_server:
+        sandbox = open_server.sandbox(server_key=None, client_key=None, insecure_loopback=True)
+        with started(repository, sandbox=sandbox):
+            pass
+    for address in ("0.0.0.0", "*", "10.0.0.1", "localhost"):
+        with (
+            pytest.raises(AssertionError, match="needs a loopback address"),
+            listening(tmp_path / "closed", "--insecure-loopback", bind=f"tcp://{address}:*"),
+        ):
+            pass
+    with pytest.raises(PolicyError, match="not on a loopback address"):
+        open_server.sandbox(endpoint="tcp://192.0.2.1:5555", insecure_loopback=True)
+
+
+def test_a_key_that_is_taken_off_the_list_is_out(tmp_path: Path, repository: Path) -> None:
+    """The list is read anew when it changes: also for who is in already."""
+    pair, other = keys.generate(), keys.generate()
+    authorized = tmp_path / "authorized"
+    authorized.write_text(f"# who may come in\n{key_text(pair.public)} alice\n")
+    with listening(tmp_path / "server", "--authorized-clients", str(authorized)) as server:
+        sandbox = server.sandbox(client_key=key_text(pair.secret))
+        with started(repository, sandbox=sandbox) as env:
+            assert [one["client"] for one in server.sessions()] == ["alice"]
+            authorized.write_text(f"{key_text(other.public)} bob\n")
+            assert eventually(lambda: _is_refused(env))
+            assert eventually(lambda: server.jails() == 0)
+        with pytest.raises(SandboxUnavailableError, match="does not know our key"):
+            make_env(repository, n_envs=2, sandbox=sandbox)
+
+
+def _is_refused(env: Any) -> bool:
+    try:
+        env.step(np.array([0]))
+    except WorkerError as error:
+        return "not authorised any more" in str(error)
+    return False

@@ -1,0 +1,1 @@
+"""What a server says of itself: log, figures, health, and what ``doctor`` makes of them."""

@@ -1,0 +1,185 @@
+"""What a server writes down: a line an event, as an operator and his programs read it."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from envhub_sandbox import make_env
+from envhub_sandbox.errors import PolicyError, ServerBusyError, WorkerDiedError
+from envhub_worker.access import keys
+from envhub_worker.access.audit.log import FORMS, LEVELS
+from envhub_worker.access.keys import KeyPair
+from envhub_worker.protocol.keys import key_text
+from tests.remote.listening import Listening, listening
+from tests.support.processes import eventually
+from tests.support.samples import sample
+from tests.support.started import started
+
+LIVE, EXIT = 0, 1
+# under nohup all that we start ignores the end of a terminal
+_IGNORED = signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+_HANGS_UP = signal.SIGINT if _IGNORED else signal.SIGHUP
+_TEXT = re.compile(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\d\.\d{3}Z (\w+) (\w+)( \w+=(\"[ -~]*?\"|\S+))*")
+
+
+@contextmanager
+def logging_server(folder: Path, names: dict[str, KeyPair], *options: str) -> Iterator[Listening]:
+    """A server whose clients have names."""
+    folder.mkdir(exist_ok=True)
+    listed = folder / "clients"
+    lines = [f"{key_text(pair.public)} {name}\n" for name, pair in names.items()]
+    listed.write_text("".join(lines), "utf-8")
+    with listening(folder / "server", "--authorized-clients", str(listed), *options) as server:
+        yield server
+
+
+def replace(path: Path, text: str) -> None:
+    """At once: nobody reads half of it."""
+    new = path.with_suffix(".new")
+    new.write_text(text, "utf-8")
+    os.replace(new, path)
+
+
+def events(server: Listening) -> list[dict[str, Any]]:
+    """All that a server has said; every line of it is JSON."""
+    return [json.loads(line) for line in server.said().splitlines()]
+
+
+def of(server: Listening, event: str, **fields: object) -> list[dict[str, Any]]:
+    """The events of a name that have these fields."""
+    return [
+        one
+        for one in events(server)
+        if one["event"] == event and all(one.get(name) == is_ for name, is_ in fields.items())
+    ]
+
+
+def test_the_life_of_two_clients_can_be_read(tmp_path: Path) -> None:
+    """Who came, what was opened for whom, what died of what, what was refused, and who left."""
+    names = {"alice": keys.generate(), "bob the builder": keys.generate()}
+    with logging_server(tmp_path, names, "--log-format", "json", "--max-jails", "1") as server:
+        alice, bob = (server.sandbox(client_key=key_text(one.secret)) for one in names.values())
+        with started(sample("counter"), n_envs=2, sandbox=alice) as env:
+            env.step(env.action_space.sample())
+            with pytest.raises(ServerBusyError), started(sample("mortal"), sandbox=alice):
+                pass
+            with started(sample("mortal"), sandbox=bob) as others, pytest.raises(WorkerDiedError):
+                others.step([EXIT])
+            with pytest.raises(PolicyError):
+                make_env(sample("mortal"), sandbox=bob, policy={"network": "host"})
+        assert eventually(lambda: of(server, "jail_closed", client="alice"))
+        found = events(server)
+    first, last = found[0], events(server)[-1]
+    assert (first["event"], last["event"]) == ("listening", "stopped")
+    assert first["server_key"] == server.public
+    assert all(one["level"] in LEVELS and one["time"].endswith("Z") for one in found)
+    assert [one["time"] for one in found] == sorted(one["time"] for one in found)
+    assert {one["client"] for one in of(server, "client_connected")} == set(names)
+
+    [opened] = of(server, "jail_opened", client="alice")
+    assert opened["environment"].endswith("counter:env.py")
+    assert re.fullmatch("[0-9a-f]{64}", opened["snapshot"])
+    assert opened["profile"] == "strict"
+    assert opened["seconds"] > 0
+    [closed] = of(server, "jail_closed", client="alice")
+    assert (closed["jail"], closed["session"]) == (opened["jail"], opened["session"])
+    assert closed["bytes_in"] > 0 < closed["bytes_out"]
+    [upload] = of(server, "upload", client="alice", snapshot=opened["snapshot"])
+    assert upload["bytes"] > 0
+
+    busy = of(server, "refused", client="alice", error="ServerBusyError")
+    assert {(one["quota"], one["used"], one["limit"]) for one in busy} == {("jails", 1, 1)}
+    [died] = of(server, "jail_died", client="bob the builder")
+    assert (died["reason"], died["level"]) == ("exit", "warning")
+    assert died["environment"].endswith("mortal:env.py")
+    [refused] = of(server, "refused", client="bob the builder")
+    assert (refused["error"], "--allow-network" in refused["why"]) == ("PolicyError", True)
+
+
+def test_no_secret_is_in_a_log(tmp_path: Path) -> None:
+    """Nor what an environment prints, which is its client's alone."""
+    alice = keys.generate()
+    with logging_server(tmp_path, {"alice": alice}, "--log-level", "debug") as server:
+        secret = key_text(alice.secret)
+        with started(sample("mortal"), sandbox=server.sandbox(client_key=secret)):
+            pass
+        assert eventually(lambda: "jail_closed" in server.said())
+    lines = [line for line in server.said().splitlines() if _TEXT.match(line)]
+    assert any(" jail_opened client=alice " in line for line in lines)
+    own = (server.state / "server.key").read_text().strip()
+    assert not any(key in server.said() for key in (secret, own))
+
+
+def test_the_end_of_a_server_is_the_end_of_what_it_has(
+    tmp_path: Path, wait_no_more: Callable[[], None]
+) -> None:
+    """Of its jails, its clients and its note; also when its terminal is closed."""
+    alice = keys.generate()
+    with logging_server(tmp_path, {"alice": alice}, "--log-format", "json") as server:
+        remote = server.sandbox(client_key=key_text(alice.secret))
+        with started(sample("mortal"), sandbox=remote):
+            server.process.send_signal(_HANGS_UP)
+            assert server.process.wait(60) == 0
+            wait_no_more()
+    assert server.noted() == ""
+    [opened], [closed] = of(server, "jail_opened"), of(server, "jail_closed")
+    assert closed["jail"] == opened["jail"]
+    [left] = of(server, "client_left")
+    assert (left["session"], left["why"]) == (opened["session"], "the server ends")
+    assert events(server)[-1]["event"] == "stopped"
+
+
+def test_a_broken_list_of_clients_is_told_once(tmp_path: Path) -> None:
+    """And that it is read again, with what its owner calls them."""
+    alice = keys.generate()
+    with logging_server(tmp_path, {"Zoë": alice}, "--log-format", "json") as server:
+        line = f"{key_text(alice.public)} Zoë\n"
+        replace(tmp_path / "clients", f"{line}no key\n")
+        assert eventually(lambda: of(server, "clients_kept_as_they_were"))
+        remote = server.sandbox(client_key=key_text(alice.secret))
+        with started(sample("mortal"), sandbox=remote):  # takes a while: seconds pass
+            pass
+        replace(tmp_path / "clients", line)
+        assert eventually(lambda: of(server, "clients_read", clients=1))
+    [wrong] = of(server, "clients_kept_as_they_were")
+    assert "line 2" in wrong["why"]
+    assert {one["client"] for one in of(server, "client_connected")} == {"Zoë"}
+
+
+def test_less_can_be_asked_for(tmp_path: Path) -> None:
+    """Of an ordinary life nothing is as bad as a warning."""
+    alice = keys.generate()
+    options = ("--log-format", "json", "--log-level", "warning")
+    with logging_server(tmp_path, {"alice": alice}, *options) as server:
+        remote = server.sandbox(client_key=key_text(alice.secret))
+        with started(sample("mortal"), sandbox=remote):
+            pass
+        assert eventually(lambda: server.jails() == 0)
+    assert server.said() == ""
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_a_line_is_short_plain_and_one(form: str) -> None:
+    """Whatever there is in a value."""
+    evil = "a\n\r\x1b[2J\x85\u2028\u202e\ud800\"'\\ b=c" + "x" * 10_000
+    line = FORMS[form](0.0, "info", "jail_opened", {"client": evil, "number": 7, "some": True})
+    assert line.isprintable()
+    assert line.isascii()
+    assert len(line) < 1_000
+    assert "1970-01-01T00:00:00.000Z" in line
+    if form == "json":
+        told = json.loads(line)
+        assert (told["number"], told["some"], told["event"]) == (7, True, "jail_opened")
+        assert told["client"].startswith(evil[:30])
+    else:
+        assert line.startswith('1970-01-01T00:00:00.000Z info jail_opened client="a\\n')
+        assert line.endswith("number=7 some=true")

@@ -1,0 +1,358 @@
+"""What a listening server tells whoever watches it: figures, health and readiness, over HTTP.
+
+The port has no keys: so there are attacks on it, while a client's work goes on.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import http.client
+import os
+import re
+import socket
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+
+from envhub_sandbox import make_env
+from envhub_sandbox.errors import ServerBusyError, WorkerDiedError
+from envhub_worker.access.audit import figures, usage
+from envhub_worker.cli import http_port
+from envhub_worker.cli.http_port import MAX_CONNECTIONS, MAX_REQUEST_BYTES, HttpPort, parse_address
+from envhub_worker.cli.metrics import STALE_S, MetricsPage
+from tests.remote.listening import listening, worker
+from tests.remote.monitoring.watched import Watched, get, watched
+from tests.remote.strangers import hears, knock
+from tests.support.processes import eventually
+from tests.support.started import started
+
+_MIB = 1 << 20
+
+
+@pytest.fixture(scope="module")
+def one(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Watched]:
+    """A server with room for two jails of a key."""
+    with watched(tmp_path_factory.mktemp("watched"), "--max-jails", "2") as found:
+        yield found
+
+
+def test_a_client_is_seen_with_what_it_uses(one: Watched, repository: Path) -> None:
+    """By name, against its quota; what it did is counted, and stays when it has gone."""
+    who = "the one client"
+    before = one.values()
+    with started(repository, sandbox=one.server.sandbox()) as env:
+        for _ in range(5):
+            env.step(np.array([0]))
+        assert one.shows("envhub_server_jails", who, value=1)
+        assert one.shows("envhub_server_sessions", who, value=1)
+        steps = before.get(("envhub_server_requests_total", who, "step"), 0)
+        assert one.shows("envhub_server_requests_total", who, "step", value=steps + 5)
+        now = one.values()
+        assert now["envhub_server_quota", "jails"] == 2
+        assert now["envhub_server_memory_limit_bytes", who] == 8 << 30
+        assert now["envhub_server_upload_bytes", who] > 0
+        assert eventually(lambda: one.values()["envhub_server_memory_bytes", who] > _MIB)
+        sandbox = one.server.sandbox()
+        with started(repository, n_envs=2, sandbox=sandbox), pytest.raises(ServerBusyError):
+            make_env(repository, n_envs=3, sandbox=sandbox)
+        refused = before["envhub_server_refusals_total", "jails"] + 1
+        assert one.shows("envhub_server_refusals_total", "jails", value=refused)
+        told = one.server.status()["server"]
+        assert told["clients"][who]["sessions"] == 1
+        assert told["refusals"]["jails"] == refused
+        pid = one.server.sessions()[0]["jails"][0]["pids"][0]
+        os.kill(pid, 9)
+        with pytest.raises(WorkerDiedError):
+            env.step(np.array([0]))
+    deaths = before["envhub_server_deaths_total", "signal"] + 1
+    assert one.shows("envhub_server_deaths_total", "signal", value=deaths)
+    assert one.values()["envhub_server_jails_opened_total", who] >= 2
+    assert eventually(lambda: one.values().get(("envhub_server_sessions", who), 0) == 0)
+
+
+def test_a_client_is_told_of_itself_only(one: Watched, repository: Path) -> None:
+    """Quotas and versions, and nobody else's figures."""
+    done = worker("status", *one.server.as_client(), "--json")
+    assert '"quotas"' in done.stdout
+    for word in ("refusals", "deaths", "disk", "pid", "operator"):
+        assert f'"{word}"' not in done.stdout
+
+
+def test_no_secret_is_in_a_label(one: Watched, repository: Path) -> None:
+    """Neither a key nor a session's name, which lets a connection be one of its client's."""
+    with started(repository, sandbox=one.server.sandbox()):
+        text = one.get("/metrics")[1]
+        names = [found["session"] for found in one.server.sessions()]
+    assert names
+    for secret in (*names, one.server.client_key, one.server.public):
+        assert secret not in text
+    assert re.search(r"[0-9a-f]{32}", text) is None
+
+
+def test_readiness_is_red_in_a_drain(tmp_path: Path, repository: Path) -> None:
+    """And health is not: it answers those that it has."""
+    with (
+        watched(tmp_path / "server", "--drain-s", "600") as one,
+        started(repository, sandbox=one.server.sandbox()),
+    ):
+        one.server.process.terminate()
+        assert eventually(lambda: one.get("/readyz")[0] == 503)
+        assert "drains" in one.get("/readyz")[1]
+        assert one.get("/healthz")[0] == 200
+        assert one.values()["envhub_server_draining",] == 1
+        assert one.server.status()["server"]["draining_s"] > 0
+
+
+def test_a_server_that_is_stuck_is_not_healthy(one: Watched) -> None:
+    """Its port's own thread says so; there is nothing of last week's to read."""
+    now = [0.0]
+    page = MetricsPage(True, lambda _: ("text/plain", b"figures"), lambda: now[0])
+    assert page.answer("/healthz")[0] == page.answer("/metrics")[0] == 503
+    page.publish({"draining_s": None})
+    assert page.answer("/metrics")[2] == b"figures"
+    assert page.answer("/readyz")[0] == 200
+    now[0] = STALE_S + 1
+    for path in ("/metrics", "/healthz", "/readyz"):
+        assert page.answer(path)[0] == 503
+    unusable = MetricsPage(False, lambda _: ("text/plain", b""), lambda: now[0])
+    unusable.publish({"draining_s": None})
+    assert unusable.answer("/readyz")[0] == 503
+    assert unusable.answer("/healthz")[0] == 200
+
+
+# --- where it listens --------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "address"),
+    [
+        ("9090", ("127.0.0.1", 9090)),
+        (":9090", ("127.0.0.1", 9090)),
+        ("10.0.0.5:80", ("10.0.0.5", 80)),
+        ("[::1]:0", ("::1", 0)),
+    ],
+)
+def test_without_an_address_it_is_loopback(text: str, address: tuple[str, int]) -> None:
+    """Any other has to be said."""
+    assert parse_address(text) == address
+
+
+@pytest.mark.parametrize("text", ["", "x", "localhost:1", "127.0.0.1:", "127.0.0.1:65536", "1:-1"])
+def test_what_is_no_address_is_refused(text: str) -> None:
+    """Names, too: whose address they have is not ours to say."""
+    with pytest.raises(ValueError, match="--metrics takes"):
+        parse_address(text)
+
+
+def test_a_port_that_others_can_reach_is_said(tmp_path: Path) -> None:
+    """One that is asked for; a port that is taken ends the start, with the reason."""
+    with listening(tmp_path / "server", "--metrics", "0.0.0.0:0") as server:
+        assert "warning metrics_are_open" in server.said()
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with (
+            pytest.raises(AssertionError, match=r"--metrics \d+: .*in use"),
+            listening(tmp_path / "other", "--metrics", str(port)),
+        ):
+            pass
+
+
+def test_without_the_library_the_error_names_the_extra(tmp_path: Path) -> None:
+    """And without the option nothing asks for it."""
+    program = (
+        "import sys; sys.modules['prometheus_client'] = None\n"
+        "from envhub_worker.__main__ import main\n"
+        "sys.exit(main(['listen', '--state-dir', sys.argv[1], '--bind', 'tcp://127.0.0.1:*', "
+        "*sys.argv[2:]]))"
+    )
+    command = [sys.executable, "-c", program, str(tmp_path / "state")]
+    done = subprocess.run([*command, "--metrics", "0"], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 2
+    assert "pip install 'envhub-sandbox[metrics]'" in done.stderr
+    done = subprocess.run([*command, "--metrics", "x"], capture_output=True, text=True, timeout=120)
+    assert "--metrics takes" in done.stderr
+
+
+# --- attacks -----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def good(one: Watched, repository: Path) -> Iterator[Any]:
+    """A client's environment and a reader of figures, which both must go on."""
+    with started(repository, sandbox=one.server.sandbox()) as env:
+        yield env
+        assert env.step(np.array([0]))[0].tolist() == [[1.0]]
+        assert one.get("/healthz")[0] == 200
+
+
+def test_slow_readers_and_writers_are_shown_the_door(one: Watched, good: Any) -> None:
+    """A request that does not end, and an answer that nobody reads."""
+    silent, slow, deaf = knock(one.port), knock(one.port), knock(one.port)
+    slow.sendall(b"GET /metrics HTTP/1.1\r\n")
+    deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1)
+    deaf.sendall(b"GET /metrics HTTP/1.1\r\n\r\n")
+    good.call("count")
+    assert hears(silent) == hears(slow) == b""
+    for connection in (silent, slow, deaf):
+        connection.close()
+
+
+def test_more_connections_than_there_is_room_for(one: Watched, good: Any) -> None:
+    """They hold neither descriptors nor whoever comes after them."""
+    before = psutil.Process(one.server.process.pid).num_fds()
+    with contextlib.ExitStack() as crowd:
+        for _ in range(10 * MAX_CONNECTIONS):
+            connection = crowd.enter_context(socket.socket())
+            connection.setblocking(False)
+            connection.connect_ex(("127.0.0.1", one.port))
+        assert one.get("/healthz")[0] == 200
+        now = psutil.Process(one.server.process.pid).num_fds()
+        assert now < before + 5 * MAX_CONNECTIONS
+        good.call("count")
+
+
+def test_a_huge_request_is_not_kept(one: Watched, good: Any) -> None:
+    """It is answered, or ended, once it is larger than any of ours."""
+    before = one.server.memory()
+    for data in (b"x" * 64 * _MIB, b"GET /" + b"a" * 16 * _MIB, b"GET / HTTP/1.1\r\n" * 1_000_000):
+        with knock(one.port) as connection, contextlib.suppress(ConnectionError):
+            connection.sendall(data)
+            heard = hears(connection)
+            assert heard == b"" or heard.startswith(b"HTTP/1.1 4"), heard[:100]
+    assert one.server.memory() - before < 16 * _MIB
+
+
+@pytest.mark.parametrize(
+    ("request_", "status"),
+    [
+        (b"GET /metrics HTTP/1.1\r\n\r\n", 200),
+        (b"GET /metrics?x=1 HTTP/1.0\n\n", 200),
+        (b"HEAD /healthz HTTP/1.1\r\n\r\n", 200),
+        (b"GET /../../etc/passwd HTTP/1.1\r\n\r\n", 404),
+        (b"POST /metrics HTTP/1.1\r\nContent-Length: 9\r\n\r\n", 405),
+        (b"\r\n\r\n", 400),
+        (b"GET\r\n\r\n", 400),
+        (b"GET /metrics HTTP/9.9\r\n\r\n", 400),
+        (b"\x16\x03\x01\x02\x00\x01\x00\n\n", 400),
+        (b"GET /\xff\x00\x1b HTTP/1.1\r\n\r\n", 404),
+        (b"GET / HTTP/1.1\r\n" + b"a: b\r\n" * MAX_REQUEST_BYTES, 431),
+    ],
+)
+def test_only_whole_requests_for_a_page_are_answered(
+    one: Watched, request_: bytes, status: int
+) -> None:
+    """Whatever else is sent; ``HEAD`` without the page."""
+    with knock(one.port) as connection:
+        with contextlib.suppress(ConnectionError):
+            connection.sendall(request_)
+        heard = hears(connection)
+    if status == 431:
+        assert heard == b"" or b" 431 " in heard  # what was not read may take the answer along
+        return
+    head, _, body = heard.partition(b"\r\n\r\n")
+    assert head.startswith(b"HTTP/1.1 %d " % status)
+    read = status == 200 and not request_.startswith(b"HEAD")
+    assert bool(body) == (read or status == 404)
+
+
+def test_a_crowd_of_readers_does_not_hold_the_clients(one: Watched, good: Any) -> None:
+    """Figures are made once for all of them; steps go on meanwhile."""
+    stop = threading.Event()
+
+    def read() -> None:
+        while not stop.is_set():
+            with contextlib.suppress(OSError, http.client.HTTPException):
+                get(one.port, "/metrics")
+
+    readers = [threading.Thread(target=read) for _ in range(4)]
+    for reader in readers:
+        reader.start()
+    try:
+        for _ in range(50):
+            good.call("count")
+    finally:
+        stop.set()
+        for reader in readers:
+            reader.join()
+
+
+def test_a_page_that_fails_is_an_answer() -> None:
+    """The thread goes on; what was wrong is in the log."""
+
+    def answer(path: str) -> http_port.Reply:
+        if path == "/wrong":
+            raise RuntimeError("on purpose")
+        return 200, "text/plain", b"right"
+
+    said = list[str]()
+    port = HttpPort("127.0.0.1", 0, answer, said.append)
+    try:
+        number = int(port.address.rpartition(":")[2])
+        assert get(number, "/wrong")[0] == 500
+        assert get(number, "/right") == (200, "right")
+    finally:
+        port.close()
+    assert len(said) == 1
+    assert "on purpose" in said[0]
+
+
+# --- figures -----------------------------------------------------------------------------------
+
+
+def test_what_clients_say_cannot_make_a_label() -> None:
+    """Operations, reasons and names have their number; the rest is added up."""
+    tally = figures.Tally()
+    for number in range(1000):
+        tally.asked(f"client {number}", f"operation {number}")
+        tally.open(f"client {number}")
+        tally.refused(f"Error{number}", f"quota{number}")
+    assert len(tally.requests) == figures.MAX_CLIENTS + 1
+    assert {word for one in tally.requests.values() for word in one} == {"other"}
+    assert tally.requests[figures.OTHERS]["other"] == 1000 - figures.MAX_CLIENTS
+    assert tally.refusals == {"other": 1000}
+    clients = figures.ClientFigures()
+    clients.add_past(tally, usage.Usage(lambda _: None))
+    assert len(clients.plain()) <= figures.MAX_CLIENTS + 1
+    assert figures.client_name("a\n\x1b[2J" * 100, insecure=False).isprintable()
+    assert len(figures.client_name("a" * 1000, insecure=False)) == 64
+
+
+def test_usage_is_of_all_processes_of_a_jail() -> None:
+    """Of its first process, and of what that has below it."""
+    program = (
+        "import subprocess, sys, time\n"
+        "child = 'import time\\nwhile time.process_time() < 0.2: pass\\nprint(1, flush=True)\\n"
+        "time.sleep(600)'\n"
+        "found = [subprocess.Popen([sys.executable, '-c', child], stdout=subprocess.PIPE) "
+        "for _ in range(2)]\n"
+        "for one in found: one.stdout.readline()\n"
+        "print(1, flush=True)\n"
+        "sys.stdin.read()\n"
+        "for one in found: one.kill()\n"
+    )
+    pipe = subprocess.PIPE
+    with subprocess.Popen([sys.executable, "-c", program], stdin=pipe, stdout=pipe) as jail:
+        assert jail.stdout is not None
+        jail.stdout.readline()
+        seen = usage.Usage(lambda _: None)
+        seen.close()  # no thread: it looks when it is told to
+        seen.watch({jail.pid: "alice"})
+        seen.look()
+        spent = seen.cpu_s["alice"]
+        assert spent >= 0.3  # of two, each less a tick of the kernel's clock
+        assert seen.memory_bytes["alice"] > _MIB
+        seen.look()
+        assert spent <= seen.cpu_s["alice"] < 2 * spent
+        jail.communicate(b"")
+    seen.look()
+    assert seen.memory_bytes.get("alice", 0) == 0
+    assert seen.cpu_s["alice"] >= spent
+    assert usage.look_at(jail.pid) is None
+    assert usage.children(jail.pid) == []

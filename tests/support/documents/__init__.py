@@ -1,0 +1,1 @@
+"""Documents that are written from the code, and the blocks of code in the others."""

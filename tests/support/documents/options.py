@@ -1,0 +1,138 @@
+"""``docs/options.md``, written from the commands themselves.
+
+Write it again with ``python -m tests.support.documents.options``.
+"""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import pkgutil
+import re
+import typing
+from collections.abc import Callable, Iterator
+from enum import Enum
+from typing import Any, Literal
+
+import typer
+
+from envhub_sandbox.cli.app import app
+from envhub_worker import cli
+from tests.support.documents.written import DOCS, filled
+
+DOCUMENT = DOCS / "options.md"
+Row = tuple[str, str, str]
+
+
+def document() -> str:
+    """What the file has to hold."""
+    parts = [*_commands("envhub", app)]
+    for name in sorted(module.name for module in pkgutil.iter_modules(cli.__path__)):
+        module = importlib.import_module(f"{cli.__name__}.{name}")
+        if hasattr(module, "add_arguments") and name != "serve":
+            module.add_arguments(told := _Told())
+            parts += _part(f"envhub-worker {name}", module.run.__doc__, told.rows)
+    return filled(DOCUMENT, written="\n".join(parts))
+
+
+def _commands(name: str, tree: typer.Typer) -> Iterator[str]:
+    """The commands of a program, and those that are below others."""
+    for one in tree.registered_commands:
+        function = one.callback
+        assert function is not None
+        rows = list(_options(function))
+        yield from _part(f"{name} {one.name or function.__name__}", function.__doc__, rows)
+    for group in tree.registered_groups:
+        assert group.typer_instance is not None
+        yield from _commands(f"{name} {group.name}", group.typer_instance)
+
+
+def _part(name: str, what: str | None, rows: list[Row]) -> Iterator[str]:
+    yield f"## `{name}`\n"
+    yield f"{_cell((what or '').partition(chr(10) * 2)[0])}\n"
+    if rows:
+        yield "| option | default | what it is |\n|---|---|---|"
+        yield from (
+            f"| {_written(name)} | {default} | {_cell(text)} |" for name, default, text in rows
+        )
+        yield ""
+
+
+def _options(function: Callable[..., Any]) -> Iterator[Row]:
+    """How each option of a command is written, its default, and its help."""
+    hints = typing.get_type_hints(function, include_extras=True)
+    for name, parameter in inspect.signature(function).parameters.items():
+        if hints[name] is typer.Context:
+            continue
+        kind, info = _annotated(hints[name])
+        default = _plain(parameter.default)
+        told = isinstance(default, str | int | float) and not isinstance(default, bool)
+        shown = _code(str(default)) if told and default != "" else ""
+        choices = [str(_plain(one)) for one in _choices(kind)]
+        value = info.metavar or "|".join(choices)
+        if isinstance(info, typer.models.ArgumentInfo):
+            yield value or name.upper(), shown, info.help or ""
+            continue
+        # inside Annotated typer takes the first of them for a default, until it makes the command
+        first = [info.default] if isinstance(info.default, str) else []
+        names = ", ".join([*first, *(info.param_decls or ())] or [f"--{name.replace('_', '-')}"])
+        flag = kind is bool
+        yield names if flag else f"{names} {value or 'VALUE'}", shown, info.help or ""
+
+
+def _annotated(hint: Any) -> tuple[Any, Any]:
+    """The type of an option and what it is told; Python 3.10 may say Optional around both."""
+    while not hasattr(hint, "__metadata__"):
+        hint = typing.get_args(hint)[0]
+    return typing.get_args(hint)[0], hint.__metadata__[0]
+
+
+def _choices(kind: Any) -> list[Any]:
+    """What may be said, where that is a list."""
+    if isinstance(kind, type) and issubclass(kind, Enum):
+        return list(kind)
+    if typing.get_origin(kind) is Literal:
+        return list(typing.get_args(kind))
+    return [choice for part in typing.get_args(kind) for choice in _choices(part)]
+
+
+def _plain(value: Any) -> Any:
+    return value.value if isinstance(value, Enum) else value
+
+
+class _Told:
+    """What a command of the worker tells of its options; their defaults stand in the help."""
+
+    def __init__(self) -> None:
+        self.rows: list[Row] = []
+
+    def add_argument(self, *names: str, **of: Any) -> None:
+        """As a parser is told."""
+        # what depends on the host is explained elsewhere
+        text = re.sub(r" \(default here: .*\)$", "", of["help"])
+        default = re.search(r" \(default: ([^)]*)\)", text)
+        value = of.get("metavar") or "|".join(of.get("choices", ())) or "VALUE"
+        written = ", ".join(names) if "action" in of else f"{', '.join(names)} {value}"
+        if default is not None:
+            text = text.replace(default[0], "")
+        self.rows.append((written, _cell(default[1]) if default else "", text))
+
+
+def _written(option: str) -> str:
+    """The names in one piece, and each value in one, so that a narrow column can have them."""
+    names, _, value = option.rpartition(" ")
+    parts = [_code(names), " \\| ".join(_code(one) for one in value.split("|"))]
+    return " ".join(parts) if names and value[0] != "-" else _code(option)
+
+
+def _code(text: str) -> str:
+    return "`" + text.replace("|", "\\|") + "`"
+
+
+def _cell(text: str) -> str:
+    plain = " ".join(text.split()).replace("``", "`")
+    return re.sub(r"([|*_<>\[\]])", r"\\\1", plain)
+
+
+if __name__ == "__main__":
+    DOCUMENT.write_text(document())

@@ -1,0 +1,1 @@
+"""Parts of a worker, or of a session, in this process."""

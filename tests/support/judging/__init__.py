@@ -1,0 +1,1 @@
+"""What envhub check says of what is known to be hostile, honest or faulty."""

@@ -1,0 +1,1 @@
+"""What programs write, as CI systems, terminals and browsers read it."""

@@ -1,0 +1,1 @@
+"""Packages, their indexes and sources, made here, and folders of installed ones."""
