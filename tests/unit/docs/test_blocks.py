@@ -109,7 +109,7 @@ def held(words: list[str]) -> None:
     elif program in ("python", "python3") and rest[0] == "-m":
         assert importlib.util.find_spec(rest[1]) is not None, words
     elif program == "pytest":
-        ours = (CHECKOUT / "tests" / "support" / "selection.py").read_text()
+        ours = (CHECKOUT / "tests" / "support" / "plugins" / "selection.py").read_text()
         plugin = inspect.getsource(
             importlib.import_module("envhub_sandbox.integrations.pytest_plugin")
         )
