@@ -20,10 +20,10 @@ _ELSEWHERE = {
     "deadline": "test_deadline.py",
     "licence": "test_findings.py",
     "limits-reached": "test_judged.py",
-    "pinned": "test_check_clones.py",
-    "source-ignored": "test_check_checkouts.py",
-    "source-link": "test_check_survey.py",
-    "source-uncommitted": "test_check_checkouts.py",
+    "pinned": "test_survey_clones.py",
+    "source-ignored": "test_survey_checkouts.py",
+    "source-link": "test_survey.py",
+    "source-uncommitted": "test_survey_checkouts.py",
 }
 """Checks that need more than a folder, and what tests them."""
 

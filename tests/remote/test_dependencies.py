@@ -227,15 +227,15 @@ def test_nobody_keeps_others_waiting_who_have_room(
 
     monkeypatch.setattr(package_program, "command", counted)
 
-    def told(key: bytes, name: str) -> str:
+    def progress(key: bytes, name: str) -> str:
         reply = idle.need(key, order(name), ())
         assert reply.state == "making"
-        return reply.told
+        return reply.progress
 
-    assert (told(b"a", "first"), len(begun)) == ("at work", 1)
-    assert (told(b"a", "second"), len(begun)) == ("waiting for other packages of your key", 1)
-    assert (told(b"b", "first"), len(begun)) == ("at work", 2)
-    assert told(b"c", "first") == "waiting for others' packages: 0 before it, 2 at work"
+    assert (progress(b"a", "first"), len(begun)) == ("at work", 1)
+    assert (progress(b"a", "second"), len(begun)) == ("waiting for other packages of your key", 1)
+    assert (progress(b"b", "first"), len(begun)) == ("at work", 2)
+    assert progress(b"c", "first") == "waiting for others' packages: 0 before it, 2 at work"
     assert len(begun) == 2
 
 

@@ -32,12 +32,12 @@ def ran(folder: Path, *command: str) -> tuple[int, str, set[str]]:
 
 def test_python_m_is_refused(folder: Path) -> None:
     """It names what to write instead, which works; the control executes the stranger's module."""
-    code, said, found = ran(folder, "-m", "envhub_sandbox", "version")
+    code, said, found = ran(folder, "-m", "envhub_sandbox", "--version")
     assert (code, found) == (2, set())
     assert "-I -m envhub_sandbox" in said
-    assert ran(folder, "-I", "-m", "envhub_sandbox", "version")[::2] == (0, set())
+    assert ran(folder, "-I", "-m", "envhub_sandbox", "--version")[::2] == (0, set())
     control = "from envhub_sandbox.cli import main; main()"
-    assert ran(folder, "-c", control, "version")[2]
+    assert ran(folder, "-c", control, "--version")[2]
 
 
 def test_the_workers_program_is_refused_too(folder: Path) -> None:

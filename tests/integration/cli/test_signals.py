@@ -68,7 +68,7 @@ def test_an_interrupted_run_ends_and_leaves_nothing(
         ("run", str(EXAMPLES / "cartpole"), "--episodes", "1", "--json"),
         ("inspect", str(EXAMPLES / "cartpole")),
         ("cache", "list", "--json"),
-        ("version",),
+        ("--version",),
     ],
 )
 def test_a_closed_pipe_is_no_traceback(arguments: tuple[str, ...]) -> None:

@@ -32,8 +32,9 @@ def test_the_page_lists_the_files_of_a_step(checkout: Path) -> None:
     """All that each step runs; and no file that there is not."""
     page = (checkout / "docs" / "internals" / "a-step.md").read_text()
     listed = set(re.findall(r"^\| `([^`]+\.py)`", page, re.MULTILINE))
-    assert [one for one in listed if not (checkout / one).is_file()] == []
     roots = [Path(one.__file__ or "").parent for one in (envhub_sandbox, envhub_worker)]
+    there = [root.parent / one.removeprefix("worker/") for one in listed for root in roots]
+    assert sum(one.is_file() for one in set(there)) == len(listed)
     steps: list[set[str]] = []
 
     def note(frame: FrameType, event: str, _: object) -> None:

@@ -329,7 +329,7 @@ def test_the_rules_of_interruption_are_those_that_the_source_names() -> None:
     page = (CHECKOUT / "docs" / "internals" / "interruption.md").read_text()
     rules = {int(found) for found in re.findall(r"^\*\*Rule (\d+):", page, re.MULTILINE)}
     named: set[int] = set()
-    for path in (CHECKOUT / "envhub_sandbox").rglob("*.py"):
+    for path in folder("envhub_sandbox").rglob("*.py"):
         text = path.read_text()
         for found in (
             re.findall(r"\brules? (\d[\d, toand]*)", text) if "interruption.md" in text else ()
@@ -343,8 +343,15 @@ def test_the_rules_of_interruption_are_those_that_the_source_names() -> None:
 def test_the_files_that_a_page_on_the_inside_names_are_there(page: str) -> None:
     """By their path, or by its end."""
     text = (CHECKOUT / "docs" / "internals" / f"{page}.md").read_text()
-    roots = [CHECKOUT / name for name in ("envhub_sandbox", "worker", "tests")]
-    files = [f"/{one.relative_to(CHECKOUT)}" for root in roots for one in root.rglob("*.py")]
+    files = [
+        f"/{prefix}{one.relative_to(root.parent)}"
+        for prefix, root in (
+            ("", folder("envhub_sandbox")),
+            ("worker/", folder("envhub_worker")),
+            ("", CHECKOUT / "tests"),
+        )
+        for one in root.rglob("*.py")
+    ]
     named = re.findall(r"`([a-z_/-]+\.py)`", text)
     assert named
     assert [one for one in named if not any(file.endswith(f"/{one}") for file in files)] == []
