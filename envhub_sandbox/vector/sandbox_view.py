@@ -54,5 +54,10 @@ class SandboxView:
         """
         return self._session.stats()
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Also for copy and deepcopy: what it looks at has sockets and processes, which a half-made
+        # copy would close. The environment itself can be copied and has a view of its own.
+        raise TypeError(f"{self!r} is of one running environment; copy or pickle that environment")
+
     def __repr__(self) -> str:
         return f"<sandbox of {self._session.repository.label}>"
