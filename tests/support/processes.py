@@ -41,6 +41,19 @@ def halted(pids: Iterable[int]) -> Iterator[None]:
                 os.kill(pid, signal.SIGCONT)
 
 
+def other_niceness() -> int:
+    """The lowest priority that this process does not have itself, however it was started.
+
+    Only root may raise a priority, where the run has the lowest one.
+    """
+    return 19 if os.nice(0) < 19 else 18
+
+
+def may_change_niceness() -> bool:
+    """Whether a process of this user can give another one ``other_niceness``."""
+    return os.nice(0) < 19 or os.geteuid() == 0
+
+
 def resident() -> dict[int, int]:
     """Bytes of memory of this process and of each of its children, by pid."""
     found = {}

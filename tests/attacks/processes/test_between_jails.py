@@ -15,6 +15,7 @@ from tests.attacks.harness import Arena, new_alias, run_in, token
 from tests.attacks.processes.neighbour import Pair, between
 from tests.attacks.processes.victim import READS, SIGNALS, WORD
 from tests.support.interpreter import can_run
+from tests.support.processes import may_change_niceness, other_niceness
 
 FAMILY = "Other jails"
 
@@ -66,6 +67,8 @@ def test_everybody_is_not_another_jail(arena: Arena, pair: Pair) -> None:
 
 def test_limits_and_priority_of_another_jail_stay(arena: Arena, pair: Pair) -> None:
     """prlimit and setpriority are refused."""
+    nice = other_niceness()
+    lowest = "" if may_change_niceness() else "this run has the lowest priority already"
     arena.attack(
         "change another jail: prlimit",
         "prlimit",
@@ -76,8 +79,9 @@ def test_limits_and_priority_of_another_jail_stay(arena: Arena, pair: Pair) -> N
     arena.attack(
         "change another jail: setpriority",
         "setpriority",
-        lambda run: os.getpriority(os.PRIO_PROCESS, pair.of(run).pid) == 19,
-        nice=19,
+        lambda run: os.getpriority(os.PRIO_PROCESS, pair.of(run).pid) == nice,
+        impossible=lowest,
+        nice=nice,
         **pair.at("pid"),
     )
 

@@ -14,11 +14,14 @@ import pytest
 from tests.attacks.harness import Arena
 from tests.attacks.processes.neighbour import Pair, victims
 from tests.attacks.processes.victim import SIGNALS, WORD
+from tests.support.processes import may_change_niceness, other_niceness
 
 FAMILY = "Other processes"
 
 _IDLE_CLASS = 3 << 13
 _ONE_CORE = {min(os.sched_getaffinity(0))}
+_NICE = other_niceness()
+_LOWEST = "" if may_change_niceness() else "this run has the lowest priority already"
 _SINGLE = "" if len(os.sched_getaffinity(0)) > 1 else "this machine has a single core"
 
 
@@ -104,8 +107,8 @@ CHANGES: dict[str, tuple[str, dict[str, Any], Look]] = {
     ),
     "setpriority on the client": (
         "setpriority",
-        {"nice": 19},
-        lambda pid: os.getpriority(os.PRIO_PROCESS, pid) == 19,
+        {"nice": _NICE, "impossible": _LOWEST},
+        lambda pid: os.getpriority(os.PRIO_PROCESS, pid) == _NICE,
     ),
     "sched_setaffinity on the client": (
         "sched_setaffinity",

@@ -14,7 +14,9 @@ from collections.abc import Mapping, Sequence
 
 _LINES = re.compile("\r\n|[\n\r\v\f\x1c-\x1e\x85\u2028\u2029]")
 _SKIPPED = re.compile("(?:\\s|\x1b\\[[0-9;?]*[A-Za-z])*")
-_ANYWHERE = re.compile(r"##\w*\[|section_(?:start|end):")
+_ANYWHERE = re.compile(r"##\w{0,16}\[|section_(?:start|end):")
+"""GitHub's runner looks for ``##[`` and Azure's for ``##vso[``; the name between is short elsewhere
+too (``##teamcity[``)."""
 
 
 def obeyed(log: str) -> list[str]:
