@@ -87,7 +87,8 @@ wheel() {
 }
 
 # smoke NAME PYTHON [OPTION...]: the wheel in an environment of its own, with a reduced set of
-# tests: the unit tests, and real environments that need nothing beyond gymnasium.
+# tests: the unit tests, but for those that are marked as the same for versions, and real
+# environments that need nothing beyond gymnasium.
 smoke() {
   local name=$1 python=$2 built
   shift 2
@@ -101,7 +102,8 @@ smoke() {
   copy_tests "$CI_WORK/$name/checkout"
   (
     cd "$CI_WORK/$name/checkout"
-    with_summary "$name" bash "$CI_AGAIN" "$CI_WORK/$name/bin/python" -m pytest -n 2 --dist worksteal \
+    with_summary "$name" bash "$CI_AGAIN" "$CI_WORK/$name/bin/python" -m pytest \
+      -n "$(processes)" --dist worksteal --differs-by versions \
       tests/unit tests/integration/test_examples.py
   )
 }

@@ -1,9 +1,11 @@
 # What a newcomer does: both of the README's commands, word for word, in a clean copy, with the
 # python3 that is first on the PATH; then once more as a plain user, with the system's python3.
 # Proves that they pass for both, whatever root's interpreter is, and that what cannot be tested
-# there is skipped. Root's second command leaves the unit tests out: root runs them in "tests",
-# "oldest" and "newest", with Debian's interpreter and with pyenv's; what jails make of root's own
-# interpreter, which no other user may read, is in the rest.
+# there is skipped. What others run is not repeated: root's second command leaves out the unit tests,
+# which root runs in "tests", "oldest" and "newest", with Debian's interpreter and with pyenv's, and what
+# is marked as the same for users; what jails make of root's own interpreter, which no other user may
+# read, is in the rest. The plain user's leaves out the attacks and the integration tests that the step
+# "user" runs whole, with the same interpreter, and what is marked.
 set -euo pipefail
 . "$(dirname "${BASH_SOURCE[0]}")/../lib.sh"
 unset PYTHON "${!ENVHUB_@}"
@@ -31,9 +33,13 @@ if [ "$(id -u)" != 0 ]; then
   exit 0
 fi
 # both side by side: they are two users, and much of an installation is waiting
-(newcomer readme-user bash "$CI_STEPS/../as-user.sh" 0) >"$CI_WORK/readme-user.out" 2>&1 &
+elsewhere=(tests/integration \
+  tests/attacks/{files,kernel,network,output,packages,processes,resources,runner})
+(newcomer readme-user bash "$CI_STEPS/../as-user.sh" 0 \
+  env "PYTEST_ADDOPTS=--differs-by users ${elsewhere[*]/#/--ignore=}") >"$CI_WORK/readme-user.out" 2>&1 &
 user=$!
-(newcomer readme env ENVHUB_CACHE="$CI_WORK/readme-cache" PYTEST_ADDOPTS=--ignore=tests/unit) &
+(newcomer readme env ENVHUB_CACHE="$CI_WORK/readme-cache" \
+  PYTEST_ADDOPTS="--differs-by users --ignore=tests/unit") &
 root=$!
 failed=0
 wait "$root" || failed=1

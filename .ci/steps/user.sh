@@ -12,16 +12,11 @@ export ENVHUB_CI=1 ENVHUB_CI_WITHOUT_CGROUPS=1
 unset ENVHUB_TEST_DIR  # each part has its own
 export PYTHON=/usr/bin/python3
 
-# What downloads, what trains, how loading fails, what comes out of shared memory and what the client
-# makes of what it is told does not depend on who runs it, and has been run; the unit tests are
-# run by the plain user of the step "readme".
-elsewhere=(--ignore=tests/attacks/client)
-for kind in loading borrowed lane_ concurrent_ validation decoder_ slabs; do
-  elsewhere+=("--ignore-glob=*/test_$kind*")
-done
-for kind in hub/ drop_in/ documents/test_shell; do
-  elsewhere+=("--ignore-glob=*/integration/$kind*")
-done
+# What is marked as the same for users has been run. What comes out of shared memory and what the client
+# makes of a worker's answers does not depend on who runs it either; the plain user of the step "readme"
+# runs the short form of these, and the unit tests.
+elsewhere=(--differs-by users --ignore=tests/attacks/client)
+elsewhere+=(--ignore=tests/attacks/protocol/test_{decoder_fuzz,slabs}.py)
 
 # part NUMBER ARGUMENT...: these tests, by one process of a user of their own: some limits count what a
 # user runs, and two processes would count each other's. What the step "tests" installed serves here

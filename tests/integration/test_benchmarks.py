@@ -13,6 +13,8 @@ import pytest
 
 from tests.support.command_line import python
 
+pytestmark = pytest.mark.same_for("users")
+
 SHORT = {
     "breakdown cartpole 1": "| 1 | 1 | chosen |",
     "doorbells --rounds 1 --trips 20": "of eventfds",

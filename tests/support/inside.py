@@ -33,6 +33,7 @@ from envhub_sandbox.session.jails.loaded import LoadedJail
 from envhub_sandbox.session.recipe import Recipe
 from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.system import folders
+from envhub_sandbox.transport import tcp
 from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import JailHandle
@@ -75,6 +76,16 @@ def choice_of_runtime() -> Spot:
 def choice_of_packages() -> Spot:
     """Makes the packages that a repository declares."""
     return make, "packages_for"
+
+
+def cut_s() -> Spot:
+    """For how long a server may end handshakes."""
+    return tcp, "_CUT_S"
+
+
+def first_keep_alive_s() -> Spot:
+    """After how long a server on another host first hears that its client lives."""
+    return remote, "_FIRST_S"
 
 
 def use_lock(env: Any) -> Spot:

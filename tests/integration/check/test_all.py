@@ -20,6 +20,8 @@ from tests.support.output.pages import Page
 from tests.support.processes import eventually
 from tests.support.repositories import write_repository
 
+pytestmark = pytest.mark.same_for("users")
+
 _QUICK = ("--steps", "4", "--resets", "0", "--n-envs", "1", "--memory", "1G")
 _HONEST = Entry(group="honest")
 _BREAKS = "def step(self, action):\n    raise RuntimeError('it broke')"

@@ -135,7 +135,9 @@ def commands(place: Path) -> list[list[str]]:
     ]
 
 
-@pytest.mark.parametrize("columns", [None, 20, 80])
+@pytest.mark.parametrize(
+    "columns", [20, *(pytest.param(one, marks=pytest.mark.same_for("users")) for one in (None, 80))]
+)
 def test_no_command_of_a_repository_is_obeyed(columns: int | None, place: Path) -> None:
     """By what every command prints, into a pipe and to a terminal; ours are, with ``--github``.
 

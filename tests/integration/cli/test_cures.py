@@ -14,6 +14,8 @@ from envhub_sandbox.errors import EnvHubError
 from tests.support.command_line import envhub
 from tests.support.repositories import write_repository
 
+pytestmark = pytest.mark.same_for("users")
+
 _WANTS = "import nothing_of_this_name\n\ndef make_env(n_envs=1, use_async_envs=False): pass\n"
 _SLOW = "import time\n\ndef make_env(n_envs=1, use_async_envs=False): time.sleep(3600)\n"
 _IN_PYTHON = re.compile(r"\b(?:dependencies|policy|timeouts|limits|python|sandbox)=|Policy\(")

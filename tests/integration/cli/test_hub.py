@@ -14,6 +14,8 @@ from tests.hub.olah_server import OlahServer
 from tests.support.command_line import COMMAND, envhub
 from tests.support.samples import EXAMPLES
 
+pytestmark = pytest.mark.same_for("users")
+
 
 @pytest.fixture
 def hub(olah: OlahServer, hub_cache: Path) -> list[str]:

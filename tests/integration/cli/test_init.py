@@ -17,6 +17,8 @@ from envhub_sandbox.cli.shared.exits import UsageError
 from envhub_sandbox.hub.local import LocalFolder
 from tests.support.command_line import COMMAND
 
+pytestmark = pytest.mark.same_for("users")
+
 PLUGIN = "envhub_sandbox.integrations.pytest_plugin"
 
 

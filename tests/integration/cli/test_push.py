@@ -16,6 +16,8 @@ from envhub_sandbox.cli.init.starter import starter
 from tests.hub.stub_hub import StubHub
 from tests.support.command_line import envhub
 
+pytestmark = pytest.mark.same_for("users")
+
 TOKEN = "hf_of_the_author"
 
 

@@ -14,6 +14,8 @@ from tests.support.command_line import envhub
 from tests.support.repositories import STILL, write_repository
 from tests.support.samples import sample
 
+pytestmark = pytest.mark.same_for("users")
+
 _KWARGS = {"moment": "step", "fault": "exit"}
 
 

@@ -18,6 +18,8 @@ from tests.support.command_line import python
 from tests.support.in_process.runner_here import RunnerHere
 from tests.support.samples import SAMPLES
 
+pytestmark = pytest.mark.same_for("users")
+
 ACTIONS = np.zeros(2, np.int64)
 PLAY = f"""
 import numpy as np

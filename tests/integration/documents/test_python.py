@@ -12,6 +12,8 @@ from tests.support.command_line import python
 from tests.support.documents import blocks
 from tests.support.samples import EXAMPLES
 
+pytestmark = pytest.mark.same_for("users")
+
 # No block may take a port that another program has.
 _ANY_PORT = """
 import prometheus_client

@@ -9,6 +9,8 @@ import pytest
 from tests.support.command_line import python
 from tests.support.samples import EXAMPLES
 
+pytestmark = pytest.mark.same_for("users")
+
 
 @pytest.mark.parametrize(
     ("script", "needs", "printed"),

@@ -22,6 +22,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor  # noqa: E4
 
 from envhub_sandbox.integrations.sb3 import SandboxVecEnv  # noqa: E402
 
+pytestmark = pytest.mark.same_for("users")
+
 _MODES = ("NextStep", "SameStep", "Disabled")
 _TOLD = ("count", "ratio", "even", "text", "nothing", "sometimes", "is_success")
 

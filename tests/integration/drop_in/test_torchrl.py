@@ -7,6 +7,8 @@ import pytest
 from tests.support.command_line import python
 from tests.support.samples import sample
 
+pytestmark = pytest.mark.same_for("users")
+
 pytest.importorskip("torch")
 pytest.importorskip("torchrl")
 

@@ -24,6 +24,8 @@ from tests.integration.hub.conftest import Fetch
 from tests.support.command_line import python
 from tests.support.repositories import CARTPOLE
 
+pytestmark = pytest.mark.same_for("users")
+
 TOKEN = "hf_SECRETSECRETSECRET"
 
 

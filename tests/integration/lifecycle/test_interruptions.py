@@ -18,7 +18,10 @@ from tests.support.in_process.interrupts import at_call
 from tests.support.processes import eventually
 from tests.support.samples import sample
 
-pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+pytestmark = [
+    pytest.mark.same_for("users"),
+    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
+]
 
 _STARTS, _CLOSES = 41, 13
 """Calls between two moments: of some 500 in a start, and of some 120 in a close."""

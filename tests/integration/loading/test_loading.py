@@ -28,7 +28,7 @@ from tests.support.compare import assert_same
 from tests.support.repositories import CARTPOLE, CARTPOLES, STILL, write_repository
 from tests.support.samples import make_env_of, reference, sample
 
-pytestmark = pytest.mark.short
+pytestmark = [pytest.mark.same_for("users"), pytest.mark.short]
 
 
 def roll(env: VectorEnv[Any, Any, Any], steps: int = 5) -> Any:

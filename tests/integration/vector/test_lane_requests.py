@@ -18,6 +18,8 @@ from tests.support.compare import assert_same
 from tests.support.repositories import STILL, write_repository
 from tests.support.samples import sample
 
+pytestmark = pytest.mark.same_for("users")
+
 REPOSITORY = '''
 LARGE = 2 * 65536
 

@@ -13,6 +13,8 @@ from gymnasium.utils.env_checker import check_env
 from envhub_sandbox import SandboxEnv
 from tests.support.samples import EXAMPLES
 
+pytestmark = pytest.mark.same_for("users")
+
 _ID = "envhub_sandbox.integrations.gym:Hub-v0"
 
 

@@ -19,6 +19,8 @@ from tests.support.command_line import envhub
 from tests.support.repositories import STILL, write_repository
 from tests.support.samples import sample
 
+pytestmark = pytest.mark.same_for("users")
+
 # told by the caller how it is to leave its space, and when
 _LEAVER = """
 class Leaver(Still):

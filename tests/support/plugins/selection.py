@@ -3,35 +3,46 @@
 Without a path, ``-k``, ``-m`` or ``--full``, the short form is run: all of ``tests/unit``, and what
 bears the marker ``short``, as a module, a class or a function. ``@pytest.mark.short("strict-")``
 takes, of a function's cases, those whose parameters' id starts so.
+
+CI repeats tests as another user (``--differs-by users``), and with other versions of Python and
+of packages (``--differs-by versions``). ``@pytest.mark.same_for("users", "versions")`` says for
+which of these a test proves the same again: it is left out there.
 """
 
 from __future__ import annotations
 
 import pytest
 
+REPEATED = ("users", "versions")
+"""What CI repeats tests for."""
+
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """``--full``."""
+    """``--full`` and ``--differs-by``."""
     text = "run every test, and not only tests/unit and what is marked as short"
     parser.addoption("--full", action="store_true", help=text)
+    text = "leave out what is marked as the same for them"
+    parser.addoption("--differs-by", choices=REPEATED, help=text)
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out what is not in the short form.
+    """Leave out what need not be repeated, and what is not in the short form.
 
     Raises:
-        UsageError: A marker names cases of which there is none.
+        UsageError: A marker names cases of which there is none, or what is no reason to repeat.
     """
+    if wrong := sorted({str(one) for x in items for one in _same_for(x) - set(REPEATED)}):
+        raise pytest.UsageError(
+            f"same_for names {', '.join(wrong)}; CI repeats for {' and '.join(REPEATED)}"
+        )
+    _keep(config, items, [one for one in items if config.option.differs_by not in _same_for(one)])
     if not is_short(config):
         return
     if idle := sorted(_named(items) - _named(items, met=True)):
         text = ", ".join(f"{start!r} of {test}" for test, start in idle)
         raise pytest.UsageError(f"the short selection names no case by {text}")
     unit = config.rootpath / "tests" / "unit"
-    kept = [one for one in items if one.path.is_relative_to(unit) or _is_marked(one)]
-    others = set(items).difference(kept)
-    config.hook.pytest_deselected(items=[one for one in items if one in others])
-    items[:] = kept
+    _keep(config, items, [x for x in items if x.path.is_relative_to(unit) or _is_marked(x)])
 
 
 def pytest_terminal_summary(
@@ -47,6 +58,16 @@ def is_short(config: pytest.Config) -> bool:
     named = config.args_source is pytest.Config.ArgsSource.ARGS
     asked = named or config.option.keyword or config.option.markexpr
     return not (asked or config.option.full)
+
+
+def _keep(config: pytest.Config, items: list[pytest.Item], kept: list[pytest.Item]) -> None:
+    others = set(items).difference(kept)
+    config.hook.pytest_deselected(items=[one for one in items if one in others])
+    items[:] = kept
+
+
+def _same_for(item: pytest.Item) -> set[object]:
+    return {name for mark in item.iter_markers("same_for") for name in mark.args}
 
 
 def _is_marked(item: pytest.Item) -> bool:

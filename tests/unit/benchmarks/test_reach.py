@@ -19,6 +19,8 @@ from benchmarks.reach.cases import Case, cases
 from benchmarks.reach.measure import Outcome
 from envhub_sandbox.dependencies.declared import declared
 
+pytestmark = pytest.mark.same_for("users", "versions")
+
 CASES = cases()
 OUTCOME = Outcome("0", "package", "", "", "", "", (9.0, 1.0, 1.0), 1024, 12, "equal")
 OUTCOMES = {

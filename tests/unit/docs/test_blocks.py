@@ -19,6 +19,8 @@ from tests import libraries
 from tests.support.documents import blocks, options, shell
 from tests.support.documents.blocks import CHECKOUT, DRAWN, HELD, OWN, PARSED, RUN, SHOWN, Block
 
+pytestmark = pytest.mark.same_for("users", "versions")
+
 # Programs of others, whose options are theirs; and what begins a line that is no command.
 _OTHERS = {"docker", "pip", "lerobot-eval", "lerobot-train", "lerobot-eval-sandboxed", "ruff"}
 _SHELL = "tests/support/documents/shell.py"

@@ -17,6 +17,8 @@ from typer.testing import CliRunner
 from envhub_sandbox.cli.app import app
 from tests.support.repositories import write_repository
 
+pytestmark = pytest.mark.same_for("users", "versions")
+
 _RECORDS = """#!/bin/sh
 case "$1 $3" in
 "doctor strict") echo "no user namespaces"; exit 6 ;;

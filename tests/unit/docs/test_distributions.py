@@ -17,6 +17,8 @@ from typing import cast
 
 import pytest
 
+pytestmark = pytest.mark.same_for("users", "versions")
+
 NAME = "lerobot_env_envhub_sandbox"
 BUILD = """
 import sys

@@ -22,6 +22,8 @@ from envhub_worker.protocol.manifest.names import MAX_NAME
 from tests.support.documents import options, settings
 from tests.unit.docs.test_imports import folder
 
+pytestmark = pytest.mark.same_for("users")
+
 CHECKOUT = Path(__file__).resolve().parents[3]
 DOCUMENTS = sorted([*CHECKOUT.glob("*.md"), *(CHECKOUT / "docs").rglob("*.md")])
 README = (CHECKOUT / "README.md").read_text()

@@ -11,6 +11,8 @@ import pytest
 
 from tests.unit.docs.test_imports import WORKERS_OWN
 
+pytestmark = pytest.mark.same_for("users", "versions")
+
 CHECKOUT = Path(__file__).resolve().parents[3]
 _IMPORTED_AS = {"pyzmq": "zmq"}
 

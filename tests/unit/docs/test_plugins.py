@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.same_for("users", "versions")
+
 PLUGINS = 'pytest_plugins = ["tests.support.plugins.selection", "tests.support.plugins.skips"]'
 TESTS = """
 import pytest
@@ -83,6 +85,24 @@ def test_a_marker_that_names_no_case_is_an_error(folder: Path, checkout: Path) -
     (folder / "test_it.py").write_text(TESTS.replace('short("few")', 'short("gone", "few")'))
     said = run(folder, checkout)
     assert "the short selection names no case by 'gone' of test_it.py::test_two" in said
+
+
+def test_what_is_the_same_is_not_repeated(folder: Path, checkout: Path) -> None:
+    """As another user or with other versions, each by itself; the control is a run of its own."""
+    marked = {"one": '"users"', "two": '"users", "versions"'}
+    text = "".join(
+        f"@pytest.mark.same_for({names})\ndef test_{which}():\n    pass\n"
+        for which, names in marked.items()
+    )
+    (folder / "test_it.py").write_text(f"import pytest\ndef test_other():\n    pass\n{text}")
+    for arguments, said in {
+        (): "3 passed",
+        ("--differs-by=users",): "1 passed, 2 deselected",
+        ("--differs-by=versions",): "2 passed, 1 deselected",
+    }.items():
+        assert said in run(folder, checkout, "--full", *arguments)
+    (folder / "test_it.py").write_text("import pytest\n" + text.replace("users", "user"))
+    assert "same_for names user; CI repeats for" in run(folder, checkout, "--full")
 
 
 @pytest.mark.parametrize("arguments", [(), ("-n", "2")])

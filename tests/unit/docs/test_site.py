@@ -8,6 +8,8 @@ from typing import Any
 
 import pytest
 
+pytestmark = pytest.mark.same_for("users", "versions")
+
 _PAGE = "<head><meta http-equiv='Content-Security-Policy' content=\"default-src 'self'\">%s</head>"
 
 

@@ -13,6 +13,8 @@ from envhub_sandbox import Policy, Timeouts, make_env
 from envhub_sandbox.errors import EnvHubError
 from tests.support.documents import troubleshooting
 
+pytestmark = pytest.mark.same_for("users", "versions")
+
 _PAGE = troubleshooting.DOCUMENT.read_text()
 
 

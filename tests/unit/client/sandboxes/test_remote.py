@@ -13,6 +13,7 @@ from envhub_sandbox.errors import WorkerTimeoutError
 from envhub_sandbox.sandboxes import remote
 from envhub_sandbox.transport.tcp import TcpServer
 from envhub_worker.protocol import messages as m
+from tests.support import inside
 
 FAULTS = (
     zmq.ZMQError(errno.EMFILE),
@@ -49,6 +50,7 @@ def test_the_thread_outlives_every_fault(moment: str, monkeypatch: pytest.Monkey
                 raise zmq.ZMQError(errno.ENOTSOCK)
 
     monkeypatch.setattr(remote, "WorkerConnection", Connection)
+    monkeypatch.setattr(*inside.first_keep_alive_s(), 0.01)
     server = remote.RemoteServer("tcp://host:1", TcpServer(None, None))
     assert heard.wait(60)
     assert left == []

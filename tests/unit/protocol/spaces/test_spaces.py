@@ -24,6 +24,8 @@ from envhub_worker.protocol.spaces.spaces import OpaqueSpace, encode_space
 from tests.support.compare import assert_same
 from tests.support.wire import decode_space
 
+pytestmark = pytest.mark.same_for("users")
+
 Space = gym.Space[Any]
 INF = float("inf")
 MANY = 10**6

@@ -18,6 +18,8 @@ from envhub_sandbox.errors import (
 from tests.support.packages.git_server import commit, git_served, make_repository
 from tests.support.packages.git_server import git as run_git
 
+pytestmark = pytest.mark.same_for("versions")
+
 
 @pytest.fixture
 def repository(tmp_path: Path) -> Path:

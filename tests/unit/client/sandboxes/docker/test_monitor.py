@@ -52,7 +52,7 @@ class Kept:
 
 
 @contextlib.contextmanager
-def kept(tmp_path: Path, what: str) -> Iterator[Kept]:
+def kept(tmp_path: Path, what: str, script: Path | None = None) -> Iterator[Kept]:
     """A monitor whose engine does ``what`` when it is to run a container."""
     folder, log, engine = tmp_path / "folder", tmp_path / "calls", tmp_path / "engine"
     folder.mkdir()
@@ -62,7 +62,7 @@ def kept(tmp_path: Path, what: str) -> Iterator[Kept]:
     pidfd, (ready, ready_end) = os.pidfd_open(client.pid), os.pipe()
     words = [str(pidfd), str(ready_end), str(folder), "envhub-test", "--", str(engine), "run"]
     monitor = subprocess.Popen(
-        [sys.executable, "-I", "-S", str(inside.monitor_script()), *words],
+        [sys.executable, "-I", "-S", str(script or inside.monitor_script()), *words],
         pass_fds=(pidfd, ready_end),
     )
     os.close(ready_end)
@@ -127,6 +127,10 @@ def test_a_server_that_talks_much_does_not_wait_for_a_reader(tmp_path: Path) -> 
 
 def test_a_container_that_ignores_the_end_of_its_stdin_is_removed(tmp_path: Path) -> None:
     """By the engine's own means, after some patience."""
-    with kept(tmp_path, f"{_ANNOUNCES}; exec sleep 300") as made:
+    text = inside.monitor_script().read_text()
+    script = tmp_path / "monitor.py"
+    script.write_text(text.replace("\n_END_S = 8.0\n", "\n_END_S = 0.2\n"))
+    assert script.read_text() != text
+    with kept(tmp_path, f"{_ANNOUNCES}; exec sleep 300", script) as made:
         made.monitor.terminate()
         assert made.ends()
