@@ -1,6 +1,11 @@
-"""``python -m benchmarks``."""
+"""``python -m benchmarks``, and ``python -m benchmarks auto``."""
 
-from benchmarks.command import main
+import sys
+
+from benchmarks import auto, command
 
 if __name__ == "__main__":
-    raise SystemExit(main())
+    if sys.argv[1:2] == ["auto"]:
+        auto.main(sys.argv[2:])
+    else:
+        raise SystemExit(command.main())

@@ -15,10 +15,10 @@ import select
 import socket
 import statistics
 from collections.abc import Callable, Sequence
-from pathlib import Path
 from time import perf_counter_ns
 from typing import Any
 
+from benchmarks.load import stolen
 from envhub_sandbox.transport.shared_memory.doorbell import OwnBell, RunnerBell, Watch
 
 _RING = (1).to_bytes(8, "little")
@@ -112,12 +112,6 @@ def _echo(words: Any, ring: Callable[[], object], sleep: Callable[[], object], t
             ring()
     finally:
         os._exit(0)
-
-
-def stolen() -> tuple[int, int]:
-    """Jiffies that the host took, and all of them."""
-    cpu = Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:9]
-    return int(cpu[7]), sum(map(int, cpu))
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

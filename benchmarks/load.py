@@ -79,6 +79,12 @@ class Patience:
         return round(busy, 2)
 
 
+def stolen() -> tuple[int, int]:
+    """Jiffies that the host took, and all of them."""
+    cpu = Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:9]
+    return int(cpu[7]), sum(map(int, cpu))
+
+
 def _jiffies() -> int:
     # user, nice, system, idle, iowait, irq, softirq, steal: see proc_stat(5)
     with open("/proc/stat") as stat:

@@ -16,7 +16,6 @@ from envhub_sandbox.session.manifest_cache import ManifestCache, manifest_key
 from envhub_sandbox.session.prewarm import Prewarm, SuitePrewarm
 from envhub_sandbox.session.recipe import provenance_of
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.shared_memory.sharding import bounds_for
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol.manifest.manifest import EnvManifest, Manifest
@@ -112,11 +111,11 @@ class EnvFactory:
     def _session(
         self, manifest: Manifest, env: EnvManifest, shared: SharedJail | None
     ) -> EnvSession:
-        paces = self._cache.paces
-        bounds = bounds_for(env, self._num_workers, paces.of(env))
+        trials = self._cache.shard_trials(self._repository.lane)
+        bounds = trials.bounds_for(env, self._num_workers)
         expected = ExpectedManifest(manifest, env, len(bounds))
         source = shared or JailSource(self._launcher, self._cache.forget, expected)
-        return EnvSession(source, env, bounds, paces)
+        return EnvSession(source, env, bounds, trials)
 
     def _use(self, loaded: LoadedJail, sessions: list[EnvSession]) -> None:
         """The jail that gave the manifest becomes the only task's; a suite closes it."""

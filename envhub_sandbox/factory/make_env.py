@@ -72,7 +72,7 @@ def make_env(
         lock: A file that ``envhub lock`` wrote: its packages are used and no others, and whatever
             differs from it (commit, files, Python, spaces) is refused. For ``sandbox="process"``.
         num_workers: Processes over which the sub-environments are spread; by default one, or with
-            ``use_async_envs`` as many as are useful for the cores there are.
+            ``use_async_envs`` as many as were fastest when the first uses tried them.
         prewarm: How many of a suite's next tasks are started in the background when a task is first
             reset, and so how many unused jails there are at most. By default one,
             once tasks are seen to be closed before the next is reset, on this machine and without

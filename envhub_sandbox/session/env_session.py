@@ -28,8 +28,8 @@ from envhub_sandbox.session.use_lock import UseLock
 from envhub_sandbox.system.log import WORKER
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import RunnersDiedError
-from envhub_sandbox.transport.pace import PaceBook
 from envhub_sandbox.transport.results import Results
+from envhub_sandbox.transport.shard_trials import ShardTrials
 from envhub_worker.protocol.lifecycle import Event, Lifecycle, State
 from envhub_worker.protocol.manifest.manifest import EnvManifest
 
@@ -48,7 +48,7 @@ class EnvSession:
 
     Args:
         bounds: The slices of its sub-environments, one for each shard.
-        paces: Takes note of what its steps took.
+        trials: Takes note of what its steps took.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class EnvSession:
         jails: JailSource,
         manifest: EnvManifest,
         bounds: Sequence[tuple[int, int]],
-        paces: PaceBook,
+        trials: ShardTrials,
     ) -> None:
         self.repository: Repository = jails.launcher.repository
         policy = self.repository.policy
@@ -66,7 +66,7 @@ class EnvSession:
         self.counters = counters = Counters()
         self.history = history = History(manifest, policy.crash_history)
         results = Results(manifest, self.bounds)
-        self.lease = lease = Lease(jails, results, self.lifecycle, counters, paces)
+        self.lease = lease = Lease(jails, results, self.lifecycle, counters, trials)
         self._restarts = Restarts(policy, counters)
         self._failures = failures = Failures(lease, history)
         self.use = use = UseLock(lease, failures)
@@ -182,7 +182,7 @@ class EnvSession:
         try:
             state = self.lifecycle.state
             self._end_life()
-            self.lease.note_pace()
+            self.lease.note_steps()
             if state is State.READY:
                 self.lease.close_politely()
         finally:

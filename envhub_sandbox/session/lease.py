@@ -12,6 +12,8 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any
 
+import numpy as np
+
 from envhub_sandbox.errors import EnvHubError, ServerBusyError, WorkerError
 from envhub_sandbox.session.counters import Counters
 from envhub_sandbox.session.jails.builder import Builder
@@ -27,8 +29,8 @@ from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.system.processes import OwnerProcess
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
 from envhub_sandbox.transport.lane import Lane
-from envhub_sandbox.transport.pace import PaceBook
 from envhub_sandbox.transport.results import Results
+from envhub_sandbox.transport.shard_trials import LEAST_STEPS, ShardTrials
 from envhub_sandbox.transport.tcp import UnreachableError
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.lifecycle import Lifecycle, State
@@ -60,7 +62,7 @@ class Lease:
         results: Results,
         lifecycle: Lifecycle,
         counters: Counters,
-        paces: PaceBook,
+        trials: ShardTrials,
     ) -> None:
         self.repository: Repository = jails.launcher.repository
         self.lifecycle = lifecycle
@@ -71,7 +73,7 @@ class Lease:
         self._launcher = jails.launcher
         self.results = results
         self.counters = counters
-        self._paces = paces
+        self._trials = trials
         self._builder = Builder(jails, results)
         # interruption.md, rule 12: none gives back what another ends
         self._ending = threading.RLock()
@@ -253,11 +255,12 @@ class Lease:
         with contextlib.suppress(EnvHubError):
             lane.jail.receive(lane.jail.send("close", requests), deadline)
 
-    def note_pace(self) -> None:
-        """Remember what steps took, for the next time."""
-        pace = None if self.lane is None else self.lane.pace()
-        if pace:
-            self._paces.note(self.results.manifest, pace)
+    def note_steps(self) -> None:
+        """Remember what a typical step took, for the next use of the pin."""
+        latencies_s = self.counters.latencies_s()
+        if len(latencies_s) >= LEAST_STEPS:
+            typical_s = float(np.median(latencies_s))
+            self._trials.note(self.results.manifest, self.results.bounds, typical_s)
 
     def let_go(self, *, wait: bool = True) -> None:
         """Give back whatever is left, for good. A fork of its owner gives back nothing."""

@@ -17,7 +17,7 @@ from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.settings.policy import Policy
 from envhub_sandbox.system import folders
 from envhub_sandbox.system.files import write_whole_file
-from envhub_sandbox.transport.pace import PaceBook
+from envhub_sandbox.transport.shard_trials import ShardTrials
 from envhub_sandbox.transport.values import pickles
 from envhub_sandbox.transport.values.generators import generator
 from envhub_worker import protocol
@@ -36,10 +36,10 @@ class ManifestCache:
     def __init__(self, folder: Path, key: str | None) -> None:
         self._path = None if key is None else folder / key
 
-    @property
-    def paces(self) -> PaceBook:
-        """What the environments took, which lies beside the entry."""
-        return PaceBook(None if self._path is None else self._path.with_suffix(".pace"))
+    def shard_trials(self, lane: str) -> ShardTrials:
+        """What steps of the environments took by this lane, which lies beside the entry."""
+        path = None if self._path is None else self._path.with_suffix(f".{lane}-shards")
+        return ShardTrials(path)
 
     def load(self, *, max_elements: int) -> Manifest | None:
         """The remembered manifest, if there is one that can be read."""

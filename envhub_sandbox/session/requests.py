@@ -37,6 +37,7 @@ from envhub_sandbox.transport.jail import RunnersDiedError
 from envhub_sandbox.transport.lane import Lane, Request
 from envhub_sandbox.transport.replies import all_replies
 from envhub_sandbox.transport.results import StepResult
+from envhub_sandbox.transport.shard_trials import ENOUGH_STEPS
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.lifecycle import Event, State
 from envhub_worker.protocol.spaces import batches
@@ -335,6 +336,8 @@ class Requests:
             raise
         if self._unshown:
             self.show_warnings()
+        if self._counters.steps == ENOUGH_STEPS:  # it may never be closed
+            self._lease.note_steps()
         return result
 
     def _mended(self, error: BaseException, deadline: Deadline) -> StepResult:

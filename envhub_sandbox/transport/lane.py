@@ -14,7 +14,6 @@ from typing import Any, Protocol
 from envhub_sandbox.errors import EnvHubError, WorkerError
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import JailHandle, RunnersDiedError
-from envhub_sandbox.transport.pace import Pace
 from envhub_sandbox.transport.replies import all_replies
 from envhub_sandbox.transport.results import Results, StepResult
 from envhub_sandbox.transport.values import pickles
@@ -150,9 +149,6 @@ class Lane(Protocol):
             deadline: For all of it.
         """
 
-    def pace(self) -> Pace | None:
-        """What steps took, if that says how to spread them the next time."""
-
     def traffic(self) -> tuple[int, int, int]:
         """Stale replies, and bytes sent and received, so far."""
 
@@ -258,10 +254,6 @@ class RelayLane:
         """See ``Lane``."""
         for index, runner in zip(dead, fresh, strict=True):
             self.runners[index] = runner
-
-    def pace(self) -> Pace | None:
-        """None: what a shard takes itself is not known over the server."""
-        return None
 
     def traffic(self) -> tuple[int, int, int]:
         """See ``Lane``."""

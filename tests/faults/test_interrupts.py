@@ -134,7 +134,7 @@ def _half(client: Any, frames: Any, copy: bool) -> None:
 def test_ctrl_c_in_close_leaves_nothing(
     lane: str, owner: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """While the repository's ``close`` is waited for, or the pace noted; it can be repeated."""
+    """While the repository's ``close`` is waited for, or a step's time noted; repeatable."""
     suites = made(lane)
     env = suites.env
     loaded, release = inside.loaded(env), released(env)
@@ -142,7 +142,7 @@ def test_ctrl_c_in_close_leaves_nothing(
     if owner == "jail":
         monkeypatch.setattr(loaded.jail, "receive", interrupted)
     else:
-        monkeypatch.setattr(*inside.noting_pace(env), interrupted)
+        monkeypatch.setattr(*inside.noting_steps(env), interrupted)
     with pytest.raises(KeyboardInterrupt):
         env.close()
     assert loaded.closed

@@ -16,9 +16,7 @@ import pytest
 from gymnasium.error import ClosedEnvironmentError
 
 from envhub_sandbox import errors, make_env
-from envhub_sandbox.factory import env_factory
 from envhub_sandbox.session.survival.seeds import derived_seed
-from envhub_sandbox.transport.shared_memory.sharding import bounds_for
 from envhub_worker.protocol.lifecycle import State
 from tests.faults.mortal import (
     ALL_LIVE,
@@ -41,15 +39,7 @@ from tests.support.samples import reference, sample
 LAST_DIES = [LIVE, LIVE, LIVE, EXIT]
 DEAD = slice(2, 4)
 
-pytestmark = pytest.mark.usefixtures("neighbour", "_evenly")
-
-
-@pytest.fixture
-def _evenly(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever an earlier test has measured: two and two."""
-    monkeypatch.setattr(
-        env_factory, "bounds_for", lambda env, count, _: bounds_for(env, count, None)
-    )
+pytestmark = pytest.mark.usefixtures("neighbour")
 
 
 def made(

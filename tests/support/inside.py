@@ -310,9 +310,9 @@ def holding(env: Any) -> Spot:
     return launcher(env), "hold"
 
 
-def noting_pace(env: Any) -> Spot:
-    """Where the pace of its steps is noted, at its close."""
-    return session(env).lease, "note_pace"
+def noting_steps(env: Any) -> Spot:
+    """Where it is noted what its steps took, at its close."""
+    return session(env).lease, "note_steps"
 
 
 def sending(connection: WorkerConnection) -> Spot:

@@ -15,13 +15,12 @@ from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import RunnersDiedError
 from envhub_sandbox.transport.lane import Frames, RelayLane, Request
-from envhub_sandbox.transport.pace import Pace, PaceMeter
 from envhub_sandbox.transport.replies import typed_reply
 from envhub_sandbox.transport.results import Results, StepResult
 from envhub_sandbox.transport.shared_memory.attachment import Attachment
+from envhub_sandbox.transport.shared_memory.cores import CPUS, Cores
 from envhub_sandbox.transport.shared_memory.observations import RING, ObservationSlab
 from envhub_sandbox.transport.shared_memory.shard import LaneShard, Outcome
-from envhub_sandbox.transport.shared_memory.sharding import CPUS, Cores, awake_shards
 from envhub_sandbox.transport.shared_memory.spin import SpinChooser
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.shared_memory import slabs
@@ -29,8 +28,6 @@ from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.stream import pack_packet
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
-_SAMPLE_EVERY = 64
-"""Steps between two samples; the runners measure every 32nd."""
 _CAUSE_S = 10.0
 # elsewhere a core may see the sequence word before the data it announces: sleep, do not poll
 _ORDERED_STORES = platform.machine() in ("x86_64", "AMD64")
@@ -91,12 +88,10 @@ class SharedMemoryLane:
         self._spin = self._step_spin = SpinChooser(may_spin)
         self._talk_spin = SpinChooser(may_spin)  # messages take another time than steps
         self._asked_ns = 0
-        self._slept_ns = 0
         # One core is the client's. Shards that find no other sleep until they are asked, then run
         # on the client's while it sleeps: so it waits for those first, and for the others awake.
-        self._awake = awake_shards(len(self.shards))
-        self._cores = Cores(len(self.shards), self._awake)
-        self._meter = PaceMeter([one.count for one in layouts], self._awake)
+        self._cores = Cores(len(self.shards))
+        self._awake = self._cores.awake
         self._sleepers = self.shards[self._awake :]
         self._wakers = self.shards[: self._awake]
 
@@ -188,8 +183,6 @@ class SharedMemoryLane:
         if len(self.shards) == 1:
             self.shards[0].ask(leaves, slot, spin_ns)
             return
-        if not self.shards[0].sequence % _SAMPLE_EVERY:
-            self._meter.sample(self._busy_ns(), self._slept_ns, self.elapsed_ns)
         cpus = self._cores.of_shards()
         for index, (shard, (start, stop)) in enumerate(zip(self.shards, self._bounds, strict=True)):
             rows = [leaf[start:stop] for leaf in leaves]
@@ -336,9 +329,7 @@ class SharedMemoryLane:
             if not shard.answered_before_death(self._watch, deadline):
                 raise _RunnerGoneError
         budget_ns = self._spin.budget_ns
-        now_ns = perf_counter_ns()
-        self._slept_ns = now_ns - self._asked_ns
-        until_ns = now_ns + budget_ns
+        until_ns = perf_counter_ns() + budget_ns
         for shard in self._wakers:
             if not budget_ns or not shard.answered_until(until_ns):
                 if budget_ns:
@@ -405,14 +396,6 @@ class SharedMemoryLane:
         return m.StepDone(observation, rewards, over, cut, info)
 
     # --- the rest ------------------------------------------------------------------------------
-
-    def pace(self) -> Pace | None:
-        """See ``Lane``."""
-        return self._meter.pace(self.shards[0].sequence, self._busy_ns())
-
-    def _busy_ns(self) -> list[int]:
-        """What the last measured step took each runner. Trust: they say so themselves."""
-        return [shard.busy_ns for shard in self.shards]
 
     def traffic(self) -> tuple[int, int, int]:
         """See ``Lane``; of what lies in shared memory, infos and messages are left out."""

@@ -145,11 +145,6 @@ class LaneShard:
         tells = self._tells
         return tells[slabs.OUTCOME] == slabs.DONE and not tells[slabs.LENGTH]
 
-    @property
-    def busy_ns(self) -> int:
-        """What the last measured step took the runner. Trust: it says so itself."""
-        return self._tells[slabs.BUSY]
-
     def answered_before_death(self, watch: Watch, deadline: Deadline) -> bool:
         """Sleep until the reply is there, or a process dies; whether it is there.
 

@@ -92,9 +92,6 @@ class FakeLane:
         """None."""
         return 0, 0, 0
 
-    def pace(self) -> None:
-        """None."""
-
     def close(self) -> None:
         """Nothing is used any more."""
         self.closed = True
@@ -121,8 +118,8 @@ def session_over(lane: FakeLane) -> EnvSession:
     repository = FakeRepository()
     launcher = SimpleNamespace(repository=repository, stay=lambda: lambda: None)
     jails = SimpleNamespace(launcher=launcher, shared=False)
-    paces = SimpleNamespace(note=lambda *_: None)
-    session = EnvSession(cast("Any", jails), env_manifest(), [(0, NUM_ENVS)], cast("Any", paces))
+    trials = SimpleNamespace(note=lambda *_: None)
+    session = EnvSession(cast("Any", jails), env_manifest(), [(0, NUM_ENVS)], cast("Any", trials))
     session.lease.lane = cast("Any", lane)
     session.lifecycle.state = State.READY
     return session

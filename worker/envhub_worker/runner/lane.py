@@ -25,8 +25,6 @@ from envhub_worker.runner.sync_envs import SubEnvs
 from envhub_worker.runner.watches import Watches
 
 _RING = (1).to_bytes(8, "little")
-_MEASURE = 31
-"""One step in 32 is measured."""
 
 
 class Lane:
@@ -139,21 +137,13 @@ class Lane:
         if sequence == self._served:
             return False
         words = self._told
-        if sequence & _MEASURE or self._asked[slabs.MESSAGE]:
-            words[slabs.OUTCOME], words[slabs.LENGTH] = self._run()
-        else:
-            self._run_measured()
+        words[slabs.OUTCOME], words[slabs.LENGTH] = self._run()
         self._served = sequence
         words[slabs.SEQUENCE] = sequence
         if self._asked[slabs.PARKED]:
             with contextlib.suppress(BlockingIOError):  # it is full: it has been rung already
                 os.write(self._client_bell, _RING)
         return True
-
-    def _run_measured(self) -> None:
-        words, start = self._told, perf_counter_ns()
-        words[slabs.OUTCOME], words[slabs.LENGTH] = self._run()
-        words[slabs.BUSY] = perf_counter_ns() - start
 
     def _run(self) -> tuple[int, int]:
         try:

@@ -47,8 +47,6 @@ OUTCOME = 16
 """Reply: ``DONE``, ``RAISED``, ``FETCH`` or ``COLUMNS``."""
 LENGTH = 17
 """Reply: bytes of the encoded infos, or of what was raised; 0 for an empty info."""
-BUSY = 18
-"""Reply: nanoseconds that a step took the shard itself; written now and then."""
 SPIN = 16
 """Request: nanoseconds that the shard may wait for the next request without sleeping."""
 SLOT = 17

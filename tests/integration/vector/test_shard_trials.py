@@ -1,0 +1,43 @@
+"""Uses of one pin that are cut in different ways, and give the same."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from envhub_sandbox import make_env
+from envhub_sandbox.transport import shard_trials
+from tests.support import inside
+from tests.support.compare import assert_same
+from tests.support.samples import sample
+
+N_ENVS = 4
+WAYS = [[(0, 2), (2, 4)], [(0, 3), (3, 4)], [(0, 4)]]
+STEPS = shard_trials.LEAST_STEPS
+
+
+def use(lane: str, steps: int) -> tuple[list[tuple[int, int]], list[Any]]:
+    """How it was cut, and all that it gave."""
+    with make_env(sample("cartpole"), N_ENVS, use_async_envs=True, lane=lane) as suites:
+        env = suites.env
+        found: list[Any] = [env.reset(seed=3)]
+        found += [env.step(np.arange(N_ENVS) % 2) for _ in range(steps)]
+        return inside.bounds(env), found
+
+
+@pytest.mark.parametrize("lane", ["auto", "frames"])
+def test_the_first_uses_try_all_ways_and_give_the_same(
+    lane: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Any
+) -> None:
+    """Rows, seeds, order and infos; a use that is too short to be measured is repeated."""
+    monkeypatch.setenv("ENVHUB_CACHE", str(tmp_path))
+    monkeypatch.setattr(shard_trials, "ways_to_cut", lambda count, cores: WAYS)
+    monkeypatch.setattr(shard_trials, "HOPELESS", float("inf"))
+    assert use(lane, STEPS - 1)[0] == WAYS[0]
+    uses = [use(lane, STEPS) for _ in WAYS]
+    assert [bounds for bounds, _ in uses] == WAYS
+    for _, found in uses[1:]:
+        assert_same(found, uses[0][1])
+    assert use(lane, 0)[0] in WAYS

@@ -1,0 +1,165 @@
+"""Over how many processes sub-environments are spread: what was tried, and what was fastest."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from functools import partial
+from pathlib import Path
+
+import pytest
+from gymnasium.spaces import Discrete
+from hypothesis import given
+from hypothesis import strategies as st
+
+from envhub_sandbox.transport import shard_trials
+from envhub_sandbox.transport.shard_trials import ShardTrials, ways_to_cut
+from tests.support.wire import env_manifest
+
+environment = partial(env_manifest, Discrete(2), Discrete(2))
+ENV = environment(16)
+
+
+def cores(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
+    """Let the machine have this many."""
+    monkeypatch.setattr(shard_trials.os, "sched_getaffinity", lambda pid: set(range(count)))
+
+
+@pytest.fixture(autouse=True)
+def _two_cores(monkeypatch: pytest.MonkeyPatch) -> None:
+    cores(monkeypatch, 2)
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    """Where it is remembered."""
+    return tmp_path / "entry.auto-shards"
+
+
+def use(path: Path, times: Mapping[str, float], count: int = 16) -> str:
+    """One use of a pin whose steps take that long; returns how it was cut."""
+    env, trials = environment(count), ShardTrials(path)
+    bounds = trials.bounds_for(env, None)
+    name = "+".join(str(stop - start) for start, stop in bounds)
+    trials.note(env, bounds, times[name])
+    return name
+
+
+@pytest.mark.parametrize(
+    ("times", "expected"),
+    [
+        ({"8+8": 90e-6, "10+6": 80e-6, "16": 120e-6}, "10+6"),
+        ({"8+8": 90e-6, "10+6": 95e-6, "16": 60e-6}, "16"),
+        ({"8+8": 90e-6, "10+6": 100e-6, "16": 92e-6}, "16"),  # nearly as fast with fewer processes
+        ({"8+8": 90e-6, "10+6": 100e-6, "16": 95e-6}, "8+8"),
+    ],
+)
+def test_the_fastest_of_all_that_were_tried_is_used(
+    path: Path, times: dict[str, float], expected: str
+) -> None:
+    """Each way once, then always the best."""
+    assert [use(path, times) for _ in range(3)] == list(times)
+    assert {use(path, times) for _ in range(5)} == {expected}
+
+
+def test_where_computing_is_all_fewer_shards_are_not_tried(path: Path) -> None:
+    """A use that is twice as slow would be a high price for what is known already."""
+    times = {"8+8": 16e-3, "10+6": 20e-3}
+    assert [use(path, times) for _ in range(4)] == ["8+8", "10+6", "8+8", "8+8"]
+
+
+def test_another_load_lets_all_be_tried_again(path: Path) -> None:
+    """The way that is used has become slower: the others may be better now."""
+    quiet = {"8+8": 90e-6, "10+6": 80e-6, "16": 100e-6}
+    loaded = {"8+8": 400e-6, "10+6": 300e-6, "16": 130e-6}
+    for _ in range(4):
+        use(path, quiet)
+    assert [use(path, loaded) for _ in range(4)] == ["10+6", "8+8", "16", "16"]
+    assert use(path, quiet) == "16"  # 1.3 times: that may be noise
+    quick = {name: step_s / 2 for name, step_s in quiet.items()}
+    assert [use(path, quick) for _ in range(5)] == ["16", "8+8", "10+6", "10+6", "10+6"]
+
+
+def test_what_was_far_slower_is_not_tried_again(path: Path) -> None:
+    """It is so under another load, too."""
+    times = {"2+2": 1e-3, "3+1": 1.1e-3, "4": 1.9e-3}
+    tried = [use(path, times, 4) for _ in range(4)]
+    assert tried == ["2+2", "3+1", "4", "2+2"]
+    slower = {name: 2 * step_s for name, step_s in times.items()}
+    assert [use(path, slower, 4) for _ in range(4)] == ["2+2", "3+1", "2+2", "2+2"]
+
+
+def test_another_number_of_cores_is_another_machine(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What was fastest on two says nothing about four."""
+    for _ in range(3):
+        use(path, {"8+8": 2e-4, "10+6": 2e-4, "16": 1e-4})
+    cores(monkeypatch, 4)
+    assert len(ShardTrials(path).bounds_for(ENV, None)) == 4
+    cores(monkeypatch, 2)
+    assert len(ShardTrials(path).bounds_for(ENV, None)) == 1
+
+
+def test_what_may_share_state_stays_together(path: Path) -> None:
+    """A SyncVectorEnv's sub-environments live in one process, and so does what is no such env."""
+    trials = ShardTrials(path)
+    assert trials.bounds_for(environment(16, sync=True), None) == [(0, 16)]
+    assert trials.bounds_for(environment(16, shardable=False), 4) == [(0, 16)]
+
+
+@pytest.mark.parametrize(("workers", "expected"), [(1, 1), (3, 3), (20, 16)])
+def test_a_number_of_workers_is_kept(path: Path, workers: int, expected: int) -> None:
+    """Whatever was measured, if there are as many sub-environments."""
+    use(path, {"8+8": 1e-3})
+    assert len(ShardTrials(path).bounds_for(ENV, workers)) == expected
+
+
+@given(count=st.integers(1, 200), cpus=st.integers(1, 70))
+def test_every_sub_environment_has_one_shard(count: int, cpus: int) -> None:
+    """Slices are adjacent, none is empty, together they are all; one shard is the last resort."""
+    ways = ways_to_cut(count, cpus)
+    for bounds in ways:
+        assert [start for start, _ in bounds] == [0, *(stop for _, stop in bounds[:-1])]
+        assert bounds[-1][1] == count
+        assert all(start < stop for start, stop in bounds)
+        assert len(bounds) <= cpus
+    assert len(ways[-1]) == 1
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"[]",
+        b"{",
+        b"\xff",
+        *(json.dumps({'["", "0", 2]': times}).encode() for times in ([], {"8+8": "1"})),
+        *(json.dumps({'["", "0", 2]': {"8+8": one}}).encode() for one in (0.0, -1.0, 1e9, True)),
+    ],
+)
+def test_a_damaged_file_is_as_none(path: Path, content: bytes) -> None:
+    """The first way is tried, and what it takes is remembered."""
+    path.write_bytes(content)
+    assert use(path, {"8+8": 1e-3}) == "8+8"
+    assert use(path, {"10+6": 1e-3}) == "10+6"
+
+
+@pytest.mark.parametrize("step_s", [0.0, float("nan"), float("inf"), -1.0])
+def test_an_impossible_time_is_not_remembered(path: Path, step_s: float) -> None:
+    """A clock may be strange."""
+    ShardTrials(path).note(ENV, [(0, 16)], step_s)
+    assert not path.exists()
+
+
+def test_what_must_not_be_remembered_is_not() -> None:
+    """There is no file."""
+    trials = ShardTrials(None)
+    trials.note(ENV, [(0, 8), (8, 16)], 1e-3)
+    assert trials.bounds_for(ENV, None) == [(0, 8), (8, 16)]
+
+
+def test_a_cache_that_cannot_be_written_is_no_error(tmp_path: Path) -> None:
+    """The folder is not there."""
+    ShardTrials(tmp_path / "missing" / "entry").note(ENV, [(0, 16)], 1e-3)
+    assert not (tmp_path / "missing").exists()
