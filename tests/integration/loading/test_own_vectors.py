@@ -1,0 +1,116 @@
+"""Vector environments of a repository's own class, which declare their spaces as they like."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from envhub_sandbox import make_env
+from envhub_sandbox.errors import ActionError, ObservationError
+from tests.support.repositories import write_repository
+
+pytestmark = pytest.mark.short
+
+_OWN = """
+import gymnasium as gym
+import numpy as np
+from gymnasium.spaces import Box, Dict, Discrete
+
+class Own{base}:
+    num_envs = 3
+    metadata = {{"autoreset_mode": None}}
+    {spaces}
+
+    def reset(self, *, seed=None, options=None):
+        self.seen = None
+        return self._observation(), {{}}
+
+    def _observation(self):
+        return {observation}
+
+    def step(self, actions):
+        self.seen = actions
+        no = np.zeros(3, bool)
+        return self._observation(), np.zeros(3), no, no, {{}}
+
+    def got(self):
+        return self.seen
+
+    def close(self, **kwargs):
+        pass
+
+def make_env(n_envs=1, use_async_envs=False):
+    return Own()
+"""
+_OF_GYMNASIUM = "(gym.vector.VectorEnv)"
+_PLAIN = "np.zeros((3, 4), np.float32)"
+_LIKE_ARENA = """
+    single_observation_space = observation_space = Box(-1, 1, (3, 4))
+    single_action_space = action_space = Box(-1, 1, (3, 36))
+"""
+
+
+def own(folder: Path, spaces: str, observation: str = _PLAIN, base: str = _OF_GYMNASIUM) -> Path:
+    """A repository around a vector environment with these spaces."""
+    return write_repository(
+        folder, _OWN.format(base=base, spaces=spaces.strip(), observation=observation)
+    )
+
+
+class TestSpacesThatAreNoBatches:
+    """Where a batched space is no batch of the single one, the vector environment's own decides."""
+
+    def test_a_sample_of_the_action_space_is_taken_whole(self, tmp_path: Path) -> None:
+        """NVIDIA's wrapper for Isaac Lab Arena gives its action space as the single one, too."""
+        with make_env(own(tmp_path, _LIKE_ARENA), n_envs=3) as suites:
+            env = suites.env
+            assert env.action_space.shape == env.single_action_space.shape == (3, 36)
+            env.reset(seed=0)
+            actions = env.action_space.sample()
+            observation, *_ = env.step(actions)
+            assert observation.shape == (3, 4)
+            [seen] = [env.got()]
+            assert np.array_equal(seen, actions)
+            assert seen.dtype == np.float32
+
+    def test_another_shape_is_refused_by_the_vectors_own(self, tmp_path: Path) -> None:
+        """Nothing is sent, and the error names the batched space."""
+        with make_env(own(tmp_path, _LIKE_ARENA), n_envs=3) as suites:
+            suites.env.reset(seed=0)
+            for wrong in (np.zeros((3, 3, 36), np.float32), np.zeros((2, 36), np.float32)):
+                with pytest.raises(ActionError, match=r"float32 of shape \(3, 36\)"):
+                    suites.env.step(wrong)
+            assert suites.env.got() is None
+
+    def test_mappings_of_any_leading_dimension_are_taken(self, tmp_path: Path) -> None:
+        """Each leaf has the shape that the vector environment's own space gives it."""
+        spaces = """
+    observation_space = Box(-1, 1, (3, 4))
+    single_action_space = Box(-1, 1, (2,))
+    action_space = Dict(robot=Box(-1, 1, (2, 7)), mode=Discrete(4))
+"""
+        with make_env(own(tmp_path, spaces), n_envs=3) as suites:
+            env = suites.env
+            env.reset(seed=0)
+            actions = env.action_space.sample()
+            env.step(actions)
+            seen: Any = env.got()
+            assert np.array_equal(seen["robot"], actions["robot"])
+            assert seen["mode"] == actions["mode"]
+
+    def test_validation_looks_at_the_vectors_own_spaces(self, tmp_path: Path) -> None:
+        """Both ways: a good batch passes, one outside of the space does not."""
+        with make_env(own(tmp_path, _LIKE_ARENA), n_envs=3, validate=True) as suites:
+            suites.env.reset(seed=0)
+            suites.env.step(suites.env.action_space.sample())
+            with pytest.raises(ActionError, match="outside"):
+                suites.env.step(np.full((3, 36), 2, np.float32))
+        outside = own(tmp_path / "outside", _LIKE_ARENA, "np.full((3, 4), 2, np.float32)")
+        with (
+            make_env(outside, n_envs=3, validate=True) as suites,
+            pytest.raises(ObservationError, match="outside"),
+        ):
+            suites.env.reset(seed=0)
