@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from envhub_sandbox import make_env
-from envhub_sandbox.errors import ActionError, ObservationError
+from envhub_sandbox.errors import ActionError, LoadError, ObservationError
 from tests.support.repositories import write_repository
 
 pytestmark = pytest.mark.short
@@ -114,3 +114,70 @@ class TestSpacesThatAreNoBatches:
             pytest.raises(ObservationError, match="outside"),
         ):
             suites.env.reset(seed=0)
+
+
+_BATCHED = """
+    observation_space = Dict(agent_pos=Box(-1, 1, (3, 4)))
+    action_space = Box(-1, 1, (3, 2))
+"""
+_SEEN = '{"agent_pos": np.zeros((3, 4), np.float32)}'
+
+
+class TestSpacesThatAreMissing:
+    """A vector object without a base class and without the spaces of one sub-environment."""
+
+    @pytest.mark.parametrize(
+        ("spaces", "observation"),
+        [
+            (_BATCHED, _SEEN),
+            (_BATCHED.replace("(3, 4)", "(4,)").replace("(3, 2)", "(2,)"), _SEEN),
+            ("action_space = Box(-1, 1, (3, 2))", _SEEN),
+            ("action_space = Box(-1, 1, (2,))", _SEEN),
+        ],
+        ids=["batched", "single", "no observation space, batched", "no observation space"],
+    )
+    def test_they_are_derived_from_the_first_reset(
+        self, tmp_path: Path, spaces: str, observation: str
+    ) -> None:
+        """The observation that it gives shows whether its spaces are batched."""
+        with make_env(own(tmp_path, spaces, observation, base=""), n_envs=3) as suites:
+            env = suites.env
+            assert env.single_observation_space["agent_pos"].shape == (4,)
+            assert env.observation_space["agent_pos"].shape == (3, 4)
+            assert env.single_action_space.shape == (2,)
+            assert env.action_space.shape == (3, 2)
+            observations, _ = env.reset(seed=0)
+            assert observations["agent_pos"].shape == (3, 4)
+            env.step(env.action_space.sample())
+            assert env.get_attr("seen").shape == (3, 2)
+
+    def test_images_without_a_space_are_bytes(self, tmp_path: Path) -> None:
+        """dtype uint8 has the bounds of its type."""
+        spaces = "action_space = Box(-1, 1, (2,))"
+        image = "np.zeros((3, 8, 8, 3), np.uint8)"
+        with make_env(own(tmp_path, spaces, image, base=""), n_envs=3) as suites:
+            space = suites.env.single_observation_space
+            assert (space.shape, space.dtype, space.high.max()) == ((8, 8, 3), np.uint8, 255)
+
+    def test_without_an_action_space_the_error_says_what_to_add(self, tmp_path: Path) -> None:
+        """No observation shows what an action is."""
+        folder = own(tmp_path, "observation_space = Box(-1, 1, (3, 4))", base="")
+        with pytest.raises(LoadError, match=r"Own.*add single_action_space"):
+            make_env(folder, n_envs=3)
+
+    def test_an_observation_that_is_no_batch_is_named(self, tmp_path: Path) -> None:
+        """A space cannot be made of it: the error says which attribute to add."""
+        folder = own(tmp_path, "action_space = Box(-1, 1, (2,))", "'text'", base="")
+        with pytest.raises(LoadError, match=r"Own.*add single_observation_space"):
+            make_env(folder, n_envs=3)
+
+    @pytest.mark.parametrize("lacking", ["num_envs", "close"])
+    def test_what_is_nearly_a_vector_environment_hears_what_it_lacks(
+        self, tmp_path: Path, lacking: str
+    ) -> None:
+        """``reset`` and ``step`` alone do not say how many sub-environments there are."""
+        folder = own(tmp_path, _BATCHED, _SEEN, base="")
+        entry = folder / "env.py"
+        entry.write_text(entry.read_text().replace(f" {lacking}", f" my_{lacking}"))
+        with pytest.raises(LoadError, match=rf"add {lacking}"):
+            make_env(folder, n_envs=3)
