@@ -5,12 +5,16 @@ from __future__ import annotations
 import contextlib
 import inspect
 import os
-from collections.abc import Mapping
+from collections.abc import Hashable, Iterator, Mapping
 from dataclasses import fields, is_dataclass
 from enum import Enum
+from pathlib import PurePath
 from typing import Any
 
 import numpy as np
+
+from envhub_sandbox.session.recipe import PlainConfig
+from envhub_worker.protocol.messages import CONFIG_CLASS
 
 _PLAIN = (type(None), bool, int, float, complex, str, bytes, np.ndarray, np.generic)
 _MAX_DEPTH = 16
@@ -34,34 +38,48 @@ def reference_of(cfg: Any) -> tuple[str, Any]:
 
 
 def plain_config(config: Any) -> dict[str, object]:
-    """The ``vars()`` of a config object with nested ones, and its own public properties.
+    """The attributes of a config object with nested ones, and its own public properties.
 
-    Dataclasses and other plain objects become mappings, enums their values, paths text. What has
-    no plain form (a function, an open file) is left out: nothing of the caller is pickled.
+    Dataclasses and other plain objects become mappings which say what their classes are called
+    (``messages.CONFIG_CLASS``), and so do members of enums and paths. What has no plain form (a
+    function, an open file) is left out: nothing of the caller is pickled.
     """
-    return _attributes(config, 0)
+    return config.values if isinstance(config, PlainConfig) else _attributes(config, 0)
 
 
 def _attributes(config: Any, depth: int) -> dict[str, object]:
     names = list(getattr(config, "__dict__", {}))
     if is_dataclass(config):
         names = list(dict.fromkeys([*(item.name for item in fields(config)), *names]))
-    made = {name: _plain(getattr(config, name, None), depth + 1) for name in names}
-    if not depth:
-        made |= {name: _plain(value, 1) for name, value in _computed(config).items()}
-    return {name: value for name, value in made.items() if value is not _LEFT_OUT}
+    made = _known({name: _plain(getattr(config, name, None), depth + 1) for name in names})
+    wanted = {item.name for item in fields(config)} if is_dataclass(config) else made
+    computed = _known({name: _plain(value, 1) for name, value in _computed(config, depth)})
+    described = (_names(type(config)), tuple(name for name in made if name in wanted), computed)
+    return {**made, CONFIG_CLASS: described}
 
 
-def _computed(config: Any) -> dict[str, Any]:
+def _is_key(key: Any) -> bool:
+    plain = key.value if isinstance(key, Enum) else key
+    return isinstance(plain, Hashable) and type(_plain(plain, 0)) is type(plain)
+
+
+def _known(values: dict[Any, Any]) -> dict[Any, Any]:
+    return {name: value for name, value in values.items() if value is not _LEFT_OUT}
+
+
+def _names(kind: type) -> tuple[tuple[str, str], ...]:
+    """Module and name of a class and of those that it inherits from."""
+    return tuple((cls.__module__, cls.__qualname__) for cls in kind.__mro__ if cls is not object)
+
+
+def _computed(config: Any, depth: int) -> Iterator[tuple[str, Any]]:
     """The public properties of a config that can be had: LeRobot's have their ``type`` so."""
     kind = type(config)
-    found = {}
-    for name in dir(kind):
+    for name in [] if depth else dir(kind):
         if name.startswith("_") or not isinstance(inspect.getattr_static(kind, name), property):
             continue
         with contextlib.suppress(Exception):
-            found[name] = getattr(config, name)
-    return found
+            yield name, getattr(config, name)
 
 
 _LEFT_OUT = object()
@@ -71,14 +89,18 @@ def _plain(value: Any, depth: int) -> Any:
     if depth > _MAX_DEPTH or callable(value):
         return _LEFT_OUT
     if isinstance(value, Enum):
-        return _plain(value.value, depth)
+        inner = _plain(value.value, depth)
+        return {CONFIG_CLASS: (_names(type(value)), None, {}), "value": inner}
     if isinstance(value, _PLAIN):
         return value
     if isinstance(value, os.PathLike):
-        return os.fspath(value)
+        text = os.fspath(value)
+        named = {CONFIG_CLASS: ((("pathlib", "Path"),), None, {}), "value": text}
+        return named if isinstance(value, PurePath) else text
     if isinstance(value, Mapping):
-        items = {_plain(k, depth + 1): _plain(v, depth + 1) for k, v in value.items()}
-        return {k: v for k, v in items.items() if k is not _LEFT_OUT and v is not _LEFT_OUT}
+        keys = {k: k.value if isinstance(k, Enum) else k for k in value if _is_key(k)}
+        kept = _known({key: _plain(value[k], depth + 1) for k, key in keys.items()})
+        return kept if type(value) is dict else {**kept, CONFIG_CLASS: ((), (), {})}
     if isinstance(value, (list, tuple, set, frozenset)):
         made = [item for item in (_plain(v, depth + 1) for v in value) if item is not _LEFT_OUT]
         return tuple(made) if isinstance(value, tuple) else made

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from types import SimpleNamespace
 from typing import Any
 
 from envhub_sandbox.hub.client import default_endpoint
@@ -20,6 +19,14 @@ from envhub_worker.protocol.manifest.manifest import Manifest
 from envhub_worker.protocol.messages import VERSION
 
 
+@dataclass(frozen=True)
+class PlainConfig:
+    """What ``make_env`` takes in place of a caller's config object: what of it has crossed."""
+
+    hub_path: str
+    values: dict[str, object]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Recipe:
     """The arguments of ``make_env``, with the commit pinned.
@@ -27,7 +34,7 @@ class Recipe:
     Attributes:
         make_env: The function that takes them; it travels by its name.
         reference: The pinned hub reference, or a local folder and its entry file.
-        config: The ``vars()`` of the caller's config object, or None.
+        config: The caller's config object as plain values, or None.
         options: The other arguments, by name.
     """
 
@@ -46,7 +53,7 @@ class Recipe:
         """Fresh environments: what ``make_env`` returns and raises."""
         cfg: Any = self.reference
         if self.config is not None:
-            cfg = SimpleNamespace(**{**self.config, "hub_path": self.reference})
+            cfg = PlainConfig(self.reference, {**self.config, "hub_path": self.reference})
         options = dict(self.options)
         if options.get("endpoint") == without_login(default_endpoint()):
             options["endpoint"] = None  # it may come with a login here

@@ -31,10 +31,11 @@ class UniterableError(ActionTypeError, CustomSpaceError):
 
 
 @singledispatch
-def batch_of(space: gym.Space[Any], value: Any, count: int, where: str = "actions") -> Any:
+def batch_of(space: gym.Space[Any], value: Any, count: int | None, where: str = "actions") -> Any:
     """A batch of ``count`` members of a *single* action space.
 
     Args:
+        count: None where the space is that of the whole batch.
         where: What to call it in an error.
 
     Returns:
@@ -44,6 +45,8 @@ def batch_of(space: gym.Space[Any], value: Any, count: int, where: str = "action
     Raises:
         ActionError: A wrong shape, dtype or structure.
     """
+    if count is None:
+        return value
     try:
         members = tuple(value)
     except TypeError:
@@ -59,15 +62,18 @@ def batch_of(space: gym.Space[Any], value: Any, count: int, where: str = "action
 @batch_of.register(spaces.Discrete)
 @batch_of.register(spaces.MultiDiscrete)
 @batch_of.register(spaces.MultiBinary)
-def _batch_of_arrays(space: gym.Space[Any], value: Any, count: int, where: str = "actions") -> Any:
+def _batch_of_arrays(
+    space: gym.Space[Any], value: Any, count: int | None, where: str = "actions"
+) -> Any:
     array = value if type(value) is np.ndarray else _array(space, value, where)
-    shape = (count, *(space.shape or ()))
+    shape = _shape(space, count)
     dtype = np.dtype(space.dtype)
     # an empty list has numbers of no kind
     if array.shape != shape or (array.size and array.dtype.kind not in _kinds_for(space)):
         kind = ActionError if array.shape else ActionTypeError
+        of = "all" if count is None else count
         raise kind(
-            f"{where}: expected {dtype} of shape {shape} for {space} in {count} sub-environments, "
+            f"{where}: expected {dtype} of shape {shape} for {space} in {of} sub-environments, "
             f"got {array.dtype} of shape {array.shape}"
         )
     # an environment in this process would see the caller's own numbers
@@ -75,7 +81,9 @@ def _batch_of_arrays(space: gym.Space[Any], value: Any, count: int, where: str =
 
 
 @batch_of.register(spaces.Dict)
-def _batch_of_dicts(space: spaces.Dict, value: Any, count: int, where: str = "actions") -> Any:
+def _batch_of_dicts(
+    space: spaces.Dict, value: Any, count: int | None, where: str = "actions"
+) -> Any:
     if not isinstance(value, Mapping):
         raise ActionTypeError(f"{where}: expected a mapping for {space}, got {_named(value)}")
     missing = [key for key in space.spaces if key not in value]
@@ -89,7 +97,7 @@ def _batch_of_dicts(space: spaces.Dict, value: Any, count: int, where: str = "ac
 
 @batch_of.register(spaces.Tuple)
 def _batch_of_tuples(
-    space: spaces.Tuple[Any], value: Any, count: int, where: str = "actions"
+    space: spaces.Tuple[Any], value: Any, count: int | None, where: str = "actions"
 ) -> Any:
     sequence = isinstance(value, (tuple, list))
     if not sequence or len(value) != len(space.spaces):
@@ -107,13 +115,13 @@ def _batch_of_tuples(
 class ActionReader:
     """``batch_of`` for one environment, with what does not change worked out once."""
 
-    def __init__(self, space: gym.Space[Any], count: int) -> None:
+    def __init__(self, space: gym.Space[Any], count: int | None) -> None:
         self._space = space
         self._count = count
         self._shape: tuple[int, ...] | None = None
         self._dtypes: frozenset[Any] = frozenset()
         if isinstance(space, ARRAY_SPACES):
-            self._shape = (count, *(space.shape or ()))
+            self._shape = _shape(space, count)
             kinds = _kinds_for(space)
             self._dtypes = frozenset(dtype for dtype in DTYPE_CODES if dtype.kind in kinds)
 
@@ -124,6 +132,10 @@ class ActionReader:
         ):
             return actions
         return batch_of(self._space, actions, self._count)
+
+
+def _shape(space: gym.Space[Any], count: int | None) -> tuple[int, ...]:
+    return tuple(space.shape or ()) if count is None else (count, *(space.shape or ()))
 
 
 def _is_listed(value: Any, array: Any) -> bool:

@@ -21,10 +21,12 @@ from envhub_worker.protocol.spaces.spaces import OpaqueSpace
 
 def action_reader(manifest: EnvManifest) -> Callable[[Any], Any]:
     """Checks a batch of actions and makes it what the worker takes."""
-    space = manifest.single_action_space
-    if isinstance(space, OpaqueSpace):
+    single, own = manifest.single_action_space, manifest.own_batch("action_space")
+    if isinstance(single, OpaqueSpace):
         return lambda actions: actions
-    return ActionReader(space, manifest.num_envs).read
+    if own is not None:
+        return ActionReader(own, None).read
+    return ActionReader(single, manifest.num_envs).read
 
 
 def metadata(manifest: EnvManifest) -> dict[str, Any]:

@@ -36,9 +36,14 @@ class ValidatedVectorEnv(SandboxVectorEnv):
 
     def __init__(self, session: EnvSession) -> None:
         super().__init__(session)
-        spaces_of_actions = self.single_action_space, self.action_space
+        # those of a batch that is no batch of the single space: it is one member of its own
+        self._own_observations, own_actions = (
+            session.manifest.own_batch(name) for name in ("observation_space", "action_space")
+        )
+        members = partial(_members, self.action_space, own_actions)
+        space = self.single_action_space if own_actions is None else own_actions
         # not a bound method: it would refer to this environment (interruption.md, rule 13)
-        self._read_actions = partial(_read_and_check, self._read_actions, *spaces_of_actions)
+        self._read_actions = partial(_read_and_check, self._read_actions, members, space)
 
     def _end_reset(self, timeout_s: float | None) -> tuple[Any, dict[Any, Any]]:
         """What both ``reset`` and ``reset_wait`` end with, checked."""
@@ -66,14 +71,18 @@ class ValidatedVectorEnv(SandboxVectorEnv):
     def _check_batch(self, operation: str, observations: Any) -> None:
         with self._session.repository.named():
             try:
-                members = list(_members(self.observation_space, observations))
+                members = list(
+                    _members(self.observation_space, self._own_observations, observations)
+                )
             except Exception as error:  # a vector environment of the repository's own gave it
                 text = f"{operation} returned no batch of observations for {self.observation_space}"
                 raise ObservationError(text, observation=observations) from error
-        self._check(operation, members)
+        self._check(operation, members, self._own_observations)
 
-    def _check(self, operation: str, observations: Iterable[Any]) -> None:
-        space = self.single_observation_space
+    def _check(
+        self, operation: str, observations: Iterable[Any], own: gym.Space[Any] | None = None
+    ) -> None:
+        space = self.single_observation_space if own is None else own
         with self._session.repository.named():
             for index, observation in enumerate(observations):
                 if observation is not None and not holds(space, observation):
@@ -109,10 +118,13 @@ def holds(space: gym.Space[Any], member: Any) -> bool:
 
 
 def _read_and_check(
-    read: Callable[[Any], Any], single: gym.Space[Any], batched: gym.Space[Any], actions: Any
+    read: Callable[[Any], Any],
+    members: Callable[[Any], Iterable[Any]],
+    single: gym.Space[Any],
+    actions: Any,
 ) -> Any:
     batch = read(actions)
-    for index, action in enumerate(_members(batched, batch)):
+    for index, action in enumerate(members(batch)):
         if not holds(single, action):
             raise ActionError(
                 f"the action of sub-environment {index} is outside of its space: "
@@ -121,8 +133,10 @@ def _read_and_check(
     return batch
 
 
-def _members(space: gym.Space[Any], batch: Any) -> Iterable[Any]:
-    """One value for each sub-environment."""
+def _members(space: gym.Space[Any], own: gym.Space[Any] | None, batch: Any) -> Iterable[Any]:
+    """One value for each sub-environment; the batch where it has a space of its own."""
+    if own is not None:
+        return [batch]
     return batch if isinstance(space, OpaqueSpace) else iterate(space, batch)
 
 

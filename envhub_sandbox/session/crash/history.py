@@ -93,8 +93,10 @@ class History:
     """
 
     def __init__(self, manifest: EnvManifest, limit: int) -> None:
-        space = manifest.single_action_space
-        self._shape = (manifest.num_envs, *(space.shape or ()))
+        own = manifest.own_batch("action_space")
+        space = manifest.single_action_space if own is None else own
+        count = () if own is not None else (manifest.num_envs,)
+        self._shape = (*count, *(space.shape or ()))
         is_flat = isinstance(space, ARRAY_SPACES)
         size = 8 * int(np.prod(self._shape, dtype=np.int64)) if is_flat else 0
         self._unit = _ENTRY_BYTES + size

@@ -119,7 +119,8 @@ class SharedMemoryLane:
         sizes = [stop - start for start, stop in results.bounds]
         layouts = [slabs.layout_of(manifest.single_action_space, size) for size in sizes]
         known = [layout for layout in layouts if layout is not None]
-        if observed is None or len(known) < len(layouts):
+        own = [manifest.own_batch(name) for name in ("action_space", "observation_space")]
+        if observed is None or len(known) < len(layouts) or own != [None, None]:
             attachment.close()
             return None
         lane = cls(relay, results, observed, known, attachment)

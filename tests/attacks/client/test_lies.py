@@ -295,6 +295,14 @@ DISAGREEING: dict[str, dict[str, Any]] = {
     "action space of another number": {
         "action_space": encode_space(spaces.MultiDiscrete([2] * 7)),
     },
+    "its own action space, and slabs for the single one": {
+        "shardable": False,
+        "action_space": encode_space(spaces.MultiDiscrete([2] * 7)),
+    },
+    "its own mapping of actions": {
+        "shardable": False,
+        "action_space": encode_space(spaces.Dict(a=spaces.Discrete(3))),
+    },
 }
 
 
@@ -309,6 +317,7 @@ def test_manifest_that_contradicts_itself_does_no_harm(
         observation, _ = suites.env.reset()
         # what was declared for one sub-environment decides; the rest is for the caller to read
         assert observation.shape == (suites.env.num_envs, 3)
+        assert len(suites.env.step(suites.env.action_space.sample())) == 5
 
 
 DOCUMENTS: dict[str, Callable[[], Frames]] = {

@@ -12,12 +12,13 @@ import importlib
 import inspect
 import os
 import sys
-import types
 from collections.abc import Callable
+from operator import attrgetter
 from pathlib import Path, PurePosixPath
 from typing import Any
 
 from envhub_worker.protocol.messages import Load, LoadTask
+from envhub_worker.runner.configs import config_of
 from envhub_worker.runner.parameters import Parameters, parameters_of, takes
 
 PACKAGE = "hub_env"
@@ -67,8 +68,7 @@ def call_make_env(make_env: Callable[..., Any], request: Load | LoadTask) -> Any
         "use_async_envs": request.use_async_envs,
     }
     if request.cfg is not None:
-        values = {key: _readable(value) for key, value in request.cfg.items()}
-        offered["cfg"] = types.SimpleNamespace(**values)
+        offered["cfg"] = config_of(request.cfg, _class_named)
     parameters = parameters_of(make_env)
     if parameters is None:
         return make_env(**offered, **request.env_kwargs)
@@ -77,24 +77,12 @@ def call_make_env(make_env: Callable[..., Any], request: Load | LoadTask) -> Any
     return make_env(**(taken | request.env_kwargs))
 
 
-class Attributes(dict[str, Any]):
-    """Part of a caller's config: ``cfg.camera["width"]`` and ``cfg.camera.width`` both work.
-
-    Whether the caller had a mapping or an object there is not known here, so it can be read as
-    either.
-    """
-
-    def __init__(self, values: dict[str, Any]) -> None:
-        super().__init__(values)
-        self.__dict__ = self
-
-
-def _readable(value: object) -> Any:
-    if isinstance(value, dict) and all(isinstance(key, str) for key in value):
-        return Attributes({key: _readable(item) for key, item in value.items()})
-    if isinstance(value, (list, tuple)):
-        return type(value)(map(_readable, value))
-    return value
+def _class_named(module: str, qualified_name: str) -> type[Any] | None:
+    try:
+        found = attrgetter(qualified_name)(importlib.import_module(module))
+    except Exception:  # not here, or not importable, or local to a function
+        return None
+    return found if isinstance(found, type) else None
 
 
 def _package_of(root: Path, path: PurePosixPath) -> tuple[Path, list[str]]:

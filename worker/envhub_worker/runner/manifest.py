@@ -13,6 +13,7 @@ from gymnasium.vector.utils import batch_space
 from envhub_worker.protocol.manifest.manifest import EnvManifest, Manifest
 from envhub_worker.protocol.manifest.names import MAX_NAMES
 from envhub_worker.runner import gymnasium_compat as compat
+from envhub_worker.runner.derived_spaces import derived_space
 from envhub_worker.runner.described import facts_of
 from envhub_worker.runner.tasks import Task
 
@@ -85,15 +86,12 @@ def describe_vector(task: Task, env: Any) -> EnvManifest:
 
 
 def _spaces(env: Any, name: str, num_envs: int) -> tuple[Any, Any]:
-    """A duck-typed environment may name just one of the two, usually the single one."""
-    single = getattr(env, f"single_{name}", None)
-    batched = getattr(env, name, None)
-    if single is None and batched is None:
-        raise AttributeError(f"{type(env).__qualname__} has no single_{name}")
-    known: Any = batched if single is None else single
-    if single is not None and batched is not None:
-        return single, batched
-    return known, batch_space(known, num_envs)
+    """A duck-typed environment may name just one of the two, or neither."""
+    derived = derived_space(env, name)
+    if derived is not None:
+        return derived, batch_space(derived, num_envs)
+    single, batched = getattr(env, f"single_{name}"), getattr(env, name, None)
+    return single, batch_space(single, num_envs) if batched is None else batched
 
 
 def _spec(env: Any) -> dict[str, Any] | None:

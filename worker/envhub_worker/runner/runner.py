@@ -177,9 +177,7 @@ class Runner:
         """``VectorEnv.step``."""
         env = self._envs[request.env]
         if not isinstance(env, SubEnvs):
-            actions, space = request.actions, getattr(env, "single_action_space", None)
-            if space is not None and batches.restores(space):
-                actions = batches.restore_batch(space, actions)
+            actions = _restored(env, request.actions)
             observation, rewards, terminated, truncated, info = env.step(actions)
             return m.StepDone(observation, rewards, terminated, truncated, joined_infos(info))
         return _step_done(env, env.run_step(request.actions))
@@ -293,6 +291,16 @@ class Runner:
         if env is not None:
             env.close()
         return m.Value(None)
+
+
+def _restored(env: Any, actions: Any) -> Any:
+    """Actions with the classes that Gymnasium gives their members."""
+    single, batched = (getattr(env, name, None) for name in ("single_action_space", "action_space"))
+    if single is None or not batches.restores(single):
+        return actions
+    if batched is not None and not batches.is_batch(batched, single, int(env.num_envs)):
+        return batches.restore(batched, actions)
+    return batches.restore_batch(single, actions)
 
 
 def _step_done(env: SubEnvs, pairs: Pairs) -> m.Message:

@@ -17,6 +17,7 @@ from gymnasium.vector import VectorEnv
 
 from envhub_worker.protocol.manifest.manifest import TaskId
 from envhub_worker.runner import old_gym
+from envhub_worker.runner.derived_spaces import derive_spaces
 from envhub_worker.runner.recording import Recording, recording
 from envhub_worker.runner.sync_envs import SubEnvs
 
@@ -137,6 +138,12 @@ class _Maker:
     def task(self, suite: str, task: TaskId, env: Any, pick: Picker) -> Task:
         if isinstance(env, VectorEnv) or _is_duck(env) or _has_single_spaces(env):
             made = recording(env)
+            lacking = "" if made else derive_spaces(env)
+            if lacking:
+                raise ResultError(
+                    f"make_env returned {_described(env)}: add {lacking} to it, the space of one "
+                    "sub-environment; it has none from which it could be derived"
+                )
             return Task(suite, task, recording=made, vector=None if made else env)
         if old_gym.is_vector(env):
             return Task(suite, task, vector=old_gym.adapted_vector(env))
@@ -144,6 +151,13 @@ class _Maker:
             _refuse_batched(env.unwrapped)
         if isinstance(env, gym.Env) or old_gym.is_env(env):
             return Task(suite, task, recording=self._multiplied(env, pick))
+        lacks = [name for name in _DUCK if not hasattr(env, name)]
+        if not {"reset", "step"} & {*lacks}:
+            raise ResultError(
+                f"make_env returned {_described(env)}, which has reset and step: to pass as a "
+                f"vector environment, add {', '.join(lacks)}; or derive it from gymnasium.Env or "
+                "gymnasium.vector.VectorEnv"
+            )
         raise ResultError(
             f"make_env must return a gymnasium VectorEnv, an Env, or a mapping "
             f"{{suite: {{task_id: VectorEnv}}}}; for suite {suite!r}, task {task!r} it returned "

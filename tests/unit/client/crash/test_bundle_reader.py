@@ -8,7 +8,6 @@ import pickle
 import struct
 from collections.abc import Callable
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 from unittest.mock import Mock
 
@@ -30,15 +29,14 @@ from envhub_sandbox.session.crash.replay import Verdict, replay
 from envhub_sandbox.settings.policy import Limits, Policy, Timeouts
 from envhub_worker.protocol import messages as m
 from tests.support import inside
-from tests.support.wire import requested
+from tests.support.wire import env_manifest, requested
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 
 
 def bundle(folder: Path, **options: Any) -> Path:
     """A bundle of a reset and three steps, as ``bundle_writer`` writes it."""
-    manifest: Any = SimpleNamespace(single_action_space=spaces.Discrete(5), num_envs=2)
-    history = History(manifest, 100)
+    history = History(env_manifest(spaces.Discrete(2), spaces.Discrete(5), 2), 100)
     history.requested(requested(m.Reset(0, [1, 2], None, None)))
     for number in range(3):
         history.step(np.array([number, number]))

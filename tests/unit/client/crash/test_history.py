@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,15 +14,13 @@ from envhub_sandbox.session.crash import history
 from envhub_sandbox.session.crash.history import History, RecordedRequest, Recording, Steps
 from envhub_worker.protocol import messages as m
 from tests.support.compare import assert_same
-from tests.support.wire import requested
+from tests.support.wire import env_manifest, requested
 
 
 def made(space: Any = None, num_envs: int = 2, limit: int = 1000) -> History:
     """A history of an environment with this single action space."""
-    manifest: Any = SimpleNamespace(
-        single_action_space=spaces.Discrete(5) if space is None else space, num_envs=num_envs
-    )
-    return History(manifest, limit)
+    single = spaces.Discrete(5) if space is None else space
+    return History(env_manifest(spaces.Discrete(2), single, num_envs), limit)
 
 
 def ask(kept: History, message: m.Message) -> None:

@@ -73,6 +73,14 @@ def test_lists_tuples_and_other_dtypes_are_taken(
     assert_same(expected, batch_of(space, value, 2))
 
 
+@pytest.mark.parametrize("name", sorted({*SINGLE_SPACES} - {"discrete", "dict", "tuple"}))
+def test_without_a_count_the_space_is_that_of_the_whole_batch(name: str) -> None:
+    """A vector environment whose action space is no batch of its single one."""
+    space = SINGLE_SPACES[name]
+    sample = space.sample()
+    assert_same(sample, batch_of(space, sample, None))
+
+
 def test_mappings_of_any_class_become_dicts_in_the_spaces_order() -> None:
     """Further keys are left out, as Gymnasium's own iteration does."""
     value = types.MappingProxyType({"grip": [0, 1], "move": np.zeros((2, 2)), "more": 1})

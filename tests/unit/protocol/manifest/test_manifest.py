@@ -90,6 +90,14 @@ def test_one_environment_arrives_as_it_was() -> None:
     assert decode_env(value, max_elements=ELEMENTS) == an_env()
 
 
+def test_only_a_vector_environment_with_a_step_of_its_own_decides_what_a_batch_is() -> None:
+    """A worker cannot have the client read actions by another space than it cuts them by."""
+    other = spaces.MultiDiscrete([2] * 7)
+    assert an_env(shardable=False, action_space=other).own_batch("action_space") == other
+    assert an_env(shardable=False).own_batch("action_space") is None
+    assert an_env(action_space=other).own_batch("action_space") is None
+
+
 def test_every_field_crosses() -> None:
     """A field that is added to a manifest is on the wire too."""
     made = value_of()

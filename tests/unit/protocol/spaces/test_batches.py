@@ -54,6 +54,23 @@ def parts_of(space: gym.Space[Any], members: list[Any], bounds: batches.Bounds) 
     ]
 
 
+@given(NAMES, st.integers(1, 4))
+def test_what_gymnasium_batches_is_a_batch(name: str, count: int) -> None:
+    """Of so many members, and of no other number where the space has a shape."""
+    space = SINGLE_SPACES[name]
+    assert batches.is_batch(batch_space(space, count), space, count)
+    shaped = not isinstance(space, (spaces.Text, spaces.Graph, spaces.Sequence))
+    assert batches.is_batch(batch_space(space, count), space, count + 1) != shaped
+
+
+@pytest.mark.parametrize("name", sorted(SINGLE_SPACES))
+def test_a_space_is_no_batch_of_itself(name: str) -> None:
+    """Where a vector environment gives one space for both, as NVIDIA's wrapper does."""
+    space = SINGLE_SPACES[name]
+    known = not isinstance(space, (spaces.Text, spaces.Graph, spaces.Sequence))
+    assert batches.is_batch(space, space, 3) != known
+
+
 @given(st.integers(1, 200), st.data())
 def test_bounds_cover_everybody_once_and_evenly(count: int, data: st.DataObject) -> None:
     """Shards follow each other, and differ by one sub-environment at most."""

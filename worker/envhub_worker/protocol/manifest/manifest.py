@@ -24,6 +24,7 @@ from envhub_worker.protocol.manifest.names import (
     string_keys,
 )
 from envhub_worker.protocol.records import dataclass
+from envhub_worker.protocol.spaces.batches import is_batch
 from envhub_worker.protocol.spaces.reader import GeneratorMaker, SpaceReader
 from envhub_worker.protocol.spaces.spaces import encode_space
 from envhub_worker.protocol.untrusted import UNTRUSTED
@@ -73,6 +74,15 @@ class EnvManifest:
     spec: dict[str, Any] | None
     attributes: tuple[str, ...]
     type_name: str
+
+    def own_batch(self, name: str) -> gym.Space[Any] | None:
+        """The batched space of this name where it is no batch of the single one, else None.
+
+        A repository's own vector environment decides then what a batch is.
+        """
+        batched, single = getattr(self, name), getattr(self, f"single_{name}")
+        own = not self.shardable and not is_batch(batched, single, self.num_envs)
+        return batched if own else None
 
 
 @dataclass(frozen=True, kw_only=True)

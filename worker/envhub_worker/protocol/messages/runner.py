@@ -4,11 +4,20 @@ from __future__ import annotations
 
 from envhub_worker.protocol.messages.base import Message
 
+CONFIG_CLASS = "<class>"
+"""The key, among an object's attributes in ``Load.cfg``, of what its class is: ``(names, fields,
+computed)``.
+
+``names`` are pairs of a module's and a class's name, in the order of inheritance; none for a
+mapping of another class than dict. ``fields`` are the names of its fields; None where ``value``
+stands for the whole, as of an enum's member. ``computed`` has the values of its properties.
+"""
+
 
 class Load(Message, kind=64, asks="make_env", handed=("cfg", "env_kwargs")):
     """Import the entry file and call its ``make_env``. Reply: ``LoadDone`` or ``RaisedException``.
 
-    ``cfg`` holds the ``vars()`` of the caller's config object, or None.
+    ``cfg`` holds the ``vars()`` of the caller's config object, or None; see ``CONFIG_CLASS``.
     """
 
     n_envs: int

@@ -30,6 +30,33 @@ def even_bounds(count: int, parts: int) -> list[tuple[int, int]]:
     return list(itertools.pairwise(starts))
 
 
+def is_batch(batched: gym.Space[Any], single: gym.Space[Any], count: int) -> bool:
+    """Whether a vector environment's space has the form of ``count`` members of the single one.
+
+    Only arrays, in mappings and tuples of the same keys, can differ: for others it is True. Nothing
+    is allocated, since both may be a worker's.
+    """
+    if isinstance(single, ARRAY_SPACES):
+        shape = (count, *(single.shape or ()))
+        return isinstance(batched, ARRAY_SPACES) and batched.shape == shape
+    if isinstance(single, spaces.Dict):
+        return (
+            isinstance(batched, spaces.Dict)
+            and batched.spaces.keys() == single.spaces.keys()
+            and all(is_batch(batched[key], sub, count) for key, sub in single.spaces.items())
+        )
+    if isinstance(single, spaces.Tuple):
+        return (
+            isinstance(batched, spaces.Tuple)
+            and len(batched.spaces) == len(single.spaces)
+            and all(
+                is_batch(whole, sub, count)
+                for whole, sub in zip(batched.spaces, single.spaces, strict=True)
+            )
+        )
+    return True
+
+
 def split(space: gym.Space[Any], batch: Any, bounds: Bounds) -> list[Any]:
     """The slices of a batch. Arrays are views."""
     if isinstance(space, spaces.Dict):

@@ -1,0 +1,183 @@
+"""Vector environments of a repository's own class, which declare their spaces as they like."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from envhub_sandbox import make_env
+from envhub_sandbox.errors import ActionError, LoadError, ObservationError
+from tests.support.repositories import write_repository
+
+pytestmark = pytest.mark.short
+
+_OWN = """
+import gymnasium as gym
+import numpy as np
+from gymnasium.spaces import Box, Dict, Discrete
+
+class Own{base}:
+    num_envs = 3
+    metadata = {{"autoreset_mode": None}}
+    {spaces}
+
+    def reset(self, *, seed=None, options=None):
+        self.seen = None
+        return self._observation(), {{}}
+
+    def _observation(self):
+        return {observation}
+
+    def step(self, actions):
+        self.seen = actions
+        no = np.zeros(3, bool)
+        return self._observation(), np.zeros(3), no, no, {{}}
+
+    def got(self):
+        return self.seen
+
+    def close(self, **kwargs):
+        pass
+
+def make_env(n_envs=1, use_async_envs=False):
+    return Own()
+"""
+_OF_GYMNASIUM = "(gym.vector.VectorEnv)"
+_PLAIN = "np.zeros((3, 4), np.float32)"
+_LIKE_ARENA = """
+    single_observation_space = observation_space = Box(-1, 1, (3, 4))
+    single_action_space = action_space = Box(-1, 1, (3, 36))
+"""
+
+
+def own(folder: Path, spaces: str, observation: str = _PLAIN, base: str = _OF_GYMNASIUM) -> Path:
+    """A repository around a vector environment with these spaces."""
+    return write_repository(
+        folder, _OWN.format(base=base, spaces=spaces.strip(), observation=observation)
+    )
+
+
+class TestSpacesThatAreNoBatches:
+    """Where a batched space is no batch of the single one, the vector environment's own decides."""
+
+    def test_a_sample_of_the_action_space_is_taken_whole(self, tmp_path: Path) -> None:
+        """NVIDIA's wrapper for Isaac Lab Arena gives its action space as the single one, too."""
+        with make_env(own(tmp_path, _LIKE_ARENA), n_envs=3) as suites:
+            env = suites.env
+            assert env.action_space.shape == env.single_action_space.shape == (3, 36)
+            env.reset(seed=0)
+            actions = env.action_space.sample()
+            observation, *_ = env.step(actions)
+            assert observation.shape == (3, 4)
+            [seen] = [env.got()]
+            assert np.array_equal(seen, actions)
+            assert seen.dtype == np.float32
+
+    def test_another_shape_is_refused_by_the_vectors_own(self, tmp_path: Path) -> None:
+        """Nothing is sent, and the error names the batched space."""
+        with make_env(own(tmp_path, _LIKE_ARENA), n_envs=3) as suites:
+            suites.env.reset(seed=0)
+            for wrong in (np.zeros((3, 3, 36), np.float32), np.zeros((2, 36), np.float32)):
+                with pytest.raises(ActionError, match=r"float32 of shape \(3, 36\)"):
+                    suites.env.step(wrong)
+            assert suites.env.got() is None
+
+    def test_mappings_of_any_leading_dimension_are_taken(self, tmp_path: Path) -> None:
+        """Each leaf has the shape that the vector environment's own space gives it."""
+        spaces = """
+    observation_space = Box(-1, 1, (3, 4))
+    single_action_space = Box(-1, 1, (2,))
+    action_space = Dict(robot=Box(-1, 1, (2, 7)), mode=Discrete(4))
+"""
+        with make_env(own(tmp_path, spaces), n_envs=3) as suites:
+            env = suites.env
+            env.reset(seed=0)
+            actions = env.action_space.sample()
+            env.step(actions)
+            seen: Any = env.got()
+            assert np.array_equal(seen["robot"], actions["robot"])
+            assert seen["mode"] == actions["mode"]
+
+    def test_validation_looks_at_the_vectors_own_spaces(self, tmp_path: Path) -> None:
+        """Both ways: a good batch passes, one outside of the space does not."""
+        with make_env(own(tmp_path, _LIKE_ARENA), n_envs=3, validate=True) as suites:
+            suites.env.reset(seed=0)
+            suites.env.step(suites.env.action_space.sample())
+            with pytest.raises(ActionError, match="outside"):
+                suites.env.step(np.full((3, 36), 2, np.float32))
+        outside = own(tmp_path / "outside", _LIKE_ARENA, "np.full((3, 4), 2, np.float32)")
+        with (
+            make_env(outside, n_envs=3, validate=True) as suites,
+            pytest.raises(ObservationError, match="outside"),
+        ):
+            suites.env.reset(seed=0)
+
+
+_BATCHED = """
+    observation_space = Dict(agent_pos=Box(-1, 1, (3, 4)))
+    action_space = Box(-1, 1, (3, 2))
+"""
+_SEEN = '{"agent_pos": np.zeros((3, 4), np.float32)}'
+
+
+class TestSpacesThatAreMissing:
+    """A vector object without a base class and without the spaces of one sub-environment."""
+
+    @pytest.mark.parametrize(
+        ("spaces", "observation"),
+        [
+            (_BATCHED, _SEEN),
+            (_BATCHED.replace("(3, 4)", "(4,)").replace("(3, 2)", "(2,)"), _SEEN),
+            ("action_space = Box(-1, 1, (3, 2))", _SEEN),
+            ("action_space = Box(-1, 1, (2,))", _SEEN),
+        ],
+        ids=["batched", "single", "no observation space, batched", "no observation space"],
+    )
+    def test_they_are_derived_from_the_first_reset(
+        self, tmp_path: Path, spaces: str, observation: str
+    ) -> None:
+        """The observation that it gives shows whether its spaces are batched."""
+        with make_env(own(tmp_path, spaces, observation, base=""), n_envs=3) as suites:
+            env = suites.env
+            assert env.single_observation_space["agent_pos"].shape == (4,)
+            assert env.observation_space["agent_pos"].shape == (3, 4)
+            assert env.single_action_space.shape == (2,)
+            assert env.action_space.shape == (3, 2)
+            observations, _ = env.reset(seed=0)
+            assert observations["agent_pos"].shape == (3, 4)
+            env.step(env.action_space.sample())
+            assert env.get_attr("seen").shape == (3, 2)
+
+    def test_images_without_a_space_are_bytes(self, tmp_path: Path) -> None:
+        """dtype uint8 has the bounds of its type."""
+        spaces = "action_space = Box(-1, 1, (2,))"
+        image = "np.zeros((3, 8, 8, 3), np.uint8)"
+        with make_env(own(tmp_path, spaces, image, base=""), n_envs=3) as suites:
+            space = suites.env.single_observation_space
+            assert (space.shape, space.dtype, space.high.max()) == ((8, 8, 3), np.uint8, 255)
+
+    def test_without_an_action_space_the_error_says_what_to_add(self, tmp_path: Path) -> None:
+        """No observation shows what an action is."""
+        folder = own(tmp_path, "observation_space = Box(-1, 1, (3, 4))", base="")
+        with pytest.raises(LoadError, match=r"Own.*add single_action_space"):
+            make_env(folder, n_envs=3)
+
+    def test_an_observation_that_is_no_batch_is_named(self, tmp_path: Path) -> None:
+        """A space cannot be made of it: the error says which attribute to add."""
+        folder = own(tmp_path, "action_space = Box(-1, 1, (2,))", "'text'", base="")
+        with pytest.raises(LoadError, match=r"Own.*add single_observation_space"):
+            make_env(folder, n_envs=3)
+
+    @pytest.mark.parametrize("lacking", ["num_envs", "close"])
+    def test_what_is_nearly_a_vector_environment_hears_what_it_lacks(
+        self, tmp_path: Path, lacking: str
+    ) -> None:
+        """``reset`` and ``step`` alone do not say how many sub-environments there are."""
+        folder = own(tmp_path, _BATCHED, _SEEN, base="")
+        entry = folder / "env.py"
+        entry.write_text(entry.read_text().replace(f" {lacking}", f" my_{lacking}"))
+        with pytest.raises(LoadError, match=rf"add {lacking}"):
+            make_env(folder, n_envs=3)
