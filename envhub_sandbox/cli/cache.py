@@ -28,7 +28,8 @@ class StoredSnapshot:
     """A snapshot in the store.
 
     Attributes:
-        repository: ``"org/repo"``, with ``spaces/`` or ``datasets/`` in front; ``"local"``.
+        repository: ``"org/repo"``, with ``spaces/``, ``datasets/`` or ``git+https://HOST/`` in
+            front; ``"local"`` for folders, ``"pypi"`` for ids of packages.
         revision: The branch or tag that it was fetched as, or None.
         used: Unix time (seconds) of the last use.
         size: Bytes of all files, as the record has them.
@@ -55,7 +56,7 @@ def stored_snapshots() -> list[StoredSnapshot]:
     from envhub_sandbox.hub.cache import cache_root
 
     folder = cache_root() / "snapshots"
-    records = [*folder.glob("local/*/record.json"), *folder.glob("*/*/*/record.json")]
+    records = [*folder.glob("*/*/record.json"), *folder.glob("*/*/*/record.json")]
     found = [_read(record) for record in records]
     return sorted((one for one in found if one is not None), key=lambda one: -one.used)
 
@@ -69,12 +70,14 @@ def _read(record: Path) -> StoredSnapshot | None:
         return None
     home = record.parent
     revision = document.get("revision")
-    return StoredSnapshot(_repository(home.parent.name), home.name, revision, used, size, home)
+    name = _repository(home.parent.name, str(document.get("endpoint")))
+    return StoredSnapshot(name, home.name, revision, used, size, home)
 
 
-def _repository(name: str) -> str:
+def _repository(name: str, endpoint: str) -> str:
     kind, *parts = name.split("--")
-    prefix = {"space": "spaces/", "dataset": "datasets/"}.get(kind, "")
+    prefixes = {"space": "spaces/", "dataset": "datasets/", "git": f"git+{endpoint}/"}
+    prefix = prefixes.get(kind, "")
     return prefix + "/".join(parts) if parts else name
 
 

@@ -16,7 +16,7 @@ from envhub_sandbox.check.findings import Finding
 from envhub_sandbox.check.static import contents
 from envhub_sandbox.check.static.constructs import constructs, long_lines
 from envhub_sandbox.errors import SnapshotError
-from envhub_sandbox.hub.checkout import Checkout
+from envhub_sandbox.hub.git.checkout import Checkout
 from envhub_sandbox.hub.listing import FileRecord, Snapshot
 from envhub_sandbox.hub.local import LocalFolder
 from envhub_sandbox.hub.sources.parsing import MOST_BYTES, ParsedFile
