@@ -29,7 +29,7 @@ class StoredSnapshot:
 
     Attributes:
         repository: ``"org/repo"``, with ``spaces/``, ``datasets/`` or ``git+https://HOST/`` in
-            front; ``"local"`` for folders, ``"pypi"`` for ids of packages.
+            front; a package's id with ``pypi:``; of folders ``"local"``.
         revision: The branch or tag that it was fetched as, or None.
         used: Unix time (seconds) of the last use.
         size: Bytes of all files, as the record has them.
@@ -46,7 +46,7 @@ class StoredSnapshot:
     def answers_to(self, name: str) -> bool:
         """Whether a name means it: the repository, a commit's beginning, or both with ``@``."""
         repository, _, commit = name.partition("@")
-        if commit:
+        if commit and name != self.repository:
             return repository == self.repository and self.commit.startswith(commit)
         return name == self.repository or (len(name) >= 7 and self.commit.startswith(name))
 
@@ -70,15 +70,14 @@ def _read(record: Path) -> StoredSnapshot | None:
         return None
     home = record.parent
     revision = document.get("revision")
-    name = _repository(home.parent.name, str(document.get("endpoint")))
-    return StoredSnapshot(name, home.name, revision, used, size, home)
+    return StoredSnapshot(_repository(document), home.name, revision, used, size, home)
 
 
-def _repository(name: str, endpoint: str) -> str:
-    kind, *parts = name.split("--")
-    prefixes = {"space": "spaces/", "dataset": "datasets/", "git": f"git+{endpoint}/"}
-    prefix = prefixes.get(kind, "")
-    return prefix + "/".join(parts) if parts else name
+def _repository(document: dict[str, Any]) -> str:
+    kind, name = document.get("repo_type"), str(document.get("repo_id"))
+    prefixes = {"space": "spaces/", "dataset": "datasets/", "pypi": "pypi:"}
+    prefixes["git"] = f"git+{document.get('endpoint')}/"
+    return "local" if kind == "local" else prefixes.get(str(kind), "") + name
 
 
 @opt.with_options()

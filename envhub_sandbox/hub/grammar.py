@@ -180,7 +180,7 @@ def read(text: str) -> Parts:
     if text.partition("/")[0].lower() in HUB_HOSTS:
         return _read_url("https://" + text, text)
     if text.startswith("git@"):
-        raise _git_remote(text.partition(":")[2])
+        raise _git_remote(*text.partition(":")[::2])
     return _read_plain(text)
 
 
@@ -317,12 +317,14 @@ def _wrong_page(parts: Parts, page: str, rest: list[str]) -> Wrong:
 
 
 def _read_git(_: str, rest: str) -> Parts:
-    raise _git_remote(rest.partition("/")[2])
+    raise _git_remote(*rest.partition("/")[::2])
 
 
-def _git_remote(path: str) -> Wrong:
-    repo = path.removesuffix(".git").strip("/")
-    return Wrong("this is a git remote", repr(repo) if repo else GRAMMAR)
+def _git_remote(place: str, path: str) -> Wrong:
+    repo, host = path.removesuffix(".git").strip("/"), place.rpartition("@")[2].lower()
+    elsewhere = "github:" if host == "github.com" else f"git+https://{host}/"
+    write = repo if host in HUB_HOSTS else elsewhere + repo
+    return Wrong("this is a git remote", repr(write) if repo else GRAMMAR)
 
 
 _SCHEMES: dict[str, Callable[[str, str], Parts]] = {

@@ -156,8 +156,9 @@ def _candidates(
 ) -> Sequence[_Candidate]:
     """As what it may be read; the last three are of the Hub alone."""
     if ref.repo_type == address.KIND:
-        host, _, name = ref.repo_id.partition("://")[2].partition("/")
-        return [_GitCandidate(ref, Repository(address.KIND, name), f"https://{host}", limits)]
+        scheme, _, rest = ref.repo_id.partition("://")
+        host, _, name = rest.partition("/")
+        return [_GitCandidate(ref, Repository(address.KIND, name), f"{scheme}://{host}", limits)]
     hub = HubClient(checked_endpoint(endpoint), checked_token(token), hub_cache_dir)
     kinds = (ref.repo_type,) if ref.repo_type else ("model", "space")
     return [
@@ -259,7 +260,7 @@ def _by_content(
     commit = f"{kind}-{content_digest(files)}"
     slot = store.Slot(store.folder_of(kind), commit, f"{kind} {name}")
     if store.load_whole(slot) is None:
-        store.publish(slot, files, copy, {"repo_type": kind})
+        store.publish(slot, files, copy, {"repo_type": kind, "repo_id": name})
         # Every edit leaves a copy; a Hub commit, in contrast, is kept until somebody removes it.
         store.remove_unused(slot.folder, days=_COPIES_DAYS)
     store.mark_used(slot)

@@ -69,7 +69,8 @@ class Survey:
 def survey(snapshot: Snapshot, parsed: Mapping[str, ParsedFile | None]) -> Survey:
     """Look at every file of a repository, and at what ``parsing.read`` read of it."""
     found = Survey()
-    found.add(_papers(snapshot))
+    if snapshot.repo_type != "pypi":  # whose one file is ours
+        found.add(_papers(snapshot))
     found.add(_in_place(snapshot))
     found.add(_in_front(snapshot))
     left = _MOST_BYTES_IN_ALL

@@ -134,7 +134,7 @@ def _reference(provenance: dict[str, Any]) -> str:
     commit = _member(provenance, "commit", str)
     if kind == "local" and not os.path.isabs(repository):
         raise BundleError("a local folder's path is not absolute")
-    if not (is_commit(commit) or commit.startswith(f"{kind}-")):
+    if kind not in ("local", "pypi") and not is_commit(commit):
         raise BundleError(f"{commit} is no commit")
     return pinned(kind, repository, commit, path)
 
