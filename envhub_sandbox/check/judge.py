@@ -43,6 +43,7 @@ from envhub_sandbox.errors import (
     WorkerTimeoutError,
 )
 from envhub_sandbox.factory.make_env import make_env
+from envhub_sandbox.hub.reference import HubRef
 from envhub_sandbox.hub.snapshot import Snapshot, snapshot_named
 from envhub_sandbox.hub.sources import imports, parsing
 from envhub_sandbox.session.recipe import pinned
@@ -135,7 +136,9 @@ class _Judge:
     def _read(self) -> None:
         reference, snapshot = self._asked.reference, self._snapshot
         is_moving = snapshot.repo_type != "local" and snapshot.commit not in reference
-        moving = f"{reference} may mean another commit tomorrow"
+        if snapshot.repo_type == "pypi":
+            is_moving = HubRef.parse(reference).revision is None
+        moving = f"{reference} may mean another commit or version tomorrow"
         self._report.judged("pinned", [moving] if is_moving else [])
         found = survey(self._snapshot, self._files).findings
         for finding in found:

@@ -28,7 +28,8 @@ class StoredSnapshot:
     """A snapshot in the store.
 
     Attributes:
-        repository: ``"org/repo"``, with ``spaces/`` or ``datasets/`` in front; ``"local"``.
+        repository: ``"org/repo"``, with ``spaces/``, ``datasets/`` or ``git+https://HOST/`` in
+            front; a package's id with ``pypi:``; of folders ``"local"``.
         revision: The branch or tag that it was fetched as, or None.
         used: Unix time (seconds) of the last use.
         size: Bytes of all files, as the record has them.
@@ -45,7 +46,7 @@ class StoredSnapshot:
     def answers_to(self, name: str) -> bool:
         """Whether a name means it: the repository, a commit's beginning, or both with ``@``."""
         repository, _, commit = name.partition("@")
-        if commit:
+        if commit and name != self.repository:
             return repository == self.repository and self.commit.startswith(commit)
         return name == self.repository or (len(name) >= 7 and self.commit.startswith(name))
 
@@ -55,7 +56,7 @@ def stored_snapshots() -> list[StoredSnapshot]:
     from envhub_sandbox.hub.cache import cache_root
 
     folder = cache_root() / "snapshots"
-    records = [*folder.glob("local/*/record.json"), *folder.glob("*/*/*/record.json")]
+    records = [*folder.glob("*/*/record.json"), *folder.glob("*/*/*/record.json")]
     found = [_read(record) for record in records]
     return sorted((one for one in found if one is not None), key=lambda one: -one.used)
 
@@ -69,13 +70,14 @@ def _read(record: Path) -> StoredSnapshot | None:
         return None
     home = record.parent
     revision = document.get("revision")
-    return StoredSnapshot(_repository(home.parent.name), home.name, revision, used, size, home)
+    return StoredSnapshot(_repository(document), home.name, revision, used, size, home)
 
 
-def _repository(name: str) -> str:
-    kind, *parts = name.split("--")
-    prefix = {"space": "spaces/", "dataset": "datasets/"}.get(kind, "")
-    return prefix + "/".join(parts) if parts else name
+def _repository(document: dict[str, Any]) -> str:
+    kind, name = document.get("repo_type"), str(document.get("repo_id"))
+    prefixes = {"space": "spaces/", "dataset": "datasets/", "pypi": "pypi:"}
+    prefixes["git"] = f"git+{document.get('endpoint')}/"
+    return "local" if kind == "local" else prefixes.get(str(kind), "") + name
 
 
 @opt.with_options()

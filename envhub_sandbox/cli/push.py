@@ -62,6 +62,8 @@ def push(
     from envhub_sandbox.hub.snapshot import local
 
     target = HubRef.parse(ref)
+    if target.repo_type in ("git", "pypi"):
+        raise UsageError(f"{target} is not on the Hub; a folder is published as owner/name")
     others: list[str] = []
     with ProgressBar(quiet=json) as bar:
         bar.begin(f"reading {folder}")

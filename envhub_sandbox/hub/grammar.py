@@ -23,7 +23,7 @@ _COMMIT = re.compile(r"[0-9a-f]{40}")
 _NAME = re.compile(r"\b[\w\-.]{1,96}\b", re.ASCII)
 _NOT_IN_A_REVISION = re.compile(r"\.\.|@\{|//|/\.|[~^?*\[\\:\s]|\.lock(?:/|$)|^[/.-]|[/.]$")
 _TYPE_OF_PREFIX = {prefix: kind for kind in REPO_TYPES for prefix in (kind, f"{kind}s")}
-_HUB_HOSTS = frozenset({"huggingface.co", "www.huggingface.co", "hf.co", "www.hf.co"})
+HUB_HOSTS = frozenset({"huggingface.co", "www.huggingface.co", "hf.co", "www.hf.co"})
 _FILE_PAGES = frozenset({"tree", "blob", "resolve", "raw"})
 _SLASHED_REVISION = re.compile(r"refs/(?:pr|convert|heads|tags)/[^/]+")
 _DRIVE = re.compile(r"[A-Za-z]:(?:[\\/]|$)")
@@ -49,8 +49,12 @@ class Wrong(Exception):
 
 
 def join(parts: Parts) -> str:
-    """The canonical text of a reference."""
+    """The canonical text of a reference, of whatever kind."""
+    if parts.repo_type == "pypi":
+        package, _, env_id = parts.repo_id.partition("#")
+        return f"pypi:{package}{f'@{parts.revision}' if parts.revision else ''}#{env_id}"
     prefix = f"{parts.repo_type}s/" if parts.repo_type else ""
+    prefix = "git+" if parts.repo_type == "git" else prefix
     at = f"@{parts.revision}" if parts.revision is not None else ""
     colon = f":{parts.path}" if parts.path != DEFAULT_PATH else ""
     return f"{prefix}{parts.repo_id}{at}{colon}"
@@ -76,8 +80,8 @@ def check(parts: Parts) -> None:
     if parts.repo_type is not None and parts.repo_type not in REPO_TYPES:
         raise Wrong(f"there is no repository type {parts.repo_type!r}", " or ".join(REPO_TYPES))
     _check_repo_id(parts)
-    _check_revision(parts)
-    _check_path(parts)
+    check_revision(parts)
+    check_path(parts)
 
 
 def _check_repo_id(parts: Parts) -> None:
@@ -97,7 +101,8 @@ def _check_repo_id(parts: Parts) -> None:
             )
 
 
-def _check_revision(parts: Parts) -> None:
+def check_revision(parts: Parts) -> None:
+    """Raise ``Wrong`` unless git could have such a revision."""
     revision = parts.revision
     if revision is None:
         return
@@ -110,7 +115,8 @@ def _check_revision(parts: Parts) -> None:
         )
 
 
-def _check_path(parts: Parts) -> None:
+def check_path(parts: Parts) -> None:
+    """Raise ``Wrong`` unless it is a Python file inside of the repository."""
     path = parts.path
     pieces = path.replace("\\", "/").split("/")
     if not path:
@@ -171,10 +177,10 @@ def read(text: str) -> Parts:
         if reader is None:
             raise Wrong(f"'{text.partition(':')[0]}://' does not lead to the Hub", GRAMMAR)
         return reader(text, rest)
-    if text.partition("/")[0].lower() in _HUB_HOSTS:
+    if text.partition("/")[0].lower() in HUB_HOSTS:
         return _read_url("https://" + text, text)
     if text.startswith("git@"):
-        raise _git_remote(text.partition(":")[2])
+        raise _git_remote(*text.partition(":")[::2])
     return _read_plain(text)
 
 
@@ -197,16 +203,18 @@ def _read_plain(text: str) -> Parts:
     head, colon, path = text.partition(":")
     repo, at, revision = head.partition("@")
     kind, repo_id = _split_repo(repo, text[len(repo) :])
-    return _parts(kind, repo_id, revision if at else None, _normal(path) if colon else DEFAULT_PATH)
+    path = normal_path(path) if colon else DEFAULT_PATH
+    return parts_of(kind, repo_id, revision if at else None, path)
 
 
-def _parts(kind: str | None, repo_id: str, revision: str | None, path: str) -> Parts:
+def parts_of(kind: str | None, repo_id: str, revision: str | None, path: str) -> Parts:
+    """The parts, with a commit in lower case."""
     if revision is not None and is_commit(revision.lower()):
         revision = revision.lower()
     return Parts(repo_id, revision, path, kind)
 
 
-def _normal(path: str) -> str:
+def normal_path(path: str) -> str:
     """``./a//b.py`` is ``a/b.py``; what is absolute or climbs stays, to be refused."""
     if path.startswith("/") or "\\" in path:
         return path
@@ -261,7 +269,7 @@ def _split_revision(steps: list[str]) -> tuple[str, list[str]]:
 
 def _with_path(kind: str | None, repo_id: str, revision: str | None, steps: list[str]) -> Parts:
     path = unquote("/".join(step for step in steps if step))
-    return _parts(kind, repo_id, revision, _normal(path) or DEFAULT_PATH)
+    return parts_of(kind, repo_id, revision, normal_path(path) or DEFAULT_PATH)
 
 
 def _read_url(url: str, _: str) -> Parts:
@@ -275,7 +283,7 @@ def _read_url(url: str, _: str) -> Parts:
             "the URL has a user or token in it", f"{plain!r}, and pass {option_name('token')}"
         )
     steps = [step for step in split.path.split("/") if step]
-    if split.netloc.lower() not in _HUB_HOSTS:
+    if split.netloc.lower() not in HUB_HOSTS:
         repo = "/".join(steps[:2]) or "owner/name"
         endpoint = f"{split.scheme}://{split.netloc}"
         mirror = f"{repo!r}, with {option_name('endpoint', endpoint)} if that mirrors the Hub"
@@ -292,11 +300,11 @@ def _read_page(steps: list[str]) -> Parts:
     kind, repo_id = _split_repo(repo, "")
     page, rest = "".join(steps[lead : lead + 1]), steps[lead + 1 :]
     if not page or (page in _FILE_PAGES and not rest):
-        return _parts(kind, repo_id, None, DEFAULT_PATH)
+        return parts_of(kind, repo_id, None, DEFAULT_PATH)
     if page in _FILE_PAGES:
         return _with_path(kind, repo_id, *_split_revision(rest))
     if page in ("commit", "commits") and rest:
-        return _parts(kind, repo_id, _split_revision(rest)[0], DEFAULT_PATH)
+        return parts_of(kind, repo_id, _split_revision(rest)[0], DEFAULT_PATH)
     raise _wrong_page(Parts(repo_id, repo_type=kind), page, rest)
 
 
@@ -309,12 +317,14 @@ def _wrong_page(parts: Parts, page: str, rest: list[str]) -> Wrong:
 
 
 def _read_git(_: str, rest: str) -> Parts:
-    raise _git_remote(rest.partition("/")[2])
+    raise _git_remote(*rest.partition("/")[::2])
 
 
-def _git_remote(path: str) -> Wrong:
-    repo = path.removesuffix(".git").strip("/")
-    return Wrong("this is a git remote", repr(repo) if repo else GRAMMAR)
+def _git_remote(place: str, path: str) -> Wrong:
+    repo, host = path.removesuffix(".git").strip("/"), place.rpartition("@")[2].lower()
+    elsewhere = "github:" if host == "github.com" else f"git+https://{host}/"
+    write = repo if host in HUB_HOSTS else elsewhere + repo
+    return Wrong("this is a git remote", repr(write) if repo else GRAMMAR)
 
 
 _SCHEMES: dict[str, Callable[[str, str], Parts]] = {
@@ -324,5 +334,4 @@ _SCHEMES: dict[str, Callable[[str, str], Parts]] = {
     "ssh": _read_git,
     "git": _read_git,
     "git+ssh": _read_git,
-    "git+https": _read_git,
 }

@@ -8,7 +8,7 @@ import stat
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import IO, Any
 
 from envhub_sandbox.hub.listing import FileRecord
 
@@ -44,7 +44,13 @@ def digest_of(source: Path, kind: str, size: int) -> str:
 
 
 def copy_verified(source: Path, target: Path, record: FileRecord) -> None:
-    """Copy a file into a new one; what was written is exactly what the record says.
+    """Copy a file into a new one; as ``write_verified``."""
+    with _open_regular(source) as stream:
+        write_verified(stream, target, record)
+
+
+def write_verified(stream: IO[bytes], target: Path, record: FileRecord) -> None:
+    """Write a new file; what was written is exactly what the record says.
 
     The hash is taken of the bytes on their way, so they cannot change in between.
 
@@ -53,7 +59,7 @@ def copy_verified(source: Path, target: Path, record: FileRecord) -> None:
     """
     running = _start(record.digest.partition(":")[0], record.size)
     written = 0
-    with _open_regular(source) as stream, target.open("xb") as out:
+    with target.open("xb") as out:
         for chunk in _chunks(stream):
             written += len(chunk)
             if written > record.size:
@@ -78,7 +84,7 @@ def differing(root: Path, mine: Iterable[FileRecord], theirs: Iterable[FileRecor
 
 
 @contextmanager
-def _open_regular(path: Path) -> Iterator[BinaryIO]:
+def _open_regular(path: Path) -> Iterator[IO[bytes]]:
     try:
         # A pipe or device under the name would block or never end.
         if not stat.S_ISREG(os.stat(path).st_mode):
@@ -90,6 +96,6 @@ def _open_regular(path: Path) -> Iterator[BinaryIO]:
         yield stream
 
 
-def _chunks(stream: BinaryIO) -> Iterator[bytes]:
+def _chunks(stream: IO[bytes]) -> Iterator[bytes]:
     while chunk := stream.read(_CHUNK_BYTES):
         yield chunk

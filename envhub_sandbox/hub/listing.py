@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from envhub_sandbox.errors import PolicyError, SnapshotError, SnapshotTooLargeError
-from envhub_sandbox.hub.grammar import has_control_characters
+from envhub_sandbox.hub.grammar import Parts, has_control_characters, join
 from envhub_worker.protocol.text import size_text
 
 MAX_NAME_BYTES = 255  # NAME_MAX of every common file system.
@@ -42,9 +42,11 @@ class Snapshot:
     """A repository's files at one commit: verified, real files, read-only, never imported here.
 
     Attributes:
-        repo_id: ``"owner/name"``; for a local folder its absolute path.
-        repo_type: ``"model"``, ``"space"``, ``"dataset"`` or ``"local"``.
-        commit: The full commit; for a local folder ``"local-"`` and a hash of its content.
+        repo_id: ``"owner/name"``; for a local folder its absolute path; for git
+            ``"https://host/org/repo"``; for a package ``"name@version#id"``.
+        repo_type: ``"model"``, ``"space"``, ``"dataset"``, ``"git"``, ``"pypi"`` or ``"local"``.
+        commit: The full commit; for a local folder and for a package that type, ``-``, and a hash
+            of the content.
         path: The entry file, relative to ``root``, for example ``"env.py"``.
         root: The folder that holds the files (0444 in folders 0555) and nothing else.
         files: Every file below ``root``, sorted by path.
@@ -56,6 +58,13 @@ class Snapshot:
     path: str
     root: Path
     files: tuple[FileRecord, ...]
+
+    @property
+    def name(self) -> str:
+        """The repository, as a reference begins; of a local folder its path."""
+        kind = self.repo_type
+        plain = kind in ("model", "local")
+        return self.repo_id if plain else join(Parts(self.repo_id, repo_type=kind))
 
     @property
     def label(self) -> str:
@@ -73,10 +82,8 @@ class Snapshot:
 
     @property
     def _source(self) -> str:
-        if self.repo_type == "local":
-            return self.repo_id
-        prefix = "" if self.repo_type == "model" else f"{self.repo_type}s/"
-        return f"{prefix}{self.repo_id}@{self.commit[:12]}"
+        by_content = self.repo_type in ("local", "pypi")
+        return self.name if by_content else f"{self.name}@{self.commit[:12]}"
 
 
 @dataclass(frozen=True, kw_only=True)

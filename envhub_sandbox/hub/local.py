@@ -22,7 +22,7 @@ from envhub_sandbox.errors import (
     SnapshotError,
     SnapshotTooLargeError,
 )
-from envhub_sandbox.hub.checkout import Checkout, read_checkout
+from envhub_sandbox.hub.git.checkout import Checkout, read_checkout
 from envhub_sandbox.hub.hashing import SHA256, HashMismatch, copy_verified, digest_of
 from envhub_sandbox.hub.listing import (
     MAX_DEPTH,
@@ -229,10 +229,10 @@ def _digest(file: LocalFile, title: str) -> str:
         raise SnapshotError(f"{title}: {file.path!r} cannot be read: {error}") from error
 
 
-def content_commit(files: tuple[FileRecord, ...]) -> str:
-    """``"local-"`` and a hash of names and contents: the same content is the same commit."""
+def content_digest(files: tuple[FileRecord, ...]) -> str:
+    """A hash of names and contents, which is the commit of what has none."""
     rows = [[file.path, file.size, file.digest] for file in files]
-    return "local-" + hashlib.sha256(json.dumps(rows).encode()).hexdigest()
+    return hashlib.sha256(json.dumps(rows).encode()).hexdigest()
 
 
 def copier(files: tuple[LocalFile, ...], title: str) -> Callable[[FileRecord, Path], None]:

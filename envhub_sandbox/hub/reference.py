@@ -1,8 +1,10 @@
 """Hub references: ``[models/|spaces/|datasets/]owner/name[@revision][:path]``, and Hub URLs.
 
-A reference is text that somebody pasted, so every form that can mean only one thing works, and
-for every other form the error says what to write instead. Extends the grammar of
-``lerobot.envs.utils._parse_hub_url``. Nothing is asked of the network.
+And of other places: a commit of git (``hub.git.address``), and an environment that a package of the
+index registers (``hub.registered.reference``). A reference is text that somebody pasted, so every
+form that can mean only one thing works, and for every other form the error says what to write
+instead. Extends the grammar of ``lerobot.envs.utils._parse_hub_url``. Nothing is asked of the
+network.
 """
 
 from __future__ import annotations
@@ -11,20 +13,15 @@ import re
 from dataclasses import dataclass
 
 from envhub_sandbox.errors import HubReferenceError
-from envhub_sandbox.hub.grammar import (
-    DEFAULT_PATH,
-    GRAMMAR,
-    REPO_TYPES,
-    Parts,
-    Wrong,
-    check,
-    is_commit,
-    is_local,
-    join,
-    read,
-)
+from envhub_sandbox.hub import grammar
+from envhub_sandbox.hub.git import address
+from envhub_sandbox.hub.grammar import DEFAULT_PATH, REPO_TYPES, Parts, Wrong, is_commit, is_local
+from envhub_sandbox.hub.registered import reference as registered
 
-__all__ = ["DEFAULT_PATH", "REPO_TYPES", "HubRef", "is_local"]
+__all__ = ["DEFAULT_PATH", "REPO_TYPES", "HubRef", "is_local", "pinned"]
+
+_OTHERS = (address, registered)
+"""References that are none of the Hub's."""
 
 
 @dataclass(frozen=True)
@@ -32,10 +29,13 @@ class HubRef:
     """One environment file of one repository, at one revision.
 
     Attributes:
-        repo_id: ``"owner/name"``.
-        revision: A branch, tag, pull request (``"refs/pr/3"``) or commit; None for ``main``.
+        repo_id: ``"owner/name"``; of git ``"https://host/org/repo"``; of a package
+            ``"name[extra]#id"``.
+        revision: A branch, tag, pull request (``"refs/pr/3"``) or commit; None for ``main``, and of
+            git for ``HEAD``. Of a package its version; None for any.
         path: The entry file, relative to the repository's root, with ``/``.
-        repo_type: ``"model"``, ``"space"`` or ``"dataset"``; None for "model first, then space".
+        repo_type: ``"model"``, ``"space"`` or ``"dataset"``; None for "model first, then space";
+            ``"git"``; ``"pypi"`` for a package.
 
     Raises:
         HubReferenceError: When a part is not what the Hub could have.
@@ -48,7 +48,7 @@ class HubRef:
 
     def __post_init__(self) -> None:
         try:
-            check(self._parts())
+            _check(self.parts)
         except Wrong as wrong:
             raise _refusal(str(self), wrong) from None
 
@@ -60,24 +60,51 @@ class HubRef:
             HubReferenceError: The text names the reference and what to write instead.
         """
         if not isinstance(text, str):
-            raise HubReferenceError(f"a hub reference is a str ({GRAMMAR}), got {text!r}")
+            raise HubReferenceError(f"a hub reference is a str ({grammar.GRAMMAR}), got {text!r}")
         try:
-            parts = read(text.strip())
-            check(parts)
+            plain = text.strip()
+            parts = next((one for one in _OTHERS if one.is_one(plain)), grammar).read(plain)
+            _check(parts)
         except Wrong as wrong:
             raise _refusal(text, wrong) from None
         return cls(parts.repo_id, parts.revision, parts.path, parts.repo_type)
 
     def __str__(self) -> str:
-        return join(self._parts())
+        return grammar.join(self.parts)
 
     @property
     def is_pinned(self) -> bool:
         """Whether the revision is a full commit, which can never mean anything else."""
-        return self.revision is not None and is_commit(self.revision)
+        known = self.repo_type != registered.KIND and self.revision is not None
+        return known and is_commit(self.revision or "")
 
-    def _parts(self) -> Parts:
+    @property
+    def meaning(self) -> str:
+        """The same for every way to write it."""
+        usual = {"git": "HEAD", "pypi": None}.get(self.repo_type or "", "main")
+        return grammar.join(self.parts._replace(revision=self.revision or usual))
+
+    @property
+    def parts(self) -> Parts:
+        """Its fields."""
         return Parts(self.repo_id, self.revision, self.path, self.repo_type)
+
+
+def pinned(repo_type: str, repo_id: str, commit: str, path: str) -> str:
+    """A reference that means a snapshot, wherever it is read, by what provenance says of it.
+
+    What a package is then depends on the version in it, and on a lock.
+    """
+    if repo_type == "local":
+        return f"{repo_id}:{path}"
+    if repo_type == registered.KIND:
+        return str(HubRef.parse(f"{repo_type}:{repo_id}"))
+    return str(HubRef(repo_id, commit, path, repo_type))
+
+
+def _check(parts: Parts) -> None:
+    kind = parts.repo_type
+    next((one for one in _OTHERS if kind == one.KIND), grammar).check(parts)
 
 
 def _refusal(text: str, wrong: Wrong) -> HubReferenceError:

@@ -9,8 +9,9 @@ read-only in a store of our own. A full commit that is in the store costs no req
 from __future__ import annotations
 
 import difflib
+import hashlib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeVar
@@ -24,7 +25,8 @@ from envhub_sandbox.errors import (
 from envhub_sandbox.hub import store as store
 from envhub_sandbox.hub.client import HubClient, Repository, checked_endpoint, checked_token
 from envhub_sandbox.hub.failures import ABSENT, UNREACHABLE, HubFailure, Kind
-from envhub_sandbox.hub.hashing import HashMismatch, copy_verified
+from envhub_sandbox.hub.git import address
+from envhub_sandbox.hub.hashing import GIT_SHA1, SHA256, HashMismatch, copy_verified, write_verified
 from envhub_sandbox.hub.listing import (
     DEFAULT_LIMITS,
     FileRecord,
@@ -33,14 +35,16 @@ from envhub_sandbox.hub.listing import (
     check_listing_names,
     listing_within_limits,
 )
-from envhub_sandbox.hub.local import LocalFolder, content_commit, copier, split_local
+from envhub_sandbox.hub.local import LocalFolder, content_digest, copier, split_local
 from envhub_sandbox.hub.reference import DEFAULT_PATH, HubRef, is_local
+from envhub_sandbox.hub.registered import entry as registered_entry
+from envhub_sandbox.hub.registered import reference as registered
 from envhub_sandbox.system.log import SNAPSHOT
 
 __all__ = ["FileRecord", "Snapshot", "SnapshotLimits", "fetch", "local"]
 
 _SHOWN_COMMITS = 5
-_LOCAL_COPIES_DAYS = 14.0
+_COPIES_DAYS = 14.0
 _SHOWN_FILES = 20
 T = TypeVar("T")
 
@@ -88,12 +92,14 @@ def commit_of(
     """
     if is_here(reference):
         root, _ = split_local(reference, DEFAULT_PATH)
-        return content_commit(LocalFolder.at(root).listed(DEFAULT_LIMITS)[1])
+        return f"local-{content_digest(LocalFolder.at(root).listed(DEFAULT_LIMITS)[1])}"
     ref = HubRef.parse(reference)
+    if ref.repo_type == registered.KIND:
+        return fetch(ref).commit
     if ref.is_pinned and ref.revision is not None:
         return ref.revision
-    hub = HubClient(checked_endpoint(endpoint), checked_token(token), hub_cache_dir)
-    return _first(_candidates(ref, hub, DEFAULT_LIMITS), _Candidate.resolved)
+    candidates = _candidates(ref, DEFAULT_LIMITS, endpoint, token, hub_cache_dir)
+    return _first(candidates, _Candidate.resolved)
 
 
 def fetch(
@@ -123,8 +129,9 @@ def fetch(
         SnapshotError: A hostile name in the listing, or the store cannot be written.
         HubReferenceError: The token or endpoint cannot be one.
     """
-    hub = HubClient(checked_endpoint(endpoint), checked_token(token), hub_cache_dir)
-    candidates = _candidates(ref, hub, limits)
+    if ref.repo_type == registered.KIND:
+        return _registered(ref)
+    candidates = _candidates(ref, limits, endpoint, token, hub_cache_dir)
     try:
         for candidate in candidates if ref.is_pinned else ():
             if (stored := candidate.stored()) is not None:
@@ -140,12 +147,27 @@ def fetch(
     return _first(candidates, _Candidate.fetched)
 
 
-def _candidates(ref: HubRef, hub: HubClient, limits: SnapshotLimits) -> list[_Candidate]:
+def _candidates(
+    ref: HubRef,
+    limits: SnapshotLimits,
+    endpoint: str | None,
+    token: str | bool | None,
+    hub_cache_dir: str | Path | None,
+) -> Sequence[_Candidate]:
+    """As what it may be read; the last three are of the Hub alone."""
+    if ref.repo_type == address.KIND:
+        scheme, _, rest = ref.repo_id.partition("://")
+        host, _, name = rest.partition("/")
+        return [_GitCandidate(ref, Repository(address.KIND, name), f"{scheme}://{host}", limits)]
+    hub = HubClient(checked_endpoint(endpoint), checked_token(token), hub_cache_dir)
     kinds = (ref.repo_type,) if ref.repo_type else ("model", "space")
-    return [_Candidate(ref, Repository(kind, ref.repo_id), hub, limits) for kind in kinds]
+    return [
+        _HubCandidate(ref, Repository(kind, ref.repo_id), hub.public_endpoint, limits, hub)
+        for kind in kinds
+    ]
 
 
-def _first(candidates: list[_Candidate], ask: Callable[[_Candidate], T]) -> T:
+def _first(candidates: Sequence[_Candidate], ask: Callable[[_Candidate], T]) -> T:
     """The answer of the first candidate that is there; raises as ``fetch``."""
     failures: list[HubFailure] = []
     for candidate in candidates:
@@ -159,22 +181,20 @@ def _first(candidates: list[_Candidate], ask: Callable[[_Candidate], T]) -> T:
 
 
 def _unavailable(
-    candidates: list[_Candidate], failures: list[HubFailure]
+    candidates: Sequence[_Candidate], failures: list[HubFailure]
 ) -> RepositoryUnavailableError:
     """One error for all that was tried; the furthest attempt gives the advice."""
-    ref, hub = candidates[0].ref, candidates[0].hub
+    ref, endpoint = candidates[0].ref, candidates[0].endpoint
     whats = "; and ".join(dict.fromkeys(failure.what for failure in failures))
     best = next((f for f in failures if f.kind is not Kind.NO_REPOSITORY), failures[0])
     advice = best.advice
     if best.kind is Kind.NO_REPOSITORY and ref.repo_type is None:
         advice += f". A dataset repository is written 'datasets/{ref.repo_id}'"
     in_store = "" if best.kind is Kind.NO_ENTRY else _in_store(candidates, best.kind in UNREACHABLE)
-    return RepositoryUnavailableError(
-        f"{ref} on {hub.public_endpoint}: {whats}. {advice}.{in_store}"
-    )
+    return RepositoryUnavailableError(f"{ref} on {endpoint}: {whats}. {advice}.{in_store}")
 
 
-def _in_store(candidates: list[_Candidate], even_if_none: bool) -> str:
+def _in_store(candidates: Sequence[_Candidate], even_if_none: bool) -> str:
     """Which commits can be had without the Hub, and how to write them."""
     ref = candidates[0].ref
     found = [stored for candidate in candidates for stored in store.commits(candidate.folder)]
@@ -213,28 +233,57 @@ def local(
     if all(file.path != path for file in files):
         what, advice = here.why_left_out(path) or _missing_entry(path, files)
         raise RepositoryUnavailableError(f"{here} {what}. {advice}")
-    slot = store.Slot(store.local_folder(), content_commit(files), str(here))
+    return _by_content("local", str(root), path, files, copier(found, str(here)))
+
+
+def _registered(ref: HubRef) -> Snapshot:
+    """The repository of one file that stands for an environment of a package."""
+    text = registered_entry.entry(ref.parts)
+    digest = f"{SHA256}:{hashlib.sha256(text).hexdigest()}"
+    files = (FileRecord(DEFAULT_PATH, len(text), digest),)
+    name = str(ref).partition(":")[2]
+
+    def write(_: FileRecord, target: Path) -> None:
+        target.write_bytes(text)
+
+    return _by_content(registered.KIND, name, DEFAULT_PATH, files, write)
+
+
+def _by_content(
+    kind: str,
+    name: str,
+    path: str,
+    files: tuple[FileRecord, ...],
+    copy: Callable[[FileRecord, Path], None],
+) -> Snapshot:
+    """A snapshot that is named by what is in it."""
+    commit = f"{kind}-{content_digest(files)}"
+    slot = store.Slot(store.folder_of(kind), commit, f"{kind} {name}")
     if store.load_whole(slot) is None:
-        store.publish(slot, files, copier(found, str(here)), {"repo_type": "local"})
+        store.publish(slot, files, copy, {"repo_type": kind, "repo_id": name})
         # Every edit leaves a copy; a Hub commit, in contrast, is kept until somebody removes it.
-        store.remove_unused(slot.folder, days=_LOCAL_COPIES_DAYS)
+        store.remove_unused(slot.folder, days=_COPIES_DAYS)
     store.mark_used(slot)
-    return Snapshot(str(root), "local", slot.commit, path, slot.tree, files)
+    return Snapshot(name, kind, slot.commit, path, slot.tree, files)
 
 
 @dataclass(frozen=True)
 class _Candidate:
-    """A reference read as a repository of one type. Raises ``HubFailure`` and ``SnapshotError``."""
+    """A reference read as a repository of one type. Raises ``HubFailure`` and ``SnapshotError``.
+
+    Attributes:
+        endpoint: The host that is asked, without a login.
+    """
 
     ref: HubRef
     repo: Repository
-    hub: HubClient
+    endpoint: str
     limits: SnapshotLimits
 
     @property
     def folder(self) -> Path:
         """Where the repository's commits lie in the store."""
-        return store.repository_folder(self.hub.public_endpoint, *self.repo)
+        return store.repository_folder(self.endpoint, *self.repo)
 
     def stored(self) -> Snapshot | None:
         """The pinned commit, if it is in the store. No request. Raises ``HalfDeletedError``."""
@@ -243,7 +292,7 @@ class _Candidate:
         return None if files is None else self._finished(slot, files)
 
     def fetched(self) -> Snapshot:
-        """The revision as the Hub resolves it now, downloaded unless it is in the store."""
+        """The revision as the host resolves it now, downloaded unless it is in the store."""
         slot = self._slot(self.resolved())
         files = store.load_whole(slot)
         if files is None:
@@ -254,31 +303,69 @@ class _Candidate:
         return self._finished(slot, files)
 
     def resolved(self) -> str:
-        """The commit that the revision is at the Hub now."""
-        commit = self.hub.resolve(self.repo, self.ref.revision)
+        """The commit that the revision is at the host now."""
+        commit = self._resolved()
         if self.ref.is_pinned and commit != self.ref.revision:
             raise SnapshotIntegrityError(
-                f"{self.ref}: {self.hub.public_endpoint} answered with another commit, {commit}, "
+                f"{self.ref}: {self.endpoint} answered with another commit, {commit}, "
                 "than the pinned one. Do not trust this endpoint; use another"
             )
         return commit
 
-    def _slot(self, commit: str) -> store.Slot:
-        title = f"{'/'.join(self.repo)}@{commit} on {self.hub.public_endpoint}"
-        return store.Slot(self.folder, commit, title)
+    def _resolved(self) -> str:
+        raise NotImplementedError
 
     def _bring(self, slot: store.Slot) -> None:
-        listing = self.hub.listing(self.repo, slot.commit)
+        raise NotImplementedError
+
+    def _slot(self, commit: str) -> store.Slot:
+        title = f"{'/'.join(self.repo)}@{commit} on {self.endpoint}"
+        return store.Slot(self.folder, commit, title)
+
+    def _judged(self, slot: store.Slot, listing: Iterable[FileRecord]) -> tuple[FileRecord, ...]:
         files = listing_within_limits(listing, self.limits, slot.title)
         check_listing_names(files, slot.title)
         self._require_entry(files)
         size = sum(file.size for file in files)
         SNAPSHOT.info("%s: downloading %d files, %d bytes", slot.title, len(files), size)
-        folder = self.hub.download(self.repo, slot.commit, [file.path for file in files])
-        note = {"endpoint": self.hub.public_endpoint, **self.repo._asdict()}
+        return files
+
+    def _publish(
+        self,
+        slot: store.Slot,
+        files: tuple[FileRecord, ...],
+        copy: Callable[[FileRecord, Path], None],
+    ) -> None:
+        note = {"endpoint": self.endpoint, **self.repo._asdict()}
         note["revision"] = None if self.ref.is_pinned else self.ref.revision or "main"
-        store.publish(slot, files, self._copier(slot, folder), note)
+        store.publish(slot, files, copy, note)
         SNAPSHOT.info("%s: verified, and in the store", slot.title)
+
+    def _finished(self, slot: store.Slot, files: tuple[FileRecord, ...]) -> Snapshot:
+        listing_within_limits(files, self.limits, slot.title)
+        self._require_entry(files)
+        name = self.ref.repo_id
+        return Snapshot(name, self.repo.repo_type, slot.commit, self.ref.path, slot.tree, files)
+
+    def _require_entry(self, files: tuple[FileRecord, ...]) -> None:
+        if all(file.path != self.ref.path for file in files):
+            what, advice = _missing_entry(self.ref.path, files)
+            raise HubFailure(Kind.NO_ENTRY, f"the {self.repo.repo_type} repository {what}", advice)
+
+
+@dataclass(frozen=True)
+class _HubCandidate(_Candidate):
+    """A repository of the Hub."""
+
+    hub: HubClient
+
+    def _resolved(self) -> str:
+        return self.hub.resolve(self.repo, self.ref.revision)
+
+    def _bring(self, slot: store.Slot) -> None:
+        files = self._judged(slot, self.hub.listing(self.repo, slot.commit))
+        folder = self.hub.download(self.repo, slot.commit, [file.path for file in files])
+        self._publish(slot, files, self._copier(slot, folder))
 
     def _copier(self, slot: store.Slot, folder: Path) -> Callable[[FileRecord, Path], None]:
         def copy(record: FileRecord, target: Path) -> None:
@@ -306,16 +393,33 @@ class _Candidate:
                 f"rm '{source}'"
             ) from mismatch
 
-    def _finished(self, slot: store.Slot, files: tuple[FileRecord, ...]) -> Snapshot:
-        listing_within_limits(files, self.limits, slot.title)
-        self._require_entry(files)
-        repo_type, repo_id = self.repo
-        return Snapshot(repo_id, repo_type, slot.commit, self.ref.path, slot.tree, files)
 
-    def _require_entry(self, files: tuple[FileRecord, ...]) -> None:
-        if all(file.path != self.ref.path for file in files):
-            what, advice = _missing_entry(self.ref.path, files)
-            raise HubFailure(Kind.NO_ENTRY, f"the {self.repo.repo_type} repository {what}", advice)
+@dataclass(frozen=True)
+class _GitCandidate(_Candidate):
+    """A repository of git. What is asked for by a commit is that: its name is a hash of it."""
+
+    def _resolved(self) -> str:
+        from envhub_sandbox.hub.git import commits
+
+        return commits.resolve(self.ref.repo_id, self.ref.revision or "HEAD")
+
+    def _bring(self, slot: store.Slot) -> None:
+        from envhub_sandbox.hub.git import commits
+
+        with commits.fetched(self.ref.repo_id, slot.commit) as found:
+            blobs = {blob.path: blob for blob in found.blobs}
+            listing = (
+                FileRecord(one.path, one.size, f"{GIT_SHA1}:{one.digest}") for one in found.blobs
+            )
+            files = self._judged(slot, listing)
+            for path in found.submodules:
+                SNAPSHOT.warning("%s: the submodule %r is left out", slot.title, path)
+
+            def copy(record: FileRecord, target: Path) -> None:
+                with found.open(blobs[record.path]) as stream:
+                    write_verified(stream, target, record)
+
+            self._publish(slot, files, copy)
 
 
 def _missing_entry(path: str, files: tuple[FileRecord, ...]) -> tuple[str, str]:

@@ -93,9 +93,9 @@ def repository_folder(endpoint: str, repo_type: str, repo_id: str) -> Path:
     return cache_root() / "snapshots" / f"{host}-{key}" / name
 
 
-def local_folder() -> Path:
-    """Where the copies of local folders lie."""
-    return cache_root() / "snapshots" / "local"
+def folder_of(kind: str) -> Path:
+    """Where copies lie that are named by their content: of local folders, and of packages' ids."""
+    return cache_root() / "snapshots" / kind
 
 
 def load(slot: Slot) -> tuple[FileRecord, ...] | None:

@@ -11,9 +11,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+from envhub_sandbox.hub import reference
 from envhub_sandbox.hub.client import default_endpoint
 from envhub_sandbox.hub.logins import without_login
-from envhub_sandbox.hub.reference import HubRef
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_worker.protocol.manifest.manifest import Manifest
 from envhub_worker.protocol.messages import VERSION
@@ -66,10 +66,8 @@ class Recipe:
 
 def pinned(snapshot: Snapshot) -> str:
     """A reference that means this snapshot, wherever it is read."""
-    if snapshot.repo_type == "local":
-        return f"{snapshot.repo_id}:{snapshot.path}"
-    kind = snapshot.repo_type
-    return str(HubRef(snapshot.repo_id, snapshot.commit, snapshot.path, kind))
+    kind, name = snapshot.repo_type, snapshot.repo_id
+    return reference.pinned(kind, name, snapshot.commit, snapshot.path)
 
 
 def provenance_of(

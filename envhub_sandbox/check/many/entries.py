@@ -6,7 +6,7 @@ import hashlib
 import os
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
@@ -112,4 +112,4 @@ def _meaning(reference: str) -> tuple[str, str]:
             raise HubReferenceError(f"{reference}: its entry lies outside of its folder")
         return reference, f"{folder.resolve()}:{path}"
     ref = HubRef.parse(reference)
-    return str(ref), str(replace(ref, revision=ref.revision or "main"))
+    return str(ref), ref.meaning

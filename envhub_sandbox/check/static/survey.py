@@ -16,7 +16,7 @@ from envhub_sandbox.check.findings import Finding
 from envhub_sandbox.check.static import contents
 from envhub_sandbox.check.static.constructs import constructs, long_lines
 from envhub_sandbox.errors import SnapshotError
-from envhub_sandbox.hub.checkout import Checkout
+from envhub_sandbox.hub.git.checkout import Checkout
 from envhub_sandbox.hub.listing import FileRecord, Snapshot
 from envhub_sandbox.hub.local import LocalFolder
 from envhub_sandbox.hub.sources.parsing import MOST_BYTES, ParsedFile
@@ -69,7 +69,8 @@ class Survey:
 def survey(snapshot: Snapshot, parsed: Mapping[str, ParsedFile | None]) -> Survey:
     """Look at every file of a repository, and at what ``parsing.read`` read of it."""
     found = Survey()
-    found.add(_papers(snapshot))
+    if snapshot.repo_type != "pypi":  # whose one file is ours
+        found.add(_papers(snapshot))
     found.add(_in_place(snapshot))
     found.add(_in_front(snapshot))
     left = _MOST_BYTES_IN_ALL

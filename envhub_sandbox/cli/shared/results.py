@@ -143,8 +143,8 @@ def print_provenance(provenance: dict[str, Any], *, in_process: bool) -> None:
 def _repository(provenance: dict[str, Any]) -> str:
     kind = provenance["repo_type"]
     commit = provenance["commit"]
-    if kind == "local":
-        commit = commit[: len("local-") + _SHOWN_DIGITS]
+    if commit.startswith(f"{kind}-"):
+        commit = commit[: len(f"{kind}-") + _SHOWN_DIGITS]
     return f"{provenance['repository']} ({kind}) at {commit}, {provenance['path']}"
 
 

@@ -31,7 +31,7 @@ MAX_TEXT = 4096
 LOCAL = "local"
 """The repository of a folder of this machine, whose path means nothing elsewhere."""
 _REQUIREMENTS = ("extra", "only", "override", "without")
-_COMMIT = re.compile(r"[0-9a-f]{40}|local-[0-9a-f]+")
+_COMMIT = re.compile(r"[0-9a-f]{40}|(local|pypi)-[0-9a-f]+")
 _PYTHON = re.compile(r"3\.\d{1,3}")
 _WORD = re.compile(r"[a-z0-9_]{1,40}")
 _DIGEST = re.compile(r"git-sha1:[0-9a-f]{40}|sha256:[0-9a-f]{64}")
@@ -68,7 +68,7 @@ class LockFile:
     """All that is locked.
 
     Attributes:
-        repository: ``"org/repo"``, with ``spaces/`` or ``datasets/`` in front; or ``LOCAL``.
+        repository: As a reference begins, such as ``"org/repo"``; or ``LOCAL``.
         commit: The full commit; of a folder its content's.
         entry: The entry file.
         files: The digest of each.
@@ -100,16 +100,15 @@ class LockFile:
 
 def repository_of(snapshot: Snapshot) -> str:
     """As a lock file names it."""
-    if snapshot.repo_type == "local":
-        return LOCAL
-    prefix = "" if snapshot.repo_type == "model" else f"{snapshot.repo_type}s/"
-    return prefix + snapshot.repo_id
+    return LOCAL if snapshot.repo_type == "local" else snapshot.name
 
 
 def reference_of(lock: LockFile) -> str | None:
     """The pinned reference; None for a folder, whose place is not known."""
     if lock.repository == LOCAL:
         return None
+    if lock.commit.startswith("pypi-"):
+        return lock.repository
     return f"{lock.repository}@{lock.commit}:{lock.entry}"
 
 

@@ -18,7 +18,8 @@ from typing import Any, TypeVar
 import numpy as np
 
 from envhub_sandbox.errors import BundleError, EnvHubError
-from envhub_sandbox.hub.reference import HubRef
+from envhub_sandbox.hub.grammar import is_commit
+from envhub_sandbox.hub.reference import pinned
 from envhub_sandbox.session.crash.bundle_writer import FORMAT
 from envhub_sandbox.settings.policy import Limits, Policy
 from envhub_sandbox.transport.values.tensors import to_tensor
@@ -130,14 +131,12 @@ def _doubts(
 def _reference(provenance: dict[str, Any]) -> str:
     repository, path = _member(provenance, "repository", str), _member(provenance, "path", str)
     kind = _member(provenance, "repo_type", str)
-    if kind == "local":
-        if not os.path.isabs(repository):
-            raise BundleError("a local folder's path is not absolute")
-        return f"{repository}:{path}"
-    ref = HubRef(repository, _member(provenance, "commit", str), path, kind)
-    if not ref.is_pinned:
-        raise BundleError(f"{ref} names no commit")
-    return str(ref)
+    commit = _member(provenance, "commit", str)
+    if kind == "local" and not os.path.isabs(repository):
+        raise BundleError("a local folder's path is not absolute")
+    if kind not in ("local", "pypi") and not is_commit(commit):
+        raise BundleError(f"{commit} is no commit")
+    return pinned(kind, repository, commit, path)
 
 
 def _death(death: dict[str, Any]) -> dict[str, Any]:
@@ -272,6 +271,8 @@ def wishes(bundle: Bundle) -> list[str]:
         found += [f"limits.{n}={v!r}" for n, v in limits.items() if _is_more(n, v)]
     carried = {name: bundle.arguments.get(name) for name in _CARRIED}
     found += [f"{name}={value!r}" for name, value in carried.items() if value not in _USUAL]
+    if bundle.reference.startswith("git+"):  # a host that the bundle chose is asked
+        found.append(f"repository={bundle.reference!r}")
     return [one_line(wish, 300) for wish in found]  # a line each, whatever its name is
 
 

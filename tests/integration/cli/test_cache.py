@@ -55,16 +55,23 @@ def test_hub_repositories_are_named_as_they_are_written(
     """With the prefix of their type; folders that are no snapshots are left alone."""
     monkeypatch.setenv("ENVHUB_CACHE", str(tmp_path))
     host = tmp_path / "snapshots" / "huggingface.co-12345678"
-    for name in ("model--org--a", "space--org--b", "dataset--org--c"):
-        home = host / name / ("f" * 40)
+    for kind, name in (
+        *(("model", "org/a"), ("space", "org/b"), ("dataset", "org/c")),
+        *(("git", "org/d"), ("pypi", "x@1.0#Y-v0")),
+    ):
+        home = host / f"{kind}--x" / ("f" * 40)
         home.mkdir(parents=True)
-        record = {"format": 1, "revision": "main", "files": [["env.py", 7, "d", 0, 0, 0]]}
+        files = [["env.py", 7, "d", 0, 0, 0]]
+        origin = {"endpoint": "https://h", "repo_type": kind, "repo_id": name}
+        record = {"format": 1, **origin, "revision": "main", "files": files}
         (home / "record.json").write_text(json.dumps(record))
     broken = host / "model--org--d" / ("e" * 40)
     broken.mkdir(parents=True)
     (broken / "record.json").write_text("[")
     found = {one.repository: one for one in stored_snapshots()}
-    assert set(found) == {"org/a", "spaces/org/b", "datasets/org/c"}
+    assert set(found) == {
+        *("org/a", "spaces/org/b", "datasets/org/c", "git+https://h/org/d", "pypi:x@1.0#Y-v0")
+    }
     assert found["org/a"].answers_to("org/a")
     assert found["org/a"].answers_to("org/a@ffff")
     assert found["org/a"].answers_to("f" * 7)

@@ -10,7 +10,7 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.dependencies import interpreters
-from envhub_sandbox.dependencies.builds import git, wheel_store
+from envhub_sandbox.dependencies.builds import wheel_store
 from envhub_sandbox.dependencies.builds.build import build_wheels
 from envhub_sandbox.dependencies.builds.sources import Source
 from envhub_sandbox.dependencies.locks import lockfile
@@ -19,6 +19,7 @@ from envhub_sandbox.dependencies.request import Choice
 from envhub_sandbox.dependencies.resolutions import lock_for
 from envhub_sandbox.errors import DependencyError, PackageIntegrityError, ResolutionError
 from envhub_sandbox.hub.cache import cache_root, remove_tree
+from envhub_sandbox.hub.git import address
 from envhub_sandbox.hub.snapshot import local
 from tests.support.packages.git_server import git_served, make_repository
 from tests.support.packages.sdists import backend, make_sdist
@@ -113,17 +114,17 @@ def test_a_build_that_fails(packages: Index, tmp_path: Path) -> None:
 
 def test_a_commit_of_git(packages: Index, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """By a branch, from a folder of it; the wheel says which commit it was."""
-    monkeypatch.setattr(git, "PROTOCOLS", ("http",))
+    monkeypatch.setattr(address, "PROTOCOLS", ("http",))
     served = tmp_path / "served" / "repo"
     files = {f"python/{name}": text for name, text in backend("x", "3.0").items()}
     commit = make_repository(served, files)
-    with git_served(served.parent) as address:
-        source = Source("x", "", f"{address}/repo", commit="main", subdirectory="python")
+    with git_served(served.parent) as where:
+        source = Source("x", "", f"{where}/repo", commit="main", subdirectory="python")
         [wheel] = built([source])
     assert wheel.name == "x-3.0-py3-none-any.whl"
     known = wheel_store.describe(wheel)
     assert known is not None
-    assert known.source.identity == f"git+{address}/repo@{commit}#subdirectory=python"
+    assert known.source.identity == f"git+{where}/repo@{commit}#subdirectory=python"
 
 
 ENV = importing("sourced", origin="sourced.FROM")

@@ -96,7 +96,7 @@ def test_a_folders_commit_is_named_without_a_copy(folder: Path) -> None:
     (folder / "new.py").write_text("new = 1")
     named = commit_of(str(folder))
     assert named == commit_of(f"{folder}:new.py") == commit_of(f"{folder}/new.py")
-    assert store.commits(store.local_folder()) == []
+    assert store.commits(store.folder_of("local")) == []
     assert local(folder).commit == named
     (folder / "new.py").write_text("new = 2")
     assert commit_of(str(folder)) != named

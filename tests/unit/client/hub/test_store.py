@@ -283,7 +283,7 @@ def test_store_that_cannot_be_made_says_where(
     """A file in the way of the store is named, with the variable that moves the store."""
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("ENVHUB_CACHE", str(tmp_path / "file" / "cache"))
-    slot = store.Slot(store.local_folder(), COMMIT, "x")
+    slot = store.Slot(store.folder_of("local"), COMMIT, "x")
     with pytest.raises(SnapshotError, match="set ENVHUB_CACHE to another folder"):
         store.publish(slot, records(), write, {})
 

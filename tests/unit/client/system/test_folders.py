@@ -80,7 +80,7 @@ def test_manifests_are_nobody_elses(tmp_path: Path, mask: int) -> None:
 @pytest.fixture
 def slot(snapshot_store: Path) -> store.Slot:
     """A snapshot in the store."""
-    made = store.Slot(store.local_folder(), COMMIT, "model/org/repo@ccc")
+    made = store.Slot(store.folder_of("local"), COMMIT, "model/org/repo@ccc")
     _publish(made, GOOD)
     return made
 
@@ -134,7 +134,7 @@ def test_links_are_followed_step_by_step(
     (tmp_path / "open" / "store").symlink_to(f"../{snapshot_store.name}/.")
     (tmp_path / "link").symlink_to(tmp_path / "open" / "x" / ".." / "store")
     monkeypatch.setenv("ENVHUB_CACHE", str(tmp_path / "link"))
-    behind = store.Slot(store.local_folder(), COMMIT, "x")
+    behind = store.Slot(store.folder_of("local"), COMMIT, "x")
     assert store.load(behind) is not None
     (tmp_path / "open").chmod(0o777)
     with pytest.raises(SnapshotError, match="open can be written by everybody"):
@@ -173,7 +173,7 @@ def test_somebody_elses_link_is_not_followed(
     os.chown(tmp_path / "link", SOMEBODY, -1, follow_symlinks=False)
     monkeypatch.setenv("ENVHUB_CACHE", str(tmp_path / "link"))
     with pytest.raises(SnapshotError, match=r"the link .* belongs to uid"):
-        store.load(store.Slot(store.local_folder(), COMMIT, "x"))
+        store.load(store.Slot(store.folder_of("local"), COMMIT, "x"))
 
 
 @needs_root
@@ -182,7 +182,7 @@ def test_planted_snapshot_is_refused(
     snapshot_store: Path, slot: store.Slot, monkeypatch: pytest.MonkeyPatch, way: str
 ) -> None:
     """Somebody puts a snapshot and a record that vouches for it; unchecked it is believed."""
-    place = store.local_folder()
+    place = store.folder_of("local")
     for folder in [snapshot_store, *snapshot_store.parents]:
         if folder.stat().st_mode & 0o001 == 0 and folder.stat().st_uid == 0:
             folder.chmod(folder.stat().st_mode | 0o011)
@@ -229,7 +229,7 @@ def test_file_that_others_can_write_is_closed(slot: store.Slot) -> None:
 
 def test_nobody_gets_at_a_snapshot_before_it_is_complete(snapshot_store: Path) -> None:
     """While its files have the umask's modes, their folder is ours alone."""
-    made, seen = store.Slot(store.local_folder(), COMMIT, "x"), []
+    made, seen = store.Slot(store.folder_of("local"), COMMIT, "x"), []
 
     def copy(_: FileRecord, target: Path) -> None:
         target.write_bytes(GOOD)

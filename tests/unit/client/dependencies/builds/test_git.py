@@ -15,6 +15,7 @@ from envhub_sandbox.errors import (
     PackagesTooLargeError,
     RequirementError,
 )
+from envhub_sandbox.hub.git import address, commits
 from tests.support.packages.git_server import commit, git_served, make_repository
 from tests.support.packages.git_server import git as run_git
 
@@ -36,10 +37,10 @@ def repository(tmp_path: Path) -> Path:
 @pytest.fixture
 def url(repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
     """Its address; http is permitted here alone."""
-    monkeypatch.setattr(git, "PROTOCOLS", ("http",))
+    monkeypatch.setattr(address, "PROTOCOLS", ("http",))
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
-    with git_served(tmp_path / "served") as address:
-        yield f"{address}/org/repo"
+    with git_served(tmp_path / "served") as where:
+        yield f"{where}/org/repo"
 
 
 @pytest.fixture
@@ -149,7 +150,7 @@ def test_a_name_that_leads_out(url: str, repository: Path, target: Path) -> None
 
 def test_bounds(url: str, repository: Path, target: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Their number before they are read."""
-    monkeypatch.setattr(git, "MAX_FILES", 1)
+    monkeypatch.setattr(commits, "MAX_FILES", 1)
     with pytest.raises(PackagesTooLargeError, match="more than 1 files"):
         git.check_out(url, run_git(repository, "rev-parse", "HEAD"), target, print)
 

@@ -2,7 +2,7 @@
 
 A checkout may be a stranger's. Its ``.git`` names programs that git runs (``core.fsmonitor``,
 filters, hooks), the folder that git looks at (``core.worktree``), and where git fetches missing
-objects from. So git gets a repository folder of our own, ``git_folder``, with no such settings. Of
+objects from. So git gets a repository folder of our own, ``folder``, with no such settings. Of
 the checkout's it reads data alone: the index, the objects and ``info/exclude``; and in the folder
 ``.gitignore`` and ``.gitattributes``. The caller's own settings hold, as for any ``git``.
 """
@@ -25,7 +25,7 @@ TIMEOUT_S = 20.0
 """For git: a hostile pattern in ``.gitignore`` can take for ever."""
 _MOST_BYTES = 64 << 10
 """Of a file that is read here rather than by git."""
-_GIT_FOLDER = Path(__file__).with_name("git_folder")
+_GIT_FOLDER = Path(__file__).with_name("folder")
 _SETTINGS = ("core.fsmonitor=false", "core.untrackedCache=false", f"core.hooksPath={os.devnull}")
 _KEPT = ("GIT_CONFIG_GLOBAL", "GIT_CONFIG_SYSTEM", "GIT_CONFIG_NOSYSTEM")
 _LIST = ("ls-files", "-z", "-v", "--cached", "--others", "--exclude-standard")

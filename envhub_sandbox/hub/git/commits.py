@@ -1,0 +1,256 @@
+"""Fetches the files of one commit of a git repository, as data.
+
+Git gets no settings but ours: no hooks, no filters, no submodules, no logins, and no protocol but
+https. Nothing is checked out: files are read out of the objects, whose names are hashes of their
+content, so that a full commit names all of them. Snapshots and sources of packages both come by it.
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+import resource
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+from envhub_sandbox.errors import HubReferenceError, SnapshotError, SnapshotTooLargeError
+from envhub_sandbox.hub.failures import HubFailure, Kind
+from envhub_sandbox.hub.git import address
+from envhub_sandbox.hub.grammar import is_commit
+from envhub_worker.protocol.text import printable, size_text
+
+MAX_BYTES = 2 * 2**30
+"""Of a file that git writes: what it fetches, and all files of a commit, unpacked."""
+MAX_FILES = 50_000
+_TIMEOUT_S = 900.0
+_BLOCK = 1 << 20
+_SAID_BYTES = 1000
+_ROW = re.compile(rb"(\d{6}) (\w+) ([0-9a-f]{40}) +(\d+|-)\t(.+)", re.DOTALL)
+_SETTINGS = (
+    *("protocol.allow=never", f"core.hooksPath={os.devnull}", "credential.helper="),
+    *("core.fsmonitor=false", "submodule.recurse=false", "transfer.bundleURI=false"),
+    *("gc.auto=0", "maintenance.auto=false", "core.askPass=true"),
+)
+_LIMITED = 'ulimit -f "$1" && ulimit -v "$2" && shift 2 && exec "$@"'
+"""What ``sh`` does first: git's own children have the same limits."""
+_MEMORY_KIB = 4 * 2**20
+_ALONE = {"GIT_TERMINAL_PROMPT": "0", "GIT_NO_LAZY_FETCH": "1", "GIT_CEILING_DIRECTORIES": "/"}
+
+
+Variables = Mapping[str, str]
+"""Of the user: what of it leads to the network is given to git."""
+
+
+def resolve(url: str, revision: str, variables: Variables | None = None) -> str:
+    """The full commit that a branch or a tag means now; one that is full is not asked for.
+
+    Raises:
+        HubReferenceError: The URL or the name is none that is taken.
+        HubFailure: The host does not answer, or has no such name.
+    """
+    if is_commit(revision):
+        return revision
+    if not address.REVISION.fullmatch(revision):
+        raise HubReferenceError(f"{revision[:200]!r} is no commit, tag or branch of {url[:200]!r}")
+    names = [f"refs/tags/{revision}^{{}}", f"refs/tags/{revision}", f"refs/heads/{revision}"]
+    names = ["HEAD"] if revision == "HEAD" else names
+    with tempfile.TemporaryDirectory(prefix="envhub-git-") as place:
+        git = _Git(Path(place), os.environ if variables is None else variables)
+        said = git.run("ls-remote", "--quiet", _checked(url), *names).decode()
+    found = {name: commit for commit, _, name in (x.partition("\t") for x in said.splitlines())}
+    commit = next((found[name] for name in names if name in found), "")
+    if not is_commit(commit):
+        what = f"{url} has no tag or branch {revision!r}"
+        raise HubFailure(Kind.NO_REVISION, what, "Of a commit write all 40 digits")
+    return commit
+
+
+@dataclass(frozen=True)
+class GitBlob:
+    """A file of a commit: its path, its name as an object, bytes, and which kind of file it is."""
+
+    path: str
+    digest: str
+    size: int
+    executable: bool
+    is_link: bool
+
+
+class GitFiles:
+    """What a commit holds, as long as it is here.
+
+    Attributes:
+        blobs: Its files, and its links, of which the text is the content.
+        submodules: The paths of those; nothing is fetched for them.
+    """
+
+    def __init__(self, blobs: list[GitBlob], submodules: list[str], content: IO[bytes]) -> None:
+        self.blobs = blobs
+        self.submodules = submodules
+        self._content = content
+        self._starts: dict[str, int] = {}
+        end = 0
+        for blob in blobs:  # each behind the line that ``cat-file --batch`` writes before it
+            start = end + len(f"{blob.digest} blob {blob.size}\n")
+            self._starts[blob.path] = start
+            end = start + blob.size + 1
+
+    def open(self, blob: GitBlob) -> IO[bytes]:
+        """A stream of its bytes; one at a time."""
+        return io.BufferedReader(_Part(self._content, self._starts[blob.path], blob.size))
+
+
+class _Part(io.RawIOBase):
+    """Some bytes of a file, by blocks: a stranger chose how many they are."""
+
+    def __init__(self, file: IO[bytes], start: int, size: int) -> None:
+        self._file = file
+        self._at = start
+        self._end = start + size
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        self._file.seek(self._at)
+        data = self._file.read(min(len(buffer), self._end - self._at))
+        buffer[: len(data)] = data
+        self._at += len(data)
+        return len(data)
+
+
+@contextmanager
+def fetched(url: str, commit: str, variables: Variables | None = None) -> Iterator[GitFiles]:
+    """The files of a full commit, for as long as the context lasts.
+
+    Raises:
+        HubReferenceError: The URL is none that is taken.
+        HubFailure: The host does not answer, or does not give this commit.
+        SnapshotTooLargeError: It has more files or bytes than are taken.
+        SnapshotError: It holds what git itself would not commit; or there is no git here.
+    """
+    source = _checked(url)
+    title = f"{url}@{commit[:12]}"
+    with tempfile.TemporaryDirectory(prefix="envhub-git-") as place:
+        store = Path(place)
+        git = _Git(store, os.environ if variables is None else variables)
+        git.run("init", "--quiet", "--bare", "--template=", ".")
+        options = ("--quiet", "--depth=1", "--no-tags", "--no-recurse-submodules", "--no-auto-gc")
+        git.run("fetch", *options, source, commit)
+        submodules: list[str] = []
+        with (store / "rows").open("w+b") as file:
+            git.run("ls-tree", "-r", "-z", "-l", "--full-tree", commit, output=file)
+            file.seek(0)
+            blobs = list(_blobs(_rows(file, title), title, submodules))
+        size = sum(blob.size for blob in blobs)
+        if size > MAX_BYTES:
+            raise SnapshotTooLargeError(f"{title} has {size_text(size)} of files; that is too much")
+        with (store / "blobs").open("w+b") as file:
+            names = "".join(f"{blob.digest}\n" for blob in blobs)
+            git.run("cat-file", "--batch", given=names.encode(), output=file)
+            yield GitFiles(blobs, submodules, file)
+
+
+def _rows(file: IO[bytes], title: str) -> Iterator[bytes]:
+    """Each file of a tree. Trees that hold each other make billions of a few bytes."""
+    left = b""
+    count = 0
+    while block := file.read(_BLOCK):
+        *rows, left = (left + block).split(b"\0")
+        count += len(rows)
+        if count > MAX_FILES or len(left) > _BLOCK:
+            raise SnapshotTooLargeError(f"{title} has more than {MAX_FILES} files")
+        yield from rows
+
+
+def _blobs(rows: Iterable[bytes], title: str, submodules: list[str]) -> Iterator[GitBlob]:
+    for row in rows:
+        found = _ROW.fullmatch(row)
+        if found is None:
+            raise SnapshotError(f"{title}: git lists {row[:200]!r}")
+        mode, kind, digest, size, name = found.groups()
+        path = os.fsdecode(name)
+        if kind == b"blob":
+            executable, is_link = mode == b"100755", mode == b"120000"
+            yield GitBlob(path, digest.decode(), int(size), executable, is_link)
+        else:
+            submodules.append(path)
+
+
+def _checked(url: str) -> str:
+    if not address.is_url(url):
+        raise HubReferenceError(
+            f"{printable(url, 200)!r} is no address that files are taken from: git+https://, a "
+            "host and a path, without a login"
+        )
+    return url
+
+
+class _Git:
+    """Git in one folder, with nothing of the user's own settings and logins."""
+
+    def __init__(self, store: Path, variables: Variables) -> None:
+        self._store = store
+        ours = {"GIT_CONFIG_NOSYSTEM": "1", "GIT_CONFIG_GLOBAL": os.devnull, "HOME": str(store)}
+        self._environment = {**_to_the_network(variables), **ours, **_ALONE}
+
+    def run(self, *arguments: str, given: bytes = b"", output: IO[bytes] | None = None) -> bytes:
+        """Run git, and return the first of what it prints, where there is no file for that.
+
+        It prints into files, for which it has a limit: a pipe would bring all of it into our
+        memory.
+        """
+        program = shutil.which("git")
+        if program is None:
+            raise SnapshotError(
+                f"git {arguments[0]}: files of a repository of git are needed, and there is no git "
+                "here; install it"
+            )
+        settings = [*_SETTINGS, *(f"protocol.{name}.allow=always" for name in address.PROTOCOLS)]
+        command = [program, *(word for one in settings for word in ("-c", one)), *arguments]
+        store = self._store
+        with tempfile.TemporaryFile(dir=store) as said, tempfile.TemporaryFile(dir=store) as kept:
+            try:
+                subprocess.run(
+                    ["/bin/sh", "-c", _LIMITED, "sh", *_limits(), *command],
+                    input=given,
+                    stdout=output or kept,
+                    stderr=said,
+                    cwd=store,
+                    env=self._environment,
+                    timeout=_TIMEOUT_S,
+                    check=True,
+                )
+            except (OSError, subprocess.SubprocessError) as error:
+                said.seek(max(0, said.seek(0, os.SEEK_END) - _SAID_BYTES))
+                text = said.read(_SAID_BYTES).decode("utf-8", "replace") or str(error)
+                what = f"git {arguments[0]} failed: {printable(text, _SAID_BYTES).strip()}"
+                advice = "Check the address, the commit and the network"
+                raise HubFailure(Kind.UNREACHABLE, what, advice) from error
+            kept.seek(0)
+            return kept.read(_BLOCK)
+
+
+def _limits() -> tuple[str, str]:
+    """Of a file in blocks of 512 bytes, and of memory in KiB."""
+    _, most = resource.getrlimit(resource.RLIMIT_FSIZE)
+    file_bytes = MAX_BYTES if most == resource.RLIM_INFINITY else min(MAX_BYTES, most)
+    return str(file_bytes // 512), str(_MEMORY_KIB)
+
+
+def _to_the_network(variables: Variables) -> dict[str, str]:
+    kept = {
+        name: value
+        for name, value in variables.items()
+        if name in ("PATH", "LANG") or name.lower().endswith("_proxy")
+    }
+    if certificates := variables.get("SSL_CERT_FILE"):
+        kept["GIT_SSL_CAINFO"] = os.path.abspath(os.path.expanduser(certificates))
+    return kept

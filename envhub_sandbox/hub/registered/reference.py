@@ -1,0 +1,54 @@
+"""References to registered environments: ``pypi:NAME[EXTRA][@VERSION]#ID``.
+
+``read`` and ``check`` are to these what those of ``hub.grammar`` are to references of the Hub. The
+name of the repository is ``NAME[EXTRA]#ID``, and its revision the version.
+"""
+
+from __future__ import annotations
+
+import re
+
+from envhub_sandbox.hub.grammar import Parts, Wrong, join
+
+KIND = "pypi"
+GRAMMAR = (
+    "pypi:PACKAGE#ID or pypi:PACKAGE@VERSION#ID, such as 'pypi:minigrid#MiniGrid-Empty-5x5-v0'"
+)
+_PREFIX = "pypi:"
+_NAME = r"[A-Za-z0-9](?:[A-Za-z0-9._-]{0,98}[A-Za-z0-9])?"
+_PACKAGE = re.compile(rf"({_NAME})(\[{_NAME}(?:,{_NAME}){{0,15}}\])?", re.ASCII)
+_VERSION = re.compile(r"[0-9][A-Za-z0-9.!+_-]{0,99}", re.ASCII)
+_ID = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.:/-]{0,199}", re.ASCII)
+
+
+def is_one(text: str) -> bool:
+    """Whether a text is meant as such a reference."""
+    return text.lower().startswith(_PREFIX)
+
+
+def read(text: str) -> Parts:
+    """The parts of a reference, before they are looked at; ``==`` is another ``@``."""
+    wanted, hash_, env_id = text[len(_PREFIX) :].strip().partition("#")
+    if not hash_:
+        raise Wrong("the environment's id is missing", GRAMMAR)
+    package, at, version = wanted.replace("==", "@", 1).partition("@")
+    package = package.replace(" ", "")
+    return Parts(f"{package}#{env_id}", version.strip() if at else None, repo_type=KIND)
+
+
+def check(parts: Parts) -> None:
+    """Raise ``Wrong`` unless an index and a registry could have it."""
+    package, env_id = parts.repo_id.partition("#")[::2]
+    if not _PACKAGE.fullmatch(package):
+        raise Wrong(f"{package[:200]!r} is no name of a package", GRAMMAR)
+    if parts.revision is not None and not _VERSION.fullmatch(parts.revision):
+        plain = repr(join(parts._replace(revision=None)))
+        raise Wrong(f"{parts.revision[:200]!r} is no version, such as '3.0.0'", plain)
+    if not _ID.fullmatch(env_id):
+        raise Wrong(f"{env_id[:200]!r} is no id of an environment", GRAMMAR)
+
+
+def requirement(parts: Parts) -> str:
+    """What its package is asked for as."""
+    package = parts.repo_id.partition("#")[0]
+    return package if parts.revision is None else f"{package}=={parts.revision}"

@@ -1,0 +1,151 @@
+"""``git+https://host/org/repo@commit:path``: a repository of git as one of the Hub."""
+
+from __future__ import annotations
+
+import json
+import logging
+import pickle
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from envhub_sandbox import make_env
+from envhub_sandbox.cli.app import app
+from envhub_sandbox.errors import RepositoryUnavailableError, SnapshotTooLargeError
+from envhub_sandbox.hub.git import address
+from envhub_sandbox.hub.reference import HubRef
+from envhub_sandbox.hub.snapshot import SnapshotLimits, commit_of, fetch, snapshot_named
+from tests.support.packages.git_server import commit, git, git_served, make_repository
+from tests.support.repositories import CARTPOLE
+
+pytestmark = pytest.mark.short
+
+
+@pytest.fixture
+def repository(tmp_path: Path) -> Path:
+    """One with an environment below its root, a tag, and a commit after that."""
+    folder = tmp_path / "served" / "org" / "repo"
+    make_repository(folder, {"envs/env.py": CARTPOLE, "envs/asset.bin": "x" * 5000})
+    git(folder, "tag", "-a", "v1", "-m", "x")
+    (folder / "later.txt").write_text("later")
+    commit(folder)
+    return folder
+
+
+@pytest.fixture
+def served(
+    repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[list[str]]:
+    """The beginning of its reference; http is permitted here alone. Without it nothing is there."""
+    monkeypatch.setattr(address, "PROTOCOLS", ("http",))
+    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+    monkeypatch.setenv("ENVHUB_CACHE", str(tmp_path / "cache"))
+    with git_served(tmp_path / "served") as where:
+        yield [f"git+{where}/org/repo"]
+
+
+@pytest.fixture
+def ref(served: list[str]) -> str:
+    """The reference without a revision."""
+    return served[0]
+
+
+def envhub(*arguments: str, code: int = 0) -> dict[str, Any]:
+    """The document of a command."""
+    done = CliRunner().invoke(app, [*arguments, "--json"])
+    assert done.exit_code == code, done.output
+    return dict(json.loads(done.stdout))
+
+
+def test_it_runs_and_says_what_ran(ref: str, repository: Path, tmp_path: Path) -> None:
+    """By a tag; the provenance has the commit, and a pickle makes that one again."""
+    tagged = git(repository, "rev-parse", "v1^{commit}")
+    with make_env(f"{ref}@v1:envs/env.py", n_envs=2) as suites:
+        suites.env.reset(seed=0)
+        suites.env.step(suites.env.action_space.sample())
+        provenance, again = suites.provenance, suites.reference
+        pickled = pickle.dumps(suites.env)
+    assert provenance["repository"] == ref.removeprefix("git+")
+    assert (provenance["repo_type"], provenance["commit"]) == ("git", tagged)
+    blob = git(repository, "rev-parse", "v1:envs/env.py")
+    assert provenance["files"]["envs/env.py"] == f"git-sha1:{blob}"
+    assert "later.txt" not in provenance["files"]
+    assert again == f"{ref}@{tagged}:envs/env.py"
+    env = pickle.loads(pickled)
+    env.reset(seed=0)
+    env.close()
+
+
+def test_a_pin_that_is_there_asks_nobody(
+    repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A branch is asked for each time; what is in the store is named where nobody answers."""
+    monkeypatch.setattr(address, "PROTOCOLS", ("http",))
+    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+    monkeypatch.setenv("ENVHUB_CACHE", str(tmp_path / "cache"))
+    with git_served(tmp_path / "served") as where:
+        ref = f"git+{where}/org/repo"
+        first = snapshot_named(f"{ref}@main:envs/env.py")
+        assert first.commit == git(repository, "rev-parse", "main") == commit_of(ref)
+    assert snapshot_named(f"{ref}@{first.commit}:envs/env.py") == first
+    with pytest.raises(RepositoryUnavailableError, match="ls-remote failed") as caught:
+        snapshot_named(f"{ref}@main:envs/env.py")
+    assert f"'{ref}@{first.commit}:envs/env.py' (main" in str(caught.value)
+
+
+def test_links_and_submodules(ref: str, repository: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """A link is a file with its text, as from the Hub; a submodule is left out, and said."""
+    (repository / "link").symlink_to("/etc/passwd")
+    git(repository, "update-index", "--add", "--cacheinfo", f"160000,{'0' * 39}1,module")
+    git(repository, "add", "link")
+    git(repository, "commit", "--quiet", "--message=x")
+    with caplog.at_level(logging.WARNING):
+        found = snapshot_named(f"{ref}:envs/env.py")
+    names = {file.path for file in found.files}
+    assert names == {"envs/env.py", "envs/asset.bin", "later.txt", "link"}
+    assert (found.root / "link").read_bytes() == b"/etc/passwd"
+    assert not (found.root / "link").is_symlink()
+    assert "the submodule 'module' is left out" in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("behind", "said"),
+    [
+        ("", "has no file 'env.py'. Name the entry behind a colon, as in ':envs/env.py'"),
+        ("@v9:envs/env.py", "no tag or branch 'v9'. Of a commit write all 40 digits"),
+        ("@0123456:envs/env.py", "write all 40 digits"),
+        (f"@{'1' * 40}:envs/env.py", "git fetch failed"),
+    ],
+)
+def test_what_is_not_there(ref: str, behind: str, said: str) -> None:
+    """The error says what to write."""
+    with pytest.raises(RepositoryUnavailableError) as caught:
+        make_env(f"{ref}{behind}")
+    assert said in str(caught.value)
+
+
+def test_limits_hold(ref: str) -> None:
+    """By the listing: nothing is in the store."""
+    with pytest.raises(SnapshotTooLargeError, match=r"asset\.bin"):
+        fetch(HubRef.parse(f"{ref}:envs/env.py"), limits=SnapshotLimits(max_file_bytes=4000))
+
+
+def test_commands_know_it(ref: str, repository: Path, tmp_path: Path) -> None:
+    """Lock, verify, diff, check, inspect and the store's list."""
+    pin = f"{ref}@{git(repository, 'rev-parse', 'v1^{commit}')}:envs/env.py"
+    newest = f"{ref}@{git(repository, 'rev-parse', 'main')}:envs/env.py"
+    lock = str(tmp_path / "pylock.x.toml")
+    assert envhub("lock", pin, "-o", lock, "--no-spaces")["reference"] == pin
+    assert envhub("verify", lock, "--no-index", "--no-spaces")["drift"] == []
+    drift = envhub("verify", lock, newest, "--no-index", "--no-spaces", code=7)["drift"]
+    assert "file later.txt: new" in drift
+    changes = envhub("diff", pin, newest, code=7)
+    assert "later.txt" in json.dumps(changes)
+    assert envhub("inspect", pin)["provenance"]["repo_type"] == "git"
+    judged = CliRunner().invoke(app, ["check", f"{ref}@main:envs/env.py", "--steps", "20"])
+    assert "may mean another commit" in " ".join(judged.output.split())
+    listed = [one["repository"] for one in envhub("cache", "list")["snapshots"]]
+    assert set(listed) == {ref}

@@ -1,0 +1,233 @@
+"""``pypi:NAME@VERSION#ID``: an environment that a package registers, without a repository."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import pytest
+from typer.testing import CliRunner
+
+from envhub_sandbox import make_env
+from envhub_sandbox.cli.app import app
+from envhub_sandbox.errors import LoadError, ResolutionError, WorkerDiedError
+from envhub_sandbox.session.crash.bundle_reader import load_bundle
+from tests.support.compare import assert_same
+from tests.support.packages.wheels import Index, make_wheel
+
+REGISTERS = """
+import gymnasium
+gymnasium.register("Walled/Maze-v{version}", "{module}:Maze", max_episode_steps=7)
+gymnasium.register("Walled/Other-v0", "{module}:Maze")
+"""
+MAZE = """
+import os
+
+import gymnasium
+import numpy as np
+
+
+class Maze(gymnasium.Env):
+    metadata = {"render_modes": ["human", "rgb_array"], "render_fps": 5}
+
+    def __init__(self, size=3, render_mode=None):
+        self.size, self.render_mode, self.dies = size, render_mode, False
+        self.observation_space = gymnasium.spaces.Box(0, 1, (size,))
+        self.action_space = gymnasium.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.np_random.random(self.size, dtype=np.float32), {}
+
+    def step(self, action):
+        if self.dies:
+            os._exit(3)
+        return self.np_random.random(self.size, dtype=np.float32), float(action), False, False, {}
+
+    def render(self):
+        return np.full((4, 4, 3), self.size, np.uint8)
+"""
+
+
+@pytest.fixture(scope="module")
+def packages(real_index: Index) -> Index:
+    """Packages that register in each way that there is; none of them is installed here."""
+    folder = real_index.folder
+    for version in ("1.0", "2.0"):
+        named = REGISTERS.format(version=version[0], module="walled.maze")
+        files = {"walled/__init__.py": named, "walled/maze.py": MAZE}
+        make_wheel(folder, "walled", version, files=files, requires=["gymnasium"])
+    inner = REGISTERS.format(version=1, module="inner.envs")
+    make_wheel(
+        folder,
+        "inner-registers",
+        files={
+            "inner/__init__.py": "",
+            "inner/envs.py": MAZE + inner,
+            "tests.py": "1 / 0",
+        },
+    )
+    function = f"def register_all():{inner}".replace("\n", "\n    ").replace("inner", "plugin")
+    make_wheel(
+        folder,
+        "plugged-in",
+        files={
+            "plugin/__init__.py": "",
+            "plugin/envs.py": MAZE,
+            "plugin/later.py": function,
+            "plugged_in-1.0.dist-info/entry_points.txt": (
+                "[gymnasium.envs]\n__root__ = plugin.later:register_all\n"
+            ),
+        },
+    )
+    make_wheel(folder, "no-envs", files={"no_envs.py": ""})
+    return real_index
+
+
+def envhub(*arguments: str, code: int = 0) -> dict[str, Any]:
+    """The document of a command."""
+    done = CliRunner().invoke(app, [*arguments, "--json"])
+    assert done.exit_code == code, done.output
+    return dict(json.loads(done.stdout))
+
+
+@pytest.fixture(scope="module")
+def here() -> dict[str, Any]:
+    """The class, in this process: the test is its author."""
+    namespace: dict[str, Any] = {}
+    exec(MAZE, namespace)
+    return namespace
+
+
+def roll(env: Any) -> Any:
+    """A few seeded steps, beyond the time limit."""
+    found = [env.reset(seed=3)]
+    env.action_space.seed(3)
+    return found + [env.step(env.action_space.sample()) for _ in range(20)]
+
+
+@pytest.mark.parametrize("use_async_envs", [False, True])
+def test_it_is_what_gymnasium_makes(
+    packages: Index, here: dict[str, Any], use_async_envs: bool
+) -> None:
+    """With its time limit, and arguments of its own."""
+    kwargs = {"size": 5}
+    with make_env("pypi:walled@1.0#Walled/Maze-v1", 3, use_async_envs, env_kwargs=kwargs) as suites:
+        rolled = roll(suites.env)
+        assert suites.env.num_envs == 3
+        installed, provenance = suites.provenance["installed"], suites.provenance
+    gymnasium.register("Maze-v1", lambda **given: here["Maze"](**given), max_episode_steps=7)
+    try:
+        makes = [lambda: gymnasium.make("Maze-v1", size=5)] * 3
+        assert_same(roll(gymnasium.vector.SyncVectorEnv(makes)), rolled)
+    finally:
+        gymnasium.registry.pop("Maze-v1")
+    assert "walled==1.0" in installed["packages"]
+    assert (provenance["repository"], provenance["repo_type"]) == (
+        "walled@1.0#Walled/Maze-v1",
+        "pypi",
+    )
+
+
+def test_without_a_version_the_index_chooses(packages: Index) -> None:
+    """And says which it was."""
+    with make_env("pypi:walled#Walled/Maze-v2") as suites:
+        assert "walled==2.0" in suites.provenance["installed"]["packages"]
+        assert suites.reference == "pypi:walled#Walled/Maze-v2"
+
+
+def test_it_gives_pictures_unasked(packages: Index) -> None:
+    """Where its class says so; and what the caller says holds."""
+    with make_env("pypi:walled#Walled/Other-v0") as suites:
+        suites.env.reset(seed=0)
+        [picture] = suites.env.call("render")
+        assert picture.tolist() == [[[3] * 3] * 4] * 4
+    with make_env("pypi:walled#Walled/Other-v0", env_kwargs={"render_mode": None}) as suites:
+        assert suites.env.render_mode is None
+
+
+@pytest.mark.parametrize(
+    "package", ["inner-registers#", "plugged-in#", "inner-registers#inner.envs:"]
+)
+def test_what_registers_it_is_found(packages: Index, begins: str) -> None:
+    """A module further inside, also by its name; and a function of the entry point for that."""
+    with make_env(f"pypi:{begins}Walled/Maze-v1") as suites:
+        suites.env.reset(seed=0)
+
+
+def test_an_id_that_is_not_there(packages: Index) -> None:
+    """The error names near ones of that package."""
+    with pytest.raises(LoadError, match=r"walled 2\.0 registers no environment") as caught:
+        make_env("pypi:walled#Walled/Mase-v2")
+    assert "such as Walled/Maze-v2" in str(caught.value)
+    assert "CartPole" not in str(caught.value)
+    with pytest.raises(LoadError, match="It registers none"):
+        make_env("pypi:no-envs#Walled/Maze-v2")
+
+
+def test_a_package_or_version_that_is_not_there(packages: Index) -> None:
+    """The index says so, and nothing runs."""
+    with pytest.raises(ResolutionError, match=r"walled==9\.9"):
+        make_env("pypi:walled@9.9#Walled/Maze-v2")
+
+
+def test_a_config_of_lerobots(packages: Index) -> None:
+    """Its gym_kwargs are the environment's arguments."""
+
+    class Config:
+        hub_path = "pypi:walled#Walled/Other-v0"
+
+        def __init__(self) -> None:
+            self.gym_kwargs = {"size": 4}
+
+    with make_env(Config()) as suites:
+        assert suites.env.single_observation_space.shape == (4,)
+
+
+def test_gymnasium_makes_it_by_our_id(packages: Index) -> None:
+    """One environment, and several."""
+    name = "envhub_sandbox.integrations.gym:Hub-v0"
+    env = gymnasium.make(name, ref="pypi:walled#Walled/Maze-v2", render_mode="rgb_array")
+    env.reset(seed=0)
+    assert env.render().shape == (4, 4, 3)
+    env.close()
+    envs = gymnasium.make_vec(name, num_envs=2, ref="pypi:walled#Walled/Maze-v2")
+    assert envs.reset(seed=0)[0].shape == (2, 3)
+    envs.close()
+
+
+def test_commands_know_it(packages: Index, tmp_path: Path) -> None:
+    """Lock, verify, diff, inspect, run, check and the store's list."""
+    ref, newer = "pypi:walled@1.0#Walled/Other-v0", "pypi:walled#Walled/Other-v0"
+    lock = str(tmp_path / "pylock.x.toml")
+    locked = envhub("lock", ref, "-o", lock)
+    assert locked["reference"] == ref
+    assert "walled==1.0" in locked["packages"]
+    assert envhub("verify", lock)["drift"] == []
+    assert envhub("verify", lock, newer, "--no-spaces", code=7)["drift"]
+    with make_env(ref, lock=lock) as suites:
+        suites.env.reset(seed=0)
+    assert "walled" in json.dumps(envhub("diff", ref, newer, code=7))
+    assert envhub("inspect", ref)["provenance"]["repo_type"] == "pypi"
+    played = envhub("run", ref, "--episodes", "1", "--steps", "5")
+    assert played["provenance"]["repository"] == ref.removeprefix("pypi:")
+    judged = CliRunner().invoke(app, ["check", newer, "--steps", "20"])
+    said = " ".join(judged.output.split())
+    assert "another commit or version tomorrow" in said
+    assert "licence" not in said
+    listed = [one["repository"] for one in envhub("cache", "list")["snapshots"]]
+    assert {ref, newer} <= set(listed)
+
+
+def test_a_crash_bundle_has_it(packages: Index, tmp_path: Path) -> None:
+    """And names it again."""
+    ref, policy = "pypi:walled@1.0#Walled/Other-v0", {"crash_folder": str(tmp_path)}
+    with make_env(ref, policy={**policy, "restart": "never"}) as suites:
+        suites.env.reset(seed=0)
+        suites.env.set_attr("dies", True)
+        with pytest.raises(WorkerDiedError):
+            suites.env.step(suites.env.action_space.sample())
+    [folder] = [path.parent for path in tmp_path.rglob("bundle.json")]
+    assert load_bundle(folder).reference == ref
