@@ -14,6 +14,7 @@ import shutil
 import subprocess
 import sys
 import tarfile
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,7 @@ POLICY = (
 )
 _LINK = re.compile(r"\]\((?!https?:|mailto:|#)([^)\s#]+)")
 _EXAMPLE = re.compile(r"^\[(examples/[\w/]+\.py)\]\([^)]*\)$", re.M)
+_COMMAND = re.compile(r"^```sh\n(.*?)\n```$", re.M | re.S)
 _ROW = re.compile(r"^\|.*\|$", re.M)
 _CODE = re.compile(r"(?<!\\)`[^`]+`")
 _DIAGRAM = re.compile(r'<pre class="mermaid">.*?</pre>', re.S)
@@ -53,6 +55,8 @@ def on_files(files: Files, config: Any) -> Files:
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
     """Lead each link to where its target is on the site; show an example that stands by itself."""
+    if page.is_homepage:
+        markdown = _home(markdown, page.meta)
     markdown = _EXAMPLE.sub(_shown, markdown)
     # a bar in code in a table: forges want it escaped, and MkDocs shows the escape
     markdown = _ROW.sub(lambda row: _CODE.sub(_with_bars, row[0]), markdown)
@@ -66,6 +70,21 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
         return f"]({os.path.relpath(there, os.path.dirname(place) or '.')}"
 
     return _LINK.sub(led, markdown)
+
+
+def _home(readme: str, meta: Any) -> str:
+    """The README below what ``.ci/theme/home.html`` shows of it: all up to its first command."""
+    title, introduction, picture, *_ = readme.split("\n\n")
+    _, command, after = _COMMAND.split(readme, maxsplit=1)
+    meta |= {
+        "template": "home.html",
+        "hide": ["navigation", "toc"],
+        "title": title.removeprefix("# "),
+        "description": " ".join(introduction.split()).replace("`", ""),
+        "picture": picture.partition("[")[2].partition("]")[0],
+        "command": f"<pre><code>{escape(command)}</code></pre>",
+    }
+    return after
 
 
 def _with_bars(code: re.Match[str]) -> str:

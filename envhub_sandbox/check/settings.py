@@ -37,8 +37,8 @@ class JudgeOptions:
         reference: The repository.
         arguments: Of ``make_env``, beyond the reference.
         seed, steps: The seed and the steps of each play.
-        resets: Resets in a row, four times, to count what they leave behind; 0 skips this.
-        slow_step_s: The longest that the median step may take; a reset may take five times that.
+        resets: Resets in each of four rounds that look for leaks; 0 skips them.
+        slow_step_s: Longest permitted median step; resets may take five times as long.
         episode_steps: In which some episode has to end, if 30 seconds suffice for them.
         tasks: Chooses ``(suite, task)`` pairs of the environments.
         tell: Called with what is done next.

@@ -60,7 +60,7 @@ def check(
         int,
         typer.Option(
             min=0,
-            help="Resets in a row, four times, to count what they leave behind; 0 skips this.",
+            help="Resets in each of four rounds that look for leaks; 0 skips them.",
         ),
     ] = 8,
     slow_step: Annotated[
@@ -68,7 +68,7 @@ def check(
         typer.Option(
             metavar="SECONDS",
             min=0.0,
-            help="The longest that the median step may take; a reset may take five times that.",
+            help="Longest permitted median step; resets may take five times as long.",
         ),
     ] = 1.0,
     seed: Annotated[int, typer.Option("--seed", "-s", min=0, help="The seed of each play.")] = 0,

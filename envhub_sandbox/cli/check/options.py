@@ -25,7 +25,7 @@ File = Annotated[
     typer.Option(
         "--all",
         metavar="FILE",
-        help="Judge each reference of a list, one a line; '-' is stdin.",
+        help="Judge a list of references, one per line; '-' is stdin.",
         rich_help_panel=_PANEL,
     ),
 ]
@@ -41,7 +41,7 @@ Jobs = Annotated[
     int | None,
     typer.Option(
         min=1,
-        help="With --all: judgements at once; by default one for every two cores.",
+        help="With --all: repositories judged at once; by default one for every two cores.",
         rich_help_panel=_PANEL,
     ),
 ]
@@ -49,8 +49,8 @@ MaxMemory = Annotated[
     str | None,
     typer.Option(
         metavar="SIZE",
-        help="With --all: what the limits of all jails at once may add up to; by default the "
-        "memory that is free, here and in the control groups around.",
+        help="With --all: sum of the memory limits of all jails at once; by default the free "
+        "memory of this machine and its control groups.",
         rich_help_panel=_PANEL,
     ),
 ]
@@ -61,15 +61,14 @@ Deadline = Annotated[
         "--deadline",
         metavar="SECONDS",
         min=1,
-        help="How long one judgement may take as a whole; then the report says what was not "
-        "judged.",
+        help="Time for one repository; after it the report names what was not judged.",
     ),
 ]
 Again = Annotated[
     bool,
     typer.Option(
         "--again",
-        help="With --all: judge all of them again, also those with results.",
+        help="With --all: judge repositories again that have results.",
         rich_help_panel=_PANEL,
     ),
 ]

@@ -19,7 +19,7 @@ from envhub_worker.protocol.lifecycle import TABLE, Event, State
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, MAX_NUM_ENVS
 from envhub_worker.protocol.manifest.manifest import MAX_ENVS
 from envhub_worker.protocol.manifest.names import MAX_NAME
-from tests.support.documents import options, settings
+from tests.support.documents import options, picture, settings
 from tests.unit.docs.test_imports import folder
 
 pytestmark = pytest.mark.same_for("users")
@@ -131,6 +131,17 @@ def test_readme_opens_with_one_command_to_try_and_one_to_test() -> None:
     assert introduction.count("\n") <= 5
 
 
+def test_readme_shows_the_first_command_with_what_it_prints() -> None:
+    """The picture was drawn from a run of it, moves by itself, and names no machine."""
+    drawn = picture.DOCUMENT.read_text()
+    assert f"]({picture.DOCUMENT.relative_to(CHECKOUT)})" in README
+    assert f"<title>{picture.command()}: " in drawn
+    assert "wrote cartpole.mp4" in drawn
+    assert "animation:" in drawn
+    assert len(drawn) < picture.MAX_BYTES
+    assert not _FORBIDDEN.search(drawn)
+
+
 def test_ci_runs_the_commands_of_the_readme() -> None:
     """Both word for word, read off it; and the second for every test."""
     steps = CHECKOUT / ".ci" / "steps"
@@ -168,10 +179,8 @@ def test_contributing_names_twenty_modules_to_read_first() -> None:
         assert (root / rest).is_file(), name
 
 
-@pytest.mark.parametrize(
-    ("document", "printed"), [("README.md", "local-"), ("docs/integrations.md", "")]
-)
-def test_the_python_of_a_document_runs(document: str, printed: str) -> None:
+@pytest.mark.parametrize("document", ["README.md", "docs/integrations.md"])
+def test_the_python_of_a_document_runs(document: str) -> None:
     """All of its blocks, one after the other, do what they say."""
     blocks = fenced((CHECKOUT / document).read_text(), "python")
     done = subprocess.run(
@@ -183,12 +192,12 @@ def test_the_python_of_a_document_runs(document: str, printed: str) -> None:
         check=False,
     )
     assert done.returncode == 0, done.stderr
-    assert done.stdout.startswith(printed)
 
 
 def error_texts() -> list[str]:
-    """Every error text of the troubleshooting table."""
-    table = rows(section(README, "Troubleshooting"))
+    """Every error text of the table of the most frequent errors."""
+    page = (CHECKOUT / "docs" / "troubleshooting.md").read_text()
+    table = rows(section(page, "The most frequent errors"))
     return [text for symptom, _ in table for text in code_words(symptom)]
 
 
@@ -198,29 +207,13 @@ _FOREIGN_TEXTS = {"no module named venv", "ensurepip is not available"}
 
 @pytest.mark.parametrize("text", [text for text in error_texts() if text not in _FOREIGN_TEXTS])
 def test_troubleshooting_quotes_errors_that_exist(text: str) -> None:
-    """Whoever searches the README for what is on the screen finds it."""
+    """A search for what is on the screen finds it."""
     assert text in joined_literals()
 
 
 def joined_literals() -> str:
     """The source, with texts that go on over a line's end put together."""
     return re.sub(r'(?<!\\)"\s*\n?\s*f?"', "", sources())
-
-
-def test_readme_names_arguments_that_exist() -> None:
-    """Each argument of the table is one of ``make_env``, each mapping key one of its class."""
-    import inspect
-
-    from envhub_sandbox import Limits, Policy, Timeouts, make_env
-
-    parameters = inspect.signature(make_env).parameters
-    classes = {"policy": Policy, "limits": Limits, "timeouts": Timeouts}
-    for argument, meaning in rows(section(README, "Quick start")):
-        names = [word.partition("=")[0] for word in code_words(argument)]
-        assert set(names) <= set(parameters), names
-        if names[0] in classes:
-            known = {field.name for field in dataclasses.fields(classes[names[0]])}
-            assert set(re.findall(r'"(\w+)":', meaning)) <= known
 
 
 def links(text: str) -> Iterator[str]:
