@@ -43,9 +43,7 @@ def document(report: Report, failures: Sequence[Finding]) -> dict[str, Any]:
 
 def read_report(document: Mapping[str, Any]) -> tuple[Report, list[Finding]]:
     """A report and what fails it, of what ``document`` has made and somebody may have changed.
-
-    Raises:
-        KeyError, TypeError, ValueError: It is no such document.
+    Raises ``KeyError``, ``TypeError`` or ``ValueError``: it is no such document.
     """
     report = Report(_str(document["reference"]), commit=_str(document["commit"]))
     failures = []

@@ -61,9 +61,7 @@ class JudgeOptions:
 
 def merged_settings(policy: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
     """A file's policy, changed by what was given as options, limit by limit.
-
-    Raises:
-        PolicyError: The file's limits are no table.
+    Raises ``PolicyError``: the file's limits are no table.
     """
     limits = policy.get("limits", {})
     if not isinstance(limits, Mapping):
@@ -77,9 +75,7 @@ def read_settings(path: Path, known: Collection[str]) -> dict[str, Any]:
 
     It is named, and never looked for: the folder that one is in may be a stranger's clone, and a
     file that lies there would let him say what he may do and what fails him.
-
-    Raises:
-        PolicyError: The file cannot be read, or says what there is not.
+    Raises ``PolicyError``: the file cannot be read, or says what there is not.
     """
     table = read_file(path).get("check", {})
     if not isinstance(table, Mapping):
@@ -105,9 +101,7 @@ def is_judged(path: Path, reference: str) -> bool:
 
 def read_file(path: Path) -> dict[str, Any]:
     """A caller's TOML, such as the fields of a ``Policy``, which ``make_env`` then checks.
-
-    Raises:
-        PolicyError: It cannot be read.
+    Raises ``PolicyError``: it cannot be read.
     """
     try:
         with path.open("rb") as file:

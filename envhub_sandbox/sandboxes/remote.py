@@ -147,9 +147,7 @@ class RemoteSandbox(Sandbox):
 
 def check_policy(policy: Policy, runtime: Runtime) -> None:
     """Refuse what names this machine's things; the server would refuse it, too.
-
-    Raises:
-        PolicyError: With what to do instead.
+    Raises ``PolicyError``: with what to do instead.
     """
     if os.sep in runtime.packages:
         raise PolicyError(

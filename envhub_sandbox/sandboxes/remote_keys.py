@@ -19,11 +19,7 @@ CONFIG_VARIABLE = "ENVHUB_CONFIG"
 
 
 def address_of(endpoint: str) -> str:
-    """``host:port`` of an endpoint.
-
-    Raises:
-        PolicyError: It is none.
-    """
+    """``host:port`` of an endpoint. Raises ``PolicyError``: it is none."""
     parts = urlsplit(endpoint)
     if "@" in parts.netloc:
         raise PolicyError(
@@ -60,10 +56,7 @@ def config_folder() -> Path:
 
 def server_key(endpoint: str, given: str | None) -> bytes:
     """A server's public key: given, in the environment, or in ``known_hosts``.
-
-    Raises:
-        SandboxUnavailableError: There is none.
-        PolicyError: It is no key.
+    Raises ``SandboxUnavailableError``: there is none; ``PolicyError``: it is no key.
     """
     text = given or os.environ.get(SERVER_KEY_VARIABLE) or _known(address_of(endpoint))
     if not text:

@@ -31,11 +31,7 @@ _MAX_CHARS = 300
 
 
 def order_of(request: PackageRequest) -> m.NeedPackages:
-    """What a server is asked for.
-
-    Raises:
-        PolicyError: The request names a path of this machine.
-    """
+    """What a server is asked for. Raises ``PolicyError``: the request names a path of this machine."""
     if os.sep in request.python:
         raise PolicyError(
             f"python in dependencies is {request.python!r}, an interpreter of this machine, and a "
@@ -74,12 +70,9 @@ def request_packages(
     tell: Callable[[str], None] = lambda line: None,
 ) -> PackageSet | None:
     """Have packages made; None where the server's own do.
-
-    Raises:
-        DependencyError: They cannot be made; the text says what to change.
-        PolicyError: The server's operator does not permit it.
-        ServerBusyError: Others of the same key are at it.
-        WorkerTimeoutError: It took too long.
+    Raises ``DependencyError``: they cannot be made; the text says what to change; ``PolicyError``:
+    the server's operator does not permit it; ``ServerBusyError``: others of the same key are at it;
+    ``WorkerTimeoutError``: it took too long.
     """
     shown = ""
     while True:

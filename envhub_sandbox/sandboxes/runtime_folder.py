@@ -119,11 +119,8 @@ def remove_stale() -> list[Path]:
 
 
 def is_in_use(path: Path) -> bool:
-    """Whether the client of a folder lives.
-
-    Raises:
-        FileNotFoundError: It is no folder of a client, or not one of this machine.
-        OSError: That cannot be known.
+    """Whether the client of a folder lives. Raises ``FileNotFoundError``: it is no folder of a
+    client, or not one of this machine; ``OSError``: that cannot be known.
     """
     if not (path.is_absolute() and _NAME.fullmatch(path.name)):
         raise FileNotFoundError(errno.ENOENT, "it is no runtime folder", str(path))

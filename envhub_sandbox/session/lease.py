@@ -118,11 +118,7 @@ class Lease:
             self._launcher.note_denied(error, loaded.server, loaded.jail.number)
 
     def look(self, operation: str, deadline: Deadline) -> None:
-        """Ask the server whether the jail lives.
-
-        Raises:
-            WorkerDiedError: It does not.
-        """
+        """Ask the server whether the jail lives. Raises ``WorkerDiedError``: it does not."""
         if self.loaded is not None:
             self.loaded.jail.output(operation, deadline)
 
@@ -136,10 +132,8 @@ class Lease:
 
     def acquire(self, deadline: StartupDeadline) -> None:
         """Take a jail, and build the environment in it; ``interrupt`` brings the deadline forward.
-
-        Raises:
-            LoadError: The repository failed to load, or returned something else than before.
-            WorkerError: The jail did not come up, died, took too long, or was given up.
+        Raises ``LoadError``: the repository failed to load, or returned something else than before;
+        ``WorkerError``: the jail did not come up, died, took too long, or was given up.
         """
         self.give_back()  # of an attempt that was interrupted when all was built
         self._start(deadline, lambda: self._move_in(lambda: self._take(deadline), deadline))

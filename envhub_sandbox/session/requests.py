@@ -96,10 +96,7 @@ class Requests:
 
     def refuse_if_busy(self, name: str) -> None:
         """Refuse a request while another waits for its ``*_wait``.
-
-        Raises:
-            ClosedEnvironmentError: It is closed.
-            AlreadyPendingCallError: There is one.
+        Raises ``ClosedEnvironmentError``: it is closed; ``AlreadyPendingCallError``: there is one.
         """
         self.refuse_if_closed()
         if self.waiting is not None:
@@ -110,11 +107,7 @@ class Requests:
             )
 
     def refuse_if_closed(self) -> None:
-        """Refuse every request after ``close``.
-
-        Raises:
-            ClosedEnvironmentError: It is closed.
-        """
+        """Refuse every request after ``close``. Raises ``ClosedEnvironmentError``: it is closed."""
         if self.closed:
             raise ClosedEnvironmentError(
                 f"Trying to operate on `{self.face}`, after a call to `close()`."
@@ -122,9 +115,7 @@ class Requests:
 
     def end_wait(self, operation: str) -> None:
         """The ``*_wait`` of a request has come.
-
-        Raises:
-            NoAsyncCallError: There was no ``*_async`` before it.
+        Raises ``NoAsyncCallError``: there was no ``*_async`` before it.
         """
         self.refuse_if_closed()
         if self.waiting != operation:
@@ -178,11 +169,8 @@ class Requests:
         """With the lock held, send a request to every shard; opens the jail if there is none.
 
         ``instead`` makes what is sent in the place of what the history keeps, if the answer is to
-        say more.
-
-        Raises:
-            LocalProtocolError: It cannot be sent; nothing was.
-            WorkerError: The environment is not in a state to take it.
+        say more. Raises ``LocalProtocolError``: it cannot be sent; nothing was; ``WorkerError``:
+        the environment is not in a state to take it.
         """
         try:
             try:
@@ -227,12 +215,10 @@ class Requests:
         self, timeout_s: float | None, kind: type[m.M] | tuple[type[m.M], ...]
     ) -> list[m.M]:
         """With the lock held, the shards' replies to the last ``submit``.
-
-        Raises:
-            WorkerTimeoutError: The environment is then LATE: ``reset`` brings it back.
-            WorkerDiedError: The environment is then DEAD; with ``restart="transparent"`` READY.
-            RemoteEnvError: The repository's code raised; the environment is still usable.
-            ClosedEnvironmentError: A ``close`` in another thread came first.
+        Raises ``WorkerTimeoutError``: the environment is then LATE: ``reset`` brings it back;
+        ``WorkerDiedError``: the environment is then DEAD; with ``restart="transparent"`` READY;
+        ``RemoteEnvError``: the repository's code raised; the environment is still usable;
+        ``ClosedEnvironmentError``: a ``close`` in another thread came first.
         """
         try:
             try:
@@ -436,10 +422,7 @@ class Requests:
         """Before an error goes to the caller.
 
         The repository's warnings come with it; a filter that makes an error of one must not hide a
-        Ctrl-C.
-
-        Raises:
-            ClosedEnvironmentError: A ``close`` in another thread is the reason.
+        Ctrl-C. Raises ``ClosedEnvironmentError``: a ``close`` in another thread is the reason.
         """
         with contextlib.suppress(RemoteEnvWarning):
             self.show_warnings()

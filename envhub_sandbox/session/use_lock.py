@@ -45,9 +45,7 @@ class UseLock:
 
     def _after_close(self, operation: str, error: BaseException) -> None:
         """What failed because of a ``close`` in its midst says so, and gives back what is left.
-
-        Raises:
-            WorkerDiedError: It was closed, and the error does not say so.
+        Raises ``WorkerDiedError``: it was closed, and the error does not say so.
         """
         if not self._lease.lifecycle.closed:
             return
@@ -57,10 +55,8 @@ class UseLock:
 
     @contextmanager
     def judging(self, operation: str) -> Iterator[None]:
-        """Hold the lock to handle replies: a worker that breaks a rule in them is given up.
-
-        Raises:
-            RemoteProtocolError: It did, whatever the handling raised; the environment is then DEAD.
+        """Hold the lock to handle replies: a worker that breaks a rule in them is given up. Raises
+        ``RemoteProtocolError``: it did, whatever the handling raised; the environment is then DEAD.
         """
         with self.hold(operation):
             try:

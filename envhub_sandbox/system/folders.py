@@ -27,10 +27,7 @@ _ACL = "system.posix_acl_access"
 def make(folder: Path, mode: int = SHARED_MODE) -> None:
     """Make a folder, and those above it that are missing (0755), whatever the umask is.
 
-    One that is there keeps its mode.
-
-    Raises:
-        OSError: It cannot be made.
+    One that is there keeps its mode. Raises ``OSError``: it cannot be made.
     """
     missing = []
     above = folder
@@ -53,9 +50,7 @@ def _make_one(path: Path, mode: int) -> None:
 
 def make_private(folder: Path) -> None:
     """The same for a folder that is ours alone; one that is there becomes it.
-
-    Raises:
-        OSError: It cannot be made, or is somebody else's.
+    Raises ``OSError``: it cannot be made, or is somebody else's.
     """
     make(folder, PRIVATE_MODE)
     if stat.S_IMODE(folder.stat().st_mode) != PRIVATE_MODE:
@@ -64,9 +59,7 @@ def make_private(folder: Path) -> None:
 
 def write_private(path: Path, content: bytes) -> None:
     """Write a new file that only its owner may read, whatever the umask is.
-
-    Raises:
-        OSError: It is there, or cannot be written.
+    Raises ``OSError``: it is there, or cannot be written.
     """
     fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, _PRIVATE_FILE_MODE)
     with os.fdopen(fd, "wb") as file:
@@ -143,9 +136,7 @@ def _fault(path: str, status: os.stat_result, strict: bool) -> str:
 
 def is_ours_alone(folder: Path) -> bool:
     """Whether only its owner, who is us or root, can write in a folder.
-
-    Raises:
-        OSError: It cannot be looked at.
+    Raises ``OSError``: it cannot be looked at.
     """
     status = folder.stat()
     return is_trusted(status.st_uid) and not status.st_mode & _OTHERS_WRITE

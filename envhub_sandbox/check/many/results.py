@@ -110,9 +110,7 @@ class Results:
     @contextlib.contextmanager
     def held(self) -> Iterator[Path]:
         """Hold the folder; yields a place in it for what is being judged.
-
-        Raises:
-            FolderError: It has other things in it, is another run's, or cannot be written.
+        Raises ``FolderError``: it has other things in it, is another run's, or cannot be written.
         """
         running = self._folder / _RUNNING
         try:
@@ -147,9 +145,7 @@ class Results:
 
     def kept(self, listed: ListEntry) -> Result | None:
         """What came of a reference when it was judged before, in this way; None if it was not.
-
-        Raises:
-            ForeignResultError: What is there is cut off, changed, or none of ours.
+        Raises ``ForeignResultError``: what is there is cut off, changed, or none of ours.
         """
         found = self._read(listed)
         return None if found is None else found[0]
@@ -192,10 +188,8 @@ class Results:
         ended: str,
     ) -> Result:
         """Keep a report as ``check --json`` has printed it, and take its page.
-
-        Raises:
-            ForeignResultError: It is no such report, or there is no page.
-            OSError: It cannot be written.
+        Raises ``ForeignResultError``: it is no such report, or there is no page; ``OSError``: it
+        cannot be written.
         """
         try:
             report, failures = reports.read_report(document)

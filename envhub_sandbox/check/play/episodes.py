@@ -127,9 +127,7 @@ class EpisodeCounter:
 
     def step(self, rewards: Any, terminations: Any, truncations: Any, infos: Any) -> None:
         """Count one vector step.
-
-        Raises:
-            RolloutError: Rewards or flags have another shape than ``(num_envs, ...)``.
+        Raises ``RolloutError``: rewards or flags have another shape than ``(num_envs, ...)``.
         """
         played = ~self._resetting
         terminated = self._flags("terminations", terminations)

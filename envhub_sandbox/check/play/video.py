@@ -33,9 +33,7 @@ class VideoError(EnvHubError):
 
 def check_target(path: Path) -> None:
     """Refuse a target that cannot work, before anything is run.
-
-    Raises:
-        VideoError: The text says what to do.
+    Raises ``VideoError``: the text says what to do.
     """
     if not can_encode():
         raise VideoError(
@@ -57,9 +55,7 @@ def can_encode() -> bool:
 
 def encoded(frames: Sequence[Frame], fps: float) -> bytes:
     """The bytes of an MP4 with H.264, of frames of one size as ``first_frame`` gives them.
-
-    Raises:
-        VideoError: It cannot be written.
+    Raises ``VideoError``: it cannot be written.
     """
     try:
         with TemporaryDirectory(prefix="envhub-film-") as folder:
@@ -148,9 +144,7 @@ class VideoWriter:
 
     def add(self, frame: Frame) -> None:
         """Append a frame as ``first_frame`` gives it.
-
-        Raises:
-            VideoError: It has another size than the first one, or it cannot be written.
+        Raises ``VideoError``: it has another size than the first one, or it cannot be written.
         """
         size = (frame.shape[1], frame.shape[0])
         if self._encoder is None:

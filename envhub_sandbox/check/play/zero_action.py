@@ -12,9 +12,7 @@ from gymnasium.error import CustomSpaceError
 
 def zero_action(space: gym.Space[Any]) -> Any:
     """A member of ``space`` that is zero, or as near to it as the space allows.
-
-    Raises:
-        gymnasium.error.CustomSpaceError: The space is none of Gymnasium's.
+    Raises ``gymnasium.error.CustomSpaceError``: the space is none of Gymnasium's.
     """
     for kind, zero in _ZEROS.items():
         if isinstance(space, kind):

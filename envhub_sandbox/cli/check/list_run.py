@@ -102,11 +102,8 @@ class ListRun:
 
     def judge(self) -> None:
         """Judge the list, but for what has been judged already.
-
-        Raises:
-            UsageError: An option cannot be, such as a folder for results with other things in it.
-            HubReferenceError: A line of the list.
-            PolicyError: The policy.
+        Raises ``UsageError``: an option cannot be, such as a folder for results with other things
+        in it; ``HubReferenceError``: a line of the list; ``PolicyError``: the policy.
         """
         if self.output is None:
             raise UsageError("--all needs --output DIR, where reports and their index go")
@@ -155,10 +152,7 @@ class ListRun:
 
     def show(self, *, json: bool, junit: Path | None, github: bool) -> None:
         """Print what has come of it, and end with its code.
-
-        Raises:
-            UsageError: A file cannot be written.
-            Exit: Not all passed.
+        Raises ``UsageError``: a file cannot be written; ``Exit``: not all passed.
         """
         results = list(self.of.values())
         if junit is not None:

@@ -78,9 +78,7 @@ def refuse_options_of_the_judged(
     places: Mapping[str, Path | None], reference: str, where: str = ""
 ) -> None:
     """No repository says how it is judged, and none holds what is found in it: refuse such places.
-
-    Raises:
-        UsageError: One lies in it.
+    Raises ``UsageError``: one lies in it.
     """
     from envhub_sandbox.check.settings import is_judged
 

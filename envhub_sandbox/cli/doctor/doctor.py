@@ -139,9 +139,7 @@ def doctor(
 @contextlib.contextmanager
 def _scratch_folder() -> Iterator[Path]:
     """A folder for a repository and a cache: what is wrong with the caller's hides no layer.
-
-    Raises:
-        SandboxUnavailableError: There is no place for one.
+    Raises ``SandboxUnavailableError``: there is no place for one.
     """
     from envhub_sandbox.hub.cache import CACHE_VARIABLE
 

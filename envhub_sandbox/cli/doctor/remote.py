@@ -24,9 +24,7 @@ _USED = {
 
 def examine(server: RemoteSandbox, profile: str, *, json: bool) -> Exit:
     """Ask a server and print what it says; the exit code is that of the profile.
-
-    Raises:
-        EnvHubError: It is not reached, or does not let us in.
+    Raises ``EnvHubError``: it is not reached, or does not let us in.
     """
     facts = ask(server)
     code, problem = _verdict(facts, profile)

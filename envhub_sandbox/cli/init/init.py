@@ -41,9 +41,7 @@ def init(
 
 def repository_name(folder: Path) -> str:
     """The name that a folder gives to its repository.
-
-    Raises:
-        UsageError: The Hub would not take it.
+    Raises ``UsageError``: the Hub would not take it.
     """
     name = folder.absolute().name
     if not _NAME.fullmatch(name) or "--" in name or ".." in name or name.endswith(".git"):
@@ -56,9 +54,7 @@ def repository_name(folder: Path) -> str:
 
 def _write(folder: Path, files: dict[str, str]) -> None:
     """Every file, or none.
-
-    Raises:
-        UsageError: Something is there already, or it cannot be written.
+    Raises ``UsageError``: something is there already, or it cannot be written.
     """
     try:
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):

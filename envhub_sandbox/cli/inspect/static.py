@@ -28,11 +28,7 @@ _PLAIN = ("Python", "text")
 
 
 def check_options(context: typer.Context, *, static: bool) -> None:
-    """Refuse options that would mean nothing.
-
-    Raises:
-        UsageError: There is one.
-    """
+    """Refuse options that would mean nothing. Raises ``UsageError``: there is one."""
     means = _OF_BOTH | _OF_STATIC if static else set(context.params) - _OF_STATIC
     for one in context.command.params:
         if one.name not in means and is_typed(context, one.name or ""):

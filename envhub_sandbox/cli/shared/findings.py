@@ -39,11 +39,7 @@ def show_finding(one: Finding, mark: str = "", *, fails: bool = False) -> None:
 
 
 def level(name: str) -> Severity:
-    """What ``--fail-on`` says.
-
-    Raises:
-        UsageError: It says something else.
-    """
+    """What ``--fail-on`` says. Raises ``UsageError``: it says something else."""
     from envhub_sandbox.check.checks import Severity
 
     if name not in {one.value for one in Severity}:
@@ -52,11 +48,7 @@ def level(name: str) -> Severity:
 
 
 def write_report(path: Path, text: str) -> None:
-    """Write a report, in UTF-8 whatever the locale.
-
-    Raises:
-        UsageError: It cannot be written.
-    """
+    """Write a report, in UTF-8 whatever the locale. Raises ``UsageError``: it cannot be written."""
     try:
         path.write_text(text, encoding="utf-8")
     except OSError as error:

@@ -135,11 +135,7 @@ class MakeOptions:
     given: Mapping[str, Any]
 
     def __getitem__(self, key: str) -> Any:
-        """An option as ``make_env`` takes it.
-
-        Raises:
-            UsageError: It cannot be read.
-        """
+        """An option as ``make_env`` takes it. Raises ``UsageError``: it cannot be read."""
         if key == "sandbox" and self.in_process:
             self._check_trust()
         return _READERS.get(key, lambda given: given)(self.given[key])
@@ -161,11 +157,7 @@ class MakeOptions:
         return bool(self.given["sandbox"] == "none")
 
     def arguments(self) -> dict[str, Any]:
-        """The arguments of ``make_env``.
-
-        Raises:
-            UsageError: An option cannot be read.
-        """
+        """The arguments of ``make_env``. Raises ``UsageError``: an option cannot be read."""
         made: dict[str, Any] = {"cfg": self.ref, "policy": {}, "limits": {}, "timeouts": {}}
         for key in self.given:
             one, value = OPTIONS[key], self[key]
@@ -206,9 +198,7 @@ def select_envs(
     tasks: Sequence[str] | None,
 ) -> list[tuple[str, Any, Any]]:
     """``(suite, task, env)`` for each chosen environment; all where nothing is chosen.
-
-    Raises:
-        UsageError: None fits; the text names what there is.
+    Raises ``UsageError``: none fits; the text names what there is.
     """
     found = [(suite, task, env) for suite, group in envs.items() for task, env in group.items()]
     chosen = [
@@ -224,11 +214,7 @@ def select_envs(
 
 
 def read_gpu(text: str | None) -> bool | list[int] | None:
-    """``all`` or indices.
-
-    Raises:
-        UsageError: It is neither.
-    """
+    """``all`` or indices. Raises ``UsageError``: it is neither."""
     if text is None or text == "all":
         return None if text is None else True
     if not all(index.isdecimal() for index in text.split(",")):
@@ -244,9 +230,7 @@ def is_typed(context: typer.Context, name: str) -> bool:
 
 def read_size(option: str, text: str | None) -> int | None:
     """Bytes from ``"512M"``, ``"1.5GiB"`` or ``"1048576"``; units are powers of 1024.
-
-    Raises:
-        UsageError: It is no size.
+    Raises ``UsageError``: it is no size.
     """
     if text is None:
         return None
@@ -258,9 +242,7 @@ def read_size(option: str, text: str | None) -> int | None:
 
 def read_env_kwargs(texts: Sequence[str]) -> dict[str, Any]:
     """Keyword arguments from JSON objects and ``key=value`` pairs; later ones win.
-
-    Raises:
-        UsageError: One is neither.
+    Raises ``UsageError``: one is neither.
     """
     values: dict[str, Any] = {}
     for text in texts:
@@ -279,9 +261,7 @@ def read_env_kwargs(texts: Sequence[str]) -> dict[str, Any]:
 
 def read_dependencies(text: str) -> str | dict[str, Any]:
     """The argument of ``make_env``: text, or a JSON object.
-
-    Raises:
-        UsageError: It begins like an object and is none.
+    Raises ``UsageError``: it begins like an object and is none.
     """
     return _json_object("--dependencies", text) if text.lstrip().startswith("{") else text
 

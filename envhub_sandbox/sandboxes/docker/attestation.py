@@ -25,11 +25,7 @@ _NATIVE_RUNTIMES = (None, "runc", "crun", "io.containerd.runc.v2")
 
 
 def parse(line: bytes) -> Surroundings:
-    """The server's announcement.
-
-    Raises:
-        WorkerStartupError: It is something else.
-    """
+    """The server's announcement. Raises ``WorkerStartupError``: it is something else."""
     try:
         with UNTRUSTED:
             return Surroundings.read(json.loads(line))
@@ -45,9 +41,7 @@ def profile_for(wanted: str, found: Surroundings) -> str:
     The container's own walls stand around every jail. So ``"strict"`` takes the strongest that can
     be had in there, as long as something keeps a jail from the server next to it: namespaces, or
     Landlock. The weaker profiles are taken at their word.
-
-    Raises:
-        SandboxUnavailableError: It cannot be had.
+    Raises ``SandboxUnavailableError``: it cannot be had.
     """
     if wanted != "strict":
         if wanted in found.profiles:

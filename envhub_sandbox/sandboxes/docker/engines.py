@@ -47,11 +47,7 @@ class Engine:
     passed_over: str = ""
 
     def run(self, *arguments: str) -> str:
-        """What a command prints.
-
-        Raises:
-            EngineError: It failed, or did not answer.
-        """
+        """What a command prints. Raises ``EngineError``: it failed, or did not answer."""
         return _run(self.command, *arguments)
 
 
@@ -82,10 +78,8 @@ def _run(command: str, *arguments: str) -> str:
 
 def find_engine(name: str | None) -> Engine:
     """The engine of that name; with None, docker if it answers, else podman.
-
-    Raises:
-        PolicyError: There is no engine of that name.
-        SandboxUnavailableError: It is not installed, does not run, or may not be used.
+    Raises ``PolicyError``: there is no engine of that name; ``SandboxUnavailableError``: it is not
+    installed, does not run, or may not be used.
     """
     if name is not None and name not in ENGINES:
         raise PolicyError(f"engine is {name!r}; it is one of {', '.join(ENGINES)}, or None")
@@ -233,10 +227,8 @@ def own_limits(engine: Engine) -> tuple[str, ...]:
 
 def find_image(engine: Engine, image: str) -> str:
     """The id of an image, so that what was looked at is what runs.
-
-    Raises:
-        PolicyError: That is no name of an image: the engine would read it as something else.
-        SandboxUnavailableError: The engine does not have it.
+    Raises ``PolicyError``: that is no name of an image: the engine would read it as something else;
+    ``SandboxUnavailableError``: the engine does not have it.
     """
     if not image.isprintable() or not image or image.startswith("-") or " " in image:
         raise PolicyError(

@@ -78,11 +78,7 @@ def dockerfile(base: str, lock: Lock, system: Sequence[str]) -> str:
 
 
 def build(engine: Engine, recipe: str, lock: Lock, tag: str, network: str | None) -> None:
-    """Build the image; what the engine says goes to stderr.
-
-    Raises:
-        DependencyError: It failed.
-    """
+    """Build the image; what the engine says goes to stderr. Raises ``DependencyError``."""
     with tempfile.TemporaryDirectory(prefix="envhub-image-") as folder:
         (Path(folder) / "Dockerfile").write_text(recipe)
         (Path(folder) / "requirements.lock").write_text(lock.text)

@@ -70,10 +70,8 @@ class ImageTarget:
 
     def make(self, request: PackageRequest, tell: Callable[[str], None]) -> PackageSet:
         """An environment of this machine, to be mounted; its interpreter is the image's.
-
-        Raises:
-            DependencyError: It cannot be made, or not for that image.
-            SandboxUnavailableError: It is no image of ours.
+        Raises ``DependencyError``: it cannot be made, or not for that image;
+        ``SandboxUnavailableError``: it is no image of ours.
         """
         ours = interpreter_fitting(self._inside()[0], request)
         made = HERE.make(replace(request, python=ours.path), tell)
@@ -83,9 +81,7 @@ class ImageTarget:
 @lru_cache(maxsize=16)
 def image_packages(engine: Engine, image: str) -> tuple[Interpreter, dict[str, InstalledPackage]]:
     """The interpreter of an image, and what is installed for its jails; by the image's id.
-
-    Raises:
-        SandboxUnavailableError: It is none of ours.
+    Raises ``SandboxUnavailableError``: it is none of ours.
     """
     from envhub_sandbox.dependencies.installed import InstalledPackage
     from envhub_sandbox.dependencies.interpreters import Interpreter, release
@@ -110,9 +106,7 @@ def image_packages(engine: Engine, image: str) -> tuple[Interpreter, dict[str, I
 
 def interpreter_fitting(theirs: Interpreter, request: PackageRequest) -> Interpreter:
     """An interpreter of this machine whose packages the image's can import.
-
-    Raises:
-        InterpreterUnavailableError: There is none.
+    Raises ``InterpreterUnavailableError``: there is none.
     """
     from packaging.specifiers import SpecifierSet
     from packaging.version import Version

@@ -176,9 +176,7 @@ def scratch_for(policy: Policy) -> int:
 
 def check_readable(paths: tuple[str, ...]) -> None:
     """Refuse what would replace the container's own files.
-
-    Raises:
-        PolicyError: A path is the root, or a folder that every system has in it.
+    Raises ``PolicyError``: a path is the root, or a folder that every system has in it.
     """
     for path in paths:
         parts = [part for part in path.split("/") if part]

@@ -75,11 +75,7 @@ class Bundle:
 
 
 def load_bundle(folder: Path) -> Bundle:
-    """The bundle in a folder.
-
-    Raises:
-        BundleError: There is none, or it breaks a rule.
-    """
+    """The bundle in a folder. Raises ``BundleError``: there is none, or it breaks a rule."""
     try:
         document = json.loads(_read(folder, "bundle.json", MAX_DOCUMENT_BYTES))
         if type(document) is not dict or document.get("format") != FORMAT:

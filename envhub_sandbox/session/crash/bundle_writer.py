@@ -82,9 +82,7 @@ class Crash:
 
 def write_bundle(folder: Path, crash: Crash) -> Path:
     """Write a bundle; returns its folder.
-
-    Raises:
-        OSError: It cannot be written; nothing is left of it.
+    Raises ``OSError``: it cannot be written; nothing is left of it.
     """
     folders.make(folder, folders.PRIVATE_MODE)
     building = Path(tempfile.mkdtemp(prefix=_BUILDING, dir=folder))  # 0700

@@ -43,10 +43,8 @@ class Builder:
 
     def build(self, loaded: LoadedJail, deadline: Deadline) -> Lane:
         """Build all of it in a loaded jail; returns the way to its runners there.
-
-        Raises:
-            LoadError: ``make_env`` returned something else than before.
-            WorkerError: The jail died, or took too long.
+        Raises ``LoadError``: ``make_env`` returned something else than before; ``WorkerError``: the
+        jail died, or took too long.
         """
         self._check_manifest(loaded)
         if self._keeps and not loaded.jail.kept:
@@ -64,10 +62,8 @@ class Builder:
         self, loaded: LoadedJail, lane: Lane, dead: Sequence[int], deadline: Deadline
     ) -> None:
         """Build some shards again, each in a fresh runner in the same jail.
-
-        Raises:
-            LoadError, RemoteEnvError: The repository failed this time.
-            WorkerError: They died again, or took too long.
+        Raises ``LoadError`` or ``RemoteEnvError``: the repository failed this time;
+        ``WorkerError``: they died again, or took too long.
         """
         gone = [lane.runners[index] for index in dead]
         fresh = loaded.jail.replace_runners(gone, deadline)

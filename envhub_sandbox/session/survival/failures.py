@@ -36,9 +36,7 @@ class Failures:
         """Ctrl-C, or another exception of a signal handler, ended a wait.
 
         The reply may still come, so the environment is LATE, and not READY.
-
-        Raises:
-            WorkerDiedError: A ``close`` within the wait took away what was waited for.
+        Raises ``WorkerDiedError``: a ``close`` within the wait took away what was waited for.
         """
         if self._lease.lifecycle.closed and isinstance(error, Exception):
             raise self.dead(WorkerDiedError("")) from error

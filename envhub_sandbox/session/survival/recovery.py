@@ -95,9 +95,7 @@ class Recovery:
 
     def survive_request(self, deaths: RunnersDiedError) -> list[m.Message]:
         """The replies to a reset, which fresh runners repeat; another request is not repeated.
-
-        Raises:
-            WorkerDiedError: It was another one; the next step or reset brings the dead back.
+        Raises ``WorkerDiedError``: it was another one; the next step or reset brings the dead back.
         """
         replies = self._of_survivors(deaths)
         if self._lifecycle.request != "reset":
@@ -122,9 +120,7 @@ class Recovery:
 
     def _of_survivors(self, deaths: RunnersDiedError) -> list[m.Message | None]:
         """What the others answered; None in the place of the dead.
-
-        Raises:
-            RemoteEnvError: One of them raised. The next request meets the deaths.
+        Raises ``RemoteEnvError``: one of them raised. The next request meets the deaths.
         """
         try:
             for reply in deaths.replies:

@@ -35,9 +35,7 @@ class Restarts:
 
     def spend(self, operation: str) -> None:
         """Count one more for an operation, and wait if the last one was a moment ago.
-
-        Raises:
-            WorkerDiedError: There are none left, or the environment was closed.
+        Raises ``WorkerDiedError``: there are none left, or the environment was closed.
         """
         budget = self._policy.restart_budget
         if self._counters.restarts >= budget:

@@ -37,19 +37,14 @@ def from_secret(secret: bytes) -> KeyPair:
 
 def load(path: Path) -> KeyPair:
     """The pair of a secret key's file.
-
-    Raises:
-        OSError: It cannot be read.
-        ValueError: It holds no key.
+    Raises ``OSError``: it cannot be read; ``ValueError``: it holds no key.
     """
     return from_secret(parse_key(_read(path)))
 
 
 def save(pair: KeyPair, folder: Path, name: str) -> tuple[Path, Path]:
     """Write ``name.key`` (secret, 0600) and ``name.pub``; what is there already is not replaced.
-
-    Raises:
-        OSError: They cannot be written, or are there.
+    Raises ``OSError``: they cannot be written, or are there.
     """
     folder.mkdir(parents=True, exist_ok=True)
     secret, public = folder / f"{name}.key", folder / f"{name}.pub"
@@ -96,11 +91,8 @@ class AuthorizedClients:
 
     def refresh(self) -> bool:
         """Read the file if it has changed; whether it was read.
-
-        Raises:
-            OSError: It cannot be read.
-            ValueError: A line of it is none, or there are too many; the text says which, and is
-                the same until it changes again.
+        Raises ``OSError``: it cannot be read; ``ValueError``: a line of it is none, or there are
+        too many; the text says which, and is the same until it changes again.
         """
         if self._path is None:
             return False

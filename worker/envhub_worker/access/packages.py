@@ -130,9 +130,7 @@ class Packages:
 
     def runtime(self, key: bytes, name: str) -> Runtime:
         """What a client's packages are, and their interpreter.
-
-        Raises:
-            RefusedError: It has not been given any of that name.
+        Raises ``RefusedError``: it has not been given any of that name.
         """
         found = self._handed.get((key.hex()[:32] or "local", name))
         if found is None or not os.path.isdir(found[0].packages):
@@ -284,10 +282,7 @@ class Packages:
 def checked(request: m.NeedPackages) -> dict[str, Any]:
     """An order as plain values, within bounds; what they mean, the program looks at.
 
-    Trust: input from a client.
-
-    Raises:
-        RefusedError: It is none.
+    Trust: input from a client. Raises ``RefusedError``: it is none.
     """
     rows: dict[str, tuple[tuple[Any, ...], int]] = {
         "requirements": (request.requirements, 2),

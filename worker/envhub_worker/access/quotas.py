@@ -75,11 +75,7 @@ class Use:
 
 
 def check_policy(request: m.OpenJail, confinement: Confinement, permitted: Permissions) -> None:
-    """Refuse what a client on another host cannot have.
-
-    Raises:
-        RefusedError: With what to do instead.
-    """
+    """Refuse what a client on another host cannot have. Raises ``RefusedError``."""
     if "/" in request.runtime.packages:
         raise RefusedError(
             "PolicyError",
@@ -107,9 +103,7 @@ def check_policy(request: m.OpenJail, confinement: Confinement, permitted: Permi
 
 def check_jail(open_jails: Iterable[Use], more: Use, quotas: Quotas) -> None:
     """Refuse a jail, or further runners of one (then without memory), above the quotas.
-
-    Raises:
-        RefusedError: With the quota that it would break.
+    Raises ``RefusedError``: with the quota that it would break.
     """
     uses = list(open_jails)
     jails = len(uses) + (more.memory_bytes > 0)
@@ -147,9 +141,7 @@ class InFlight:
 
     def add(self, key: bytes, asker: Asker, size: int, quota: int) -> None:
         """Count a request until it is answered.
-
-        Raises:
-            RefusedError: Over the quota, or its id is that of one that is not answered yet.
+        Raises ``RefusedError``: over the quota, or its id is that of one that is not answered yet.
         """
         taken = self._of.get(key, 0)
         if (asker.identity, asker.request_id) in self._requests:

@@ -186,9 +186,7 @@ def _bytes(status: int, kind: str, body: bytes, *, head: bool = False) -> bytes:
 
 def parse_address(text: str) -> tuple[str, int]:
     """``PORT``, ``HOST:PORT`` or ``[HOST]:PORT``; without a host it is 127.0.0.1.
-
-    Raises:
-        ValueError: It is none; the text says what it takes.
+    Raises ``ValueError``: it is none; the text says what it takes.
     """
     host, _, port = text.rpartition(":")
     host = host.removeprefix("[").removesuffix("]") or "127.0.0.1"

@@ -119,11 +119,7 @@ def reachable(endpoint: str) -> str:
 
 
 def check_bind(endpoint: str, insecure: bool) -> None:
-    """Refuse what is no TCP address, and a loopback that is none.
-
-    Raises:
-        UsageError: With what to do instead.
-    """
+    """Refuse what is no TCP address, and a loopback that is none. Raises ``UsageError``."""
     host, _, port = endpoint.removeprefix("tcp://").rpartition(":")
     a_port = port == "*" or (port.isdigit() and int(port) <= 65_535)
     if not endpoint.startswith("tcp://") or not host or not a_port:

@@ -131,9 +131,7 @@ def _serve(
 @contextmanager
 def _watched(metrics: str | None, log: Log, *, usable: bool) -> Iterator[Publish | None]:
     """The port for monitoring, if one is wanted: gives what is to be called with figures.
-
-    Raises:
-        UsageError: It cannot be had; the text says why.
+    Raises ``UsageError``: it cannot be had; the text says why.
     """
     if metrics is None:
         yield None

@@ -183,9 +183,7 @@ def _family(
 
 def exposition() -> Callable[[Mapping[str, Any]], tuple[str, bytes]]:
     """Makes text of figures.
-
-    Raises:
-        ImportError: prometheus_client is not installed; the text says what to do.
+    Raises ``ImportError``: prometheus_client is not installed; the text says what to do.
     """
     try:
         from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, ProcessCollector

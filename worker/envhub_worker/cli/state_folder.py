@@ -39,9 +39,7 @@ def state_dir(chosen: Path | None, *, create: bool) -> Path | None:
 
     ``chosen``, or ``envhub-worker`` in the user's state folder, or a folder of the temporary one
     where that cannot be written (a read-only container); None if not even that can be had.
-
-    Raises:
-        OSError: ``chosen`` cannot be had.
+    Raises ``OSError``: ``chosen`` cannot be had.
     """
     if chosen is not None:
         if create:
@@ -112,10 +110,7 @@ class Note:
 
 def read_note(state: Path) -> ServerNote | None:
     """What the server that runs on a state folder has written down; None if there is none.
-
-    Raises:
-        OSError: It may not be read.
-        ValueError: Something else lies there.
+    Raises ``OSError``: it may not be read; ``ValueError``: something else lies there.
     """
     try:
         file = os.open(state / _NAME, os.O_RDONLY | os.O_CLOEXEC)

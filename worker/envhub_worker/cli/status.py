@@ -60,11 +60,7 @@ def _address(arguments: argparse.Namespace) -> tuple[str, bytes | None, keys.Key
 
 
 def address_here(chosen: Path | None) -> tuple[str, bytes | None, keys.KeyPair]:
-    """The same, of the server that runs here on that state folder.
-
-    Raises:
-        UnreachableError: There is none.
-    """
+    """The same, of the server that runs here on that state folder. Raises ``UnreachableError``."""
     noted = _noted(chosen)
     if noted is None:
         raise UnreachableError("no 'envhub-worker listen' of this user is running here")
@@ -112,9 +108,7 @@ def _ask(
 
 def of_server(endpoint: str, server_key: bytes | None, pair: keys.KeyPair) -> dict[str, Any]:
     """What the server says about itself to its operator.
-
-    Raises:
-        UnreachableError: It does not know us as its operator.
+    Raises ``UnreachableError``: it does not know us as its operator.
     """
     server = _ask(endpoint, server_key, pair)[1]
     if "pid_namespace" not in server:

@@ -41,9 +41,7 @@ class HostFacts:
 
 def plan(confinement: Confinement, facts: HostFacts) -> tuple[Layer, ...]:
     """The layers for ``confinement`` on a host like ``facts``, in their order.
-
-    Raises:
-        LayerUnavailableError: The profile names a layer that the host lacks.
+    Raises ``LayerUnavailableError``: the profile names a layer that the host lacks.
     """
     _check(confinement, facts)
     limits, namespaced = confinement.limits, confinement.profile == "strict"

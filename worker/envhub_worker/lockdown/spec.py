@@ -48,9 +48,7 @@ def confinement_from_wire(data: dict[str, Any]) -> Confinement:
     """A ``Confinement`` from its ``dataclasses.asdict`` form, lists for tuples permitted.
 
     Trust: a client on another host may have written it.
-
-    Raises:
-        RemoteProtocolError: A name, type or number that there cannot be.
+    Raises ``RemoteProtocolError``: a name, type or number that there cannot be.
     """
     names = {item.name for item in fields(Confinement)}
     if set(data) != names:

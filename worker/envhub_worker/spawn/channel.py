@@ -42,9 +42,7 @@ class Channel:
 
     def send(self, message: Message, fds: Sequence[int] = ()) -> None:
         """Send, or keep for ``flush`` when the socket is full. ``fds`` stay the caller's.
-
-        Raises:
-            ValueError: The message is larger than ``MAX_MESSAGE_BYTES``.
+        Raises ``ValueError``: the message is larger than ``MAX_MESSAGE_BYTES``.
         """
         data = json.dumps(message).encode()
         if len(data) > MAX_MESSAGE_BYTES:
@@ -73,9 +71,7 @@ class Channel:
 
     def receive(self) -> tuple[Message, list[int]] | None:
         """The next message and its descriptors, or None at the end of the stream.
-
-        Raises:
-            BlockingIOError: Nothing is there (non-blocking sockets).
+        Raises ``BlockingIOError``: nothing is there (non-blocking sockets).
         """
         try:
             data, fds, flags = self._receive()

@@ -189,9 +189,7 @@ class Spawner:
 
     def spawn(self, spec: JailSpec) -> Jail:
         """Ask for a jail. Requests wait until the zygote is ready.
-
-        Raises:
-            RuntimeError: The zygote has gone.
+        Raises ``RuntimeError``: the zygote has gone.
         """
         if self._exited:
             raise RuntimeError("the zygote has gone")

@@ -137,9 +137,7 @@ class Uploads:
 
     def put(self, owner: bytes, key: bytes, request: m.PutBlob, data: bytes) -> None:
         """Take a piece of a wanted file; the last one makes it a blob.
-
-        Raises:
-            RefusedError: It is not wanted, is out of order, or it is not what its hash says.
+        Raises ``RefusedError``: it is not wanted, is out of order, or it is not what its hash says.
         """
         if len(request.sha256) != _SHA256_BYTES:  # it would be a file's name
             raise RefusedError("LocalProtocolError", "a hash has 32 bytes")
@@ -197,11 +195,7 @@ class Uploads:
             self._give_up(known, sha256)
 
     def tree(self, key: bytes, snapshot: str) -> str:
-        """The path of a client's snapshot.
-
-        Raises:
-            RefusedError: It is not here; a path is none.
-        """
+        """The path of a client's snapshot. Raises ``RefusedError``: it is not here; a path is none."""
         if _SNAPSHOT.fullmatch(snapshot):
             tree = self._store(key).tree(snapshot.removeprefix(PREFIX))
             if tree.is_dir():
@@ -253,9 +247,7 @@ def checked_listing(files: tuple[object, ...], quotas: Quotas) -> list[ListedFil
     """A listing whose every entry keeps the rules, sorted by path.
 
     Trust: input from a client: names become paths of this machine.
-
-    Raises:
-        RefusedError: The text says which rule.
+    Raises ``RefusedError``: the text says which rule.
     """
     if not 1 <= len(files) <= quotas.upload_files:
         raise RefusedError(

@@ -91,9 +91,7 @@ class Tree:
 
     def __init__(self, hierarchy: Hierarchy, name: str) -> None:
         """Make the folder ``envhub_<our pid>_<name>``.
-
-        Raises:
-            OSError: The kernel refuses; use the watchdog.
+        Raises ``OSError``: the kernel refuses; use the watchdog.
         """
         self._locks: list[int] = []
         self.kind = hierarchy.kind
@@ -112,11 +110,7 @@ class Tree:
             raise
 
     def group(self, name: str, limits: Limits) -> Group:
-        """A new group with ``limits``.
-
-        Raises:
-            OSError: The kernel refuses.
-        """
+        """A new group with ``limits``. Raises ``OSError``: the kernel refuses."""
         return Group(self.kind, [f"{folder}/{name}" for folder in self._folders], limits)
 
     def remove(self) -> None:

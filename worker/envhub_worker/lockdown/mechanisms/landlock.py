@@ -84,9 +84,7 @@ def restrict(wanted: Ruleset, rules: Iterable[LandlockRule]) -> None:
     """Enforce ``wanted`` on this thread for good. ``no_new_privs`` must be set.
 
     A rule whose path does not exist is left out: it would permit nothing.
-
-    Raises:
-        LayerUnavailableError: The kernel refuses.
+    Raises ``LayerUnavailableError``: the kernel refuses.
     """
     try:
         words = struct.pack("=QQQ", wanted.files, wanted.tcp, wanted.scope)

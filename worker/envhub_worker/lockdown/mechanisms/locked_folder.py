@@ -63,10 +63,8 @@ def remove_deserted(place: Path) -> None:
 @contextlib.contextmanager
 def unheld(path: str | Path) -> Iterator[None]:
     """Keep the lock of a file or a folder that no process holds free until this context ends.
-
-    Raises:
-        BlockingIOError: A process holds it.
-        OSError: There is no such file, or the file system has no locks.
+    Raises ``BlockingIOError``: a process holds it; ``OSError``: there is no such file, or the file
+    system has no locks.
     """
     fd = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC)
     try:

@@ -259,9 +259,7 @@ def _mount_copy_on_write(path: str, upper: str, skeleton: Sequence[str], view: V
 
 def mount_overlay(path: str, lower: Sequence[str], upper: str) -> None:
     """Over ``path`` the folders ``lower``, the first one on top; ``upper`` takes what is written.
-
-    Raises:
-        OSError: There is no overlay in a user namespace before Linux 5.11, for example.
+    Raises ``OSError``: there is no overlay in a user namespace before Linux 5.11, for example.
     """
     inner = f"{upper}-inner"
     os.mkdir(inner, 0o700)

@@ -30,9 +30,7 @@ _WEAKER = 'Or choose a weaker one by its name: profile "no-userns".'
 
 def enter_user_namespace(uid: int, gid: int) -> None:
     """Become ``INSIDE_UID`` of a new user namespace, with every capability over it.
-
-    Raises:
-        LayerUnavailableError: The host forbids it; the fix is for this host.
+    Raises ``LayerUnavailableError``: the host forbids it; the fix is for this host.
     """
     try:
         kernel.unshare(kernel.CLONE_NEWUSER)

@@ -20,9 +20,7 @@ _LOW = range(62000, 65000)
 
 def choose() -> int | None:
     """The user that root's jails become; None for a plain user, who stays.
-
-    Raises:
-        LayerUnavailableError: This root has no right to become another user.
+    Raises ``LayerUnavailableError``: this root has no right to become another user.
     """
     if os.geteuid() != 0:
         return None
@@ -39,9 +37,7 @@ def choose() -> int | None:
 
 def unused_uid() -> int:
     """A user id that is mapped here, has no name and runs no process.
-
-    Raises:
-        LayerUnavailableError: This user namespace maps too few users.
+    Raises ``LayerUnavailableError``: this user namespace maps too few users.
     """
     mapped = _mapped()
     for candidates in (_HIGH, _LOW):

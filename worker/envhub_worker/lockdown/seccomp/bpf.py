@@ -63,10 +63,8 @@ Item = Label | Do | Branch
 
 def assemble(items: Sequence[Item]) -> list[BpfInstruction]:
     """Resolve the labels. A jump over more than 255 instructions becomes a pair.
-
-    Raises:
-        KeyError: A label is missing.
-        ValueError: A label lies behind its branch, or the program is too long.
+    Raises ``KeyError``: a label is missing; ``ValueError``: a label lies behind its branch, or the
+    program is too long.
     """
     branches = {index: item for index, item in enumerate(items) if isinstance(item, Branch)}
     far: set[int] = set()  # branches that are written long; which moves what follows them

@@ -49,9 +49,7 @@ def compile_filter(
     record: bool = False,
 ) -> bytes:
     """The program for ``machine`` as bytes; see ``policy_table``; ``recorded_calls`` if ``record``.
-
-    Raises:
-        LayerUnavailableError: No table for this machine.
+    Raises ``LayerUnavailableError``: no table for this machine.
     """
     conditions = {"brokered": brokered, "measured": measured, "scoped": scoped}
     verdicts = policy_table(namespaced=namespaced, network=network, **conditions)

@@ -181,9 +181,7 @@ def _absolute(thread: int, base: str, text: bytes, own: OwnPaths, *, last: bool)
 
 def _leads(thread: int, path: str, own: OwnPaths, pending: Sequence[str], *, last: bool) -> str:
     """What stands instead of an entry of a process, or of a link in a folder of its own.
-
-    Raises:
-        ValueError: Nothing has a name there, such as below a socket.
+    Raises ``ValueError``: nothing has a name there, such as below a socket.
     """
     door = _DOORS.fullmatch(path)
     if door is not None and pending:

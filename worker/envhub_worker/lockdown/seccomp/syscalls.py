@@ -107,9 +107,7 @@ NUMBERS = {"x86_64": _numbered(_X86_64), "aarch64": _numbered(_AARCH64)}
 
 def syscall_number(name: str) -> int:
     """The number of ``name`` on this machine.
-
-    Raises:
-        KeyError: The machine is neither x86-64 nor aarch64, or has no such call.
+    Raises ``KeyError``: the machine is neither x86-64 nor aarch64, or has no such call.
     """
     return NUMBERS[os.uname().machine][name]
 

@@ -21,9 +21,7 @@ _RLIMIT_CORE = 4
 
 def run(jail: JailContext, descriptors: Iterable[int]) -> None:
     """Test every denial that can be tested without harm.
-
-    Raises:
-        LayerUnavailableError: Layer ``self-test``: one of them does not hold.
+    Raises ``LayerUnavailableError``: layer ``self-test``: one of them does not hold.
     """
     _hold("no capability is left", process.held_capabilities() == 0)
     _hold("no_new_privs is set", process.has_no_new_privileges())

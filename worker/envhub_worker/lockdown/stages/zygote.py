@@ -30,9 +30,7 @@ def enter(config: ZygoteConfig) -> Common:
     """Confine this process as far as its jails have it in common.
 
     Under ``strict`` it returns in a child of the process that called: that one only waits.
-
-    Raises:
-        LayerUnavailableError: The host lacks a layer that the profile names.
+    Raises ``LayerUnavailableError``: the host lacks a layer that the profile names.
     """
     # In this order: the root is planned while the host's files are still in sight. Under ``strict``
     # the namespaces come next, with the change of user among them (see ``_enter_namespaces``);

@@ -167,9 +167,7 @@ def _decode_manifest(value: object, reader: SpaceReader) -> Manifest:
 
 def decode_env(value: object, *, max_elements: int) -> EnvManifest:
     """Read one environment's manifest. Trust: input from the worker.
-
-    Raises:
-        RemoteProtocolError: It is not one, or over a limit.
+    Raises ``RemoteProtocolError``: it is not one, or over a limit.
     """
     with UNTRUSTED:
         return _decode_env(value, SpaceReader(max_elements))

@@ -77,11 +77,7 @@ def absent(owner: object, name: str, ask: str) -> AttributeError:
 
 
 def checked_name(value: object, what: str) -> str:
-    """A printable text of bounded length.
-
-    Raises:
-        RemoteProtocolError: It is none.
-    """
+    """A printable text of bounded length. Raises ``RemoteProtocolError``: it is none."""
     if type(value) is not str or len(value) > MAX_NAME:
         raise RemoteProtocolError(f"{what} is not a string of at most {MAX_NAME} characters")
     if not value.isprintable():  # names are printed all the time, and a terminal obeys what it gets
@@ -93,9 +89,7 @@ def checked_key(value: object, what: str) -> str:
     """A name that can be part of a path: callers write videos and results under such names.
 
     A slash is allowed (``ALE/Pong-v5``), for it leads further down.
-
-    Raises:
-        RemoteProtocolError: It is no name, or leads out of the folder that it is put behind.
+    Raises ``RemoteProtocolError``: it is no name, or leads out of the folder that it is put behind.
     """
     name = checked_name(value, what)
     parts = name.replace("\\", "/").split("/")
@@ -111,9 +105,7 @@ def optional_name(value: object, what: str) -> str | None:
 
 def string_keys(value: object, what: str) -> dict[str, Any]:
     """A mapping with such names for keys.
-
-    Raises:
-        RemoteProtocolError: It is none, or has too many.
+    Raises ``RemoteProtocolError``: it is none, or has too many.
     """
     if type(value) is not dict or len(value) > MAX_NAMES:
         raise RemoteProtocolError(f"{what} is not a mapping of at most {MAX_NAMES} entries")

@@ -86,9 +86,7 @@ def values_of(message: Message) -> list[Any]:
 
 def check_fields(cls: type[Message], values: list[object]) -> None:
     """Whether decoded values are fields of this message. Trust: input from the other side.
-
-    Raises:
-        RemoteProtocolError: They are too many, too few, or of another type.
+    Raises ``RemoteProtocolError``: they are too many, too few, or of another type.
     """
     names = cls.FIELDS
     if len(values) != len(names):

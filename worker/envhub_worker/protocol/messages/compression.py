@@ -55,10 +55,8 @@ def unpack_frames(frames: Sequence[Buffer], limits: WireLimits) -> list[Buffer]:
     """The frames as they were before ``pack_frames``.
 
     Trust: input from the other side. Every size is checked before it is allocated.
-
-    Raises:
-        MessageTooLargeError: Over ``limits`` once unpacked.
-        RemoteProtocolError: What is there is not what ``CompressionHeader`` says.
+    Raises ``MessageTooLargeError``: over ``limits`` once unpacked; ``RemoteProtocolError``: what is
+    there is not what ``CompressionHeader`` says.
     """
     if not frames or m.number_of(frames[0]) != 0:
         return list(frames)

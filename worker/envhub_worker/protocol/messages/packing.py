@@ -42,9 +42,7 @@ def pack(
     """The frames of a message.
 
     With a pickler, what the caller hands over (``Message.HANDED``) arrives exactly as it is.
-
-    Raises:
-        LocalProtocolError: A field holds what the wire cannot carry; nothing was sent.
+    Raises ``LocalProtocolError``: a field holds what the wire cannot carry; nothing was sent.
     """
     cls = type(message)
     values = values_of(message)
@@ -111,11 +109,7 @@ def unpack(
     tensors: TensorMaker | None = None,
     things: ThingReader | None = None,
 ) -> Message:
-    """The message of some frames.
-
-    Raises:
-        RemoteProtocolError: The peer broke the rules.
-    """
+    """The message of some frames. Raises ``RemoteProtocolError``: the peer broke the rules."""
     with UNTRUSTED:
         document, tail, buffers = split_frames(frames, limits)
         form = _INCOMING.get(document)
@@ -136,9 +130,7 @@ def pack_header(message: Message, number: int) -> list[Buffer]:
 
 def unpack_header(frame: Buffer, *, limits: WireLimits = DEFAULT_LIMITS) -> tuple[int, Message]:
     """The id and the message of a header. Trust: input from the other side.
-
-    Raises:
-        RemoteProtocolError: The peer broke the rules.
+    Raises ``RemoteProtocolError``: the peer broke the rules.
     """
     number = id_of(frame)
     if number is None:

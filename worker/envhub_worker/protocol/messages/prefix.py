@@ -63,9 +63,7 @@ class Prefix(Generic[T]):
 
     def read(self, frames: Sequence[Buffer]) -> tuple[list[T], Sequence[Buffer]]:
         """The things in front of a reply, and its own frames. Trust: input from the worker.
-
-        Raises:
-            RemoteProtocolError: They are too many or too large, or something else.
+        Raises ``RemoteProtocolError``: they are too many or too large, or something else.
         """
         end = _LENGTH_BYTES + len(self._head)
         if len(frames) < 2 or memoryview(frames[0]).cast("B")[_LENGTH_BYTES:end] != self._head:
