@@ -6,6 +6,7 @@ guarded output, help that is text, errors that name options.
 
 from __future__ import annotations
 
+import importlib
 import inspect as python
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any
@@ -13,40 +14,87 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from envhub_sandbox.cli import cache, diff, image, lock, prefetch, push, replay, run
-from envhub_sandbox.cli.check.check import check
-from envhub_sandbox.cli.doctor.doctor import doctor
-from envhub_sandbox.cli.init.init import init
-from envhub_sandbox.cli.inspect.inspect import inspect
 from envhub_sandbox.cli.shared.console import guarded, out
 from envhub_sandbox.cli.shared.exits import EXIT_CODES, reported
-from envhub_sandbox.cli.shared.versions import versions
 from envhub_sandbox.settings.options import on_command_line, use_option_names
 
-_COMMANDS: dict[str, Callable[..., None]] = {
-    "run": run.run,
-    "inspect": inspect,
-    "check": check,
-    "diff": diff.diff,
-    "prefetch": prefetch.prefetch,
-    "lock": lock.lock,
-    "verify": lock.verify,
-    "init": init,
-    "push": push.push,
-    "replay": replay.replay,
-    "doctor": doctor,
-}
-_GROUPS: dict[str, tuple[str, dict[str, Callable[..., None]]]] = {
+Where = Mapping[str, str]
+"""The commands of a group: where the function of each is, below this package."""
+
+# each with the first line of its help, so that a list of them imports none
+_COMMANDS: dict[str, tuple[str, str | Where]] = {
+    "run": (
+        "Play episodes of an environment and print returns, lengths, speed and provenance.",
+        "run:run",
+    ),
+    "inspect": (
+        "Print suites, tasks, spaces, metadata and provenance, without stepping anything.",
+        "inspect.inspect:inspect",
+    ),
+    "check": (
+        "Run a repository in a sandbox and say what is wrong with it.",
+        "check.check:check",
+    ),
+    "diff": (
+        "Say what changed from one commit to another, in terms of what a repository would do.",
+        "diff:diff",
+    ),
+    "prefetch": (
+        "Download a repository and make the environment that it runs in, and run nothing of it.",
+        "prefetch:prefetch",
+    ),
+    "lock": (
+        "Write down commit, file hashes, packages, Python and spaces, for make_env(lock=FILE).",
+        "lock:lock",
+    ),
+    "verify": (
+        "Say whether a repository is still as it was locked, and if not, what differs (exit code "
+        "7).",
+        "lock:verify",
+    ),
+    "init": (
+        "Write a new environment's repository: env.py, requirements, card, licence, test, CI "
+        "workflow.",
+        "init.init:init",
+    ),
+    "push": (
+        "Publish a folder on the Hub as one commit, and print the pinned reference.",
+        "push:push",
+    ),
+    "replay": (
+        "Make the environment of a crash bundle again, ask the same of it, and say how that ends.",
+        "replay:replay",
+    ),
+    "doctor": (
+        "Try what this host can enforce, say what is missing and how to get it.",
+        "doctor.doctor:doctor",
+    ),
     "cache": (
         "List and remove what was downloaded and made of it, and what killed clients have left.",
-        {"list": cache.list_, "remove": cache.remove, "gc": cache.gc},
+        {"list": "cache:list_", "remove": "cache:remove", "gc": "cache:gc"},
     ),
-    "image": ("Container images for repositories.", {"build": image.build}),
+    "image": ("Container images for repositories.", {"build": "image:build"}),
 }
 
 
 class Program(TyperGroup):
-    """``envhub``: CI systems obey nothing of what it prints, usage errors included."""
+    """``envhub``: CI systems obey nothing of what it prints, usage errors included.
+
+    A command is imported when it is called: until then it has its name and its line in the list.
+    """
+
+    def __init__(self, **given: Any) -> None:
+        super().__init__(**given)
+        if not self.commands:
+            self.commands = {
+                name: Command(name, help=text) for name, (text, _) in _COMMANDS.items()
+            }
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """The command that is called, with its options."""
+        if args[0] in _COMMANDS:
+            self.commands[args[0]] = whole_command(args[0])
+        return super().resolve_command(ctx, args)
 
     def main(self, *args: Any, **options: Any) -> Any:
         """Run a command."""
@@ -78,29 +126,46 @@ class Command(TyperCommand):
         super().format_help(ctx, formatter)
 
 
-def _group(text: str, commands: Mapping[str, Callable[..., None]], **options: Any) -> typer.Typer:
-    made = typer.Typer(help=text, no_args_is_help=True, rich_markup_mode="rich", **options)
-    for name, command in commands.items():
-        made.command(name, cls=Command, no_args_is_help=command is cache.remove)(command)
-    return made
+def functions(name: str) -> dict[str, Callable[..., None]]:
+    """The function of a command, or those of a group, by name."""
+    where = _COMMANDS[name][1]
+    found = {}
+    for one, place in ({name: where} if isinstance(where, str) else where).items():
+        module, _, function = place.partition(":")
+        found[one] = getattr(importlib.import_module(f"{__package__}.{module}"), function)
+    return found
 
 
-app = _group(
+def whole_command(name: str) -> Any:
+    """A command, or a group, with all its options."""
+    text, where = _COMMANDS[name]
+    made = _typer(text)
+    for one, function in functions(name).items():
+        made.command(one, cls=Command, no_args_is_help=one == "remove")(function)
+    group = typer.main.get_group(made)
+    group.name = name
+    return group.commands[name] if isinstance(where, str) else group
+
+
+def _typer(text: str, **options: Any) -> typer.Typer:
+    return typer.Typer(help=text, no_args_is_help=True, rich_markup_mode="rich", **options)
+
+
+app = _typer(
     "Run anybody's Gymnasium environment from the Hugging Face Hub, without letting its code "
     "into your process.",
-    _COMMANDS,
     name="envhub",
     cls=Program,
     epilog=EXIT_CODES,
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for name, group in _GROUPS.items():
-    app.add_typer(_group(*group), name=name)
 
 
 def _print_versions(wanted: bool) -> None:
     if wanted:
+        from envhub_sandbox.cli.shared.versions import versions
+
         with reported(debug=False):
             for name, text in versions().items():
                 out(f"{name:<16} {text or 'not installed'}")

@@ -13,7 +13,6 @@ import os
 import re
 import sys
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
 from functools import lru_cache
 from importlib.machinery import PathFinder
 from pathlib import Path
@@ -23,6 +22,7 @@ from envhub_sandbox.errors import RequirementError
 from envhub_sandbox.hub.cache import cache_root, keep, recall
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.settings.options import option_name
+from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.text import printable
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ and a server on another host is a ``PackageTarget``.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Protocol
 
 from envhub_sandbox.dependencies.request import Choice, PackageRequest, request_of
@@ -21,6 +21,7 @@ from envhub_sandbox.errors import (
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.system import progress
 from envhub_sandbox.system.log import DEPENDENCIES
+from envhub_worker.protocol.records import dataclass
 
 if TYPE_CHECKING:
     from envhub_sandbox.dependencies.environments import Environment

@@ -8,13 +8,14 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from envhub_sandbox.errors import PolicyError
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.settings.options import option_name
+from envhub_worker.protocol.records import dataclass
 
 if TYPE_CHECKING:  # they cost time, and most repositories need none of them
     from envhub_sandbox.dependencies.declared import WantedPackage

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from envhub_sandbox.dependencies.locks import use as locks
@@ -26,6 +25,7 @@ from envhub_sandbox.settings.policy import Policy, Timeouts, policy_from, timeou
 from envhub_sandbox.system import processes
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
+from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.runtime import Runtime
 
 if TYPE_CHECKING:

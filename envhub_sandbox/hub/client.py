@@ -13,9 +13,8 @@ import re
 import sys
 import threading
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import field
 from importlib import import_module
 from pathlib import Path
 from traceback import walk_tb
@@ -29,6 +28,7 @@ from envhub_sandbox.hub.grammar import is_commit
 from envhub_sandbox.hub.hashing import GIT_SHA1, SHA256
 from envhub_sandbox.hub.listing import FileRecord
 from envhub_sandbox.hub.logins import authorization, login_of, without_login
+from envhub_worker.protocol.records import dataclass
 
 _DEFAULT_ENDPOINT = "https://huggingface.co"
 _LIBRARY = {"library_name": "envhub-sandbox"}
@@ -131,6 +131,8 @@ class HubClient:
         One by one and not by ``snapshot_download``: that asks for a listing of its own, which may
         be another than the one that was judged.
         """
+        from concurrent.futures import ThreadPoolExecutor
+
         with self._explained(repo, commit), ThreadPoolExecutor(_WORKERS) as pool:
             futures = [pool.submit(self._download, repo, commit, path) for path in paths]
             try:

@@ -13,7 +13,6 @@ import json
 import os
 import stat
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
@@ -31,6 +30,7 @@ from envhub_sandbox.hub.listing import (
     check_listing_names,
     listing_within_limits,
 )
+from envhub_worker.protocol.records import dataclass
 
 _GIT = ".git"
 _ALL_COUNTS = (

@@ -8,11 +8,10 @@ read-only in a store of our own. A full commit that is in the store costs no req
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 import os
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
@@ -40,6 +39,7 @@ from envhub_sandbox.hub.reference import DEFAULT_PATH, HubRef, is_local
 from envhub_sandbox.hub.registered import entry as registered_entry
 from envhub_sandbox.hub.registered import reference as registered
 from envhub_sandbox.system.log import SNAPSHOT
+from envhub_worker.protocol.records import dataclass
 
 __all__ = ["FileRecord", "Snapshot", "SnapshotLimits", "fetch", "local"]
 
@@ -428,6 +428,8 @@ def _missing_entry(path: str, files: tuple[FileRecord, ...]) -> tuple[str, str]:
     what = f"has no file {path!r}"
     if not names:
         return what, "It has no .py file at all, so it is no environment"
+    import difflib
+
     close = difflib.get_close_matches(path, names, n=1) or names
     shown = ", ".join(repr(name) for name in names[:_SHOWN_FILES])
     more = f" and {len(names) - _SHOWN_FILES} more" if len(names) > _SHOWN_FILES else ""

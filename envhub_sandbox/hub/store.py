@@ -23,7 +23,6 @@ import stat
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import urlsplit
@@ -36,6 +35,7 @@ from envhub_sandbox.system import folders
 from envhub_sandbox.system.files import write_whole_file
 from envhub_sandbox.system.locks import sharers
 from envhub_sandbox.system.log import SNAPSHOT
+from envhub_worker.protocol.records import dataclass
 
 _FORMAT = 1
 _ABANDONED_AFTER_S = 24 * 3600.0

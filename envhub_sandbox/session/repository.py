@@ -6,7 +6,7 @@ import os
 import shlex
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import field
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -21,7 +21,6 @@ from envhub_sandbox.errors import (
 from envhub_sandbox.hub.cache import cache_root
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.session.author_lines import add_author_line
-from envhub_sandbox.session.crash.bundle_writer import Crash, write_bundle
 from envhub_sandbox.session.crash.history import Recording
 from envhub_sandbox.session.jails.loaded import LoadedJail
 from envhub_sandbox.session.recipe import Recipe, provenance_of
@@ -36,6 +35,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import LACKS_PACKAGES
 from envhub_worker.protocol.limits import WireLimits
 from envhub_worker.protocol.manifest.manifest import EnvManifest
+from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.runtime import RECORD, Runtime
 from envhub_worker.protocol.text import printable
 
@@ -193,6 +193,8 @@ class Repository:
             return
         manifest = None if loaded is None else loaded.manifest
         report = self.latest_report if loaded is None else loaded.jail.report
+        from envhub_sandbox.session.crash.bundle_writer import Crash, write_bundle
+
         crash = Crash(
             error=error,
             label=self.label,

@@ -8,8 +8,6 @@ An error names an option by its key (``option_name``). What reads a command line
 ``use_option_names``, so that errors use the words of that command line.
 """
 
-# ruff: noqa: RUF009  # _option() is dataclasses.field()
-
 from __future__ import annotations
 
 import contextlib
@@ -18,7 +16,7 @@ import operator
 import os
 import shlex
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import field, fields, replace
 from keyword import iskeyword
 from pathlib import Path
 from typing import Any
@@ -26,6 +24,7 @@ from typing import Any
 from envhub_sandbox.errors import PolicyError
 from envhub_worker.protocol.confinement import NETWORKS, PROFILES
 from envhub_worker.protocol.limits import MAX_NUM_ENVS
+from envhub_worker.protocol.records import dataclass
 
 _CODE, _LIMITS, _HUB = "How it is built", "What it may do", "Where it comes from"
 _LANES = ("auto", "frames")

@@ -6,13 +6,14 @@ that is out look alike. Its monitor knows; this turns what it says into errors.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import field
 from time import monotonic
 
 import zmq
 from zmq.utils import z85
 
 from envhub_sandbox.errors import EnvHubError, SandboxUnavailableError, WorkerDiedError
+from envhub_worker.protocol.records import dataclass
 
 CONNECT_S = 10.0
 """How long a server may take to answer at all, and to come back after the connection was lost."""

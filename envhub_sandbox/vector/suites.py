@@ -10,7 +10,6 @@ from typing import Any
 from gymnasium.vector import VectorEnv
 
 from envhub_sandbox.session.recipe import Recipe
-from envhub_sandbox.vector.html_repr import suites_html
 
 Envs = Mapping[str, Mapping[int | str, VectorEnv[Any, Any, Any]]]
 
@@ -80,6 +79,8 @@ class EnvSuites(dict[str, dict[Any, VectorEnv[Any, Any, Any]]]):
         return self._provenance()
 
     def _repr_html_(self) -> str:
+        from envhub_sandbox.vector.html_repr import suites_html
+
         return suites_html(self)
 
     def close(self) -> None:

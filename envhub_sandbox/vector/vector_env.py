@@ -24,7 +24,6 @@ from envhub_sandbox.transport.replies import typed_reply
 from envhub_sandbox.transport.results import StepResult
 from envhub_sandbox.transport.values import generators
 from envhub_sandbox.vector import from_manifest
-from envhub_sandbox.vector.html_repr import environment_html
 from envhub_sandbox.vector.sandbox_view import SandboxView
 from envhub_sandbox.vector.sub_environment import SubEnvironment
 from envhub_sandbox.vector.tracebacks import short_traceback, shortened
@@ -412,6 +411,8 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         return f"SandboxVectorEnv({self._session.repository.label}, num_envs={self.num_envs})"
 
     def _repr_html_(self) -> str:
+        from envhub_sandbox.vector.html_repr import environment_html
+
         return environment_html(self, self.sandbox.report())
 
     __html__ = _repr_html_

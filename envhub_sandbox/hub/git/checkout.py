@@ -14,12 +14,12 @@ import re
 import shutil
 import subprocess
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 from envhub_sandbox.errors import SnapshotError
 from envhub_sandbox.system.log import SNAPSHOT
+from envhub_worker.protocol.records import dataclass
 
 TIMEOUT_S = 20.0
 """For git: a hostile pattern in ``.gitignore`` can take for ever."""

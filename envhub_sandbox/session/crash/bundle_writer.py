@@ -25,7 +25,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -40,6 +40,7 @@ from envhub_sandbox.system import folders
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.codec.inert import inert_copy, one_line
+from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.stream import pack_packet
 from envhub_worker.protocol.text import printable
 

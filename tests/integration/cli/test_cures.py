@@ -6,10 +6,9 @@ import re
 from pathlib import Path
 
 import pytest
-import typer
 
 from envhub_sandbox import make_env
-from envhub_sandbox.cli.app import app
+from envhub_sandbox.cli.app import whole_command
 from envhub_sandbox.errors import EnvHubError
 from tests.support.command_line import envhub
 from tests.support.repositories import write_repository
@@ -24,8 +23,7 @@ EXTRA = """--dependencies '{"extra": ["NAME-OF-THE-PACKAGE"]}'"""
 
 def options_of(command: str) -> set[str]:
     """Those that a command has."""
-    made = typer.main.get_command(app).commands[command]  # type: ignore[attr-defined]
-    return {option for one in made.params for option in one.opts}
+    return {option for one in whole_command(command).params for option in one.opts}
 
 
 def said(command: str, *arguments: str | Path) -> str:

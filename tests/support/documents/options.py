@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 import typer
 
-from envhub_sandbox.cli.app import app
+from envhub_sandbox.cli.app import app, functions
 from envhub_worker import cli
 from tests.support.documents.written import DOCS, filled
 
@@ -26,7 +26,7 @@ Row = tuple[str, str, str]
 
 def document() -> str:
     """What the file has to hold."""
-    parts = [*_commands("envhub", app)]
+    parts = [*_commands()]
     for name in sorted(module.name for module in pkgutil.iter_modules(cli.__path__)):
         module = importlib.import_module(f"{cli.__name__}.{name}")
         if hasattr(module, "add_arguments") and name != "serve":
@@ -35,16 +35,12 @@ def document() -> str:
     return filled(DOCUMENT, written="\n".join(parts))
 
 
-def _commands(name: str, tree: typer.Typer) -> Iterator[str]:
-    """The commands of a program, and those that are below others."""
-    for one in tree.registered_commands:
-        function = one.callback
-        assert function is not None
-        rows = list(_options(function))
-        yield from _part(f"{name} {one.name or function.__name__}", function.__doc__, rows)
-    for group in tree.registered_groups:
-        assert group.typer_instance is not None
-        yield from _commands(f"{name} {group.name}", group.typer_instance)
+def _commands() -> Iterator[str]:
+    """The commands of the program, and those that are below others."""
+    for name in typer.main.get_command(app).commands:  # type: ignore[attr-defined]
+        for one, function in functions(name).items():
+            words = name if one == name else f"{name} {one}"
+            yield from _part(f"envhub {words}", function.__doc__, list(_options(function)))
 
 
 def _part(name: str, what: str | None, rows: list[Row]) -> Iterator[str]:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import ast
 import inspect
 import re
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,7 +18,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 import envhub_sandbox.cli
-from envhub_sandbox.cli.app import app
+from envhub_sandbox.cli.app import app, functions, whole_command
 from envhub_sandbox.cli.shared.console import neutralised, out, say, show_rows
 from tests.support.output.ci import obeyed
 
@@ -25,7 +27,7 @@ _WIDTH = 80
 
 def commands() -> Iterator[tuple[str, Any]]:
     """Every command, and those below others, by the words that call it."""
-    waiting = [("", typer.main.get_command(app))]
+    waiting = [(name, whole_command(name)) for name in LISTED]
     while waiting:
         name, command = waiting.pop()
         below = getattr(command, "commands", {})
@@ -34,6 +36,7 @@ def commands() -> Iterator[tuple[str, Any]]:
             yield name, command
 
 
+LISTED = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 _COMMANDS = dict(commands())
 
 
@@ -49,6 +52,24 @@ def help_of(name: str, width: int = _WIDTH) -> str:
 def plain(text: str) -> str:
     """Text without the boxes around it, and with single spaces."""
     return " ".join(re.sub("[│╭╮╰╯─]", " ", text).split())
+
+
+@pytest.mark.parametrize("name", LISTED)
+def test_the_list_of_commands_has_the_first_line_of_each(name: str) -> None:
+    """It stands there once more, so that the list imports no command."""
+    whole = whole_command(name)
+    assert LISTED[name].help == whole.help.partition("\n\n")[0]
+    assert set(functions(name)) == set(getattr(whole, "commands", {name: whole}))
+
+
+def test_a_list_of_commands_imports_none() -> None:
+    """Nor what they need."""
+    shown = (
+        "import sys\nfrom typer.testing import CliRunner\nfrom envhub_sandbox.cli.app import app\n"
+        "assert 'doctor' in CliRunner().invoke(app, ['--help']).output\n"
+        "sys.exit(bool({'envhub_sandbox.cli.run', 'numpy', 'yaml'} & set(sys.modules)))"
+    )
+    assert subprocess.run([sys.executable, "-c", shown]).returncode == 0
 
 
 @pytest.mark.parametrize("name", _COMMANDS)

@@ -6,14 +6,13 @@ from dataclasses import fields
 from pathlib import Path
 
 import pytest
-import typer
 from typer.testing import CliRunner, Result
 
 from envhub_sandbox.check.many.entries import ListEntry
 from envhub_sandbox.check.many.judgements import Outcome
 from envhub_sandbox.check.many.results import Result as Judgement
 from envhub_sandbox.check.many.results import Verdict
-from envhub_sandbox.cli.app import app
+from envhub_sandbox.cli.app import app, whole_command
 from envhub_sandbox.cli.check import list_run
 from envhub_sandbox.cli.check.check import check
 from envhub_sandbox.cli.check.options import OF_A_LIST, SETTINGS
@@ -98,9 +97,7 @@ def test_a_file_says_what_one_may_type_about_a_list(
 
 def test_every_option_is_handed_on_or_about_the_list() -> None:
     """A new one is handed on by itself."""
-    command = typer.main.get_command(app)
-    [found] = [one for name, one in command.commands.items() if name == "check"]  # type: ignore[attr-defined]
-    names = {one.name for one in found.params}
+    names = {one.name for one in whole_command("check").params}
     of_the_list = list_run.OF_THE_LIST
     assert names > of_the_list
     assert names > set(SETTINGS)
