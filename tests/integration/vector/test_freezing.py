@@ -1,7 +1,7 @@
 """LeRobot's rollouts: a sub-environment whose episode has ended does nothing until the next one.
 
-The oracle is what LeRobot's ``FreezeAfterEpisodeEnd`` does around each sub-environment, here in the
-fewest words; ``tests/lerobot`` compares with that class itself.
+The oracle is what LeRobot's ``FreezeAfterEpisodeEnd`` does around each sub-environment;
+``tests/lerobot`` compares with that class itself.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
@@ -17,6 +16,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from envhub_sandbox import make_env
 from tests.support.compare import assert_same
 from tests.support.repositories import write_repository
+from tests.support.samples import Frozen
 
 pytestmark = pytest.mark.short
 
@@ -66,28 +66,6 @@ def make_env(n_envs=1, use_async_envs=False, mode="NextStep"):
     kind = gym.vector.AsyncVectorEnv if use_async_envs else gym.vector.SyncVectorEnv
     return kind(fns, autoreset_mode=gym.vector.AutoresetMode(mode))
 """
-
-
-class Frozen(gym.Wrapper[Any, Any, Any, Any]):
-    """What LeRobot does: the last transition once more, without its reward."""
-
-    over: Any = None
-
-    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        """The last observation, unless a rollout begins."""
-        if self.over and not (options or {}).get("lerobot_new_rollout"):
-            return self.over[0], self.over[4]
-        self.over = None
-        return self.env.reset(seed=seed, options=options)
-
-    def step(self, action: Any) -> Any:
-        """The last transition, if there is one."""
-        if self.over:
-            return self.over
-        result = self.env.step(action)
-        if result[2] or result[3]:
-            self.over = (result[0], 0.0, *result[2:])
-        return result
 
 
 @pytest.fixture(scope="module")
