@@ -183,6 +183,12 @@ CHECKS: dict[str, Check] = {
             "Where it renders frames, metadata['render_fps'] says how many make a second.",
             "Set metadata['render_fps'] to a number; LeRobot and RecordVideo read it.",
         ),
+        _note(
+            "lerobot",
+            "LeRobot's policies can play it, beside loops of Gymnasium's vector environments.",
+            "Nothing, where it is not for LeRobot; else see what `envhub init --lerobot` writes: "
+            "agent_pos and pixels to observe, a Box of one dimension to act, _max_episode_steps.",
+        ),
         _warning(
             "slow-steps",
             "Half of the steps take no longer than --slow-step says: a second.",

@@ -235,7 +235,7 @@ def _seconds(name: str, value: Any) -> None:
 def _gpu(value: object) -> bool | tuple[int, ...]:
     if isinstance(value, bool):
         return value
-    indices = value if isinstance(value, (list, tuple)) else ()
+    indices = _members(value) or ()
     if not indices or any(type(index) is not int or index < 0 for index in indices):
         raise PolicyError(
             f"{option_name('gpu')} is {value!r}; it takes True, False or a list of indices"
@@ -247,10 +247,16 @@ _OPTIONAL_LIMITS = frozenset({"cpu_time_s", "file_bytes"})
 
 
 def _texts(name: str, value: object) -> tuple[str, ...]:
-    # a plain str is a sequence too, of letters
-    if not isinstance(value, (list, tuple)) or not all(isinstance(item, str) for item in value):
-        raise PolicyError(f"{option_name(name)} is {value!r}; it takes a tuple of strings")
-    return tuple(value)
+    members = _members(value)
+    if members is None or not all(isinstance(item, str) for item in members):
+        raise PolicyError(f"{option_name(name)} is {value!r}; it takes a list of strings")
+    return members
+
+
+def _members(value: object) -> tuple[Any, ...] | None:
+    """Those of any sequence, such as a list of a configuration of Hydra's; a text is none here."""
+    is_list = isinstance(value, Sequence) and not isinstance(value, (str, bytes))
+    return tuple(value) if is_list else None  # type: ignore[arg-type]
 
 
 def _checked(limits: Limits) -> Limits:

@@ -116,7 +116,9 @@ def choose(
     if found:
         raise ValueError(f"there are {len(found)} environments; choose one: {_names(found)}")
     there = _names(_named(suites, None, lambda _: True))
-    raise ValueError(f"there is no suite {suite!r} with a task {task!r}; there are: {there}")
+    named = [("suite", suite), ("task", task)]
+    wanted = " with a ".join(f"{word} {name!r}" for word, name in named if name is not None)
+    raise ValueError(f"there is no {wanted}; there are: {there}")
 
 
 def keep_only(suites: EnvSuites, suite: str | None = None, task: int | str | None = None) -> None:

@@ -18,6 +18,7 @@ _ENTRIES = {**HONEST, **FAULTS}
 _ELSEWHERE = {
     "card": "test_findings.py",
     "deadline": "test_deadline.py",
+    "lerobot": "test_findings.py",
     "licence": "test_findings.py",
     "limits-reached": "test_judged.py",
     "pinned": "test_survey_clones.py",

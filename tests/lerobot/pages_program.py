@@ -16,9 +16,11 @@ from typing import Any
 
 import numpy as np
 import torch
+from gymnasium.vector import SyncVectorEnv
 from lerobot.configs import parser
 from lerobot.configs.eval import EvalPipelineConfig
 from lerobot.configs.train import TrainPipelineConfig
+from lerobot.envs import utils
 from lerobot.envs.configs import EnvConfig, IsaaclabArenaEnv
 from lerobot.envs.factory import make_env
 from lerobot.envs.utils import env_to_policy_features, preprocess_observation
@@ -28,6 +30,7 @@ from envhub_sandbox import make_env as sandboxed
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.integrations import lerobot_eval
 from envhub_sandbox.integrations.lerobot.config import SpareSuites
+from tests.lerobot.repositories import REACH
 
 FOUND: dict[str, Any] = {}
 COMMITS: dict[str, str] = json.loads(sys.argv[1])
@@ -159,6 +162,68 @@ def said(make: Callable[[], object], words: str) -> bool:
     return False
 
 
+def said_once() -> None:
+    """What a command that cannot begin prints: one line, with the cure, and nothing of draccus."""
+    command = ["lerobot-eval", "--policy.type=act", "--env.type=envhub_sandbox"]
+    lines = []
+    for words in (
+        (),
+        ("--env.repo=robots/suites", "--env.suite=nera"),
+        ("--env.repo=robots/reach", '--env.policy={"profile": "lax"}'),
+    ):
+        try:
+            taken(*command, *words)
+        except SystemExit as error:
+            lines.append(str(error.code))
+    FOUND["said once"] = [
+        len(line.splitlines()) == 1 and cure in line
+        for line, cure in zip(
+            lines,
+            ("--env.repo=org/repo@<commit>", "['near'][0], ['near'][1]", "--env.policy: profile"),
+            strict=True,
+        )
+    ]
+
+
+def freezes() -> None:
+    """The repository's sub-environments in a rollout, beside the same in LeRobot's own wrapper."""
+    wrapper = getattr(utils, "FreezeAfterEpisodeEnd", None)
+    if wrapper is None:  # before 0.6
+        FOUND["freezes"] = True
+        return
+    names: dict[str, Any] = {}
+    exec(REACH, names)
+    os.environ.pop("REACHED")
+    lengths = (2, 5, 3)
+    theirs = SyncVectorEnv([lambda: wrapper(names["Reach"]())] * len(lengths))
+    envs = make_env("robots/reach", n_envs=len(lengths))
+    ours = envs["hub_env"][0]
+    for env in (theirs, ours):
+        env.set_attr("_max_episode_steps", list(lengths))
+    same = []
+    for rollout in range(2):
+        new = {utils.NEW_ROLLOUT_OPTION: True}
+        pairs = [env.reset(seed=rollout, options=dict(new)) for env in (theirs, ours)]
+        for _ in range(9):
+            same.append(alike(*pairs))
+            actions = theirs.action_space.sample()
+            pairs = [env.step(actions) for env in (theirs, ours)]  # type: ignore[misc]
+            same.append(alike(theirs.call("render"), ours.call("render")))
+    steps = [env.get_attr("steps") for env in (theirs, ours)]
+    FOUND["freezes"] = all(same) and steps == [lengths, lengths]
+    theirs.close()
+    envs.close()
+
+
+def alike(one: Any, other: Any) -> bool:
+    """Whether two results are the same, with shapes and dtypes."""
+    if isinstance(one, dict):
+        return list(one) == list(other) and all(alike(one[key], other[key]) for key in one)
+    if isinstance(one, tuple):
+        return len(one) == len(other) and all(map(alike, one, other))
+    return one.dtype == other.dtype and np.array_equal(one, other)
+
+
 def options() -> None:
     """What ``make_env`` takes and a configuration does not."""
     given = {item.name for item in fields(ours.SandboxedEnvConfig)}
@@ -250,8 +315,9 @@ if __name__ == "__main__":
         described,
         options,
         waits,
+        freezes,
         fails,
-        *((commands, written) if ours.config.ASKS_CONFIGS else ()),
+        *((commands, said_once, written) if ours.config.ASKS_CONFIGS else ()),
     ):
         part()
     FOUND["plugin"] = __import__("lerobot_env_envhub_sandbox").SandboxedEnvConfig.__name__

@@ -36,6 +36,8 @@ EXPECTED = {
     # how many, and async, LeRobot says itself; a token is nothing for what it prints and saves
     "not options": ["cfg", "n_envs", "token", "trust_remote_code", "use_async_envs"],
     "waits": [True, True, False],
+    # its rollouts, beside its own FreezeAfterEpisodeEnd
+    "freezes": True,
     "plugin": "SandboxedEnvConfig",
     # failures: the builtin errors that LeRobot would have raised
     "nothing": ["AttributeError"],
@@ -88,5 +90,6 @@ def test_the_pages_hold(olah: OlahServer, tmp_path: Path) -> None:
         ours = ["SandboxedEnvConfig", pinned, "act"]
         sandboxed = ["IsaaclabArenaEnv", None, "act"]
         assert found.pop("commands") == [ours, ours, sandboxed, ours]
+        assert found.pop("said once") == [True, True, True]
         assert (found.pop("misspelt"), found.pop("written")) == ("refused", ONE)
     assert found == EXPECTED

@@ -59,3 +59,25 @@ def reference(name: str, n_envs: int = 1, **env_kwargs: Any) -> gym.vector.Vecto
     if not isinstance(made, gym.vector.VectorEnv):
         raise TypeError(f"{name} gives a {type(made).__name__}, which is no single reference")
     return made
+
+
+class Frozen(gym.Wrapper[Any, Any, Any, Any]):
+    """What LeRobot does in its rollouts: the last transition once more, without its reward."""
+
+    over: Any = None
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        """The last observation, unless a rollout begins."""
+        if self.over and not (options or {}).get("lerobot_new_rollout"):
+            return self.over[0], self.over[4]
+        self.over = None
+        return self.env.reset(seed=seed, options=options)
+
+    def step(self, action: Any) -> Any:
+        """The last transition, if there is one."""
+        if self.over:
+            return self.over
+        result = self.env.step(action)
+        if result[2] or result[3]:
+            self.over = (result[0], 0.0, *result[2:])
+        return result

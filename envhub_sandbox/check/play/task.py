@@ -15,6 +15,7 @@ from gymnasium.error import CustomSpaceError
 
 from envhub_sandbox.check.findings import Report
 from envhub_sandbox.check.play import frames, leaks, traces
+from envhub_sandbox.check.play.lerobot import lerobot_lacks
 from envhub_sandbox.check.play.plays import Play, facts_of, film
 from envhub_sandbox.check.play.traces import Env, Trace
 from envhub_sandbox.check.settings import JudgeOptions
@@ -99,6 +100,7 @@ class TaskJudge:
             self._say("autoreset", first.notes["autoreset"])
         self._tell("rendering")
         self._render()
+        self._say("lerobot", lerobot_lacks(self._env))
         self._tell("one sub-environment by itself")
         self._alone()
         self._compare(first, mode)

@@ -24,6 +24,14 @@ def init(
         Path,
         typer.Argument(metavar="NAME", help="The new folder; its last part names the repository."),
     ],
+    lerobot: Annotated[
+        bool,
+        typer.Option(
+            "--lerobot",
+            help="Observe what LeRobot's policies are given: its evaluation"
+            " and its training play it.",
+        ),
+    ] = False,
 ) -> None:
     """Write a new environment's repository: env.py, requirements, card, licence, test, CI workflow.
 
@@ -32,7 +40,7 @@ def init(
     [bold]envhub init my-env && envhub run ./my-env --validate[/bold]
     """
     name = repository_name(folder)
-    _write(folder, starter(name, time.localtime().tm_year))
+    _write(folder, starter(name, time.localtime().tm_year, lerobot=lerobot))
     make_checkout(folder)
     shown = safe_line(str(folder) if folder.is_absolute() else f"./{folder}")
     out(shown)

@@ -24,7 +24,7 @@ class PuckEnv(gym.Env):
     """Observed are the puck's place and the goal's; the action is how far to push it."""
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 20}
-    observation_space = gym.spaces.Box(-1.0, 1.0, (2,), np.float32)
+    observation_space = $space
     action_space = gym.spaces.Box(-0.2, 0.2, (1,), np.float32)
     task_description = "push the puck to the goal"
 
@@ -51,7 +51,7 @@ class PuckEnv(gym.Env):
         return frame
 
     def _observation(self):
-        return np.array([self.puck, self.goal], np.float32)
+        return $observation
 
 
 def make_env(n_envs: int = 1, use_async_envs: bool = False) -> gym.vector.VectorEnv:
@@ -86,7 +86,7 @@ What it is about, in a sentence: push a puck along a line to its goal.
 
 | | |
 | --- | --- |
-| Observation | float32 `(2,)`: the puck's place and the goal's, from -1 to 1 |
+| Observation | $observed |
 | Action | float32 `(1,)`: how far to push, from -0.2 to 0.2 |
 | Reward | minus the distance |
 | Ends | at the goal (`is_success`), or after 50 steps |
@@ -97,7 +97,7 @@ from envhub_sandbox import make_env
 with make_env("OWNER/$name@COMMIT", n_envs=4) as suites:
     observations, infos = suites.env.reset(seed=0)
 ```
-
+$evaluated
 ## For its authors
 
 ```sh
@@ -189,12 +189,37 @@ _FILES = {
 }
 
 
-def starter(name: str, year: int) -> dict[str, str]:
+_PLACES = "np.array([self.puck, self.goal], np.float32)"
+_BOX = "gym.spaces.Box(-1.0, 1.0, (2,), np.float32)"
+_OBSERVED = "float32 `(2,)`: the puck's place and the goal's, from -1 to 1"
+_PLAIN = {"space": _BOX, "observation": _PLACES, "observed": _OBSERVED, "evaluated": ""}
+_FOR_LEROBOT = {
+    "space": f"""gym.spaces.Dict(
+        agent_pos={_BOX},
+        pixels=gym.spaces.Box(0, 255, (HEIGHT, WIDTH, 3), np.uint8),
+    )""",
+    "observation": f'{{"agent_pos": {_PLACES}, "pixels": self.render()}}',
+    "observed": f"`agent_pos`, {_OBSERVED}; `pixels`, uint8 `(32, 128, 3)`",
+    "evaluated": """
+With LeRobot:
+
+```sh
+lerobot-eval --env.discover_packages_path=envhub_sandbox.integrations.lerobot \\
+    --env.type=envhub_sandbox --env.repo=OWNER/$name@COMMIT --policy.path=OWNER/POLICY
+```
+""",
+}
+
+
+def starter(name: str, year: int, *, lerobot: bool = False) -> dict[str, str]:
     """The files of a new repository, by path.
 
     Args:
         name: The repository's, which the Hub would take.
         year: For the licence.
+        lerobot: Whether it observes what LeRobot's policies are given.
     """
     given = {"name": name, "year": str(year)}
+    chosen = _FOR_LEROBOT if lerobot else _PLAIN
+    given |= {key: Template(text).substitute(given) for key, text in chosen.items()}
     return {path: Template(text).substitute(given) for path, text in _FILES.items()}

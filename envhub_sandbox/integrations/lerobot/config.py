@@ -7,9 +7,11 @@ does not need, and ``lerobot-train`` refuses them altogether.
 from __future__ import annotations
 
 import json
+import sys
 import threading
 from collections.abc import Hashable
 from dataclasses import dataclass, field, fields
+from pathlib import Path
 from typing import Any
 
 import draccus
@@ -18,7 +20,7 @@ from lerobot.configs.default import EvalConfig
 from lerobot.configs.types import PolicyFeature
 from lerobot.envs.configs import EnvConfig
 
-from envhub_sandbox.errors import HubReferenceError
+from envhub_sandbox.errors import EnvHubError, HubReferenceError
 from envhub_sandbox.factory.make_env import make_env
 from envhub_sandbox.hub.logins import without_login
 from envhub_sandbox.integrations.lerobot.features import features_of
@@ -115,6 +117,15 @@ class SandboxedEnvConfig(EnvConfig):
     suite: str | None = None
 
     def __post_init__(self) -> None:
+        try:
+            self._open()
+        except (EnvHubError, ValueError, TypeError) as error:
+            if not _on_lerobots_command_line():
+                raise
+            # draccus catches these two, and prints a hundred lines of its own around them
+            sys.exit(f"{Path(sys.argv[0]).name}: {error}")
+
+    def _open(self) -> None:
         if not self.repo:
             raise ValueError("env.repo is missing: which repository? --env.repo=org/repo@<commit>")
         endpoint = self._options()["endpoint"]
@@ -199,6 +210,12 @@ class SandboxedEnvConfig(EnvConfig):
         own = [item.name for item in fields(SandboxedEnvConfig)]
         asked = {name: getattr(self, name) for name in own if not name.startswith("features")}
         return repr((n_envs, bool(use_async_envs), asked))
+
+
+def _on_lerobots_command_line() -> bool:
+    """Whether a program of LeRobot's makes this configuration of its arguments, or of its file."""
+    kind = parser.parse_arg("env.type")
+    return kind == "envhub_sandbox" or parser.parse_arg("config_path") is not None
 
 
 def _expected() -> tuple[int, bool]:

@@ -26,7 +26,7 @@ from tests.support.repositories import write_repository
 from tests.support.samples import EXAMPLES
 
 _BODY = """
-length = 10
+length = _max_episode_steps = 10
 
 def reward(self):
     return 1.0
@@ -34,7 +34,16 @@ def reward(self):
 def render(self):
     return np.zeros((4, 6, 3), np.uint8)
 """
-_HONEST = Entry(group="honest", env=_BODY).source()
+_BOX = "gym.spaces.Box(-100, 100, (2,), np.float32)"
+_PLACE = "np.array([self.at, self.count], np.float32)"
+_PLAIN = Entry(group="honest", env=_BODY).source()
+_HONEST = (
+    _PLAIN.replace(_BOX, f"gym.spaces.Dict(agent_pos={_BOX})")
+    .replace(_PLACE, f"{{'agent_pos': {_PLACE}}}")
+    .replace("gym.spaces.Discrete(3)", "gym.spaces.Box(0.0, 2.5, (1,), np.float32)")
+    .replace("int(action)", "int(action[0])")
+)
+"""What LeRobot's policies can play, too."""
 _MODES = """
     def __init__(self, render_mode):
         self.render_mode = render_mode or "rgb_array"
@@ -80,8 +89,23 @@ def test_an_honest_repository_passes(tmp_path: Path) -> None:
     assert len(play.memory) == play.played + 4, "and after each round of resets"
     assert play.film is not None
     assert play.film.stills[0] == png(np.zeros((4, 6, 3), np.uint8))
-    assert play.facts["observations"].startswith("Box(-100.0, 100.0, (2,)")
+    assert play.facts["observations"].startswith("Dict('agent_pos': Box(-100.0, 100.0, (2,)")
     assert report.asked["profile"] == "strict"
+
+
+def test_for_whom_it_is_playable_is_noted(tmp_path: Path) -> None:
+    """A note, which fails nothing: what LeRobot would miss, and who plays it all the same."""
+    text = _PLAIN.replace("length = _max_episode_steps = 10", "length = 10")
+    report = judged(repository(tmp_path / "walk", text), 2, resets=0)
+    [finding] = report.findings
+    assert (finding.id, report.failures(Severity.WARNING)) == ("lerobot", [])
+    for part in (
+        "loops of Gymnasium's",
+        "agent_pos, env",
+        "a vector (Box)",
+        "_max_episode_steps",
+    ):
+        assert part in finding.message
 
 
 _UNINSTALLED = "raise gym.error.DependencyNotInstalled('pygame is not installed')"
@@ -116,12 +140,10 @@ def test_each_mode_that_is_declared_is_rendered(tmp_path: Path) -> None:
 
 def test_a_space_of_its_own_is_no_finding(tmp_path: Path) -> None:
     """Its code is not here, and so nobody here says what is in it."""
-    space = "gym.spaces.Box(-100, 100, (2,), np.float32)"
-    own = f"gym.spaces.Dict({{'at': {space}, 'word': Words()}})"
+    own = f"gym.spaces.Dict({{'at': {_BOX}, 'word': Words()}})"
     words = "class Words(gym.spaces.Space):\n    shape, dtype = None, None\n\nclass Walk"
-    text = _HONEST.replace(space, own).replace("class Walk", words, 1)
-    given = "np.array([self.at, self.count], np.float32)"
-    text = text.replace(given, f"{{'at': {given}, 'word': 'left'}}")
+    text = _HONEST.replace(_BOX, own).replace("class Walk", words, 1)
+    text = text.replace(_PLACE, f"{{'at': {_PLACE}, 'word': 'left'}}")
     assert judged(repository(tmp_path / "walk", text)).findings == []
 
 

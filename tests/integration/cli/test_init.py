@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from envhub_sandbox.check.judge import judge
+from envhub_sandbox.check.settings import JudgeOptions
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.cli.init.init import repository_name
 from envhub_sandbox.cli.init.starter import starter
@@ -56,6 +58,18 @@ def test_a_new_repository_passes_its_own_tests(tmp_path: Path) -> None:
     done = pytest_run(folder, "--strict-markers", "--envhub-ref", ".")
     assert done.returncode == 0, done.stdout
     assert "3 passed" in done.stdout
+
+
+@pytest.mark.parametrize("option", [[], ["--lerobot"]])
+def test_what_it_writes_is_judged_as_it_was_asked_for(tmp_path: Path, option: list[str]) -> None:
+    """With --lerobot its policies can play it; else a note of ``check`` says that they cannot."""
+    made = run(tmp_path, *COMMAND, "init", "my-env", *option)
+    assert made.returncode == 0, made.stderr
+    asked = JudgeOptions(reference=str(tmp_path / "my-env"), arguments={"n_envs": 2}, steps=20)
+    found = {one.id for one in judge(asked).findings}
+    assert found == (set() if option else {"lerobot"})
+    card = (tmp_path / "my-env" / "README.md").read_text()
+    assert ("lerobot-eval --env.discover" in card, "$" in card) == (bool(option), False)
 
 
 _MORE = """

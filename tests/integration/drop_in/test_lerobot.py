@@ -10,7 +10,7 @@ import pytest
 from envhub_sandbox import make_env
 from tests.support.compare import assert_same
 from tests.support.repositories import write_repository
-from tests.support.samples import make_env_of, reference, sample
+from tests.support.samples import Frozen, make_env_of, reference, sample
 
 pytestmark = pytest.mark.same_for("users")
 
@@ -51,12 +51,12 @@ def repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
 @pytest.mark.parametrize("use_async_envs", [False, True])
 def test_rollout_is_the_same(mode: str, use_async_envs: bool) -> None:
-    """Every tensor that a rollout stacks is equal, tasks and frames included."""
+    """Every tensor is equal to those of LeRobot's wrapper, tasks and frames included."""
     kwargs = {"autoreset_mode": mode}
     frames: tuple[list[Any], list[Any]] = ([], [])
-    expected = lerobot.rollout(
-        reference("lerobot_pendulum", 3, **kwargs), policy, [4, 5, 6], frames[0]
-    )
+    plain: Any = reference("lerobot_pendulum", 3, **kwargs)
+    plain.envs = [Frozen(one) for one in plain.envs]
+    expected = lerobot.rollout(plain, policy, [4, 5, 6], frames[0])
     made = make_env(
         sample("lerobot_pendulum"), n_envs=3, use_async_envs=use_async_envs, env_kwargs=kwargs
     )

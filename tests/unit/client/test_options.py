@@ -16,6 +16,7 @@ from envhub_sandbox.factory import sandbox_spec
 from envhub_sandbox.factory.config import plain_config
 from envhub_sandbox.hub import snapshot
 from envhub_sandbox.settings.options import Options
+from envhub_worker.protocol.messages import CONFIG_CLASS
 from tests.support import inside
 from tests.support.samples import sample
 
@@ -115,8 +116,13 @@ class _Config:
 
 def test_properties_of_a_config_cross() -> None:
     """A repository that reads ``cfg.type`` works here as it does in LeRobot."""
-    read = {"hub_path": "org/repo", "task": "push", "inner": {"size": 3}, "type": "hub"}
-    assert plain_config(_Config()) == read
+    made = plain_config(_Config())
+    names, fields, computed = made.pop(CONFIG_CLASS)  # type: ignore[misc]
+    inner: Any = made.pop("inner")
+    assert (made, inner["size"]) == ({"hub_path": "org/repo", "task": "push"}, 3)
+    assert inner[CONFIG_CLASS][0][0][1] == type(_Config().inner).__qualname__
+    assert (names[0][1], computed) == ("_Config", {"type": "hub"})
+    assert fields == ("hub_path", "task", "inner")
 
 
 def test_a_folder_written_like_a_repository_gets_a_hint(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import UserList
 from pathlib import Path
 from typing import Any
 
@@ -61,7 +62,7 @@ def test_unknown_names_are_refused(make: Any, complaint: str) -> None:
         (lambda: Policy(gpu=[True]), "gpu is"),
         (lambda: Policy(gpu=[-1]), "gpu is"),
         (lambda: Policy(gpu=1), "gpu is 1; it takes True, False or"),  # type: ignore[arg-type]
-        (lambda: Policy(readable="/data"), "readable is '/data'; it takes a tuple"),  # type: ignore[arg-type]
+        (lambda: Policy(readable="/data"), "readable is '/data'; it takes a list"),  # type: ignore[arg-type]
         (lambda: Policy(environment="HOME"), "environment is 'HOME'"),  # type: ignore[arg-type]
         (lambda: Policy(environment=(1,)), "environment is"),  # type: ignore[arg-type]
         (lambda: Policy(limits=5), "limits takes a Limits, not int"),  # type: ignore[arg-type]
@@ -190,3 +191,13 @@ def test_sizes_may_have_a_unit() -> None:
     assert (policy.limits.memory_bytes, policy.limits.disk_bytes) == (4 << 30, 512 << 20)
     with pytest.raises(PolicyError, match="processes is '4K'"):
         policy_from(None, {"processes": "4K"})
+
+
+def test_lists_of_any_class_are_lists() -> None:
+    """A configuration of Hydra's has ``ListConfig``, which is a sequence and no list."""
+    names = {"environment": ["HF_HOME"], "readable": ["/srv"], "gpu": [1]}
+    made = policy_from({name: UserList(given) for name, given in names.items()}, None)
+    assert (made.environment, made.readable, made.gpu) == (("HF_HOME",), ("/srv",), (1,))
+    for text in ("HF_HOME", b"HF_HOME"):
+        with pytest.raises(PolicyError, match="takes a list of strings"):
+            Policy(environment=text)  # type: ignore[arg-type]

@@ -259,6 +259,11 @@ class Runner:
 
     def _found(self, request: m.GetOne | m.CallOne) -> Any:
         one, depth = self._one(request), request.depth
+        env, index = self._envs[request.env], request.index
+        if isinstance(env, SubEnvs) and depth in (0, -1) and index is not None:
+            method = env.freezing_method(index, request.name)
+            if method is not None:
+                return method
         if depth is None:
             return getattr(one.unwrapped, request.name)
         if depth < 0:

@@ -19,6 +19,7 @@ from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES
+from envhub_worker.runner.freezing import DRIVES, FreezingEnv, announces_rollout
 from envhub_worker.runner.gymnasium_compat import SyncBase
 from envhub_worker.runner.infos import Pairs, join
 
@@ -101,6 +102,7 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         reward_shape: Of one sub-environment's reward; ``()`` but for multi-objective ones.
         sliced: Whether there are others elsewhere, in other processes.
         pairs: The infos of the last reset or step, as each sub-environment gave them.
+        driven: What is reset, stepped and drawn: ``envs``, or what freezes them.
     """
 
     def __init__(
@@ -115,6 +117,7 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         # AsyncVectorEnv stacks vector rewards, SyncVectorEnv refuses them
         self.reward_shape = () if sync else _reward_shape(self.envs[0])
         self.batch = Batch(self.single_observation_space, self.num_envs, self.reward_shape)
+        self.driven: Sequence[Any] = self.envs
         self._done = [False] * self.num_envs
         self._flagged: list[int] = []  # whose flags are not both False
         self._mode = autoreset_mode
@@ -135,11 +138,13 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         for index in chosen:
             self._done[index] = False
             self.batch.terminations[index] = self.batch.truncations[index] = False
+        if self.driven is self.envs and announces_rollout(options):
+            self.driven = [FreezingEnv(one) for one in self.envs]
         infos: Pairs = []
         self.pairs = infos
         for index in chosen:
             seed = None if seeds is None else seeds[index]
-            observation, info = self.envs[index].reset(seed=seed, options=options)
+            observation, info = self.driven[index].reset(seed=seed, options=options)
             self.batch.store(index, observation)
             if info:
                 infos.append((index, info))
@@ -182,7 +187,7 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         infos: Pairs = []
         self.pairs = infos
         index = 0
-        each = zip(range(count), self._each(actions), self.envs, self._done, rows, strict=True)
+        each = zip(range(count), self._each(actions), self.driven, self._done, rows, strict=True)
         try:
             for index, action, env, over, row in each:
                 if over:
@@ -216,6 +221,21 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         batch.stay()
         self._done = done
         return infos
+
+    def render(self) -> Any:
+        """One frame each."""
+        return super().render() if self.driven is self.envs else self.call("render")
+
+    def call(self, name: str, *args: Any, **kwargs: Any) -> Any:
+        """As ``SyncVectorEnv.call``."""
+        if name == "render" and self.driven is not self.envs and not (args or kwargs):
+            return tuple(one.render() for one in self.driven)
+        return super().call(name, *args, **kwargs)
+
+    def freezing_method(self, index: int, name: str) -> Any:
+        """``reset``, ``step`` or ``render`` of one, where it freezes at the end; else None."""
+        freezes = self.driven is not self.envs and name in DRIVES
+        return getattr(self.driven[index], name) if freezes else None
 
     def joined(self, pairs: Pairs) -> dict[Any, Any]:
         """Infos of these sub-environments as one."""
