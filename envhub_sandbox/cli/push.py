@@ -135,9 +135,9 @@ def _publish(
     from dataclasses import replace
 
     from envhub_sandbox.errors import SnapshotIntegrityError
-    from envhub_sandbox.hub.client import HubClient, Repository, checked_endpoint, checked_token
+    from envhub_sandbox.hub.client import HubClient, checked_endpoint, checked_token
     from envhub_sandbox.hub.hashing import differing
-    from envhub_sandbox.hub.listing import DEFAULT_LIMITS, listing_within_limits
+    from envhub_sandbox.hub.listing import DEFAULT_LIMITS, Repository, listing_within_limits
 
     hub = HubClient(checked_endpoint(make["endpoint"]), checked_token(make["token"]))
     repo = Repository(target.repo_type or "model", target.repo_id)

@@ -43,7 +43,9 @@ def make_env(
     """Make the vector environments of a repository, without its code entering this process.
 
     Args:
-        cfg: A hub reference (``"org/repo@commit:path"``), a local folder (``"./my-env"``), a
+        cfg: A hub reference (``"org/repo@commit:path"``), one of git
+            (``"github:org/repo@commit:path"``), an id that a package registers
+            (``"pypi:minigrid@3.0.0#MiniGrid-Empty-5x5-v0"``), a local folder (``"./my-env"``), a
             ``.py`` file that is here (``"env.py"``), or a ``HubEnvConfig``-like object with
             ``hub_path``, whose ``vars()`` and public properties the repository's ``make_env``
             gets as ``cfg``.

@@ -18,15 +18,15 @@ from dataclasses import field
 from importlib import import_module
 from pathlib import Path
 from traceback import walk_tb
-from typing import Any, NamedTuple
+from typing import Any
 from urllib.parse import parse_qsl, quote, urlsplit
 
 from envhub_sandbox.errors import HubReferenceError, SnapshotError, SnapshotIntegrityError
 from envhub_sandbox.hub.answers import HostileAnswerError, bounded_body, guarded, streamed
 from envhub_sandbox.hub.failures import chain, conceal, explain
 from envhub_sandbox.hub.grammar import is_commit
-from envhub_sandbox.hub.hashing import GIT_SHA1, SHA256
-from envhub_sandbox.hub.listing import FileRecord
+from envhub_sandbox.hub.hashing import GIT_SHA1, SHA256, HashMismatch, copy_verified
+from envhub_sandbox.hub.listing import Copier, FileRecord, Repository
 from envhub_sandbox.hub.logins import authorization, login_of, without_login
 from envhub_worker.protocol.records import dataclass
 
@@ -36,13 +36,6 @@ _xet_switch = threading.Lock()
 _WORKERS = 8
 MAX_IDLE_PAGES = 1000
 """Pages of a listing in a row without a file: folders alone can fill some."""
-
-
-class Repository(NamedTuple):
-    """A repository's type and name."""
-
-    repo_type: str
-    repo_id: str
 
 
 def default_endpoint() -> str:
@@ -124,6 +117,11 @@ class HubClient:
                 )
             yield from found
             query = _next_page(following, query)
+
+    @contextmanager
+    def files(self, repo: Repository, commit: str) -> Iterator[_HubFiles]:
+        """The files of a commit."""
+        yield _HubFiles(self, repo, commit)
 
     def download(self, repo: Repository, commit: str, paths: Sequence[str]) -> Path:
         """Download these files into the Hub cache; the folder of the commit there.
@@ -234,6 +232,46 @@ class HubClient:
         login = login_of(self.endpoint)
         secrets = (token, *self._login().values(), login and login[1])
         return tuple(secret for secret in secrets if secret)
+
+
+@dataclass(frozen=True)
+class _HubFiles:
+    """The files of a commit at the Hub."""
+
+    hub: HubClient
+    repo: Repository
+    commit: str
+
+    @property
+    def listing(self) -> Iterator[FileRecord]:
+        return self.hub.listing(self.repo, self.commit)
+
+    def copier(self, files: Sequence[FileRecord], title: str) -> Copier:
+        folder = self.hub.download(self.repo, self.commit, [file.path for file in files])
+
+        def copy(record: FileRecord, target: Path) -> None:
+            try:
+                copy_verified(folder / record.path, target, record)
+            except HashMismatch:
+                # The Hub cache may hold an edited or half-written file: once more, from the Hub.
+                target.unlink(missing_ok=True)
+                again = self.hub.download_again(self.repo, self.commit, record.path)
+                _copy_or_refuse(title, again, target, record)
+
+        return copy
+
+
+def _copy_or_refuse(title: str, source: Path, target: Path, record: FileRecord) -> None:
+    try:
+        copy_verified(source, target, record)
+    except HashMismatch as mismatch:
+        raise SnapshotIntegrityError(
+            f"{title}: the file {record.path!r} came with other content than the "
+            f"commit's listing says: {mismatch.found}, not {record.size} bytes with "
+            f"{record.digest}. Nothing of it was used. A proxy, a mirror or the Hub cache "
+            f"changes files: try another network or endpoint, and remove the bad copy: "
+            f"rm '{source}'"
+        ) from mismatch
 
 
 def _next_page(url: str | None, query: dict[str, str]) -> dict[str, str] | None:

@@ -7,10 +7,11 @@ so both are judged before anything is downloaded.
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 from envhub_sandbox.errors import PolicyError, SnapshotError, SnapshotTooLargeError
 from envhub_sandbox.hub.grammar import Parts, has_control_characters, join
@@ -35,6 +36,42 @@ class FileRecord:
     path: str
     size: int
     digest: str
+
+
+Copier = Callable[[FileRecord, Path], None]
+"""Writes the file of a record; raises unless it wrote what the record says."""
+
+
+class Repository(NamedTuple):
+    """A repository's type and name."""
+
+    repo_type: str
+    repo_id: str
+
+
+class CommitFiles(Protocol):
+    """The files of a commit at a host."""
+
+    @property
+    def listing(self) -> Iterator[FileRecord]:
+        """What there is, before anything of it is believed."""
+
+    def copier(self, files: Sequence[FileRecord], title: str) -> Copier:
+        """Bring these files, and give what copies each into the store."""
+
+
+class RepositoryHost(Protocol):
+    """Where repositories are: the Hub, or a host of git. Every method raises ``HubFailure``."""
+
+    @property
+    def public_endpoint(self) -> str:
+        """Its address, without a login."""
+
+    def resolve(self, repo: Repository, revision: str | None) -> str:
+        """The full commit that a revision is now."""
+
+    def files(self, repo: Repository, commit: str) -> AbstractContextManager[CommitFiles]:
+        """The files of a commit, as long as the context lasts."""
 
 
 @dataclass(frozen=True)

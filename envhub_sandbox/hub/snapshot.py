@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
@@ -22,13 +22,15 @@ from envhub_sandbox.errors import (
     SnapshotIntegrityError,
 )
 from envhub_sandbox.hub import store as store
-from envhub_sandbox.hub.client import HubClient, Repository, checked_endpoint, checked_token
+from envhub_sandbox.hub.client import HubClient, checked_endpoint, checked_token
 from envhub_sandbox.hub.failures import ABSENT, UNREACHABLE, HubFailure, Kind
 from envhub_sandbox.hub.git import address
-from envhub_sandbox.hub.hashing import GIT_SHA1, SHA256, HashMismatch, copy_verified, write_verified
+from envhub_sandbox.hub.hashing import SHA256
 from envhub_sandbox.hub.listing import (
     DEFAULT_LIMITS,
     FileRecord,
+    Repository,
+    RepositoryHost,
     Snapshot,
     SnapshotLimits,
     check_listing_names,
@@ -156,15 +158,15 @@ def _candidates(
 ) -> Sequence[_Candidate]:
     """As what it may be read; the last three are of the Hub alone."""
     if ref.repo_type == address.KIND:
+        from envhub_sandbox.hub.git.host import GitHost
+
         scheme, _, rest = ref.repo_id.partition("://")
-        host, _, name = rest.partition("/")
-        return [_GitCandidate(ref, Repository(address.KIND, name), f"{scheme}://{host}", limits)]
+        place, _, name = rest.partition("/")
+        host = GitHost(f"{scheme}://{place}")
+        return [_Candidate(ref, Repository(address.KIND, name), host, limits)]
     hub = HubClient(checked_endpoint(endpoint), checked_token(token), hub_cache_dir)
     kinds = (ref.repo_type,) if ref.repo_type else ("model", "space")
-    return [
-        _HubCandidate(ref, Repository(kind, ref.repo_id), hub.public_endpoint, limits, hub)
-        for kind in kinds
-    ]
+    return [_Candidate(ref, Repository(kind, ref.repo_id), hub, limits) for kind in kinds]
 
 
 def _first(candidates: Sequence[_Candidate], ask: Callable[[_Candidate], T]) -> T:
@@ -184,7 +186,7 @@ def _unavailable(
     candidates: Sequence[_Candidate], failures: list[HubFailure]
 ) -> RepositoryUnavailableError:
     """One error for all that was tried; the furthest attempt gives the advice."""
-    ref, endpoint = candidates[0].ref, candidates[0].endpoint
+    ref, endpoint = candidates[0].ref, candidates[0].host.public_endpoint
     whats = "; and ".join(dict.fromkeys(failure.what for failure in failures))
     best = next((f for f in failures if f.kind is not Kind.NO_REPOSITORY), failures[0])
     advice = best.advice
@@ -269,21 +271,17 @@ def _by_content(
 
 @dataclass(frozen=True)
 class _Candidate:
-    """A reference read as a repository of one type. Raises ``HubFailure`` and ``SnapshotError``.
-
-    Attributes:
-        endpoint: The host that is asked, without a login.
-    """
+    """A reference read as a repository of one type. Raises ``HubFailure`` and ``SnapshotError``."""
 
     ref: HubRef
     repo: Repository
-    endpoint: str
+    host: RepositoryHost
     limits: SnapshotLimits
 
     @property
     def folder(self) -> Path:
         """Where the repository's commits lie in the store."""
-        return store.repository_folder(self.endpoint, *self.repo)
+        return store.repository_folder(self.host.public_endpoint, *self.repo)
 
     def stored(self) -> Snapshot | None:
         """The pinned commit, if it is in the store. No request. Raises ``HalfDeletedError``."""
@@ -304,42 +302,29 @@ class _Candidate:
 
     def resolved(self) -> str:
         """The commit that the revision is at the host now."""
-        commit = self._resolved()
+        commit = self.host.resolve(self.repo, self.ref.revision)
         if self.ref.is_pinned and commit != self.ref.revision:
             raise SnapshotIntegrityError(
-                f"{self.ref}: {self.endpoint} answered with another commit, {commit}, "
+                f"{self.ref}: {self.host.public_endpoint} answered with another commit, {commit}, "
                 "than the pinned one. Do not trust this endpoint; use another"
             )
         return commit
 
-    def _resolved(self) -> str:
-        raise NotImplementedError
-
     def _bring(self, slot: store.Slot) -> None:
-        raise NotImplementedError
+        with self.host.files(self.repo, slot.commit) as source:
+            files = listing_within_limits(source.listing, self.limits, slot.title)
+            check_listing_names(files, slot.title)
+            self._require_entry(files)
+            size = sum(file.size for file in files)
+            SNAPSHOT.info("%s: downloading %d files, %d bytes", slot.title, len(files), size)
+            note = {"endpoint": self.host.public_endpoint, **self.repo._asdict()}
+            note["revision"] = None if self.ref.is_pinned else self.ref.revision or "main"
+            store.publish(slot, files, source.copier(files, slot.title), note)
+        SNAPSHOT.info("%s: verified, and in the store", slot.title)
 
     def _slot(self, commit: str) -> store.Slot:
-        title = f"{'/'.join(self.repo)}@{commit} on {self.endpoint}"
+        title = f"{'/'.join(self.repo)}@{commit} on {self.host.public_endpoint}"
         return store.Slot(self.folder, commit, title)
-
-    def _judged(self, slot: store.Slot, listing: Iterable[FileRecord]) -> tuple[FileRecord, ...]:
-        files = listing_within_limits(listing, self.limits, slot.title)
-        check_listing_names(files, slot.title)
-        self._require_entry(files)
-        size = sum(file.size for file in files)
-        SNAPSHOT.info("%s: downloading %d files, %d bytes", slot.title, len(files), size)
-        return files
-
-    def _publish(
-        self,
-        slot: store.Slot,
-        files: tuple[FileRecord, ...],
-        copy: Callable[[FileRecord, Path], None],
-    ) -> None:
-        note = {"endpoint": self.endpoint, **self.repo._asdict()}
-        note["revision"] = None if self.ref.is_pinned else self.ref.revision or "main"
-        store.publish(slot, files, copy, note)
-        SNAPSHOT.info("%s: verified, and in the store", slot.title)
 
     def _finished(self, slot: store.Slot, files: tuple[FileRecord, ...]) -> Snapshot:
         listing_within_limits(files, self.limits, slot.title)
@@ -351,75 +336,6 @@ class _Candidate:
         if all(file.path != self.ref.path for file in files):
             what, advice = _missing_entry(self.ref.path, files)
             raise HubFailure(Kind.NO_ENTRY, f"the {self.repo.repo_type} repository {what}", advice)
-
-
-@dataclass(frozen=True)
-class _HubCandidate(_Candidate):
-    """A repository of the Hub."""
-
-    hub: HubClient
-
-    def _resolved(self) -> str:
-        return self.hub.resolve(self.repo, self.ref.revision)
-
-    def _bring(self, slot: store.Slot) -> None:
-        files = self._judged(slot, self.hub.listing(self.repo, slot.commit))
-        folder = self.hub.download(self.repo, slot.commit, [file.path for file in files])
-        self._publish(slot, files, self._copier(slot, folder))
-
-    def _copier(self, slot: store.Slot, folder: Path) -> Callable[[FileRecord, Path], None]:
-        def copy(record: FileRecord, target: Path) -> None:
-            try:
-                copy_verified(folder / record.path, target, record)
-            except HashMismatch:
-                # The Hub cache may hold an edited or half-written file: once more, from the Hub.
-                target.unlink(missing_ok=True)
-                again = self.hub.download_again(self.repo, slot.commit, record.path)
-                self._copy_or_refuse(slot, again, target, record)
-
-        return copy
-
-    def _copy_or_refuse(
-        self, slot: store.Slot, source: Path, target: Path, record: FileRecord
-    ) -> None:
-        try:
-            copy_verified(source, target, record)
-        except HashMismatch as mismatch:
-            raise SnapshotIntegrityError(
-                f"{slot.title}: the file {record.path!r} came with other content than the "
-                f"commit's listing says: {mismatch.found}, not {record.size} bytes with "
-                f"{record.digest}. Nothing of it was used. A proxy, a mirror or the Hub cache "
-                f"changes files: try another network or endpoint, and remove the bad copy: "
-                f"rm '{source}'"
-            ) from mismatch
-
-
-@dataclass(frozen=True)
-class _GitCandidate(_Candidate):
-    """A repository of git. What is asked for by a commit is that: its name is a hash of it."""
-
-    def _resolved(self) -> str:
-        from envhub_sandbox.hub.git import commits
-
-        return commits.resolve(self.ref.repo_id, self.ref.revision or "HEAD")
-
-    def _bring(self, slot: store.Slot) -> None:
-        from envhub_sandbox.hub.git import commits
-
-        with commits.fetched(self.ref.repo_id, slot.commit) as found:
-            blobs = {blob.path: blob for blob in found.blobs}
-            listing = (
-                FileRecord(one.path, one.size, f"{GIT_SHA1}:{one.digest}") for one in found.blobs
-            )
-            files = self._judged(slot, listing)
-            for path in found.submodules:
-                SNAPSHOT.warning("%s: the submodule %r is left out", slot.title, path)
-
-            def copy(record: FileRecord, target: Path) -> None:
-                with found.open(blobs[record.path]) as stream:
-                    write_verified(stream, target, record)
-
-            self._publish(slot, files, copy)
 
 
 def _missing_entry(path: str, files: tuple[FileRecord, ...]) -> tuple[str, str]:

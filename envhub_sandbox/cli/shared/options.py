@@ -32,7 +32,8 @@ Ref = Annotated[
     str,
     typer.Argument(
         metavar="REF",
-        help="A hub reference, 'org/repo@revision:path/env.py', or a folder, './my-env'.",
+        help="A hub reference, 'org/repo@revision:path/env.py', 'github:org/repo@commit', "
+        "'pypi:package#id', or a folder, './my-env'.",
         show_default=False,
     ),
 ]

@@ -209,10 +209,8 @@ class _Git:
         """
         program = shutil.which("git")
         if program is None:
-            raise SnapshotError(
-                f"git {arguments[0]}: files of a repository of git are needed, and there is no git "
-                "here; install it"
-            )
+            what = "files of a repository of git are needed, and there is no git here"
+            raise HubFailure(Kind.OTHER, what, "Install it, as in 'apt-get install git'")
         settings = [*_SETTINGS, *(f"protocol.{name}.allow=always" for name in address.PROTOCOLS)]
         command = [program, *(word for one in settings for word in ("-c", one)), *arguments]
         store = self._store

@@ -18,7 +18,8 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import HubReferenceError, RepositoryUnavailableError
-from envhub_sandbox.hub.client import HubClient, Repository
+from envhub_sandbox.hub.client import HubClient
+from envhub_sandbox.hub.listing import Repository
 from tests.hub.stub_hub import StubHub
 from tests.integration.hub.conftest import Fetch
 from tests.support.command_line import python

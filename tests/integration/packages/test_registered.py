@@ -149,7 +149,7 @@ def test_it_gives_pictures_unasked(packages: Index) -> None:
 
 
 @pytest.mark.parametrize(
-    "package", ["inner-registers#", "plugged-in#", "inner-registers#inner.envs:"]
+    "begins", ["inner-registers#", "plugged-in#", "inner-registers#inner.envs:"]
 )
 def test_what_registers_it_is_found(packages: Index, begins: str) -> None:
     """A module further inside, also by its name; and a function of the entry point for that."""
@@ -161,9 +161,9 @@ def test_an_id_that_is_not_there(packages: Index) -> None:
     """The error names near ones of that package."""
     with pytest.raises(LoadError, match=r"walled 2\.0 registers no environment") as caught:
         make_env("pypi:walled#Walled/Mase-v2")
-    assert "such as Walled/Maze-v2" in str(caught.value)
+    assert "but 2 others. There are Walled/Maze-v2" in str(caught.value)
     assert "CartPole" not in str(caught.value)
-    with pytest.raises(LoadError, match="It registers none"):
+    with pytest.raises(LoadError, match="but 0 others"):
         make_env("pypi:no-envs#Walled/Maze-v2")
 
 

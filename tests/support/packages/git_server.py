@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import threading
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -45,13 +45,18 @@ def commit(folder: Path) -> str:
 
 
 @contextmanager
-def git_served(root: Path) -> Iterator[str]:
-    """Serve the repositories in a folder; gives the URL that their names follow."""
+def git_served(
+    root: Path, rewritten: Callable[[bytes], bytes] = lambda body: body
+) -> Iterator[str]:
+    """Serve the repositories in a folder; gives the URL that their names follow.
+
+    ``rewritten`` is what a lying server makes of a request before it answers.
+    """
 
     class Handler(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
             path, _, query = self.path.partition("?")
-            length = int(self.headers.get("Content-Length") or 0)
+            body = rewritten(self.rfile.read(int(self.headers.get("Content-Length") or 0)))
             asked = {
                 "GIT_PROJECT_ROOT": str(root),
                 "GIT_HTTP_EXPORT_ALL": "1",
@@ -59,25 +64,25 @@ def git_served(root: Path) -> Iterator[str]:
                 "QUERY_STRING": query,
                 "REQUEST_METHOD": self.command,
                 "CONTENT_TYPE": self.headers.get("Content-Type", ""),
-                "CONTENT_LENGTH": str(length),
+                "CONTENT_LENGTH": str(len(body)),
                 "HTTP_CONTENT_ENCODING": self.headers.get("Content-Encoding", ""),
                 "GIT_PROTOCOL": self.headers.get("Git-Protocol", ""),
             }
             answer = subprocess.run(
                 ["git", "-c", "safe.directory=*", "http-backend"],
-                input=self.rfile.read(length),
+                input=body,
                 env=os.environ | _OURS | asked,
                 stdout=subprocess.PIPE,
                 check=True,
             ).stdout
-            head, _, body = answer.partition(b"\r\n\r\n")
+            head, _, found = answer.partition(b"\r\n\r\n")
             fields = dict(line.split(": ", 1) for line in head.decode().splitlines())
             self.send_response(int(fields.pop("Status", "200")[:3]))
             for name, value in fields.items():
                 self.send_header(name, value)
-            self.send_header("Content-Length", str(len(body)))
+            self.send_header("Content-Length", str(len(found)))
             self.end_headers()
-            self.wfile.write(body)
+            self.wfile.write(found)
 
         do_POST = do_GET
 

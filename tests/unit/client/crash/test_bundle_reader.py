@@ -350,3 +350,24 @@ def test_a_document_of_millions_of_lists_is_not_read(tmp_path: Path) -> None:
         file.write("[" + "[]," * (MAX_DOCUMENT_BYTES // 3) + "[]]")
     with pytest.raises(BundleError, match="bytes"):
         load_bundle(folder)
+
+
+def test_a_bundle_of_git_names_a_host(tmp_path: Path) -> None:
+    """Which the user grants: a stranger chose it. A package is the index's, as for any other."""
+    folder = bundle(tmp_path)
+    edit(folder, "provenance", "repository", value="https://git.example/org/repo")
+    edit(folder, "provenance", "repo_type", value="git")
+    found = load_bundle(folder)
+    assert found.reference == f"git+https://git.example/org/repo@{COMMIT}"
+    assert wishes(found) == [f"repository='{found.reference}'"]
+    edit(folder, "provenance", "repository", value="file:///etc")
+    with pytest.raises(BundleError, match="not fetched by 'file'"):
+        load_bundle(folder)
+    edit(folder, "provenance", "repository", value="x@1.0#Y-v0")
+    edit(folder, "provenance", "repo_type", value="pypi")
+    assert load_bundle(folder).reference == "pypi:x@1.0#Y-v0"
+    assert wishes(load_bundle(folder)) == []
+    edit(folder, "provenance", "repo_type", value="model")
+    edit(folder, "provenance", "commit", value="main")
+    with pytest.raises(BundleError, match="is no commit"):
+        load_bundle(folder)

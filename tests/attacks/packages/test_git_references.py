@@ -1,0 +1,301 @@
+"""Hostile repositories of git, by reference: no program runs, nothing else is asked, no lie holds.
+
+The control is plain git with the same repository and the same user: there each of them succeeds.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+
+import pytest
+
+from envhub_sandbox.errors import EnvHubError, HubReferenceError, RepositoryUnavailableError
+from envhub_sandbox.hub.git import address, commits
+from envhub_sandbox.hub.reference import HubRef
+from envhub_sandbox.hub.snapshot import Snapshot, snapshot_named
+from tests.support.packages.git_server import commit, git, git_served, make_repository
+from tests.support.repositories import CARTPOLE
+
+pytestmark = [
+    pytest.mark.short,
+    pytest.mark.skipif(shutil.which("git") is None, reason="needs git"),
+]
+
+
+@pytest.fixture
+def repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """One with an environment; http is permitted here alone, and its user has a home."""
+    monkeypatch.setattr(address, "PROTOCOLS", ("http",))
+    for name in ("NO_PROXY", "no_proxy"):
+        monkeypatch.setenv(name, "127.0.0.1")
+    monkeypatch.setenv("ENVHUB_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("HOME", str(tmp_path / "home"))
+    monkeypatch.setenv("GIT_CONFIG_NOSYSTEM", "1")
+    (tmp_path / "home").mkdir()
+    made = tmp_path / "served" / "org" / "repo"
+    make_repository(made, {"env.py": CARTPOLE})
+    return made
+
+
+@pytest.fixture
+def program(tmp_path: Path) -> Path:
+    """What the stranger wants to run: it leaves a mark."""
+    path = tmp_path / "program"
+    path.write_text(f"#!/bin/sh\ntouch '{tmp_path}/ran'\n")
+    path.chmod(0o755)
+    return path
+
+
+def ran(program: Path) -> bool:
+    """Whether it has, since this was asked last."""
+    mark = program.parent / "ran"
+    found = mark.exists()
+    mark.unlink(missing_ok=True)
+    return found
+
+
+@contextmanager
+def canary(status: int = 404) -> Iterator[tuple[str, list[BaseHTTPRequestHandler]]]:
+    """A server that nobody should ask: its address, and who did."""
+    asked: list[BaseHTTPRequestHandler] = []
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            asked.append(self)
+            self.send_response(status)
+            self.send_header("WWW-Authenticate", 'Basic realm="x"')
+            self.send_header("Content-Length", "0")
+            self.end_headers()
+
+        do_POST = do_GET
+
+        def log_message(self, format: str, *args: object) -> None:
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{server.server_address[1]}", asked
+    finally:
+        server.shutdown()
+        thread.join()
+        server.server_close()
+
+
+def plain_git(*arguments: str) -> subprocess.CompletedProcess[bytes]:
+    """Git as this user runs it, with his settings."""
+    return subprocess.run(
+        ["git", *arguments],
+        capture_output=True,
+        check=False,
+        stdin=subprocess.DEVNULL,
+        env={**os.environ, "GIT_TERMINAL_PROMPT": "0"},
+        timeout=60,
+    )
+
+
+def setting(text: str) -> None:
+    """One of this user's own settings."""
+    with Path(os.environ["HOME"], ".gitconfig").open("a") as file:
+        file.write(text)
+
+
+def hooked(repository: Path, program: Path) -> None:
+    """A hook in the templates that this user's git copies into each repository."""
+    hooks = program.parent / "template" / "hooks"
+    hooks.mkdir(parents=True)
+    for name in ("post-checkout", "reference-transaction", "pre-auto-gc"):
+        shutil.copy(program, hooks / name)
+    setting(f"[init]\n\ttemplateDir = {hooks.parent}\n")
+
+
+def filtered(repository: Path, program: Path) -> None:
+    """The repository asks for a filter that this user has, as for files of LFS."""
+    setting(f'[filter "lfs"]\n\tsmudge = {program}\n')
+    (repository / ".gitattributes").write_text("*.py filter=lfs\n")
+    commit(repository)
+
+
+def rerouted(repository: Path, program: Path) -> None:
+    """An address that this user's git replaces by a program."""
+    setting(f'[url "ext::{program} "]\n\tinsteadOf = http://\n[protocol]\n\tallow = always\n')
+
+
+def watched(repository: Path, program: Path) -> None:
+    """A program that this user's git asks."""
+    setting(f"[core]\n\tfsmonitor = {program}\n")
+
+
+@pytest.mark.parametrize("trap", [hooked, filtered, rerouted, watched])
+def test_no_program_runs(
+    repository: Path, program: Path, trap: Callable[[Path, Path], None], tmp_path: Path
+) -> None:
+    """Plain git runs each; ours brings the very bytes of the commit."""
+    trap(repository, program)
+    with git_served(tmp_path / "served") as where:
+        plain_git("clone", f"{where}/org/repo", str(tmp_path / "clone"))
+        plain_git("-C", str(tmp_path / "clone"), "status")
+        assert ran(program), "the control failed"
+        found = snapshot_named(f"git+{where}/org/repo")
+    assert not ran(program)
+    assert (found.root / "env.py").read_text() == CARTPOLE
+
+
+def test_variables_of_the_user_do_nothing(
+    repository: Path, program: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Git obeys settings in variables, too."""
+    pairs = {f"url.ext::{program} .insteadOf": "http://", "protocol.allow": "always"}
+    monkeypatch.setenv("GIT_CONFIG_COUNT", str(len(pairs)))
+    for number, (key, value) in enumerate(pairs.items()):
+        monkeypatch.setenv(f"GIT_CONFIG_KEY_{number}", key)
+        monkeypatch.setenv(f"GIT_CONFIG_VALUE_{number}", value)
+    with git_served(tmp_path / "served") as where:
+        plain_git("ls-remote", f"{where}/org/repo")
+        assert ran(program), "the control failed"
+        snapshot_named(f"git+{where}/org/repo")
+    assert not ran(program)
+
+
+def test_submodules_are_not_fetched(repository: Path, tmp_path: Path) -> None:
+    """Plain git asks the host that the repository names."""
+    with canary() as (elsewhere, asked), git_served(tmp_path / "served") as where:
+        text = f'[submodule "m"]\n\tpath = m\n\turl = {elsewhere}/m\n'
+        (repository / ".gitmodules").write_text(text)
+        git(repository, "update-index", "--add", "--cacheinfo", f"160000,{'1' * 40},m")
+        git(repository, "add", ".gitmodules")
+        git(repository, "commit", "--quiet", "--message=x")
+        clone = str(tmp_path / "clone")
+        plain_git("clone", "--recurse-submodules", f"{where}/org/repo", clone)
+        assert asked, "the control failed"
+        asked.clear()
+        found = snapshot_named(f"git+{where}/org/repo")
+        assert not asked
+    assert {file.path for file in found.files} == {"env.py", ".gitmodules"}
+
+
+def test_alternates_are_not_followed(repository: Path, tmp_path: Path) -> None:
+    """A server of plain files says where further objects are; git may be set to ask there."""
+    git(repository, "update-server-info")
+    files = repository / ".git"
+    head = git(repository, "rev-parse", "HEAD")
+    with canary() as (elsewhere, asked), served_plainly(files) as where:
+        (files / "objects/info").mkdir(exist_ok=True)
+        (files / "objects/info/http-alternates").write_text(f"{elsewhere}/objects\n")
+        blob = git(repository, "rev-parse", "HEAD:env.py")
+        (files / "objects" / blob[:2] / blob[2:]).unlink()
+        clone = str(tmp_path / "clone")
+        plain_git("-c", "http.followRedirects=true", "clone", f"{where}/x", clone)
+        assert asked, "the control failed"
+        asked.clear()
+        with pytest.raises(EnvHubError):
+            snapshot_named(f"git+{where}/x@{head}")
+        assert not asked
+
+
+@contextmanager
+def served_plainly(folder: Path) -> Iterator[str]:
+    """Its files, below any first step of a path, as a server that knows nothing of git."""
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            path = folder / self.path.partition("?")[0].strip("/").partition("/")[2]
+            data = path.read_bytes() if path.is_file() else None
+            self.send_response(404 if data is None else 200)
+            self.send_header("Content-Length", str(len(data or b"")))
+            self.end_headers()
+            self.wfile.write(data or b"")
+
+        def log_message(self, format: str, *args: object) -> None:
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{server.server_address[1]}"
+    finally:
+        server.shutdown()
+        thread.join()
+        server.server_close()
+
+
+def test_no_login_is_sent(
+    repository: Path, program: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Plain git has this user's for any host that asks: from .netrc, or of a helper's."""
+    netrc = Path(os.environ["HOME"], ".netrc")
+    netrc.write_text("machine 127.0.0.1 login jane password hunter2\n")
+    netrc.chmod(0o600)
+    setting(f"[credential]\n\thelper = {program}\n")
+    with canary(401) as (where, asked):
+        plain_git("ls-remote", f"{where}/org/repo")
+        assert any("Authorization" in one.headers for one in asked), "the control failed"
+        assert ran(program), "the control failed"
+        asked.clear()
+        with pytest.raises(RepositoryUnavailableError):
+            snapshot_named(f"git+{where}/org/repo")
+        assert asked
+        assert not any("Authorization" in one.headers for one in asked)
+    assert not ran(program)
+
+
+def test_a_commit_is_the_one_that_was_asked_for(repository: Path, tmp_path: Path) -> None:
+    """The server answers for another. By a name plain git has to believe it; a commit is a hash."""
+    approved = git(repository, "rev-parse", "HEAD")
+    (repository / "env.py").write_text(CARTPOLE + "# evil\n")
+    evil = commit(repository)
+
+    def lying(body: bytes) -> bytes:
+        return body.replace(approved.encode(), evil.encode())
+
+    def brought(where: str, revision: str) -> Snapshot:
+        return snapshot_named(f"git+{where}/org/repo@{revision}")
+
+    with git_served(tmp_path / "served", lying) as where:
+        clone = str(tmp_path / "clone")
+        plain_git("clone", f"{where}/org/repo", clone)
+        assert "# evil" in Path(clone, "env.py").read_text(), "the control failed"
+        assert "# evil" in (brought(where, "main").root / "env.py").read_text()
+        with pytest.raises(RepositoryUnavailableError, match="git"):
+            brought(where, approved)
+    with git_served(tmp_path / "served") as where:
+        assert "# evil" not in (brought(where, approved).root / "env.py").read_text()
+
+
+OPTION = "--upload-pack={}"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("git+https://h/x@{}", "git+{}", "github:{}", "github:org/{}", "git+https://{}/x"),
+        *("git+ext::{}", "git+file://{}", "git+ssh://{}/x", "ext::{}", "file://{}"),
+    ],
+)
+def test_nothing_in_a_reference_is_an_option_or_a_program(
+    repository: Path, program: Path, text: str
+) -> None:
+    """Plain git takes what begins with a dash for an option."""
+    option = OPTION.format(program)
+    plain_git("ls-remote", option, str(repository))
+    assert ran(program), "the control failed"
+    for hostile in (option, str(program)):
+        with pytest.raises(HubReferenceError):
+            HubRef.parse(text.format(hostile))
+        with pytest.raises((HubReferenceError, EnvHubError)):
+            snapshot_named(text.format(hostile))
+        with pytest.raises(HubReferenceError):
+            commits.resolve(text.format(hostile).removeprefix("git+"), "main")
+    for revision in (option, f"main {option}", "a..b"):
+        with pytest.raises(HubReferenceError):
+            commits.resolve("http://127.0.0.1:9/x", revision)
+    assert not ran(program)
