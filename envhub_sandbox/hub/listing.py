@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from bisect import bisect_left
 from collections.abc import Iterable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
 from envhub_sandbox.errors import PolicyError, SnapshotError, SnapshotTooLargeError
-from envhub_sandbox.hub.grammar import has_control_characters
+from envhub_sandbox.hub.grammar import REPO_TYPES, has_control_characters
 from envhub_worker.protocol.text import size_text
 
 MAX_NAME_BYTES = 255  # NAME_MAX of every common file system.
@@ -48,6 +48,8 @@ class Snapshot:
         path: The entry file, relative to ``root``, for example ``"env.py"``.
         root: The folder that holds the files (0444 in folders 0555) and nothing else.
         files: Every file below ``root``, sorted by path.
+        revision: What was asked for; None for nothing in particular.
+        assets: Further repositories that its code may read.
     """
 
     repo_id: str
@@ -56,6 +58,31 @@ class Snapshot:
     path: str
     root: Path
     files: tuple[FileRecord, ...]
+    revision: str | None = field(default=None, compare=False)
+    assets: tuple[Snapshot, ...] = field(default=(), compare=False)
+
+    @property
+    def pinned(self) -> str:
+        """The repository at its commit, without an entry file: ``"datasets/org/data@COMMIT"``."""
+        prefix = "" if self.repo_type == "model" else f"{self.repo_type}s/"
+        return f"{prefix}{self.repo_id}@{self.commit}"
+
+    @property
+    def hub_copies(self) -> tuple[tuple[str, str, tuple[str, ...], str], ...]:
+        """What a jail finds in its cache of the Hub, itself and assets: the fields of ``HubCopy``.
+
+        A folder of this machine, for instance, is nothing that the Hub has.
+        """
+        return tuple(
+            (
+                f"{one.repo_type}s--{one.repo_id.replace('/', '--')}",
+                one.commit,
+                tuple(sorted({"main", one.revision or "main"} - {one.commit})),
+                "" if one is self else str(one.root),
+            )
+            for one in (self, *self.assets)
+            if one.repo_type in REPO_TYPES
+        )
 
     @property
     def label(self) -> str:
@@ -94,10 +121,10 @@ class SnapshotLimits:
     max_file_bytes: int = 2 * 2**30
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
+        for one in fields(self):
+            value = getattr(self, one.name)
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise PolicyError(f"{field.name} must be a positive int, got {value!r}")
+                raise PolicyError(f"{one.name} must be a positive int, got {value!r}")
 
 
 DEFAULT_LIMITS = SnapshotLimits()

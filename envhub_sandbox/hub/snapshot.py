@@ -103,6 +103,7 @@ def fetch(
     token: str | bool | None = None,
     endpoint: str | None = None,
     limits: SnapshotLimits = DEFAULT_LIMITS,
+    needs_entry: bool = True,
 ) -> Snapshot:
     """Bring a repository's files here, verified.
 
@@ -114,6 +115,7 @@ def fetch(
         token: As in huggingface_hub: None for the stored one, False for none.
         endpoint: As in huggingface_hub: None for ``$HF_ENDPOINT`` or https://huggingface.co.
         limits: What the repository may bring.
+        needs_entry: False for one that is no environment: it may be of any type.
 
     Raises:
         RepositoryUnavailableError: No such repository, revision or file, no access, no Hub. The
@@ -124,7 +126,7 @@ def fetch(
         HubReferenceError: The token or endpoint cannot be one.
     """
     hub = HubClient(checked_endpoint(endpoint), checked_token(token), hub_cache_dir)
-    candidates = _candidates(ref, hub, limits)
+    candidates = _candidates(ref, hub, limits, needs_entry)
     try:
         for candidate in candidates if ref.is_pinned else ():
             if (stored := candidate.stored()) is not None:
@@ -140,9 +142,13 @@ def fetch(
     return _first(candidates, _Candidate.fetched)
 
 
-def _candidates(ref: HubRef, hub: HubClient, limits: SnapshotLimits) -> list[_Candidate]:
-    kinds = (ref.repo_type,) if ref.repo_type else ("model", "space")
-    return [_Candidate(ref, Repository(kind, ref.repo_id), hub, limits) for kind in kinds]
+def _candidates(
+    ref: HubRef, hub: HubClient, limits: SnapshotLimits, needs_entry: bool = True
+) -> list[_Candidate]:
+    every = ("model", "space") if needs_entry else ("model", "dataset", "space")
+    kinds = (ref.repo_type,) if ref.repo_type else every
+    repos = [Repository(kind, ref.repo_id) for kind in kinds]
+    return [_Candidate(ref, repo, hub, limits, needs_entry) for repo in repos]
 
 
 def _first(candidates: list[_Candidate], ask: Callable[[_Candidate], T]) -> T:
@@ -166,7 +172,7 @@ def _unavailable(
     whats = "; and ".join(dict.fromkeys(failure.what for failure in failures))
     best = next((f for f in failures if f.kind is not Kind.NO_REPOSITORY), failures[0])
     advice = best.advice
-    if best.kind is Kind.NO_REPOSITORY and ref.repo_type is None:
+    if best.kind is Kind.NO_REPOSITORY and ref.repo_type is None and candidates[0].needs_entry:
         advice += f". A dataset repository is written 'datasets/{ref.repo_id}'"
     in_store = "" if best.kind is Kind.NO_ENTRY else _in_store(candidates, best.kind in UNREACHABLE)
     return RepositoryUnavailableError(
@@ -230,6 +236,7 @@ class _Candidate:
     repo: Repository
     hub: HubClient
     limits: SnapshotLimits
+    needs_entry: bool
 
     @property
     def folder(self) -> Path:
@@ -310,10 +317,11 @@ class _Candidate:
         listing_within_limits(files, self.limits, slot.title)
         self._require_entry(files)
         repo_type, repo_id = self.repo
-        return Snapshot(repo_id, repo_type, slot.commit, self.ref.path, slot.tree, files)
+        place = slot.commit, self.ref.path, slot.tree, files
+        return Snapshot(repo_id, repo_type, *place, self.ref.revision)
 
     def _require_entry(self, files: tuple[FileRecord, ...]) -> None:
-        if all(file.path != self.ref.path for file in files):
+        if self.needs_entry and all(file.path != self.ref.path for file in files):
             what, advice = _missing_entry(self.ref.path, files)
             raise HubFailure(Kind.NO_ENTRY, f"the {self.repo.repo_type} repository {what}", advice)
 

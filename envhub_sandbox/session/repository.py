@@ -121,7 +121,7 @@ class Repository:
         """Keep its files and packages from being removed, until ``let_go``."""
         if self._in_use:
             return
-        folders = [self.snapshot.root.parent]
+        folders = [one.root.parent for one in (self.snapshot, *self.snapshot.assets)]
         if os.path.isabs(self.runtime.packages):  # else they have a name, on another host
             folders.append(Path(self.runtime.packages).with_name(RECORD))
         self._in_use = [SharedLock(folder) for folder in folders]

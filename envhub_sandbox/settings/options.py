@@ -17,7 +17,7 @@ import json
 import operator
 import os
 import shlex
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from keyword import iskeyword
 from pathlib import Path
@@ -27,6 +27,7 @@ from envhub_sandbox.errors import PolicyError
 from envhub_worker.protocol.confinement import NETWORKS, PROFILES
 from envhub_worker.protocol.limits import MAX_NUM_ENVS
 
+MAX_ASSETS = 16
 _CODE, _LIMITS, _HUB = "How it is built", "What it may do", "Where it comes from"
 _LANES = ("auto", "frames")
 
@@ -111,6 +112,14 @@ def _lane(value: Any) -> str:
     return str(value)
 
 
+def _assets(value: Any) -> tuple[str, ...]:
+    if not isinstance(value, (list, tuple)) or not all(isinstance(one, str) for one in value):
+        raise TypeError(f"`assets` is {value!r}; it takes a list such as ['org/data@COMMIT']")
+    if len(value) > MAX_ASSETS:
+        raise ValueError(f"`assets` holds {len(value)} repositories; it takes {MAX_ASSETS} at most")
+    return tuple(value)
+
+
 def _keyword_arguments(value: Any) -> dict[str, Any]:
     if value is None:
         return {}
@@ -171,6 +180,17 @@ class Options:
         "--lock",
         "What 'envhub lock' wrote: its packages, and nothing that differs from it.",
         metavar="FILE",
+        sandboxed=True,
+    )
+    assets: Sequence[str] = _option(
+        (),
+        "--assets",
+        "A further repository of the Hub that it may read, as in datasets/org/data@COMMIT "
+        "(repeatable).",
+        metavar="REF",
+        kind=list,
+        check=_assets,
+        panel=_HUB,
         sandboxed=True,
     )
     num_workers: int | None = _option(

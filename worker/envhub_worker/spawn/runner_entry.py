@@ -33,6 +33,7 @@ from envhub_worker.lockdown.stages import runner
 from envhub_worker.protocol.records import dataclass
 from envhub_worker.spawn import blas
 from envhub_worker.spawn.channel import Channel
+from envhub_worker.spawn.hub_cache import make_hub_cache
 
 _SELF_TEST = Layer("self-test", True, "the denials above were tried and held")
 
@@ -81,6 +82,7 @@ def _run(order: Order) -> int:
     blas.restore_threads(order.jail.common.set_blas_threads, order.runners)
     init.send({"report": [_SELF_TEST.to_wire()]})
     init.close()
+    make_hub_cache(order.jail.spec)
     main = _main(order)  # not before init is out of reach: packages may be a stranger's
     stream = socket.socket(fileno=order.fds[0])
     return int(main(stream, order.jail.spec, order.fds[1:]) or 0)
@@ -130,9 +132,11 @@ def confine(order: Order, init: Channel) -> None:
 def _forget_the_zygote(jail: JailContext) -> None:
     """Own environment, folders and random numbers; a fork shares them all with its siblings."""
     scratch, granted = jail.scratch, jail.spec.confinement.environment
-    built = jail_environment(os.environ, granted, scratch.home, scratch.temporary)
+    network = jail.spec.confinement.network
+    built = jail_environment(os.environ, granted, scratch.home, scratch.temporary, network)
     os.environ.clear()
     os.environ.update(built)
+    sys.argv = [jail.spec.entry]  # a repository may parse it; ours are not its arguments
     os.chdir(scratch.work)
     os.umask(0o022)
     tempfile.tempdir = None
