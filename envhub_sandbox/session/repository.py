@@ -24,6 +24,7 @@ from envhub_sandbox.session.author_lines import add_author_line
 from envhub_sandbox.session.crash.bundle_writer import Crash, write_bundle
 from envhub_sandbox.session.crash.history import Recording
 from envhub_sandbox.session.jails.loaded import LoadedJail
+from envhub_sandbox.session.jails.reach import add_reach_advice
 from envhub_sandbox.session.recipe import Recipe, provenance_of
 from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.settings.policy import Policy, Timeouts
@@ -141,6 +142,7 @@ class Repository:
             if isinstance(error, DependencyError) and not str(error).startswith(self.label):
                 error.args = (f"{error}. {self._advice(str(error))}",)
             name_source(error, self.label)
+            add_reach_advice(error, self.policy)
             add_author_line(error, self.snapshot)
             raise
 
