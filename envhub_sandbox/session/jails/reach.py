@@ -17,10 +17,10 @@ _HUB = re.compile(
     r"LocalEntryNotFoundError|OfflineModeIsEnabled|HF_HUB_OFFLINE|huggingface\.co|"
     r"[Oo]utgoing traffic has been disabled"
 )
-_INSTALL = re.compile(r"\b(pip|pip3|uv|conda)\b[ ',\"]+(-\S+[ ',\"]+)*install\b|\buv\b.*\badd\b")
+_INSTALL = re.compile(r"\b(pip|pip3|uv|conda)\b[^\n]{0,80}\b(install|add|sync)\b")
 _NO_FAMILY = re.compile(r"\[Errno 97\]|[Aa]ddress family not supported")
 _DOWNLOAD = re.compile(
-    r"\bgit\b[ ',\"]+(-\S+[ ',\"]+)*(clone|fetch|pull|submodule|lfs)\b|\b(wget|curl|aria2c)\b|"
+    r"\bgit\b[^\n]{0,80}\b(clone|fetch|pull|submodule|lfs)\b|\b(wget|curl|aria2c)\b|"
     r"URLError|gaierror|ConnectionError|ConnectError|NewConnectionError|Max retries exceeded|"
     r"[Nn]ame resolution|Name or service not known|Could not resolve host|Network is unreachable"
 )

@@ -8,7 +8,13 @@ from typing import Any
 import pytest
 
 from envhub_sandbox import make_env
-from envhub_sandbox.errors import EnvHubError, LoadError, RemoteEnvError, WorkerDiedError
+from envhub_sandbox.errors import (
+    EnvHubError,
+    LoadError,
+    RemoteEnvError,
+    RemoteEnvWarning,
+    WorkerDiedError,
+)
 from tests.support.repositories import STILL, write_repository
 
 pytestmark = pytest.mark.short
@@ -117,3 +123,20 @@ def test_a_loopback_device_of_its_own(tmp_path: Path) -> None:
         suites.env.call("run", "socket.create_server(('127.0.0.1', 0))")
         with pytest.raises(EnvHubError, match="A jail has no network"):
             suites.env.call("run", f"urllib.request.urlopen({URL!r})")
+
+
+@pytest.mark.filterwarnings("default")
+def test_lerobot_that_is_imported_for_an_annotation_needs_no_package(tmp_path: Path) -> None:
+    """A stub stands in, nothing is installed, and the caller is warned of it."""
+    code = f"""
+from lerobot.envs.configs import EnvConfig, HubEnvConfig
+from lerobot.utils.constants import OBS_STATE
+{STILL}
+def make_env(n_envs: int = 1, use_async_envs: bool = False, cfg: EnvConfig | None = None):
+    return vector(Still, n_envs)
+"""
+    folder = write_repository(tmp_path / "repo", code)
+    with pytest.warns(RemoteEnvWarning, match="lerobot is not installed in the jail"):
+        suites = make_env(str(folder))
+    with suites:
+        assert suites.provenance["installed"] is None

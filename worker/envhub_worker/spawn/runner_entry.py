@@ -34,6 +34,7 @@ from envhub_worker.protocol.records import dataclass
 from envhub_worker.spawn import blas
 from envhub_worker.spawn.channel import Channel
 from envhub_worker.spawn.hub_cache import make_hub_cache
+from envhub_worker.spawn.lerobot_stub import install_lerobot_stub
 
 _SELF_TEST = Layer("self-test", True, "the denials above were tried and held")
 
@@ -83,6 +84,7 @@ def _run(order: Order) -> int:
     init.send({"report": [_SELF_TEST.to_wire()]})
     init.close()
     make_hub_cache(order.jail.spec)
+    install_lerobot_stub()
     main = _main(order)  # not before init is out of reach: packages may be a stranger's
     stream = socket.socket(fileno=order.fds[0])
     return int(main(stream, order.jail.spec, order.fds[1:]) or 0)
