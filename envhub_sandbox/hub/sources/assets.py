@@ -74,8 +74,9 @@ def _declared(snapshot: Snapshot) -> list[HubRef]:
 
 
 def _asset(text: str, snapshot: Snapshot, where: str) -> HubRef:
-    shown = repr(text[:200])
-    names_file = re.search(r":(?!//)", text) is not None
+    masked = re.sub(r"://[^/]*@", "://***@", text)  # a pasted URL may carry a token
+    shown = repr(masked[:200])
+    names_file = re.search(r":(?!//)", masked) is not None
     try:
         ref = HubRef.parse(text)
         names_file |= ref.path != DEFAULT_PATH

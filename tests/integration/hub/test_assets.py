@@ -12,6 +12,7 @@ import pytest
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import HubReferenceError, RemoteEnvError, RepositoryUnavailableError
 from tests.hub.stub_hub import StubHub, StubRepository
+from tests.support.interpreter import profiles
 from tests.support.repositories import STILL
 
 pytestmark = pytest.mark.short
@@ -110,6 +111,16 @@ def test_an_asset_is_found_and_read_only(make: Make, asset: str) -> None:
         with pytest.raises(OSError, match=r"Read-only|Permission"):
             suites.env.call("write", "org/data", "dataset")
         assert suites.provenance["assets"] == [f"datasets/org/data@{DATA}"]
+
+
+@pytest.mark.parametrize("arena", profiles("no-userns"))
+def test_a_profile_without_mounts_shows_an_asset_too(make: Make, arena: str) -> None:
+    """By Landlock; and every process of an environment that is spread finds it."""
+    options = {"policy": {"profile": arena}, "n_envs": 4, "use_async_envs": True, "num_workers": 2}
+    with make(assets=["org/data"], **options) as suites:
+        assert suites.env.call("text", "org/data", "mesh.txt", "dataset") == ("a mesh",) * 4
+        with pytest.raises(OSError, match=r"Read-only|Permission"):
+            suites.env.call("write", "org/data", "dataset")
 
 
 def test_assets_are_part_of_what_is_remembered_and_handed_on(make: Make) -> None:
