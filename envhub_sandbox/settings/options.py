@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any
 
 from envhub_sandbox.errors import PolicyError
-from envhub_worker.protocol.confinement import NETWORKS, PROFILES
+from envhub_worker.protocol.confinement import DISPLAYS, NETWORKS, PROFILES
 from envhub_worker.protocol.limits import MAX_NUM_ENVS
 
 MAX_ASSETS = 16
@@ -300,6 +300,9 @@ _KEYS: dict[str, dict[str, Option]] = {
             "--profile", "Which layers must hold; strict by default.", "|".join(PROFILES)
         ),
         "network": Option("--network", "None by default.", "|".join(NETWORKS)),
+        "display": Option(
+            "--display", "A display of its own, by Xvfb; none by default.", "|".join(DISPLAYS)
+        ),
         "gpu": Option("--gpu", "Grant all GPUs, or those, as nvidia-smi counts them.", "all|N[,N]"),
         "readable": Option(
             "--readable", "A further absolute path that it may read (repeatable).", "PATH", list

@@ -254,7 +254,7 @@ def _files(mapping: dict[str, Any]) -> dict[str, str]:
 
 # --- what it asks of this machine --------------------------------------------------------------
 
-_GRANTED = ("profile", "network", "readable", "gpu", "environment")
+_GRANTED = ("profile", "network", "display", "readable", "gpu", "environment")
 _CARRIED = ("hub_cache_dir", "endpoint", "python", "dependencies", "lock", "assets")
 _USUAL: tuple[object, ...] = (None, "auto", [])
 

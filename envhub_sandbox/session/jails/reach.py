@@ -73,9 +73,10 @@ def _advice(text: str, policy: Policy) -> str:
 
 
 def _of_display(text: str, policy: Policy) -> str:
-    if not _DISPLAY.search(text):
+    if not _DISPLAY.search(text) or policy.display != "none":
         return ""
     return (
         "It tried to open a window, and a jail has no display: have it render to arrays "
-        "(render_mode='rgb_array')"
+        "(render_mode='rgb_array'), or give the jail a display of its own, with "
+        f"{option_name('display', 'virtual')}"
     )

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, fields
 from typing import Any
 
-from envhub_worker.protocol.confinement import NETWORKS, PROFILES, Confinement, Limits
+from envhub_worker.protocol.confinement import DISPLAYS, NETWORKS, PROFILES, Confinement, Limits
 from envhub_worker.protocol.errors import RemoteProtocolError
 from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.runtime import HubCopy, read_hub_copies
@@ -63,7 +63,7 @@ def confinement_from_wire(data: dict[str, Any]) -> Confinement:
     checked = {"limits": _limits(data["limits"]), "gpu": _gpu(data["gpu"])}
     made = Confinement(**{**data, "readable": tuple(_texts(data["readable"])), **checked})
     known = made.profile in PROFILES and made.network in NETWORKS
-    known = known and type(made.record_denials) is bool
+    known = known and made.display in DISPLAYS and type(made.record_denials) is bool
     if not known or len(made.readable) > _MAX_READABLE or not _may_be_granted(made.environment):
         raise RemoteProtocolError("a confinement that there cannot be")
     return made

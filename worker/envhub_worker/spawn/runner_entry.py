@@ -33,6 +33,7 @@ from envhub_worker.lockdown.stages import runner
 from envhub_worker.protocol.records import dataclass
 from envhub_worker.spawn import blas
 from envhub_worker.spawn.channel import Channel
+from envhub_worker.spawn.display import check_display, start_display
 from envhub_worker.spawn.hub_cache import make_hub_cache
 from envhub_worker.spawn.lerobot_stub import install_lerobot_stub
 
@@ -85,6 +86,7 @@ def _run(order: Order) -> int:
     init.close()
     make_hub_cache(order.jail.spec)
     install_lerobot_stub()
+    start_display(order.jail.spec)
     main = _main(order)  # not before init is out of reach: packages may be a stranger's
     stream = socket.socket(fileno=order.fds[0])
     return int(main(stream, order.jail.spec, order.fds[1:]) or 0)
@@ -128,6 +130,7 @@ def confine(order: Order, init: Channel) -> None:
     descriptors = {0, 1, 2, order.status, *order.fds}
     process.close_all_but({*descriptors, *order.jail.view.shared.values()})
     _forget_the_zygote(order.jail)
+    check_display(order.jail.spec, os.environ)
     runner.enter(order.jail, descriptors, lambda listener: init.send({"broker": True}, [listener]))
 
 
