@@ -1,9 +1,9 @@
-# What tests need of the operating system: git for the Hub, GL for mujoco and OpenCV, venv for
-# the plain user, a cable to another network namespace, a Prometheus that is unpacked and not
+# What tests need of the operating system: git for the Hub, GL for mujoco and OpenCV, Xvfb for
+# displays, venv for the plain user, a cable to another network namespace, a Prometheus that is unpacked and not
 # installed, as its package would start one. With no right to install, the tests themselves say what
 # is missing.
 . "$(dirname "${BASH_SOURCE[0]}")/../lib.sh"
-packages=(git iproute2 iptables python3-venv libegl1 libgl1 libglib2.0-0 libosmesa6)
+packages=(git iproute2 iptables python3-venv libegl1 libgl1 libglib2.0-0 libosmesa6 xvfb)
 missing=()
 for package in "${packages[@]}"; do
   dpkg-query -W -f='${Status}' "$package" 2>/dev/null | grep -q 'ok installed' ||

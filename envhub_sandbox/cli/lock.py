@@ -40,7 +40,7 @@ NoSpaces = Annotated[
 ]
 
 
-@opt.with_options("dependencies", "env_kwargs", *opt.HUB)
+@opt.with_options("dependencies", "env_kwargs", "assets", *opt.HUB)
 def lock(
     *,
     ref: opt.Ref,
@@ -67,6 +67,7 @@ def lock(
         snapshot = make.snapshot(ref)
         path = _path(output, snapshot)
         old = _old(path, upgrade)
+        snapshot = make.snapshot_with_assets(ref, () if old is None else old.assets)
         choice = _choice(make["dependencies"], old)
         made = making.locked(snapshot, choice, upgrade=upgrade)
         if not no_spaces:
@@ -105,7 +106,7 @@ def verify(
         from envhub_sandbox.dependencies.locks import drift, lockfile
 
         locked = lockfile.read(file)
-        snapshot = make.snapshot(_reference(ref, locked, file))
+        snapshot = make.snapshot_with_assets(_reference(ref, locked, file), locked.assets)
         now = _now(locked, snapshot, no_index=no_index)
         if not no_spaces and not drift.differences(locked, now):
             now = _spaces_again(now, locked, snapshot, make.hub)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from envhub_sandbox.hub.snapshot import Snapshot
 
 
-@opt.with_options("dependencies", "lock", *opt.HUB)
+@opt.with_options("dependencies", "lock", "assets", *opt.HUB)
 def prefetch(
     *,
     ref: opt.Ref,
@@ -32,7 +32,7 @@ def prefetch(
     """
     with ProgressBar(quiet=json) as bar:
         bar.begin(f"reading {ref}")
-        snapshot = make.snapshot(ref)
+        snapshot = make.snapshot_with_assets(ref)
         given, lock = make["dependencies"], make["lock"]
         environment = (
             _environment(snapshot, given, upgrade)

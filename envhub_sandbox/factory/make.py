@@ -15,6 +15,7 @@ from envhub_sandbox.factory.config import plain_config, reference_of
 from envhub_sandbox.factory.env_factory import EnvFactory
 from envhub_sandbox.hub.cache import cache_root
 from envhub_sandbox.hub.snapshot import Snapshot, snapshot_named
+from envhub_sandbox.hub.sources.assets import with_assets
 from envhub_sandbox.sandboxes import inprocess
 from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.session.jails.launcher import Launcher
@@ -47,6 +48,8 @@ def make(make_env: Callable[..., EnvSuites], cfg: Any, given: Options) -> EnvSui
     processes.occupy_streams()  # before anything of ours is opened
     wanted = _wanted(options.sandbox, options)
     snapshot = snapshot_named(reference, **options.hub)
+    locked = wanted.lock.assets if wanted.lock is not None else ()
+    snapshot = with_assets(snapshot, options.assets or locked, options.hub)
     packages = _packages(snapshot, wanted)
     load = LoadArguments(
         n_envs=options.n_envs,
@@ -60,6 +63,7 @@ def make(make_env: Callable[..., EnvSuites], cfg: Any, given: Options) -> EnvSui
         config=load.cfg,
         options=options.for_a_recipe(
             env_kwargs=load.env_kwargs,
+            assets=tuple(one.pinned for one in snapshot.assets),
             policy=wanted.policy,
             timeouts=wanted.timeouts,
             python=wanted.python,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,7 @@ def make_env(
     python: str | Path | None = None,
     dependencies: str | os.PathLike[str] | Mapping[str, Any] = "auto",
     lock: str | os.PathLike[str] | None = None,
+    assets: Sequence[str] = (),
     num_workers: int | None = None,
     prewarm: int | None = None,
     lane: str = "auto",
@@ -73,6 +74,10 @@ def make_env(
             ``docs/dependencies.md``; for ``sandbox="process"``.
         lock: A file that ``envhub lock`` wrote: its packages are used and no others, and whatever
             differs from it (commit, files, Python, spaces) is refused. For ``sandbox="process"``.
+        assets: Further repositories of the Hub that the code may read, sixteen at most, as in
+            ``["datasets/org/data@<commit>"]``; without a prefix a model, a dataset or a space. They
+            are verified as its own files are, and ``snapshot_download`` and ``hf_hub_download``
+            find them, in a jail without a network. See ``docs/authors.md``.
         num_workers: Processes over which the sub-environments are spread; by default one, or with
             ``use_async_envs`` as many as were fastest when the first uses tried them.
         prewarm: How many of a suite's next tasks are started in the background when a task is first

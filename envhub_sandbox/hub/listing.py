@@ -9,12 +9,12 @@ from __future__ import annotations
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol, TypeVar
 
 from envhub_sandbox.errors import PolicyError, SnapshotError, SnapshotTooLargeError
-from envhub_sandbox.hub.grammar import Parts, has_control_characters, join
+from envhub_sandbox.hub.grammar import REPO_TYPES, Parts, has_control_characters, join
 from envhub_worker.protocol.text import size_text
 
 MAX_NAME_BYTES = 255  # NAME_MAX of every common file system.
@@ -87,6 +87,8 @@ class Snapshot:
         path: The entry file, relative to ``root``, for example ``"env.py"``.
         root: The folder that holds the files (0444 in folders 0555) and nothing else.
         files: Every file below ``root``, sorted by path.
+        revision: What was asked for; None for nothing in particular.
+        assets: Further repositories that its code may read.
     """
 
     repo_id: str
@@ -95,6 +97,30 @@ class Snapshot:
     path: str
     root: Path
     files: tuple[FileRecord, ...]
+    revision: str | None = field(default=None, compare=False)
+    assets: tuple[Snapshot, ...] = field(default=(), compare=False)
+
+    @property
+    def pinned(self) -> str:
+        """The repository at its commit, without an entry file: ``"datasets/org/data@COMMIT"``."""
+        return f"{self.name}@{self.commit}"
+
+    @property
+    def hub_copies(self) -> tuple[tuple[str, str, tuple[str, ...], str], ...]:
+        """What a jail finds in its cache of the Hub, itself and assets: the fields of ``HubCopy``.
+
+        A folder of this machine, for instance, is nothing that the Hub has.
+        """
+        return tuple(
+            (
+                f"{one.repo_type}s--{one.repo_id.replace('/', '--')}",
+                one.commit,
+                tuple(sorted({"main", one.revision or "main"} - {one.commit})),
+                "" if one is self else str(one.root),
+            )
+            for one in (self, *self.assets)
+            if one.repo_type in REPO_TYPES
+        )
 
     @property
     def name(self) -> str:
@@ -138,10 +164,10 @@ class SnapshotLimits:
     max_file_bytes: int = 2 * 2**30
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
+        for one in fields(self):
+            value = getattr(self, one.name)
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise PolicyError(f"{field.name} must be a positive int, got {value!r}")
+                raise PolicyError(f"{one.name} must be a positive int, got {value!r}")
 
 
 DEFAULT_LIMITS = SnapshotLimits()

@@ -111,6 +111,7 @@ def fetch(
     token: str | bool | None = None,
     endpoint: str | None = None,
     limits: SnapshotLimits = DEFAULT_LIMITS,
+    needs_entry: bool = True,
 ) -> Snapshot:
     """Bring a repository's files here, verified.
 
@@ -122,6 +123,7 @@ def fetch(
         token: As in huggingface_hub: None for the stored one, False for none.
         endpoint: As in huggingface_hub: None for ``$HF_ENDPOINT`` or https://huggingface.co.
         limits: What the repository may bring.
+        needs_entry: False for one that is no environment: it may be of any type.
 
     Raises:
         RepositoryUnavailableError: No such repository, revision or file, no access, no Hub. The
@@ -133,7 +135,7 @@ def fetch(
     """
     if ref.repo_type == registered.KIND:
         return _registered(ref)
-    candidates = _candidates(ref, limits, endpoint, token, hub_cache_dir)
+    candidates = _candidates(ref, limits, endpoint, token, hub_cache_dir, needs_entry)
     try:
         for candidate in candidates if ref.is_pinned else ():
             if (stored := candidate.stored()) is not None:
@@ -155,18 +157,21 @@ def _candidates(
     endpoint: str | None,
     token: str | bool | None,
     hub_cache_dir: str | Path | None,
+    needs_entry: bool = True,
 ) -> Sequence[_Candidate]:
-    """As what it may be read; the last three are of the Hub alone."""
+    """As what it may be read; the last four are of the Hub alone."""
     if ref.repo_type == address.KIND:
         from envhub_sandbox.hub.git.host import GitHost
 
         scheme, _, rest = ref.repo_id.partition("://")
         place, _, name = rest.partition("/")
         host = GitHost(f"{scheme}://{place}")
-        return [_Candidate(ref, Repository(address.KIND, name), host, limits)]
+        return [_Candidate(ref, Repository(address.KIND, name), host, limits, needs_entry)]
     hub = HubClient(checked_endpoint(endpoint), checked_token(token), hub_cache_dir)
-    kinds = (ref.repo_type,) if ref.repo_type else ("model", "space")
-    return [_Candidate(ref, Repository(kind, ref.repo_id), hub, limits) for kind in kinds]
+    every = ("model", "space") if needs_entry else ("model", "dataset", "space")
+    kinds = (ref.repo_type,) if ref.repo_type else every
+    repos = [Repository(kind, ref.repo_id) for kind in kinds]
+    return [_Candidate(ref, repo, hub, limits, needs_entry) for repo in repos]
 
 
 def _first(candidates: Sequence[_Candidate], ask: Callable[[_Candidate], T]) -> T:
@@ -190,7 +195,7 @@ def _unavailable(
     whats = "; and ".join(dict.fromkeys(failure.what for failure in failures))
     best = next((f for f in failures if f.kind is not Kind.NO_REPOSITORY), failures[0])
     advice = best.advice
-    if best.kind is Kind.NO_REPOSITORY and ref.repo_type is None:
+    if best.kind is Kind.NO_REPOSITORY and ref.repo_type is None and candidates[0].needs_entry:
         advice += f". A dataset repository is written 'datasets/{ref.repo_id}'"
     in_store = "" if best.kind is Kind.NO_ENTRY else _in_store(candidates, best.kind in UNREACHABLE)
     return RepositoryUnavailableError(f"{ref} on {endpoint}: {whats}. {advice}.{in_store}")
@@ -277,6 +282,7 @@ class _Candidate:
     repo: Repository
     host: RepositoryHost
     limits: SnapshotLimits
+    needs_entry: bool
 
     @property
     def folder(self) -> Path:
@@ -329,11 +335,11 @@ class _Candidate:
     def _finished(self, slot: store.Slot, files: tuple[FileRecord, ...]) -> Snapshot:
         listing_within_limits(files, self.limits, slot.title)
         self._require_entry(files)
-        name = self.ref.repo_id
-        return Snapshot(name, self.repo.repo_type, slot.commit, self.ref.path, slot.tree, files)
+        place = slot.commit, self.ref.path, slot.tree, files
+        return Snapshot(self.ref.repo_id, self.repo.repo_type, *place, self.ref.revision)
 
     def _require_entry(self, files: tuple[FileRecord, ...]) -> None:
-        if all(file.path != self.ref.path for file in files):
+        if self.needs_entry and all(file.path != self.ref.path for file in files):
             what, advice = _missing_entry(self.ref.path, files)
             raise HubFailure(Kind.NO_ENTRY, f"the {self.repo.repo_type} repository {what}", advice)
 

@@ -91,7 +91,9 @@ class RemoteSandbox(Sandbox):
     def __deepcopy__(self, memo: dict[int, Any]) -> RemoteSandbox:
         return replace(self)
 
-    def for_repository(self, snapshot: Path, policy: Policy, runtime: Runtime) -> RemoteRepository:
+    def for_repository(
+        self, snapshot: Path, policy: Policy, runtime: Runtime, assets: tuple[Path, ...] = ()
+    ) -> RemoteRepository:
         """The sandbox for one repository. Connects to nothing.
 
         Raises:
@@ -187,7 +189,7 @@ class RemoteRepository(Sandbox):
     order: m.NeedPackages | None
     packages: str
     retry_s: float = 0.0
-    _files: tuple[upload.Sent, ...] = ()
+    _files: dict[Path, tuple[upload.Sent, ...]] = field(default_factory=dict)
 
     def runs_on(self, runtime: Runtime) -> Runtime:
         """The server, by its key, and the packages there."""
@@ -207,9 +209,17 @@ class RemoteRepository(Sandbox):
         with cast("RemoteServer", server).uploading:
             if self.order is not None:
                 self._check_packages(self.order, client, deadline)
-            self._files = self._files or upload.listing(self.snapshot)
-            snapshot, _ = upload.upload(client, self.snapshot, self._files, deadline)
+            here = {copy.tree for copy in order.repositories if copy.tree}
+            trees = {tree: self._bring(Path(tree), client, deadline) for tree in sorted(here)}
+            snapshot = self._bring(self.snapshot, client, deadline)
+        order = m.replace(order, hub_copies=order.with_trees(trees))
         return m.replace(order, snapshot=snapshot, python="", packages=self.packages)
+
+    def _bring(self, root: Path, client: WorkerConnection, deadline: Deadline) -> str:
+        """What the server calls a folder of files, once it has them."""
+        if root not in self._files:
+            self._files[root] = upload.listing(root)
+        return upload.upload(client, root, self._files[root], deadline)[0]
 
     def _check_packages(
         self, order: m.NeedPackages, client: WorkerConnection, deadline: Deadline

@@ -28,7 +28,9 @@ class Sandbox:
     name: str
     retry_s: float = 0.0
 
-    def for_repository(self, snapshot: Path, policy: Policy, runtime: Runtime) -> Sandbox:
+    def for_repository(
+        self, snapshot: Path, policy: Policy, runtime: Runtime, assets: tuple[Path, ...] = ()
+    ) -> Sandbox:
         """The place for one repository, where each gets a server that sees no other's files.
 
         Starts nothing, and connects to nothing.
@@ -37,6 +39,7 @@ class Sandbox:
             snapshot: The verified files.
             policy: What the jails may do.
             runtime: The interpreter that the caller named, or none, and the repository's packages.
+            assets: The verified files of further repositories that its jails are shown.
 
         Raises:
             PolicyError: The place cannot permit what the policy does.

@@ -89,7 +89,9 @@ def manifest_key(snapshot: Snapshot, load: m.Load, policy: Policy, runtime: Runt
     facts = (
         *(_FORMAT, m.VERSION, _stamp(Path(protocol.__file__).parent.parent)),
         *(snapshot.repo_type, snapshot.repo_id, snapshot.commit, snapshot.path),
+        [copy[:3] for copy in snapshot.hub_copies],
         *(policy.profile, policy.network, policy.readable, policy.gpu, policy.environment),
+        policy.display,
         policy.record_denials,  # where it is refused nothing is remembered that says it is not
         *_facts_of(runtime.python or sys.executable, runtime.packages),
     )

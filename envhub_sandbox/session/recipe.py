@@ -94,6 +94,7 @@ def provenance_of(
         "files": {record.path: record.digest for record in snapshot.files},
         "interpreter": dict(manifest.interpreter) if manifest else None,
         "packages": dict(manifest.packages) if manifest else None,
+        "assets": [one.pinned for one in snapshot.assets],
         "installed": installed,
         "protocol": VERSION,
         "profile": profile,

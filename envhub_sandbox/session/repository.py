@@ -23,6 +23,7 @@ from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.session.author_lines import add_author_line
 from envhub_sandbox.session.crash.history import Recording
 from envhub_sandbox.session.jails.loaded import LoadedJail
+from envhub_sandbox.session.jails.reach import add_reach_advice
 from envhub_sandbox.session.recipe import Recipe, provenance_of
 from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.settings.policy import Policy, Timeouts
@@ -121,7 +122,7 @@ class Repository:
         """Keep its files and packages from being removed, until ``let_go``."""
         if self._in_use:
             return
-        folders = [self.snapshot.root.parent]
+        folders = [one.root.parent for one in (self.snapshot, *self.snapshot.assets)]
         if os.path.isabs(self.runtime.packages):  # else they have a name, on another host
             folders.append(Path(self.runtime.packages).with_name(RECORD))
         self._in_use = [SharedLock(folder) for folder in folders]
@@ -141,6 +142,7 @@ class Repository:
             if isinstance(error, DependencyError) and not str(error).startswith(self.label):
                 error.args = (f"{error}. {self._advice(str(error))}",)
             name_source(error, self.label)
+            add_reach_advice(error, self.policy)
             add_author_line(error, self.snapshot)
             raise
 

@@ -15,17 +15,18 @@ import json
 import operator
 import os
 import shlex
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import field, fields, replace
 from keyword import iskeyword
 from pathlib import Path
 from typing import Any
 
 from envhub_sandbox.errors import PolicyError
-from envhub_worker.protocol.confinement import NETWORKS, PROFILES
+from envhub_worker.protocol.confinement import DISPLAYS, NETWORKS, PROFILES
 from envhub_worker.protocol.limits import MAX_NUM_ENVS
 from envhub_worker.protocol.records import dataclass
 
+MAX_ASSETS = 16
 _CODE, _LIMITS, _HUB = "How it is built", "What it may do", "Where it comes from"
 _LANES = ("auto", "frames")
 
@@ -110,6 +111,14 @@ def _lane(value: Any) -> str:
     return str(value)
 
 
+def _assets(value: Any) -> tuple[str, ...]:
+    if not isinstance(value, (list, tuple)) or not all(isinstance(one, str) for one in value):
+        raise TypeError(f"`assets` is {value!r}; it takes a list such as ['org/data@COMMIT']")
+    if len(value) > MAX_ASSETS:
+        raise ValueError(f"`assets` holds {len(value)} repositories; it takes {MAX_ASSETS} at most")
+    return tuple(value)
+
+
 def _keyword_arguments(value: Any) -> dict[str, Any]:
     if value is None:
         return {}
@@ -170,6 +179,17 @@ class Options:
         "--lock",
         "What 'envhub lock' wrote: its packages, and nothing that differs from it.",
         metavar="FILE",
+        sandboxed=True,
+    )
+    assets: Sequence[str] = _option(
+        (),
+        "--assets",
+        "A further repository of the Hub that it may read, as in datasets/org/data@COMMIT "
+        "(repeatable).",
+        metavar="REF",
+        kind=list,
+        check=_assets,
+        panel=_HUB,
         sandboxed=True,
     )
     num_workers: int | None = _option(
@@ -279,6 +299,9 @@ _KEYS: dict[str, dict[str, Option]] = {
             "--profile", "Which layers must hold; strict by default.", "|".join(PROFILES)
         ),
         "network": Option("--network", "None by default.", "|".join(NETWORKS)),
+        "display": Option(
+            "--display", "A display of its own, by Xvfb; none by default.", "|".join(DISPLAYS)
+        ),
         "gpu": Option("--gpu", "Grant all GPUs, or those, as nvidia-smi counts them.", "all|N[,N]"),
         "readable": Option(
             "--readable", "A further absolute path that it may read (repeatable).", "PATH", list

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 
 from envhub_sandbox.errors import PolicyError
 from envhub_sandbox.settings.options import option_name
-from envhub_worker.protocol.confinement import NETWORKS, PROFILES, Confinement, Limits
+from envhub_worker.protocol.confinement import DISPLAYS, NETWORKS, PROFILES, Confinement, Limits
 from envhub_worker.protocol.text import parse_size
 
 __all__ = [
@@ -76,6 +76,8 @@ class Policy:
         profile: Which layers must hold. ``"strict"`` needs all of them; ``"no-userns"`` and
             ``"container"`` are weaker and must be asked for by name (``docs/threat-model.md``).
         network: ``"none"``, ``"loopback"`` (its own, empty one) or ``"host"``.
+        display: ``"none"``, or ``"virtual"``: an X display of its own (Xvfb, which has to be
+            installed where the jail runs), inside the jail, for code that opens windows.
         readable: Further absolute paths that the jail may read.
         gpu: ``True`` grants all GPUs, ``[0, 2]`` those, counted as ``nvidia-smi`` does (NVIDIA's by
             PCI address, then others): the device nodes for computing and rendering, and of
@@ -102,6 +104,7 @@ class Policy:
 
     profile: str = "strict"
     network: str = "none"
+    display: str = "none"
     readable: tuple[str, ...] = ()
     gpu: bool | Sequence[int] = False
     environment: tuple[str, ...] = ()
@@ -117,6 +120,7 @@ class Policy:
     def __post_init__(self) -> None:
         _one_of("profile", self.profile, PROFILES)
         _one_of("network", self.network, NETWORKS)
+        _one_of("display", self.display, DISPLAYS)
         _one_of("restart", self.restart, RESTARTS)
         _count("restart_budget", self.restart_budget)
         _seconds("restart_backoff_s", self.restart_backoff_s)
@@ -150,6 +154,7 @@ class Policy:
             environment=granted,
             limits=self.limits,
             record_denials=self.record_denials,
+            display=self.display,
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
@@ -90,6 +91,7 @@ def test_only_ones_own_sessions_are_shown(alice: Any, mallory: Peer) -> None:
         ({"confinement": asdict(Confinement(network="host"))}, "--allow-network"),
         ({"confinement": asdict(Confinement(profile="nothing"))}, "no confinement"),
         ({"runners": 10_000}, "runners"),
+        ({"hub_copies": (("models--../x", "a" * 40, ("main",), ""),)}, "there cannot be"),
     ],
 )
 def test_a_jail_cannot_be_asked_more_than_a_policy_may(
@@ -107,6 +109,33 @@ def test_a_jail_cannot_be_asked_more_than_a_policy_may(
         **changes,
     }
     assert complaint in mallory.refused(m.OpenJail(**order)).message
+
+
+def test_another_repository_is_a_snapshot_that_the_client_has_brought(
+    alice: Any, mallory: Peer
+) -> None:
+    """Not a path of the server, and not what is not hers; her own, as the control."""
+    mine = brought(mallory, b"x = 1")
+
+    def order(tree: str) -> m.OpenJail:
+        copies = (("datasets--org--data", "a" * 40, ("main",), tree),)
+        place = ("x", "", "", mine, "env.py", asdict(Confinement()), 1)
+        return m.OpenJail(*place, hub_copies=copies)
+
+    for tree in ("/etc", "sha256:../../etc", "sha256:" + "0" * 64):
+        assert "no such snapshot" in mallory.refused(order(tree)).message
+    assert isinstance(mallory.ask(order(mine)), m.JailOpened)
+
+
+def brought(client: Peer, code: bytes) -> str:
+    """The name of a snapshot that has this file."""
+    sha256 = hashlib.sha256(code).digest()
+    offer = m.OfferSnapshot((("env.py", len(code), sha256),))
+    client.ask(offer)
+    client.ask(m.PutBlob(sha256, 0), code)
+    wanted = client.ask(offer)
+    assert isinstance(wanted, m.MissingBlobs)
+    return wanted.snapshot
 
 
 def test_more_bytes_than_may_be_in_flight_are_refused(alice: Any, mallory: Peer) -> None:

@@ -147,6 +147,13 @@ class MakeOptions:
 
         return snapshot_named(ref, **self.hub)
 
+    def snapshot_with_assets(self, ref: str, locked: Sequence[str] = ()) -> Snapshot:
+        """The same, with its assets: those of the command line, or these."""
+        from envhub_sandbox.hub.sources.assets import with_assets
+
+        assets = self.given.get("assets") or locked
+        return with_assets(self.snapshot(ref), assets, self.hub)
+
     @property
     def hub(self) -> dict[str, Any]:
         """Which Hub, and how."""

@@ -132,6 +132,8 @@ def _percent(rate: float | None) -> str:
 def print_provenance(provenance: dict[str, Any], *, in_process: bool) -> None:
     """Where the code came from, what ran it, and what confined it."""
     show("repository", _repository(provenance), width=_WIDTH)
+    for asset in provenance.get("assets") or ():
+        show("could read", str(asset), width=_WIDTH)
     interpreter = provenance.get("interpreter") or {}
     if interpreter:
         text = _interpreter(interpreter, provenance.get("packages") or {})

@@ -50,6 +50,7 @@ def with_files(lock: LockFile, snapshot: Snapshot) -> LockFile:
         commit=snapshot.commit,
         entry=snapshot.path,
         files={record.path: record.digest for record in snapshot.files},
+        assets=tuple(one.pinned for one in snapshot.assets),
     )
 
 
@@ -62,6 +63,9 @@ def _of_files(then: LockFile, now: LockFile) -> Iterator[str]:
         yield f"commit: {then.commit[:18]} was locked, this is {now.commit[:18]}"
     if then.entry != now.entry:
         yield f"entry file: {then.entry} was locked, this is {now.entry}"
+    if set(then.assets) != set(now.assets):
+        old, new = (", ".join(sorted(one.assets)) or "none" for one in (then, now))
+        yield f"assets: {printable(old, 2000)} were locked, these are {printable(new, 2000)}"
     for name in sorted({*then.files, *now.files}):
         shown = printable(name, 200)
         if name not in now.files:

@@ -81,6 +81,7 @@ class LockFile:
         override: Those that hold instead of all others of the same package.
         without: Packages that he left out.
         inferred: What was taken though nothing declares it, and where it is imported.
+        assets: Further repositories that it may read, each at its commit.
     """
 
     repository: str
@@ -96,6 +97,7 @@ class LockFile:
     override: tuple[str, ...] = ()
     without: tuple[str, ...] = ()
     inferred: tuple[str, ...] = ()
+    assets: tuple[str, ...] = ()
 
 
 def repository_of(snapshot: Snapshot) -> str:
@@ -165,6 +167,7 @@ class _Reader:
             ),
             packages=packages,
             inferred=self._texts("inferred"),
+            assets=self._texts("assets"),
             exclude_newer=newer,
             spaces=self._spaces(),
             **{name: self._requirements(name) for name in _REQUIREMENTS if name in self._ours},
@@ -250,7 +253,7 @@ def written(lock: LockFile) -> str:
         facts["exclude-newer"] = lock.exclude_newer
     ours = ["", "[tool.envhub]", f"format = {FORMAT}"]
     ours += [f"{name} = {quoted(value)}" for name, value in facts.items()]
-    lists = {name: getattr(lock, name) for name in (*_REQUIREMENTS, "inferred")}
+    lists = {name: getattr(lock, name) for name in (*_REQUIREMENTS, "inferred", "assets")}
     ours += [
         f"{name} = [{', '.join(map(quoted, texts))}]"
         for name, texts in lists.items()

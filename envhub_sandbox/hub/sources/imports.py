@@ -119,4 +119,4 @@ def of_module(name: str) -> list[str]:
 def _table() -> dict[str, list[str]]:
     text = Path(__file__).with_name("modules.txt").read_text("utf-8")
     rows = [line.split() for line in text.splitlines() if not line.startswith("#")]
-    return {module: names or [module] for module, *names in rows}
+    return {module: [] if names == ["-"] else names or [module] for module, *names in rows}

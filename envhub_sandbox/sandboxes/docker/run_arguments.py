@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 from envhub_sandbox.errors import PolicyError
@@ -48,6 +49,7 @@ class Container:
         sockets: The host's folder that is mounted at ``SOCKETS``.
         snapshot: The host's folder that is mounted at ``SNAPSHOT``, read-only.
         packages: The host's folder that is mounted at ``PACKAGES``, read-only, or empty.
+        assets: The host's folders of further repositories, mounted read-only beside it.
         readable: Further paths of the host, read-only, at the same place.
         seccomp: The host's path of the system call profile.
         user: User and group of its processes.
@@ -78,6 +80,7 @@ class Container:
     gpus: str | None
     ulimits: tuple[str, ...] = ()
     packages: str = ""
+    assets: tuple[str, ...] = ()
 
 
 def run_arguments(engine: Engine, wanted: Container) -> list[str]:
@@ -135,6 +138,7 @@ def _files(wanted: Container) -> list[str]:
         _mount(wanted.sockets, SOCKETS, read_only=False),
         _mount(wanted.snapshot, SNAPSHOT, read_only=True),
         *([_mount(wanted.packages, PACKAGES, read_only=True)] if wanted.packages else []),
+        *(_mount(path, place, read_only=True) for path, place in asset_places(wanted.assets)),
         *(_mount(path, path, read_only=True) for path in wanted.readable),
     ]
     scratch = f"rw,nosuid,nodev,size={wanted.scratch},mode=1777"
@@ -142,6 +146,11 @@ def _files(wanted: Container) -> list[str]:
         *("--tmpfs", f"/tmp:{scratch}", "--shm-size", str(_SHARED_MEMORY_BYTES)),
         *(word for mount in mounts for word in ("--mount", mount)),
     ]
+
+
+def asset_places(assets: Iterable[str]) -> Iterator[tuple[str, str]]:
+    """Each asset's folder on the host, and where it lies inside."""
+    return ((path, f"{SNAPSHOTS}/asset-{number}") for number, path in enumerate(assets))
 
 
 def _mount(source: str, target: str, *, read_only: bool) -> str:

@@ -87,7 +87,7 @@ class DockerSandbox(Sandbox):
                 raise PolicyError(f"DockerSandbox: {option} is {value!r}; it takes more than 0")
 
     def for_repository(
-        self, snapshot: Path, policy: Policy, runtime: Runtime
+        self, snapshot: Path, policy: Policy, runtime: Runtime, assets: tuple[Path, ...] = ()
     ) -> RepositoryContainer:
         """The container for one repository. Starts nothing, but asks for engine and image.
 
@@ -118,7 +118,7 @@ class DockerSandbox(Sandbox):
         engine = find_engine(self.engine)
         _check_users(engine)
         image, packages = find_image(engine, self.image), runtime.packages
-        return RepositoryContainer(self, engine, image, snapshot, policy, packages)
+        return RepositoryContainer(self, engine, image, snapshot, policy, packages, assets)
 
     def package_target(self) -> packages.ImageTarget:
         """Packages are made on this machine, for the image's Python."""
@@ -164,6 +164,7 @@ class RepositoryContainer(Sandbox):
     snapshot: Path
     policy: Policy
     packages: str = ""
+    assets: tuple[Path, ...] = ()
 
     def runs_on(self, runtime: Runtime) -> Runtime:
         """The image, by its id."""
@@ -184,8 +185,10 @@ class RepositoryContainer(Sandbox):
     ) -> m.OpenJail:
         """Files and packages lie elsewhere in there, and not every profile can be had."""
         container = cast("ContainerServer", server)
+        trees = dict(run_arguments.asset_places(map(str, self.assets)))
         return m.replace(
             order,
+            hub_copies=order.with_trees(trees),
             snapshot=run_arguments.SNAPSHOT,
             # with packages of its own it has no use for those of another environment in the image
             python="" if self.packages else container.python,
@@ -262,6 +265,7 @@ class RepositoryContainer(Sandbox):
             sockets=str(sockets),
             snapshot=str(self.snapshot),
             packages=self.packages,
+            assets=tuple(map(str, self.assets)),
             readable=policy.readable,
             seccomp=str(folder / "seccomp.json"),
             user=(user, group),

@@ -249,9 +249,9 @@ def _files(mapping: dict[str, Any]) -> dict[str, str]:
 
 # --- what it asks of this machine --------------------------------------------------------------
 
-_GRANTED = ("profile", "network", "readable", "gpu", "environment")
-_CARRIED = ("hub_cache_dir", "endpoint", "python", "dependencies", "lock")
-_USUAL = (None, "auto")
+_GRANTED = ("profile", "network", "display", "readable", "gpu", "environment")
+_CARRIED = ("hub_cache_dir", "endpoint", "python", "dependencies", "lock", "assets")
+_USUAL: tuple[object, ...] = (None, "auto", [])
 
 
 def wishes(bundle: Bundle) -> list[str]:
@@ -306,7 +306,7 @@ def replayed_arguments(bundle: Bundle, *, granted: bool) -> dict[str, Any]:
         made |= {"num_workers": bundle.task["shards"], "lane": bundle.task["lane"]}
     if granted:
         carried = {name: bundle.arguments.get(name) for name in _CARRIED}
-        made |= {name: value for name, value in carried.items() if type(value) in (str, dict)}
+        made |= {name: value for name, value in carried.items() if type(value) in (str, dict, list)}
     return made
 
 

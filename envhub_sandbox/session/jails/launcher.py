@@ -54,7 +54,9 @@ class Launcher:
     def __init__(self, repository: Repository, sandbox: Sandbox, store: Path) -> None:
         self.repository = repository
         runtime = repository.runtime
-        place = sandbox.for_repository(repository.snapshot.root, repository.policy, runtime)
+        assets = tuple(one.root for one in repository.snapshot.assets)
+        own = repository.snapshot.root
+        place = sandbox.for_repository(own, repository.policy, runtime, assets)
         self._sandbox = place
         self.runs_on = place.runs_on(runtime)
         self.retry_s = place.retry_s
@@ -154,7 +156,8 @@ class Launcher:
         repository, snapshot = self.repository, self.repository.snapshot
         confinement = asdict(repository.policy.confinement())
         files = str(snapshot.root), snapshot.path
-        return m.OpenJail(repository.label, *repository.runtime, *files, confinement, runners)
+        order = (repository.label, *repository.runtime, *files, confinement, runners)
+        return m.OpenJail(*order, snapshot.hub_copies)
 
     def _load(
         self, jail: JailHandle, use: ServerUse[WorkerServer], deadline: Deadline

@@ -22,7 +22,7 @@ WORKERS_OWN = {"cloudpickle", "envhub_worker", "gymnasium", "msgpack", "numpy", 
 CLIENTS_OWN = {
     *("cloudpickle", "envhub_sandbox", "envhub_worker", "gymnasium", "huggingface_hub", "msgpack"),
     *("numpy", "packaging", "platformdirs", "psutil", "pyproject_hooks", "rich", "tomli"),
-    *("tomllib", "typer", "uv", "zmq"),
+    *("tomllib", "typer", "uv", "yaml", "zmq"),
 }
 # used where they are installed, and only there
 OPTIONAL = {

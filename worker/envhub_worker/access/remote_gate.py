@@ -177,6 +177,7 @@ class RemoteGate(Gate):
         packages = request.runtime.packages
         runtime = self._packages.runtime(key, packages) if packages else OWN
         use = Use(confinement.limits.memory_bytes, request.runners)
+        copies = self._hub_copies(key, request)
         self._places.for_jail(asked.asker, use, asked.sessions, asked.jails)
         return m.replace(
             request,
@@ -184,7 +185,16 @@ class RemoteGate(Gate):
             python=runtime.python,
             packages=runtime.packages,
             snapshot=self._uploads.tree(key, request.snapshot),
+            hub_copies=copies,
         )
+
+    def _hub_copies(self, key: bytes, request: m.OpenJail) -> tuple[object, ...]:
+        """With the paths of snapshots that this client has brought, and no other paths."""
+        try:
+            wanted = {copy.tree for copy in request.repositories if copy.tree}
+        except ProtocolError as error:
+            raise RefusedError("LocalProtocolError", str(error)) from None
+        return request.with_trees({one: self._uploads.tree(key, one) for one in wanted})
 
     def _need(self, asked: ClientRequest, request: m.NeedPackages) -> m.Message:
         asker = asked.asker
@@ -192,7 +202,9 @@ class RemoteGate(Gate):
 
     def _offer(self, asked: ClientRequest, request: m.OfferSnapshot) -> m.Message:
         asker = asked.asker
-        in_use = {entry.jail.spec.snapshot for entry in asked.jails.open_ones()}
+        specs = [entry.jail.spec for entry in asked.jails.open_ones()]
+        in_use = {one.snapshot for one in specs}
+        in_use |= {copy.tree for one in specs for copy in one.hub_copies}
         wanted = self._uploads.offer(asker.session, asker.key, request, in_use)
         if wanted.hashes:
             sizes = {file[2]: file[1] for file in request.files if isinstance(file, tuple)}

@@ -88,6 +88,12 @@ def _check(confinement: Confinement, facts: HostFacts) -> None:
             f"the profile {confinement.profile} has no network of its own to give",
             'Use profile "strict", or the network "none".',
         )
+    if confinement.profile != "strict" and confinement.display != "none":
+        raise LayerUnavailableError(
+            "display",
+            f"the profile {confinement.profile} has no sockets by name, which a display needs",
+            'Use profile "strict", or leave the display out.',
+        )
 
 
 def _user_layers(facts: HostFacts, namespaced: bool) -> list[Layer]:

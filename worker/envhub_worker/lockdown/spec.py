@@ -6,9 +6,10 @@ from collections.abc import Mapping
 from dataclasses import asdict, fields
 from typing import Any
 
-from envhub_worker.protocol.confinement import NETWORKS, PROFILES, Confinement, Limits
+from envhub_worker.protocol.confinement import DISPLAYS, NETWORKS, PROFILES, Confinement, Limits
 from envhub_worker.protocol.errors import RemoteProtocolError
 from envhub_worker.protocol.records import dataclass
+from envhub_worker.protocol.runtime import HubCopy, read_hub_copies
 
 _MAX_LIMIT = 1 << 62
 _MAX_OUTPUT_BYTES = 64 << 20
@@ -27,12 +28,14 @@ class JailSpec:
     Attributes:
         snapshot: Absolute path of the read-only snapshot root.
         entry: The entry file, relative to it.
+        hub_copies: What its cache of the Hub holds.
     """
 
     snapshot: str
     entry: str
     confinement: Confinement
     name: str
+    hub_copies: tuple[HubCopy, ...] = ()
 
     def to_wire(self) -> dict[str, Any]:
         """Plain data for a channel between our own processes."""
@@ -41,7 +44,9 @@ class JailSpec:
     @classmethod
     def from_wire(cls, data: dict[str, Any]) -> JailSpec:
         """The inverse of ``to_wire``."""
-        return cls(**{**data, "confinement": confinement_from_wire(data["confinement"])})
+        copies = read_hub_copies(data["hub_copies"])
+        confinement = confinement_from_wire(data["confinement"])
+        return cls(**{**data, "confinement": confinement, "hub_copies": copies})
 
 
 def confinement_from_wire(data: dict[str, Any]) -> Confinement:
@@ -56,7 +61,7 @@ def confinement_from_wire(data: dict[str, Any]) -> Confinement:
     checked = {"limits": _limits(data["limits"]), "gpu": _gpu(data["gpu"])}
     made = Confinement(**{**data, "readable": tuple(_texts(data["readable"])), **checked})
     known = made.profile in PROFILES and made.network in NETWORKS
-    known = known and type(made.record_denials) is bool
+    known = known and made.display in DISPLAYS and type(made.record_denials) is bool
     if not known or len(made.readable) > _MAX_READABLE or not _may_be_granted(made.environment):
         raise RemoteProtocolError("a confinement that there cannot be")
     return made

@@ -13,6 +13,7 @@ GIB = 1024 * MIB
 PROFILES = ("strict", "no-userns", "container")
 """The strongest first."""
 NETWORKS = ("none", "loopback", "host")
+DISPLAYS = ("none", "virtual")
 LEAST_LANDLOCK = {"strict": 1, "no-userns": 3, "container": 0}
 """The Landlock ABI that a profile needs. Without a mount namespace Landlock must itself guard
 truncation, which it does from the third on."""
@@ -81,6 +82,7 @@ class Confinement:
         environment: Environment variables that the caller grants by name, with their values.
         limits: Hard caps.
         record_denials: Init itself answers the system calls that are denied, and tells which.
+        display: ``"none"``, or ``"virtual"`` for an Xvfb of its own.
     """
 
     profile: str = "strict"
@@ -90,3 +92,4 @@ class Confinement:
     environment: dict[str, str] = field(default_factory=dict)
     limits: Limits = field(default_factory=Limits)
     record_denials: bool = False
+    display: str = "none"

@@ -1,8 +1,22 @@
-"""What runs a repository: an interpreter of this machine, and the packages that it gets."""
+"""What runs a repository: an interpreter of this machine, and the packages that it gets.
+
+And what it finds in its cache of the Hub: see ``HubCopy``.
+"""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import re
+from typing import Any, NamedTuple
+
+from envhub_worker.protocol.errors import RemoteProtocolError
+
+MAX_HUB_COPIES = 17
+"""The repository's own files, and sixteen others."""
+_FOLDER = re.compile(r"(models|datasets|spaces)(--[A-Za-z0-9_][\w.-]{0,95}){1,2}", re.ASCII)
+_COMMIT = re.compile(r"[0-9a-f]{40}")
+_REVISION = re.compile(r"[\w][\w.-]{0,99}(/[\w][\w.-]{0,99}){0,4}", re.ASCII)
+_MAX_REVISIONS = 4
+_MAX_PATH = 4096
 
 
 class Runtime(NamedTuple):
@@ -28,3 +42,54 @@ removes them has it alone. No jail sees it."""
 
 OWN = Runtime("")
 """The worker server's own interpreter, with its packages."""
+
+
+class HubCopy(NamedTuple):
+    """One repository of a jail's own cache of the Hub, at one commit.
+
+    Attributes:
+        folder: What the cache of the Hub calls it: ``"models--org--name"``.
+        commit: The full commit.
+        revisions: Branches and tags that mean this commit.
+        tree: The folder with its files; empty for those of the jail's own snapshot.
+    """
+
+    folder: str
+    commit: str
+    revisions: tuple[str, ...]
+    tree: str
+
+
+def read_hub_copies(value: Any) -> tuple[HubCopy, ...]:
+    """Read what ``OpenJail`` holds; lists for tuples permitted.
+
+    Trust: a client on another host may have written it.
+
+    Raises:
+        RemoteProtocolError: A name or number that there cannot be.
+    """
+    if type(value) not in (list, tuple) or len(value) > MAX_HUB_COPIES:
+        raise _wrong()
+    copies = tuple(map(_copy, value))
+    if len({copy.folder for copy in copies}) < len(copies):
+        raise _wrong()
+    return copies
+
+
+def _copy(value: Any) -> HubCopy:
+    if type(value) not in (list, tuple) or len(value) != 4:
+        raise _wrong()
+    folder, commit, revisions, tree = value
+    if type(revisions) not in (list, tuple) or len(revisions) > _MAX_REVISIONS:
+        raise _wrong()
+    texts = (folder, commit, tree, *revisions)
+    if not all(type(text) is str for text in texts) or len(tree) > _MAX_PATH or "\0" in tree:
+        raise _wrong()
+    known = _FOLDER.fullmatch(folder) and _COMMIT.fullmatch(commit)
+    if not known or not all(map(_REVISION.fullmatch, revisions)):
+        raise _wrong()
+    return HubCopy(folder, commit, tuple(revisions), tree)
+
+
+def _wrong() -> RemoteProtocolError:
+    return RemoteProtocolError("repositories of the Hub that there cannot be")

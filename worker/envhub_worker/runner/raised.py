@@ -5,6 +5,7 @@ from __future__ import annotations
 import builtins
 import contextlib
 import os
+import sys
 import traceback
 from collections.abc import Iterator
 
@@ -33,7 +34,7 @@ def raised(error: BaseException, stage: str, root: str = "") -> RaisedException:
         denied = PermissionError(f"{_text(error)}, but {hidden}")
         error = denied.with_traceback(error.__traceback__)
     with contextlib.suppress(Exception):  # the error may be of a class of the repository's
-        why = why_file_unwritable(error, root)
+        why = _usage(error) or why_file_unwritable(error, root)
     kind = type(error)
     name = kind.__qualname__
     if kind.__module__ not in ("builtins", "__main__"):
@@ -61,6 +62,18 @@ def _text(error: BaseException) -> str:
         return str(error)
     except Exception:
         return "(its text could not be read)"
+
+
+def _usage(error: BaseException) -> str:
+    """What argparse printed before it left, where it did."""
+    parsing = getattr(sys.modules.get("argparse"), "__file__", None)
+    if not isinstance(error, SystemExit) or parsing is None:
+        return ""
+    for frame, _ in traceback.walk_tb(error.__traceback__):
+        if frame.f_code.co_name == "exit" and frame.f_code.co_filename == parsing:
+            usage, why = frame.f_locals["self"].format_usage(), frame.f_locals.get("message")
+            return f"argparse said: {usage}{why or ''}".rstrip()
+    return ""
 
 
 def _traceback(error: BaseException, root: str) -> str:

@@ -33,6 +33,9 @@ from envhub_worker.lockdown.stages import runner
 from envhub_worker.protocol.records import dataclass
 from envhub_worker.spawn import blas
 from envhub_worker.spawn.channel import Channel
+from envhub_worker.spawn.display import check_display, start_display
+from envhub_worker.spawn.hub_cache import make_hub_cache
+from envhub_worker.spawn.lerobot_stub import install_lerobot_stub
 
 _SELF_TEST = Layer("self-test", True, "the denials above were tried and held")
 
@@ -81,6 +84,9 @@ def _run(order: Order) -> int:
     blas.restore_threads(order.jail.common.set_blas_threads, order.runners)
     init.send({"report": [_SELF_TEST.to_wire()]})
     init.close()
+    make_hub_cache(order.jail.spec)
+    install_lerobot_stub()
+    start_display(order.jail.spec)
     main = _main(order)  # not before init is out of reach: packages may be a stranger's
     stream = socket.socket(fileno=order.fds[0])
     return int(main(stream, order.jail.spec, order.fds[1:]) or 0)
@@ -124,15 +130,18 @@ def confine(order: Order, init: Channel) -> None:
     descriptors = {0, 1, 2, order.status, *order.fds}
     process.close_all_but({*descriptors, *order.jail.view.shared.values()})
     _forget_the_zygote(order.jail)
+    check_display(order.jail.spec, os.environ)
     runner.enter(order.jail, descriptors, lambda listener: init.send({"broker": True}, [listener]))
 
 
 def _forget_the_zygote(jail: JailContext) -> None:
     """Own environment, folders and random numbers; a fork shares them all with its siblings."""
     scratch, granted = jail.scratch, jail.spec.confinement.environment
-    built = jail_environment(os.environ, granted, scratch.home, scratch.temporary)
+    network = jail.spec.confinement.network
+    built = jail_environment(os.environ, granted, scratch.home, scratch.temporary, network)
     os.environ.clear()
     os.environ.update(built)
+    sys.argv = [jail.spec.entry]  # a repository may parse it; ours are not its arguments
     os.chdir(scratch.work)
     os.umask(0o022)
     tempfile.tempdir = None

@@ -9,6 +9,7 @@ import itertools
 import os
 import secrets
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from envhub_worker.lockdown.mechanisms.procfs import Children
@@ -92,12 +93,16 @@ class Jails:
             raise RefusedError(
                 "WorkerError", f"at most {MAX_JAILS} jails of 1 to {MAX_RUNNERS} runners"
             )
+        copies = request.repositories
         confinement = confinement_from_wire(request.confinement)
+        trees = tuple(copy.tree for copy in copies if copy.tree)
+        confinement = replace(confinement, readable=(*confinement.readable, *trees))
         spec = JailSpec(
             snapshot=request.snapshot,
             entry=request.entry,
             confinement=confinement,
             name=request.name,
+            hub_copies=copies,
         )
         zygote, jail = self._zygotes.fork(request.runtime, spec)
         entry = JailRecord(

@@ -30,7 +30,10 @@ SAMPLES: list[m.Message] = [
     m.Hello(m.VERSION, bytes(range(16))),
     m.Welcome(1, "0.1.0", 4242),
     m.Refusal("SandboxUnavailableError", "no user namespaces", "user-namespace", "sysctl ..."),
-    m.OpenJail("org/repo@abc:env.py", "", "", "/s", "env.py", {"limits": {"processes": 5}}, 2),
+    m.OpenJail(
+        *("org/repo@abc:env.py", "", "", "/s", "env.py", {"limits": {"processes": 5}}, 2),
+        hub_copies=(("models--org--repo", "ab" * 20, ("main",), ""),),
+    ),
     m.JailOpened(3, (1, 2), ({"layer": "seccomp", "enforced": True, "detail": "x"},)),
     m.StartRunners(3, 1),
     m.Relay(3, "step", ((1, 2), (2, 1))),

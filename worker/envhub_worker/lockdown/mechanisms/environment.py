@@ -23,6 +23,9 @@ _HEADLESS = {
     "SDL_VIDEODRIVER": "dummy",
 }
 
+# A jail has no network: without these, such programs try again for some twenty seconds.
+_OFFLINE = {"HF_HUB_OFFLINE": "1", "PIP_RETRIES": "0", "UV_OFFLINE": "1"}
+
 
 def zygote_environment(host: Mapping[str, str], python: str) -> dict[str, str]:
     """What the zygote is executed with. ``host`` gives language and time zone, nothing else."""
@@ -37,7 +40,11 @@ def zygote_environment(host: Mapping[str, str], python: str) -> dict[str, str]:
 
 
 def jail_environment(
-    base: Mapping[str, str], granted: Mapping[str, str], home: str, temporary: str
+    base: Mapping[str, str],
+    granted: Mapping[str, str],
+    home: str,
+    temporary: str,
+    network: str = "none",
 ) -> dict[str, str]:
     """What a runner of a jail sees.
 
@@ -48,6 +55,8 @@ def jail_environment(
     return {
         **kept,
         **_HEADLESS,
+        **({} if network == "host" else _OFFLINE),
+        "HF_HOME": f"{home}/.cache/huggingface",
         "HOME": home,
         "LOGNAME": "sandbox",
         # it would be written into the scratch, once for each jail; child processes inherit this

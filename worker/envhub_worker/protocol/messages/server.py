@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from envhub_worker.protocol.confinement import Reason
 from envhub_worker.protocol.messages.base import Message
-from envhub_worker.protocol.runtime import Runtime
+from envhub_worker.protocol.runtime import HubCopy, Runtime, read_hub_copies
 
 
 class Hello(Message, kind=1):
@@ -44,6 +46,7 @@ class OpenJail(Message, kind=4):
     ``python`` is the interpreter that runs the repository; empty for the server's own.
     ``packages`` is a folder of packages for it, which are used instead of that interpreter's own;
     empty for these. Nothing of the folder runs outside of the jail.
+    ``hub_copies`` has a ``HubCopy`` for each repository in the jail's cache of the Hub.
     """
 
     name: str
@@ -53,11 +56,22 @@ class OpenJail(Message, kind=4):
     entry: str
     confinement: dict[str, object]
     runners: int
+    hub_copies: tuple[object, ...] = ()
 
     @property
     def runtime(self) -> Runtime:
         """What runs the repository."""
         return Runtime(self.python, self.packages)
+
+    @property
+    def repositories(self) -> tuple[HubCopy, ...]:
+        """What the jail's cache of the Hub holds; raises ``RemoteProtocolError``."""
+        return read_hub_copies(self.hub_copies)
+
+    def with_trees(self, trees: Mapping[str, str]) -> tuple[object, ...]:
+        """``hub_copies`` with other paths for these."""
+        known = self.repositories
+        return tuple((*copy[:3], trees.get(copy.tree, copy.tree)) for copy in known)
 
 
 class JailOpened(Message, kind=5):

@@ -1,0 +1,127 @@
+"""Further repositories of the Hub that a jail may read: those of ``assets=`` and of the card.
+
+They are fetched and verified as an environment's own files are. The caller's may be private; what
+the author's card declares is fetched without a token and only as a full commit: a card must not
+bring the caller's private data into a jail, nor name something that changes.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+from envhub_sandbox.errors import EnvHubError, HubReferenceError, SnapshotError
+from envhub_sandbox.hub.listing import DEFAULT_LIMITS, SnapshotLimits
+from envhub_sandbox.hub.reference import DEFAULT_PATH, HubRef
+from envhub_sandbox.hub.snapshot import Snapshot, fetch
+from envhub_sandbox.hub.sources.card import CARD, CardError, declared_assets
+from envhub_sandbox.settings.options import option_name
+from envhub_sandbox.system.log import SNAPSHOT
+from envhub_sandbox.system.progress import progress_shown
+
+
+def with_assets(snapshot: Snapshot, given: Sequence[str], hub: Mapping[str, Any]) -> Snapshot:
+    """The snapshot with its assets, fetched and verified.
+
+    Args:
+        snapshot: The environment's own files.
+        given: References of the caller; one replaces the card's of the same repository.
+        hub: ``hub_cache_dir``, ``token`` and ``endpoint``, as ``fetch`` takes them.
+
+    Raises:
+        HubReferenceError: An asset is none, is the environment's own repository, or is named twice.
+        SnapshotError: The card cannot be read, or an asset cannot be had; see ``fetch``.
+    """
+    wanted = [_asset(text, snapshot, option_name("assets")) for text in given]
+    declared = _declared(snapshot)
+    if not wanted and not declared:
+        return snapshot
+    with progress_shown("assets") as tell:
+        found = [_fetched(ref, option_name("assets"), tell, hub) for ref in wanted]
+        theirs = {(one.repo_type, one.repo_id.casefold()) for one in found}
+        left = DEFAULT_LIMITS.max_bytes
+        for ref in declared:
+            if any(_may_be(ref, *one) for one in theirs):
+                continue
+            limits = replace(DEFAULT_LIMITS, max_bytes=max(1, left))
+            taken = _fetched(ref, f"its {CARD}", tell, {**hub, "token": False}, limits)
+            left -= sum(file.size for file in taken.files)
+            found.append(taken)
+            SNAPSHOT.info(
+                "%s: its %s declares %s as an asset, which the environment can read",
+                *(snapshot.label, CARD, taken.pinned),
+            )
+    _check_distinct(snapshot, found)
+    return replace(snapshot, assets=tuple(found))
+
+
+def _declared(snapshot: Snapshot) -> list[HubRef]:
+    try:
+        texts = declared_assets(snapshot.root)
+    except CardError as error:
+        raise SnapshotError(f"{snapshot.label}: its {CARD} is refused: {error}") from error
+    refs = [_asset(text, snapshot, f"its {CARD}") for text in texts]
+    for ref in refs:
+        if not ref.is_pinned:
+            raise HubReferenceError(
+                f"{snapshot.label}: its {CARD} declares the asset {str(ref)!r}; a card takes full "
+                "commits only, as in 'org/data@<40 hex digits>'. Give the asset with "
+                f"{option_name('assets')} instead"
+            )
+    return refs
+
+
+def _asset(text: str, snapshot: Snapshot, where: str) -> HubRef:
+    masked = re.sub(r"://[^/]*@", "://***@", text)  # a pasted URL may carry a token
+    shown = repr(masked[:200])
+    names_file = re.search(r":(?!//)", masked) is not None
+    try:
+        ref = HubRef.parse(text)
+        names_file |= ref.path != DEFAULT_PATH
+    except HubReferenceError as error:
+        if not names_file:
+            error.args = (f"{snapshot.label}: {where} holds {shown}: {error}",)
+            raise
+    if names_file:
+        raise HubReferenceError(
+            f"{snapshot.label}: {where} holds {shown}, which names a file; an asset is a whole "
+            "repository, as in 'org/data@COMMIT'"
+        )
+    if _may_be(ref, snapshot.repo_type, snapshot.repo_id.casefold()):
+        raise HubReferenceError(
+            f"{snapshot.label}: {where} holds {shown}, which is the environment's own repository; "
+            "its files are there already"
+        )
+    return ref
+
+
+def _may_be(ref: HubRef, repo_type: str, repo_id: str) -> bool:
+    return ref.repo_id.casefold() == repo_id and ref.repo_type in (None, repo_type)
+
+
+def _fetched(
+    ref: HubRef,
+    where: str,
+    tell: Callable[[str], None],
+    hub: Mapping[str, Any],
+    limits: SnapshotLimits = DEFAULT_LIMITS,
+) -> Snapshot:
+    tell(str(ref).partition(":")[0])
+    try:
+        return fetch(ref, **hub, limits=limits, needs_entry=False)
+    except EnvHubError as error:
+        error.args = (f"{error}\nIt is an asset: {where} names it.", *error.args[1:])
+        raise
+
+
+def _check_distinct(snapshot: Snapshot, found: Sequence[Snapshot]) -> None:
+    shown: dict[tuple[str, str], Snapshot] = {}
+    for one in found:
+        other = shown.setdefault((one.repo_type, one.repo_id.casefold()), one)
+        if other is not one:
+            raise HubReferenceError(
+                f"{snapshot.label}: {other.pinned} is an asset, and {one.pinned} too; a repository "
+                "is shown once, at one commit: leave one of them out"
+            )

@@ -1,0 +1,184 @@
+"""What an environment finds in its cache of the Hub: its own files, and assets; in a jail."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from envhub_sandbox import make_env
+from envhub_sandbox.errors import HubReferenceError, RemoteEnvError, RepositoryUnavailableError
+from tests.hub.stub_hub import StubHub, StubRepository
+from tests.support.interpreter import profiles
+from tests.support.repositories import STILL
+
+pytestmark = pytest.mark.short
+
+DATA = "d" * 40
+ENV = f"""{STILL}
+import os
+from pathlib import Path
+from huggingface_hub import hf_hub_download, snapshot_download
+
+class Downloads(Still):
+    def here(self, repo, kind=None, revision=None):
+        folder = Path(snapshot_download(repo, repo_type=kind, revision=revision))
+        return sorted(p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.is_file())
+
+    def text(self, repo, name, kind=None):
+        return Path(hf_hub_download(repo, name, repo_type=kind)).read_text()
+
+    def write(self, repo, kind=None):
+        (Path(snapshot_download(repo, repo_type=kind)) / "mesh.txt").write_text("changed")
+
+    def variables(self):
+        names = ("HF_HOME", "HF_HUB_OFFLINE", "HF_TOKEN", "HUGGING_FACE_HUB_TOKEN")
+        return {{name: os.environ.get(name) for name in names}}
+
+snapshot_download(OWN)
+def make_env(n_envs=1, use_async_envs=False):
+    return vector(Downloads, n_envs)
+"""
+Make = Callable[..., Any]
+
+
+def env_of(own: str) -> str:
+    """An environment that downloads its own repository while it is imported."""
+    return ENV.replace("OWN", repr(own))
+
+
+@pytest.fixture
+def own(stub_hub: StubHub) -> StubRepository:
+    """The environment's own repository, and one with data."""
+    stub_hub.add("org/data", {"mesh.txt": "a mesh"}, "dataset").commit = DATA
+    return stub_hub.add("org/repo", {"env.py": env_of("org/repo"), "scene/a.txt": "a scene"})
+
+
+@pytest.fixture
+def make(stub_hub: StubHub, hub_cache: Path, own: StubRepository) -> Make:
+    """``make_env`` of a repository of the stub."""
+
+    def run(ref: str = f"org/repo@{StubRepository({}).commit}", **options: Any) -> Any:
+        given = {"endpoint": stub_hub.endpoint, "hub_cache_dir": hub_cache, "token": False}
+        return make_env(ref, **{**given, **options})
+
+    return run
+
+
+@pytest.mark.parametrize("ref", ["org/repo", f"org/repo@{StubRepository({}).commit}"])
+def test_downloads_of_the_own_id_return_the_pinned_files(make: Make, ref: str) -> None:
+    """``snapshot_download`` and ``hf_hub_download`` find them, by no revision, main and commit."""
+    commit = StubRepository({}).commit
+    with make(ref) as suites:
+        for revision in (None, "main", commit):
+            [found] = suites.env.call("here", "org/repo", None, revision)
+            assert found == ["env.py", "scene/a.txt"]
+        assert suites.env.call("text", "org/repo", "scene/a.txt") == ("a scene",)
+
+
+def test_a_revision_that_was_asked_for_is_found(
+    make: Make, stub_hub: StubHub, own: StubRepository
+) -> None:
+    """A tag of the reference is a revision inside; another one is not."""
+    own.refs.add("v1.0")
+    with make("org/repo@v1.0") as suites:
+        assert suites.env.call("here", "org/repo", None, "v1.0")
+        with pytest.raises(RemoteEnvError):
+            suites.env.call("here", "org/repo", None, "v2.0")
+
+
+@pytest.mark.parametrize("kind", ["space", "dataset"])
+def test_other_types_of_repository_find_themselves(
+    make: Make, stub_hub: StubHub, kind: str
+) -> None:
+    """A space finds itself as a space, and a dataset as a dataset."""
+    code = ENV.replace("snapshot_download(OWN)", f"snapshot_download('org/x', repo_type={kind!r})")
+    stub_hub.add("org/x", {"env.py": code}, kind)
+    with make(f"{kind}s/org/x") as suites:
+        assert suites.env.call("here", "org/x", kind) == (["env.py"],)
+        with pytest.raises(RemoteEnvError):
+            suites.env.call("here", "org/x", "model")
+
+
+@pytest.mark.parametrize("asset", [f"datasets/org/data@{DATA}", f"org/data@{DATA}", "org/data"])
+def test_an_asset_is_found_and_read_only(make: Make, asset: str) -> None:
+    """It has its own type; what runs without a network can read it and not change it."""
+    with make(assets=[asset]) as suites:
+        assert suites.env.call("text", "org/data", "mesh.txt", "dataset") == ("a mesh",)
+        with pytest.raises(OSError, match=r"Read-only|Permission"):
+            suites.env.call("write", "org/data", "dataset")
+        assert suites.provenance["assets"] == [f"datasets/org/data@{DATA}"]
+
+
+@pytest.mark.parametrize("arena", profiles("no-userns"))
+def test_a_profile_without_mounts_shows_an_asset_too(make: Make, arena: str) -> None:
+    """By Landlock; and every process of an environment that is spread finds it."""
+    options = {"policy": {"profile": arena}, "n_envs": 4, "use_async_envs": True, "num_workers": 2}
+    with make(assets=["org/data"], **options) as suites:
+        assert suites.env.call("text", "org/data", "mesh.txt", "dataset") == ("a mesh",) * 4
+        with pytest.raises(OSError, match=r"Read-only|Permission"):
+            suites.env.call("write", "org/data", "dataset")
+
+
+def test_assets_are_part_of_what_is_remembered_and_handed_on(make: Make) -> None:
+    """With an asset and without it are two manifests; a pickle makes the same again, pinned."""
+    with make() as suites, pytest.raises(RemoteEnvError):
+        suites.env.call("text", "org/data", "mesh.txt", "dataset")
+    with make(assets=["org/data"]) as suites:
+        again = pickle.loads(pickle.dumps(suites.env))
+        try:
+            assert again.call("text", "org/data", "mesh.txt", "dataset") == ("a mesh",)
+        finally:
+            again.close()
+
+
+def test_a_card_declares_assets(make: Make, stub_hub: StubHub, own: StubRepository) -> None:
+    """They are fetched without a token, and the provenance says so."""
+    own.files["README.md"] = f"---\nenvhub:\n  assets: [org/data@{DATA}]\n---\n# x\n".encode()
+    with make(token="hf_secret") as suites:
+        assert suites.env.call("text", "org/data", "mesh.txt", "dataset") == ("a mesh",)
+        assert suites.provenance["assets"] == [f"datasets/org/data@{DATA}"]
+    asked = zip(stub_hub.requests, stub_hub.authorizations, strict=True)
+    tokens = {"data" if "org/data" in one else "own": token for one, token in asked}
+    assert tokens["own"] is not None
+    assert tokens["data"] is None
+
+
+def test_an_asset_that_is_not_there_is_named(make: Make) -> None:
+    """The error says that it is an asset, and of which argument."""
+    with pytest.raises(RepositoryUnavailableError, match="It is an asset: assets names it"):
+        make(assets=["org/nothing@" + "e" * 40])
+
+
+@pytest.mark.parametrize(
+    ("asset", "why"),
+    [
+        ("org/repo@" + "a" * 40, "own repository"),
+        ("Org/Repo@" + "a" * 40, "own repository"),
+        (f"org/data@{DATA}:mesh.txt", "names a file"),
+        ("org/../data@" + "a" * 40, "holds"),
+        ("/etc", "holds"),
+        ("org/data@../../main", "holds"),
+    ],
+)
+def test_what_is_no_asset_is_refused(make: Make, asset: str, why: str) -> None:
+    """The environment's own repository, one file, and tricks with paths."""
+    with pytest.raises(HubReferenceError, match=why):
+        make(assets=[asset])
+
+
+def test_no_token_and_no_cache_of_the_users_is_inside(
+    make: Make, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """The cache of a jail is its own, whatever the caller's is."""
+    monkeypatch.setenv("HF_TOKEN", "hf_secret")
+    monkeypatch.setenv("HF_HOME", str(tmp_path / "mine"))
+    with make() as suites:
+        [found] = suites.env.call("variables")
+    assert found["HF_HOME"].startswith("/sandbox/home/")
+    assert found["HF_HUB_OFFLINE"] == "1"
+    assert found["HF_TOKEN"] is None
+    assert found["HUGGING_FACE_HUB_TOKEN"] is None

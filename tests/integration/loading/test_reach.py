@@ -1,0 +1,142 @@
+"""What an environment wants when it starts: its command line, sockets, downloads and windows."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from envhub_sandbox import make_env
+from envhub_sandbox.errors import (
+    EnvHubError,
+    LoadError,
+    RemoteEnvError,
+    RemoteEnvWarning,
+    WorkerDiedError,
+)
+from tests.support.repositories import STILL, write_repository
+
+pytestmark = pytest.mark.short
+
+PARSES = f"""
+import argparse, sys
+parser = argparse.ArgumentParser()
+parser.add_argument("--level", type=int, ARGUMENTS)
+LEVEL = parser.parse_args().level
+{STILL}
+class Told(Still):
+    def argv(self):
+        return list(sys.argv)
+
+def make_env(n_envs=1, use_async_envs=False):
+    return vector(Told, n_envs)
+"""
+RUNS = f"""
+import os, socket, subprocess, sys, urllib.request
+{STILL}
+class Runs(Still):
+    def run(self, code):
+        exec(code, globals())
+
+def make_env(n_envs=1, use_async_envs=False):
+    return vector(Runs, n_envs)
+"""
+
+
+def test_a_command_line_is_parsed(tmp_path: Path) -> None:
+    """``sys.argv`` is the entry file and nothing else."""
+    folder = write_repository(tmp_path / "repo", PARSES.replace("ARGUMENTS", "default=3"))
+    with make_env(str(folder)) as suites:
+        assert suites.env.call("argv") == (["env.py"],)
+
+
+def test_argparse_that_leaves_shows_its_usage(tmp_path: Path) -> None:
+    """Instead of ``SystemExit: 2``, which says nothing."""
+    folder = write_repository(tmp_path / "repo", PARSES.replace("ARGUMENTS", "required=True"))
+    with pytest.raises(LoadError) as caught:
+        make_env(str(folder))
+    assert "usage: env.py [-h] --level LEVEL" in str(caught.value)
+    assert "the following arguments are required: --level" in str(caught.value)
+
+
+@pytest.fixture(scope="module")
+def env(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    """An environment that runs what it is given."""
+    folder = write_repository(tmp_path_factory.mktemp("runs") / "repo", RUNS)
+    with make_env(str(folder), policy={"restart": "on_reset"}) as suites:
+        yield suites.env
+
+
+URL = "http://envhub.example/x"
+PIP = "[sys.executable, '-m', 'pip', 'install', 'requests']"
+
+
+@pytest.mark.parametrize(
+    ("code", "advice"),
+    [
+        ("from huggingface_hub import snapshot_download as s; s('org/other')", "with assets="),
+        ("from huggingface_hub import hf_hub_download as h; h('org/other', 'x')", "with assets="),
+        (f"urllib.request.urlopen({URL!r})", "assets=['org/repo@COMMIT'] names"),
+        (f"subprocess.run(['git', 'clone', {URL!r}, '/tmp/x'], check=True)", "] names"),
+        (f"subprocess.run({PIP}, check=True)", "dependencies={'extra': ['PACKAGE']}"),
+        ("subprocess.check_call('pip install -q requests', shell=True)", "requirements.txt"),
+        ("socket.create_server(('127.0.0.1', 0))", "policy={'network': 'loopback'}"),
+        ("socket.create_connection(('localhost', 1))", "policy={'network': 'loopback'}"),
+        ("raise RuntimeError('could not connect to display')", "render to arrays"),
+    ],
+)
+def test_what_is_not_there_fails_with_what_brings_it(env: Any, code: str, advice: str) -> None:
+    """One sentence, which names the argument; the program's own words stay."""
+    env.reset()
+    with pytest.raises(RemoteEnvError) as caught:
+        env.call("run", code)
+    assert advice in str(caught.value)
+    assert (
+        str(caught.value).count("a jail has no display")
+        + str(caught.value).count("A jail has no network")
+        == 1
+    )
+
+
+def test_other_errors_get_no_advice(env: Any) -> None:
+    """What has nothing to do with a network or a display."""
+    env.reset()
+    with pytest.raises(RemoteEnvError) as caught:
+        env.call("run", "raise ValueError('the display of 3 networks is 97')")
+    assert "A jail has no" not in str(caught.value)
+
+
+def test_a_window_that_cannot_be_opened_is_no_mere_abort(env: Any) -> None:
+    """Qt ends the process; the error says why."""
+    env.reset()
+    said = 'qt.qpa.plugin: Could not load the Qt platform plugin "xcb" in ""'
+    with pytest.raises(WorkerDiedError, match="It tried to open a window") as caught:
+        env.call("run", f"sys.stderr.write({said!r} + chr(10)); sys.stderr.flush(); os.abort()")
+    assert caught.value.signal == "SIGABRT"
+
+
+def test_a_loopback_device_of_its_own(tmp_path: Path) -> None:
+    """What the advice names works."""
+    folder = write_repository(tmp_path / "repo", RUNS)
+    with make_env(str(folder), policy={"network": "loopback"}) as suites:
+        suites.env.call("run", "socket.create_server(('127.0.0.1', 0))")
+        with pytest.raises(EnvHubError, match="A jail has no network"):
+            suites.env.call("run", f"urllib.request.urlopen({URL!r})")
+
+
+@pytest.mark.filterwarnings("default")
+def test_lerobot_that_is_imported_for_an_annotation_needs_no_package(tmp_path: Path) -> None:
+    """A stub stands in, nothing is installed, and the caller is warned of it."""
+    code = f"""
+from lerobot.envs.configs import EnvConfig, HubEnvConfig
+from lerobot.utils.constants import OBS_STATE
+{STILL}
+def make_env(n_envs: int = 1, use_async_envs: bool = False, cfg: EnvConfig | None = None):
+    return vector(Still, n_envs)
+"""
+    folder = write_repository(tmp_path / "repo", code)
+    with pytest.warns(RemoteEnvWarning, match="lerobot is not installed in the jail"):
+        suites = make_env(str(folder))
+    with suites:
+        assert suites.provenance["installed"] is None
