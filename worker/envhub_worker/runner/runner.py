@@ -213,6 +213,11 @@ class Runner:
         env = self._envs[request.env]
         return m.Value(tuple(env.pairs) if isinstance(env, SubEnvs) else ())
 
+    def take_apart(self, request: m.TakeApart) -> m.Message:
+        """Infos are sent as the only sub-environment gives them from now on."""
+        self._envs[request.env].apart = True
+        return m.Value(None)
+
     def call(self, request: m.Call) -> m.Message:
         """``VectorEnv.call``."""
         results = _caller(self._envs[request.env])(request.name, *request.args, **request.kwargs)
@@ -346,4 +351,5 @@ _HANDLERS: dict[type[m.Message], Callable[[Runner, Any], m.Message]] = {
     m.Attach: Runner.attach,
     m.FetchInfos: Runner.fetch_infos,
     m.FetchInfosApart: Runner.fetch_infos_apart,
+    m.TakeApart: Runner.take_apart,
 }

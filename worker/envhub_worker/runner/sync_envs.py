@@ -20,7 +20,7 @@ from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES
 from envhub_worker.runner.gymnasium_compat import SyncBase
-from envhub_worker.runner.infos import Pairs, join
+from envhub_worker.runner.infos import Pairs, apart, join
 
 Store = Callable[[int, Any], None]
 
@@ -100,7 +100,9 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         batch: Where ``reset`` and ``step`` leave their results.
         reward_shape: Of one sub-environment's reward; ``()`` but for multi-objective ones.
         sliced: Whether there are others elsewhere, in other processes.
+        apart: Whether there is one, whose infos are sent as it gave them.
         pairs: The infos of the last reset or step, as each sub-environment gave them.
+        integers: Which discrete members of its last observation are Python's; () unless ``apart``.
     """
 
     def __init__(
@@ -119,7 +121,9 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         self._flagged: list[int] = []  # whose flags are not both False
         self._mode = autoreset_mode
         self.sliced = sliced
+        self.apart = False
         self.pairs: Pairs = []
+        self.integers: list[bool] = []
         self._restores = batches.restores(self.single_action_space)
         self._plain_actions = isinstance(self.single_action_space, ARRAY_SPACES)
 
@@ -143,6 +147,8 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
             self.batch.store(index, observation)
             if info:
                 infos.append((index, info))
+            if self.apart:
+                self.integers = batches.integers(self.single_observation_space, observation)
         return infos
 
     def run_revive(self, seeds: Any) -> Pairs:
@@ -215,10 +221,14 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
             raise
         batch.stay()
         self._done = done
+        if self.apart:
+            self.integers = batches.integers(self.single_observation_space, observation)
         return infos
 
     def joined(self, pairs: Pairs) -> dict[Any, Any]:
-        """Infos of these sub-environments as one."""
+        """Infos of these sub-environments as they are sent: as one, or apart."""
+        if self.apart:
+            return apart(pairs, self.integers)
         return join(pairs, self.num_envs, sliced=self.sliced)
 
     def _each(self, actions: Any) -> Iterator[Any]:
