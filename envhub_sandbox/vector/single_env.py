@@ -183,7 +183,7 @@ class SingleEnv(gym.Env[Any, Any]):
 
     @property
     @short_traceback
-    def spec(self) -> Any:  # type: ignore[override]
+    def spec(self) -> Any:
         """What was set here, or the environment's: its id and limits, of which nothing is made.
 
         The first reading asks for it, which starts its processes.

@@ -19,6 +19,7 @@ import numpy as np
 
 from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 from envhub_worker.protocol.manifest.manifest import encode_env, encode_manifest
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.stream import Packet, StreamReader, pack_packet
@@ -40,7 +41,9 @@ _RECHECK_MS = 2
 
 def main(stream: socket.socket, spec: JailSpec, fds: list[int]) -> int:
     """Serve until the other side closes the stream. Runs confined, as the jail's main program."""
-    runner = Runner(spec.snapshot, spec.entry)
+    size = spec.confinement.limits.message_bytes
+    limits = WireLimits(frame_bytes=size, message_bytes=size)
+    runner = Runner(spec.snapshot, spec.entry, limits)
     runner.warned.listen()
     reader = StreamReader()
     poller = select.poll()
@@ -85,8 +88,11 @@ def _send(stream: socket.socket, request_id: int, frames: list[Any]) -> None:
 class Runner:
     """The state of one runner: the repository's tasks and the environments built of them."""
 
-    def __init__(self, snapshot: str, entry: str) -> None:
-        self._pack = partial(m.pack, describer=described)
+    def __init__(
+        self, snapshot: str, entry: str, limits: WireLimits = DEFAULT_LIMITS
+    ) -> None:
+        self._pack = partial(m.pack, describer=described, limits=limits)
+        self._pack_infos = partial(self._pack, reduces=True)
         self._snapshot = snapshot
         self._entry = entry
         self._tasks: dict[tuple[str, Any], Task] = {}
@@ -118,7 +124,7 @@ class Runner:
             reply = _HANDLERS[type(request)](self, request)
             if by_lane and isinstance(reply, m.ResetDone):
                 reply = m.Value(reply.info)  # the observation lies in the slab already
-            return self._pack(reply)
+            return (self._pack_infos if type(request) in _WITH_INFOS else self._pack)(reply)
         except ResultError as error:
             return m.pack(raised(error, "return", self._snapshot))
         except BaseException as error:
@@ -201,7 +207,7 @@ class Runner:
         reply = partial(self.reply, by_lane=True)
         fail = partial(raised, root=self._snapshot)
         more = (self.warned.pending, self.watches)
-        self.lane = Lane(env, request, self.descriptors, reply, self._pack, fail, *more)
+        self.lane = Lane(env, request, self.descriptors, reply, self._pack_infos, fail, *more)
         return m.Value(True)
 
     def fetch_infos(self, request: m.FetchInfos) -> m.Message:
@@ -331,6 +337,8 @@ def _own(env: Any, name: str) -> Any:
         return getattr(getattr(env, "unwrapped", env), name)
 
 
+_WITH_INFOS = frozenset({m.Reset, m.Step, m.Revive, m.FetchInfos, m.FetchInfosApart})
+"""Whose replies have infos, of which one part must not lose the others."""
 _HANDLERS: dict[type[m.Message], Callable[[Runner, Any], m.Message]] = {
     m.Load: Runner.load,
     m.LoadTask: Runner.load_task,
