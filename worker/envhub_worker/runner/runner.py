@@ -19,7 +19,7 @@ import numpy as np
 
 from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
+from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits, limits_for
 from envhub_worker.protocol.manifest.manifest import encode_env, encode_manifest
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.stream import Packet, StreamReader, pack_packet
@@ -41,8 +41,7 @@ _RECHECK_MS = 2
 
 def main(stream: socket.socket, spec: JailSpec, fds: list[int]) -> int:
     """Serve until the other side closes the stream. Runs confined, as the jail's main program."""
-    size = spec.confinement.limits.message_bytes
-    limits = WireLimits(frame_bytes=size, message_bytes=size)
+    limits = limits_for(spec.confinement.limits.message_bytes)
     runner = Runner(spec.snapshot, spec.entry, limits)
     runner.warned.listen()
     reader = StreamReader()
@@ -88,9 +87,7 @@ def _send(stream: socket.socket, request_id: int, frames: list[Any]) -> None:
 class Runner:
     """The state of one runner: the repository's tasks and the environments built of them."""
 
-    def __init__(
-        self, snapshot: str, entry: str, limits: WireLimits = DEFAULT_LIMITS
-    ) -> None:
+    def __init__(self, snapshot: str, entry: str, limits: WireLimits = DEFAULT_LIMITS) -> None:
         self._pack = partial(m.pack, describer=described, limits=limits)
         self._pack_infos = partial(self._pack, reduces=True)
         self._snapshot = snapshot

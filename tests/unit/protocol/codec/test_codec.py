@@ -332,7 +332,7 @@ def cyclic() -> dict[str, Any]:
         (b"x" * DEFAULT_LIMITS.header_bytes, "header_bytes"),
         ([None] * DEFAULT_LIMITS.items, "items"),
         ("x" * (DEFAULT_LIMITS.text_bytes + 1), "text_bytes"),
-        (np.broadcast_to(np.uint8(0), (2**28 + 1,)), "frame_bytes"),
+        (np.broadcast_to(np.uint8(0), (2**28 + 1,)), "message_bytes"),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )

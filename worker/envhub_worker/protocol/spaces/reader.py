@@ -153,7 +153,8 @@ class SpaceReader:
         self._left -= size
         if self._left < 0:
             raise RemoteProtocolError(
-                f"The spaces cost more than {self._max_elements} elements (max_elements)."
+                f"The spaces cost more than {self._max_elements} elements of a Box. If they are meant, "
+                'raise that limit: limits={"elements": ...}, or "message_bytes" for those in an answer'
             )
 
     def shape(self, value: object, element_bytes: int) -> tuple[int, ...]:
