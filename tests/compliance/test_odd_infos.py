@@ -1,4 +1,4 @@
-"""Infos that the wire has no form for lose nothing but themselves, in one process and in several."""
+"""Infos that the wire has no form for lose nothing but themselves, in one process and several."""
 
 from __future__ import annotations
 

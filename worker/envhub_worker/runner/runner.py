@@ -23,9 +23,9 @@ from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits, limits_for
 from envhub_worker.protocol.manifest.manifest import encode_env, encode_manifest
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.stream import Packet, StreamReader, pack_packet
+from envhub_worker.runner import gymnasium_compat as compat
 from envhub_worker.runner import loader, manifest
 from envhub_worker.runner.described import described
-from envhub_worker.runner.gymnasium_compat import joined_infos
 from envhub_worker.runner.infos import Pairs
 from envhub_worker.runner.lane import Lane
 from envhub_worker.runner.raised import raised
@@ -37,6 +37,7 @@ from envhub_worker.runner.watches import Watches
 
 _ANCILLARY_BYTES = socket.CMSG_SPACE(8 * array("i").itemsize)
 _RECHECK_MS = 2
+_MOST_WRAPPERS = 100
 
 
 def main(stream: socket.socket, spec: JailSpec, fds: list[int]) -> int:
@@ -173,8 +174,8 @@ class Runner:
         if request.mask is not None:
             options = {} if options is None else options  # our own copy
             options["reset_mask"] = request.mask
-        observation, info = env.reset(seed=request.seeds, options=options)
-        return m.ResetDone(observation, info)
+        result = compat.reset_result(env, env.reset(seed=request.seeds, options=options))
+        return m.ResetDone(*result)
 
     def step(self, request: m.Step) -> m.Message:
         """``VectorEnv.step``."""
@@ -183,8 +184,7 @@ class Runner:
             actions, space = request.actions, getattr(env, "single_action_space", None)
             if space is not None and batches.restores(space):
                 actions = batches.restore_batch(space, actions)
-            observation, rewards, terminated, truncated, info = env.step(actions)
-            return m.StepDone(observation, rewards, terminated, truncated, joined_infos(info))
+            return m.StepDone(*compat.step_result(env, env.step(actions)))
         return _step_done(env, env.run_step(request.actions))
 
     def revive(self, request: m.Revive) -> m.Message:
@@ -192,7 +192,7 @@ class Runner:
         env = self._envs[request.env]
         if isinstance(env, SubEnvs):
             return _step_done(env, env.run_revive(request.seeds))
-        observation, info = env.reset(seed=request.seeds)
+        observation, info = compat.reset_result(env, env.reset(seed=request.seeds))
         no, yes = np.zeros(env.num_envs, np.bool_), np.ones(env.num_envs, np.bool_)
         return m.StepDone(observation, np.zeros(env.num_envs), no, yes, info)
 
@@ -236,8 +236,9 @@ class Runner:
     def set_attr(self, request: m.SetAttr) -> m.Message:
         """``VectorEnv.set_attr``."""
         env = self._envs[request.env]
-        if hasattr(env, "set_attr"):
-            env.set_attr(request.name, list(request.values))
+        set_attr = _forwarded(env, "set_attr")
+        if set_attr is not None:
+            set_attr(request.name, list(request.values))
         else:
             setattr(env, request.name, request.values[0])
         return m.Value(None)
@@ -317,14 +318,24 @@ def _scratch() -> str:
 
 def _caller(env: Any) -> Callable[..., Any]:
     """``env.call``, or for a vector environment without one, its own attribute."""
-    if hasattr(env, "call"):
-        return env.call  # type: ignore[no-any-return]
+    forwarded = _forwarded(env, "call")
+    if forwarded is not None:
+        return forwarded
 
     def call(name: str, *args: Any, **kwargs: Any) -> Any:
         value = _own(env, name)
         return value(*args, **kwargs) if callable(value) else value
 
     return call
+
+
+def _forwarded(env: Any, name: str) -> Callable[..., Any] | None:
+    """Its method, or that of what it wraps: ``VectorWrapper`` has no ``call`` of its own."""
+    for _ in range(_MOST_WRAPPERS):
+        if hasattr(env, name):
+            return getattr(env, name)  # type: ignore[no-any-return]
+        env = getattr(env, "env", None)
+    return None
 
 
 def _own(env: Any, name: str) -> Any:

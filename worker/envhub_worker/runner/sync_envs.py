@@ -19,6 +19,7 @@ from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES
+from envhub_worker.runner import old_gym
 from envhub_worker.runner.gymnasium_compat import SyncBase
 from envhub_worker.runner.infos import Pairs, apart, join
 
@@ -143,7 +144,10 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         self.pairs = infos
         for index in chosen:
             seed = None if seeds is None else seeds[index]
-            observation, info = self.envs[index].reset(seed=seed, options=options)
+            try:
+                observation, info = self.envs[index].reset(seed=seed, options=options)
+            except (TypeError, ValueError) as error:
+                raise old_gym.explained(error, self.envs[index], "reset") from error
             self.batch.store(index, observation)
             if info:
                 infos.append((index, info))
@@ -216,8 +220,10 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
                     store(index, observation)
                 if info:
                     infos.append((index, info))
-        except BaseException:
+        except BaseException as error:
             batch.carry(index)  # who was not asked any more has his last observation still
+            if isinstance(error, ValueError):
+                raise old_gym.explained(error, self.envs[index], "step") from error
             raise
         batch.stay()
         self._done = done
