@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import builtins
 from pathlib import Path
 from typing import Any
 
@@ -63,9 +64,10 @@ def test_what_is_none_of_it_is_named(tmp_path: Path, case: str) -> None:
     with make_env(write_repository(tmp_path, _OWN), n_envs=2, env_kwargs={"case": case}) as suites:
         env = suites.env
         what = "in place of" if case == "no info" else case
-        with pytest.raises(RemoteEnvError, match=f"make_env returned a VectorEnv .*Own.*{what}"):
+        if case != "no info":
             env.reset()
-            env.step([0, 1])
+        with pytest.raises(RemoteEnvError, match=f"make_env returned a VectorEnv .*Own.*{what}"):
+            _ = env.reset() if case == "no info" else env.step([0, 1])
 
 
 _WRAPPED = """
@@ -113,7 +115,7 @@ def make_env(n_envs=1, use_async_envs=False):
     return gym.vector.SyncVectorEnv([lambda: gym.wrappers.OrderEnforcing(Old())] * n_envs)
 """
 _RESETS = {
-    "def reset(self): return np.zeros(3, np.float32)": r"Old.reset \(env.py, line 9\) takes no seed",
+    "def reset(self): return np.zeros(3)": r"Old.reset \(env.py, line 9\) takes no seed",
     "def reset(self, seed=None, options=None): return np.zeros(3)": r"line 9\) does not return obs",
     "def reset(self, seed=None, options=None): return np.zeros(3), {}": (
         r"Old.step \(env.py, line 11\) does not return observation, reward, terminated, truncated"
@@ -125,9 +127,11 @@ _RESETS = {
 def test_the_api_of_old_is_named_with_its_line(tmp_path: Path, text: str) -> None:
     """What ``gym`` before 0.26 had, in an environment of today's Gymnasium."""
     folder = write_repository(tmp_path, _OLD.replace("RESET", text))
-    with make_env(folder) as suites, pytest.raises(RemoteEnvError, match=_RESETS[text]) as caught:
-        suites.env.reset()
-        suites.env.step([0])
+    with make_env(folder) as suites:
+        if "step" in _RESETS[text]:
+            suites.env.reset()
+        with pytest.raises(RemoteEnvError, match=_RESETS[text]) as caught:
+            _ = suites.env.step([0]) if "step" in _RESETS[text] else suites.env.reset()
     assert "0.26" in str(caught.value)
 
 
@@ -158,15 +162,12 @@ def test_errors_are_of_their_class(tmp_path: Path) -> None:
     """Gymnasium's, and Python's that are made of more than a text."""
     names = ["UnicodeDecodeError", "UserWarning", "CustomSpaceError", "AlreadyPendingCallError"]
     names += ["NoAsyncCallError", "ClosedEnvironmentError", "ResetNeeded"]
-    builtins: dict[str, Any] = (
-        __builtins__ if isinstance(__builtins__, dict) else vars(__builtins__)
-    )
-    names += ["ExceptionGroup"] if "ExceptionGroup" in builtins else []
+    names += ["ExceptionGroup"] if hasattr(builtins, "ExceptionGroup") else []
     with make_env(write_repository(tmp_path, _RAISING)) as suites:
         env = suites.env
         env.reset()
         for name in names:
-            kind: Any = getattr(gym_errors, name, None) or builtins[name]
+            kind: Any = getattr(gym_errors, name, None) or getattr(builtins, name)
             with pytest.raises(kind) as caught:
                 env.call("fail", name)
             assert isinstance(caught.value, RemoteEnvError)

@@ -126,11 +126,10 @@ def _column(env: Any, name: str, values: Any, dtype: Any) -> Any:
             values = np.asarray(values, None if name == "rewards" else dtype)
         except ValueError:
             values = np.empty(0, object)
-    shape = getattr(values, "shape", None)
-    if not shape or shape[0] != env.num_envs or getattr(values, "dtype", None) == object:
-        raise _misfit(
-            env, f"step returns {name} that are not one number each, {env.num_envs} in all"
-        )
+    shape, dtype = getattr(values, "shape", None), getattr(values, "dtype", None)
+    if not shape or shape[0] != env.num_envs or getattr(dtype, "kind", "f") == "O":
+        count = env.num_envs
+        raise _misfit(env, f"step returns {name} that are not one number each, {count} in all")
     return values
 
 
