@@ -47,6 +47,7 @@ the repository warns of is a ``RemoteEnvWarning``, whatever its category is ther
 
 from __future__ import annotations
 
+import builtins
 import multiprocessing
 import sys
 from functools import cache
@@ -285,7 +286,8 @@ class RemoteEnvError(EnvHubError):
     """
 
     def __init__(self, type_name: str, message: str, traceback: str = "") -> None:
-        super().__init__(f"{type_name}: {continued(message)}" if message else type_name)
+        # not by the builtin that a twin is as well, which may be made of something else
+        Exception.__init__(self, f"{type_name}: {continued(message)}" if message else type_name)
         self.type_name = type_name
         self.message = message
         self.traceback = traceback
@@ -322,6 +324,7 @@ __all__ = [name for name in dir() if name.endswith(("Error", "Warning"))]
 
 _BUILTINS: tuple[type[Exception], ...] = (
     *(ArithmeticError, AssertionError, AttributeError, EOFError, FileNotFoundError, ImportError),
+    *(Warning, UserWarning, DeprecationWarning, RuntimeWarning, FutureWarning, UnicodeError),
     *(IndexError, KeyError, LookupError, MemoryError, ModuleNotFoundError, NotImplementedError),
     *(OSError, OverflowError, PermissionError, RecursionError, RuntimeError, TimeoutError),
     *(TypeError, ValueError, ZeroDivisionError),
@@ -339,21 +342,49 @@ def _twin(ours: type[EnvHubError], kind: type[Exception]) -> Any:
 
 
 _PREFIXES: dict[type[EnvHubError], str] = {RemoteEnvError: "Remote", LoadError: "Load"}
+
+
+def _group(kind: Any) -> Any:
+    """A twin of a group of exceptions, of which there must be one: its text by itself."""
+    made = _twin(RemoteEnvError, kind)
+    made.__new__ = lambda cls, *given: kind.__new__(cls, given[1], [RemoteEnvError(*given)])
+    # a group's own cannot be set
+    made.message = property(
+        lambda self: vars(self)["message"], lambda self, text: vars(self).update(message=text)
+    )
+    return made
+
+
 _TWINS = {(ours, kind.__name__): _twin(ours, kind) for ours in _PREFIXES for kind in _BUILTINS}
+for _kind in (UnicodeDecodeError, UnicodeEncodeError, UnicodeTranslateError):
+    _TWINS[RemoteEnvError, _kind.__name__] = _twin(RemoteEnvError, _kind)
+if hasattr(builtins, "ExceptionGroup"):  # since Python 3.11
+    _TWINS[RemoteEnvError, "ExceptionGroup"] = _group(builtins.ExceptionGroup)
 globals().update({twin.__name__: twin for twin in _TWINS.values()})
 _GYMNASIUM = "gymnasium.error"
 
 
 @cache
 def _gymnasiums() -> dict[str, Any]:
-    """Twins of Gymnasium's own errors, by full name; of those that are made of a text alone."""
+    """Twins of Gymnasium's own errors, by full name."""
     module = sys.modules.get(_GYMNASIUM)  # there, where there is an environment
-    base = getattr(module, "Error", Exception)
-    return {
-        f"{_GYMNASIUM}.{name}": _twin(RemoteEnvError, kind)
+    kinds = {
+        name: kind
         for name, kind in vars(module).items()
-        if isinstance(kind, type) and issubclass(kind, base) and kind.__init__ is base.__init__
+        if isinstance(kind, type) and issubclass(kind, Exception) and kind.__module__ == _GYMNASIUM
     }
+    made = {f"{_GYMNASIUM}.{name}": _twin(RemoteEnvError, kind) for name, kind in kinds.items()}
+    for twin in made.values():
+        twin.name = ""  # of the call that was pending, which nothing tells
+    return made
+
+
+def _nearest(ours: type[EnvHubError], builtin: str) -> Any:
+    """The twin of a builtin exception, or of its nearest ancestor that has one."""
+    kind = getattr(builtins, builtin, None)
+    ancestors = kind.__mro__ if isinstance(kind, type) else ()
+    known = (_TWINS.get((ours, one.__name__)) for one in ancestors)
+    return next((twin for twin in known if twin is not None), ours)
 
 
 def _builtin_of(cls: type[RemoteEnvError]) -> str:
@@ -363,7 +394,7 @@ def _builtin_of(cls: type[RemoteEnvError]) -> str:
 
 def remote_error(builtin: str, type_name: str, message: str, traceback: str = "") -> RemoteEnvError:
     """The exception for a remote failure: its class's twin, or plain ``RemoteEnvError``."""
-    twin = _TWINS.get((RemoteEnvError, builtin), RemoteEnvError)
+    twin = _nearest(RemoteEnvError, builtin)
     for name in (builtin, type_name):
         if name.startswith(_GYMNASIUM) and _GYMNASIUM in sys.modules:
             twin = _gymnasiums().get(name, twin)
@@ -373,7 +404,7 @@ def remote_error(builtin: str, type_name: str, message: str, traceback: str = ""
 
 def load_error(builtin: str, message: str) -> LoadError:
     """The exception for a repository that raised while it was loaded, which is that builtin too."""
-    error: LoadError = _TWINS.get((LoadError, builtin), LoadError)(message)
+    error: LoadError = _nearest(LoadError, builtin)(message)
     return error
 
 

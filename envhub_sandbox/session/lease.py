@@ -154,6 +154,12 @@ class Lease:
         assert lane is not None
         self._start(deadline, lambda: self._builder.rebuild(loaded, lane, dead, deadline))
 
+    def take_apart(self, deadline: Deadline) -> None:
+        """See ``Results.apart``: from now on, in the jail that there is and in each later one."""
+        self.results.apart = True
+        if self.lane is not None:
+            self._builder.take_apart(self.lane, deadline)
+
     def _start(self, deadline: StartupDeadline, start: Callable[[], None]) -> None:
         self._startup = deadline
         try:

@@ -34,7 +34,7 @@ from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.remote_warnings import RemoteWarnings
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import LACKS_PACKAGES
-from envhub_worker.protocol.limits import WireLimits
+from envhub_worker.protocol.limits import WireLimits, limits_for
 from envhub_worker.protocol.manifest.manifest import EnvManifest
 from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.runtime import RECORD, Runtime
@@ -116,7 +116,7 @@ class Repository:
     @property
     def wire_limits(self) -> WireLimits:
         """Bounds on what a jail may send."""
-        return _wire_limits(self.policy.limits.message_bytes)
+        return limits_for(self.policy.limits.message_bytes)
 
     def hold(self) -> None:
         """Keep its files and packages from being removed, until ``let_go``."""
@@ -219,9 +219,3 @@ class Repository:
             again = f"To try the same again: envhub replay {shlex.quote(error.bundle)}"
             error.args = (f"{error.args[0]}\n{again}", *error.args[1:])
             CRASHES.info("%s: crash bundle %s", self.label, bundle)
-
-
-@cache
-def _wire_limits(size: int) -> WireLimits:
-    # one for all environments: what is remembered of a message is for the limits that it met
-    return WireLimits(frame_bytes=size, message_bytes=size)

@@ -350,7 +350,7 @@ class Requests:
         except RunnersDiedError as deaths:
             self.lifecycle.answered()  # the next request meets the deaths
             raise deaths.first from None
-        return self.results.apart(all_replies(replies, m.Value))
+        return self.results.joined_own(all_replies(replies, m.Value))
 
     # --- out and back --------------------------------------------------------------------------
 

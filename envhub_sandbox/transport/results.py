@@ -14,7 +14,7 @@ from envhub_worker.protocol.codec.inert import one_line
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
 from envhub_worker.protocol.manifest.manifest import EnvManifest
 from envhub_worker.protocol.spaces import batches
-from envhub_worker.protocol.untrusted import FAULTS
+from envhub_worker.protocol.untrusted import FAULTS, UNTRUSTED
 
 _SHOWN = 500
 StepResult = tuple[Any, Any, Any, Any, dict[Any, Any]]
@@ -29,11 +29,14 @@ class Results:
 
     Attributes:
         manifest, bounds: As given.
+        apart: Whether infos are to come as the only sub-environment gave them, which is what the
+            environment is then built for; set before that.
     """
 
     def __init__(self, manifest: EnvManifest, bounds: Sequence[tuple[int, int]]) -> None:
         self.manifest = manifest
         self.bounds = list(bounds)
+        self.apart = False
         self._space = manifest.single_observation_space
         self._declared = manifest.shardable
         self._sizes = [stop - start for start, stop in bounds]
@@ -43,7 +46,7 @@ class Results:
         """What ``VectorEnv.step`` returns; with these infos, if there are other ones.
 
         Raises:
-            Misfit: The shards' infos do not go together; the others are what ``apart`` makes.
+            Misfit: The shards' infos do not go together; the others are what ``joined_own`` makes.
         """
         return (
             self._observation([reply.observation for reply in replies]),
@@ -62,7 +65,7 @@ class Results:
             infos = self.infos([reply.info for reply in replies])
         return observation, infos
 
-    def apart(self, replies: list[m.Value]) -> dict[Any, Any]:
+    def joined_own(self, replies: list[m.Value]) -> dict[Any, Any]:
         """One mapping of the sub-environments' own infos, joined here as Gymnasium does it.
 
         Raises:
@@ -89,6 +92,31 @@ class Results:
         """One mapping of the shards' infos."""
         whole = len(parts) == 1
         return self._restored(parts[0] if whole else batches.join_infos(parts, self._sizes))
+
+    def joined(self, infos: dict[Any, Any]) -> dict[Any, Any]:
+        """Infos as ``VectorEnv`` has them, also where they came apart; raises as ``own``."""
+        if not self.apart:
+            return infos
+        with UNTRUSTED:
+            own, _ = self.own(infos)
+        return self.joined_own([m.Value(tuple((0, one) for one in own))])
+
+    def own(self, infos: dict[Any, Any]) -> tuple[list[dict[Any, Any]], Sequence[bool]]:
+        """Infos that came apart, in their order, and which members of the observation are Python's.
+
+        Trust: input from the worker.
+        """
+        places = [key for key in infos if type(key) is int and key >= 0]
+        own, rest = [infos[place] for place in sorted(places)], dict(infos)
+        which = rest.pop(batches.APART_SCALARS, ())
+        if set(map(type, own)) - {dict} or type(which) is not tuple or len(own) > 2:
+            raise RemoteProtocolError("the worker's infos are not one mapping each")
+        for place in places:
+            del rest[place]
+        marks = {key: rest[key][0] for key in rest if f"_{key}" in rest}
+        if marks:  # of ours: that it was lost and came back
+            own = [*own[:-1], {**(own or [{}])[-1], **marks}]
+        return own, which
 
     def _restored(self, infos: dict[Any, Any]) -> dict[Any, Any]:
         final = infos.get("final_obs") if self._restores else None

@@ -8,20 +8,27 @@ step takes the same way, the fast one, as every other.
 from __future__ import annotations
 
 import html
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, SupportsFloat, cast
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import VectorEnv
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
 from envhub_sandbox.vector.sandbox_view import SandboxView
 from envhub_sandbox.vector.tracebacks import short_traceback, shortened
+from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol.manifest.names import absent, is_servable
+from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
+_DECLARED = frozenset({"action_space", "observation_space", "metadata", "render_mode"})
+"""What is known of the environment without a request; set here and there."""
+_OURS = frozenset({"_apart", "_begun", "_close", "_resets_in_the_same_step", "_spec", "_vector"})
+_PACKAGE = __name__.partition(".")[0]
 _PLAIN = (spaces.Box, spaces.Discrete, spaces.MultiBinary, spaces.MultiDiscrete)
 
 
@@ -52,12 +59,15 @@ class SingleEnv(gym.Env[Any, Any]):
             )
         self._vector = vector
         self._close = close or vector.close
+        self._apart = vector._apart() if isinstance(vector, SandboxVectorEnv) else None
         self._begun: tuple[Any, dict[str, Any]] | None = None
-        self.observation_space = vector.single_observation_space
-        self.action_space = vector.single_action_space
         items = vector.metadata.items()  # the mode is a vector environment's alone
-        self.metadata = {key: value for key, value in items if key != "autoreset_mode"}
-        self.render_mode = vector.render_mode
+        self.__dict__.update(  # not by __setattr__, which sets them in the environment as well
+            observation_space=vector.single_observation_space,
+            action_space=vector.single_action_space,
+            metadata={key: value for key, value in items if key != "autoreset_mode"},
+            render_mode=vector.render_mode,
+        )
         mode = getattr(vector.metadata.get("autoreset_mode"), "value", None)
         self._resets_in_the_same_step = mode == "SameStep"
 
@@ -96,9 +106,13 @@ class SingleEnv(gym.Env[Any, Any]):
         begun, self._begun = self._begun, None
         if begun is not None and seed is None and not options:
             return begun
-        batch, infos = self._vector.reset(seed=seed, options=options)
+        if self._apart is not None:
+            batch, infos = self._apart.reset(seed, options)
+        else:
+            batch, infos = self._vector.reset(seed=seed, options=options)
         with UNTRUSTED:
-            return self._first(batch), info_of(infos, 0, 1)
+            [info, *_], which = self._own(infos)
+            return self._first(batch, which), info
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """One step with ``action``, an element of ``action_space``.
@@ -112,8 +126,9 @@ class SingleEnv(gym.Env[Any, Any]):
                 ``SandboxVectorEnv.step``.
         """
         self._begun = None
+        step = self._vector.step if self._apart is None else self._apart.step
         try:
-            result = self._vector.step(self._batch(action))
+            result = step(self._batch(action))
         except BaseException as error:
             if shortened(error):
                 __tracebackhide__ = True  # pytest hides the frame then
@@ -126,12 +141,13 @@ class SingleEnv(gym.Env[Any, Any]):
         self, batch: Any, rewards: Any, terminations: Any, truncations: Any, infos: Any
     ) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """What a step of the only one returns."""
-        observation, info = self._first(batch), info_of(infos, 0, 1)
+        [info, *more], which = self._own(infos)
+        observation = self._first(batch, which)
         terminated, truncated = bool(terminations[0]), bool(truncations[0])
         if (terminated or truncated) and self._resets_in_the_same_step:
             last, last_info = info.pop("final_obs"), info.pop("final_info", {})
-            self._begun = observation, info
-            observation, info = last, last_info
+            self._begun = observation, {**info, **(more[0] if more else {})}
+            observation, info = batches.restore(self.observation_space, last), last_info
         return observation, float(rewards[0]), terminated, truncated, info
 
     @short_traceback
@@ -164,6 +180,58 @@ class SingleEnv(gym.Env[Any, Any]):
         found: Any = self._vector.np_random_seed
         seed = found[0] if isinstance(found, tuple) else found
         return -1 if seed is None else int(seed)
+
+    @property
+    @short_traceback
+    def spec(self) -> Any:
+        """What was set here, or the environment's: its id and limits, of which nothing is made.
+
+        The first reading asks for it, which starts its processes.
+        """
+        if "_spec" not in self.__dict__:
+            if getattr(self._vector, "closed", False):
+                return None
+            spec = self._vector.spec or getattr(self._inner, "spec", None)
+            self._spec = spec if isinstance(spec, EnvSpec) else None
+        return self._spec
+
+    @spec.setter
+    def spec(self, value: Any) -> None:
+        self._spec = value
+
+    @short_traceback
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Set an attribute where ``__getattr__`` finds it; a new one in the outermost wrapper.
+
+        Raises:
+            AttributeError: ``__getattr__`` serves no such name: ``set_wrapper_attr`` sets it.
+        """
+        if name in _DECLARED:
+            self._vector.set_attr(name, [value])  # type: ignore[attr-defined]
+        elif not self._is_local(name):
+            if not is_servable(name):
+                raise AttributeError(
+                    f"a {type(self).__name__} does not set {name!r} in the environment, where it "
+                    f"is not read either; call set_wrapper_attr({name!r}, value)"
+                )
+            self._vector.set_attr(name, [value])  # type: ignore[attr-defined]
+            return
+        object.__setattr__(self, name, value)
+
+    def _is_local(self, name: str) -> bool:
+        """Whether it is ours, or of a class that somebody derives of this one."""
+        derived = not type(self).__module__.startswith(_PACKAGE) and name.startswith("_")
+        return name in _OURS or derived or name.startswith("__") or hasattr(type(self), name)
+
+    def set_wrapper_attr(self, name: str, value: Any, *, force: bool = True) -> bool:
+        """Set it, also under names that ``__setattr__`` does not set; as in Gymnasium."""
+        if self._is_own(name):
+            setattr(self, name, value)
+        elif force or self._inner.has_wrapper_attr(name):
+            self._vector.set_attr(name, [value])  # type: ignore[attr-defined]
+        else:
+            return False
+        return True
 
     def __getattr__(self, name: str) -> Any:
         """An attribute or a method of the environment, whichever of its wrappers has it."""
@@ -207,13 +275,26 @@ class SingleEnv(gym.Env[Any, Any]):
         return f"<code>{html.escape(repr(self))}</code>{inside}"
 
     def _batch(self, action: Any) -> Any:
-        space = self.action_space
+        space = self._vector.single_action_space
+        if type(action) in (int, float):
+            return [action]  # arrives as it is
         if isinstance(space, _PLAIN):
             return np.asarray(action)[None]
         return concatenate(space, [action], cast("Any", create_empty_array(space, 1)))
 
-    def _first(self, batch: Any) -> Any:
-        return next(iter(iterate(self._vector.observation_space, batch)))
+    def _first(self, batch: Any, which: Sequence[bool]) -> Any:
+        """The only observation; its discrete members of the class that they had there."""
+        first = next(iter(iterate(self._vector.observation_space, batch)))
+        if True not in which:
+            return first
+        return batches.with_integers(self.observation_space, first, iter(which))
+
+    def _own(self, infos: dict[Any, Any]) -> tuple[list[dict[Any, Any]], Sequence[bool]]:
+        """Its infos, of the end of an episode before those of the next; see ``Results.own``."""
+        if self._apart is None:
+            return [info_of(infos, 0, 1)], ()
+        own, which = self._apart.own(infos) if infos else ([], ())
+        return [*own, {}, {}], which
 
 
 def info_of(infos: dict[Any, Any], index: int, num_envs: int) -> dict[Any, Any]:

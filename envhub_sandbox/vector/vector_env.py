@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import warnings
 import weakref
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
-from typing import Any, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from gymnasium.error import Error
@@ -19,6 +19,7 @@ from gymnasium.vector import VectorEnv
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.requests import Bounds, MessageFor, OneMessageFor
+from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.remote_warnings import level_of_the_caller
 from envhub_sandbox.transport.replies import typed_reply
 from envhub_sandbox.transport.results import StepResult
@@ -28,6 +29,7 @@ from envhub_sandbox.vector.sandbox_view import SandboxView
 from envhub_sandbox.vector.sub_environment import SubEnvironment
 from envhub_sandbox.vector.tracebacks import short_traceback, shortened
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.lifecycle import State
 from envhub_worker.protocol.manifest.names import absent, is_servable
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
@@ -36,6 +38,14 @@ _NOT_CALLED = frozenset({"reset", "step", "close"})
 
 _OURS = frozenset({"prewarm", "sandbox"})
 """Public names that Gymnasium's vector environments do not have."""
+
+
+class VectorApart(NamedTuple):
+    """``reset`` and ``step`` with infos as they came, and ``Results.own``, which reads these."""
+
+    reset: Callable[[Any, dict[str, Any] | None], tuple[Any, dict[Any, Any]]]
+    step: Callable[[Any], StepResult]
+    own: Callable[[dict[Any, Any]], tuple[list[dict[Any, Any]], Sequence[bool]]]
 
 
 class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
@@ -129,6 +139,10 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             WorkerDiedError: The worker process ended.
             RemoteEnvError: The environment raised; it is still usable.
         """
+        observation, infos = self._reset(seed, options)
+        return observation, self._requests.results.joined(infos)
+
+    def _reset(self, seed: Any, options: dict[str, Any] | None) -> tuple[Any, dict[Any, Any]]:
         # Not by reset_async and reset_wait: an interrupt between them would leave `waiting` set,
         # and the next request refused, although no reset_wait can follow.
         self._note_first_use()
@@ -186,7 +200,9 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         """The results of ``reset_async``; ``timeout`` in seconds, else ``Timeouts.reset_s``."""
         with self._requests.use.lock:
             self._requests.end_wait("reset")
-            return self._end_reset(self._timeouts.reset_s if timeout is None else timeout)
+            timeout_s = self._timeouts.reset_s if timeout is None else timeout
+            observation, infos = self._end_reset(timeout_s)
+        return observation, self._requests.results.joined(infos)
 
     def _end_reset(self, timeout_s: float | None) -> tuple[Any, dict[Any, Any]]:
         replies = self._requests.collect(timeout_s, m.ResetDone)
@@ -208,18 +224,23 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             WorkerDiedError: The worker process ended.
             RemoteEnvError: The environment raised; it is still usable.
         """
-        requests = self._requests
+        results = self._requests.results
         try:  # without the decorator and step_async's calls: this is the method that is called most
-            with requests.use.lock:
-                if requests.closed or requests.waiting is not None:
-                    requests.refuse_if_busy("step_async")
-                requests.submit_step(self._read_actions(actions))
-                return requests.collect_step(self._timeouts.step_s)
+            done = self._step(actions)
+            return (*done[:4], results.joined(done[4])) if results.apart else done
         except EnvHubError as error:
             if shortened(error):
                 __tracebackhide__ = True  # pytest hides the frame then
                 raise error  # ENVHUB_TRACEBACK=full shows where
             raise
+
+    def _step(self, actions: Any) -> StepResult:
+        requests = self._requests
+        with requests.use.lock:
+            if requests.closed or requests.waiting is not None:
+                requests.refuse_if_busy("step_async")
+            requests.submit_step(self._read_actions(actions))
+            return requests.collect_step(self._timeouts.step_s)
 
     @short_traceback
     def step_async(self, actions: Any) -> None:
@@ -235,7 +256,8 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         with self._requests.use.lock:
             self._requests.end_wait("step")
             timeout_s = self._timeouts.step_s if timeout is None else timeout
-            return self._requests.collect_step(timeout_s)
+            *done, infos = self._requests.collect_step(timeout_s)
+        return (*done, self._requests.results.joined(infos))
 
     # --- everything else -----------------------------------------------------------------------
 
@@ -416,6 +438,19 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         return environment_html(self, self.sandbox.report())
 
     __html__ = _repr_html_
+
+    def _apart(self) -> VectorApart | None:
+        """How a ``SingleEnv`` uses it: infos are what its only sub-environment gives from now on.
+
+        None where the repository's own class joins them, or where it cannot be asked now.
+        """
+        results, state = self._requests.results, self._session.lifecycle.state
+        if not self._manifest.shardable or self.num_envs != 1:
+            return None
+        with self._requests.use.hold("make_env"):
+            if not results.apart and (self._session.lease.lane is None or state is State.READY):
+                self._session.lease.take_apart(Deadline(self._timeouts.call_s))
+        return VectorApart(self._reset, self._step, results.own) if results.apart else None
 
     def _ask_one(self, name: str, index: int, message: OneMessageFor) -> m.Message:
         # a method of ours: a copy of a sub-environment then asks the copy of its vector environment

@@ -220,7 +220,7 @@ def apart(dice: Dice) -> None:
     found = Results(env_manifest(), list(zip([0, *stops], stops, strict=False)))
     honest = [tuple((index, {"a": 1, "b": {"c": "x"}}) for index in range(size)) for size in sizes]
     with UNTRUSTED:
-        joined = found.apart([m.Value(dice.spoiled(part)) for part in honest])
+        joined = found.joined_own([m.Value(dice.spoiled(part)) for part in honest])
     for key, value in joined.items():
         told = type(value) is dict or (type(value) is np.ndarray and len(value) == stops[-1])
         demand(told, f"{key!r} of another length")

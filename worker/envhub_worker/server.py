@@ -70,6 +70,7 @@ class Server:
             fd_path or runtime_dir / "fds",
             ahead,
             self._gate.witness,
+            local=isinstance(self._gate, LocalGate),
         )
         self._loop.tick(self._tick)
         if client_pidfd is not None:

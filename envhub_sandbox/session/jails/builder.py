@@ -87,6 +87,15 @@ class Builder:
         replies = relay.jail.exchange("make_env", builds, deadline)
         for index, reply in zip(shards, replies, strict=True):
             self._check_built(typed_reply(reply, m.BuildDone), *self._bounds[index])
+        if self._results.apart:
+            self.take_apart(relay, deadline)
+
+    def take_apart(self, lane: Lane, deadline: Deadline) -> None:
+        """Have the only sub-environment's infos come as it gives them: see ``Results.apart``."""
+        [reply] = lane.jail.exchange(
+            "make_env", [(lane.runners[0], m.TakeApart(lane.number))], deadline
+        )
+        typed_reply(reply, m.Value)
 
     def _check_built(self, reply: m.BuildDone, start: int, stop: int) -> None:
         """Hold what was built against the manifest. Trust: input from the worker."""

@@ -21,7 +21,7 @@ from envhub_sandbox.transport.shared_memory.memfd import SEAL_FUTURE_WRITE, seal
 from envhub_sandbox.transport.values.descriptions import unpacked
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.shared_memory import slabs
-from envhub_worker.protocol.shared_memory.columns import Column, columns_of
+from envhub_worker.protocol.shared_memory.columns import Column, columns_of, own_info
 from envhub_worker.protocol.stream import read_packet
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
@@ -59,6 +59,7 @@ class LaneShard:
         self._asks = slabs.words(self._request)
         self._tells = slabs.words(self._reply)
         self._columns: list[tuple[Column, Any]] = []
+        self._own: dict[Any, Any] | None = None
         self._views: dict[tuple[int, Any], Any] = {}
         self._codes = [_UNKNOWN] * len(layout.actions)
         self._wishes: tuple[int, int, int] | None = (0, 0, 0)
@@ -203,12 +204,17 @@ class LaneShard:
         start = self.layout.infos
         columns = columns_of(infos) or ()
         self._columns = [(column, column.view(self._reply, start)) for column in columns]
+        self._own = None if own_info(infos) is None else infos
 
     def columns(self) -> dict[Any, Any]:
         """Infos that came as columns: fresh arrays."""
         if not self._columns:
             raise RemoteProtocolError("the worker sent columns before their schema")
-        return {column.key: view.astype(column.dtype) for column, view in self._columns}
+        columns = {column.key: view.astype(column.dtype) for column, view in self._columns}
+        if self._own is None:
+            return columns
+        own = {key: _as(value, columns[key][0]) for key, value in self._own[0].items()}
+        return {**self._own, 0: own}
 
     def close(self) -> None:
         """Give everything back."""
@@ -218,3 +224,8 @@ class LaneShard:
         self._asks.release()
         self._tells.release()
         # the maps go with the last array over them
+
+
+def _as(known: Any, value: Any) -> Any:
+    """A column's value as its schema had one: of Python's class, or numpy's."""
+    return value if isinstance(known, (np.generic, np.ndarray)) else value.item()

@@ -4,6 +4,7 @@
 
     python -m tests.compliance.theirs ~/Gymnasium/tests/vector               # all variants
     python -m tests.compliance.theirs ~/Gymnasium/tests/vector --variant frames -- -k autoreset
+    python -m tests.compliance.theirs ~/Gymnasium/tests/wrappers --variant single
 
 Gymnasium's releases do not ship these tests: PATH lies in a checkout of it. What follows ``--`` is
 for pytest, which runs in the checkout's root, once for each variant. The exit code is 0 if all

@@ -6,10 +6,13 @@ Imports nothing of our tests: where somebody else's tests run, ``tests`` is thei
 from __future__ import annotations
 
 import contextlib
+import importlib
 import json
+import operator
 import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +21,8 @@ import gymnasium as gym
 import pytest
 
 from envhub_sandbox import RemoteSandbox, SandboxVectorEnv, make_env
+from envhub_sandbox.errors import LoadError
+from envhub_sandbox.vector.single_env import SingleEnv
 
 REPOSITORY = Path(__file__).resolve().parents[2] / "samples" / "given"
 VARIANTS: dict[str, dict[str, Any]] = {
@@ -26,8 +31,10 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "frames": {"lane": "frames"},
     "workers": {"num_workers": 2},
     "tcp": {},
+    "single": {},
 }
-"""What else ``make_env`` is told; ``"tcp"`` is told where its server is, too."""
+"""What else ``make_env`` is told; ``"tcp"`` is told where its server is, too. ``"single"`` is for
+tests of single environments: what these make is in a sandbox."""
 SERVER = "ENVHUB_THEIRS_SERVER"
 
 
@@ -110,6 +117,28 @@ _POSITIONS = {
 }
 
 
+class SingleMaker:
+    """Called like a function or a class of theirs, whose environment is then in a sandbox.
+
+    In the sandbox it is the function or the class itself: their own code names it there.
+    """
+
+    def __init__(self, make: Any) -> None:
+        self._make = make
+
+    def __call__(self, *args: Any, **kwargs: Any) -> Any:
+        """One environment, or without a sandbox what no vector environment can be made of."""
+        if args and isinstance(args[0], gym.envs.registration.EnvSpec):
+            return self._make(*args, **kwargs)  # whose entry point may be a test's own wrapper
+        try:
+            return SingleEnv(vector([partial(self._make, *args, **kwargs)]))
+        except LoadError:  # one without spaces, for instance, which a test of theirs is about
+            return self._make(*args, **kwargs)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return operator.itemgetter(0), ((self._make,),)
+
+
 def pytest_addoption(parser: pytest.Parser) -> None:
     """``--variant``."""
     parser.addoption("--variant", choices=VARIANTS, default="plain", help="how it is sandboxed")
@@ -117,5 +146,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     """Gymnasium's classes make sandboxed environments from now on, before a test is imported."""
+    if config.option.variant == "single":
+        theirs = importlib.import_module("tests.testing_env")
+        for module, name in ((theirs, "GenericTestEnv"), (gym, "make")):
+            setattr(module, name, SingleMaker(getattr(module, name)))
+        return
     for name, use_async_envs in (("SyncVectorEnv", False), ("AsyncVectorEnv", True)):
         setattr(gym.vector, name, replacement(config.option.variant, use_async_envs))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import cache
+
 from envhub_worker.protocol.records import dataclass
 
 KIB = 1024
@@ -42,5 +44,13 @@ class WireLimits:
 
 
 DEFAULT_LIMITS = WireLimits()
+
+
+@cache
+def limits_for(message_bytes: int) -> WireLimits:
+    """Those of one jail. One object for each size: what is kept of a message is for its limits."""
+    return WireLimits(frame_bytes=message_bytes, message_bytes=message_bytes)
+
+
 LARGE_BYTES = 64 * KIB
 """Below this a copy costs less than to keep the owner of the bytes until they are gone."""

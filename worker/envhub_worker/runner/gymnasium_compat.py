@@ -97,6 +97,59 @@ joined_infos: Callable[[Any], Any] = renamed if _BEFORE_1_0 else lambda info: in
 """The infos of a vector environment with a ``step`` of its own, under the names of today."""
 
 
+def reset_result(env: Any, result: Any) -> tuple[Any, Any]:
+    """What ``reset`` of a repository's own vector environment returned, as Gymnasium has it."""
+    observation, infos = _parts(env, "reset", result, ("observations", "infos"))
+    return observation, _own_infos(env, "reset", infos)
+
+
+def step_result(env: Any, result: Any) -> tuple[Any, ...]:
+    """The same of ``step``."""
+    names = ("observations", "rewards", "terminations", "truncations", "infos")
+    observation, *columns, infos = _parts(env, "step", result, names)
+    each = zip(names[1:-1], columns, (np.float64, np.bool_, np.bool_), strict=True)
+    made = [_column(env, name, column, dtype) for name, column, dtype in each]
+    return (observation, *made, joined_infos(_own_infos(env, "step", infos)))
+
+
+def _parts(env: Any, method: str, result: Any, names: tuple[str, ...]) -> Any:
+    if isinstance(result, (tuple, list)) and len(result) == len(names):
+        return result
+    got = f"{len(result)} values" if isinstance(result, tuple) else f"a {type(result).__name__}"
+    raise _misfit(env, f"{method} returns {got} in place of {', '.join(names)}")
+
+
+def _column(env: Any, name: str, values: Any, dtype: Any) -> Any:
+    """One value each: an array, or a list of numbers, which Gymnasium's wrappers take as well."""
+    if isinstance(values, (list, tuple)):
+        try:
+            values = np.asarray(values, None if name == "rewards" else dtype)
+        except ValueError:
+            values = np.empty(0, object)
+    shape, dtype = getattr(values, "shape", None), getattr(values, "dtype", None)
+    if not shape or shape[0] != env.num_envs or getattr(dtype, "kind", "f") == "O":
+        count = env.num_envs
+        raise _misfit(env, f"step returns {name} that are not one number each, {count} in all")
+    return values
+
+
+def _own_infos(env: Any, method: str, infos: Any) -> Any:
+    """A mapping; of a list of them, as other libraries' have it, what Gymnasium would make."""
+    if isinstance(infos, dict):
+        return infos
+    mappings = isinstance(infos, (list, tuple)) and all(isinstance(one, dict) for one in infos)
+    if not mappings or len(infos) != env.num_envs:
+        raise _misfit(env, f"{method} returns infos that are a {type(infos).__name__}, no dict")
+    return batches.join_pairs([(i, one) for i, one in enumerate(infos) if one], len(infos))
+
+
+def _misfit(env: Any, what: str) -> TypeError:
+    kind = type(env)
+    return TypeError(
+        f"make_env returned a VectorEnv ({kind.__module__}.{kind.__qualname__}) whose {what}"
+    )
+
+
 class _WithMode(SyncVectorEnv):
     """``SyncVectorEnv`` of 1.0, with an autoreset mode; what it does in ``step`` is not used."""
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from envhub_worker.protocol import messages as m
@@ -30,40 +30,58 @@ def join(pairs: Pairs, count: int, *, sliced: bool = False) -> dict[Any, Any]:
         return dict(batches.APART)
 
 
+def apart(pairs: Pairs, integers: Sequence[bool] = ()) -> dict[Any, Any]:
+    """The infos of the only sub-environment as it gave them, in their order."""
+    infos: dict[Any, Any] = {place: info for place, (_, info) in enumerate(pairs)}
+    return {**infos, batches.APART_SCALARS: tuple(integers)} if any(integers) else infos
+
+
 class InfoWriter:
     """Writes infos into a slab: as columns while their schema stays the same, else encoded.
 
     Args:
         start: Offset of its info area.
+        joined: Joins infos as they are sent.
     """
 
     def __init__(
-        self, reply: Any, start: int, count: int, pack: Pack = m.pack, *, sliced: bool
+        self,
+        reply: Any,
+        start: int,
+        count: int,
+        pack: Pack = m.pack,
+        *,
+        joined: Callable[[Pairs], dict[Any, Any]],
     ) -> None:
         self._reply = reply
         self._start = start
         self._count = count
         self._pack = pack
-        self._sliced = sliced
+        self._joined = joined
+        self._integers: Sequence[bool] = ()
         self._keys: list[Any] | None = None
         self._types: list[type] = []
         self._rows: list[Any] = []
         self._masks: list[Any] = []
         self._fresh = False
 
-    def write(self, pairs: Pairs) -> tuple[int, int]:
+    def write(self, pairs: Pairs, integers: Sequence[bool] = ()) -> tuple[int, int]:
         """The outcome and the length for the reply's header.
+
+        Args:
+            integers: What ``joined`` says of the observation; part of the schema.
 
         Raises:
             ProtocolError: They cannot cross.
         """
-        if self._keys is not None and self._write_columns(pairs):
+        if self._keys is not None and integers == self._integers and self._write_columns(pairs):
             return slabs.COLUMNS, 0
-        infos = join(pairs, self._count, sliced=self._sliced)
+        infos = self._joined(pairs)
         frames = self._pack(m.Value(infos))
         if len(frames) > 1 or memoryview(frames[0]).nbytes > slabs.INFO_BYTES:
             return slabs.FETCH, 0
         self._learn(pairs, infos)
+        self._integers = integers
         return slabs.DONE, self.put(frames[0])
 
     def put(self, frame: Any) -> int:
@@ -80,9 +98,12 @@ class InfoWriter:
         for _, info in pairs:
             if list(info) != keys or list(map(type, info.values())) != types:
                 return False
-        for index, info in pairs:
-            for row, value in zip(rows, info.values(), strict=True):
-                row[index] = value
+        try:
+            for index, info in pairs:
+                for row, value in zip(rows, info.values(), strict=True):
+                    row[index] = value
+        except OverflowError:  # an integer beyond 64 bit: joining fails of it, or it goes encoded
+            return False
         if self._fresh:  # the encoded infos lay here
             for mask in self._masks:
                 mask[...] = 1
@@ -93,7 +114,7 @@ class InfoWriter:
         """Columns are for scalars that every sub-environment has: then all masks are true."""
         self._keys = None
         columns = columns_of(infos)
-        first = pairs[0][1]
+        first = pairs[0][1] if pairs else {}
         types = list(map(type, first.values()))
         if (
             columns is None

@@ -83,7 +83,7 @@ class Lane:
         self._codes: list[int] = []
         self._takes: list[Callable[[], Any]] = []
         self._pairs: Pairs = []
-        self._writer = InfoWriter(self._reply, layout.infos, layout.count, pack, sliced=env.sliced)
+        self._writer = InfoWriter(self._reply, layout.infos, layout.count, pack, joined=env.joined)
         self._changes = self._cpu = self._spin_ns = 0
         self._move(attach.start, observed)
 
@@ -159,7 +159,10 @@ class Lane:
             pairs = self._pairs = self._env.run_step(actions)
             if (self._watched or self._warned) and self._has_more_to_say():
                 return slabs.FETCH, 0
-            return self._writer.write(pairs) if pairs else (slabs.DONE, 0)
+            integers = self._env.integers
+            if pairs or True in integers:
+                return self._writer.write(pairs, integers)
+            return slabs.DONE, 0
         except BaseException as error:
             frame = _raised_frame(self._raised(error, "step"))
             if (self._watched or self._warned) and self._has_more_to_say():

@@ -17,7 +17,9 @@ Shimmy's ``GymV21CompatibilityV0`` and ``GymV26CompatibilityV0``.
 
 from __future__ import annotations
 
+import os
 import sys
+import traceback
 import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
@@ -274,3 +276,41 @@ _SPACES: dict[str, Callable[[Any], Any]] = {
         OrderedDict((key, space_of(one)) for key, one in space.spaces.items())
     ),
 }
+
+
+_RETURNS = {
+    "reset": "observation, info",
+    "step": "observation, reward, terminated, truncated, info",
+}
+
+
+def explained(error: Exception, env: Any, method: str) -> Exception:
+    """The error itself, or one that says that the environment's ``method`` is as before 0.26.
+
+    Args:
+        error: What calling it as of today, and taking its result apart, has raised.
+    """
+    text = str(error)
+    keyword = "unexpected keyword argument 'seed'" in text or "argument 'options'" in text
+    unpacked = "to unpack" in text or "cannot unpack" in text
+    frames = traceback.extract_tb(error.__traceback__)
+    function = getattr(getattr(type(env.unwrapped), method, None), "__code__", None)
+    theirs = any(function and one.filename == function.co_filename for one in frames)
+    if function is None or theirs or not (keyword or unpacked):
+        return error
+    where = f"{type(env.unwrapped).__qualname__}.{method} ({_relative(function.co_filename)}, line "
+    where += f"{function.co_firstlineno})"
+    if keyword:
+        what = "takes no seed and options; write: def reset(self, *, seed=None, options=None)"
+    else:
+        what = f"does not return {_RETURNS[method]}"
+    return type(error)(
+        f"{where} {what}. That is the API before Gymnasium 0.26; see "
+        f"https://gymnasium.farama.org/introduction/migration_guide/ ({text})"
+    )
+
+
+def _relative(name: str) -> str:
+    """A file as its repository calls it."""
+    roots = [f"{root.rstrip(os.sep)}{os.sep}" for root in sys.path if root]
+    return next((name.removeprefix(root) for root in roots if name.startswith(root)), name)

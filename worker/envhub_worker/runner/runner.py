@@ -19,12 +19,13 @@ import numpy as np
 
 from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits, limits_for
 from envhub_worker.protocol.manifest.manifest import encode_env, encode_manifest
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.stream import Packet, StreamReader, pack_packet
+from envhub_worker.runner import gymnasium_compat as compat
 from envhub_worker.runner import loader, manifest
 from envhub_worker.runner.described import described
-from envhub_worker.runner.gymnasium_compat import joined_infos
 from envhub_worker.runner.infos import Pairs
 from envhub_worker.runner.lane import Lane
 from envhub_worker.runner.raised import raised
@@ -36,11 +37,13 @@ from envhub_worker.runner.watches import Watches
 
 _ANCILLARY_BYTES = socket.CMSG_SPACE(8 * array("i").itemsize)
 _RECHECK_MS = 2
+_MOST_WRAPPERS = 100
 
 
 def main(stream: socket.socket, spec: JailSpec, fds: list[int]) -> int:
     """Serve until the other side closes the stream. Runs confined, as the jail's main program."""
-    runner = Runner(spec.snapshot, spec.entry)
+    limits = limits_for(spec.confinement.limits.message_bytes)
+    runner = Runner(spec.snapshot, spec.entry, limits)
     runner.warned.listen()
     reader = StreamReader()
     poller = select.poll()
@@ -85,8 +88,9 @@ def _send(stream: socket.socket, request_id: int, frames: list[Any]) -> None:
 class Runner:
     """The state of one runner: the repository's tasks and the environments built of them."""
 
-    def __init__(self, snapshot: str, entry: str) -> None:
-        self._pack = partial(m.pack, describer=described)
+    def __init__(self, snapshot: str, entry: str, limits: WireLimits = DEFAULT_LIMITS) -> None:
+        self._pack = partial(m.pack, describer=described, limits=limits)
+        self._pack_infos = partial(self._pack, reduces=True)
         self._snapshot = snapshot
         self._entry = entry
         self._tasks: dict[tuple[str, Any], Task] = {}
@@ -118,7 +122,7 @@ class Runner:
             reply = _HANDLERS[type(request)](self, request)
             if by_lane and isinstance(reply, m.ResetDone):
                 reply = m.Value(reply.info)  # the observation lies in the slab already
-            return self._pack(reply)
+            return (self._pack_infos if type(request) in _WITH_INFOS else self._pack)(reply)
         except ResultError as error:
             return m.pack(raised(error, "return", self._snapshot))
         except BaseException as error:
@@ -170,16 +174,15 @@ class Runner:
         if request.mask is not None:
             options = {} if options is None else options  # our own copy
             options["reset_mask"] = request.mask
-        observation, info = env.reset(seed=request.seeds, options=options)
-        return m.ResetDone(observation, info)
+        result = compat.reset_result(env, env.reset(seed=request.seeds, options=options))
+        return m.ResetDone(*result)
 
     def step(self, request: m.Step) -> m.Message:
         """``VectorEnv.step``."""
         env = self._envs[request.env]
         if not isinstance(env, SubEnvs):
             actions = _restored(env, request.actions)
-            observation, rewards, terminated, truncated, info = env.step(actions)
-            return m.StepDone(observation, rewards, terminated, truncated, joined_infos(info))
+            return m.StepDone(*compat.step_result(env, env.step(actions)))
         return _step_done(env, env.run_step(request.actions))
 
     def revive(self, request: m.Revive) -> m.Message:
@@ -187,7 +190,7 @@ class Runner:
         env = self._envs[request.env]
         if isinstance(env, SubEnvs):
             return _step_done(env, env.run_revive(request.seeds))
-        observation, info = env.reset(seed=request.seeds)
+        observation, info = compat.reset_result(env, env.reset(seed=request.seeds))
         no, yes = np.zeros(env.num_envs, np.bool_), np.ones(env.num_envs, np.bool_)
         return m.StepDone(observation, np.zeros(env.num_envs), no, yes, info)
 
@@ -199,7 +202,7 @@ class Runner:
         reply = partial(self.reply, by_lane=True)
         fail = partial(raised, root=self._snapshot)
         more = (self.warned.pending, self.watches)
-        self.lane = Lane(env, request, self.descriptors, reply, self._pack, fail, *more)
+        self.lane = Lane(env, request, self.descriptors, reply, self._pack_infos, fail, *more)
         return m.Value(True)
 
     def fetch_infos(self, request: m.FetchInfos) -> m.Message:
@@ -210,6 +213,11 @@ class Runner:
         """The last reset's or step's infos, as each sub-environment gave them."""
         env = self._envs[request.env]
         return m.Value(tuple(env.pairs) if isinstance(env, SubEnvs) else ())
+
+    def take_apart(self, request: m.TakeApart) -> m.Message:
+        """Infos are sent as the only sub-environment gives them from now on."""
+        self._envs[request.env].apart = True
+        return m.Value(None)
 
     def call(self, request: m.Call) -> m.Message:
         """``VectorEnv.call``."""
@@ -226,8 +234,9 @@ class Runner:
     def set_attr(self, request: m.SetAttr) -> m.Message:
         """``VectorEnv.set_attr``."""
         env = self._envs[request.env]
-        if hasattr(env, "set_attr"):
-            env.set_attr(request.name, list(request.values))
+        set_attr = _forwarded(env, "set_attr")
+        if set_attr is not None:
+            set_attr(request.name, list(request.values))
         else:
             setattr(env, request.name, request.values[0])
         return m.Value(None)
@@ -322,14 +331,24 @@ def _scratch() -> str:
 
 def _caller(env: Any) -> Callable[..., Any]:
     """``env.call``, or for a vector environment without one, its own attribute."""
-    if hasattr(env, "call"):
-        return env.call  # type: ignore[no-any-return]
+    forwarded = _forwarded(env, "call")
+    if forwarded is not None:
+        return forwarded
 
     def call(name: str, *args: Any, **kwargs: Any) -> Any:
         value = _own(env, name)
         return value(*args, **kwargs) if callable(value) else value
 
     return call
+
+
+def _forwarded(env: Any, name: str) -> Callable[..., Any] | None:
+    """Its method, or that of what it wraps: ``VectorWrapper`` has no ``call`` of its own."""
+    for _ in range(_MOST_WRAPPERS):
+        if hasattr(env, name):
+            return getattr(env, name)  # type: ignore[no-any-return]
+        env = getattr(env, "env", None)
+    return None
 
 
 def _own(env: Any, name: str) -> Any:
@@ -339,6 +358,8 @@ def _own(env: Any, name: str) -> Any:
         return getattr(getattr(env, "unwrapped", env), name)
 
 
+_WITH_INFOS = frozenset({m.Reset, m.Step, m.Revive, m.FetchInfos, m.FetchInfosApart})
+"""Whose replies have infos, of which one part must not lose the others."""
 _HANDLERS: dict[type[m.Message], Callable[[Runner, Any], m.Message]] = {
     m.Load: Runner.load,
     m.LoadTask: Runner.load_task,
@@ -359,4 +380,5 @@ _HANDLERS: dict[type[m.Message], Callable[[Runner, Any], m.Message]] = {
     m.Attach: Runner.attach,
     m.FetchInfos: Runner.fetch_infos,
     m.FetchInfosApart: Runner.fetch_infos_apart,
+    m.TakeApart: Runner.take_apart,
 }

@@ -19,9 +19,10 @@ from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES
+from envhub_worker.runner import old_gym
 from envhub_worker.runner.freezing import DRIVES, FreezingEnv, announces_rollout
 from envhub_worker.runner.gymnasium_compat import SyncBase
-from envhub_worker.runner.infos import Pairs, join
+from envhub_worker.runner.infos import Pairs, apart, join
 
 Store = Callable[[int, Any], None]
 
@@ -101,8 +102,10 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         batch: Where ``reset`` and ``step`` leave their results.
         reward_shape: Of one sub-environment's reward; ``()`` but for multi-objective ones.
         sliced: Whether there are others elsewhere, in other processes.
+        apart: Whether there is one, whose infos are sent as it gave them.
         pairs: The infos of the last reset or step, as each sub-environment gave them.
         driven: What is reset, stepped and drawn: ``envs``, or what freezes them.
+        integers: Which discrete members of its last observation are Python's; () unless ``apart``.
     """
 
     def __init__(
@@ -122,7 +125,9 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         self._flagged: list[int] = []  # whose flags are not both False
         self._mode = autoreset_mode
         self.sliced = sliced
+        self.apart = False
         self.pairs: Pairs = []
+        self.integers: list[bool] = []
         self._restores = batches.restores(self.single_action_space)
         self._plain_actions = isinstance(self.single_action_space, ARRAY_SPACES)
 
@@ -144,10 +149,15 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         self.pairs = infos
         for index in chosen:
             seed = None if seeds is None else seeds[index]
-            observation, info = self.driven[index].reset(seed=seed, options=options)
+            try:
+                observation, info = self.driven[index].reset(seed=seed, options=options)
+            except (TypeError, ValueError) as error:
+                raise old_gym.explained(error, self.envs[index], "reset") from error
             self.batch.store(index, observation)
             if info:
                 infos.append((index, info))
+            if self.apart:
+                self.integers = batches.integers(self.single_observation_space, observation)
         return infos
 
     def run_revive(self, seeds: Any) -> Pairs:
@@ -215,11 +225,15 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
                     store(index, observation)
                 if info:
                     infos.append((index, info))
-        except BaseException:
+        except BaseException as error:
             batch.carry(index)  # who was not asked any more has his last observation still
+            if isinstance(error, ValueError):
+                raise old_gym.explained(error, self.envs[index], "step") from error
             raise
         batch.stay()
         self._done = done
+        if self.apart:
+            self.integers = batches.integers(self.single_observation_space, observation)
         return infos
 
     def render(self) -> Any:
@@ -238,7 +252,9 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         return getattr(self.driven[index], name) if freezes else None
 
     def joined(self, pairs: Pairs) -> dict[Any, Any]:
-        """Infos of these sub-environments as one."""
+        """Infos of these sub-environments as they are sent: as one, or apart."""
+        if self.apart:
+            return apart(pairs, self.integers)
         return join(pairs, self.num_envs, sliced=self.sliced)
 
     def _each(self, actions: Any) -> Iterator[Any]:

@@ -16,7 +16,7 @@ from envhub_worker.lockdown.mechanisms.procfs import Children
 from envhub_worker.lockdown.spec import JailSpec, confinement_from_wire
 from envhub_worker.loop import Loop
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.limits import WireLimits
+from envhub_worker.protocol.limits import WireLimits, limits_for
 from envhub_worker.spawn.channel import close_fds
 from envhub_worker.spawn.zygote_process import ZygoteProcess
 from envhub_worker.supervisor.fd_store import FdStore
@@ -66,8 +66,11 @@ class Jails:
         fd_path: Path,
         ahead: ZygoteProcess | None,
         witness: Witness,
+        *,
+        local: bool,
     ) -> None:
         self._limits = limits
+        self._local = local
         self._jails: dict[int, JailRecord] = {}
         self._packet_ids = itertools.count(1)
         self._counting = CountLimit()
@@ -126,11 +129,16 @@ class Jails:
             raise RefusedError("WorkerError", f"{len(entry.lost)} of its runners have died")
         self._start_runners(asker, entry, request.runners)
 
+    def _wire_limits(self, entry: JailRecord) -> WireLimits:
+        """What its client permits; where that is somebody on another host, no more than ours."""
+        wanted = entry.jail.spec.confinement.limits.message_bytes
+        return limits_for(wanted if self._local else min(wanted, self._limits.message_bytes))
+
     def _start_runners(self, asker: Asker, entry: JailRecord, count: int) -> None:
         runners = []
         for _ in range(count):
             runner, sock = entry.jail.start_runner()
-            entry.links[runner] = RunnerLink(sock, self._limits)
+            entry.links[runner] = RunnerLink(sock, self._wire_limits(entry))
             self._events.follow_runner(entry, runner)
             runners.append(runner)
         entry.opening.append(Opening(asker, set(runners), tuple(runners)))

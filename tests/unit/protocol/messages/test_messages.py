@@ -97,6 +97,7 @@ SAMPLES: list[m.Message] = [
     m.Attach(1, 2, 8, 5),
     m.FetchInfos(1),
     m.FetchInfosApart(1),
+    m.TakeApart(1),
     m.Revive(1, [5, None]),
     m.FollowOutput(3, 4096),
     m.OutputBytes(4096, b"caf\xc3\xa9\x1b"),

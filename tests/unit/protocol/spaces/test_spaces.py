@@ -357,7 +357,7 @@ def test_bytes_of_all_spaces_together_are_counted(
     """``max_elements`` is exact: all that is built counts, and what is alike counts once."""
     elements = -(-(spaces_in_it * SPACE_BYTES + more) // ELEMENT_BYTES)
     assert decode_space(encode_space(space), max_elements=elements) == space
-    with pytest.raises(RemoteProtocolError, match="max_elements"):
+    with pytest.raises(RemoteProtocolError, match="elements"):
         decode_space(encode_space(space), max_elements=elements - 1)
 
 
@@ -384,7 +384,7 @@ def test_absurd_sizes_are_refused_before_they_are_allocated(value: dict[str, Any
     }
     value = honest.get(value["kind"], {}) | value
     tracemalloc.start()
-    with pytest.raises(RemoteProtocolError, match="max_elements"):
+    with pytest.raises(RemoteProtocolError, match="elements"):
         decode_space(value, max_elements=MANY)
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
@@ -402,7 +402,7 @@ def test_boxes_that_are_alike_share_their_bounds_and_nothing_else() -> None:
     boxes[1].seed(1)
     assert boxes[0].np_random is not boxes[1].np_random
     assert (boxes[0].sample() != boxes[1].sample()).any()
-    with pytest.raises(RemoteProtocolError, match="max_elements"):
+    with pytest.raises(RemoteProtocolError, match="elements"):
         reader.space(encode_space(spaces.Box(0, 254, (100, 100), np.uint8)))
 
 
@@ -410,7 +410,7 @@ def test_what_is_in_a_sequence_has_bounds_of_its_own() -> None:
     """Gymnasium makes a batch of it, which is paid for however often it comes."""
     box = spaces.Box(0, 1, (1000,))
     value = encode_space(spaces.Tuple([box, *[spaces.Sequence(box)] * 3]))
-    with pytest.raises(RemoteProtocolError, match="max_elements"):
+    with pytest.raises(RemoteProtocolError, match="elements"):
         decode_space(value, max_elements=1000 * (1 + 2 * 2 + 1))
 
 

@@ -77,7 +77,7 @@ class Slab:
     def __init__(self, count: int) -> None:
         self.count = count
         self.memory = bytearray(slabs.INFO_BYTES)
-        self.writer = InfoWriter(self.memory, 0, count, sliced=False)
+        self.writer = InfoWriter(self.memory, 0, count, joined=lambda pairs: join(pairs, count))
         self.columns: Any = None
         self.outcomes: list[int] = []
 

@@ -9,6 +9,7 @@ sets, ranges). Nothing that ``decode`` is given can make it execute anything.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 from envhub_worker.protocol.codec.decoder import Decoder, TensorMaker, ThingReader, Unpickler
 from envhub_worker.protocol.codec.encoder import Describer, Encoder, Pickler
@@ -28,6 +29,7 @@ def encode(
     limits: WireLimits = DEFAULT_LIMITS,
     names: Sequence[str] = (),
     describer: Describer | None = None,
+    reduces: bool = False,
 ) -> list[Buffer]:
     """Encodes a value as frames: the header, then one per large array.
 
@@ -38,6 +40,7 @@ def encode(
         limits: What the receiver accepts.
         names: What to call the elements of the value in an error.
         describer: Describes what the receiver can make again. Worker to client only.
+        reduces: Whether a ``RemoteObject`` may stand in the place of a part that cannot be sent.
 
     Returns:
         Frames to be sent in this order. Large contiguous arrays are not copied, and must
@@ -50,12 +53,39 @@ def encode(
     encoder = Encoder(pickler, limits, describer)
     try:
         frames = encoder.frames(value)
+        if reduces:
+            check_outgoing_frames(frames, limits)
     except Exception as error:
+        if reduces and type(value) is list:
+            smaller = _reduced_frames(value, limits, describer)
+            if smaller is not None:
+                return smaller
         # Objects' own code runs here (__array__, iteration): anything can come out of it.
         from envhub_worker.protocol.codec.explain import explain
 
         raise LocalProtocolError(explain(value, error, limits, pickler, names)) from error
     check_outgoing_frames(frames, limits)
+    return frames
+
+
+def _reduced_frames(
+    message: list[Any], limits: WireLimits, describer: Describer | None
+) -> list[Buffer] | None:
+    """Those of the message without what cannot be sent; None where that does not help."""
+    from envhub_worker.protocol.codec.reduced import reduced
+
+    def sendable(value: object) -> bool:
+        try:
+            check_outgoing_frames(Encoder(None, limits, describer).frames(value), limits)
+        except Exception:
+            return False
+        return True
+
+    try:
+        frames = Encoder(None, limits, describer).frames(reduced(message, sendable, limits))
+        check_outgoing_frames(frames, limits)
+    except Exception:
+        return None
     return frames
 
 

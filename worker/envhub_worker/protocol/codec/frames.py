@@ -51,8 +51,8 @@ def _check_sizes(frames: Sequence[Buffer], limits: WireLimits) -> None:
     for name, size, cap in (
         ("frames", len(sizes), limits.frames),
         ("header_bytes", sizes[0], limits.header_bytes),
-        ("frame_bytes", max(sizes), max(limits.frame_bytes, sizes[0])),
         ("message_bytes", sum(sizes), limits.message_bytes),
+        ("frame_bytes", max(sizes), max(limits.frame_bytes, sizes[0])),
     ):
         if size > cap:
             raise MessageTooLargeError(f"{size} is over the limit of {cap} ({name}).")

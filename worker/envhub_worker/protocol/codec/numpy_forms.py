@@ -27,14 +27,26 @@ Encoder = Any
 Tensors = Callable[[Array, str], object] | None
 
 
+_WIDEST: dict[str, Any] = {"g": np.float64, "G": np.complex128}
+"""What long doubles arrive as; structured and raw elements do as tuples and bytes. None of this on
+the way to a worker: what the caller hands over arrives exactly as it is, or is refused."""
+
+
 def _write_array(encoder: Encoder, array: Array) -> object:
-    if array.dtype.kind != "O":
+    if array.dtype.char in _WIDEST and encoder.pickler is None:
+        array = array.astype(_WIDEST[array.dtype.char])
+    if array.dtype.kind not in ("O" if encoder.pickler else "OV"):
         return msgpack.ExtType(kinds.ARRAY, encoder.array(array))
     return [msgpack.ExtType(kinds.OBJECTS, pack_shape(array.shape)), *array.ravel().tolist()]
 
 
 def _write_scalar(encoder: Encoder, scalar: np.generic) -> object:
-    """Dtype code, parameter, value."""
+    """Dtype code, parameter, value; a structured one is a tuple."""
+    if isinstance(scalar, np.void) and encoder.pickler is None:
+        plain = scalar.item()
+        return plain if type(plain) is bytes else encoder.default(plain)
+    if scalar.dtype.char in _WIDEST and encoder.pickler is None:
+        scalar = _WIDEST[scalar.dtype.char](scalar)
     array = native(np.asarray(scalar))
     return msgpack.ExtType(kinds.SCALAR, describe_dtype(array.dtype) + array.tobytes())
 

@@ -38,10 +38,12 @@ def pack(
     pickler: Pickler | None = None,
     limits: WireLimits = DEFAULT_LIMITS,
     describer: Describer | None = None,
+    reduces: bool = False,
 ) -> list[Buffer]:
     """The frames of a message.
 
     With a pickler, what the caller hands over (``Message.HANDED``) arrives exactly as it is.
+    ``reduces``: as ``encode`` has it.
     Raises ``LocalProtocolError``: a field holds what the wire cannot carry; nothing was sent.
     """
     cls = type(message)
@@ -50,12 +52,17 @@ def pack(
         values = _handed(message, values, pickler, limits)
     found = forms.outline(values)
     if found is None:
-        return _encoded(message, values, pickler, limits, describer)
+        return _encoded(message, values, pickler, limits, describer, reduces=reduces)
     outline, arrays = found
     form = _OUTGOING.get((cls, outline))
     if form is not None and form.limits is limits:
         return form.frames(arrays)
-    frames = _encoded(message, values, pickler, limits)
+    try:
+        frames = _encoded(message, values, pickler, limits)
+    except LocalProtocolError:
+        if not reduces:
+            raise
+        return _encoded(message, values, pickler, limits, describer, reduces=True)
     _OUTGOING.met((cls, outline), lambda: forms.Outgoing(frames, arrays, limits))
     return frames
 
@@ -85,10 +92,13 @@ def _encoded(
     pickler: Pickler | None,
     limits: WireLimits,
     describer: Describer | None = None,
+    *,
+    reduces: bool = False,
 ) -> list[Buffer]:
     value, names = [message.kind, *values], ("kind", *message.FIELDS)
+    options: dict[str, Any] = {"describer": describer, "reduces": reduces}
     try:
-        return encode(value, pickler=pickler, limits=limits, names=names, describer=describer)
+        return encode(value, pickler=pickler, limits=limits, names=names, **options)
     except LocalProtocolError as error:
         raise LocalProtocolError(f"{_asked(message)}{error}") from error.__cause__
 

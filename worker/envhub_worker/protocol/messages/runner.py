@@ -205,6 +205,16 @@ class FetchInfosApart(Message, kind=85):
     env: int
 
 
+class TakeApart(Message, kind=93):
+    """Infos are not joined from now on, but those of the only sub-environment. Reply: ``Value``.
+
+    ``{0: info}``, or ``{0: {"final_obs": ..., "final_info": ...}, 1: info}`` where an episode has
+    ended; under -1, if one is, which of an observation's discrete members are Python's integers.
+    """
+
+    env: int
+
+
 class LoadTask(Message, kind=86, asks="make_env", handed=("cfg", "env_kwargs")):
     """As ``Load``, where the client knows what comes back: nothing is described, nor built for it.
 

@@ -14,6 +14,8 @@ import numpy as np
 
 from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.shared_memory.slabs import INFO_BYTES, LINE
+from envhub_worker.protocol.spaces import batches
+from envhub_worker.protocol.untrusted import FAULTS
 
 MAX_COLUMNS = 256
 _KINDS = frozenset("biuf")
@@ -44,9 +46,23 @@ class Column:
         return np.ndarray(self.shape, dtype, buffer, start + self.offset)
 
 
+def own_info(infos: dict[Any, Any]) -> dict[Any, Any] | None:
+    """The only one of infos that are not joined; None where there are others, or they are."""
+    own = infos.get(0)
+    return own if type(own) is dict and not infos.keys() - {0, batches.APART_SCALARS} else None
+
+
 def columns_of(infos: dict[Any, Any]) -> tuple[Column, ...] | None:
-    """The columns of flat, numeric infos in their order; None for any others."""
+    """The columns of flat, numeric infos in their order; None for any others.
+
+    Of infos that are not joined, those of what joining makes of them.
+    """
     columns: list[Column] = []
+    if own_info(infos) is not None:
+        try:
+            infos = batches.join_pairs([(0, infos[0])], 1)
+        except FAULTS:
+            return None
     offset = 0
     for key, value in infos.items():
         if type(key) is not str or type(value) is not np.ndarray or value.dtype.kind not in _KINDS:

@@ -7,7 +7,7 @@ custom space, a tuple of members. Followed: ``gymnasium.vector.utils.iterate`` a
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import gymnasium as gym
@@ -107,6 +107,36 @@ class Misfit(RemoteProtocolError):
 
 APART: dict[Any, Any] = {None: None}
 """What a shard says in place of infos that it cannot join without knowing the other shards'."""
+
+
+APART_SCALARS = -1
+"""The key, in infos of the only sub-environment that are not joined, of what ``integers`` says."""
+
+
+def integers(space: gym.Space[Any], member: Any) -> list[bool]:
+    """Whether each discrete member of this member of the space is an integer of Python's."""
+    if isinstance(space, spaces.Discrete):
+        return [type(member) is int]
+    if isinstance(space, spaces.Dict):
+        found = [integers(sub, member[key]) for key, sub in space.spaces.items()]
+    elif isinstance(space, spaces.Tuple):
+        found = [integers(sub, member[index]) for index, sub in enumerate(space.spaces)]
+    else:
+        return []
+    return list(itertools.chain.from_iterable(found))
+
+
+def with_integers(space: gym.Space[Any], member: Any, which: Iterator[bool]) -> Any:
+    """The member with those for which the next of ``which`` is true; the other way round."""
+    if isinstance(space, spaces.Discrete):
+        return int(member) if next(which, False) else member
+    if isinstance(space, spaces.Dict):
+        known = space.spaces
+        return {key: with_integers(sub, member[key], which) for key, sub in known.items()}
+    if isinstance(space, spaces.Tuple):
+        each = zip(space.spaces, member, strict=True)
+        return tuple(with_integers(sub, one, which) for sub, one in each)
+    return member
 
 
 def join_infos(parts: Sequence[dict[Any, Any]], sizes: Sequence[int]) -> dict[Any, Any]:

@@ -153,7 +153,9 @@ class SpaceReader:
         self._left -= size
         if self._left < 0:
             raise RemoteProtocolError(
-                f"The spaces cost more than {self._max_elements} elements (max_elements)."
+                f"The spaces cost more than {self._max_elements} elements of a Box. If they are "
+                'meant, raise that limit: limits={"elements": ...}; of those in an answer, '
+                "message_bytes"
             )
 
     def shape(self, value: object, element_bytes: int) -> tuple[int, ...]:

@@ -1,0 +1,105 @@
+"""Infos that the wire has no form for lose nothing but themselves, in one process and several."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from envhub_sandbox import SandboxEnv, make_env
+from envhub_sandbox.errors import RemoteEnvError
+from envhub_worker.protocol.codec.codec import RemoteObject
+from tests.support.repositories import write_repository
+
+_ENV = """
+import gymnasium as gym
+import numpy as np
+
+deep = []
+for _ in range(40):
+    deep = [deep]
+ODD = {
+    "structured": np.array([(1, 2.5)], [("a", "i4"), ("b", "f8")]),
+    "record": np.array([(1, 2.5)], [("a", "i4"), ("b", "f8")])[0],
+    "void": np.void(b"abc"),
+    "long": np.longdouble(1.5),
+    "longs": np.array([1.5, 2.5], np.longdouble),
+    "deep": deep,
+    "many": [0] * 250_000,
+    "text": "x" * (5 << 20),
+    "integer": [2 ** 10_000],
+}
+
+class Odd(gym.Env):
+    observation_space = gym.spaces.Box(0, 100, (2,))
+    action_space = gym.spaces.Discrete(2)
+
+    def __init__(self, odd):
+        self.odd = ODD[odd]
+
+    def reset(self, *, seed=None, options=None):
+        self.n = 0
+        return np.zeros(2, np.float32), {"before": 1, "odd": self.odd, "after": "text"}
+
+    def step(self, action):
+        self.n += 1
+        info = {"before": self.n, "odd": self.odd, "after": "text"}
+        return np.full(2, self.n, np.float32), float(self.n), False, False, info
+
+    def tell(self):
+        return self.odd
+
+def make_env(n_envs=1, use_async_envs=False, odd="deep"):
+    return gym.vector.SyncVectorEnv([lambda: Odd(odd)] * n_envs)
+"""
+ODD = ("structured", "record", "void", "long", "longs", "deep", "many", "text", "integer")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A repository whose infos are odd."""
+    return write_repository(tmp_path_factory.mktemp("odd"), _ENV)
+
+
+def _is_inert(value: Any) -> bool:
+    if isinstance(value, (list, tuple, np.ndarray)):
+        return any(map(_is_inert, value))
+    return isinstance(value, RemoteObject)
+
+
+@pytest.mark.parametrize("odd", ODD)
+@pytest.mark.parametrize("options", [{}, {"lane": "frames"}, {"num_workers": 2}], ids=str)
+def test_the_rest_of_a_step_arrives(folder: Path, odd: str, options: dict[str, Any]) -> None:
+    """Observations, rewards, flags, other infos; and of what is odd its value or a description."""
+    with make_env(folder, n_envs=2, env_kwargs={"odd": odd}, **options) as suites:
+        env = suites.env
+        infos = env.reset()[1]
+        for step in range(1, 4):
+            assert infos["before"].tolist() == [max(1, step - 1)] * 2
+            assert infos["after"].tolist() == ["text"] * 2
+            assert infos["_odd"].all()
+            observation, rewards, _, _, infos = env.step(np.zeros(2, int))
+            assert observation.tolist() == [[step, step]] * 2
+            assert rewards.tolist() == [step, step]
+        if odd in ODD[5:]:
+            assert _is_inert(infos["odd"])
+            with pytest.raises(RemoteEnvError, match="cannot be sent"):
+                env.call("tell")
+
+
+def test_one_environment_has_plain_values_of_them(folder: Path) -> None:
+    """Of numpy's own, without a vector environment's columns."""
+    expected = [np.array([(1, 2.5)], object), (1, 2.5), b"abc", np.float64(1.5), [1.5, 2.5]]
+    for odd, value in zip(ODD, expected, strict=False):
+        env = SandboxEnv(folder, env_kwargs={"odd": odd})
+        env.reset()
+        found = env.step(0)[4]["odd"]
+        if odd == "structured":
+            assert found.tolist() == [(1, 2.5)]
+        elif odd == "longs":
+            assert found.tolist() == value
+        else:
+            assert (type(found), found) == (type(value), value)
+        env.close()

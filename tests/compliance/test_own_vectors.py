@@ -1,0 +1,178 @@
+"""Repositories' own vector environments, wrapped ones, and old or odd results and errors."""
+
+from __future__ import annotations
+
+import builtins
+from pathlib import Path
+from typing import Any
+
+import gymnasium.error as gym_errors
+import pytest
+
+from envhub_sandbox import make_env
+from envhub_sandbox.errors import RemoteEnvError
+from tests.support.repositories import write_repository
+
+_OWN = """
+import gymnasium as gym
+import numpy as np
+
+class Own(gym.vector.VectorEnv):
+    def __init__(self, n, case):
+        self.num_envs, self.case = n, case
+        self.single_observation_space = gym.spaces.Box(0, 1, (2,))
+        self.single_action_space = gym.spaces.Discrete(2)
+        self.observation_space = gym.spaces.Box(0, 1, (n, 2))
+        self.action_space = gym.spaces.MultiDiscrete([2] * n)
+
+    def reset(self, *, seed=None, options=None):
+        infos = [{"i": i} for i in range(self.num_envs)]
+        if self.case == "no info":
+            return np.zeros((self.num_envs, 2), np.float32)
+        return np.zeros((self.num_envs, 2), np.float32), infos
+
+    def step(self, actions):
+        n = self.num_envs
+        results = {
+            "rewards": [None] * n if self.case == "rewards" else [0.5] * n,
+            "terminations": [False] * n,
+            "truncations": [False] * n,
+            "infos": "none" if self.case == "infos" else [{"i": i, "x": 0.5} for i in range(n)],
+        }
+        return np.zeros((n, 2), np.float32), *results.values()
+
+def make_env(n_envs=1, use_async_envs=False, case=""):
+    return Own(n_envs, case)
+"""
+
+
+def test_lists_are_what_gymnasium_would_make_of_them(tmp_path: Path) -> None:
+    """Infos, rewards and flags, as other libraries' vector environments return them."""
+    with make_env(write_repository(tmp_path, _OWN), n_envs=2) as suites:
+        env = suites.env
+        infos = env.reset()[1]
+        assert (infos["i"].tolist(), infos["_i"].tolist()) == ([0, 1], [True, True])
+        _, rewards, over, cut, infos = env.step([0, 1])
+        assert (rewards.tolist(), rewards.dtype.kind) == ([0.5, 0.5], "f")
+        assert (over.tolist(), cut.tolist()) == ([False, False], [False, False])
+        assert infos["x"].tolist() == [0.5, 0.5]
+
+
+@pytest.mark.parametrize("case", ["rewards", "infos", "no info"])
+def test_what_is_none_of_it_is_named(tmp_path: Path, case: str) -> None:
+    """It is the repository's fault, not the wire's; the environment stays usable."""
+    with make_env(write_repository(tmp_path, _OWN), n_envs=2, env_kwargs={"case": case}) as suites:
+        env = suites.env
+        what = "in place of" if case == "no info" else case
+        if case != "no info":
+            env.reset()
+        with pytest.raises(RemoteEnvError, match=f"make_env returned a VectorEnv .*Own.*{what}"):
+            _ = env.reset() if case == "no info" else env.step([0, 1])
+
+
+_WRAPPED = """
+import gymnasium as gym
+
+class Inner(gym.Wrapper):
+    level = 3
+    def raised(self, by):
+        return self.level + by
+
+class Outer(gym.vector.VectorWrapper):
+    level = "the wrapper's"
+
+def make_env(n_envs=1, use_async_envs=False):
+    fns = [lambda: Inner(gym.make("CartPole-v1"))] * n_envs
+    return Outer(Outer(gym.vector.SyncVectorEnv(fns)))
+"""
+
+
+def test_a_vector_wrapper_passes_calls_on(tmp_path: Path) -> None:
+    """``call``, ``get_attr`` and ``set_attr`` are the sub-environments'."""
+    with make_env(write_repository(tmp_path, _WRAPPED), n_envs=2) as suites:
+        env = suites.env
+        assert env.get_attr("level") == (3, 3)
+        env.set_attr("level", [4, 5])
+        assert env.get_attr("level") == (4, 5)
+        assert env.call("raised", 1) == (5, 6)
+        assert env.level == "the wrapper's"
+
+
+_OLD = """
+import gymnasium as gym
+import numpy as np
+
+class Old(gym.Env):
+    observation_space = gym.spaces.Box(0, 1, (3,))
+    action_space = gym.spaces.Discrete(2)
+
+    RESET
+
+    def step(self, action):
+        return np.zeros(3, np.float32), 0.0, False, {}
+
+def make_env(n_envs=1, use_async_envs=False):
+    return gym.vector.SyncVectorEnv([lambda: gym.wrappers.OrderEnforcing(Old())] * n_envs)
+"""
+_RESETS = {
+    "def reset(self): return np.zeros(3)": r"Old.reset \(env.py, line 9\) takes no seed",
+    "def reset(self, seed=None, options=None): return np.zeros(3)": r"line 9\) does not return obs",
+    "def reset(self, seed=None, options=None): return np.zeros(3), {}": (
+        r"Old.step \(env.py, line 11\) does not return observation, reward, terminated, truncated"
+    ),
+}
+
+
+@pytest.mark.parametrize("text", _RESETS)
+def test_the_api_of_old_is_named_with_its_line(tmp_path: Path, text: str) -> None:
+    """What ``gym`` before 0.26 had, in an environment of today's Gymnasium."""
+    folder = write_repository(tmp_path, _OLD.replace("RESET", text))
+    with make_env(folder) as suites:
+        if "step" in _RESETS[text]:
+            suites.env.reset()
+        with pytest.raises(RemoteEnvError, match=_RESETS[text]) as caught:
+            _ = suites.env.step([0]) if "step" in _RESETS[text] else suites.env.reset()
+    assert "0.26" in str(caught.value)
+
+
+_RAISING = """
+import gymnasium as gym
+from gymnasium import error
+
+class Raising(gym.Wrapper):
+    def fail(self, name):
+        raise {
+            "CustomSpaceError": lambda: error.CustomSpaceError("a"),
+            "AlreadyPendingCallError": lambda: error.AlreadyPendingCallError("a", "step"),
+            "NoAsyncCallError": lambda: error.NoAsyncCallError("a", "step"),
+            "ClosedEnvironmentError": lambda: error.ClosedEnvironmentError("a"),
+            "ResetNeeded": lambda: error.ResetNeeded("a"),
+            "UnicodeDecodeError": lambda: UnicodeDecodeError("utf-8", b"a", 0, 1, "why"),
+            "ExceptionGroup": lambda: ExceptionGroup("several", [ValueError("a")]),
+            "UserWarning": lambda: UserWarning("a"),
+            "BrokenPipeError": lambda: BrokenPipeError(32, "a"),
+        }[name]()
+
+def make_env(n_envs=1, use_async_envs=False):
+    return gym.vector.SyncVectorEnv([lambda: Raising(gym.make("CartPole-v1"))] * n_envs)
+"""
+
+
+def test_errors_are_of_their_class(tmp_path: Path) -> None:
+    """Gymnasium's, and Python's that are made of more than a text."""
+    names = ["UnicodeDecodeError", "UserWarning", "CustomSpaceError", "AlreadyPendingCallError"]
+    names += ["NoAsyncCallError", "ClosedEnvironmentError", "ResetNeeded"]
+    names += ["ExceptionGroup"] if hasattr(builtins, "ExceptionGroup") else []
+    with make_env(write_repository(tmp_path, _RAISING)) as suites:
+        env = suites.env
+        env.reset()
+        for name in names:
+            kind: Any = getattr(gym_errors, name, None) or getattr(builtins, name)
+            with pytest.raises(kind) as caught:
+                env.call("fail", name)
+            assert isinstance(caught.value, RemoteEnvError)
+            assert name in str(caught.value)
+            assert type(caught.value).__name__ == f"Remote{name}"
+        with pytest.raises(OSError, match="BrokenPipe"):
+            env.call("fail", "BrokenPipeError")
+        assert len(env.get_attr("render_mode")) == 1
