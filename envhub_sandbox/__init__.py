@@ -12,6 +12,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from envhub_worker import __version__ as __version__
+
 if TYPE_CHECKING:
     from envhub_sandbox import errors as errors
     from envhub_sandbox.factory.make_env import make_env as make_env
@@ -24,8 +26,6 @@ if TYPE_CHECKING:
     from envhub_sandbox.settings.policy import Timeouts as Timeouts
     from envhub_sandbox.vector.suites import EnvSuites as EnvSuites
     from envhub_sandbox.vector.vector_env import SandboxVectorEnv as SandboxVectorEnv
-
-__version__ = "0.1.0"
 
 _HOMES = {
     "DockerSandbox": "sandboxes.docker.sandbox",
