@@ -12,8 +12,6 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from envhub_worker import __version__ as __version__
-
 if TYPE_CHECKING:
     from envhub_sandbox import errors as errors
     from envhub_sandbox.factory.make_env import make_env as make_env
@@ -26,6 +24,8 @@ if TYPE_CHECKING:
     from envhub_sandbox.settings.policy import Timeouts as Timeouts
     from envhub_sandbox.vector.suites import EnvSuites as EnvSuites
     from envhub_sandbox.vector.vector_env import SandboxVectorEnv as SandboxVectorEnv
+
+    __version__: str
 
 _HOMES = {
     "DockerSandbox": "sandboxes.docker.sandbox",
@@ -45,6 +45,8 @@ __all__ = [*_HOMES]
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":  # it stands where an image without this package finds it, too
+        return importlib.import_module("envhub_worker").__version__
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     module = importlib.import_module(f"{__name__}.{_HOMES[name]}")
