@@ -112,6 +112,6 @@ smoke() {
 copy_tests() {
   mkdir -p "$1"
   cp -R .ci benchmarks docs examples plugins tests ./*.md Dockerfile .dockerignore action.yml mkdocs.yml \
-    .pre-commit-hooks.yaml LICENSE pyproject.toml \
+    .pre-commit-hooks.yaml CITATION.cff LICENSE pyproject.toml \
     test "$1/"
 }

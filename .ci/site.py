@@ -97,11 +97,17 @@ def _shown(found: re.Match[str]) -> str:
 
 def on_post_page(output: str, page: Any, config: Any) -> str:
     """Forbid the browser to load anything from elsewhere; and diagrams need mermaid."""
-    output, diagrams = _DIAGRAM.subn(r'<div class="diagram">\g<0></div>', output)
+    output, diagrams = _DIAGRAM.subn(_framed, output)
     if diagrams:
         script = f'<script src="{get_relative_url(MERMAID, page.url)}"></script>'
         output = output.replace("</head>", f"{script}</head>", 1)
     return _confined(output)
+
+
+def _framed(drawing: re.Match[str]) -> str:
+    """A chart fits any screen; a diagram scrolls where its words would be too small."""
+    kind = "diagram chart" if "xychart" in drawing[0] else "diagram"
+    return f'<div class="{kind}">{drawing[0]}</div>'
 
 
 def on_post_template(output_content: str, template_name: str, config: Any) -> str:

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from envhub_sandbox.vector.suites import EnvSuites as EnvSuites
     from envhub_sandbox.vector.vector_env import SandboxVectorEnv as SandboxVectorEnv
 
-__version__ = "0.1.0"
+    __version__: str
 
 _HOMES = {
     "DockerSandbox": "sandboxes.docker.sandbox",
@@ -45,6 +45,8 @@ __all__ = [*_HOMES]
 
 
 def __getattr__(name: str) -> Any:
+    if name == "__version__":  # it stands where an image without this package finds it, too
+        return importlib.import_module("envhub_worker").__version__
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     module = importlib.import_module(f"{__name__}.{_HOMES[name]}")

@@ -19,7 +19,10 @@ from uv import find_uv_bin
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 PLUGIN = "lerobot_env_envhub_sandbox"
-PACKED = ("envhub_sandbox", "worker", "plugins", "pyproject.toml", "README.md", "LICENSE")
+PACKED = (
+    *("envhub_sandbox", "worker", "examples", "plugins"),
+    *("pyproject.toml", "README.md", "LICENSE"),
+)
 FINDS = f"""
 from importlib import metadata, util
 assert "{PLUGIN}" in [one.metadata["Name"] for one in metadata.distributions()]
@@ -73,6 +76,7 @@ def plays(folder: Path, package: Path, plugin: Path) -> None:
     name, *arguments = command.split()
     run(str(bin_folder / name), *arguments, cwd=folder)
     assert (folder / "cartpole.mp4").stat().st_size, "there is no video"
+    run(str(bin_folder / name), "run", "examples:cartpole", "--episodes", "2", cwd=folder)
     run(str(bin_folder / "python"), "-c", FINDS, cwd=folder)
 
 

@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from envhub_sandbox.dependencies.environments import Environment
 
 _DAY_S = 24 * 3600.0
+_SHOWN = 18
+"""Characters of a commit: twelve digits behind local-, as errors show it; --json has all."""
 
 
 @dataclass(frozen=True)
@@ -130,7 +132,13 @@ def _documents(found: Sequence[StoredSnapshot | Environment], **named: str) -> l
 
 def _print(found: list[StoredSnapshot]) -> None:
     rows = [
-        (one.repository, one.commit, one.revision or "", _day(one.used), size_text(one.size))
+        (
+            one.repository,
+            one.commit[:_SHOWN],
+            one.revision or "",
+            _day(one.used),
+            size_text(one.size),
+        )
         for one in found
     ]
     show_rows([("repository", "commit", "revision", "last used", "size"), *rows], right=(4,))

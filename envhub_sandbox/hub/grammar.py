@@ -66,8 +66,9 @@ def is_commit(revision: str) -> bool:
 
 
 def is_local(text: str) -> bool:
-    """Whether the text names a folder here: ``./env``, ``../env``, ``/abs/env``, ``~/env``."""
-    return text in (".", "..", "~") or text.startswith(("./", "../", "/", "~/", ".\\", "..\\"))
+    """Whether it names a folder here: ``./env``, ``../env``, ``/env``, ``~/env``, ``examples:``."""
+    here = ("./", "../", "/", "~/", ".\\", "..\\", "examples:")
+    return text in (".", "..", "~") or text.startswith(here)
 
 
 def has_control_characters(text: str) -> bool:

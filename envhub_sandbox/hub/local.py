@@ -12,6 +12,7 @@ import hashlib
 import json
 import os
 import stat
+import sysconfig
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -33,6 +34,7 @@ from envhub_sandbox.hub.listing import (
 from envhub_worker.protocol.records import dataclass
 
 _GIT = ".git"
+_EXAMPLES = "examples:"
 _ALL_COUNTS = (
     "It is in no git checkout, so every file in it counts. Move away what does not belong to the "
     "repository, or run 'git init' there and name it in .gitignore"
@@ -193,7 +195,9 @@ def _is_empty_folder(path: Path) -> bool:
 
 
 def split_local(text: str, path: str) -> tuple[Path, str]:
-    """The folder and entry of ``./env``, ``./env:sub/env.py`` or ``./env/other.py``."""
+    """The folder and entry of ``./env``, ``./env:sub/env.py``, ``./x/other.py``, ``examples:x``."""
+    if text.startswith(_EXAMPLES):
+        text = str(_example(text))
     folder = Path(os.path.abspath(os.path.expanduser(text)))
     if folder.is_dir():
         return folder, os.path.normpath(path)
@@ -213,6 +217,24 @@ def split_local(text: str, path: str) -> tuple[Path, str]:
         "Write './folder', './folder:path/env.py' or './folder/env.py'; a repository of the Hub "
         "is owner/name"
     )
+
+
+def _example(text: str) -> Path:
+    """The folder of an example: in the checkout that this is, or where the wheel has put it."""
+    checkout = Path(__file__).resolve().parents[2]
+    schemes = ("data", sysconfig.get_default_scheme()), ("data", "posix_user")
+    installed = [checkout / "share"] + [Path(sysconfig.get_path(*one), "share") for one in schemes]
+    roots = [checkout] if (checkout / "worker" / "envhub_worker").is_dir() else []
+    roots += [share / "envhub-sandbox" for share in installed]
+    examples = next((one for root in roots if (one := root / "examples").is_dir()), None)
+    known = sorted(one.parent.name for one in examples.glob("*/env.py")) if examples else []
+    name = text.removeprefix(_EXAMPLES)
+    if examples is None or name not in known:
+        raise RepositoryUnavailableError(
+            f"{text!r}: there is no such example; choose one: "
+            + (", ".join(f"{_EXAMPLES}{one}" for one in known) or "none is installed")
+        )
+    return examples / name
 
 
 def hash_files(files: tuple[LocalFile, ...], title: str) -> tuple[FileRecord, ...]:

@@ -59,4 +59,4 @@ def _from_where_pytest_began(ref: str, request: pytest.FixtureRequest) -> str:
     from envhub_sandbox.hub.reference import is_local
 
     began = request.config.invocation_params.dir
-    return str(began / ref) if is_local(ref) and not ref.startswith("~") else ref
+    return str(began / ref) if is_local(ref) and not ref.startswith(("~", "examples:")) else ref

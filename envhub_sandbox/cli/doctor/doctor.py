@@ -127,7 +127,7 @@ def doctor(
             here = {"host": host(), "versions": versions(), "engine": engine(), **resources(cache)}
             print_json({**here, "profiles": list(map(asdict, trials)), **probed})
         else:
-            _print(trials)
+            _print(trials, profile)
             _print_missing(probed)
             if cache is not None:
                 out()
@@ -257,11 +257,12 @@ def examine(folder: str, profile: str) -> Trial:
     return Trial(profile, available=True, layers=layers, first_step_s=taken)
 
 
-def _print(trials: list[Trial]) -> None:
+def _print(trials: list[Trial], asked: str) -> None:
+    """The layers of the profile that was asked for, and of each other what it goes without."""
     facts = host()
     user = "root" if facts["root"] else "a plain user"
     out(f"{facts['system']} on {facts['machine']}, as {user}, {facts['python']}")
-    for trial in trials:
+    for trial in sorted(trials, key=lambda one: one.profile != asked):
         out()
         if trial.problem is not None:
             out(f"{trial.profile}: not available here", "bold red")
@@ -269,6 +270,11 @@ def _print(trials: list[Trial]) -> None:
             continue
         took = f"first step after {trial.first_step_s:.2f} s"
         out(f"{trial.profile}: available ({took})", "bold green")
+        if trial.profile != asked:
+            lacks = [safe_line(one.get("layer")) for one in trial.layers if not one.get("enforced")]
+            all_layers, without = len(trial.layers), ", ".join(lacks) or "none"
+            out(f"  {all_layers - len(lacks)} of {all_layers} layers hold; missing: {without}")
+            continue
         for layer in trial.layers:
             mark = "holds" if layer.get("enforced") else "none"
             show(f"  {mark:6} {safe_line(layer.get('layer'))}", layer.get("detail"), width=26)

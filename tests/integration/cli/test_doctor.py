@@ -146,3 +146,24 @@ def test_nothing_can_be_written(command: str, code: int, monkeypatch: pytest.Mon
     assert done.exit_code == code
     assert "bug" not in done.stderr
     assert ("--tmpfs /tmp" in done.stderr) is (command == "doctor")
+
+
+def test_only_the_profile_that_was_asked_for_is_printed_layer_by_layer(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The others have one line each, with what they go without."""
+    layers = [
+        {"layer": "seccomp", "enforced": True, "detail": "a list"},
+        {"layer": "pid-namespace", "enforced": False, "detail": "none"},
+    ]
+    monkeypatch.setattr(
+        doctor_command,
+        "examine",
+        lambda _, name: doctor_command.Trial(name, available=True, layers=layers, first_step_s=0.1),
+    )
+    probed = {"layers": [], "apparmor_profile": None, "gpu": None}
+    monkeypatch.setattr(doctor_command, "probe", lambda: probed)
+    printed = RUNNER.invoke(app, ["doctor", "--profile", "container"]).stdout
+    assert printed.index("container: available") < printed.index("strict: available")
+    assert printed.count("holds  seccomp") == 1
+    assert printed.count("  1 of 2 layers hold; missing: pid-namespace\n") == 2

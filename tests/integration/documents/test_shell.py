@@ -25,7 +25,7 @@ _WITHIN = {"docs/ci.md": "my-env"}
 # What is in no plain installation.
 _NEEDS = {"--video": "imageio_ffmpeg", "--metrics": "prometheus_client"}
 # What takes words, and no options.
-_WITHOUT_PARSER = {"benchmarks.remote", "tests.distributions"}
+_WITHOUT_PARSER = {"benchmarks.memory", "benchmarks.remote", "tests.distributions"}
 
 
 @pytest.mark.parametrize("document", [one for one in blocks.DOCUMENTS if executed(one)])

@@ -52,6 +52,7 @@ NOT_EXECUTED = {
     ("benchmarks/README.md", "python -m"): _LONG,
     ("docs/deployment.md", "envhub image build"): _DERIVED,
     ("docs/lerobot.md", "pip install"): _INSTALLS,
+    ("docs/speed.md", "python -m benchmarks"): _LONG,
     ("docs/lerobot.md", "python -m tests.lerobot"): _LONG,
 }
 _EVERYWHERE = {"sh": RUN, "": SHOWN, "text": SHOWN, "mermaid": DRAWN}

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 import sys
 import tarfile
@@ -16,6 +17,10 @@ from pathlib import Path
 from typing import cast
 
 import pytest
+import yaml
+
+import envhub_sandbox
+import envhub_worker
 
 pytestmark = pytest.mark.same_for("users", "versions")
 
@@ -80,6 +85,23 @@ def assert_fit(told: Message) -> None:
 def test_the_package_is_fit_for_an_index() -> None:
     """As it is installed here."""
     assert_fit(cast("Message", metadata.metadata("envhub-sandbox")))
+
+
+def test_the_package_holds_no_test() -> None:
+    """Two packages, their metadata, the programs, and the examples."""
+    files = metadata.files("envhub-sandbox") or []
+    assert files
+    assert [one for one in files if {"tests", "benchmarks", "conftest.py"} & {*one.parts}] == []
+
+
+def test_the_version_stands_in_one_place(checkout: Path) -> None:
+    """The rest is made of it, or is the same."""
+    citation = yaml.safe_load((checkout / "CITATION.cff").read_text())
+    version = envhub_worker.__version__
+    assert version == envhub_sandbox.__version__ == metadata.version("envhub-sandbox")
+    assert citation["version"] == version
+    project = (checkout / "pyproject.toml").read_text().partition("\n\n[")[2]
+    assert not re.search(r'^version = "', project, re.M)
 
 
 def test_the_plugin_is_fit_for_an_index(plugin: Path) -> None:

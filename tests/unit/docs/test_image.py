@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+import envhub_worker
 from tests.unit.docs.test_imports import WORKERS_OWN
 
 pytestmark = pytest.mark.same_for("users", "versions")
@@ -54,10 +55,10 @@ def test_the_image_can_be_watched(project: dict[str, Any]) -> None:
     }
 
 
-def test_the_image_carries_the_projects_version(project: dict[str, Any]) -> None:
+def test_the_image_carries_the_projects_version() -> None:
     """The label says which worker it is."""
     text = (CHECKOUT / "Dockerfile").read_text()
-    assert f"ARG VERSION={project['project']['version']}\n" in text
+    assert f"ARG VERSION={envhub_worker.__version__}\n" in text
 
 
 def test_nothing_but_the_worker_goes_into_the_image() -> None:

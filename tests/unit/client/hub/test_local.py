@@ -15,6 +15,7 @@ from envhub_sandbox.errors import (
     SnapshotIntegrityError,
     SnapshotTooLargeError,
 )
+from envhub_sandbox.hub.local import split_local
 from envhub_sandbox.hub.snapshot import Snapshot, SnapshotLimits, commit_of, local, store
 
 
@@ -219,3 +220,20 @@ def test_forgotten_copies_are_removed_with_the_next_new_one(folder: Path) -> Non
     new = local(folder)
     assert not old.root.exists()
     assert new.root.exists()
+
+
+def test_an_example_is_found_from_anywhere(
+    checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The wheel brings them; in a checkout they are those of the checkout."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("cartpole", "catch", "two_tasks"):
+        folder, entry = split_local(f"examples:{name}", "env.py")
+        assert (folder / entry).read_bytes() == (checkout / "examples" / name / entry).read_bytes()
+
+
+@pytest.mark.parametrize("name", ["", "nope", "../tests", "cartpole/env.py", "ci"])
+def test_what_is_no_example_is_refused_with_those_that_there_are(name: str) -> None:
+    """A name is one of a list, and never a path."""
+    with pytest.raises(RepositoryUnavailableError, match="choose one: examples:cartpole, "):
+        split_local(f"examples:{name}", "env.py")

@@ -191,7 +191,9 @@ def test_reference_that_no_hub_has_cannot_be_built(fields: dict[str, str]) -> No
         HubRef(**fields)
 
 
-@pytest.mark.parametrize("text", [".", "..", "~", "./env", "../env", "/env", "~/env"])
+@pytest.mark.parametrize(
+    "text", [".", "..", "~", "./env", "../env", "/env", "~/env", "examples:env"]
+)
 def test_local_folder_is_recognised(text: str) -> None:
     """Paths that start like paths are local; everything else is the Hub's."""
     assert is_local(text)
