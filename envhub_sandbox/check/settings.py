@@ -34,14 +34,12 @@ class JudgeOptions:
     """What is judged, and how.
 
     Attributes:
-        reference: The repository.
         arguments: Of ``make_env``, beyond the reference.
         seed, steps: The seed and the steps of each play.
         resets: Resets in a row, four times, to count what they leave behind; 0 skips this.
         slow_step_s: The longest that the median step may take; a reset may take five times that.
         episode_steps: In which some episode has to end, if 30 seconds suffice for them.
         tasks: Chooses ``(suite, task)`` pairs of the environments.
-        tell: Called with what is done next.
         pictures: Also gather what only a page shows: frames, and memory over time.
     """
 

@@ -38,7 +38,6 @@ def held(
     may remove the file: the next one makes another.
 
     Args:
-        path: The file.
         wait_s: For how long to wait while another holds it.
         shared: Whether others may hold it as well, if theirs is shared, too.
         on_wait: Called once before the first wait.
@@ -82,13 +81,8 @@ def _take(path: Path, mode: int, *, shared: bool) -> int | None:
 
 def is_held(path: Path) -> bool:
     """Whether another, in whatever namespace, holds a lock that is not shared.
-
-    Args:
-        path: A file or a folder.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        OSError: The file cannot be opened, or its file system has no locks.
+    Raises ``FileNotFoundError``: there is no such file; ``OSError``: the file cannot be opened, or
+    its file system has no locks.
     """
     with unheld(path) as free:
         return not free
@@ -133,10 +127,6 @@ class LifeLock(_HeldLock):
     """A new file whose lock this process holds: under its name it is never seen without.
 
     Where the file system has no locks, ``is_held`` cannot tell, and says so.
-
-    Args:
-        path: The file.
-        content: What stands in it.
     """
 
     def __init__(self, path: Path, content: str = "") -> None:

@@ -130,9 +130,6 @@ class VideoWriter:
     Args:
         path: The file; see ``check_target``.
         fps: Frames per second.
-
-    Attributes:
-        frames: How many were written.
     """
 
     def __init__(self, path: Path, fps: float) -> None:

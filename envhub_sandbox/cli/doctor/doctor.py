@@ -40,7 +40,6 @@ class Trial:
     """What came of one profile.
 
     Attributes:
-        profile: Its name.
         available: A jail under it ran.
         layers: One mapping per layer: ``layer``, ``enforced``, ``detail``.
         first_step_s: Seconds from ``make_env`` to the first step's result.
@@ -164,9 +163,7 @@ def _scratch_folder() -> Iterator[Path]:
 
 def _cache_problem(*, by_others: bool) -> str | None:
     """Why the caller's cache is of no use, and what to do; None if it is.
-
-    Args:
-        by_others: Whether root's jails read it as another user: all but those with a private root.
+    ``by_others``: whether root's jails read it as another user: all but those with a private root.
     """
     from envhub_sandbox.hub.cache import cache_root
 

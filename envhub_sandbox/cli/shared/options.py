@@ -125,10 +125,7 @@ def _completion(metavar: str) -> Callable[[], list[str]] | None:
 @dataclass(frozen=True)
 class MakeOptions:
     """What a command line says about ``make_env``.
-
-    Attributes:
-        ref: The reference.
-        given: The values of the options that the command has, as typed, by keys of ``OPTIONS``.
+    ``given``: the values of the options that the command has, as typed, by keys of ``OPTIONS``.
     """
 
     ref: str

@@ -23,9 +23,7 @@ class TaskResult:
 
     Attributes:
         suite, task: Its keys. Trust: input from the worker.
-        num_envs: Sub-environments.
         autoreset_mode: ``"NextStep"``, ``"SameStep"``, ``"Disabled"`` or None.
-        rollout: What was played.
         video: The file that was written, or None.
     """
 

@@ -42,15 +42,12 @@ class Container:
     """One container, as it is wanted.
 
     Attributes:
-        name: Its name.
         image: The image's id.
-        labels: Label to value.
         sockets: The host's folder that is mounted at ``SOCKETS``.
         snapshot: The host's folder that is mounted at ``SNAPSHOT``, read-only.
         packages: The host's folder that is mounted at ``PACKAGES``, read-only, or empty.
         readable: Further paths of the host, read-only, at the same place.
         seccomp: The host's path of the system call profile.
-        user: User and group of its processes.
         network: ``"none"`` or ``"host"``.
         memory: Bytes, or None where the engine cannot limit it; swap is not added.
         pids: Processes and threads, or None likewise.

@@ -27,11 +27,7 @@ Answer = tuple[int, str, bytes]
 
 
 class MetricsPage:
-    """What there is to read.
-
-    Args:
-        render: Makes text of figures, and says of which kind.
-    """
+    """What there is to read. ``render``: makes text of figures, and says of which kind."""
 
     def __init__(
         self,

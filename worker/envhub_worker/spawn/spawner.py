@@ -38,9 +38,7 @@ RUNNER_TARGET = "envhub_worker.runner.runner:main"
 @dataclass(frozen=True)
 class ZygoteDied:
     """The zygote has gone, and every jail with it.
-
-    Attributes:
-        code: Its exit code, or minus the signal that ended it.
+    ``code``: its exit code, or minus the signal that ended it.
     """
 
     code: int

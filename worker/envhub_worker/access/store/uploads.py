@@ -92,13 +92,8 @@ class Uploads:
     def offer(
         self, owner: bytes, key: bytes, request: m.OfferSnapshot, in_use: Collection[str]
     ) -> m.MissingBlobs:
-        """What is missing of a snapshot. Nothing: it lies ready.
-
-        Args:
-            in_use: Trees that must stay, by path.
-
-        Raises:
-            RefusedError: A listing that breaks a rule or the quota.
+        """What is missing of a snapshot. Nothing: it lies ready. ``in_use``: trees that must stay,
+        by path. Raises ``RefusedError``: a listing that breaks a rule or the quota.
         """
         files = checked_listing(request.files, self._quotas)
         digest = digest_of(files)
@@ -195,7 +190,7 @@ class Uploads:
             self._give_up(known, sha256)
 
     def tree(self, key: bytes, snapshot: str) -> str:
-        """The path of a client's snapshot. Raises ``RefusedError``: it is not here; a path is none."""
+        """The path of a client's snapshot. Raises ``RefusedError`` where it is not here."""
         if _SNAPSHOT.fullmatch(snapshot):
             tree = self._store(key).tree(snapshot.removeprefix(PREFIX))
             if tree.is_dir():

@@ -40,9 +40,7 @@ def jail_environment(
     base: Mapping[str, str], granted: Mapping[str, str], home: str, temporary: str
 ) -> dict[str, str]:
     """What a runner of a jail sees.
-
-    Args:
-        granted: Variables that the caller grants by name; they win.
+    ``granted``: variables that the caller grants by name; they win.
     """
     kept = {name: value for name, value in base.items() if name in ("PATH", *_INHERITED)}
     return {
