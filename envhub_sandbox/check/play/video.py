@@ -32,9 +32,7 @@ class VideoError(EnvHubError):
 
 
 def check_target(path: Path) -> None:
-    """Refuse a target that cannot work, before anything is run.
-    Raises ``VideoError``: the text says what to do.
-    """
+    """Refuse a target that cannot work, before anything is run. Raises ``VideoError``."""
     if not can_encode():
         raise VideoError(
             "writing a video needs imageio's ffmpeg, which is not installed here; install it with: "
@@ -140,9 +138,7 @@ class VideoWriter:
         self._encoder: Generator[None, Any, None] | None = None
 
     def add(self, frame: Frame) -> None:
-        """Append a frame as ``first_frame`` gives it.
-        Raises ``VideoError``: it has another size than the first one, or it cannot be written.
-        """
+        """Append a frame as ``first_frame`` gives it. Raises ``VideoError``."""
         size = (frame.shape[1], frame.shape[0])
         if self._encoder is None:
             self._size, self._encoder = size, self._open(size)

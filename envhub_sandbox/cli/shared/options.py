@@ -257,9 +257,7 @@ def read_env_kwargs(texts: Sequence[str]) -> dict[str, Any]:
 
 
 def read_dependencies(text: str) -> str | dict[str, Any]:
-    """The argument of ``make_env``: text, or a JSON object.
-    Raises ``UsageError``: it begins like an object and is none.
-    """
+    """The argument of ``make_env``: text, or a JSON object. Raises ``UsageError``."""
     return _json_object("--dependencies", text) if text.lstrip().startswith("{") else text
 
 

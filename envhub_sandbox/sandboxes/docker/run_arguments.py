@@ -172,9 +172,7 @@ def scratch_for(policy: Policy) -> int:
 
 
 def check_readable(paths: tuple[str, ...]) -> None:
-    """Refuse what would replace the container's own files.
-    Raises ``PolicyError``: a path is the root, or a folder that every system has in it.
-    """
+    """Refuse what would replace the container's own files. Raises ``PolicyError``."""
     for path in paths:
         parts = [part for part in path.split("/") if part]
         if ".." in parts or not parts or (len(parts) == 1 and parts[0] in _OWN):

@@ -124,9 +124,7 @@ class Packages:
         return m.Packages("making", "", {}, progress)
 
     def runtime(self, key: bytes, name: str) -> Runtime:
-        """What a client's packages are, and their interpreter.
-        Raises ``RefusedError``: it has not been given any of that name.
-        """
+        """What a client's packages are, and their interpreter. Raises ``RefusedError``."""
         found = self._handed.get((key.hex()[:32] or "local", name))
         if found is None or not os.path.isdir(found[0].packages):
             raise RefusedError(

@@ -186,9 +186,7 @@ class Spawner:
         return code
 
     def spawn(self, spec: JailSpec) -> Jail:
-        """Ask for a jail. Requests wait until the zygote is ready.
-        Raises ``RuntimeError``: the zygote has gone.
-        """
+        """Ask for a jail. Requests wait until the zygote is ready. Raises ``RuntimeError``."""
         if self._exited:
             raise RuntimeError("the zygote has gone")
         self._count += 1

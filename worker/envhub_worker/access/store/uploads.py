@@ -131,9 +131,7 @@ class Uploads:
         self.forget(owner)
 
     def put(self, owner: bytes, key: bytes, request: m.PutBlob, data: bytes) -> None:
-        """Take a piece of a wanted file; the last one makes it a blob.
-        Raises ``RefusedError``: it is not wanted, is out of order, or it is not what its hash says.
-        """
+        """Take a piece of a wanted file; the last one makes it a blob. Raises ``RefusedError``."""
         if len(request.sha256) != _SHA256_BYTES:  # it would be a file's name
             raise RefusedError("LocalProtocolError", "a hash has 32 bytes")
         offer = self._offers.get(owner)
