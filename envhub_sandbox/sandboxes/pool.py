@@ -248,10 +248,8 @@ class ServerPool(Generic[S]):
     def stop_all(self) -> None:
         """End all that this process has started, and keep none from now on: at its exit."""
         self._ends = True
-        self._stop(lambda: [*self._mine(), *self._used_here()])
-
-    def _used_here(self) -> list[_Entry[S]]:
-        return [entry for entry in self._used.values() if entry.pid == os.getpid()]
+        here = os.getpid()
+        self._stop(lambda: [*self._mine(), *(e for e in self._used.values() if e.pid == here)])
 
     def _stop(self, which: Callable[[], list[_Entry[S]]]) -> None:
         with self._changed:

@@ -28,7 +28,6 @@ def held(
     path: Path,
     *,
     wait_s: float = 0.0,
-    shared: bool = False,
     on_wait: Callable[[], object] = lambda: None,
     mode: int = 0o600,
 ) -> Iterator[int]:
@@ -39,7 +38,6 @@ def held(
 
     Args:
         wait_s: For how long to wait while another holds it.
-        shared: Whether others may hold it as well, if theirs is shared, too.
         on_wait: Called once before the first wait.
         mode: That of a new file.
 
@@ -49,7 +47,7 @@ def held(
     """
     until = time.monotonic() + wait_s
     waits = False
-    while (descriptor := _take(path, mode, shared=shared)) is None:
+    while (descriptor := _take(path, mode)) is None:
         if time.monotonic() >= until:
             raise TimeoutError(f"another process holds the lock {path}")
         if not waits:
@@ -63,11 +61,11 @@ def held(
         os.close(descriptor)
 
 
-def _take(path: Path, mode: int, *, shared: bool) -> int | None:
+def _take(path: Path, mode: int) -> int | None:
     """Take it now; None if another has it, or has just removed the file."""
     descriptor = os.open(path, _WRITE, mode)
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_NB | (fcntl.LOCK_SH if shared else fcntl.LOCK_EX))
+        fcntl.flock(descriptor, fcntl.LOCK_NB | fcntl.LOCK_EX)
         if os.path.samestat(os.fstat(descriptor), os.stat(path)):
             return descriptor
     except (BlockingIOError, FileNotFoundError):
