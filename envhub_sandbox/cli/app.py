@@ -17,7 +17,7 @@ from envhub_sandbox.cli import cache, diff, image, lock, prefetch, push, replay,
 from envhub_sandbox.cli.check.check import check
 from envhub_sandbox.cli.doctor.doctor import doctor
 from envhub_sandbox.cli.init.init import init
-from envhub_sandbox.cli.inspect.inspect import inspect
+from envhub_sandbox.cli.inspect import inspect
 from envhub_sandbox.cli.shared.console import guarded, out
 from envhub_sandbox.cli.shared.exits import EXIT_CODES, reported
 from envhub_sandbox.cli.shared.versions import versions
