@@ -32,7 +32,6 @@ class Check:
     """One question that is asked of a repository.
 
     Attributes:
-        severity: Of its findings.
         id: Its name, in reports and for ``--allow``.
         sentence: What holds where it passes.
         cure: What an author changes where it does not.

@@ -26,12 +26,11 @@ class Finding:
     """One check that does not hold.
 
     Attributes:
-        id: The check's.
         message: What was seen, printable and of bounded length.
         task: ``"suite / task"``; empty where it is about the whole repository.
         file, line: Where it stands in the repository; empty and 0 where it stands nowhere.
-        cause: The class of the error that it is about, or how a process ended; may be empty.
-            Trust: the worker's word.
+        cause: The class of the error that it is about, or how a process ended; may be empty. Trust:
+            the worker's word.
     """
 
     id: str

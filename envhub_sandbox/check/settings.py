@@ -34,14 +34,12 @@ class JudgeOptions:
     """What is judged, and how.
 
     Attributes:
-        reference: The repository.
         arguments: Of ``make_env``, beyond the reference.
         seed, steps: The seed and the steps of each play.
         resets: Resets in each of four rounds that look for leaks; 0 skips them.
         slow_step_s: Longest permitted median step; resets may take five times as long.
         episode_steps: In which some episode has to end, if 30 seconds suffice for them.
         tasks: Chooses ``(suite, task)`` pairs of the environments.
-        tell: Called with what is done next.
         pictures: Also gather what only a page shows: frames, and memory over time.
     """
 

@@ -29,7 +29,7 @@ _COMMANDS: dict[str, tuple[str, str | Where]] = {
     ),
     "inspect": (
         "Print suites, tasks, spaces, metadata and provenance, without stepping anything.",
-        "inspect.inspect:inspect",
+        "inspect:inspect",
     ),
     "check": (
         "Run a repository in a sandbox and say what is wrong with it.",

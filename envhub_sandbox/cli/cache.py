@@ -35,7 +35,6 @@ class StoredSnapshot:
         revision: The branch or tag that it was fetched as, or None.
         used: Unix time (seconds) of the last use.
         size: Bytes of all files, as the record has them.
-        home: Its folder.
     """
 
     repository: str

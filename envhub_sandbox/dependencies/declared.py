@@ -67,7 +67,6 @@ class DeclaredPackages:
     """What a repository needs.
 
     Attributes:
-        source: The file that says so.
         wanted: Its requirements; there may be none.
         python: The versions of Python that it runs in, as in ``">=3.11"``; empty for any.
         constraints: What holds for packages if something needs them.

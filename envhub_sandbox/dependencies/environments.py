@@ -56,12 +56,10 @@ class Environment:
     Attributes:
         key: The hash of the lock and the interpreter.
         python: The interpreter that it is for, by absolute path.
-        version: That one's version.
         lock: SHA-256 of the lock's text.
         pins: ``name==version`` of each package.
         size: Bytes of all files.
         used: Unix time (seconds) of the last use.
-        home: Its folder.
     """
 
     key: str

@@ -75,9 +75,9 @@ def options() -> tuple[str, ...]:
     return ("--no-index",) if environment().get("UV_NO_INDEX", "").lower() in _YES else ()
 
 
-def places(variables: Mapping[str, str] | None = None) -> list[str]:
+def places() -> list[str]:
     """What of it decides where packages come from, as ``NAME=value``; it may hold passwords."""
-    found = environment(variables)
+    found = environment()
     names = (*_CHOOSE_AN_INDEX, "UV_INDEX_STRATEGY", "UV_EXCLUDE_NEWER", "UV_TORCH_BACKEND")
     return [f"{name}={found[name]}" for name in names if name in found]
 

@@ -42,9 +42,7 @@ class Interpreter:
 
     Attributes:
         path: Absolute, and no link.
-        implementation: ``"cpython"``.
         version: ``"3.11.2"``.
-        machine: As ``os.uname`` says it.
         libc: glibc's version.
     """
 

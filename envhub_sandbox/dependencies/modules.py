@@ -162,7 +162,6 @@ class MissingModule:
     """Advice for a repository whose import fails.
 
     Attributes:
-        snapshot: Its files.
         place: The sandbox's name.
         where: Where its packages were to come from, as ``Choice`` has it.
         python: The interpreter that the caller named.

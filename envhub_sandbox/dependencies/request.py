@@ -32,9 +32,8 @@ class Choice:
     """Where a repository's packages are to come from.
 
     Attributes:
-        where: ``"auto"``: its own environment, unless this interpreter has all of it;
-            ``"host"``: this interpreter; ``"own"``: its own environment.
-        extra: Further requirements.
+        where: ``"auto"``: its own environment, unless this interpreter has all of it; ``"host"``:
+            this interpreter; ``"own"``: its own environment.
         python: A version or versions, or a path; empty for what the repository runs in.
         exclude_newer: A date: packages of later are not seen.
         infer: Whether what it imports and does not declare is installed, too.
@@ -164,20 +163,15 @@ def _date(given: object) -> str | None:
 
 @dataclass(frozen=True)
 class PackageRequest:
-    """What packages a repository is to have.
+    """What packages a repository is to have; what ``Choice`` has, too, is the same here.
 
     Attributes:
         source: The file, or the argument, that says so.
-        wanted: All requirements.
         supports: The versions of Python that the repository runs in; empty for any.
         python: The version or versions that the caller asks for, or a path; empty for none.
-        exclude_newer: A date: packages of later are not seen.
         always: Whether it gets an environment of its own even where the place meets all of it.
         guesses: What it imports; what no other package brings is installed, too.
         constraints: What holds for packages if something needs them.
-        without: Names of packages that are left out, also where others need them.
-        override: Requirements that hold instead of all others of the same package.
-        fetch_python: Whether uv may download an interpreter that this machine lacks.
         gpu: Whether its jails are given one.
         runs_worker: Whether the worker runs with them, so that they hold what it needs, too.
     """

@@ -101,10 +101,6 @@ def run(
 
     Args:
         arguments: After ``uv``.
-        what: What it is asked for, for errors.
-        given: Its standard input.
-        timeout_s: For how long at most.
-        tell: Gets each line of its progress as it comes.
         keep: Descriptors that it keeps open for as long as it lives.
         watch: Called now and then; what it raises ends it.
         file_bytes: The largest file that it may write.

@@ -22,7 +22,6 @@ class LocalServer(WorkerServer):
         stop_s: How long its process may take to end.
 
     Attributes:
-        folder: The path of its folder.
         process: What was started: the server itself, or what ends it when it ends.
     """
 
@@ -54,9 +53,7 @@ class LocalServer(WorkerServer):
     @contextlib.contextmanager
     def starting(self, start: Callable[[int], subprocess.Popen[bytes]]) -> Iterator[int]:
         """Start the process; gives the pipe that it answers on. What fails in here ends it.
-
-        Args:
-            start: Starts it, with the end of the pipe that it writes to.
+        ``start``: starts it, with the end of the pipe that it writes to.
         """
         try:
             ready, ready_end = os.pipe()

@@ -37,7 +37,6 @@ class WorkerServer(ABC):
     """A running worker server.
 
     Attributes:
-        endpoint: Its ZeroMQ endpoint.
         process_fd: A descriptor that becomes readable when it ends.
         fd_path: The socket that takes descriptors, or None where memory cannot be shared.
         layers: What confines the server itself, with all of its jails, one mapping a layer:
@@ -91,10 +90,7 @@ class _Entry(Generic[S_co]):
 
 class ServerUse(Generic[S_co]):
     """One use of a server, which ends once: given back, or when nothing refers to it any more.
-
-    Attributes:
-        server: The server.
-        live: Whether it has not been given back.
+    ``live``: whether it has not been given back.
     """
 
     _done = True  # until there is something to give back
@@ -149,7 +145,6 @@ class ServerPool(Generic[S]):
         """A use of the server with this key, in use or idle; started if none runs.
 
         Args:
-            key: Which.
             start: Starts it.
             idle_s: For how long it is kept if this use is the last; 0 ends it, None keeps it until
                 the end of this process.
@@ -253,10 +248,8 @@ class ServerPool(Generic[S]):
     def stop_all(self) -> None:
         """End all that this process has started, and keep none from now on: at its exit."""
         self._ends = True
-        self._stop(lambda: [*self._mine(), *self._used_here()])
-
-    def _used_here(self) -> list[_Entry[S]]:
-        return [entry for entry in self._used.values() if entry.pid == os.getpid()]
+        here = os.getpid()
+        self._stop(lambda: [*self._mine(), *(e for e in self._used.values() if e.pid == here)])
 
     def _stop(self, which: Callable[[], list[_Entry[S]]]) -> None:
         with self._changed:

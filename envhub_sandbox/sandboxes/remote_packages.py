@@ -31,7 +31,7 @@ _MAX_CHARS = 300
 
 
 def order_of(request: PackageRequest) -> m.NeedPackages:
-    """What a server is asked for. Raises ``PolicyError``: the request names a path of this machine."""
+    """What a server is asked for. Raises ``PolicyError`` for a path of this machine."""
     if os.sep in request.python:
         raise PolicyError(
             f"python in dependencies is {request.python!r}, an interpreter of this machine, and a "

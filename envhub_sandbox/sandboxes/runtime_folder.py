@@ -34,16 +34,8 @@ _EMPTY_S = 60.0
 
 
 class RuntimeFolder:
-    """A new private folder, which is in use as long as this process lives.
-
-    Args:
-        prefix: What its name begins with.
-
-    Attributes:
-        path: Its path.
-
-    Raises:
-        SandboxUnavailableError: There is no place for one.
+    """A new private folder, which is in use as long as this process lives. ``prefix``: what its
+    name begins with. Raises ``SandboxUnavailableError``: there is no place for one.
     """
 
     def __init__(self, prefix: str) -> None:

@@ -33,17 +33,10 @@ class Sandbox:
     ) -> Sandbox:
         """The place for one repository, where each gets a server that sees no other's files.
 
-        Starts nothing, and connects to nothing.
-
-        Args:
-            snapshot: The verified files.
-            policy: What the jails may do.
-            runtime: The interpreter that the caller named, or none, and the repository's packages.
-            assets: The verified files of further repositories that its jails are shown.
-
-        Raises:
-            PolicyError: The place cannot permit what the policy does.
-            SandboxUnavailableError: There is no such place here.
+        Starts nothing, and connects to nothing. ``runtime``: the interpreter that the caller named,
+        or none, and the repository's packages. ``assets``: the verified files of further
+        repositories that its jails are shown. Raises ``PolicyError``: the place cannot permit what
+        the policy does; ``SandboxUnavailableError``: there is no such place here.
         """
         return self
 
@@ -64,10 +57,9 @@ class Sandbox:
         """Use a server that may show snapshots below ``store`` to jails. Servers are shared.
 
         Args:
-            store: The folder.
             runtime: What its first jail runs on. A hint: others may run on something else.
-            idle_s: For how long the server is kept for the next user, where this use is its last;
-                0 ends it at once, None keeps it for as long as this process lives.
+            idle_s: For how long the server is kept for the next user, where this use is its last; 0
+                ends it at once, None keeps it for as long as this process lives.
 
         Raises:
             SandboxUnavailableError: There is no such place here.
@@ -82,8 +74,6 @@ class Sandbox:
 
         Args:
             order: In terms of this machine.
-            server: One that ``acquire`` gave.
-            client: A connection to it.
             deadline: For what has to be brought there first.
 
         Raises:

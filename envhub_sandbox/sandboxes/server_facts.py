@@ -31,11 +31,9 @@ class ServerFacts:
     """What is known of a server. Trust: its own words, checked for their types alone.
 
     Attributes:
-        version: Of its package.
         protocol: The version that was agreed on.
         answered_s: From knocking to its welcome.
         detailed: Whether it says more than that; older servers do not.
-        python: Of the server.
         profile: The strongest that a jail can have there.
         weakest_profile: That a policy may ask for.
         network: Whether a policy may ask for the server's network.

@@ -30,7 +30,7 @@ class Sent(NamedTuple):
 
 
 def listing(root: Path) -> tuple[Sent, ...]:
-    """Every file below a snapshot's root, hashed. Raises ``SnapshotError``: a file cannot be read."""
+    """Every file below a snapshot's root, hashed. Raises ``SnapshotError``."""
     try:
         return tuple(_sent(root, path) for path in sorted(_files(root)))
     except OSError as error:

@@ -26,10 +26,8 @@ class Counters:
     """What has happened to one environment.
 
     Attributes:
-        requests: Requests sent.
         timeouts: Replies that were late.
         deaths: Processes that ended under a request.
-        steps: Steps that were answered.
         restarts: Fresh processes after deaths.
     """
 
@@ -109,7 +107,6 @@ class Row(NamedTuple):
     """The numbers of all environments with the same labels.
 
     Attributes:
-        labels: Of these environments.
         numbers: ``Counters.numbers``, of the living and of those that are gone.
         states: How many of the living are in each state.
         latencies_s: The last step latencies of the living.

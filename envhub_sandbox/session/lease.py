@@ -48,9 +48,7 @@ class Lease:
     thread calls, and ``abandon``, which a fork calls.
 
     Attributes:
-        repository: Whose jails they are.
         results: What the environment is expected to be, and its slices.
-        counters: Of the environment.
         loaded: The jail; None while there is none.
         lane: The way to its runners there.
         make_room: Asked to end what was started ahead, where a server has no place left.

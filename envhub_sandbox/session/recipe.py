@@ -35,7 +35,6 @@ class Recipe:
         make_env: The function that takes them; it travels by its name.
         reference: The pinned hub reference, or a local folder and its entry file.
         config: The caller's config object as plain values, or None.
-        options: The other arguments, by name.
     """
 
     make_env: Callable[..., Any]

@@ -114,9 +114,7 @@ class Requests:
             )
 
     def end_wait(self, operation: str) -> None:
-        """The ``*_wait`` of a request has come.
-        Raises ``NoAsyncCallError``: there was no ``*_async`` before it.
-        """
+        """The ``*_wait`` of a request has come. Raises ``NoAsyncCallError``."""
         self.refuse_if_closed()
         if self.waiting != operation:
             raise NoAsyncCallError(

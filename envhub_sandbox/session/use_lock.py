@@ -19,11 +19,8 @@ from envhub_worker.protocol.untrusted import blamed, is_fault
 
 
 class UseLock:
-    """The lock of one environment, and what is to be done when it is released.
-
-    Attributes:
-        lock: Held for as long as a use lasts; reentrant, for a signal handler may close what its
-            own thread waits for.
+    """The lock of one environment, and what is to be done when it is released. ``lock``: held for
+    as long as a use lasts; reentrant, for a signal handler may close what its own thread waits for.
     """
 
     def __init__(self, lease: Lease, failures: Failures) -> None:

@@ -12,8 +12,6 @@ def write_whole_file(path: Path, data: bytes, *, mode: int = 0o600, durable: boo
     """Write a file under another name, and rename it: meanwhile others read the old one.
 
     Args:
-        path: The file.
-        data: What will stand in it.
         mode: Its mode; the umask takes from it.
         durable: Whether it is also whole after a loss of power.
 

@@ -58,9 +58,7 @@ def make_private(folder: Path) -> None:
 
 
 def write_private(path: Path, content: bytes) -> None:
-    """Write a new file that only its owner may read, whatever the umask is.
-    Raises ``OSError``: it is there, or cannot be written.
-    """
+    """Write a new file that only its owner may read, whatever the umask is. Raises ``OSError``."""
     fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, _PRIVATE_FILE_MODE)
     with os.fdopen(fd, "wb") as file:
         os.fchmod(fd, _PRIVATE_FILE_MODE)
@@ -135,9 +133,7 @@ def _fault(path: str, status: os.stat_result, strict: bool) -> str:
 
 
 def is_ours_alone(folder: Path) -> bool:
-    """Whether only its owner, who is us or root, can write in a folder.
-    Raises ``OSError``: it cannot be looked at.
-    """
+    """Whether only its owner, who is us or root, can write in a folder. Raises ``OSError``."""
     status = folder.stat()
     return is_trusted(status.st_uid) and not status.st_mode & _OTHERS_WRITE
 

@@ -28,7 +28,6 @@ def held(
     path: Path,
     *,
     wait_s: float = 0.0,
-    shared: bool = False,
     on_wait: Callable[[], object] = lambda: None,
     mode: int = 0o600,
 ) -> Iterator[int]:
@@ -38,9 +37,7 @@ def held(
     may remove the file: the next one makes another.
 
     Args:
-        path: The file.
         wait_s: For how long to wait while another holds it.
-        shared: Whether others may hold it as well, if theirs is shared, too.
         on_wait: Called once before the first wait.
         mode: That of a new file.
 
@@ -50,7 +47,7 @@ def held(
     """
     until = time.monotonic() + wait_s
     waits = False
-    while (descriptor := _take(path, mode, shared=shared)) is None:
+    while (descriptor := _take(path, mode)) is None:
         if time.monotonic() >= until:
             raise TimeoutError(f"another process holds the lock {path}")
         if not waits:
@@ -64,11 +61,11 @@ def held(
         os.close(descriptor)
 
 
-def _take(path: Path, mode: int, *, shared: bool) -> int | None:
+def _take(path: Path, mode: int) -> int | None:
     """Take it now; None if another has it, or has just removed the file."""
     descriptor = os.open(path, _WRITE, mode)
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_NB | (fcntl.LOCK_SH if shared else fcntl.LOCK_EX))
+        fcntl.flock(descriptor, fcntl.LOCK_NB | fcntl.LOCK_EX)
         if os.path.samestat(os.fstat(descriptor), os.stat(path)):
             return descriptor
     except (BlockingIOError, FileNotFoundError):
@@ -82,13 +79,8 @@ def _take(path: Path, mode: int, *, shared: bool) -> int | None:
 
 def is_held(path: Path) -> bool:
     """Whether another, in whatever namespace, holds a lock that is not shared.
-
-    Args:
-        path: A file or a folder.
-
-    Raises:
-        FileNotFoundError: There is no such file.
-        OSError: The file cannot be opened, or its file system has no locks.
+    Raises ``FileNotFoundError``: there is no such file; ``OSError``: the file cannot be opened, or
+    its file system has no locks.
     """
     with unheld(path) as free:
         return not free
@@ -133,10 +125,6 @@ class LifeLock(_HeldLock):
     """A new file whose lock this process holds: under its name it is never seen without.
 
     Where the file system has no locks, ``is_held`` cannot tell, and says so.
-
-    Args:
-        path: The file.
-        content: What stands in it.
     """
 
     def __init__(self, path: Path, content: str = "") -> None:

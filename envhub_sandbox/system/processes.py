@@ -24,9 +24,7 @@ _STREAMS = 3
 
 class OwnerProcess:
     """The process that made this.
-
-    Attributes:
-        pid: Its number. Where each step asks, this is compared without a call.
+    ``pid``: its number. Where each step asks, this is compared without a call.
     """
 
     def __init__(self) -> None:

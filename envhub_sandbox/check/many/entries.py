@@ -32,7 +32,6 @@ class ListEntry:
     Attributes:
         reference: As it is run and shown.
         meaning: The same for every way to write it.
-        line: Where it stands.
     """
 
     reference: str
@@ -56,14 +55,9 @@ class ListEntry:
 
 def read_entries(file: IO[bytes], title: str) -> list[ListEntry]:
     """The references of a list. Empty lines, and those that begin with ``#``, are none.
-
-    Args:
-        file: The list, in UTF-8. A folder in it is looked for from the current one.
-        title: What it is called in errors.
-
-    Raises:
-        HubReferenceError: Something in it is no reference, no folder that is here, or stands there
-            twice; or there is too much, or nothing.
+    ``file``: the list, in UTF-8. A folder in it is looked for from the current one.
+    Raises ``HubReferenceError``: something in it is no reference, no folder that is here, or stands
+    there twice; or there is too much, or nothing.
     """
     data = file.read(MOST_BYTES + 1)
     if len(data) > MOST_BYTES:

@@ -41,8 +41,6 @@ class Outcome(Generic[T]):
         order: What it was started for.
         folder: Its own, with what it has written. It is there until the next is asked for.
         code: Its exit code, negative for a signal; None where we have ended it.
-        seconds: How long it ran.
-        out: What it has printed.
         said: The end of what it has complained of, or why we have ended it. Trust: partly a
             stranger's text; it is printable.
     """
@@ -173,12 +171,8 @@ def judgements(
 
     Args:
         orders: What is asked for the next as soon as there is room for it.
-        command: What is run for an order, with a folder of its own, and a pidfd of ours that it
-            has to end with.
-        folder: Where these folders are made.
-        jobs: How many run at once.
-        most_s: How long one may take.
-        variables: Of the environment, beyond ours.
+        command: What is run for an order, with a folder of its own, and a pidfd of ours that it has
+            to end with.
         patience_s: For one that has been asked to end.
     """
     waiting = enumerate(orders)

@@ -58,12 +58,9 @@ class Result:
     """What came of one reference.
 
     Attributes:
-        listed: The reference.
-        verdict: Ours.
         commit: Which was judged; empty if none was.
         found: How many findings of each severity.
         fails: What fails it: a check, and what was found. Trust: the latter is a stranger's text.
-        seconds: What that took.
         ended: When, as ISO 8601 has it.
         said: Why it was not judged, or not to its end. Trust: partly a stranger's text.
     """

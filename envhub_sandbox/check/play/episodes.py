@@ -39,7 +39,6 @@ class Episode:
     Attributes:
         sub_env: Index of the sub-environment that played it.
         returns: The sum of rewards, one per component; just one unless rewards are vectors.
-        length: Steps.
         terminated: It terminated; otherwise it was truncated.
         success: ``is_success`` of the last step's info, if there was one.
     """
@@ -94,16 +93,11 @@ class EpisodeCounter:
     shows: infos with the final observation mean SAME_STEP, otherwise NEXT_STEP is assumed, which
     is what Gymnasium's own wrappers assume.
 
-    Args:
-        num_envs: Number of sub-environments.
-        episodes: How many to count.
-        mode: See ``autoreset_mode``.
-
     Attributes:
         counted: Finished episodes within the quota.
         steps: Steps of sub-environments so far.
-        reset_mask: Sub-environments that must be reset before the next step, bool
-            ``(num_envs,)``, or None.
+        reset_mask: Sub-environments that must be reset before the next step, bool ``(num_envs,)``,
+            or None.
     """
 
     def __init__(self, num_envs: int, episodes: int, mode: str | None) -> None:
@@ -246,10 +240,9 @@ def rollout(
 
     Args:
         env: Is left open.
-        episodes: How many to count.
         seed: For ``reset`` and the actions: the same seed gives the same result.
-        actions: ``"random"`` samples from the space, seeded; ``"zero"`` does as little as the
-            space allows.
+        actions: ``"random"`` samples from the space, seeded; ``"zero"`` does as little as the space
+            allows.
         max_steps: Vector steps after which to give up; None for no bound.
         observe: Called after the reset and after every step.
 

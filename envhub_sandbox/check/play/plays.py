@@ -13,7 +13,7 @@ from gymnasium.vector import VectorEnv
 
 from envhub_sandbox.check.play import video
 from envhub_sandbox.check.play.episodes import Episode
-from envhub_sandbox.check.play.pictures import Frame, even, png, small_picture
+from envhub_sandbox.check.play.video import Frame, even, png, small_picture
 from envhub_sandbox.errors import EnvHubError
 from envhub_worker.protocol.text import printable
 

@@ -48,7 +48,6 @@ class TaskJudge:
         asked, report: What is judged, and how; what is found.
         make: Makes all environments once more, in fresh processes, with these arguments changed.
         env: The environment, whose system calls may be recorded.
-        key: Its suite and its task.
         takes_render_mode: Whether ``make_env`` has such an argument.
     """
 

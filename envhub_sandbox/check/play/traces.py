@@ -72,9 +72,7 @@ def play(
 
     Args:
         env: Is left open.
-        mode: Its autoreset mode, as its metadata says.
         seed: Of the environment, and of the actions unless ``actions_seed`` is given.
-        steps: Vector steps.
         actions_seed: Of the actions alone.
         like: Stop at the first step that differs from this one.
         observe: Called with the number of each step that was made; 0 is the reset.

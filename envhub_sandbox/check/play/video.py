@@ -1,4 +1,4 @@
-"""Writes rendered frames to a video file, with imageio's bundled ffmpeg.
+"""Makes small pictures of rendered frames, and writes videos with imageio's bundled ffmpeg.
 
 Frames come from the worker, so they are judged before they go to an encoder.
 """
@@ -7,14 +7,16 @@ from __future__ import annotations
 
 import importlib.util
 import os
+import struct
+import zlib
 from collections.abc import Generator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from envhub_sandbox.check.play.pictures import Frame, even
 from envhub_sandbox.errors import EnvHubError, RemoteEnvError
 from envhub_worker.protocol.codec.inert import one_line
 
@@ -25,6 +27,7 @@ MIN_FPS = 0.1
 """Below, the times of frames are more than some containers can write."""
 MAX_FPS = 240.0
 SUFFIXES = (".mp4", ".mkv", ".mov")
+Frame = NDArray[np.uint8]
 
 
 class VideoError(EnvHubError):
@@ -32,9 +35,7 @@ class VideoError(EnvHubError):
 
 
 def check_target(path: Path) -> None:
-    """Refuse a target that cannot work, before anything is run.
-    Raises ``VideoError``: the text says what to do.
-    """
+    """Refuse a target that cannot work, before anything is run. Raises ``VideoError``."""
     if not can_encode():
         raise VideoError(
             "writing a video needs imageio's ffmpeg, which is not installed here; install it with: "
@@ -130,9 +131,6 @@ class VideoWriter:
     Args:
         path: The file; see ``check_target``.
         fps: Frames per second.
-
-    Attributes:
-        frames: How many were written.
     """
 
     def __init__(self, path: Path, fps: float) -> None:
@@ -143,9 +141,7 @@ class VideoWriter:
         self._encoder: Generator[None, Any, None] | None = None
 
     def add(self, frame: Frame) -> None:
-        """Append a frame as ``first_frame`` gives it.
-        Raises ``VideoError``: it has another size than the first one, or it cannot be written.
-        """
+        """Append a frame as ``first_frame`` gives it. Raises ``VideoError``."""
         size = (frame.shape[1], frame.shape[0])
         if self._encoder is None:
             self._size, self._encoder = size, self._open(size)
@@ -185,3 +181,40 @@ class VideoWriter:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+# --- small pictures, encoded here of what was judged: no bytes of a worker are passed on --------
+
+
+def small_picture(frame: Frame, side: int) -> Frame:
+    """A frame of which no side is longer than that: the mean of each block of pixels."""
+    block = -(-max(frame.shape[:2]) // side)
+    if block <= 1:
+        return frame
+    # a side that is shorter than a block, of a frame of one line, is a block of its own
+    down, across = (min(block, length) for length in frame.shape[:2])
+    height, width = frame.shape[0] // down, frame.shape[1] // across
+    blocks = frame[: height * down, : width * across].reshape(height, down, width, across, 3)
+    small: Frame = blocks.mean((1, 3), np.float32).round().astype(np.uint8)
+    return small
+
+
+def even(frame: Frame) -> Frame:
+    """A frame with even sides, as encoders need them: an odd one repeats its last row or column."""
+    height, width, _ = frame.shape
+    return np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
+
+
+def png(frame: Frame) -> bytes:
+    """A frame as PNG, uint8 ``(height, width, 3)``: eight bits, RGB, filter "Up"."""
+    height, width, _ = frame.shape
+    lines = np.ascontiguousarray(frame).reshape(height, width * 3)
+    above = np.vstack([np.zeros((1, width * 3), np.uint8), lines[:-1]])
+    filtered = np.hstack([np.full((height, 1), 2, np.uint8), lines - above])  # modulo 256
+    head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
+    chunks = ((b"IHDR", head), (b"IDAT", zlib.compress(filtered.tobytes(), 6)), (b"IEND", b""))
+    return b"\x89PNG\r\n\x1a\n" + b"".join(_chunk(name, data) for name, data in chunks)
+
+
+def _chunk(name: bytes, data: bytes) -> bytes:
+    return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))

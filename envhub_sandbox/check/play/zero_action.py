@@ -21,13 +21,11 @@ def zero_action(space: gym.Space[Any]) -> Any:
 
 
 def _of_discrete(space: spaces.Discrete) -> Any:
-    kind = getattr(space, "dtype", None) or np.dtype(np.int64)
-    return kind.type(min(max(0, int(space.start)), int(space.start) + int(space.n) - 1))
+    return space.dtype.type(min(max(0, int(space.start)), int(space.start) + int(space.n) - 1))
 
 
 def _of_multi_discrete(space: spaces.MultiDiscrete) -> Any:
-    start = getattr(space, "start", np.zeros_like(space.nvec))  # Gymnasium 0.29 has none
-    return np.clip(0, start, start + space.nvec - 1).astype(space.dtype)
+    return np.clip(0, space.start, space.start + space.nvec - 1).astype(space.dtype)
 
 
 def _of_sequence(space: spaces.Sequence) -> Any:
@@ -53,6 +51,5 @@ _ZEROS: dict[Any, Any] = {
     spaces.Tuple: lambda space: tuple(map(zero_action, space.spaces)),
     spaces.Sequence: _of_sequence,
     spaces.Graph: _of_graph,
-    # Gymnasium 0.29 has none
-    getattr(spaces, "OneOf", ()): lambda space: (0, zero_action(space.spaces[0])),
+    spaces.OneOf: lambda space: (0, zero_action(space.spaces[0])),
 }

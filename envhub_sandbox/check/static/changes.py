@@ -34,8 +34,6 @@ class Change:
         what: ``"file"``, ``"entry"``, ``"python"``, ``"package"``, ``"import"``, ``"finding"`` or
             ``"environment"``.
         how: ``"new"``, ``"gone"``, ``"changed"`` or ``"renamed"``.
-        text: In words, printable.
-        finding: The finding, if it is one.
     """
 
     what: str

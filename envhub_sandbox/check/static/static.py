@@ -35,8 +35,6 @@ class Static:
     """What was read; nothing of it ran.
 
     Attributes:
-        snapshot: What was read.
-        files: Every file, sorted by path.
         entries: The arguments of each ``make_env`` at the top of the entry file, and its line.
         imports: What the entry file leads to and the repository does not have, by name.
         declared: What it declares; None where it says nothing, or nothing that can be taken.
@@ -137,7 +135,6 @@ def undeclared(
     """The imports that nothing declared brings along.
 
     Args:
-        found: What is imported.
         stated: What the repository declares, by canonical name.
         packages: The environment that was made of it; None where this interpreter serves.
         taken: Modules that were installed although nothing declares them, and what needs them.

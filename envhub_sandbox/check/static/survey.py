@@ -34,12 +34,7 @@ _SHOWN_IGNORED = 10
 
 @dataclass(frozen=True)
 class File:
-    """One file.
-
-    Attributes:
-        record: Its path, size and hash.
-        kind: As in ``"Python"``, ``"text"``, ``"binary"``, ``"machine code"``.
-    """
+    """One file. ``kind``: as in ``"Python"``, ``"text"``, ``"binary"``, ``"machine code"``."""
 
     record: FileRecord
     kind: str
@@ -47,12 +42,7 @@ class File:
 
 @dataclass
 class Survey:
-    """What was read.
-
-    Attributes:
-        files: Every file, sorted by path.
-        findings: What is worth a look, file by file.
-    """
+    """What was read. ``findings``: what is worth a look, file by file."""
 
     files: list[File] = field(default_factory=list)
     findings: list[Finding] = field(default_factory=list)

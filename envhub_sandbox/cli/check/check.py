@@ -145,60 +145,59 @@ def check(
 
     [bold]envhub check --all references.txt --output judged[/bold]
     """
-    with reported(debug=debug):
-        if not math.isfinite(deadline):
-            raise UsageError(f"--deadline is {deadline}; it takes seconds, such as 900")
-        least, allowed = level(fail_on), _known(allow or ())
-        if listed is not None:
-            _refuse_beside_a_list(ref=ref, sarif=sarif, html=html)
-            from envhub_sandbox.cli.check import list_run
+    if not math.isfinite(deadline):
+        raise UsageError(f"--deadline is {deadline}; it takes seconds, such as 900")
+    least, allowed = level(fail_on), _known(allow or ())
+    if listed is not None:
+        _refuse_beside_a_list(ref=ref, sarif=sarif, html=html)
+        from envhub_sandbox.cli.check import list_run
 
-            run = list_run.ListRun(
-                file=listed,
-                output=output,
-                jobs=jobs,
-                max_memory=max_memory,
-                deadline=deadline,
-                again=again,
-                make=make,
-                settings=settings,
-                policy=policy,
-                arguments=list_run.handed_on(ctx),
-                debug=debug,
-            )
-            run.judge()
-            run.show(json=json, junit=junit, github=github)
-            return
-        if ref is None:
-            raise UsageError("name a repository, or a list of them: --all FILE --output DIR")
-        if any(opt.is_typed(ctx, name) for name in own.OF_A_LIST):
-            raise UsageError("--output, --jobs, --max-memory and --again are for --all FILE")
-        own.refuse_options_of_the_judged({"--settings": settings, "--policy": policy}, ref)
-        report = _judge(
-            make,
-            policy,
-            deadline,
-            quiet=json or github,
-            seed=seed,
-            steps=steps,
-            resets=resets,
-            slow_step_s=slow_step,
-            tasks=lambda envs: [one[:2] for one in opt.select_envs(envs, suite, task)],
-            pictures=html is not None,
+        run = list_run.ListRun(
+            file=listed,
+            output=output,
+            jobs=jobs,
+            max_memory=max_memory,
+            deadline=deadline,
+            again=again,
+            make=make,
+            settings=settings,
+            policy=policy,
+            arguments=list_run.handed_on(ctx),
+            debug=debug,
         )
-        failures = report.failures(least, allowed)
-        _write(report, failures, junit, sarif, html)
-        from envhub_sandbox.check import reports
+        run.judge()
+        run.show(json=json, junit=junit, github=github)
+        return
+    if ref is None:
+        raise UsageError("name a repository, or a list of them: --all FILE --output DIR")
+    if any(opt.is_typed(ctx, name) for name in own.OF_A_LIST):
+        raise UsageError("--output, --jobs, --max-memory and --again are for --all FILE")
+    own.refuse_options_of_the_judged({"--settings": settings, "--policy": policy}, ref)
+    report = _judge(
+        make,
+        policy,
+        deadline,
+        quiet=json or github,
+        seed=seed,
+        steps=steps,
+        resets=resets,
+        slow_step_s=slow_step,
+        tasks=lambda envs: [one[:2] for one in opt.select_envs(envs, suite, task)],
+        pictures=html is not None,
+    )
+    failures = report.failures(least, allowed)
+    _write(report, failures, junit, sarif, html)
+    from envhub_sandbox.check import reports
 
-        if github:
-            _print_confinement(report)
-            annotate(reports.workflow_commands(report), reports.summary(report, failures))
-        if json:
-            print_json(reports.document(report, failures))
-        elif not github:
-            _print(report, failures)
-        if failures:
-            raise typer.Exit(Exit.UNJUDGED if report.is_unjudged(failures) else Exit.ENVIRONMENT)
+    if github:
+        _print_confinement(report)
+        annotate(reports.workflow_commands(report), reports.summary(report, failures))
+    if json:
+        print_json(reports.document(report, failures))
+    elif not github:
+        _print(report, failures)
+    if failures:
+        raise typer.Exit(Exit.UNJUDGED if report.is_unjudged(failures) else Exit.ENVIRONMENT)
 
 
 def _refuse_beside_a_list(*, ref: str | None, **files: Path | None) -> None:

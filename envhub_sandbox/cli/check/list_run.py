@@ -76,13 +76,10 @@ class ListRun:
     """One ``envhub check --all``: its options, and what has come of each reference so far.
 
     Attributes:
-        file: The list.
-        output: Where results go.
         jobs, max_memory, deadline, again: As the options.
         make: The options of ``make_env``, for whatever reference.
         settings, policy: The caller's files.
         arguments: Options for each judgement, as words.
-        debug: Whether each shows tracebacks.
         of: What has come of each reference.
     """
 

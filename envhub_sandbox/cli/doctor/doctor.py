@@ -24,8 +24,9 @@ from typing import Annotated, Any
 import typer
 
 from envhub_sandbox.cli.init.starter import starter
+from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import out, print_json, safe_line, safe_text, show
-from envhub_sandbox.cli.shared.exits import Exit, UsageError, describe, reported
+from envhub_sandbox.cli.shared.exits import Exit, UsageError, describe
 from envhub_sandbox.cli.shared.memory import free_memory_bytes
 from envhub_sandbox.cli.shared.progress import ProgressBar
 from envhub_sandbox.cli.shared.versions import versions
@@ -40,7 +41,6 @@ class Trial:
     """What came of one profile.
 
     Attributes:
-        profile: Its name.
         available: A jail under it ran.
         layers: One mapping per layer: ``layer``, ``enforced``, ``detail``.
         first_step_s: Seconds from ``make_env`` to the first step's result.
@@ -56,6 +56,7 @@ class Trial:
     code: Exit = Exit.OK
 
 
+@opt.with_options()
 def doctor(
     server: Annotated[
         str | None,
@@ -71,10 +72,7 @@ def doctor(
             autocompletion=lambda: list(PROFILES),
         ),
     ] = "strict",
-    json: Annotated[
-        bool, typer.Option("--json", help="Print one JSON document on stdout.")
-    ] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Show tracebacks.")] = False,
+    json: opt.Json = False,
     server_key: Annotated[
         str | None,
         typer.Option(
@@ -94,46 +92,42 @@ def doctor(
     it over our key: 6 also if it is not reached or does not know us, 5 if it is about to end or
     refuses.
     """
-    with reported(debug=debug):
-        from envhub_sandbox.settings.policy import Policy
+    from envhub_sandbox.settings.policy import Policy
 
-        Policy(profile=profile)  # refuses a name that there is not, before anything is tried
-        if server is not None:
-            from envhub_sandbox.cli.doctor import remote
-            from envhub_sandbox.sandboxes.remote import RemoteSandbox
+    Policy(profile=profile)  # refuses a name that there is not, before anything is tried
+    if server is not None:
+        from envhub_sandbox.cli.doctor import remote
+        from envhub_sandbox.sandboxes.remote import RemoteSandbox
 
-            if insecure_loopback and server_key is not None:
-                raise UsageError("--server-key is of a server with keys: not --insecure-loopback")
-            place = RemoteSandbox(
-                server, server_key=server_key, insecure_loopback=insecure_loopback
-            )
-            raise typer.Exit(remote.examine(place, profile, json=json))
-        if server_key is not None or insecure_loopback:
-            raise UsageError(
-                "--server-key and --insecure-loopback are of a server: envhub doctor "
-                "tcp://HOST:PORT"
-            )
-        with ProgressBar(quiet=json) as bar, _scratch_folder() as folder:
-            (folder / "idle").mkdir()
-            (folder / "idle" / "env.py").write_text(starter("idle", 2026)["env.py"])
-            trials = []
-            for name in PROFILES:
-                bar.begin(f"trying {name}")
-                trials.append(examine(str(folder / "idle"), name))
-            bar.begin("trying each layer")
-            probed = probe()
-        cache = _cache_problem(by_others=profile != "strict" or not trials[0].available)
-        if json:
-            here = {"host": host(), "versions": versions(), "engine": engine(), **resources(cache)}
-            print_json({**here, "profiles": list(map(asdict, trials)), **probed})
-        else:
-            _print(trials, profile)
-            _print_missing(probed)
-            if cache is not None:
-                out()
-                out(f"The cache: {safe_line(cache, 1000)}")
-        decisive = next(trial for trial in trials if trial.profile == profile)
-        raise typer.Exit(decisive.code or (Exit.SNAPSHOT if cache else Exit.OK))
+        if insecure_loopback and server_key is not None:
+            raise UsageError("--server-key is of a server with keys: not --insecure-loopback")
+        place = RemoteSandbox(server, server_key=server_key, insecure_loopback=insecure_loopback)
+        raise typer.Exit(remote.examine(place, profile, json=json))
+    if server_key is not None or insecure_loopback:
+        raise UsageError(
+            "--server-key and --insecure-loopback are of a server: envhub doctor tcp://HOST:PORT"
+        )
+    with ProgressBar(quiet=json) as bar, _scratch_folder() as folder:
+        (folder / "idle").mkdir()
+        (folder / "idle" / "env.py").write_text(starter("idle", 2026)["env.py"])
+        trials = []
+        for name in PROFILES:
+            bar.begin(f"trying {name}")
+            trials.append(examine(str(folder / "idle"), name))
+        bar.begin("trying each layer")
+        probed = probe()
+    cache = _cache_problem(by_others=profile != "strict" or not trials[0].available)
+    if json:
+        here = {"host": host(), "versions": versions(), "engine": engine(), **resources(cache)}
+        print_json({**here, "profiles": list(map(asdict, trials)), **probed})
+    else:
+        _print(trials, profile)
+        _print_missing(probed)
+        if cache is not None:
+            out()
+            out(f"The cache: {safe_line(cache, 1000)}")
+    decisive = next(trial for trial in trials if trial.profile == profile)
+    raise typer.Exit(decisive.code or (Exit.SNAPSHOT if cache else Exit.OK))
 
 
 @contextlib.contextmanager
@@ -164,9 +158,7 @@ def _scratch_folder() -> Iterator[Path]:
 
 def _cache_problem(*, by_others: bool) -> str | None:
     """Why the caller's cache is of no use, and what to do; None if it is.
-
-    Args:
-        by_others: Whether root's jails read it as another user: all but those with a private root.
+    ``by_others``: whether root's jails read it as another user: all but those with a private root.
     """
     from envhub_sandbox.hub.cache import cache_root
 

@@ -48,9 +48,7 @@ def init(
 
 
 def repository_name(folder: Path) -> str:
-    """The name that a folder gives to its repository.
-    Raises ``UsageError``: the Hub would not take it.
-    """
+    """The name that a folder gives to its repository. Raises ``UsageError``."""
     name = folder.absolute().name
     if not _NAME.fullmatch(name) or "--" in name or ".." in name or name.endswith(".git"):
         raise UsageError(
@@ -61,9 +59,7 @@ def repository_name(folder: Path) -> str:
 
 
 def _write(folder: Path, files: dict[str, str]) -> None:
-    """Every file, or none.
-    Raises ``UsageError``: something is there already, or it cannot be written.
-    """
+    """Every file, or none. Raises ``UsageError``."""
     try:
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             raise UsageError(f"{folder} is there already, and is no empty folder; take another")

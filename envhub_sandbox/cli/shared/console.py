@@ -41,10 +41,7 @@ _TAIL = 32
 
 def neutralised(text: str, after: str = "") -> str:
     """Text that no CI system obeys: one character of each command is written as an escape.
-
-    Args:
-        text: What is written.
-        after: What stands in the same line already; it is no part of the result.
+    ``after``: what stands in the same line already; it is no part of the result.
     """
 
     def broken(found: re.Match[str]) -> str:

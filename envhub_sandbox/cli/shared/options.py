@@ -126,10 +126,7 @@ def _completion(metavar: str) -> Callable[[], list[str]] | None:
 @dataclass(frozen=True)
 class MakeOptions:
     """What a command line says about ``make_env``.
-
-    Attributes:
-        ref: The reference.
-        given: The values of the options that the command has, as typed, by keys of ``OPTIONS``.
+    ``given``: the values of the options that the command has, as typed, by keys of ``OPTIONS``.
     """
 
     ref: str
@@ -268,9 +265,7 @@ def read_env_kwargs(texts: Sequence[str]) -> dict[str, Any]:
 
 
 def read_dependencies(text: str) -> str | dict[str, Any]:
-    """The argument of ``make_env``: text, or a JSON object.
-    Raises ``UsageError``: it begins like an object and is none.
-    """
+    """The argument of ``make_env``: text, or a JSON object. Raises ``UsageError``."""
     return _json_object("--dependencies", text) if text.lstrip().startswith("{") else text
 
 

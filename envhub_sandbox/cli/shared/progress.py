@@ -6,7 +6,6 @@ import contextlib
 import sys
 import threading
 import time
-from types import TracebackType
 from typing import TYPE_CHECKING
 
 from envhub_sandbox.cli.shared.console import console, safe_line, say
@@ -96,12 +95,7 @@ class ProgressBar:
         self._also.enter_context(progress_shown_by(self.begin))
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._also.close()
         if self._waits is not None:
             self._waits.stop()

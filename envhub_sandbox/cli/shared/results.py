@@ -23,9 +23,7 @@ class TaskResult:
 
     Attributes:
         suite, task: Its keys. Trust: input from the worker.
-        num_envs: Sub-environments.
         autoreset_mode: ``"NextStep"``, ``"SameStep"``, ``"Disabled"`` or None.
-        rollout: What was played.
         video: The file that was written, or None.
     """
 
@@ -104,6 +102,8 @@ def _rows(result: TaskResult, with_success: bool) -> list[list[str]]:
     name = f"{safe_line(result.suite, 60)} / {safe_line(result.task, 60)}"
     count = str(len(rollout.episodes)) + ("" if rollout.complete else " (stopped)")
     length = _mean(statistics([episode.length for episode in rollout.episodes]))
+    successes = success_rate(rollout)
+    rate = "-" if successes is None else f"{successes:.0%}"
     rows = []
     for index, stats in enumerate(returns := returns_of(rollout)):
         first = index == 0
@@ -113,7 +113,7 @@ def _rows(result: TaskResult, with_success: bool) -> list[list[str]]:
         row = [label, count if first else "", _mean(stats, spread=True)]
         row += ["-", "-"] if stats is None else [f"{stats['min']:.2f}", f"{stats['max']:.2f}"]
         row += [length, f"{rollout.steps_per_s:,.0f}"] if first else ["", ""]
-        rows.append([*row, _percent(success_rate(rollout)) if first else ""])
+        rows.append([*row, rate if first else ""])
     return rows if with_success else [row[:-1] for row in rows]
 
 
@@ -123,10 +123,6 @@ def _mean(stats: dict[str, float] | None, *, spread: bool = False) -> str:
     if spread:
         return f"{stats['mean']:.2f} ± {stats['std']:.2f}"
     return f"{stats['mean']:.1f}"
-
-
-def _percent(rate: float | None) -> str:
-    return "-" if rate is None else f"{rate:.0%}"
 
 
 def print_provenance(provenance: dict[str, Any], *, in_process: bool) -> None:

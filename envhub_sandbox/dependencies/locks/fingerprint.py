@@ -24,7 +24,6 @@ class TaskFingerprint:
         task: Key of the inner one.
         mode: Its autoreset mode; empty if it states none.
         observations: The space of one sub-environment's observations, to be read.
-        actions: Likewise.
         spaces: SHA-256 of both, with every bound.
     """
 

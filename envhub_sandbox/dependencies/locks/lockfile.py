@@ -70,10 +70,7 @@ class LockFile:
     Attributes:
         repository: As a reference begins, such as ``"org/repo"``; or ``LOCAL``.
         commit: The full commit; of a folder its content's.
-        entry: The entry file.
-        files: The digest of each.
         runner: What the packages are for.
-        packages: All of them.
         extra: Requirements that the caller added.
         exclude_newer: The date before which versions were chosen, if there was one.
         spaces: What the environments looked like; None where nothing was run.

@@ -63,15 +63,8 @@ def profile_for(wanted: str, found: Surroundings) -> str:
 
 
 def layers(wanted: Container, found: Surroundings, title: str) -> list[dict[str, Any]]:
-    """What holds around every jail, for the report.
-
-    Args:
-        wanted: What the engine was asked for.
-        found: What the server found.
-        title: Engine and image, for the first line.
-
-    Raises:
-        SandboxUnavailableError: Something that was asked for does not hold.
+    """What holds around every jail, for the report. ``title``: engine and image, for the first
+    line. Raises ``SandboxUnavailableError``: something that was asked for does not hold.
     """
     checks: Sequence[tuple[str, bool, str]] = (
         ("container-user", found.user == wanted.user[0] != 0, f"user {found.user}, not root"),

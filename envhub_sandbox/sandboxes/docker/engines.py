@@ -32,8 +32,6 @@ class Engine:
 
     Attributes:
         kind: ``"docker"`` or ``"podman"``: whose options it takes.
-        command: Path of its program.
-        version: The engine's own.
         rootless: Whether it runs as a plain user.
         remapped: Whether it maps the users of containers to others (``userns-remap``).
         passed_over: Why it is this one, where another one would come first.
@@ -194,11 +192,7 @@ _WITHOUT_LIMITS = (
 
 def explained(engine: str, stderr: str, *, limited: bool = True) -> str:
     """What an engine's complaint means, and the command that mends it.
-
-    Args:
-        engine: Its kind.
-        stderr: The complaint.
-        limited: Whether it was asked for limits; to go without is no advice where it was not.
+    ``limited``: whether it was asked for limits; to go without is no advice where it was not.
     """
     for text, meaning in _EXPLAINED:
         if text in stderr:

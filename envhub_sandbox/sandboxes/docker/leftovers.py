@@ -42,7 +42,6 @@ class Leftover:
     Attributes:
         kind: ``"container"``, ``"folder"`` or ``"control group"``.
         name: A container's name, or a path.
-        engine: Whose container it is.
     """
 
     kind: str

@@ -42,12 +42,7 @@ print(json.dumps([*facts, platform.libc_ver()[1], there]))
 
 
 class ImageTarget:
-    """The Python of an image.
-
-    Args:
-        engine: Gives the engine, once there is something to ask it.
-        image: The image's name.
-    """
+    """The Python of an image. ``engine``: gives the engine, once there is something to ask it."""
 
     def __init__(self, engine: Callable[[], Engine], image: str) -> None:
         self._engine = engine

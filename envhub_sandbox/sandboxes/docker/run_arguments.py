@@ -43,16 +43,13 @@ class Container:
     """One container, as it is wanted.
 
     Attributes:
-        name: Its name.
         image: The image's id.
-        labels: Label to value.
         sockets: The host's folder that is mounted at ``SOCKETS``.
         snapshot: The host's folder that is mounted at ``SNAPSHOT``, read-only.
         packages: The host's folder that is mounted at ``PACKAGES``, read-only, or empty.
         assets: The host's folders of further repositories, mounted read-only beside it.
         readable: Further paths of the host, read-only, at the same place.
         seccomp: The host's path of the system call profile.
-        user: User and group of its processes.
         network: ``"none"`` or ``"host"``.
         memory: Bytes, or None where the engine cannot limit it; swap is not added.
         pids: Processes and threads, or None likewise.
@@ -184,9 +181,7 @@ def scratch_for(policy: Policy) -> int:
 
 
 def check_readable(paths: tuple[str, ...]) -> None:
-    """Refuse what would replace the container's own files.
-    Raises ``PolicyError``: a path is the root, or a folder that every system has in it.
-    """
+    """Refuse what would replace the container's own files. Raises ``PolicyError``."""
     for path in paths:
         parts = [part for part in path.split("/") if part]
         if ".." in parts or not parts or (len(parts) == 1 and parts[0] in _OWN):

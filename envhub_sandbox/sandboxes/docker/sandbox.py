@@ -138,7 +138,6 @@ class ContainerServer(LocalServer):
     """A worker server in a container that we started.
 
     Attributes:
-        wanted: What the engine was asked for.
         profile: The profile of its jails, chosen among what can be had in there.
         python: Their interpreter; empty for the server's own.
     """

@@ -41,7 +41,6 @@ class RecordedRequest:
 
     Attributes:
         operation: The message's name in lower case.
-        frames: The message, encoded.
         exact: Whether these are its very values; what only pickle can carry is left out.
     """
 
@@ -83,13 +82,8 @@ class Recording:
 
 class History:
     """Records the requests of one environment. Not thread-safe: its owner holds a lock.
-
-    Args:
-        manifest: The environment's spaces.
-        limit: How many requests are kept; 0 records nothing.
-
-    Attributes:
-        step: Records a step, given its validated batch of actions.
+    ``limit``: how many requests are kept; 0 records nothing.
+    ``step``: records a step, given its validated batch of actions.
     """
 
     def __init__(self, manifest: EnvManifest, limit: int) -> None:

@@ -29,7 +29,6 @@ class ReplayResult:
     """What a replay did.
 
     Attributes:
-        verdict: How it ended.
         requests: Requests of the bundle that were asked, the last one included.
         steps: Steps among them.
         death: What ended it: ``reason``, ``exit_code``, ``signal``, ``message``; None if nothing.

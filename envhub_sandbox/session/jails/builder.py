@@ -23,10 +23,7 @@ _numbers = itertools.count(1)
 
 class Builder:
     """Builds one environment, as often as that is needed.
-
-    Args:
-        jails: Where its jails come from.
-        results: What the environment is expected to be, and its slices, one for each shard.
+    ``results``: what the environment is expected to be, and its slices, one for each shard.
     """
 
     def __init__(self, jails: JailSource, results: Results) -> None:

@@ -42,8 +42,6 @@ class Launcher:
     """Opens and ends the jails of one repository. Thread-safe.
 
     Args:
-        repository: What they are for.
-        sandbox: Where workers run.
         store: The folder that snapshots lie in.
 
     Attributes:
@@ -80,9 +78,8 @@ class Launcher:
         """Fork a jail and have its first runner call ``make_env``.
 
         Args:
-            deadline: For all of it.
-            known: What that returns. It is then described no more, which for a suite means to
-                build an environment of each of its tasks; ``BuildDone`` is held against it instead.
+            known: What that returns. It is then described no more, which for a suite means to build
+                an environment of each of its tasks; ``BuildDone`` is held against it instead.
 
         Raises:
             LoadError: The repository failed to load, or returned something unusable.
@@ -232,11 +229,8 @@ class Launcher:
         """End a jail and give its server back.
 
         Idempotent. If interrupted, the next call finishes the work.
-
-        Args:
-            loaded: The jail.
-            wait: Until nothing of it is left; else the close of another environment of the
-                repository waits, if there is one: no later than the last.
+        ``wait``: until nothing of it is left; else the close of another environment of the
+        repository waits, if there is one: no later than the last.
         """
         if loaded.closed or loaded.closing:  # a signal handler may come into it, or a thread
             return

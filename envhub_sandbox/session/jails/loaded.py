@@ -16,7 +16,6 @@ class ExpectedManifest:
     """What a repository's ``make_env`` has returned before.
 
     Attributes:
-        manifest: All of it.
         task: The environment that a jail is wanted for.
         shards: Over how many runners it is going to be spread.
     """
@@ -34,7 +33,6 @@ class LoadedJail:
     finalizer does.
 
     Attributes:
-        jail: The jail.
         manifest: What ``make_env`` returned, checked.
         loaded: Runners that have called it.
         use: That of the server that it is in.

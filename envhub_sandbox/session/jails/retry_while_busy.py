@@ -31,10 +31,7 @@ def retry_while_busy(
     place in the line. The time in the line does not count against the deadline.
 
     Args:
-        ask: Asks once.
-        retry_s: For how long.
         deadline: For all else; once it is given up, the waiting ends.
-        label: For whom, in the log.
         refusal: The answer to an earlier try.
 
     Raises:

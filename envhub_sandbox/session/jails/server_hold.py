@@ -19,7 +19,6 @@ class ServerHold:
     for the end, and who closes the next one waits for it, or who closes the last.
 
     Args:
-        acquire: Asks for a use of the server.
         on_enter: Called when there is one environment more.
         on_empty: Called when the last one is closed; where that is interrupted, again.
     """

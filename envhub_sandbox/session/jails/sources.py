@@ -20,7 +20,6 @@ class JailSource:
     """Gives each environment a jail of its own, and takes it back.
 
     Args:
-        launcher: Opens them.
         forget_manifest: Drops the remembered manifest, when a jail contradicts it.
         expected: What such a jail is going to be.
 

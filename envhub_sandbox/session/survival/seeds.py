@@ -19,12 +19,9 @@ _SETTINGS = 256
 class SeedBook:
     """What sub-environments were last seeded with, and what those that come back get.
 
-    Where the caller gave a seed, what follows a death is derived of it, so that the same run can
-    be had again; where he gave none, the fresh one is drawn by the environment.
-
-    Args:
-        num_envs: Number of sub-environments.
-        each: Whether they are seeded one by one; otherwise the environment does that by itself.
+    Where the caller gave a seed, what follows a death is derived of it, so that the same run can be
+    had again; where he gave none, the fresh one is drawn by the environment.
+    ``each``: whether they are seeded one by one; otherwise the environment does that by itself.
     """
 
     def __init__(self, num_envs: int, each: bool) -> None:

@@ -15,7 +15,7 @@ from envhub_sandbox.check import judge as judging
 from envhub_sandbox.check.checks import CHECKS, Severity
 from envhub_sandbox.check.findings import Report
 from envhub_sandbox.check.judge import judge
-from envhub_sandbox.check.play.pictures import png
+from envhub_sandbox.check.play.video import png
 from envhub_sandbox.check.settings import JudgeOptions
 from envhub_sandbox.errors import SandboxUnavailableError, SnapshotError
 from tests.corpus.entries import Entry

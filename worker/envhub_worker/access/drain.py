@@ -15,9 +15,7 @@ _QUIET_S = 1.0
 
 class Drain:
     """When a server was asked to end, and what that means for its clients.
-
-    Args:
-        drain_s: How long what runs may go on; 0 waits for nothing.
+    ``drain_s``: how long what runs may go on; 0 waits for nothing.
     """
 
     def __init__(self, drain_s: float, clock: Callable[[], float] = time.monotonic) -> None:

@@ -36,9 +36,7 @@ def from_secret(secret: bytes) -> KeyPair:
 
 
 def load(path: Path) -> KeyPair:
-    """The pair of a secret key's file.
-    Raises ``OSError``: it cannot be read; ``ValueError``: it holds no key.
-    """
+    """The pair of a secret key's file. Raises ``OSError`` or ``ValueError``."""
     return from_secret(parse_key(_read(path)))
 
 

@@ -57,7 +57,6 @@ class Order:
     """An order that a client waits for.
 
     Attributes:
-        owner: Whose session asked first.
         asked: When it was asked for last.
         progress: What the program has said last.
     """
@@ -75,11 +74,7 @@ News = tuple[bytes, float, Mapping[str, Any]]
 
 
 class Packages:
-    """The packages of all clients.
-
-    Args:
-        folder: Where they lie; None where the operator does not permit any.
-    """
+    """The packages of all clients."""
 
     def __init__(self, folder: Path | None, quotas: Quotas, make_s: float = MAKE_S) -> None:
         self._folder = folder
@@ -129,9 +124,7 @@ class Packages:
         return m.Packages("making", "", {}, progress)
 
     def runtime(self, key: bytes, name: str) -> Runtime:
-        """What a client's packages are, and their interpreter.
-        Raises ``RefusedError``: it has not been given any of that name.
-        """
+        """What a client's packages are, and their interpreter. Raises ``RefusedError``."""
         found = self._handed.get((key.hex()[:32] or "local", name))
         if found is None or not os.path.isdir(found[0].packages):
             raise RefusedError(

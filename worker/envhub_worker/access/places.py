@@ -80,11 +80,7 @@ class Line:
 
 
 class Places:
-    """Finds a place, or raises ``BusyError``.
-
-    Attributes:
-        lines: The clients that wait, by quota.
-    """
+    """Finds a place, or raises ``BusyError``. ``lines``: the clients that wait, by quota."""
 
     def __init__(self, quotas: Quotas, expiry: SessionExpiry) -> None:
         self._quotas, self._expiry = quotas, expiry

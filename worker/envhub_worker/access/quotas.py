@@ -140,9 +140,7 @@ class InFlight:
         return self._of.get(key, 0)
 
     def add(self, key: bytes, asker: Asker, size: int, quota: int) -> None:
-        """Count a request until it is answered.
-        Raises ``RefusedError``: over the quota, or its id is that of one that is not answered yet.
-        """
+        """Count a request until it is answered. Raises ``RefusedError``."""
         taken = self._of.get(key, 0)
         if (asker.identity, asker.request_id) in self._requests:
             raise RefusedError("LocalProtocolError", "a request with this id is not answered yet")

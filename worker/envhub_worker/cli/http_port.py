@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import ipaddress
-import itertools
 import selectors
 import socket
 import threading
@@ -32,9 +31,8 @@ Reply = tuple[int, str, bytes]
 """Status, content type, body."""
 
 
-@dataclass
+@dataclass(eq=False)
 class _Connection:
-    number: int
     sock: socket.socket
     since: float = field(default_factory=monotonic)
     asked: bytearray = field(default_factory=bytearray)
@@ -66,8 +64,7 @@ class HttpPort:
         self._listener.setblocking(False)
         self._selector = selectors.DefaultSelector()
         self._selector.register(self._listener, selectors.EVENT_READ)
-        self._connections: dict[int, _Connection] = {}
-        self._numbers = itertools.count()
+        self._connections: dict[_Connection, None] = {}  # the oldest first
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._run, name="envhub metrics", daemon=True)
         self._thread.start()
@@ -88,7 +85,7 @@ class HttpPort:
             while not self._stopped.is_set():
                 self._round()
         finally:
-            for connection in list(self._connections.values()):
+            for connection in list(self._connections):
                 self._drop(connection)
             self._selector.close()
             self._listener.close()
@@ -98,9 +95,9 @@ class HttpPort:
             if key.fileobj is self._listener:
                 self._accept()
             elif key.data in self._connections:  # else it made room for another just now
-                self._serve(self._connections[key.data])
+                self._serve(key.data)
         late = monotonic() - PATIENCE_S
-        for connection in [one for one in self._connections.values() if one.since < late]:
+        for connection in [one for one in self._connections if one.since < late]:
             self._drop(connection)
 
     def _accept(self) -> None:
@@ -112,14 +109,14 @@ class HttpPort:
             self._stopped.wait(_PAUSE_S)
             return
         if len(self._connections) >= MAX_CONNECTIONS:
-            self._drop(next(iter(self._connections.values())))
+            self._drop(next(iter(self._connections)))
         sock.setblocking(False)
-        number = next(self._numbers)
-        self._connections[number] = _Connection(number, sock)
-        self._selector.register(sock, selectors.EVENT_READ, number)
+        connection = _Connection(sock)
+        self._connections[connection] = None
+        self._selector.register(sock, selectors.EVENT_READ, connection)
 
     def _drop(self, connection: _Connection) -> None:
-        del self._connections[connection.number]
+        del self._connections[connection]
         self._selector.unregister(connection.sock)
         connection.sock.close()
 
@@ -145,7 +142,7 @@ class HttpPort:
             raise ConnectionError
         else:
             return
-        self._selector.modify(connection.sock, selectors.EVENT_WRITE, connection.number)
+        self._selector.modify(connection.sock, selectors.EVENT_WRITE, connection)
 
     def _write(self, connection: _Connection) -> None:
         assert connection.left is not None

@@ -27,11 +27,7 @@ Answer = tuple[int, str, bytes]
 
 
 class MetricsPage:
-    """What there is to read.
-
-    Args:
-        render: Makes text of figures, and says of which kind.
-    """
+    """What there is to read. ``render``: makes text of figures, and says of which kind."""
 
     def __init__(
         self,
@@ -182,9 +178,7 @@ def _family(
 
 
 def exposition() -> Callable[[Mapping[str, Any]], tuple[str, bytes]]:
-    """Makes text of figures.
-    Raises ``ImportError``: prometheus_client is not installed; the text says what to do.
-    """
+    """Makes text of figures. Raises ``ImportError``."""
     try:
         from prometheus_client import CONTENT_TYPE_LATEST, CollectorRegistry, ProcessCollector
         from prometheus_client.exposition import generate_latest

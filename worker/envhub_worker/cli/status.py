@@ -107,9 +107,7 @@ def _ask(
 
 
 def of_server(endpoint: str, server_key: bytes | None, pair: keys.KeyPair) -> dict[str, Any]:
-    """What the server says about itself to its operator.
-    Raises ``UnreachableError``: it does not know us as its operator.
-    """
+    """What the server says about itself to its operator. Raises ``UnreachableError``."""
     server = _ask(endpoint, server_key, pair)[1]
     if "pid_namespace" not in server:
         raise UnreachableError("the server does not know this key as its operator's")

@@ -26,11 +26,7 @@ _KFD, _KFD_FOLDER = "/dev/kfd", "/sys/class/kfd/kfd"
 
 @dataclass(frozen=True)
 class GpuGrant:
-    """What a jail gets.
-
-    Attributes:
-        folders: Paths of /sys; links among them are followed.
-    """
+    """What a jail gets. ``folders``: paths of /sys; links among them are followed."""
 
     devices: tuple[str, ...] = ()
     folders: tuple[str, ...] = ()

@@ -23,9 +23,7 @@ class Layer:
 
 class LayerUnavailableError(Exception):
     """A layer that the profile names cannot be had on this host. Nothing may run.
-
-    Attributes:
-        fix: What the user can do, by exact command where there is one.
+    ``fix``: what the user can do, by exact command where there is one.
     """
 
     def __init__(self, layer: str, reason: str, fix: str) -> None:

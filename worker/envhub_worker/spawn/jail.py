@@ -45,9 +45,7 @@ class RunnerStarted:
 @dataclass(frozen=True)
 class RunnerExited:
     """A runner has ended, with an exit code or by a signal.
-
-    Attributes:
-        detail: The numbers, where a limit was the reason.
+    ``detail``: the numbers, where a limit was the reason.
     """
 
     runner: int

@@ -171,9 +171,7 @@ def _bring_in(folder: str, home: str) -> None:
 
     Behind the standard library, as the packages of any interpreter, with their ``.pth`` files; and
     what of ``site`` a program may expect. What it starts as ``sys.executable`` has them as well.
-
-    Args:
-        home: The jail's own home. All of its runners make the same there.
+    ``home``: the jail's own home. All of its runners make the same there.
     """
     environment = f"{home}/.environment"
     _make_environment(environment, folder)

@@ -38,9 +38,7 @@ RUNNER_TARGET = "envhub_worker.runner.runner:main"
 @dataclass(frozen=True)
 class ZygoteDied:
     """The zygote has gone, and every jail with it.
-
-    Attributes:
-        code: Its exit code, or minus the signal that ended it.
+    ``code``: its exit code, or minus the signal that ended it.
     """
 
     code: int
@@ -188,9 +186,7 @@ class Spawner:
         return code
 
     def spawn(self, spec: JailSpec) -> Jail:
-        """Ask for a jail. Requests wait until the zygote is ready.
-        Raises ``RuntimeError``: the zygote has gone.
-        """
+        """Ask for a jail. Requests wait until the zygote is ready. Raises ``RuntimeError``."""
         if self._exited:
             raise RuntimeError("the zygote has gone")
         self._count += 1

@@ -37,12 +37,8 @@ MAX_DEAD = 256
 
 class JailEvents:
     """Writes down what happens, and tells everybody who waits for it.
-
-    Args:
-        jails: All jails of the server; what has ended long ago is taken out.
-
-    Attributes:
-        deaths: How many jails, and runners of kept jails, have ended unasked, by reason.
+    ``jails``: all jails of the server; what has ended long ago is taken out.
+    ``deaths``: how many jails, and runners of kept jails, have ended unasked, by reason.
     """
 
     def __init__(

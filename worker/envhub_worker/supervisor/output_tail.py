@@ -13,9 +13,7 @@ MAX_BYTES = 1 << 20
 
 class OutputTail:
     """The last ``limit`` bytes of a pipe that a jail writes to. Owns the descriptor.
-
-    Attributes:
-        ended: Nothing more will come.
+    ``ended``: nothing more will come.
     """
 
     def __init__(self, fd: int, limit: int) -> None:

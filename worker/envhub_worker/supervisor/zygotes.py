@@ -24,9 +24,7 @@ Key = tuple[object, ...]
 
 class Zygotes:
     """Started when a jail needs one, ended when they are too many.
-
-    Args:
-        ahead: A process for the first of them.
+    ``ahead``: a process for the first of them.
     """
 
     def __init__(

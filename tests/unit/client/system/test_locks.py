@@ -34,13 +34,6 @@ def test_a_lock_is_held_until_its_context_ends(tmp_path: Path) -> None:
             pass
     assert waits == [1]
     assert not is_held(path)
-    with (
-        held(path, shared=True),
-        held(path, shared=True),
-        pytest.raises(TimeoutError),
-        held(path),
-    ):
-        pass
 
 
 def test_the_holder_may_remove_the_file(tmp_path: Path) -> None:

@@ -68,9 +68,7 @@ class Tally:
 @dataclass(frozen=True, kw_only=True)
 class ServerFigures:
     """What does not change while a server runs.
-
-    Attributes:
-        state: A path on the disk that keys and snapshots lie on.
+    ``state``: a path on the disk that keys and snapshots lie on.
     """
 
     profile: str

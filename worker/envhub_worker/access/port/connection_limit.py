@@ -30,9 +30,7 @@ _DROP = struct.pack("=HBBI", 0x06, 0, 0, 0)  # BPF: return 0 bytes of the packet
 
 class ConnectionLimiter:
     """Watches a socket's connections. To be made before it is bound.
-
-    Args:
-        limit: Connections at once. The backlog may come in besides.
+    ``limit``: connections at once. The backlog may come in besides.
     """
 
     def __init__(self, router: zmq.Socket[bytes], loop: Loop, log: Log, limit: int) -> None:

@@ -119,9 +119,7 @@ def _descriptor_of(frame: zmq.Frame) -> int:
 
 class Zap:
     """Answers libzmq's questions about each handshake.
-
-    Args:
-        admits: Called with the client's public key and address; whether it may come in.
+    ``admits``: called with the client's public key and address; whether it may come in.
     """
 
     def __init__(

@@ -44,11 +44,7 @@ def tree_charge(paths: Iterable[str]) -> int:
 
 
 class BlobStore:
-    """The files of one key.
-
-    Attributes:
-        held: Bytes that they are charged.
-    """
+    """The files of one key. ``held``: bytes that they are charged."""
 
     def __init__(self, home: Path) -> None:
         self.home = home

@@ -92,13 +92,8 @@ class Uploads:
     def offer(
         self, owner: bytes, key: bytes, request: m.OfferSnapshot, in_use: Collection[str]
     ) -> m.MissingBlobs:
-        """What is missing of a snapshot. Nothing: it lies ready.
-
-        Args:
-            in_use: Trees that must stay, by path.
-
-        Raises:
-            RefusedError: A listing that breaks a rule or the quota.
+        """What is missing of a snapshot. Nothing: it lies ready. ``in_use``: trees that must stay,
+        by path. Raises ``RefusedError``: a listing that breaks a rule or the quota.
         """
         files = checked_listing(request.files, self._quotas)
         digest = digest_of(files)
@@ -136,9 +131,7 @@ class Uploads:
         self.forget(owner)
 
     def put(self, owner: bytes, key: bytes, request: m.PutBlob, data: bytes) -> None:
-        """Take a piece of a wanted file; the last one makes it a blob.
-        Raises ``RefusedError``: it is not wanted, is out of order, or it is not what its hash says.
-        """
+        """Take a piece of a wanted file; the last one makes it a blob. Raises ``RefusedError``."""
         if len(request.sha256) != _SHA256_BYTES:  # it would be a file's name
             raise RefusedError("LocalProtocolError", "a hash has 32 bytes")
         offer = self._offers.get(owner)
@@ -195,7 +188,7 @@ class Uploads:
             self._give_up(known, sha256)
 
     def tree(self, key: bytes, snapshot: str) -> str:
-        """The path of a client's snapshot. Raises ``RefusedError``: it is not here; a path is none."""
+        """The path of a client's snapshot. Raises ``RefusedError`` where it is not here."""
         if _SNAPSHOT.fullmatch(snapshot):
             tree = self._store(key).tree(snapshot.removeprefix(PREFIX))
             if tree.is_dir():

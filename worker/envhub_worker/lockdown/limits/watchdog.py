@@ -255,9 +255,7 @@ class Watchdog:
 
     def __init__(self, jail: JailContext, events: int) -> None:
         """A watchdog for ``jail``.
-
-        Args:
-            events: Where its control group counts out-of-memory; -1 to measure instead.
+        ``events``: where its control group counts out-of-memory; -1 to measure instead.
         """
         self._limits = jail.spec.confinement.limits
         tmpfs = jail.scratch.temporary if jail.common.namespaced else None

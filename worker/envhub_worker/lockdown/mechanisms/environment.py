@@ -47,9 +47,7 @@ def jail_environment(
     network: str = "none",
 ) -> dict[str, str]:
     """What a runner of a jail sees.
-
-    Args:
-        granted: Variables that the caller grants by name; they win.
+    ``granted``: variables that the caller grants by name; they win.
     """
     kept = {name: value for name, value in base.items() if name in ("PATH", *_INHERITED)}
     return {

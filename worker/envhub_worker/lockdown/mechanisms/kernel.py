@@ -37,9 +37,7 @@ _CAPABILITY_VERSION_3 = 0x20080522
 
 
 def syscall(call: int, *args: int | bytes | None) -> int:
-    """Call the kernel. Integers are passed as longs, bytes as pointers.
-    Raises ``OSError``: with the kernel's errno.
-    """
+    """Call the kernel. Integers are passed as longs, bytes as pointers. Raises ``OSError``."""
     words = [ctypes.c_long(arg) if isinstance(arg, int) else arg for arg in args]
     return _checked(_libc.syscall(ctypes.c_long(call), *words))
 

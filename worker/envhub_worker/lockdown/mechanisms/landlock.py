@@ -55,9 +55,7 @@ class Ruleset:
 
 def ruleset(abi: int, network: str) -> Ruleset:
     """All that ``abi`` can handle. An unknown bit would be refused, so it is clamped.
-
-    Args:
-        network: ``"none"`` denies all TCP; otherwise its own layer decides.
+    ``network``: ``"none"`` denies all TCP; otherwise its own layer decides.
     """
     bits = {1: 13, 2: 14, 3: 15, 4: 15}.get(abi, 16)
     return Ruleset(

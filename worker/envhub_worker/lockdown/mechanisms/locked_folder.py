@@ -24,9 +24,7 @@ _LONGEST = "/envhub-12345678/fds"
 
 class LockedFolder:
     """A new one. It is private; its owner may let others pass.
-
-    Args:
-        place: Where it lies; by default below the folder for temporary files.
+    ``place``: where it lies; by default below the folder for temporary files.
     """
 
     def __init__(self, prefix: str, place: Path | None = None) -> None:

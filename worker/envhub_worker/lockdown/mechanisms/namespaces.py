@@ -131,9 +131,7 @@ def user_namespace_unavailable(
     error: OSError, read: Callable[[str], str | None] | None = None
 ) -> LayerUnavailableError:
     """Why this host refused a user namespace, and what to do about it here.
-
-    Args:
-        read: Gives the text of a sysctl file, or None where there is none.
+    ``read``: gives the text of a sysctl file, or None where there is none.
     """
     read = read or _read
     reason, fix = _diagnosis(error, read)

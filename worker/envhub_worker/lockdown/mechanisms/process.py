@@ -105,10 +105,8 @@ def _close_range(low: int, high: int) -> None:
 
 def reset_signals(handled: Iterable[int]) -> None:
     """Dispositions and mask as a Python program finds them after a plain exec.
-
-    Args:
-        handled: The signals that this program has set a handler for. (Asking for all 64 costs
-            more than the rest of a fork.)
+    ``handled``: the signals that this program has set a handler for. (Asking for all 64 costs more
+    than the rest of a fork.)
     """
     signal.set_wakeup_fd(-1)
     for signum in handled:

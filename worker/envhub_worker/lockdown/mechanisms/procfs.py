@@ -68,9 +68,7 @@ def descendants(
     root: int, keep: Collection[int] = (), children: Children | None = None
 ) -> list[int]:
     """Pids below ``root``, without those in ``keep`` and what is below them.
-
-    Args:
-        children: What ``all_children`` gave a moment ago; looked up by default.
+    ``children``: what ``all_children`` gave a moment ago; looked up by default.
     """
     children = all_children() if children is None else children
     found: list[int] = []

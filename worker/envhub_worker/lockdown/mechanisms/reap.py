@@ -36,9 +36,7 @@ def drain(fd: int) -> None:
 
 def reap(before: Callable[[int], None] = lambda pid: None) -> Iterator[tuple[int, int]]:
     """The pid and wait status of every child that has ended; orphans we adopted included.
-
-    Args:
-        before: Called with the pid while that still belongs to the dead child.
+    ``before``: called with the pid while that still belongs to the dead child.
     """
     with contextlib.suppress(ChildProcessError):
         while ended := os.waitid(os.P_ALL, 0, os.WEXITED | os.WNOHANG | os.WNOWAIT):

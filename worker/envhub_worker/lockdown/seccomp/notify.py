@@ -147,9 +147,7 @@ def _has_callers(listener: int) -> bool:
 
 def decide(request: Request, inside: _Inside) -> Answer:
     """Send the signal that ``request`` asks for, where that is permitted.
-
-    Args:
-        inside: Gives the pids of the jail's processes, without init.
+    ``inside``: gives the pids of the jail's processes, without init.
     """
     first, second, third = request.arguments
     if request.caller == 0:

@@ -89,9 +89,7 @@ def enter(
 
 def rules(jail: JailContext, pid: int) -> list[LandlockRule]:
     """What Landlock permits a runner; everything else it denies.
-
-    Args:
-        pid: The runner's own: without a pid namespace it may read only its own ``/proc`` folder.
+    ``pid``: the runner's own: without a pid namespace it may read only its own ``/proc`` folder.
     """
     common = jail.common
     readable = [*common.trees, jail.spec.snapshot]
@@ -125,9 +123,7 @@ def runner_paths(jail: JailContext, pid: int, thread: int) -> OwnPaths:
 
 def resource_limits(limits: Limits, processes: int | None) -> dict[int, tuple[int, int]]:
     """Resource number to (soft, hard).
-
-    Args:
-        processes: Cap for ``RLIMIT_NPROC``, or None where it would count strangers.
+    ``processes``: cap for ``RLIMIT_NPROC``, or None where it would count strangers.
     """
     file_bytes = limits.disk_bytes if limits.file_bytes is None else limits.file_bytes
     rules = {

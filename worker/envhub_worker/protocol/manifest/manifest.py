@@ -43,20 +43,17 @@ class EnvManifest:
     Attributes:
         suite: Key of the outer mapping.
         task: Key of the inner mapping.
-        num_envs: Number of sub-environments.
-        shardable: The worker drives the sub-environments itself, so they can be spread over
-            several processes; otherwise the environment has a ``step`` of its own.
+        shardable: The worker drives the sub-environments itself, so they can be spread over several
+            processes; otherwise the environment has a ``step`` of its own.
         sync: The repository asked for ``SyncVectorEnv``: its sub-environments may share state.
         single_observation_space, single_action_space: Spaces of one sub-environment.
         observation_space, action_space: Batched spaces.
         autoreset_mode: ``"NextStep"``, ``"SameStep"``, ``"Disabled"``, or None if not stated.
         metadata: The environment's metadata, without the autoreset mode; values are inert data.
-        render_mode: As in Gymnasium.
         spec: ``id``, ``max_episode_steps``, ``reward_threshold`` and ``nondeterministic`` of the
             environment's ``EnvSpec``, as far as they are known, or None.
         attributes: Names of attributes that the vector environment has beyond Gymnasium's, as far
             as ``names.is_servable`` lets them in.
-        type_name: The class that the repository returned.
     """
 
     suite: str

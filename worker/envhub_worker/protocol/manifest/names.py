@@ -104,9 +104,7 @@ def optional_name(value: object, what: str) -> str | None:
 
 
 def string_keys(value: object, what: str) -> dict[str, Any]:
-    """A mapping with such names for keys.
-    Raises ``RemoteProtocolError``: it is none, or has too many.
-    """
+    """A mapping with such names for keys. Raises ``RemoteProtocolError``."""
     if type(value) is not dict or len(value) > MAX_NAMES:
         raise RemoteProtocolError(f"{what} is not a mapping of at most {MAX_NAMES} entries")
     for key in value:

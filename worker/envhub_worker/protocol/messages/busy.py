@@ -23,7 +23,6 @@ class Busy:
     """Why there is no room at present.
 
     Attributes:
-        quota: Its name, as in ``"jails"``.
         used: How much of it others of the same key have.
         limit: How much there is.
         retry_s: After how many seconds it is worth asking again.

@@ -1,1 +1,0 @@
-"""``envhub inspect``: the command, and what it prints of a repository that does not run."""
