@@ -1,0 +1,203 @@
+"""Each command by itself: what it does without a jail, and what it refuses before it opens one."""
+
+from __future__ import annotations
+
+import ast
+import inspect as python
+import json
+import os
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from envhub_sandbox.check.checks import Severity
+from envhub_sandbox.cli import cache, diff, image, lock, prefetch, push, replay, run
+from envhub_sandbox.cli.app import app
+from envhub_sandbox.cli.doctor import doctor
+from envhub_sandbox.cli.init import init, starter
+from envhub_sandbox.cli.inspect import inspect, static
+from envhub_sandbox.cli.shared import exits, findings, versions
+from envhub_sandbox.cli.shared.console import guarded
+
+_COMMANDS: Any = typer.main.get_command(app)
+
+
+@pytest.fixture(autouse=True)
+def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An empty folder, and nothing of this user's."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("ENVHUB_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("ENVHUB_CONFIG", str(tmp_path / "config"))
+
+
+def said(*words: str) -> tuple[int, str]:
+    """The exit code of a command, and all that it prints."""
+    done = CliRunner().invoke(app, words)
+    return done.exit_code, done.output
+
+
+_NO_FOLDER = "there is no such folder or file here"
+_REFUSED = [
+    ("lock a/b/c/d", 2, "a path stands behind a colon"),
+    ("verify ./gone.toml", 2, "'envhub lock REF' writes one"),
+    ("image build ./gone", 3, _NO_FOLDER),
+    ("replay ./gone", 2, "is no crash bundle that can be read"),
+    ("diff ./gone ./gone", 3, _NO_FOLDER),
+    ("run ./gone", 3, _NO_FOLDER),
+    ("push ./gone owner/name", 3, _NO_FOLDER),
+    ("push . no-owner", 2, "the owner is missing"),
+    ("prefetch ./gone", 3, _NO_FOLDER),
+    ("cache remove gone", 2, "nothing in the store is called 'gone'"),
+    ("doctor --profile gone", 2, "it is one of strict, no-userns, container"),
+    ("doctor tcp://host", 2, "a remote server is tcp://HOST:PORT"),
+    ("doctor tcp://127.0.0.1:9", 6, "anybody could pretend to be that server"),
+    ("init a--b", 2, "cannot be a name on the Hub"),
+    ("inspect ./gone", 3, _NO_FOLDER),
+    ("inspect ./gone --sarif x", 2, "--sarif means nothing here"),
+    ("inspect ./gone --static --render", 2, "No such option"),
+]
+
+
+@pytest.mark.parametrize(("words", "code", "text"), _REFUSED)
+def test_what_cannot_be_done_is_said_in_one_line(words: str, code: int, text: str) -> None:
+    """With the exit code of its kind, without a traceback, and nothing is left in the folder."""
+    found, printed = said(*words.split())
+    assert (found, text in " ".join(printed.split())) == (code, True), printed
+    assert "Traceback" not in printed
+    assert os.listdir() == []
+
+
+_MODULES = {
+    "lock": lock,
+    "verify": lock,
+    "image build": image,
+    "replay": replay,
+    "diff": diff,
+    "run": run,
+    "push": push,
+    "prefetch": prefetch,
+    "cache remove": cache,
+    "init": init,
+    "doctor": doctor,
+    "inspect": inspect,
+}
+
+
+@pytest.mark.parametrize("words", _MODULES)
+def test_a_command_is_a_function_of_its_module(words: str) -> None:
+    """Of its own name, with its help in its docstring."""
+    found = _COMMANDS
+    for word in words.split():
+        found = found.commands[word]
+    callback = python.unwrap(found.callback)
+    assert callback.__module__ == _MODULES[words].__name__
+    assert callback.__name__ == words.split()[-1]
+    assert found.help.split(".")[0].split("\n")[0] in " ".join(python.getdoc(callback).split())
+
+
+def test_reading_is_no_running(monkeypatch: pytest.MonkeyPatch) -> None:
+    """``--static`` goes another way, with its own options."""
+    asked = list[Any]()
+    assert inspect.inspect_static is static.inspect_static
+    monkeypatch.setattr(inspect, "inspect_static", lambda ref, **options: asked.append(options))
+    assert said("inspect", "./here", "--static", "--json")[0] == 0
+    assert [one["as_json"] for one in asked] == [True]
+    assert said("inspect", "./here", "--fail-on", "note")[0] == 2
+
+
+def test_an_empty_store_is_listed() -> None:
+    """For people, and for programs."""
+    code, printed = said("cache", "list")
+    assert (code, printed.startswith("0 snapshots, 0 environments")) == (0, True)
+    code, printed = said("cache", "list", "--json")
+    assert json.loads(printed)["snapshots"] == []
+    assert cache.stored_snapshots() == []
+
+
+def test_a_snapshot_is_called_by_repository_or_commit() -> None:
+    """A commit by seven characters at least, or by fewer behind its repository."""
+    one = cache.StoredSnapshot("org/repo", "0123456789", None, 0.0, 1, Path())
+    for name in ("org/repo", "0123456", "org/repo@01", "0123456789"):
+        assert one.answers_to(name), name
+    for name in ("012345", "org/repo@1", "org", "other/repo@0123456", "1234567"):
+        assert not one.answers_to(name), name
+
+
+@pytest.mark.parametrize("name", ["my-env", "a", "A.b_c", "x" * 96])
+def test_a_repository_has_the_name_of_its_folder(name: str) -> None:
+    """Where the Hub takes it; its files are Python that can be read, and name it."""
+    assert init.repository_name(Path(name)) == name
+    files = starter.starter(name, 2026)
+    assert {"env.py", "README.md", "LICENSE"} <= set(files)
+    for path, text in files.items():
+        assert "$" not in text.replace("${{", ""), path
+        if path.endswith(".py"):
+            ast.parse(text)
+    assert name in files["env.py"]
+    assert "2026" in files["LICENSE"]
+
+
+@pytest.mark.parametrize("name", ["-a", "a.", "a..b", "a.git", "x" * 97, "ä", "a b"])
+def test_other_names_are_refused(name: str) -> None:
+    """Before anything is written."""
+    with pytest.raises(exits.UsageError, match="cannot be a name on the Hub"):
+        init.repository_name(Path(name))
+
+
+def test_init_writes_all_or_nothing() -> None:
+    """A folder with something in it stays as it is."""
+    Path("there").mkdir()
+    Path("there/file").touch()
+    assert said("init", "there")[0] == 2
+    assert os.listdir("there") == ["file"]
+    assert said("init", "new")[0] == 0
+    assert set(starter.starter("new", 2026)) <= {
+        str(path.relative_to("new")) for path in Path("new").rglob("*")
+    }
+
+
+def test_severities_of_fail_on() -> None:
+    """By name; another one is a mistake of usage."""
+    for one in Severity:
+        assert findings.level(one.value) is one
+    with pytest.raises(exits.UsageError, match="it takes error, warning or note"):
+        findings.level("fatal")
+
+
+def test_reports_are_written_in_utf_8() -> None:
+    """Whatever the locale; where they cannot be, that is said."""
+    findings.write_report(Path("report"), "ü")
+    assert Path("report").read_bytes() == "ü".encode()
+    with pytest.raises(exits.UsageError, match="the report cannot be written"):
+        findings.write_report(Path("no/report"), "")
+
+
+def test_annotations_are_for_the_job_and_its_summary(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The summary is added to what other steps have written."""
+    summary = Path("summary")
+    summary.write_text("before\n")
+    monkeypatch.setenv("GITHUB_STEP_SUMMARY", str(summary))
+    with guarded():
+        findings.annotate(["::notice::one", "::error::two"], "after\n")
+    assert capsys.readouterr().out == "::notice::one\n::error::two\n"
+    assert summary.read_text() == "before\nafter\n"
+
+
+def test_versions_of_all_that_matters(monkeypatch: pytest.MonkeyPatch) -> None:
+    """None for what is not installed; every value is plain."""
+    found = versions.versions()
+    assert found == json.loads(json.dumps(found))
+    assert found["python"]
+    assert found["numpy"]
+
+    def gone(name: str) -> str:
+        raise metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(metadata, "version", gone)
+    assert versions.versions()["numpy"] is None

@@ -1,0 +1,152 @@
+"""The forms of a reference, what the Hub's failures mean, and TOML of strangers, by themselves."""
+
+from __future__ import annotations
+
+import errno
+from typing import Any
+
+import pytest
+
+from envhub_sandbox.hub import failures, grammar
+from envhub_sandbox.hub.failures import Kind
+from envhub_sandbox.hub.sources import toml
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["owner/name", "owner/name@main", "owner/name:a/b.py", "spaces/owner/name@v1:c.py"],
+)
+def test_what_is_read_is_written_again(text: str) -> None:
+    """A canonical reference stays as it is."""
+    parts = grammar.read(text)
+    grammar.check(parts)
+    assert grammar.join(parts) == text
+
+
+@pytest.mark.parametrize(
+    ("parts", "what"),
+    [
+        (grammar.Parts("name"), "owner is missing"),
+        (grammar.Parts("owner/name.git"), "does not end in '.git'"),
+        (grammar.Parts("owner/a--b"), "cannot be a name"),
+        (grammar.Parts("owner/name", ""), "revision after '@' is empty"),
+        (grammar.Parts("owner/name", "a..b"), "cannot be a revision"),
+        (grammar.Parts("owner/name", path="../env.py"), "has '..'"),
+        (grammar.Parts("owner/name", path="/env.py"), "absolute"),
+        (grammar.Parts("owner/name", path="a\\env.py"), "backslashes"),
+        (grammar.Parts("owner/name", path="C:/env.py"), "drive letter"),
+        (grammar.Parts("owner/name", path="env.txt"), "not a .py file"),
+        (grammar.Parts("owner/name", path="envs"), "a folder"),
+        (grammar.Parts("owner/name", path="env.py@main"), "stands behind the path"),
+        (grammar.Parts("owner/name", repo_type="paper"), "no repository type"),
+    ],
+)
+def test_parts_that_the_hub_cannot_have(parts: grammar.Parts, what: str) -> None:
+    """What is wrong, and what to write instead."""
+    with pytest.raises(grammar.Wrong) as wrong:
+        grammar.check(parts)
+    assert what in wrong.value.what
+    assert wrong.value.write
+
+
+def test_folders_and_commits_are_told_from_names() -> None:
+    """By their form alone."""
+    assert all(map(grammar.is_local, [".", "./env", "../env", "/env", "~/env"]))
+    assert not any(map(grammar.is_local, ["env", "owner/name", ".hidden/name"]))
+    assert grammar.is_commit("0123456789abcdef" * 2 + "01234567")
+    assert not grammar.is_commit("0123456789ABCDEF" * 2 + "01234567")
+    assert grammar.has_control_characters("a\x1b[2J")
+    assert not grammar.has_control_characters("a ü")
+
+
+class Response:
+    """What a request was answered with."""
+
+    def __init__(self, status: int, **headers: str) -> None:
+        self.status_code = status
+        self.headers = {name.replace("_", "-"): value for name, value in headers.items()}
+
+
+def failed(error: BaseException, *secrets: str) -> failures.HubFailure:
+    """What an exception of the Hub's client means."""
+    return failures.explain(
+        error,
+        secrets,
+        repo_type="space",
+        repo_id="owner/name",
+        revision=None,
+        endpoint="https://hub.example",
+    )
+
+
+def answered(status: int, **headers: str) -> BaseException:
+    """An exception of an HTTP client."""
+    error = type("HTTPStatusError", (Exception,), {})("status")
+    error.response = Response(status, **headers)
+    return error
+
+
+@pytest.mark.parametrize(
+    ("error", "kind"),
+    [
+        (answered(401), Kind.NO_REPOSITORY),
+        (answered(401, X_Error_Message="Invalid credentials in Authorization header"), None),
+        (answered(403), Kind.FORBIDDEN),
+        (answered(404), Kind.NO_REPOSITORY),
+        (answered(429), Kind.RATE_LIMITED),
+        (answered(503), Kind.SERVER_ERROR),
+        (answered(418), Kind.OTHER),
+        (OSError(errno.ENOSPC, "full"), Kind.DISK_FULL),
+        (TimeoutError(), Kind.TIMEOUT),
+        (ConnectionError("refused"), Kind.UNREACHABLE),
+        (type("GatedRepoError", (Exception,), {})(), Kind.GATED),
+        (RuntimeError("anything"), Kind.OTHER),
+    ],
+)
+def test_each_failure_has_its_kind(error: BaseException, kind: Kind | None) -> None:
+    """Whichever release of the Hub's client raises it, and whatever is wrapped around it."""
+    expected = kind or Kind.UNAUTHORIZED
+    assert failed(error).kind is expected
+    wrapper = type("LocalEntryNotFoundError", (Exception,), {})("wrapped")
+    wrapper.__cause__ = error
+    assert failed(wrapper).kind is expected
+
+
+def test_a_failure_says_what_to_do() -> None:
+    """With the page, the wait and what the Hub said, as one line."""
+    failure = failed(answered(429, Retry_After="30", X_Error_Message="too\nmany"))
+    assert 'it said: "too many"' in failure.what
+    assert "Wait 30 s" in failure.advice
+    gated = failed(type("GatedRepoError", (Exception,), {})())
+    assert "https://hub.example/spaces/owner/name" in gated.advice
+
+
+def test_a_secret_that_is_echoed_is_in_no_text() -> None:
+    """Neither in what is said nor in the exceptions below it."""
+    error = answered(403, X_Error_Message="hf_secret may not")
+    assert "hf_secret" not in failed(error, "hf_secret").what
+    inner = ValueError("hf_secret", 3)
+    outer = RuntimeError("with hf_secret")
+    outer.__cause__, inner.__context__ = inner, outer  # a cycle ends, too
+    failures.conceal(outer, ("hf_secret",))
+    assert (outer.args, inner.args) == (("with ***",), ("***", 3))
+    assert list(failures.chain(outer)) == [outer, inner]
+
+
+def test_toml_is_read_within_bounds() -> None:
+    """Its length, and the dots that a parser's time grows with."""
+    assert toml.loads("a.b = 1", 100) == {"a": {"b": 1}}
+    for text, most in (("a = 1", 4), (".".join("a" * 3_000) + " = 1", 10_000), ("a = [", 100)):
+        with pytest.raises(ValueError, match=r".") as error:
+            toml.loads(text, most)
+        assert len(str(error.value)) <= 200
+
+
+def test_dots_in_texts_of_a_generated_document_do_not_count() -> None:
+    """It has thousands of addresses; a text of several lines could hide others, and is refused."""
+    dotted: dict[str, Any] = toml.loads(f'a = "{"." * 3_000}"', 10_000, generated=True)
+    assert len(dotted["a"]) == 3_000
+    with pytest.raises(ValueError, match="dots"):
+        toml.loads(f'a = "{"." * 3_000}"', 10_000)
+    with pytest.raises(ValueError, match="several lines"):
+        toml.loads('a = """\nb"""', 100, generated=True)

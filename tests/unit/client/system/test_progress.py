@@ -1,0 +1,59 @@
+"""Progress is a line where somebody looks, and a record in any case."""
+
+from __future__ import annotations
+
+import io
+import logging
+import sys
+
+import pytest
+
+from envhub_sandbox.system import log, progress
+
+
+def test_loggers_are_ours_and_silent() -> None:
+    """Each below one name, without a handler that prints."""
+    for one in (log.WORKER, log.OUTPUT, log.SNAPSHOT, log.DEPENDENCIES, log.CRASHES, log.ERRORS):
+        assert one.name.startswith(f"{log.ROOT.name}.")
+        assert one.handlers == []
+    assert [type(one) for one in log.ROOT.handlers] == [logging.NullHandler]
+
+
+def test_each_line_is_logged_and_shown(caplog: pytest.LogCaptureFixture) -> None:
+    """By whoever has the terminal, the latest first, in a line that fits."""
+    outer, inner = list[str](), list[str]()
+    with caplog.at_level(logging.INFO, log.DEPENDENCIES.name):
+        with progress.progress_shown_by(outer.append):
+            with (
+                progress.progress_shown_by(inner.append),
+                progress.progress_shown("org/repo") as tell,
+            ):
+                tell("resolving")
+                tell("x" * 300)
+            with progress.progress_shown("org/repo") as tell:
+                tell("installing")
+        with progress.progress_shown("org/repo") as tell:
+            tell("for nobody")
+    assert inner[0] == "org/repo: resolving"
+    assert len(inner[1]) == 100
+    assert outer == ["org/repo: installing"]
+    assert len(caplog.messages) == 4
+
+
+@pytest.mark.parametrize("variables", [{}, {"CI": "1"}])
+def test_only_a_terminal_is_written_to(
+    variables: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither a pipe nor the log of a CI system."""
+
+    class Terminal(io.StringIO):
+        def isatty(self) -> bool:
+            return bool(variables)
+
+    monkeypatch.delenv("CI", raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    monkeypatch.setattr(sys, "stderr", Terminal())
+    with progress.progress_shown("org/repo") as tell:
+        tell("resolving")
+    assert sys.stderr.getvalue() == ""  # type: ignore[attr-defined]

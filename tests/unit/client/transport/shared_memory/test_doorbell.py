@@ -1,0 +1,71 @@
+"""Doorbells: who rings never waits, and a ring that came before the wait counts."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+
+import pytest
+
+from envhub_sandbox.transport.shared_memory.doorbell import OwnBell, RunnerBell, Watch
+
+
+@pytest.fixture
+def watch() -> Iterator[Watch]:
+    """One that watches nothing yet."""
+    made = Watch()
+    yield made
+    made.close()
+
+
+def test_a_runner_hears_a_ring() -> None:
+    """However often it is rung before: a bell that nobody answers does not block."""
+    bell = RunnerBell()
+    for _ in range(100_000):
+        bell.ring()
+    assert os.read(bell.theirs, 8) == (1).to_bytes(8, "little")
+    copy = os.dup(bell.theirs)
+    bell.handed_over()
+    bell.handed_over()
+    bell.ring()
+    os.close(copy)
+    bell.ring()  # the runner has gone: that is seen elsewhere
+    bell.close()
+    bell.close()
+
+
+def test_a_runner_that_reads_nothing_is_told_of_our_end() -> None:
+    """Its read ends, once our side is closed."""
+    bell = RunnerBell()
+    copy = os.dup(bell.theirs)
+    bell.close()
+    assert os.read(copy, 8) == b""
+    os.close(copy)
+
+
+def test_a_ring_before_the_wait_counts(watch: Watch) -> None:
+    """Once; and there is nothing to hear of a bell that was forgotten."""
+    bell = OwnBell()
+    os.eventfd_write(bell.fileno(), 1)
+    watch.bell(bell)
+    assert watch.wait(60_000) is False
+    os.eventfd_write(bell.fileno(), 1)
+    watch.forget(bell)
+    assert watch.wait(0) is False
+    bell.close()
+
+
+def test_a_death_is_seen_for_as_long_as_it_lasts(watch: Watch) -> None:
+    """Beside rings of others, until it is forgotten."""
+    read, write = os.pipe()
+    bell = OwnBell()
+    watch.bell(bell)
+    watch.death(read)
+    assert watch.wait(0) is False
+    os.close(write)
+    os.eventfd_write(bell.fileno(), 1)
+    assert [watch.wait(60_000), watch.wait(None)] == [True, True]
+    watch.forget(read)
+    assert watch.wait(0) is False
+    os.close(read)
+    bell.close()
