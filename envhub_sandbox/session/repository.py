@@ -7,7 +7,6 @@ import shlex
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import field
-from functools import cache
 from pathlib import Path
 from typing import Any
 
