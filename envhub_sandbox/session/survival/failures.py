@@ -12,8 +12,9 @@ from envhub_worker.protocol.lifecycle import Event
 
 
 class Failures:
-    """The failures of one environment's requests. ``interruption``: the request whose wait was
-    interrupted, so that its reply is late; None where the last late reply has another reason.
+    """The failures of one environment's requests.
+    ``interruption``: the request whose wait was interrupted, so that its reply is late; None where
+    the last late reply has another reason.
     """
 
     def __init__(self, lease: Lease, history: History) -> None:
