@@ -20,6 +20,7 @@ class Failures:
     def __init__(self, lease: Lease, history: History) -> None:
         self._lease = lease
         self._counters = lease.counters
+        self._label = lease.repository.label
         self._history = history
         self.interruption: str | None = None
 
@@ -109,7 +110,3 @@ class Failures:
         }
         recording, loaded = self._history.recording(), lease.loaded
         lease.repository.keep_crash(error, recording, task, loaded, shared=lease.shared)
-
-    @property
-    def _label(self) -> str:
-        return self._lease.repository.label
