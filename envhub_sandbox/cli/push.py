@@ -99,8 +99,9 @@ def _unfit(path: str) -> str:
 
 
 def _check(folder: str, snapshot: Snapshot, options: dict[str, Any]) -> None:
-    """Load it and step it. Raises ``EnvHubError``: it does not load, or breaks a rule;
-    ``UsageError``: the folder was changed meanwhile.
+    """Load it and step it.
+    Raises ``EnvHubError``: it does not load, or breaks a rule; ``UsageError``: the folder was
+    changed meanwhile.
     """
     from envhub_sandbox.factory.make_env import make_env
 

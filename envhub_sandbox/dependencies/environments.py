@@ -110,7 +110,8 @@ def provide(
 ) -> Environment:
     """The environment for a lock and an interpreter; made if there is none, and marked as used.
 
-    A second process that asks for the same at once waits for the first. Raises ``DependencyError``.
+    A second process that asks for the same at once waits for the first.
+    Raises ``DependencyError``.
     """
     key = key_of(lock, interpreter)
     made = ready(key)

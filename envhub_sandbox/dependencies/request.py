@@ -62,8 +62,8 @@ def chosen(
 ) -> tuple[Choice, str | Path | None]:
     """The choice, and the interpreter whose packages are used, if it is one of the caller's.
 
-    Both as ``make_env`` takes them; ``python`` wins over ``"auto"``. Raises ``PolicyError`` and
-    ``RequirementError``.
+    Both as ``make_env`` takes them; ``python`` wins over ``"auto"``.
+    Raises ``PolicyError`` and ``RequirementError``.
     """
     if isinstance(dependencies, Mapping):
         if python is not None:

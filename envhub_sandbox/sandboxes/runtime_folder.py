@@ -34,8 +34,9 @@ _EMPTY_S = 60.0
 
 
 class RuntimeFolder:
-    """A new private folder, which is in use as long as this process lives. ``prefix``: what its
-    name begins with. Raises ``SandboxUnavailableError``: there is no place for one.
+    """A new private folder, which is in use as long as this process lives.
+    ``prefix``: what its name begins with.
+    Raises ``SandboxUnavailableError``: there is no place for one.
     """
 
     def __init__(self, prefix: str) -> None:
@@ -111,8 +112,9 @@ def remove_stale() -> list[Path]:
 
 
 def is_in_use(path: Path) -> bool:
-    """Whether the client of a folder lives. Raises ``FileNotFoundError``: it is no folder of a
-    client, or not one of this machine; ``OSError``: that cannot be known.
+    """Whether the client of a folder lives.
+    Raises ``FileNotFoundError``: it is no folder of a client, or not one of this machine;
+    ``OSError``: that cannot be known.
     """
     if not (path.is_absolute() and _NAME.fullmatch(path.name)):
         raise FileNotFoundError(errno.ENOENT, "it is no runtime folder", str(path))

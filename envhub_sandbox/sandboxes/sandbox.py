@@ -33,10 +33,11 @@ class Sandbox:
     ) -> Sandbox:
         """The place for one repository, where each gets a server that sees no other's files.
 
-        Starts nothing, and connects to nothing. ``runtime``: the interpreter that the caller named,
-        or none, and the repository's packages. ``assets``: the verified files of further
-        repositories that its jails are shown. Raises ``PolicyError``: the place cannot permit what
-        the policy does; ``SandboxUnavailableError``: there is no such place here.
+        Starts nothing, and connects to nothing.
+        ``runtime``: the interpreter that the caller named, or none, and the repository's packages.
+        ``assets``: the verified files of further repositories that its jails are shown.
+        Raises ``PolicyError``: the place cannot permit what the policy does;
+        ``SandboxUnavailableError``: there is no such place here.
         """
         return self
 

@@ -68,9 +68,10 @@ class ServerFacts:
 
 
 def ask(sandbox: RemoteSandbox) -> ServerFacts:
-    """Ask a server. Raises ``SandboxUnavailableError``: nothing answers there, or it does not let
-    us in; ``VersionMismatchError``: it shares no version of the protocol with us; ``WorkerError``:
-    it refuses to answer.
+    """Ask a server.
+    Raises ``SandboxUnavailableError``: nothing answers there, or it does not let us in;
+    ``VersionMismatchError``: it shares no version of the protocol with us; ``WorkerError``: it
+    refuses to answer.
     """
     begun, deadline = monotonic(), Deadline(_WAIT_S)
     with _connection(sandbox) as client:

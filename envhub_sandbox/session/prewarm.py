@@ -62,11 +62,6 @@ class Prewarm:
         self._timeouts = lease.repository.timeouts
         self.starting: StartupDeadline | None = None
 
-    @property
-    def closed(self) -> bool:
-        """Whether the environment is closed for good."""
-        return self.lifecycle.closed
-
     # --- for a request -------------------------------------------------------------------------
 
     def start_on_demand(self) -> None:
@@ -272,7 +267,7 @@ class SuitePrewarm:
 
 def _is_closed(ref: weakref.ref[Prewarm]) -> bool:
     task = ref()
-    return task is None or task.closed
+    return task is None or task.lifecycle.closed
 
 
 def _cancel(ref: weakref.ref[Prewarm]) -> bool:

@@ -167,8 +167,9 @@ class Requests:
         """With the lock held, send a request to every shard; opens the jail if there is none.
 
         ``instead`` makes what is sent in the place of what the history keeps, if the answer is to
-        say more. Raises ``LocalProtocolError``: it cannot be sent; nothing was; ``WorkerError``:
-        the environment is not in a state to take it.
+        say more.
+        Raises ``LocalProtocolError``: it cannot be sent; nothing was; ``WorkerError``: the
+        environment is not in a state to take it.
         """
         try:
             try:
@@ -420,7 +421,8 @@ class Requests:
         """Before an error goes to the caller.
 
         The repository's warnings come with it; a filter that makes an error of one must not hide a
-        Ctrl-C. Raises ``ClosedEnvironmentError``: a ``close`` in another thread is the reason.
+        Ctrl-C.
+        Raises ``ClosedEnvironmentError``: a ``close`` in another thread is the reason.
         """
         with contextlib.suppress(RemoteEnvWarning):
             self.show_warnings()

@@ -19,8 +19,9 @@ from envhub_worker.protocol.untrusted import blamed, is_fault
 
 
 class UseLock:
-    """The lock of one environment, and what is to be done when it is released. ``lock``: held for
-    as long as a use lasts; reentrant, for a signal handler may close what its own thread waits for.
+    """The lock of one environment, and what is to be done when it is released.
+    ``lock``: held for as long as a use lasts; reentrant, for a signal handler may close what its
+    own thread waits for.
     """
 
     def __init__(self, lease: Lease, failures: Failures) -> None:
@@ -52,8 +53,9 @@ class UseLock:
 
     @contextmanager
     def judging(self, operation: str) -> Iterator[None]:
-        """Hold the lock to handle replies: a worker that breaks a rule in them is given up. Raises
-        ``RemoteProtocolError``: it did, whatever the handling raised; the environment is then DEAD.
+        """Hold the lock to handle replies: a worker that breaks a rule in them is given up.
+        Raises ``RemoteProtocolError``: it did, whatever the handling raised; the environment is
+        then DEAD.
         """
         with self.hold(operation):
             try:

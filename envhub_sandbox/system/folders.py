@@ -27,7 +27,8 @@ _ACL = "system.posix_acl_access"
 def make(folder: Path, mode: int = SHARED_MODE) -> None:
     """Make a folder, and those above it that are missing (0755), whatever the umask is.
 
-    One that is there keeps its mode. Raises ``OSError``: it cannot be made.
+    One that is there keeps its mode.
+    Raises ``OSError``: it cannot be made.
     """
     missing = []
     above = folder

@@ -63,8 +63,9 @@ def profile_for(wanted: str, found: Surroundings) -> str:
 
 
 def layers(wanted: Container, found: Surroundings, title: str) -> list[dict[str, Any]]:
-    """What holds around every jail, for the report. ``title``: engine and image, for the first
-    line. Raises ``SandboxUnavailableError``: something that was asked for does not hold.
+    """What holds around every jail, for the report.
+    ``title``: engine and image, for the first line.
+    Raises ``SandboxUnavailableError``: something that was asked for does not hold.
     """
     checks: Sequence[tuple[str, bool, str]] = (
         ("container-user", found.user == wanted.user[0] != 0, f"user {found.user}, not root"),

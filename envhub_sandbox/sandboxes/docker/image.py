@@ -53,8 +53,9 @@ def tag_for(repository: str, base: str, lock: Lock, system: Sequence[str]) -> st
 
 
 def dockerfile(base: str, lock: Lock, system: Sequence[str]) -> str:
-    """The derived image's recipe. ``system``: Debian packages, for the libraries that some wheels
-    need. Raises ``DependencyError``: one of these is no name of a package.
+    """The derived image's recipe.
+    ``system``: Debian packages, for the libraries that some wheels need.
+    Raises ``DependencyError``: one of these is no name of a package.
     """
     for name in system:
         if not _PACKAGE.fullmatch(name):

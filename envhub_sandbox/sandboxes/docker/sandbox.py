@@ -298,8 +298,9 @@ def _answer(ready: int) -> bytes:
 
 
 def _check_started(engine: Engine, wanted: Container, answer: bytes) -> None:
-    """Say why there is no container, if there is none. Raises ``SandboxUnavailableError``: the
-    engine would not start it; ``WorkerStartupError``: the program in it ended.
+    """Say why there is no container, if there is none.
+    Raises ``SandboxUnavailableError``: the engine would not start it; ``WorkerStartupError``: the
+    program in it ended.
     """
     if not answer.startswith(b'{"ended"'):
         return

@@ -80,7 +80,8 @@ _PERSONALITIES = (0, 0xFFFFFFFF)
 
 def profile(machine: str | None = None) -> dict[str, Any]:
     """The profile, in the form that docker and podman read. ``machine``: as ``os.uname`` says it;
-    default: this one. Raises ``SandboxUnavailableError``: there is no profile for the machine.
+    default: this one.
+    Raises ``SandboxUnavailableError``: there is no profile for the machine.
     """
     machine = machine or platform.machine()
     if machine not in ARCHITECTURES:

@@ -12,13 +12,15 @@ from envhub_worker.protocol.lifecycle import Event
 
 
 class Failures:
-    """The failures of one environment's requests. ``interruption``: the request whose wait was
-    interrupted, so that its reply is late; None where the last late reply has another reason.
+    """The failures of one environment's requests.
+    ``interruption``: the request whose wait was interrupted, so that its reply is late; None where
+    the last late reply has another reason.
     """
 
     def __init__(self, lease: Lease, history: History) -> None:
         self._lease = lease
         self._counters = lease.counters
+        self._label = lease.repository.label
         self._history = history
         self.interruption: str | None = None
 
@@ -108,7 +110,3 @@ class Failures:
         }
         recording, loaded = self._history.recording(), lease.loaded
         lease.repository.keep_crash(error, recording, task, loaded, shared=lease.shared)
-
-    @property
-    def _label(self) -> str:
-        return self._lease.repository.label

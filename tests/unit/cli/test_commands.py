@@ -15,11 +15,10 @@ import typer
 from typer.testing import CliRunner
 
 from envhub_sandbox.check.checks import Severity
-from envhub_sandbox.cli import cache, diff, image, lock, prefetch, push, replay, run
+from envhub_sandbox.cli import cache, diff, image, inspect, lock, prefetch, push, replay, run
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.cli.doctor import doctor
 from envhub_sandbox.cli.init import init, starter
-from envhub_sandbox.cli.inspect import inspect, static
 from envhub_sandbox.cli.shared import exits, findings, versions
 from envhub_sandbox.cli.shared.console import guarded
 
@@ -102,8 +101,7 @@ def test_a_command_is_a_function_of_its_module(words: str) -> None:
 def test_reading_is_no_running(monkeypatch: pytest.MonkeyPatch) -> None:
     """``--static`` goes another way, with its own options."""
     asked = list[Any]()
-    assert inspect.inspect_static is static.inspect_static
-    monkeypatch.setattr(inspect, "inspect_static", lambda ref, **options: asked.append(options))
+    monkeypatch.setattr(inspect, "_inspect_static", lambda ref, **options: asked.append(options))
     assert said("inspect", "./here", "--static", "--json")[0] == 0
     assert [one["as_json"] for one in asked] == [True]
     assert said("inspect", "./here", "--fail-on", "note")[0] == 2

@@ -275,7 +275,8 @@ class Packages:
 def checked(request: m.NeedPackages) -> dict[str, Any]:
     """An order as plain values, within bounds; what they mean, the program looks at.
 
-    Trust: input from a client. Raises ``RefusedError``: it is none.
+    Trust: input from a client.
+    Raises ``RefusedError``: it is none.
     """
     rows: dict[str, tuple[tuple[Any, ...], int]] = {
         "requirements": (request.requirements, 2),

@@ -38,8 +38,9 @@ def gpu_devices(host: HostFiles) -> tuple[str, ...]:
 
 
 def granted(gpu: bool | tuple[int, ...], host: HostFiles) -> GpuGrant:
-    """What ``gpu`` grants on this host: nothing, all GPUs, or those of some indices. Raises
-    ``LayerUnavailableError``: there is no such GPU. It would be missed later, and only by some.
+    """What ``gpu`` grants on this host: nothing, all GPUs, or those of some indices.
+    Raises ``LayerUnavailableError``: there is no such GPU. It would be missed later, and only by
+    some.
     """
     if gpu is False:
         return GpuGrant()

@@ -96,8 +96,9 @@ class RunnerLink:
             self._unsent[0] = self._unsent[0][sent:]
 
     def receive(self) -> list[tuple[Packet, Any]] | None:
-        """The replies that have arrived with their owners, or None at the end of the stream. Raises
-        ``RemoteProtocolError``: the runner sent what was not asked for. Trust: it is hostile.
+        """The replies that have arrived with their owners, or None at the end of the stream.
+        Raises ``RemoteProtocolError``: the runner sent what was not asked for. Trust: it is
+        hostile.
         """
         try:
             data = self.sock.recv(self._reader.chunk)

@@ -9,12 +9,13 @@ from typing import Any, cast
 import pytest
 
 from envhub_sandbox.session.prewarm import Prewarm, SuitePrewarm
+from envhub_worker.protocol.lifecycle import Lifecycle
 
 
 class _Task:
     """One environment of a suite, as far as this concerns it."""
 
-    closed = False
+    lifecycle = Lifecycle()
 
     def __init__(self) -> None:
         self.warm, self.cancelled = threading.Event(), threading.Event()

@@ -92,8 +92,9 @@ class Uploads:
     def offer(
         self, owner: bytes, key: bytes, request: m.OfferSnapshot, in_use: Collection[str]
     ) -> m.MissingBlobs:
-        """What is missing of a snapshot. Nothing: it lies ready. ``in_use``: trees that must stay,
-        by path. Raises ``RefusedError``: a listing that breaks a rule or the quota.
+        """What is missing of a snapshot. Nothing: it lies ready.
+        ``in_use``: trees that must stay, by path.
+        Raises ``RefusedError``: a listing that breaks a rule or the quota.
         """
         files = checked_listing(request.files, self._quotas)
         digest = digest_of(files)

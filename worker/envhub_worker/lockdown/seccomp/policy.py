@@ -172,7 +172,8 @@ def recorded_calls(verdicts: Mapping[str, Verdict], names: Iterable[str]) -> dic
 
     What is not there at all (ENOSYS), or only seems to work, is no attempt at anything: libraries
     ask for it on their way to something else. What names files is seen on its way to the kernel,
-    and so is what names a process, which may be another's. ``names``: every call that there is.
+    and so is what names a process, which may be another's.
+    ``names``: every call that there is.
     """
     denied = {name: _asking(name, verdicts.get(name, EPERM)) for name in names}
     seen: dict[str, Verdict] = dict.fromkeys(watched_calls(verdicts), ASK)

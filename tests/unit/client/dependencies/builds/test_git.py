@@ -159,7 +159,7 @@ def test_trees_that_hold_each_other(
     url: str, repository: Path, target: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Six objects list 100,000 files: what git prints of them never comes into our memory."""
-    monkeypatch.setattr(git, "MAX_FILES", 5_000)
+    monkeypatch.setattr(commits, "MAX_FILES", 5_000)
     kind = f"100644 blob {run_git(repository, 'hash-object', '-w', 'setup.py')}"
     for _ in range(5):
         tree = run_git(repository, "mktree", given="".join(f"{kind}\t{n}\n" for n in range(10)))
