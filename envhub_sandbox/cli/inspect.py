@@ -59,7 +59,7 @@ def inspect(
     """
     _check_options(context, static=static)
     if static:
-        _inspect_static(ref, as_json=json, sarif=sarif, fail_on=fail_on, make=make)
+        inspect_static(ref, as_json=json, sarif=sarif, fail_on=fail_on, make=make)
         return
     _inspect(make, suite, task, as_json=json)
 
@@ -129,7 +129,7 @@ def _check_options(context: typer.Context, *, static: bool) -> None:
             raise UsageError(f"{one.opts[0]} means nothing here: {why}")
 
 
-def _inspect_static(
+def inspect_static(
     ref: str,
     *,
     as_json: bool,

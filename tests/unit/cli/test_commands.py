@@ -11,18 +11,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import typer
 from typer.testing import CliRunner
 
 from envhub_sandbox.check.checks import Severity
 from envhub_sandbox.cli import cache, diff, image, inspect, lock, prefetch, push, replay, run
-from envhub_sandbox.cli.app import app
+from envhub_sandbox.cli.app import app, whole_command
 from envhub_sandbox.cli.doctor import doctor
 from envhub_sandbox.cli.init import init, starter
 from envhub_sandbox.cli.shared import exits, findings, versions
 from envhub_sandbox.cli.shared.console import guarded
-
-_COMMANDS: Any = typer.main.get_command(app)
 
 
 @pytest.fixture(autouse=True)
@@ -89,8 +86,9 @@ _MODULES = {
 @pytest.mark.parametrize("words", _MODULES)
 def test_a_command_is_a_function_of_its_module(words: str) -> None:
     """Of its own name, with its help in its docstring."""
-    found = _COMMANDS
-    for word in words.split():
+    name, *rest = words.split()
+    found = whole_command(name)
+    for word in rest:
         found = found.commands[word]
     callback = python.unwrap(found.callback)
     assert callback.__module__ == _MODULES[words].__name__
@@ -101,7 +99,7 @@ def test_a_command_is_a_function_of_its_module(words: str) -> None:
 def test_reading_is_no_running(monkeypatch: pytest.MonkeyPatch) -> None:
     """``--static`` goes another way, with its own options."""
     asked = list[Any]()
-    monkeypatch.setattr(inspect, "_inspect_static", lambda ref, **options: asked.append(options))
+    monkeypatch.setattr(inspect, "inspect_static", lambda ref, **options: asked.append(options))
     assert said("inspect", "./here", "--static", "--json")[0] == 0
     assert [one["as_json"] for one in asked] == [True]
     assert said("inspect", "./here", "--fail-on", "note")[0] == 2
