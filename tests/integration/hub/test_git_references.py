@@ -97,18 +97,20 @@ def test_a_pin_that_is_there_asks_nobody(
 
 
 def test_links_and_submodules(ref: str, repository: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """A link is a file with its text, as from the Hub; a submodule is left out, and said."""
+    """A link is a file with its text, as from the Hub; submodules and LFS are left out, and said."""
+    (repository / ".gitattributes").write_text("*.bin filter=lfs diff=lfs merge=lfs -text\n")
     (repository / "link").symlink_to("/etc/passwd")
     git(repository, "update-index", "--add", "--cacheinfo", f"160000,{'0' * 39}1,module")
-    git(repository, "add", "link")
+    git(repository, "add", "link", ".gitattributes")
     git(repository, "commit", "--quiet", "--message=x")
     with caplog.at_level(logging.WARNING):
         found = snapshot_named(f"{ref}:envs/env.py")
     names = {file.path for file in found.files}
-    assert names == {"envs/env.py", "envs/asset.bin", "later.txt", "link"}
+    assert names == {".gitattributes", "envs/env.py", "envs/asset.bin", "later.txt", "link"}
     assert (found.root / "link").read_bytes() == b"/etc/passwd"
     assert not (found.root / "link").is_symlink()
     assert "the submodule 'module' is left out" in caplog.text
+    assert "only the pointers are here" in caplog.text
 
 
 @pytest.mark.parametrize(
