@@ -97,7 +97,7 @@ def test_a_pin_that_is_there_asks_nobody(
 
 
 def test_links_and_submodules(ref: str, repository: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """A link is a file with its text, as from the Hub; submodules and LFS are left out, and said."""
+    """A link is a file with its text, as from the Hub; a submodule and LFS are left out."""
     (repository / ".gitattributes").write_text("*.bin filter=lfs diff=lfs merge=lfs -text\n")
     (repository / "link").symlink_to("/etc/passwd")
     git(repository, "update-index", "--add", "--cacheinfo", f"160000,{'0' * 39}1,module")
