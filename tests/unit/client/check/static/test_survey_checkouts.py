@@ -11,7 +11,7 @@ from envhub_sandbox.check.checks import Severity
 from envhub_sandbox.check.findings import Finding
 from envhub_sandbox.check.static.survey import survey
 from envhub_sandbox.errors import SnapshotError
-from envhub_sandbox.hub import checkout
+from envhub_sandbox.hub.git import checkout
 from envhub_sandbox.hub.snapshot import local
 from envhub_sandbox.hub.sources import parsing
 from tests.hub.olah_server import GitRepository
