@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import pickle
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,10 @@ from envhub_sandbox.hub.snapshot import SnapshotLimits, commit_of, fetch, snapsh
 from tests.support.packages.git_server import commit, git, git_served, make_repository
 from tests.support.repositories import CARTPOLE
 
-pytestmark = pytest.mark.short
+pytestmark = [
+    pytest.mark.short,
+    pytest.mark.skipif(shutil.which("git") is None, reason="needs git"),
+]
 
 
 @pytest.fixture
