@@ -81,8 +81,12 @@ class HubRef:
     @property
     def meaning(self) -> str:
         """The same for every way to write it."""
-        usual = {"git": "HEAD", "pypi": None}.get(self.repo_type or "", "main")
-        return grammar.join(self.parts._replace(revision=self.revision or usual))
+        return grammar.join(self.parts._replace(revision=self.usual_revision))
+
+    @property
+    def usual_revision(self) -> str | None:
+        """The revision, or what none means."""
+        return self.revision or {"git": "HEAD", "pypi": None}.get(self.repo_type or "", "main")
 
     @property
     def parts(self) -> Parts:

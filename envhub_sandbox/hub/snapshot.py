@@ -324,7 +324,7 @@ class _Candidate:
             size = sum(file.size for file in files)
             SNAPSHOT.info("%s: downloading %d files, %d bytes", slot.title, len(files), size)
             note = {"endpoint": self.host.public_endpoint, **self.repo._asdict()}
-            note["revision"] = None if self.ref.is_pinned else self.ref.revision or "main"
+            note["revision"] = None if self.ref.is_pinned else self.ref.usual_revision
             store.publish(slot, files, source.copier(files, slot.title), note)
         SNAPSHOT.info("%s: verified, and in the store", slot.title)
 

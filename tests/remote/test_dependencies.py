@@ -96,6 +96,20 @@ def test_what_it_imports_and_does_not_declare_is_made_there(
     ]
 
 
+def test_an_environment_of_a_package_needs_no_repository(
+    permitting: Listening, real_index: Index
+) -> None:
+    """The server installs the package, and the jail there imports it."""
+    registers = (
+        "import gymnasium\n"
+        "gymnasium.register('Far/Cart-v0', 'gymnasium.envs.classic_control:CartPoleEnv')\n"
+    )
+    make_wheel(real_index.folder, "far-carts", files={"far_carts/__init__.py": registers})
+    with make_env("pypi:far-carts#Far/Cart-v0", 2, sandbox=permitting.sandbox()) as suites:
+        assert suites.env.reset(seed=0)[0].shape == (2, 4)
+        assert "far-carts==1.0" in suites.provenance["installed"]["packages"]
+
+
 def test_what_cannot_be_made_is_told_here(
     permitting: Listening, real_index: Index, tmp_path: Path
 ) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -132,7 +133,10 @@ def print_provenance(provenance: dict[str, Any], *, in_process: bool) -> None:
         show("could read", str(asset), width=_WIDTH)
     interpreter = provenance.get("interpreter") or {}
     if interpreter:
-        text = _interpreter(interpreter, provenance.get("packages") or {})
+        shown = {*_SHOWN_PACKAGES}
+        if provenance["repo_type"] == "pypi":  # which says no version, or only in the reference
+            shown.add(_canonical(re.split(r"[\[@#]", provenance["repository"])[0]))
+        text = _interpreter(interpreter, provenance.get("packages") or {}, shown)
         show("ran on", text, width=_WIDTH)
     for title, text in _confinement(provenance, in_process):
         show(title, text, width=_WIDTH)
@@ -146,8 +150,13 @@ def _repository(provenance: dict[str, Any]) -> str:
     return f"{provenance['repository']} ({kind}) at {commit}, {provenance['path']}"
 
 
-def _interpreter(interpreter: dict[str, str], packages: dict[str, str]) -> str:
-    shown = [f"{name} {packages[name]}" for name in _SHOWN_PACKAGES if name in packages]
+def _canonical(name: str) -> str:
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def _interpreter(interpreter: dict[str, str], packages: dict[str, str], names: set[str]) -> str:
+    found = {_canonical(name): release for name, release in packages.items()}
+    shown = [f"{name} {found[name]}" for name in sorted(names & found.keys())]
     version, executable = interpreter.get("version", ""), interpreter.get("executable", "")
     return ", ".join([f"{version} ({executable})", *shown])
 

@@ -13,6 +13,8 @@ from envhub_sandbox.hub.hashing import GIT_SHA1, HashMismatch, write_verified
 from envhub_sandbox.hub.listing import Copier, FileRecord, Repository
 from envhub_sandbox.system.log import SNAPSHOT
 
+_LOOKED_AT = 64 << 10
+
 
 @dataclass(frozen=True)
 class GitHost:
@@ -28,9 +30,21 @@ class GitHost:
     def files(self, repo: Repository, commit: str) -> Iterator[_FetchedFiles]:
         """The files of a commit. Links are files with their text; submodules are left out."""
         with commits.fetched(f"{self.public_endpoint}/{repo.repo_id}", commit) as found:
+            title = f"{repo.repo_id}@{commit[:12]}"
             for path in found.submodules:
-                SNAPSHOT.warning("%s@%s: the submodule %r is left out", repo.repo_id, commit, path)
+                SNAPSHOT.warning("%s: the submodule %r is left out", title, path)
+            if _has_lfs(found):
+                SNAPSHOT.warning("%s: of its files in LFS only the pointers are here", title)
             yield _FetchedFiles(found)
+
+
+def _has_lfs(found: commits.GitFiles) -> bool:
+    """Whether ``.gitattributes`` at its root says so."""
+    for blob in found.blobs:
+        if blob.path == ".gitattributes":
+            with found.open(blob) as stream:
+                return b"filter=lfs" in stream.read(_LOOKED_AT)
+    return False
 
 
 @dataclass(frozen=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import pickle
+import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,10 @@ from envhub_sandbox.hub.snapshot import SnapshotLimits, commit_of, fetch, snapsh
 from tests.support.packages.git_server import commit, git, git_served, make_repository
 from tests.support.repositories import CARTPOLE
 
-pytestmark = pytest.mark.short
+pytestmark = [
+    pytest.mark.short,
+    pytest.mark.skipif(shutil.which("git") is None, reason="needs git"),
+]
 
 
 @pytest.fixture
@@ -97,18 +101,20 @@ def test_a_pin_that_is_there_asks_nobody(
 
 
 def test_links_and_submodules(ref: str, repository: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """A link is a file with its text, as from the Hub; a submodule is left out, and said."""
+    """A link is a file with its text, as from the Hub; a submodule and LFS are left out."""
+    (repository / ".gitattributes").write_text("*.bin filter=lfs diff=lfs merge=lfs -text\n")
     (repository / "link").symlink_to("/etc/passwd")
     git(repository, "update-index", "--add", "--cacheinfo", f"160000,{'0' * 39}1,module")
-    git(repository, "add", "link")
+    git(repository, "add", "link", ".gitattributes")
     git(repository, "commit", "--quiet", "--message=x")
     with caplog.at_level(logging.WARNING):
         found = snapshot_named(f"{ref}:envs/env.py")
     names = {file.path for file in found.files}
-    assert names == {"envs/env.py", "envs/asset.bin", "later.txt", "link"}
+    assert names == {".gitattributes", "envs/env.py", "envs/asset.bin", "later.txt", "link"}
     assert (found.root / "link").read_bytes() == b"/etc/passwd"
     assert not (found.root / "link").is_symlink()
     assert "the submodule 'module' is left out" in caplog.text
+    assert "only the pointers are here" in caplog.text
 
 
 @pytest.mark.parametrize(

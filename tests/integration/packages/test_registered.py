@@ -213,6 +213,8 @@ def test_commands_know_it(packages: Index, tmp_path: Path) -> None:
     assert envhub("inspect", ref)["provenance"]["repo_type"] == "pypi"
     played = envhub("run", ref, "--episodes", "1", "--steps", "5")
     assert played["provenance"]["repository"] == ref.removeprefix("pypi:")
+    shown = CliRunner().invoke(app, ["run", newer, "--episodes", "1", "--steps", "5"])
+    assert "walled 2.0" in " ".join(shown.output.split())
     judged = CliRunner().invoke(app, ["check", newer, "--steps", "20"])
     said = " ".join(judged.output.split())
     assert "another commit or version tomorrow" in said
@@ -231,3 +233,5 @@ def test_a_crash_bundle_has_it(packages: Index, tmp_path: Path) -> None:
             suites.env.step(suites.env.action_space.sample())
     [folder] = [path.parent for path in tmp_path.rglob("bundle.json")]
     assert load_bundle(folder).reference == ref
+    replayed = CliRunner().invoke(app, ["replay", str(folder)])
+    assert replayed.exit_code == 0, replayed.output

@@ -90,6 +90,13 @@ def test_refusal_says_what_to_write(text: str, what: str, write: str) -> None:
     assert "secret" not in str(caught.value)
 
 
+@pytest.mark.parametrize("name", ['x#a"b', "x#a\nb", "x\n--pre#a", "x #a", "x"])
+def test_a_reference_that_was_not_parsed_is_checked_too(name: str) -> None:
+    """What becomes source and a requirement has no quotes, ends of lines or options."""
+    with pytest.raises(HubReferenceError):
+        HubRef(name, repo_type="pypi")
+
+
 def test_what_git_may_be_given() -> None:
     """No option, no login, no other protocol: whoever asks."""
     assert address.is_url("https://h/x")
