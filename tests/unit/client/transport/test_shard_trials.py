@@ -62,10 +62,14 @@ def test_the_fastest_of_all_that_were_tried_is_used(
     assert {use(path, times) for _ in range(5)} == {expected}
 
 
-def test_where_computing_is_all_fewer_shards_are_not_tried(path: Path) -> None:
-    """A use that is twice as slow would be a high price for what is known already."""
-    times = {"8+8": 16e-3, "10+6": 20e-3}
-    assert [use(path, times) for _ in range(4)] == ["8+8", "10+6", "8+8", "8+8"]
+def test_where_half_as_many_are_slower_fewer_are_not_tried(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A use that is many times as slow would be a high price for what is known already."""
+    cores(monkeypatch, 8)
+    tried = ["1+1+1+1+1+1+1+1", "2+1+1+1+1+1+1", "2+2+2+2"]
+    times = dict(zip(tried, (16e-3, 32e-3, 32e-3), strict=True))
+    assert [use(path, times, 8) for _ in range(5)] == [*tried, tried[0], tried[0]]
 
 
 def test_another_load_lets_all_be_tried_again(path: Path) -> None:
