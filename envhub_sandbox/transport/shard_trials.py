@@ -69,8 +69,8 @@ class ShardTrials:
 
     def note(self, env: EnvManifest, bounds: Bounds, step_s: float) -> None:
         """Remember what a step took. A cache that cannot be written is no error."""
-        if self._path is None or not _is_sane(step_s):
-            return
+        if self._path is None or env.sync or env.num_envs == 1 or not _is_sane(step_s):
+            return  # it must not be remembered, or there is no choice
         entries = self._read()
         times, name = self._times(entries, env), _name(bounds)
         slower = step_s / times.get(name, step_s)

@@ -6,6 +6,7 @@ import json
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 from gymnasium.spaces import Discrete
@@ -153,6 +154,13 @@ def test_a_damaged_file_is_as_none(path: Path, content: bytes) -> None:
 def test_an_impossible_time_is_not_remembered(path: Path, step_s: float) -> None:
     """A clock may be strange."""
     ShardTrials(path).note(ENV, [(0, 16)], step_s)
+    assert not path.exists()
+
+
+@pytest.mark.parametrize("env", [environment(16, sync=True), environment(1)])
+def test_where_there_is_no_choice_nothing_is_remembered(path: Path, env: Any) -> None:
+    """Each close would write a file for it."""
+    ShardTrials(path).note(env, [(0, env.num_envs)], 1e-3)
     assert not path.exists()
 
 
