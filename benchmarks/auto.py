@@ -2,7 +2,7 @@
 
 For each workload and size the pin is first used as often as it has ways to be tried; then all step
 in turn, in one process: SyncVectorEnv, one worker, two, four and so on up to the cores, and what
-was chosen (*auto*). Reported: the median over the rounds of each round's median step. A round in
+was chosen (*auto*). Reported: the median over the rounds of each round's mean step. A round in
 which the host took more than a few per cent of the time is left out, if others remain.
 """
 
@@ -72,13 +72,13 @@ def _row(workload: Workload, count: int, rounds: int, seconds: float) -> str:
             steppers[workers] = stack.enter_context(_made(workload, count, workers)).env
         for env in steppers.values():
             env.reset(seed=0)
-        medians, share = _turns(steppers, action_batches(workload.name, count), rounds, seconds)
+        means, share = _turns(steppers, action_batches(workload.name, count), rounds, seconds)
         sizes = "+".join(str(stop - start) for start, stop in inside.bounds(steppers[None]))
-    best, auto = min(medians[workers] for workers in fixed), medians[None]
+    best, auto = min(means[workers] for workers in fixed), means[None]
     cells = (
-        *(workload.title, count, round(medians["sync"])),
-        ", ".join(f"{workers}: {medians[workers]:.0f}" for workers in fixed),
-        *(round(auto), f"{auto / best:.2f}", f"{auto / medians['sync']:.2f}"),
+        *(workload.title, count, round(means["sync"])),
+        ", ".join(f"{workers}: {means[workers]:.0f}" for workers in fixed),
+        *(round(auto), f"{auto / best:.2f}", f"{auto / means['sync']:.2f}"),
         *(sizes, uses, f"{share:.1%}", f"{load_average():.1f}"),
     )
     return "| " + " | ".join(map(str, cells)) + " |"
@@ -102,7 +102,7 @@ def _try_out(workload: Workload, count: int, seconds: float) -> int:
 def _turns(
     steppers: dict[Any, Any], batches: list[Any], rounds: int, seconds: float
 ) -> tuple[dict[Any, float], float]:
-    """Microseconds of a median step of each, and the share of the time that was stolen."""
+    """Microseconds of a mean step of each, and the share of the time that was stolen."""
     actions = itertools.cycle(batches)
     taken: list[float] = []
     found: list[dict[Any, float]] = []
@@ -113,12 +113,12 @@ def _turns(
         lost, passed = (late - early for late, early in zip(stolen(), before, strict=True))
         taken.append(lost / max(passed, 1))
     kept = [one for one, share in zip(found, taken, strict=True) if share <= _STOLEN] or found
-    medians = {who: statistics.median(one[who] for one in kept) for who in steppers}
-    return medians, sum(taken) / len(taken)
+    means = {who: statistics.median(one[who] for one in kept) for who in steppers}
+    return means, sum(taken) / len(taken)
 
 
 def _slice(env: Any, actions: Iterator[Any], seconds: float) -> float:
-    return float(run_slice(env, Slice(seconds, _LEAST_STEPS), actions)["p50_ns"]) / 1e3
+    return float(run_slice(env, Slice(seconds, _LEAST_STEPS), actions)["mean_ns"]) / 1e3
 
 
 def _made(workload: Workload, count: int, workers: int | None) -> Any:

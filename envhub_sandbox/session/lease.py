@@ -37,6 +37,10 @@ from envhub_worker.protocol.lifecycle import Lifecycle, State
 
 _WITHOUT_A_JAIL = frozenset({State.EXPIRED, State.DEAD, State.FOREIGN, State.CLOSED})
 """It may not have been given back yet."""
+_COLD_STEPS = 8
+"""The first ones, in which much happens once."""
+_LONGEST = 30
+"""Of a step, in medians, that counts as one of those that wait for a core."""
 _SUCCESSOR_S = 60.0
 """For how long a restart waits for the server that comes in the place of one that ends."""
 
@@ -254,11 +258,15 @@ class Lease:
             lane.jail.receive(lane.jail.send("close", requests), deadline)
 
     def note_steps(self) -> None:
-        """Remember what a typical step took, for the next use of the pin."""
+        """Remember what a step took, for the next use of the pin."""
         latencies_s = self.counters.latencies_s()
         if len(latencies_s) >= LEAST_STEPS:
-            typical_s = float(np.median(latencies_s))
-            self._trials.note(self.results.manifest, self.results.bounds, typical_s)
+            latencies_s = latencies_s[_COLD_STEPS:]
+            # the mean, for on a busy machine it is a few steps that wait for a core, and long; but
+            # a pause counts no more than they do
+            longest_s = _LONGEST * np.median(latencies_s)
+            step_s = float(np.minimum(latencies_s, longest_s).mean())
+            self._trials.note(self.results.manifest, self.results.bounds, step_s)
 
     def let_go(self, *, wait: bool = True) -> None:
         """Give back whatever is left, for good. A fork of its owner gives back nothing."""

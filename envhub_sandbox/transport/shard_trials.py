@@ -26,7 +26,7 @@ ENOUGH_STEPS = 512
 _NEARLY = 1.03
 """So much slower counts as equal."""
 HOPELESS = 1.2
-"""After a way that is so much slower than the best, those with still fewer shards are left out."""
+"""Where half as many shards are so much slower than the best, still fewer are not tried."""
 _ANOTHER_LOAD = 1.5
 """So much slower or faster than the last time is no noise."""
 
@@ -62,15 +62,15 @@ class ShardTrials:
             if step_s is None:
                 return bounds
             tried.append((step_s, bounds))
-            if step_s > HOPELESS * min(tried)[0]:
+            if 2 * len(bounds) <= len(tried[0][1]) and step_s > HOPELESS * min(tried)[0]:
                 break
         enough = _NEARLY * min(tried)[0]
         return [bounds for step_s, bounds in tried if step_s <= enough][-1]
 
     def note(self, env: EnvManifest, bounds: Bounds, step_s: float) -> None:
-        """Remember what a typical step took. A cache that cannot be written is no error."""
-        if self._path is None or not _is_sane(step_s):
-            return
+        """Remember what a step took. A cache that cannot be written is no error."""
+        if self._path is None or env.sync or env.num_envs == 1 or not _is_sane(step_s):
+            return  # it must not be remembered, or there is no choice
         entries = self._read()
         times, name = self._times(entries, env), _name(bounds)
         slower = step_s / times.get(name, step_s)

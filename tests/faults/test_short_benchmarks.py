@@ -1,4 +1,4 @@
-"""Short forms of ``benchmarks/soak.py``, ``monkey.py`` and ``clients.py``; and what they notice."""
+"""Short forms of ``benchmarks``: ``soak``, ``monkey``, ``clients``, ``auto``; what they notice."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks import clients, monkey, soak
+from benchmarks import auto, clients, monkey, soak
 from tests.support import inside
 
 
@@ -121,3 +121,14 @@ def test_growth_would_be_noticed() -> None:
     for name in flat:
         found["at_the_end"] = {**flat, name: flat[name] + 100}
         assert clients.grows(found) == [name]
+
+
+def test_short_auto(capsys: pytest.CaptureFixture[str]) -> None:
+    """One size of one workload: it runs, and each column has something in it."""
+    short = ["--rounds", "1", "--seconds", "0.01", "--busy", "1"]
+    auto.main(["--workloads", "cartpole", "--sizes", "2", *short])
+    header, _, row = [line for line in capsys.readouterr().out.splitlines() if "|" in line]
+    cells = [cell.strip() for cell in row.strip("|").split("|")]
+    assert len(cells) == header.count("|") - 1
+    assert cells[:2] == ["CartPole", "2"]
+    assert all(cells)

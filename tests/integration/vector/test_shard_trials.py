@@ -41,3 +41,18 @@ def test_the_first_uses_try_all_ways_and_give_the_same(
     for _, found in uses[1:]:
         assert_same(found, uses[0][1])
     assert use(lane, 0)[0] in WAYS
+
+
+def test_an_environment_that_is_never_closed_counts(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Any
+) -> None:
+    """A training may be killed: after enough steps it is noted what they took."""
+    monkeypatch.setenv("ENVHUB_CACHE", str(tmp_path))
+    monkeypatch.setattr(shard_trials, "ways_to_cut", lambda count, cores: WAYS)
+    with make_env(sample("cartpole"), N_ENVS, use_async_envs=True) as suites:
+        suites.env.reset(seed=3)
+        for left in range(shard_trials.ENOUGH_STEPS, 0, -1):
+            if left == 1:
+                assert use("auto", 0)[0] == WAYS[0]
+            suites.env.step(np.zeros(N_ENVS, np.int64))
+        assert use("auto", 0)[0] == WAYS[1]

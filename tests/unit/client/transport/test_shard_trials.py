@@ -6,6 +6,7 @@ import json
 from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 from gymnasium.spaces import Discrete
@@ -62,10 +63,14 @@ def test_the_fastest_of_all_that_were_tried_is_used(
     assert {use(path, times) for _ in range(5)} == {expected}
 
 
-def test_where_computing_is_all_fewer_shards_are_not_tried(path: Path) -> None:
-    """A use that is twice as slow would be a high price for what is known already."""
-    times = {"8+8": 16e-3, "10+6": 20e-3}
-    assert [use(path, times) for _ in range(4)] == ["8+8", "10+6", "8+8", "8+8"]
+def test_where_half_as_many_are_slower_fewer_are_not_tried(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A use that is many times as slow would be a high price for what is known already."""
+    cores(monkeypatch, 8)
+    tried = ["1+1+1+1+1+1+1+1", "2+1+1+1+1+1+1", "2+2+2+2"]
+    times = dict(zip(tried, (16e-3, 32e-3, 32e-3), strict=True))
+    assert [use(path, times, 8) for _ in range(5)] == [*tried, tried[0], tried[0]]
 
 
 def test_another_load_lets_all_be_tried_again(path: Path) -> None:
@@ -149,6 +154,13 @@ def test_a_damaged_file_is_as_none(path: Path, content: bytes) -> None:
 def test_an_impossible_time_is_not_remembered(path: Path, step_s: float) -> None:
     """A clock may be strange."""
     ShardTrials(path).note(ENV, [(0, 16)], step_s)
+    assert not path.exists()
+
+
+@pytest.mark.parametrize("env", [environment(16, sync=True), environment(1)])
+def test_where_there_is_no_choice_nothing_is_remembered(path: Path, env: Any) -> None:
+    """Each close would write a file for it."""
+    ShardTrials(path).note(env, [(0, env.num_envs)], 1e-3)
     assert not path.exists()
 
 
