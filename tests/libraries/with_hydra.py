@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import gymnasium as gym
+from compared import folder, report
 from hydra import compose, initialize
 from omegaconf import ListConfig
-from tests.libraries.compared import folder, report
 
 from envhub_sandbox import make_env
 

@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pufferlib.emulation
 import pufferlib.vector
-from tests.libraries.compared import folder, report
+from compared import folder, report
 
 from envhub_sandbox import SandboxEnv
 

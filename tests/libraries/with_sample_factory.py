@@ -6,11 +6,10 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import torch
+from compared import folder, report
 from sample_factory.algo.utils.make_env import make_env_func_batched
 from sample_factory.envs.env_utils import register_env
 from sample_factory.utils.attr_dict import AttrDict
-from tests.libraries.compared import folder, report
 
 from envhub_sandbox import SandboxEnv
 
@@ -28,11 +27,11 @@ def played(sandboxed: bool) -> list[Any]:
     name = "sandboxed" if sandboxed else "here"
     config = AttrDict(env=name, env_gpu_observations=False, with_wandb=False)
     env = make_env_func_batched(config, AttrDict(worker_index=0, vector_index=0, env_id=0))
-    env.seed(1) if hasattr(env, "seed") else None
+
     drawn = np.random.default_rng(0)
     seen = [{key: one.numpy().copy() for key, one in env.reset(seed=1)[0].items()}]
     for _ in range(STEPS):
-        observations, *rest = env.step(torch.tensor([drawn.integers(0, 2)]))[:4]
+        observations, *rest = env.step(np.array([drawn.integers(0, 2)]))[:4]
         found = {key: one.numpy().copy() for key, one in observations.items()}
         seen.append((found, *(one.numpy().copy() for one in rest)))  # type: ignore[arg-type]
     env.close()

@@ -6,7 +6,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from tests.libraries.compared import folder, report
+from compared import folder, report
 from tianshou.env import DummyVectorEnv, SubprocVectorEnv
 
 from envhub_sandbox import SandboxEnv
