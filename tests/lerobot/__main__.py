@@ -1,7 +1,10 @@
 """``python -m tests.lerobot [VERSION...]``: all that is tested with LeRobot, each in its own.
 
-An interpreter of its own for each version, with what that version asks for, and the plugin
-distribution installed from its folder. A torch without CUDA is taken from ``$PIP_FIND_LINKS``.
+A version is a release, or ``main``: the newest commit of a clone of LeRobot's repository, which
+``--source`` or ``$ENVHUB_LEROBOT_SOURCE`` names (a bare one will do). LeRobot's own tests of
+environments lie there as well; without it they are not run, nor is ``main``. An interpreter of its
+own for each version, with what that version asks for, and the plugin distribution installed from
+its folder. A torch without CUDA is taken from ``$PIP_FIND_LINKS``.
 """
 
 from __future__ import annotations
@@ -16,7 +19,7 @@ from pathlib import Path
 from uv import find_uv_bin
 
 from benchmarks import lerobot_venv
-from tests.lerobot.kit import OWN
+from tests.lerobot.kit import OWN, THEIRS
 
 _BOTH = (
     *("torch", "gymnasium>=1.1", "einops", "requests", "safetensors", "packaging<26", "termcolor"),
@@ -30,11 +33,24 @@ WANTED = {
         *("imageio[ffmpeg]", "diffusers", "pynput"),
     ),
 }
-TESTS = tuple(f"tests/lerobot/{name}.py" for name in ("test_pages", "evaluation", "training"))
+WANTED["main"] = WANTED["0.6.1"]
+TESTS = tuple(
+    f"tests/lerobot/{name}.py" for name in ("test_pages", "evaluation", "training", "theirs")
+)
 
 
-def make(version: str, folder: Path) -> Path:
-    """An interpreter with that LeRobot."""
+def checkout(source: str, version: str, folder: Path) -> Path:
+    """The files of that version, from a clone."""
+    folder.mkdir()
+    commit = "HEAD" if version == "main" else f"v{version}"
+    archive = ["git", "-C", source, "archive", commit]
+    packed = subprocess.run(archive, check=True, capture_output=True).stdout
+    subprocess.run(["tar", "-x", "-C", str(folder)], input=packed, check=True)
+    return folder
+
+
+def make(version: str, folder: Path, source: Path | None = None) -> Path:
+    """An interpreter with that LeRobot; of ``main``, of its source."""
     plugin = Path(__file__).parents[2] / "plugins" / "lerobot_env_envhub_sandbox"
     uv = [find_uv_bin()]
     subprocess.run([*uv, "venv", "--quiet", "--python", sys.executable, str(folder)], check=True)
@@ -56,7 +72,10 @@ def make(version: str, folder: Path) -> Path:
     subprocess.run([*install, "--no-deps", "torchvision", str(plugin)], check=True)
     # where it lies is said, since uv does not install what asks for a newer Python
     target = ["--target", str(packages), "--python-version", "3.12"]
-    subprocess.run([*install, "--no-deps", *target, f"lerobot=={version}"], check=True)
+    wanted = str(source) if version == "main" else f"lerobot=={version}"
+    subprocess.run([*install, "--no-deps", *target, wanted], check=True)
+    if source is not None:
+        subprocess.run([*install, "pytest", "pytest-timeout"], check=True)
     lerobot_venv.adapt(packages)
     return python
 
@@ -64,15 +83,25 @@ def make(version: str, folder: Path) -> Path:
 def main() -> None:
     """Run the tests with each version; exits with 1 when one of them failed."""
     parser = argparse.ArgumentParser(prog="python -m tests.lerobot")
-    parser.add_argument("versions", nargs="*", metavar="version", default=list(WANTED))
+    parser.add_argument("versions", nargs="*", metavar="version", help=", ".join(WANTED))
+    source = os.environ.get("ENVHUB_LEROBOT_SOURCE", "")
+    parser.add_argument("--source", default=source, help="a clone of LeRobot's repository")
+    options = parser.parse_args()
+    known = [version for version in WANTED if version != "main" or options.source]
     failed = []
-    for version in parser.parse_args().versions:
+    for version in options.versions or known:
+        if version == "main" and not options.source:
+            parser.error("main needs --source: a clone of https://github.com/huggingface/lerobot")
         with tempfile.TemporaryDirectory(prefix="lerobot-") as folder:
             os.chmod(folder, 0o755)  # jails of root run as another user
-            python = make(version, Path(folder) / "venv")
+            found = None
+            if options.source:
+                found = checkout(options.source, version, Path(folder) / "lerobot")
+            python = make(version, Path(folder) / "venv", found)
             print(f"== LeRobot {version}", flush=True)
-            command = [sys.executable, "-m", "pytest", "-q", "--full", *TESTS]
-            done = subprocess.run(command, env={**os.environ, OWN: str(python)}, check=False)
+            command = [sys.executable, "-m", "pytest", "-q", "-rP", "--full", *TESTS]
+            variables = {OWN: str(python), THEIRS: str(found or "")}
+            done = subprocess.run(command, env={**os.environ, **variables}, check=False)
             failed += [version] if done.returncode else []
     sys.exit(f"failed with LeRobot {', '.join(failed)}" if failed else 0)
 

@@ -19,6 +19,8 @@ OVERLAY = "ENVHUB_TEST_LEROBOT"
 """A folder with LeRobot and what it imports at least, for this interpreter: ``./test`` makes it."""
 OWN = "ENVHUB_TEST_LEROBOT_PYTHON"
 """An interpreter that has all of LeRobot: ``python -m tests.lerobot`` makes it."""
+THEIRS = "ENVHUB_TEST_LEROBOT_SOURCE"
+"""A folder with LeRobot's repository at that version, if there is one."""
 
 
 def run(program: str, olah: OlahServer, home: Path, *arguments: str) -> Any:
