@@ -119,6 +119,7 @@ def test_options_become_arguments_of_make_env(monkeypatch: pytest.MonkeyPatch) -
         "python": "/usr/bin/python3",
         "dependencies": {"python": "3.12"},
         "lock": None,
+        "assets": [],
         "num_workers": 2,
         "validate": True,
     }
