@@ -85,6 +85,9 @@ def _with_options(config: type[Any]) -> type[Any]:
         if one.kind is dict:
             config.__annotations__[key] = dict[str, Any]
             setattr(config, key, field(default_factory=dict))
+        elif one.kind is list:
+            config.__annotations__[key] = list[str]
+            setattr(config, key, field(default_factory=list))
         else:
             config.__annotations__[key] = one.kind if one.default is not None else one.kind | None
             setattr(config, key, one.default)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import pickle
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import HubReferenceError, RemoteEnvError, RepositoryUnavailableError
+from envhub_sandbox.hub.cache import remove_tree
 from tests.hub.stub_hub import StubHub, StubRepository
 from tests.support.interpreter import profiles
 from tests.support.repositories import STILL
@@ -113,10 +115,22 @@ def test_an_asset_is_found_and_read_only(make: Make, asset: str) -> None:
         assert suites.provenance["assets"] == [f"datasets/org/data@{DATA}"]
 
 
-@pytest.mark.parametrize("arena", profiles("no-userns"))
-def test_a_profile_without_mounts_shows_an_asset_too(make: Make, arena: str) -> None:
+@pytest.fixture
+def open_store(snapshot_store: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """A store that other users may read, such as those of root's jails."""
+    with tempfile.TemporaryDirectory(dir="/var/tmp") as folder:
+        Path(folder).chmod(0o755)
+        monkeypatch.setenv("ENVHUB_CACHE", folder)
+        yield
+        remove_tree(Path(folder) / "snapshots")
+
+
+@pytest.mark.usefixtures("open_store")
+@pytest.mark.parametrize("profile", profiles("no-userns"))
+def test_a_profile_without_mounts_shows_an_asset_too(make: Make, profile: str) -> None:
     """By Landlock; and every process of an environment that is spread finds it."""
-    options = {"policy": {"profile": arena}, "n_envs": 4, "use_async_envs": True, "num_workers": 2}
+    options = {"policy": {"profile": profile}, "n_envs": 4, "use_async_envs": True}
+    options["num_workers"] = 2
     with make(assets=["org/data"], **options) as suites:
         assert suites.env.call("text", "org/data", "mesh.txt", "dataset") == ("a mesh",) * 4
         with pytest.raises(OSError, match=r"Read-only|Permission"):

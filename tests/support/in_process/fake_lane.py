@@ -101,7 +101,8 @@ class FakeRepository(Repository):
     """A repository without files, of which no crash is kept."""
 
     def __init__(self) -> None:
-        self.snapshot = cast("Any", SimpleNamespace(label="a/b", path=None, root=None, assets=()))
+        known = {"label": "a/b", "path": None, "root": None, "assets": (), "hub_copies": ()}
+        self.snapshot = cast("Any", SimpleNamespace(**known))
         self.policy, self.timeouts = Policy(crash_history=8), Timeouts()
         self.warnings, self.recipe, self.copy = RemoteWarnings(), None, True
 

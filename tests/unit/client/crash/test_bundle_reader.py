@@ -225,6 +225,15 @@ def test_packages_of_a_bundles_choice_are_a_wish(tmp_path: Path, given: Any) -> 
     assert wishes(load_bundle(bundle(tmp_path / "b", dependencies="auto"))) == []
 
 
+def test_assets_of_a_bundle_are_a_wish(tmp_path: Path) -> None:
+    """A stranger's bundle could name what only the caller's token reads."""
+    found = load_bundle(bundle(tmp_path / "a", assets=["me/private"]))
+    assert wishes(found) == ["assets=['me/private']"]
+    assert "assets" not in replayed_arguments(found, granted=False)
+    assert replayed_arguments(found, granted=True)["assets"] == ["me/private"]
+    assert wishes(load_bundle(bundle(tmp_path / "b", assets=[]))) == []
+
+
 def test_wishes_beyond_an_ordinary_run_are_told(tmp_path: Path) -> None:
     """They are granted by the user, or left out."""
     policy = Policy(

@@ -51,6 +51,7 @@ def test_what_is_written_is_read_again(tmp_path: Path) -> None:
     full = changed(
         only=("a<2",), override=("b==1",), without=("c",), inferred=("d (env.py, line 1)",)
     )
+    full = dataclasses.replace(full, assets=(f"datasets/org/data@{'2' * 40}",))
     lockfile.write(full, path)
     assert lockfile.read(path) == full
     choice = making.again(full)
@@ -177,6 +178,7 @@ OTHER_BOX = gym.spaces.Box(-1, 2, (3,), np.float32)
             f"package one==1.0: the file with SHA-256 {B[:12]}... was locked, there is {A[:12]}",
         ),
         (changed(packages=()), "package one: gone, 1.0 was locked"),
+        (changed(assets=("org/a@1",)), "assets: none were locked, these are org/a@1"),
         (
             changed(spaces=Spaces('{"size": 8}', (dataclasses.replace(TASK, task=1),))),
             "environment suite/0: gone",

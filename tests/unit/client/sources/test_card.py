@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from envhub_sandbox.hub.reference import HubRef
 from envhub_sandbox.hub.sources.card import CardError, declared_assets
 
 COMMIT = "a" * 40
@@ -66,3 +67,12 @@ def test_merges_are_not_followed(tmp_path: Path) -> None:
     doubled = "".join(f"a{n + 1}: &a{n + 1}\n  <<: [*a{n}, *a{n}]\n" for n in range(30))
     with pytest.raises(CardError, match="takes 'assets'"):
         declared(tmp_path, f"---\na0: &a0 {{k: 1}}\n{doubled}envhub: *a30\nx: 1\n---\n")
+
+
+def test_the_documented_card_is_read(tmp_path: Path) -> None:
+    """The block in docs/authors.md, as an author copies it."""
+    page = (Path(__file__).parents[4] / "docs" / "authors.md").read_text()
+    block = next(one for one in page.split("```") if one.strip().startswith("---"))
+    model, dataset = declared(tmp_path, block.lstrip())
+    assert HubRef.parse(model).is_pinned
+    assert HubRef.parse(dataset).repo_type == "dataset"

@@ -26,6 +26,9 @@ _HOST_FILES = (
     "/etc/mime.types",
     "/etc/nsswitch.conf",
     "/etc/passwd",
+    "/etc/pki/tls/certs",
+    "/etc/ssl/certs",  # clients of the Hub read public certificates before they see it is offline
+    "/etc/ssl/openssl.cnf",
     "/proc/cpuinfo",
     "/proc/filesystems",
     "/proc/meminfo",

@@ -116,6 +116,14 @@ def test_each_engine_gets_its_own_words(
     assert expected <= {*words, *itertools.pairwise(words)}
 
 
+def test_assets_are_mounted_beside_the_snapshot_and_read_only() -> None:
+    """By a number: their paths outside stay unknown inside."""
+    words = run_arguments.run_arguments(DOCKER, replace(WANTED, assets=("/c/a/tree", "/c/b/tree")))
+    for number, path in enumerate(("/c/a/tree", "/c/b/tree")):
+        place = f'"dst=/snapshots/asset-{number}"'
+        assert f'"type=bind","src={path}",{place},"readonly"' in words
+
+
 def test_without_control_groups_there_are_no_limits() -> None:
     """They are left out altogether, by explicit choice."""
     words = run_arguments.run_arguments(PODMAN, replace(WANTED, memory=None, pids=None, cpus=None))

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
@@ -12,6 +15,8 @@ from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.sandboxes.docker.engines import Engine
 from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox, RepositoryContainer
 from envhub_sandbox.settings.policy import Policy
+from envhub_sandbox.transport.deadline import Deadline
+from envhub_worker.protocol import messages as m
 from tests.support.processes import descendants, eventually
 
 _ENGINE = """#!{python} -S
@@ -55,6 +60,18 @@ def test_a_container_serves_until_it_is_given_back(tmp_path: Path) -> None:
     use.release()
     assert not server.folder.exists()
     assert eventually(lambda: descendants() <= before)
+
+
+def test_an_order_names_assets_as_they_lie_inside(tmp_path: Path) -> None:
+    """The snapshot, and each tree of the jail's cache of the Hub."""
+    place = replace(sandbox(tmp_path, "serves"), assets=(Path("/c/a"), Path("/c/b")))
+    own, *others = (("models--org--r", "", ""), ("datasets--a--b", "/c/b", "asset-1"))
+    copies = tuple((name, "a" * 40, ("main",), tree) for name, tree, _ in (own, *others))
+    order = m.OpenJail("x", "", "", "/c/own", "env.py", {}, 1, hub_copies=copies)
+    server = cast("Any", SimpleNamespace(python="", profile="strict"))
+    made = place.prepare(order, server, cast("Any", None), Deadline(1))
+    assert made.snapshot == "/snapshots/this"
+    assert [copy.tree for copy in made.repositories] == ["", "/snapshots/asset-1"]
 
 
 @pytest.mark.parametrize(
