@@ -7,6 +7,7 @@ docs/internals/interruption.md, rules 10 to 12.
 from __future__ import annotations
 
 import threading
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -14,18 +15,24 @@ from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
 from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.session.refusals import closed_during
 from envhub_sandbox.session.survival.failures import Failures
+from envhub_sandbox.transport.remote_warnings import level_of_the_caller
 from envhub_worker.protocol.lifecycle import State
 from envhub_worker.protocol.untrusted import blamed, is_fault
 
 
 class UseLock:
     """The lock of one environment, and what is to be done when it is released.
-    ``lock``: held for as long as a use lasts; reentrant, for a signal handler may close what its
-    own thread waits for.
+
+    Attributes:
+        lock: Held for as long as a use lasts; reentrant, for a signal handler may close what its
+            own thread waits for.
+        stepping: The thread that is in a step, as far as it was not interrupted there.
     """
 
     def __init__(self, lease: Lease, failures: Failures) -> None:
         self.lock = threading.RLock()  # interruption.md, rule 12
+        self.stepping: int | None = None
+        self._warned = False
         self._lease = lease
         self._failures = failures
 
@@ -50,6 +57,19 @@ class UseLock:
         self._lease.let_go()
         if isinstance(error, Exception) and not isinstance(error, WorkerDiedError):
             raise closed_during(operation) from error
+
+    def warn_of_two(self, thread: int) -> None:
+        """Warn, once, where another thread is in a step: both get results, of one another's."""
+        if self.stepping in (None, thread) or self._warned:
+            return
+        self._warned = True
+        warnings.warn(
+            f"{self._lease.repository.label}: two threads step one environment at the same time. "
+            "The second waits for the first, and each continues the other's episodes: give each "
+            "thread an environment of its own, or hold a lock around reset and all its steps",
+            RuntimeWarning,
+            stacklevel=level_of_the_caller(),
+        )
 
     @contextmanager
     def judging(self, operation: str) -> Iterator[None]:
@@ -77,3 +97,4 @@ class UseLock:
     def abandon(self) -> None:
         """In a fork, which has not the thread that held the lock: interruption.md, rule 14."""
         self.lock = threading.RLock()
+        self.stepping = None

@@ -10,6 +10,7 @@ import warnings
 import weakref
 from collections.abc import Callable, Sequence
 from copy import copy
+from threading import get_ident
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -53,7 +54,8 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
 
     Everything that ``VectorEnv`` has, and ``AsyncVectorEnv``'s ``*_async`` and ``*_wait``. Arrays
     that it returns belong to the caller: writable, and never changed by a later step. One thread
-    uses it at a time, and a second one waits; ``close`` may come from any.
+    uses it at a time, and a second one waits, with a ``RuntimeWarning`` where both step; ``close``
+    may come from any.
 
     Attributes:
         num_envs: Number of sub-environments.
@@ -235,12 +237,18 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             raise
 
     def _step(self, actions: Any) -> StepResult:
-        requests = self._requests
-        with requests.use.lock:
-            if requests.closed or requests.waiting is not None:
-                requests.refuse_if_busy("step_async")
-            requests.submit_step(self._read_actions(actions))
-            return requests.collect_step(self._timeouts.step_s)
+        requests, use = self._requests, self._requests.use
+        if use.stepping is not None:
+            use.warn_of_two(get_ident())
+        with use.lock:
+            try:
+                use.stepping = get_ident()
+                if requests.closed or requests.waiting is not None:
+                    requests.refuse_if_busy("step_async")
+                requests.submit_step(self._read_actions(actions))
+                return requests.collect_step(self._timeouts.step_s)
+            finally:
+                use.stepping = None
 
     @short_traceback
     def step_async(self, actions: Any) -> None:

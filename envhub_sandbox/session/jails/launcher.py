@@ -11,12 +11,13 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
-from envhub_sandbox.errors import EnvHubError, LoadError, WorkerTimeoutError
+from envhub_sandbox.errors import EnvHubError, LoadError, WorkerDiedError, WorkerTimeoutError
 from envhub_sandbox.sandboxes.pool import ServerUse, WorkerServer
 from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.session.jails.loaded import ExpectedManifest, LoadedJail
 from envhub_sandbox.session.jails.server_hold import ServerHold
 from envhub_sandbox.session.repository import Repository
+from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.system.log import WORKER
 from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
@@ -25,6 +26,7 @@ from envhub_sandbox.transport.output import OutputFollower, OutputSinks
 from envhub_sandbox.transport.replies import expect_reply, typed_reply
 from envhub_sandbox.transport.values.generators import generator
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.codec.inert import one_line
 from envhub_worker.protocol.manifest.manifest import EnvManifest, decode_manifest
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
@@ -36,6 +38,8 @@ _DENIAL = re.compile(r"[a-z0-9_]{1,40}( [A-Z0-9_]{1,40}| /.{0,400})?")
 _MOST_DENIALS = 64
 _UNKNOWN = ("server", "connection", "gone")
 """How a jail died of which its server can say nothing."""
+_NAMED, _SHOWN = 8, 200
+"""Denials in the text of an error, and characters of each."""
 
 
 class Launcher:
@@ -288,6 +292,8 @@ class Launcher:
             return
         if getattr(error, "reason", "") not in _UNKNOWN:
             error.denied = self.denials(server, jail)
+            if isinstance(error, WorkerDiedError) and error.reason in ("exit", "signal"):
+                _name_denied(error)
 
     def _status(self, server: WorkerServer, jail: int, deadline: Deadline) -> dict[str, Any]:
         try:
@@ -336,3 +342,17 @@ def read_denials(said: object) -> tuple[str, ...] | None:
         return None
     texts = (one for one in said[:_MOST_DENIALS] if isinstance(one, str) and one.isprintable())
     return tuple(one for one in texts if _DENIAL.fullmatch(one))
+
+
+def _name_denied(error: WorkerDiedError) -> None:
+    """Say what a process was denied before it ended by itself: many a program dies of that."""
+    text = ""
+    if error.denied:
+        more = len(error.denied) - _NAMED
+        named = [one_line(one, _SHOWN) for one in error.denied[:_NAMED]]
+        text = f"Before that it was denied: {', '.join(named)}{f' and {more} more' * (more > 0)}"
+    elif error.denied is None and error.signal not in (None, "SIGKILL"):
+        recording = option_name("policy", {"record_denials": True})
+        text = f"If something that it was denied is the reason, {recording} names it"
+    if text and text not in str(error):  # called again where nothing is recorded
+        error.args = (f"{error.args[0]}\n{text}", *error.args[1:])

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import threading
+import time
+import warnings
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -68,6 +70,30 @@ def test_the_second_thread_waits(env: Any, monkeypatch: pytest.MonkeyPatch, asks
     second.join(DEADLINE_S)
     assert len(results) == 1
     assert env.step(ACTIONS)[0].shape == (2, 4)
+
+
+def test_two_threads_that_step_are_warned_of(env: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Once, although both get their results in turn; a thread after another is none of it."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        first = threading.Thread(target=lambda: env.step(ACTIONS))
+        first.start()
+        first.join(DEADLINE_S)
+        env.step(ACTIONS)
+    finish = held_between_the_halves(env, monkeypatch)
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        second = threading.Thread(target=lambda: env.step(ACTIONS))
+        second.start()
+        until = time.monotonic() + DEADLINE_S
+        while not caught and time.monotonic() < until:
+            second.join(0.01)
+        finish()
+        second.join(DEADLINE_S)
+    [warning] = caught
+    assert warning.category is RuntimeWarning
+    assert "two threads step" in str(warning.message)
+    assert "/tests/" in warning.filename
 
 
 def test_the_second_thread_is_refused_after_an_async_call(env: Any) -> None:

@@ -84,6 +84,7 @@ ATTACKS = {
     "fill_inodes": Attack(
         _LIMITS, "disk_files", {"folders": [], "count": 9999}, {"disk_files": 2000}
     ),
+    "device_events": Attack(unseen="the kernel sends a jail none"),
     "flood": Attack("", "", {"size": 4 * _MIB}, unseen=_OWN),
     "foreign_abi": Attack("survives", "SIGSYS", {**_NAMED, "abi": "i386"}),
     "fork_bomb": Attack(_LIMITS, "processes", {"count": 200}, {"processes": 64}),

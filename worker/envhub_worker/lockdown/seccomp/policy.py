@@ -107,8 +107,9 @@ SHARED_BYTES = 1 << 20
 
 _NAMESPACES = 0x7E020000  # every CLONE_NEW* that clone takes
 _S_IFMT, _S_IFIFO = 0o170000, 0o010000
-_AF_UNIX, _AF_INET, _AF_INET6 = 1, 2, 10
-_SOCK_STREAM, _SOCK_DGRAM, _SOCK_SEQPACKET, _SOCK_TYPE = 1, 2, 5, 0xF
+_AF_UNIX, _AF_INET, _AF_INET6, _AF_NETLINK = 1, 2, 10, 16
+_NETLINK_ROUTE, _NETLINK_KOBJECT_UEVENT = 0, 15
+_SOCK_STREAM, _SOCK_DGRAM, _SOCK_RAW, _SOCK_SEQPACKET, _SOCK_TYPE = 1, 2, 3, 5, 0xF
 _EAFNOSUPPORT = _ERRNO | errno.EAFNOSUPPORT
 _ENOTTY = _ERRNO | errno.ENOTTY
 _ENOMEM = _ERRNO | errno.ENOMEM
@@ -159,7 +160,8 @@ def policy_table(
     verdicts |= _filtered()
     if measured:
         verdicts |= _unmeasurable()
-    verdicts |= _sockets(namespaced and (scoped or network != "host"), network)
+    own = namespaced and network != "host"
+    verdicts |= _sockets(own or (namespaced and scoped), network, own=own)
     verdicts |= dict.fromkeys(_NAMESPACED.split(), ALLOW) if namespaced else _without_namespaces()
     if brokered:
         verdicts |= dict.fromkeys(("kill", "tkill", "tgkill"), ASK)
@@ -279,11 +281,15 @@ def _ioctls() -> tuple[tuple[tuple[Check, ...], int], ...]:
     return families + tuple(((Check(1, request),), EPERM) for request in denied)
 
 
-def _sockets(local: bool, network: str) -> dict[str, Verdict]:
-    """Local sockets by name only where no other process has such names (``local``)."""
+def _sockets(local: bool, network: str, *, own: bool) -> dict[str, Verdict]:
+    """Local sockets by name only where no other process has such names (``local``).
+
+    Args:
+        own: The network namespace is the jail's own, and its user namespace's.
+    """
     internet = network != "none"
     verdicts: dict[str, Verdict] = {
-        "socket": ByArguments(_families(local, internet), _EAFNOSUPPORT),
+        "socket": ByArguments(_families(local, internet, own), _EAFNOSUPPORT),
         "socketpair": ByArguments(_pairs(local), _EAFNOSUPPORT),
         "sendto": ByArguments((((Check(4, 0, wide=True),), ALLOW),), EPERM),
     }
@@ -292,8 +298,16 @@ def _sockets(local: bool, network: str) -> dict[str, Verdict]:
     return verdicts
 
 
-def _families(local: bool, internet: bool) -> tuple[tuple[tuple[Check, ...], int], ...]:
+def _families(local: bool, internet: bool, own: bool) -> tuple[tuple[tuple[Check, ...], int], ...]:
     rules: list[tuple[tuple[Check, ...], int]] = []
+    if own:
+        # Programs list their network devices, and SDL's games die where they cannot wait for new
+        # input devices. There are none but lo, nothing of it can be changed without a capability,
+        # and the kernel tells its events of devices to no user namespace but the first.
+        for kind in (_SOCK_DGRAM, _SOCK_RAW):
+            for protocol in (_NETLINK_ROUTE, _NETLINK_KOBJECT_UEVENT):
+                checks = (Check(0, _AF_NETLINK), Check(1, kind, _SOCK_TYPE), Check(2, protocol))
+                rules.append((checks, ALLOW))
     if local:
         rules.append(((Check(0, _AF_UNIX),), ALLOW))
     if internet:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -162,6 +163,30 @@ def test_denials_are_asked_for_where_the_server_can_know(
     launcher.note_denied(KeyboardInterrupt(), cast("Any", None), 7)
     assert len(client.asked) == asked
     assert error.denied == (("ptrace",) if asked else None)
+
+
+@pytest.mark.parametrize(
+    ("denied", "signal", "text"),
+    [
+        (("socket AF_INET", "ptrace"), "SIGSEGV", "was denied: socket AF_INET, ptrace$"),
+        (tuple(f"read /{n}" for n in range(11)), None, "read /7 and 3 more$"),
+        ((), "SIGSEGV", "^it died$"),
+        (None, "SIGSEGV", "record_denials"),
+        (None, None, "^it died$"),
+    ],
+)
+def test_a_death_after_a_denial_names_it(
+    launcher: Launcher, client: _Client, denied: Any, signal: str | None, text: str
+) -> None:
+    """Many a program dies of what it may not; where nothing was recorded, it says how to."""
+    client.status = ({"jail": 7} if denied is None else {"jail": 7, "denied": denied},)
+    kind = type(launcher.repository.policy)
+    launcher.repository.policy = kind(record_denials=denied is not None)
+    error = WorkerDiedError("it died", reason="signal" if signal else "exit", signal=signal)
+    for _ in range(2):
+        launcher.note_denied(error, _SERVER, 7)
+    assert re.search(text, str(error))
+    assert str(error).count("\n") <= 1
 
 
 def test_no_server_no_use(launcher: Launcher, place: _Place) -> None:

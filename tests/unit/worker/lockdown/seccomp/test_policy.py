@@ -164,6 +164,7 @@ def of(name: str, *first: int, last: Sequence[int]) -> list[tuple[Any, ...]]:
     return [(name, *first, one) for one in last]
 
 
+NETLINKS = [("socket", 16, kind, protocol) for kind in (2, 3) for protocol in (0, 15)]
 CLAIMS: dict[str, list[Row]] = {
     "clone3's flags lie in memory, those of clone are checked one by one": [
         under(ENOSYS, [("clone3",)], True),
@@ -176,6 +177,14 @@ CLAIMS: dict[str, list[Row]] = {
         under(NOT_SUPPORTED, [("socket", one, 1) for one in (2, 10, 16, 17, 40, 44, 1 << 32 | 2)]),
         under(NOT_SUPPORTED, [("socketpair", 2, 1)]),
         under(ALLOW, of("socketpair", 1, last=(1, 1 | 0o2000000 | 0o4000))),  # CLOEXEC, NONBLOCK
+    ],
+    "netlink tells a jail of its own devices, where it has a network of its own, and no more": [
+        under(ALLOW, NETLINKS, True),
+        under(ALLOW, NETLINKS, True, network="loopback"),
+        under(NOT_SUPPORTED, NETLINKS, True, network="host"),
+        under(NOT_SUPPORTED, NETLINKS, False),
+        under(NOT_SUPPORTED, [("socket", 16, 3, one) for one in (2, 4, 9, 11, 12, 16)]),
+        under(NOT_SUPPORTED, [("socket", 16, 1, 0), ("socketpair", 16, 3, 0)]),
     ],
     "local sockets end where the host's abstract names begin and Landlock does not": [
         under(NOT_SUPPORTED, of("socket", 1, last=(1, 2)), True, network="host", scoped=False),

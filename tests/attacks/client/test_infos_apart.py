@@ -1,0 +1,98 @@
+"""A worker that lies about infos that are not joined: a single environment takes none of it."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import cloudpickle
+import numpy as np
+import pytest
+
+from envhub_sandbox.errors import RemoteProtocolError
+from envhub_sandbox.vector.single_env import SingleEnv
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.manifest.manifest import Manifest, encode_env, encode_manifest
+from tests.attacks.client.lies import Canary, opened, pickled, refuses, relayed
+from tests.attacks.client.lying_server import ACTION, OBSERVATION, LyingServer
+from tests.support import wire
+
+
+def _done(info: Any, **changes: Any) -> m.StepDone:
+    fields: dict[str, Any] = {
+        "observation": np.zeros((1, 3), np.float32),
+        "rewards": np.zeros(1),
+        "terminations": np.zeros(1, bool),
+        "truncations": np.zeros(1, bool),
+    }
+    return m.StepDone(**(fields | changes), info=info)
+
+
+@contextmanager
+def _single(liar: LyingServer, folder: str, **changes: Any) -> Iterator[SingleEnv]:
+    """A single environment by way of the liar, which has been reset."""
+    changes = {"sync": True, "type_name": "gymnasium.vector.SyncVectorEnv", **changes}
+    described = wire.env_manifest(OBSERVATION, ACTION, 1, **changes)
+    liar.lies[m.Load] = relayed(m.LoadDone(encode_manifest(Manifest(envs=(described,), lazy=True))))
+    liar.lies[m.LoadTask] = relayed(m.Value((1, True)))
+    liar.lies[m.Build] = relayed(m.BuildDone(encode_env(described)))
+    liar.lies[m.Reset] = relayed(m.ResetDone(np.zeros((1, 3), np.float32), {0: {"begun": 1}}))
+    with opened(liar, folder, n_envs=1) as suites:
+        env = SingleEnv(suites.env)
+        assert env.reset()[1] == {"begun": 1}
+        yield env
+
+
+def test_an_honest_one_is_believed(liar: LyingServer, folder: str) -> None:
+    """The control: what the lies look like is taken, where it is true."""
+    with _single(liar, folder) as env:
+        action = env.action_space.sample()
+        for info in ({0: {"a": 2**80}}, {0: {}}, {}, {0: {"a": {"_a": 1}}, -1: ()}):
+            liar.lies[m.Step] = relayed(_done(info))
+            assert env.step(action)[4] == info.get(0, {})
+
+
+LIES: dict[str, Any] = {
+    "a number for infos": {0: 3},
+    "a list for infos": {0: [1]},
+    "a text for infos": {0: "ab", 1: {}},
+    "too many infos": {0: {}, 1: {}, 2: {}},
+    "infos of nowhere": {10**9: {}, 10**9 + 1: {}, 5: {}},
+    "a number for integers": {0: {}, -1: 3},
+    "a text for integers": {-1: "xxx"},
+    "arrays for integers": {-1: np.ones(3)},
+}
+
+
+@pytest.mark.parametrize("what", LIES)
+def test_infos_of_another_form_are_refused(liar: LyingServer, folder: str, what: str) -> None:
+    """It is the worker's fault, and the error says so."""
+    with _single(liar, folder) as env:
+        action = env.action_space.sample()
+        liar.lies[m.Step] = relayed(_done(LIES[what]))
+        assert isinstance(refuses(lambda: env.step(action)), RemoteProtocolError)
+
+
+def test_a_last_observation_that_is_missing_is_refused(liar: LyingServer, folder: str) -> None:
+    """Where an episode ends in the step that begins the next."""
+    with _single(liar, folder, autoreset_mode="SameStep") as env:
+        action = env.action_space.sample()
+        liar.lies[m.Step] = relayed(_done({0: {"a": 1}}, terminations=np.ones(1, bool)))
+        assert isinstance(refuses(lambda: env.step(action)), RemoteProtocolError)
+
+
+def test_pickles_in_infos_apart_are_never_loaded(
+    liar: LyingServer, folder: str, tmp_path: Path
+) -> None:
+    """The control loads one."""
+    canary = tmp_path / "executed"
+    with _single(liar, folder) as env:
+        action = env.action_space.sample()
+        liar.lies[m.Step] = relayed(pickled(_done({0: {"a": Canary(canary)}})))
+        refuses(lambda: env.step(action))
+    assert not canary.exists()
+    pickle.loads(cloudpickle.dumps(Canary(canary)))
+    assert canary.exists()
