@@ -14,10 +14,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-import gymnasium
 import psutil
-
-from envhub_sandbox import make_env
 
 _CARTPOLE = str(Path(__file__).resolve().parents[1] / "examples" / "cartpole")
 _PSS = re.compile(r"^Pss:\s+(\d+) kB", re.MULTILINE)
@@ -78,6 +75,11 @@ def _pss_mb(pid: int) -> float:
 
 def by_size(sizes: Iterable[int] = (1, 4, 16, 64)) -> Iterator[tuple[int, dict[str, float]]]:
     """For each number of CartPoles, what they add to this process and its descendants, in MB."""
+    # here, since probes that import this module measure what imports cost
+    import gymnasium
+
+    from envhub_sandbox import make_env
+
     makers: dict[str, Callable[[int], Any]] = {
         "SyncVectorEnv": lambda n: gymnasium.make_vec("CartPole-v1", n, "sync"),
         "AsyncVectorEnv": lambda n: gymnasium.make_vec("CartPole-v1", n, "async"),

@@ -168,7 +168,6 @@ def drawn(said: str, printed: str, frames: bytes, fps: float) -> str:
         for number, line in enumerate(lines)
         if line
     ]
-    end = _RAN_S + len(lines) * _BETWEEN_S
     x, y = left, (height - _FILM[1]) / 2 + 8
     image = base64.b64encode(frames).decode()
     film = words[-1] if (words := said.split()) else ""
@@ -183,7 +182,7 @@ viewBox="0 0 {width:.0f} {height}">
 <rect id="cover" x="{_MARGIN + 2 * _CELL}" y="{_TOP - 14}" width="{typed:.1f}" height="{_LINE}" \
 fill="#171a23" transform="translate({typed:.1f})"/>
 {chr(10).join(shown)}
-<g class="late" style="animation-delay:{end:.2f}s">
+<g>
 <text x="{x}" y="{y - 8}" style="fill:{_DIM}">{escape(film)}</text>
 <svg x="{x}" y="{y}" width="{_FILM[0]}" height="{_FILM[1]}"><g id="row"><g id="column">\
 <image width="{_FILM[0] * _GRID}" height="{_FILM[1] * _GRID}" preserveAspectRatio="none" \
