@@ -144,9 +144,7 @@ def test_a_repository_has_the_name_of_its_folder(name: str) -> None:
     assert "2026" in files["LICENSE"]
 
 
-@pytest.mark.parametrize(
-    "name", ["-a", "a.", "a..b", "a--b", "a.git", ".env", "x" * 97, "é"]
-)
+@pytest.mark.parametrize("name", ["-a", "a.", "a..b", "a--b", "a.git", ".env", "x" * 97, "é"])
 def test_other_names_are_refused(name: str) -> None:
     """Before anything is written."""
     with pytest.raises(exits.UsageError, match="cannot be a name on the Hub"):
