@@ -13,9 +13,7 @@ import pytest
 from envhub_sandbox.check.judge import judge
 from envhub_sandbox.check.settings import JudgeOptions
 from envhub_sandbox.cli.app import app
-from envhub_sandbox.cli.init.init import repository_name
 from envhub_sandbox.cli.init.starter import starter
-from envhub_sandbox.cli.shared.exits import UsageError
 from envhub_sandbox.hub.local import LocalFolder
 from tests.support.command_line import COMMAND
 
@@ -107,14 +105,6 @@ def test_a_fixture_without_a_reference_says_what_is_missing(tmp_path: Path) -> N
     done = pytest_run(tmp_path)
     assert done.returncode == 1
     assert "needs --envhub-ref REF" in done.stdout
-
-
-@pytest.mark.parametrize("name", ["-x", "a--b", "a b", "a..b", "x.git", "é", ".env", "."])
-def test_names_that_the_hub_would_not_take_are_refused(tmp_path: Path, name: str) -> None:
-    """Before anything is written."""
-    folder = tmp_path / "a b" if name == "." else tmp_path / name
-    with pytest.raises(UsageError, match="cannot be a name on the Hub"):
-        repository_name(folder)
 
 
 def test_what_is_there_already_stays(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -155,16 +155,6 @@ def test_failures_have_a_code_and_a_message(
     assert "Traceback" not in done.stderr
 
 
-@pytest.mark.parametrize(
-    ("reference", "code"), [("no spaces allowed", 2), ("org/repo/sub/dir", 2), ("./nowhere", 3)]
-)
-def test_references_that_lead_nowhere(tmp_path: Path, reference: str, code: int) -> None:
-    """A reference that cannot be read is usage; one that names nothing is not."""
-    done = envhub("run", reference)
-    assert (done.returncode, done.stdout) == (code, "")
-    assert done.stderr.startswith("Error: ")
-
-
 def test_a_repository_that_does_not_load(tmp_path: Path) -> None:
     """The code for loading; the worker's traceback only with --debug."""
     folder = write_repository(tmp_path / "bad", "import this_is_not_installed\n")

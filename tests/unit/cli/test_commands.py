@@ -6,6 +6,7 @@ import ast
 import inspect as python
 import json
 import os
+import shlex
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -44,6 +45,8 @@ _REFUSED = [
     ("replay ./gone", 2, "is no crash bundle that can be read"),
     ("diff ./gone ./gone", 3, _NO_FOLDER),
     ("run ./gone", 3, _NO_FOLDER),
+    ("run 'no spaces allowed'", 2, "Error: hub reference 'no spaces allowed'"),
+    ("run org/repo/sub/dir", 2, "a path stands behind a colon"),
     ("push ./gone owner/name", 3, _NO_FOLDER),
     ("push . no-owner", 2, "the owner is missing"),
     ("prefetch ./gone", 3, _NO_FOLDER),
@@ -61,7 +64,7 @@ _REFUSED = [
 @pytest.mark.parametrize(("words", "code", "text"), _REFUSED)
 def test_what_cannot_be_done_is_said_in_one_line(words: str, code: int, text: str) -> None:
     """With the exit code of its kind, without a traceback, and nothing is left in the folder."""
-    found, printed = said(*words.split())
+    found, printed = said(*shlex.split(words))
     assert (found, text in " ".join(printed.split())) == (code, True), printed
     assert "Traceback" not in printed
     assert os.listdir() == []
@@ -137,7 +140,7 @@ def test_a_repository_has_the_name_of_its_folder(name: str) -> None:
     assert "2026" in files["LICENSE"]
 
 
-@pytest.mark.parametrize("name", ["-a", "a.", "a..b", "a.git", "x" * 97, "ä", "a b"])
+@pytest.mark.parametrize("name", ["-a", "a.", "a..b", "a--b", "a.git", ".env", "x" * 97, "é"])
 def test_other_names_are_refused(name: str) -> None:
     """Before anything is written."""
     with pytest.raises(exits.UsageError, match="cannot be a name on the Hub"):
