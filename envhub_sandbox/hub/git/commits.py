@@ -29,6 +29,8 @@ from envhub_worker.protocol.text import printable, size_text
 MAX_BYTES = 2 * 2**30
 """Of a file that git writes: what it fetches, and all files of a commit, unpacked."""
 MAX_FILES = 50_000
+_MAX_ROW_BYTES = 2048
+"""Of a file in git's listing: its names have no limit there, and each repeats those above it."""
 _TIMEOUT_S = 900.0
 _BLOCK = 1 << 20
 _SAID_BYTES = 1000
@@ -63,8 +65,9 @@ def resolve(url: str, revision: str, variables: Variables | None = None) -> str:
     names = ["HEAD"] if revision == "HEAD" else names
     with tempfile.TemporaryDirectory(prefix="envhub-git-") as place:
         git = _Git(Path(place), os.environ if variables is None else variables)
-        said = git.run("ls-remote", "--quiet", _checked(url), *names).decode()
-    found = {name: commit for commit, _, name in (x.partition("\t") for x in said.splitlines())}
+        said = git.run("ls-remote", "--quiet", _checked(url), *names)
+    rows = said.decode("utf-8", "replace").splitlines()  # other names may end with these
+    found = {name: commit for commit, _, name in (row.partition("\t") for row in rows)}
     commit = next((found[name] for name in names if name in found), "")
     if not is_commit(commit):
         what = f"{url} has no tag or branch {revision!r}"
@@ -165,8 +168,10 @@ def _rows(file: IO[bytes], title: str) -> Iterator[bytes]:
     while block := file.read(_BLOCK):
         *rows, left = (left + block).split(b"\0")
         count += len(rows)
-        if count > MAX_FILES or len(left) > _BLOCK:
+        if count > MAX_FILES:
             raise SnapshotTooLargeError(f"{title} has more than {MAX_FILES} files")
+        if any(len(row) > _MAX_ROW_BYTES for row in (*rows, left)):
+            raise SnapshotTooLargeError(f"{title} has a file with a name that is too long")
         yield from rows
 
 

@@ -9,6 +9,7 @@ import os
 import shutil
 import subprocess
 import threading
+import tracemalloc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -16,7 +17,12 @@ from pathlib import Path
 
 import pytest
 
-from envhub_sandbox.errors import EnvHubError, HubReferenceError, RepositoryUnavailableError
+from envhub_sandbox.errors import (
+    EnvHubError,
+    HubReferenceError,
+    RepositoryUnavailableError,
+    SnapshotTooLargeError,
+)
 from envhub_sandbox.hub.git import address, commits
 from envhub_sandbox.hub.reference import HubRef
 from envhub_sandbox.hub.snapshot import Snapshot, snapshot_named
@@ -299,3 +305,34 @@ def test_nothing_in_a_reference_is_an_option_or_a_program(
         with pytest.raises(HubReferenceError):
             commits.resolve("http://127.0.0.1:9/x", revision)
     assert not ran(program)
+
+
+def test_names_of_files_cost_no_memory(repository: Path, tmp_path: Path) -> None:
+    """Each row of git's listing repeats the folder's name: a few hundred bytes become 40 MB."""
+    blob = git(repository, "rev-parse", "HEAD:env.py")
+    rows = "".join(f"100644 blob {blob}\tf{number}\n" for number in range(2000))
+    inner = git(repository, "mktree", given=rows)
+    tree = git(repository, "mktree", given=f"040000 tree {inner}\t{'d' * 20_000}\n")
+    head = git(repository, "commit-tree", tree, "-m", "x")
+    git(repository, "update-ref", "refs/heads/main", head)
+    with git_served(tmp_path / "served") as where:
+        listed = plain_git("-C", str(repository), "ls-tree", "-r", "main").stdout
+        assert len(listed) > 40_000_000, "the control failed"
+        tracemalloc.start()
+        try:
+            with pytest.raises(SnapshotTooLargeError, match="a name that is too long"):
+                snapshot_named(f"git+{where}/org/repo")
+            assert tracemalloc.get_traced_memory()[1] < 20_000_000
+        finally:
+            tracemalloc.stop()
+
+
+def test_names_of_branches_may_be_any_bytes(repository: Path, tmp_path: Path) -> None:
+    """What ends with the wanted name comes along, whatever stands in front of it."""
+    head = git(repository, "rev-parse", "HEAD")
+    odd = b"refs/heads/\xff/refs/heads/main"
+    (repository / ".git" / "packed-refs").write_bytes(head.encode() + b" " + odd + b"\n")
+    with git_served(tmp_path / "served") as where:
+        shown = plain_git("ls-remote", f"{where}/org/repo", "refs/heads/main").stdout
+        assert odd in shown, "the control failed"
+        assert commits.resolve(f"{where}/org/repo", "main") == head
