@@ -14,7 +14,7 @@ from typing import Any
 
 from envhub_sandbox.errors import EnvHubError, HubReferenceError, SnapshotError
 from envhub_sandbox.hub.listing import DEFAULT_LIMITS, SnapshotLimits
-from envhub_sandbox.hub.reference import DEFAULT_PATH, HubRef
+from envhub_sandbox.hub.reference import DEFAULT_PATH, REPO_TYPES, HubRef
 from envhub_sandbox.hub.snapshot import Snapshot, fetch
 from envhub_sandbox.hub.sources.card import CARD, CardError, declared_assets
 from envhub_sandbox.settings.options import option_name
@@ -80,6 +80,11 @@ def _asset(text: str, snapshot: Snapshot, where: str) -> HubRef:
     try:
         ref = HubRef.parse(text)
         names_file |= ref.path != DEFAULT_PATH
+        if ref.repo_type not in (None, *REPO_TYPES):  # a card would choose the host that is asked
+            names_file = False
+            raise HubReferenceError(
+                "this is not on the Hub, and an asset is; write it as in 'org/data@COMMIT'"
+            )
     except HubReferenceError as error:
         if not names_file:
             error.args = (f"{snapshot.label}: {where} holds {shown}: {error}",)

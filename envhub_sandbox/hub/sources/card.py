@@ -63,7 +63,7 @@ def _tree(text: str) -> Any:
 
     try:
         return yaml.compose(text, Loader=yaml.SafeLoader)
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
+    except (yaml.YAMLError, ArithmeticError, RecursionError, ValueError) as error:
         raise CardError(f"its YAML cannot be read: {type(error).__name__}") from None
 
 

@@ -176,12 +176,20 @@ def test_an_asset_that_is_not_there_is_named(make: Make) -> None:
         ("org/../data@" + "a" * 40, "holds"),
         ("/etc", "holds"),
         ("org/data@../../main", "holds"),
+        ("git+https://127.0.0.1:9/org/data@" + "a" * 40, "not on the Hub"),
+        ("github:org/data@" + "a" * 40, "not on the Hub"),
+        ("pypi:data#Data-v0", "not on the Hub"),
     ],
 )
-def test_what_is_no_asset_is_refused(make: Make, asset: str, why: str) -> None:
-    """The environment's own repository, one file, and tricks with paths."""
-    with pytest.raises(HubReferenceError, match=why):
-        make(assets=[asset])
+def test_what_is_no_asset_is_refused(make: Make, own: StubRepository, asset: str, why: str) -> None:
+    """The environment's own repository, one file, tricks with paths, and hosts of git.
+
+    Of a card, too: by a host of git it would have the client ask any server that it can reach.
+    """
+    own.files["README.md"] = f"---\nenvhub: {{assets: ['{asset}']}}\n---\n".encode()
+    for options in ({}, {"assets": [asset]}):
+        with pytest.raises(HubReferenceError, match=f"(?s){why}"):
+            make(**options)
 
 
 def test_no_token_and_no_cache_of_the_users_is_inside(
