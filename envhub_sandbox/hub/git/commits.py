@@ -7,11 +7,13 @@ content, so that a full commit names all of them. Snapshots and sources of packa
 
 from __future__ import annotations
 
+import contextlib
 import io
 import os
 import re
 import resource
 import shutil
+import signal
 import subprocess
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
@@ -221,24 +223,45 @@ class _Git:
         store = self._store
         with tempfile.TemporaryFile(dir=store) as said, tempfile.TemporaryFile(dir=store) as kept:
             try:
-                subprocess.run(
-                    ["/bin/sh", "-c", _LIMITED, "sh", *_limits(), *command],
-                    input=given,
-                    stdout=output or kept,
-                    stderr=said,
-                    cwd=store,
-                    env=self._environment,
-                    timeout=_TIMEOUT_S,
-                    check=True,
-                )
+                words = ["/bin/sh", "-c", _LIMITED, "sh", *_limits(), *command]
+                self._run_to_its_end(words, given, stdout=output or kept, stderr=said)
             except (OSError, subprocess.SubprocessError) as error:
                 said.seek(max(0, said.seek(0, os.SEEK_END) - _SAID_BYTES))
-                text = said.read(_SAID_BYTES).decode("utf-8", "replace") or str(error)
+                text = said.read(_SAID_BYTES).decode("utf-8", "replace") or _why(error)
                 what = f"git {arguments[0]} failed: {printable(text, _SAID_BYTES).strip()}"
                 advice = "Check the address, the commit and the network"
                 raise HubFailure(Kind.UNREACHABLE, what, advice) from error
             kept.seek(0)
             return kept.read(_BLOCK)
+
+    def _run_to_its_end(
+        self, words: list[str], given: bytes, stdout: IO[bytes], stderr: IO[bytes]
+    ) -> None:
+        """Nothing of it is left then, also where it took too long or we are interrupted.
+
+        Git's children ask the host, which may keep them for ever.
+        """
+        with subprocess.Popen(
+            words,
+            stdin=subprocess.PIPE,
+            stdout=stdout,
+            stderr=stderr,
+            cwd=self._store,
+            env=self._environment,
+            start_new_session=True,
+        ) as process:
+            try:
+                process.communicate(given, _TIMEOUT_S)
+            finally:
+                with contextlib.suppress(ProcessLookupError):
+                    os.killpg(process.pid, signal.SIGKILL)
+        if process.returncode:
+            raise subprocess.CalledProcessError(process.returncode, "git")
+
+
+def _why(error: Exception) -> str:
+    late = isinstance(error, subprocess.TimeoutExpired)
+    return f"it took longer than {_TIMEOUT_S:.0f} s" if late else str(error)
 
 
 def _limits() -> tuple[str, str]:

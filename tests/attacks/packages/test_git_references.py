@@ -5,8 +5,10 @@ The control is plain git with the same repository and the same user: there each 
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
+import socket
 import subprocess
 import threading
 import tracemalloc
@@ -23,6 +25,7 @@ from envhub_sandbox.errors import (
     RepositoryUnavailableError,
     SnapshotTooLargeError,
 )
+from envhub_sandbox.hub.failures import HubFailure
 from envhub_sandbox.hub.git import address, commits
 from envhub_sandbox.hub.reference import HubRef
 from envhub_sandbox.hub.snapshot import Snapshot, snapshot_named
@@ -336,3 +339,45 @@ def test_names_of_branches_may_be_any_bytes(repository: Path, tmp_path: Path) ->
         shown = plain_git("ls-remote", f"{where}/org/repo", "refs/heads/main").stdout
         assert odd in shown, "the control failed"
         assert commits.resolve(f"{where}/org/repo", "main") == head
+
+
+@contextmanager
+def dripping() -> Iterator[tuple[str, threading.Event]]:
+    """A server whose answer never ends: its address, and whether the client has gone."""
+    gone, over = threading.Event(), threading.Event()
+    listener = socket.create_server(("127.0.0.1", 0))
+    kind = "application/x-git-upload-pack-advertisement"
+
+    def serve() -> None:
+        client, _ = listener.accept()
+        with client, contextlib.suppress(OSError):
+            client.recv(1 << 16)
+            client.sendall(f"HTTP/1.1 200 OK\r\nContent-Type: {kind}\r\n\r\n".encode())
+            while not over.wait(0.05):
+                client.sendall(b"0")
+        if not over.is_set():
+            gone.set()
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{listener.getsockname()[1]}/org/repo", gone
+    finally:
+        over.set()
+        thread.join()
+        listener.close()
+
+
+def test_a_server_that_never_ends_keeps_no_process(
+    repository: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of plain git that is ended the children stay, for as long as the server likes."""
+    with dripping() as (url, gone):
+        with pytest.raises(subprocess.TimeoutExpired):
+            subprocess.run(["git", "ls-remote", url], capture_output=False, timeout=3, check=True)
+        assert not gone.wait(1), "the control failed"
+    monkeypatch.setattr(commits, "_TIMEOUT_S", 3.0)
+    with dripping() as (url, gone):
+        with pytest.raises(HubFailure, match="took longer than 3 s"):
+            commits.resolve(url, "main")
+        assert gone.wait(60)
