@@ -87,11 +87,11 @@ def _fingerprint(status: os.stat_result) -> list[int]:
 
 
 def repository_folder(endpoint: str, repo_type: str, repo_id: str) -> Path:
-    """Where the commits of a repository lie; names of the Hub never contain ``--``, git's may."""
+    """Where the commits of a repository lie; ``--`` is in no name of the Hub, but in git's."""
     host = re.sub(r"[^A-Za-z0-9.-]", "_", urlsplit(endpoint).netloc.rpartition("@")[2])
     key = hashlib.sha256(endpoint.encode()).hexdigest()[:8]
     name = f"{repo_type}--{repo_id.replace('/', '--')}"
-    if "--" in repo_id or len(name) > _MAX_NAME:
+    if re.search("--|-/|/-", repo_id) or len(name) > _MAX_NAME:
         name = f"{name[:_MAX_NAME]}-{hashlib.sha256(repo_id.encode()).hexdigest()[:16]}"
     return cache_root() / "snapshots" / f"{host}-{key}" / name
 

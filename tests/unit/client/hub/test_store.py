@@ -313,6 +313,8 @@ def test_endpoints_types_and_names_have_places_of_their_own(snapshot_store: Path
         ("https://git.example", "git", "a--b/c"),
         ("https://git.example", "git", "a/b--c"),
         ("https://git.example", "git", "a/b/c"),
+        ("https://git.example", "git", "a-/b"),
+        ("https://git.example", "git", "a/-b"),
         ("https://git.example", "git", "a/" * 99 + "b"),
         ("https://git.example", "git", "a/" * 99 + "c"),
     ]
