@@ -174,7 +174,9 @@ def test_variables_of_the_user_do_nothing(
     assert not ran(program)
 
 
-def test_submodules_are_not_fetched(repository: Path, tmp_path: Path) -> None:
+def test_submodules_are_not_fetched(
+    repository: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     """Plain git asks the host that the repository names."""
     with canary() as (elsewhere, asked), git_served(tmp_path / "served") as where:
         text = f'[submodule "m"]\n\tpath = m\n\turl = {elsewhere}/m\n'
@@ -186,8 +188,10 @@ def test_submodules_are_not_fetched(repository: Path, tmp_path: Path) -> None:
         plain_git("clone", "--recurse-submodules", f"{where}/org/repo", clone)
         assert asked, "the control failed"
         asked.clear()
-        found = snapshot_named(f"git+{where}/org/repo")
+        with caplog.at_level("WARNING"):
+            found = snapshot_named(f"git+{where}/org/repo")
         assert not asked
+    assert "submodules are left out: 'm'" in caplog.text
     assert {file.path for file in found.files} == {"env.py", ".gitmodules"}
 
 
