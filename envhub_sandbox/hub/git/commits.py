@@ -33,7 +33,8 @@ MAX_BYTES = 2 * 2**30
 MAX_FILES = 50_000
 _MAX_ROW_BYTES = 2048
 """Of a file in git's listing: its names have no limit there, and each repeats those above it."""
-_TIMEOUT_S = 900.0
+TIMEOUT_S = 900.0
+"""For one run of git, with all that it downloads."""
 _BLOCK = 1 << 20
 _SAID_BYTES = 1000
 _ROW = re.compile(rb"(\d{6}) (\w+) ([0-9a-f]{40}) +(\d+|-)\t(.+)", re.DOTALL)
@@ -251,7 +252,7 @@ class _Git:
             start_new_session=True,
         ) as process:
             try:
-                process.communicate(given, _TIMEOUT_S)
+                process.communicate(given, TIMEOUT_S)
             finally:
                 with contextlib.suppress(ProcessLookupError):
                     os.killpg(process.pid, signal.SIGKILL)
@@ -261,7 +262,7 @@ class _Git:
 
 def _why(error: Exception) -> str:
     late = isinstance(error, subprocess.TimeoutExpired)
-    return f"it took longer than {_TIMEOUT_S:.0f} s" if late else str(error)
+    return f"it took longer than {TIMEOUT_S:.0f} s" if late else str(error)
 
 
 def _limits() -> tuple[str, str]:

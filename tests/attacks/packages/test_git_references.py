@@ -380,7 +380,7 @@ def test_a_server_that_never_ends_keeps_no_process(
         with pytest.raises(subprocess.TimeoutExpired):
             subprocess.run(["git", "ls-remote", url], capture_output=False, timeout=3, check=True)
         assert not gone.wait(1), "the control failed"
-    monkeypatch.setattr(commits, "_TIMEOUT_S", 3.0)
+    monkeypatch.setattr(commits, "TIMEOUT_S", 3.0)
     with dripping() as (url, gone):
         with pytest.raises(HubFailure, match="took longer than 3 s"):
             commits.resolve(url, "main")
