@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 
 from envhub_sandbox.errors import PolicyError, SnapshotError, SnapshotTooLargeError
 from envhub_sandbox.hub.grammar import REPO_TYPES, Parts, has_control_characters, join
+from envhub_worker.protocol.runtime import is_cached_revision
 from envhub_worker.protocol.text import size_text
 
 MAX_NAME_BYTES = 255  # NAME_MAX of every common file system.
@@ -115,7 +116,7 @@ class Snapshot:
             (
                 f"{one.repo_type}s--{one.repo_id.replace('/', '--')}",
                 one.commit,
-                tuple(sorted({"main", one.revision or "main"} - {one.commit})),
+                _cached_revisions(one),
                 "" if one is self else str(one.root),
             )
             for one in (self, *self.assets)
@@ -147,6 +148,14 @@ class Snapshot:
     def _source(self) -> str:
         by_content = self.repo_type in ("local", "pypi")
         return self.name if by_content else f"{self.name}@{self.commit[:12]}"
+
+
+def _cached_revisions(snapshot: Snapshot) -> tuple[str, ...]:
+    """What is found in a jail: ``main``, and what was asked for, if a file can be called so."""
+    asked = snapshot.revision or "main"
+    # beside the file "main" there is no folder of that name
+    known = asked != snapshot.commit and not asked.startswith("main/") and is_cached_revision(asked)
+    return tuple(sorted({"main", *([asked] if known else [])}))
 
 
 @dataclass(frozen=True, kw_only=True)

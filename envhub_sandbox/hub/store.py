@@ -39,6 +39,7 @@ from envhub_worker.protocol.records import dataclass
 
 _FORMAT = 1
 _ABANDONED_AFTER_S = 24 * 3600.0
+_MAX_NAME = 200
 _FILE_MODE = 0o444
 _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 _TREE_FOLDER_MODE = 0o555
@@ -86,10 +87,12 @@ def _fingerprint(status: os.stat_result) -> list[int]:
 
 
 def repository_folder(endpoint: str, repo_type: str, repo_id: str) -> Path:
-    """Where the commits of a repository lie; names of the Hub never contain ``--``."""
+    """Where the commits of a repository lie; ``--`` is in no name of the Hub, but in git's."""
     host = re.sub(r"[^A-Za-z0-9.-]", "_", urlsplit(endpoint).netloc.rpartition("@")[2])
     key = hashlib.sha256(endpoint.encode()).hexdigest()[:8]
     name = f"{repo_type}--{repo_id.replace('/', '--')}"
+    if re.search("--|-/|/-", repo_id) or len(name) > _MAX_NAME:
+        name = f"{name[:_MAX_NAME]}-{hashlib.sha256(repo_id.encode()).hexdigest()[:16]}"
     return cache_root() / "snapshots" / f"{host}-{key}" / name
 
 

@@ -7,11 +7,13 @@ content, so that a full commit names all of them. Snapshots and sources of packa
 
 from __future__ import annotations
 
+import contextlib
 import io
 import os
 import re
 import resource
 import shutil
+import signal
 import subprocess
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
@@ -29,7 +31,10 @@ from envhub_worker.protocol.text import printable, size_text
 MAX_BYTES = 2 * 2**30
 """Of a file that git writes: what it fetches, and all files of a commit, unpacked."""
 MAX_FILES = 50_000
-_TIMEOUT_S = 900.0
+_MAX_ROW_BYTES = 2048
+"""Of a file in git's listing: its names have no limit there, and each repeats those above it."""
+TIMEOUT_S = 900.0
+"""For one run of git, with all that it downloads."""
 _BLOCK = 1 << 20
 _SAID_BYTES = 1000
 _ROW = re.compile(rb"(\d{6}) (\w+) ([0-9a-f]{40}) +(\d+|-)\t(.+)", re.DOTALL)
@@ -63,8 +68,9 @@ def resolve(url: str, revision: str, variables: Variables | None = None) -> str:
     names = ["HEAD"] if revision == "HEAD" else names
     with tempfile.TemporaryDirectory(prefix="envhub-git-") as place:
         git = _Git(Path(place), os.environ if variables is None else variables)
-        said = git.run("ls-remote", "--quiet", _checked(url), *names).decode()
-    found = {name: commit for commit, _, name in (x.partition("\t") for x in said.splitlines())}
+        said = git.run("ls-remote", "--quiet", _checked(url), *names)
+    rows = said.decode("utf-8", "replace").splitlines()  # other names may end with these
+    found = {name: commit for commit, _, name in (row.partition("\t") for row in rows)}
     commit = next((found[name] for name in names if name in found), "")
     if not is_commit(commit):
         what = f"{url} has no tag or branch {revision!r}"
@@ -165,8 +171,10 @@ def _rows(file: IO[bytes], title: str) -> Iterator[bytes]:
     while block := file.read(_BLOCK):
         *rows, left = (left + block).split(b"\0")
         count += len(rows)
-        if count > MAX_FILES or len(left) > _BLOCK:
+        if count > MAX_FILES:
             raise SnapshotTooLargeError(f"{title} has more than {MAX_FILES} files")
+        if any(len(row) > _MAX_ROW_BYTES for row in (*rows, left)):
+            raise SnapshotTooLargeError(f"{title} has a file with a name that is too long")
         yield from rows
 
 
@@ -216,24 +224,45 @@ class _Git:
         store = self._store
         with tempfile.TemporaryFile(dir=store) as said, tempfile.TemporaryFile(dir=store) as kept:
             try:
-                subprocess.run(
-                    ["/bin/sh", "-c", _LIMITED, "sh", *_limits(), *command],
-                    input=given,
-                    stdout=output or kept,
-                    stderr=said,
-                    cwd=store,
-                    env=self._environment,
-                    timeout=_TIMEOUT_S,
-                    check=True,
-                )
+                words = ["/bin/sh", "-c", _LIMITED, "sh", *_limits(), *command]
+                self._run_to_its_end(words, given, stdout=output or kept, stderr=said)
             except (OSError, subprocess.SubprocessError) as error:
                 said.seek(max(0, said.seek(0, os.SEEK_END) - _SAID_BYTES))
-                text = said.read(_SAID_BYTES).decode("utf-8", "replace") or str(error)
+                text = said.read(_SAID_BYTES).decode("utf-8", "replace") or _why(error)
                 what = f"git {arguments[0]} failed: {printable(text, _SAID_BYTES).strip()}"
                 advice = "Check the address, the commit and the network"
                 raise HubFailure(Kind.UNREACHABLE, what, advice) from error
             kept.seek(0)
             return kept.read(_BLOCK)
+
+    def _run_to_its_end(
+        self, words: list[str], given: bytes, stdout: IO[bytes], stderr: IO[bytes]
+    ) -> None:
+        """Nothing of it is left then, also where it took too long or we are interrupted.
+
+        Git's children ask the host, which may keep them for ever.
+        """
+        with subprocess.Popen(
+            words,
+            stdin=subprocess.PIPE,
+            stdout=stdout,
+            stderr=stderr,
+            cwd=self._store,
+            env=self._environment,
+            start_new_session=True,
+        ) as process:
+            try:
+                process.communicate(given, TIMEOUT_S)
+            finally:
+                with contextlib.suppress(ProcessLookupError):
+                    os.killpg(process.pid, signal.SIGKILL)
+        if process.returncode:
+            raise subprocess.CalledProcessError(process.returncode, "git")
+
+
+def _why(error: Exception) -> str:
+    late = isinstance(error, subprocess.TimeoutExpired)
+    return f"it took longer than {TIMEOUT_S:.0f} s" if late else str(error)
 
 
 def _limits() -> tuple[str, str]:

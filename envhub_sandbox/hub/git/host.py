@@ -14,6 +14,7 @@ from envhub_sandbox.hub.listing import Copier, FileRecord, Repository
 from envhub_sandbox.system.log import SNAPSHOT
 
 _LOOKED_AT = 64 << 10
+_SHOWN = 10
 
 
 @dataclass(frozen=True)
@@ -31,8 +32,11 @@ class GitHost:
         """The files of a commit. Links are files with their text; submodules are left out."""
         with commits.fetched(f"{self.public_endpoint}/{repo.repo_id}", commit) as found:
             title = f"{repo.repo_id}@{commit[:12]}"
-            for path in found.submodules:
-                SNAPSHOT.warning("%s: the submodule %r is left out", title, path)
+            if found.submodules:
+                shown = ", ".join(map(repr, found.submodules[:_SHOWN]))
+                more = f" and {len(found.submodules) - _SHOWN} more"
+                more = more if len(found.submodules) > _SHOWN else ""
+                SNAPSHOT.warning("%s: submodules are left out: %s%s", title, shown, more)
             if _has_lfs(found):
                 SNAPSHOT.warning("%s: of its files in LFS only the pointers are here", title)
             yield _FetchedFiles(found)

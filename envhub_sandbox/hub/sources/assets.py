@@ -13,8 +13,10 @@ from dataclasses import replace
 from typing import Any
 
 from envhub_sandbox.errors import EnvHubError, HubReferenceError, SnapshotError
+from envhub_sandbox.hub.client import checked_endpoint
 from envhub_sandbox.hub.listing import DEFAULT_LIMITS, SnapshotLimits
-from envhub_sandbox.hub.reference import DEFAULT_PATH, HubRef
+from envhub_sandbox.hub.logins import without_login
+from envhub_sandbox.hub.reference import DEFAULT_PATH, REPO_TYPES, HubRef
 from envhub_sandbox.hub.snapshot import Snapshot, fetch
 from envhub_sandbox.hub.sources.card import CARD, CardError, declared_assets
 from envhub_sandbox.settings.options import option_name
@@ -46,7 +48,7 @@ def with_assets(snapshot: Snapshot, given: Sequence[str], hub: Mapping[str, Any]
             if any(_may_be(ref, *one) for one in theirs):
                 continue
             limits = replace(DEFAULT_LIMITS, max_bytes=max(1, left))
-            taken = _fetched(ref, f"its {CARD}", tell, {**hub, "token": False}, limits)
+            taken = _fetched(ref, f"its {CARD}", tell, _without_logins(hub), limits)
             left -= sum(file.size for file in taken.files)
             found.append(taken)
             SNAPSHOT.info(
@@ -80,6 +82,11 @@ def _asset(text: str, snapshot: Snapshot, where: str) -> HubRef:
     try:
         ref = HubRef.parse(text)
         names_file |= ref.path != DEFAULT_PATH
+        if ref.repo_type not in (None, *REPO_TYPES):  # a card would choose the host that is asked
+            names_file = False
+            raise HubReferenceError(
+                "this is not on the Hub, and an asset is; write it as in 'org/data@COMMIT'"
+            )
     except HubReferenceError as error:
         if not names_file:
             error.args = (f"{snapshot.label}: {where} holds {shown}: {error}",)
@@ -101,6 +108,12 @@ def _may_be(ref: HubRef, repo_type: str, repo_id: str) -> bool:
     return ref.repo_id.casefold() == repo_id and ref.repo_type in (None, repo_type)
 
 
+def _without_logins(hub: Mapping[str, Any]) -> dict[str, Any]:
+    """Neither with the caller's token, nor with the login in the address of a mirror."""
+    endpoint = without_login(checked_endpoint(hub.get("endpoint")))
+    return {**hub, "token": False, "endpoint": endpoint}
+
+
 def _fetched(
     ref: HubRef,
     where: str,
@@ -112,7 +125,8 @@ def _fetched(
     try:
         return fetch(ref, **hub, limits=limits, needs_entry=False)
     except EnvHubError as error:
-        error.args = (f"{error}\nIt is an asset: {where} names it.", *error.args[1:])
+        why = "" if where == option_name("assets") else ", and it is fetched without a login"
+        error.args = (f"{error}\nIt is an asset: {where} names it{why}.", *error.args[1:])
         raise
 
 

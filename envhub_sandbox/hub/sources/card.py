@@ -23,6 +23,7 @@ from envhub_sandbox.settings.options import MAX_ASSETS
 
 CARD = "README.md"
 _MAX_BYTES = 64 * 1024
+_MAX_CHARS = 500
 _FRONT = re.compile(r"\A\ufeff?---[ \t]*\r?\n(.*?)^---[ \t]*\r?$", re.DOTALL | re.MULTILINE)
 
 
@@ -55,6 +56,8 @@ def declared_assets(root: Path) -> list[str]:
         raise CardError(f"it declares {len(rows)} assets, and at most {MAX_ASSETS} are taken")
     if any(row.id != "scalar" for row in rows):
         raise CardError("each of its assets is a text, as in 'org/data@COMMIT'")
+    if any(len(row.value) > _MAX_CHARS for row in rows):
+        raise CardError(f"one of its assets has more than {_MAX_CHARS} characters")
     return [str(row.value) for row in rows]
 
 
@@ -63,7 +66,7 @@ def _tree(text: str) -> Any:
 
     try:
         return yaml.compose(text, Loader=yaml.SafeLoader)
-    except (yaml.YAMLError, RecursionError, ValueError) as error:
+    except (yaml.YAMLError, ArithmeticError, RecursionError, ValueError) as error:
         raise CardError(f"its YAML cannot be read: {type(error).__name__}") from None
 
 

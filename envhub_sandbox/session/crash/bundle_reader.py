@@ -251,11 +251,15 @@ def _files(mapping: dict[str, Any]) -> dict[str, str]:
 
 _GRANTED = ("profile", "network", "display", "readable", "gpu", "environment")
 _CARRIED = ("hub_cache_dir", "endpoint", "python", "dependencies", "lock", "assets")
+_MAX_WISH = 4000
 _USUAL: tuple[object, ...] = (None, "auto", [])
 
 
 def wishes(bundle: Bundle) -> list[str]:
-    """What it asks for beyond an ordinary run, one ``name=value`` each: for the user to grant."""
+    """What it asks for beyond an ordinary run, one ``name=value`` each: for the user to grant.
+
+    Raises ``BundleError``: one is too long to be shown whole, and what is cut off would be granted.
+    """
     asked, usual = _policy(bundle), Policy()
     found = [
         f"{name}={asked[name]!r}"
@@ -269,7 +273,10 @@ def wishes(bundle: Bundle) -> list[str]:
     found += [f"{name}={value!r}" for name, value in carried.items() if value not in _USUAL]
     if bundle.reference.startswith("git+"):  # a host that the bundle chose is asked
         found.append(f"repository={bundle.reference!r}")
-    return [one_line(wish, 300) for wish in found]  # a line each, whatever its name is
+    for wish in found:
+        if len(wish) > _MAX_WISH:
+            raise BundleError(f"it asks for more than can be shown: {one_line(wish, 300)}")
+    return [one_line(wish, 8 * _MAX_WISH) for wish in found]  # a line each, whatever its name is
 
 
 def _policy(bundle: Bundle) -> dict[str, Any]:

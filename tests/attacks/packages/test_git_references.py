@@ -5,10 +5,13 @@ The control is plain git with the same repository and the same user: there each 
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
+import socket
 import subprocess
 import threading
+import tracemalloc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -16,7 +19,13 @@ from pathlib import Path
 
 import pytest
 
-from envhub_sandbox.errors import EnvHubError, HubReferenceError, RepositoryUnavailableError
+from envhub_sandbox.errors import (
+    EnvHubError,
+    HubReferenceError,
+    RepositoryUnavailableError,
+    SnapshotTooLargeError,
+)
+from envhub_sandbox.hub.failures import HubFailure
 from envhub_sandbox.hub.git import address, commits
 from envhub_sandbox.hub.reference import HubRef
 from envhub_sandbox.hub.snapshot import Snapshot, snapshot_named
@@ -165,7 +174,9 @@ def test_variables_of_the_user_do_nothing(
     assert not ran(program)
 
 
-def test_submodules_are_not_fetched(repository: Path, tmp_path: Path) -> None:
+def test_submodules_are_not_fetched(
+    repository: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     """Plain git asks the host that the repository names."""
     with canary() as (elsewhere, asked), git_served(tmp_path / "served") as where:
         text = f'[submodule "m"]\n\tpath = m\n\turl = {elsewhere}/m\n'
@@ -177,8 +188,10 @@ def test_submodules_are_not_fetched(repository: Path, tmp_path: Path) -> None:
         plain_git("clone", "--recurse-submodules", f"{where}/org/repo", clone)
         assert asked, "the control failed"
         asked.clear()
-        found = snapshot_named(f"git+{where}/org/repo")
+        with caplog.at_level("WARNING"):
+            found = snapshot_named(f"git+{where}/org/repo")
         assert not asked
+    assert "submodules are left out: 'm'" in caplog.text
     assert {file.path for file in found.files} == {"env.py", ".gitmodules"}
 
 
@@ -299,3 +312,76 @@ def test_nothing_in_a_reference_is_an_option_or_a_program(
         with pytest.raises(HubReferenceError):
             commits.resolve("http://127.0.0.1:9/x", revision)
     assert not ran(program)
+
+
+def test_names_of_files_cost_no_memory(repository: Path, tmp_path: Path) -> None:
+    """Each row of git's listing repeats the folder's name: a few hundred bytes become 40 MB."""
+    blob = git(repository, "rev-parse", "HEAD:env.py")
+    rows = "".join(f"100644 blob {blob}\tf{number}\n" for number in range(2000))
+    inner = git(repository, "mktree", given=rows)
+    tree = git(repository, "mktree", given=f"040000 tree {inner}\t{'d' * 20_000}\n")
+    head = git(repository, "commit-tree", tree, "-m", "x")
+    git(repository, "update-ref", "refs/heads/main", head)
+    with git_served(tmp_path / "served") as where:
+        listed = plain_git("-C", str(repository), "ls-tree", "-r", "main").stdout
+        assert len(listed) > 40_000_000, "the control failed"
+        tracemalloc.start()
+        try:
+            with pytest.raises(SnapshotTooLargeError, match="a name that is too long"):
+                snapshot_named(f"git+{where}/org/repo")
+            assert tracemalloc.get_traced_memory()[1] < 20_000_000
+        finally:
+            tracemalloc.stop()
+
+
+def test_names_of_branches_may_be_any_bytes(repository: Path, tmp_path: Path) -> None:
+    """What ends with the wanted name comes along, whatever stands in front of it."""
+    head = git(repository, "rev-parse", "HEAD")
+    odd = b"refs/heads/\xff/refs/heads/main"
+    (repository / ".git" / "packed-refs").write_bytes(head.encode() + b" " + odd + b"\n")
+    with git_served(tmp_path / "served") as where:
+        shown = plain_git("ls-remote", f"{where}/org/repo", "refs/heads/main").stdout
+        assert odd in shown, "the control failed"
+        assert commits.resolve(f"{where}/org/repo", "main") == head
+
+
+@contextmanager
+def dripping() -> Iterator[tuple[str, threading.Event]]:
+    """A server whose answer never ends: its address, and whether the client has gone."""
+    gone, over = threading.Event(), threading.Event()
+    listener = socket.create_server(("127.0.0.1", 0))
+    kind = "application/x-git-upload-pack-advertisement"
+
+    def serve() -> None:
+        client, _ = listener.accept()
+        with client, contextlib.suppress(OSError):
+            client.recv(1 << 16)
+            client.sendall(f"HTTP/1.1 200 OK\r\nContent-Type: {kind}\r\n\r\n".encode())
+            while not over.wait(0.05):
+                client.sendall(b"0")
+        if not over.is_set():
+            gone.set()
+
+    thread = threading.Thread(target=serve)
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{listener.getsockname()[1]}/org/repo", gone
+    finally:
+        over.set()
+        thread.join()
+        listener.close()
+
+
+def test_a_server_that_never_ends_keeps_no_process(
+    repository: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of plain git that is ended the children stay, for as long as the server likes."""
+    with dripping() as (url, gone):
+        with pytest.raises(subprocess.TimeoutExpired):
+            subprocess.run(["git", "ls-remote", url], capture_output=False, timeout=3, check=True)
+        assert not gone.wait(1), "the control failed"
+    monkeypatch.setattr(commits, "TIMEOUT_S", 3.0)
+    with dripping() as (url, gone):
+        with pytest.raises(HubFailure, match="took longer than 3 s"):
+            commits.resolve(url, "main")
+        assert gone.wait(60)

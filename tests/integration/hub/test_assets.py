@@ -149,16 +149,27 @@ def test_assets_are_part_of_what_is_remembered_and_handed_on(make: Make) -> None
             again.close()
 
 
-def test_a_card_declares_assets(make: Make, stub_hub: StubHub, own: StubRepository) -> None:
-    """They are fetched without a token, and the provenance says so."""
+@pytest.mark.parametrize("login", ["", "me:hf_secret@"])
+def test_a_card_declares_assets(
+    make: Make, stub_hub: StubHub, own: StubRepository, login: str
+) -> None:
+    """They are fetched with neither a token nor a mirror's login, and the provenance has them."""
     own.files["README.md"] = f"---\nenvhub:\n  assets: [org/data@{DATA}]\n---\n# x\n".encode()
-    with make(token="hf_secret") as suites:
+    endpoint = stub_hub.endpoint.replace("://", f"://{login}")
+    with make(token=not login and "hf_secret", endpoint=endpoint) as suites:
         assert suites.env.call("text", "org/data", "mesh.txt", "dataset") == ("a mesh",)
         assert suites.provenance["assets"] == [f"datasets/org/data@{DATA}"]
     asked = zip(stub_hub.requests, stub_hub.authorizations, strict=True)
     tokens = {"data" if "org/data" in one else "own": token for one, token in asked}
     assert tokens["own"] is not None
     assert tokens["data"] is None
+
+
+def test_an_asset_of_a_card_that_is_not_there_is_named(make: Make, own: StubRepository) -> None:
+    """It may be one that a login would show."""
+    own.files["README.md"] = f"---\nenvhub: {{assets: [org/no@{DATA}]}}\n---\n".encode()
+    with pytest.raises(RepositoryUnavailableError, match="names it, and it is fetched without"):
+        make()
 
 
 def test_an_asset_that_is_not_there_is_named(make: Make) -> None:
@@ -176,12 +187,20 @@ def test_an_asset_that_is_not_there_is_named(make: Make) -> None:
         ("org/../data@" + "a" * 40, "holds"),
         ("/etc", "holds"),
         ("org/data@../../main", "holds"),
+        ("git+https://127.0.0.1:9/org/data@" + "a" * 40, "not on the Hub"),
+        ("github:org/data@" + "a" * 40, "not on the Hub"),
+        ("pypi:data#Data-v0", "not on the Hub"),
     ],
 )
-def test_what_is_no_asset_is_refused(make: Make, asset: str, why: str) -> None:
-    """The environment's own repository, one file, and tricks with paths."""
-    with pytest.raises(HubReferenceError, match=why):
-        make(assets=[asset])
+def test_what_is_no_asset_is_refused(make: Make, own: StubRepository, asset: str, why: str) -> None:
+    """The environment's own repository, one file, tricks with paths, and hosts of git.
+
+    Of a card, too: by a host of git it would have the client ask any server that it can reach.
+    """
+    own.files["README.md"] = f"---\nenvhub: {{assets: ['{asset}']}}\n---\n".encode()
+    for options in ({}, {"assets": [asset]}):
+        with pytest.raises(HubReferenceError, match=f"(?s){why}"):
+            make(**options)
 
 
 def test_no_token_and_no_cache_of_the_users_is_inside(

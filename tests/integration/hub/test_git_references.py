@@ -113,7 +113,7 @@ def test_links_and_submodules(ref: str, repository: Path, caplog: pytest.LogCapt
     assert names == {".gitattributes", "envs/env.py", "envs/asset.bin", "later.txt", "link"}
     assert (found.root / "link").read_bytes() == b"/etc/passwd"
     assert not (found.root / "link").is_symlink()
-    assert "the submodule 'module' is left out" in caplog.text
+    assert "submodules are left out: 'module'" in caplog.text
     assert "only the pointers are here" in caplog.text
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import cache
+from functools import lru_cache
 
 from envhub_worker.protocol.records import dataclass
 
@@ -46,7 +46,7 @@ class WireLimits:
 DEFAULT_LIMITS = WireLimits()
 
 
-@cache
+@lru_cache(maxsize=256)  # a client on another host chooses them
 def limits_for(message_bytes: int) -> WireLimits:
     """Those of one jail. One object for each size: what is kept of a message is for its limits."""
     return WireLimits(frame_bytes=message_bytes, message_bytes=message_bytes)

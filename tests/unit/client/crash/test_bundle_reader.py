@@ -234,6 +234,16 @@ def test_assets_of_a_bundle_are_a_wish(tmp_path: Path) -> None:
     assert wishes(load_bundle(bundle(tmp_path / "b", assets=[]))) == []
 
 
+def test_the_whole_of_a_wish_is_shown(tmp_path: Path) -> None:
+    """What stands behind many others is granted with them; where all cannot be shown, none is."""
+    many = [f"org/{'x' * 80}{number}" for number in range(15)] + ["me/private"]
+    [wish] = wishes(load_bundle(bundle(tmp_path / "a", assets=many)))
+    assert wish.endswith("'me/private']")
+    found = load_bundle(bundle(tmp_path / "b", assets=[*many * 4, "me/private"]))
+    with pytest.raises(BundleError, match="more than can be shown"):
+        wishes(found)
+
+
 def test_wishes_beyond_an_ordinary_run_are_told(tmp_path: Path) -> None:
     """They are granted by the user, or left out."""
     policy = Policy(

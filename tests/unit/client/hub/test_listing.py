@@ -11,10 +11,13 @@ from hypothesis import strategies as st
 from envhub_sandbox.errors import PolicyError, SnapshotError, SnapshotTooLargeError
 from envhub_sandbox.hub.listing import (
     FileRecord,
+    Snapshot,
     SnapshotLimits,
     check_listing_names,
     listing_within_limits,
 )
+from envhub_sandbox.hub.reference import HubRef
+from envhub_worker.protocol.runtime import read_hub_copies
 
 DIGEST = "sha256:" + "0" * 64
 
@@ -92,3 +95,26 @@ def test_accepted_names_stay_below_the_root(names: list[str]) -> None:
     for name in names:
         assert root in (root / name).parents
         assert ".." not in (root / name).parts
+
+
+@pytest.mark.parametrize(
+    ("revision", "found"),
+    [
+        ("v1.0", ("main", "v1.0")),
+        ("feature+x", ("feature+x", "main")),
+        ("fix#3=a@b,c%d", ("fix#3=a@b,c%d", "main")),
+        ("refs/pr/3", ("main", "refs/pr/3")),
+        ("main", ("main",)),
+        ("main/x", ("main",)),
+        ("a" * 40, ("main",)),
+        ("\u00e9", ("main",)),
+        ("a/b/c/d/e/f", ("main",)),
+        ("x" * 200, ("main",)),
+    ],
+)
+def test_every_revision_of_a_reference_can_be_opened(revision: str, found: tuple[str, ...]) -> None:
+    """What no jail's cache can be asked for is left out, and not refused by the worker."""
+    asked = HubRef.parse(f"org/repo@{revision}").revision
+    snapshot = Snapshot("org/repo", "model", "a" * 40, "env.py", Path("/x"), (), asked)
+    [copy] = read_hub_copies(snapshot.hub_copies)
+    assert copy.revisions == found

@@ -310,10 +310,18 @@ def test_endpoints_types_and_names_have_places_of_their_own(snapshot_store: Path
         ("https://huggingface.co/mirror", "model", "a/b"),
         ("https://huggingface.co", "model", "a-b/c"),
         ("https://huggingface.co", "model", "a/b-c"),
+        ("https://git.example", "git", "a--b/c"),
+        ("https://git.example", "git", "a/b--c"),
+        ("https://git.example", "git", "a/b/c"),
+        ("https://git.example", "git", "a-/b"),
+        ("https://git.example", "git", "a/-b"),
+        ("https://git.example", "git", "a/" * 99 + "b"),
+        ("https://git.example", "git", "a/" * 99 + "c"),
     ]
     folders = {store.repository_folder(*key) for key in keys}
     assert len(folders) == len(keys)
     assert all(folder.parents[2] == snapshot_store for folder in folders)
+    assert all(len(folder.name) < 256 for folder in folders)
 
 
 def test_unused_snapshots_are_removed(published: store.Slot) -> None:
