@@ -14,7 +14,7 @@ from typing import Any
 
 from envhub_sandbox.errors import EnvHubError, HubReferenceError, SnapshotError
 from envhub_sandbox.hub.listing import DEFAULT_LIMITS, SnapshotLimits
-from envhub_sandbox.hub.reference import DEFAULT_PATH, HubRef
+from envhub_sandbox.hub.reference import DEFAULT_PATH, HubRef, is_local
 from envhub_sandbox.hub.snapshot import Snapshot, fetch
 from envhub_sandbox.hub.sources.card import CARD, CardError, declared_assets
 from envhub_sandbox.settings.options import option_name
@@ -77,6 +77,11 @@ def _asset(text: str, snapshot: Snapshot, where: str) -> HubRef:
     masked = re.sub(r"://[^/]*@", "://***@", text)  # a pasted URL may carry a token
     shown = repr(masked[:200])
     names_file = re.search(r":(?!//)", masked) is not None
+    if is_local(masked) or re.match(r"(git\+https|github|pypi|examples):", masked, re.IGNORECASE):
+        raise HubReferenceError(
+            f"{snapshot.label}: {where} holds {shown}; an asset is a repository of the Hub, as in "
+            "'org/data@COMMIT'"
+        )
     try:
         ref = HubRef.parse(text)
         names_file |= ref.path != DEFAULT_PATH

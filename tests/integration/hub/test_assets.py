@@ -174,7 +174,10 @@ def test_an_asset_that_is_not_there_is_named(make: Make) -> None:
         ("Org/Repo@" + "a" * 40, "own repository"),
         (f"org/data@{DATA}:mesh.txt", "names a file"),
         ("org/../data@" + "a" * 40, "holds"),
-        ("/etc", "holds"),
+        ("/etc", "is a repository of the Hub"),
+        ("pypi:minigrid#MiniGrid-Empty-5x5-v0", "is a repository of the Hub"),
+        ("github:org/data", "is a repository of the Hub"),
+        ("git+https://github.com/org/data@" + "a" * 40, "is a repository of the Hub"),
         ("org/data@../../main", "holds"),
     ],
 )

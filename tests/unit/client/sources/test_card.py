@@ -48,6 +48,7 @@ def test_assets_are_a_list_of_texts(tmp_path: Path) -> None:
         ("envhub:\n  assets: org/data", "takes 'assets'"),
         ("envhub:\n  assets: [[org/data]]", "each of its assets is a text"),
         ("envhub: [", "cannot be read"),
+        ("license: mit\nenvhub:\n\tassets: []", "cannot be read: ScannerError in line 4"),
         ("envhub:\n  assets: " + "[" * 5000, "cannot be read"),
         ("envhub:\n  assets:\n" + "  - org/data\n" * 10_000, "cannot be read|declares|at most"),
         ("envhub:\n  assets:\n" + "  - org/data\n" * 100, "it declares 100 assets, and at most 16"),
