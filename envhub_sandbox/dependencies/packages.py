@@ -27,6 +27,10 @@ from envhub_worker.protocol.records import dataclass
 if TYPE_CHECKING:
     from envhub_sandbox.dependencies.environments import Environment
 
+_CHECK_REFERENCE = (
+    "The reference names the package: is it spelt so, and has the index that version?"
+)
+
 Tell = Callable[[str], None]
 
 
@@ -110,7 +114,9 @@ def packages_for(
                 return None
     except DependencyError as error:
         if snapshot.repo_type == registered.KIND and isinstance(error, ResolutionError):
-            fits = "The reference names the package: is it spelt so, and has the index that version?"
+            fits = (
+                "The reference names the package: is it spelt so, and has the index that version?"
+            )
             error.args = (f"{error}\n{fits}", *error.args[1:])
         name_source(error, snapshot.label)
         raise
