@@ -236,6 +236,9 @@ def _split_repo(repo: str, rest: str) -> tuple[str | None, str]:
             package = package.rpartition(":")[2] or "PACKAGE"
             example = f"pypi:{package}#{env_id}"
             raise Wrong("this names an environment of Gymnasium, not a repository", repr(example))
+        if not prefix and not rest and repo.endswith(".py"):
+            what = "this is the name of a file, and no such file is here"
+            raise Wrong(what, f"'./FOLDER/{repo}' or 'OWNER/NAME:{repo}'")
         local = "" if prefix or rest else f" (or './{repo}' for a local folder)"
         example = f"{prefix}OWNER/{steps[0]}{rest}"
         raise Wrong("the owner is missing", f"{example!r} with the owner's name{local}")

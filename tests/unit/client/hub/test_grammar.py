@@ -64,6 +64,13 @@ def test_an_environment_of_a_package(text: str, write: str) -> None:
     assert write in wrong.value.write
 
 
+def test_a_file_that_is_not_here() -> None:
+    """A name of Python code is a file's, not a repository's."""
+    with pytest.raises(grammar.Wrong, match="no such file is here") as wrong:
+        grammar.read("env.py")
+    assert "OWNER/NAME:env.py" in wrong.value.write
+
+
 def test_folders_and_commits_are_told_from_names() -> None:
     """By their form alone."""
     assert all(map(grammar.is_local, [".", "./env", "../env", "/env", "~/env"]))
