@@ -17,6 +17,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, nullcontext
 from time import perf_counter
 from typing import Any
+from unittest.mock import patch
 
 import gymnasium as gym
 
@@ -49,13 +50,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     print(f"{facts['processor']}, {facts['cores']} cores; {options.busy} busy processes beside\n")
     print("| " + " | ".join(_COLUMNS) + " |\n" + "|---" * len(_COLUMNS) + "|", flush=True)
     began = perf_counter()
-    with tempfile.TemporaryDirectory() as cache:
-        os.environ["ENVHUB_CACHE"] = cache
-        with busy_processes(options.busy) if options.busy else nullcontext():
-            for name, count in itertools.product(options.workloads, options.sizes):
-                if name != "cameras" or count <= _MOST_PIXELS:
-                    row = _row(WORKLOADS[name], count, options.rounds, options.seconds)
-                    print(row, flush=True)
+    with (
+        tempfile.TemporaryDirectory() as cache,
+        patch.dict(os.environ, {"ENVHUB_CACHE": cache}),
+        busy_processes(options.busy) if options.busy else nullcontext(),
+    ):
+        for name, count in itertools.product(options.workloads, options.sizes):
+            if name != "cameras" or count <= _MOST_PIXELS:
+                row = _row(WORKLOADS[name], count, options.rounds, options.seconds)
+                print(row, flush=True)
     print(f"\n{perf_counter() - began:.0f} s")
 
 

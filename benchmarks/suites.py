@@ -21,6 +21,7 @@ from pathlib import Path
 from shutil import which
 from time import perf_counter
 from typing import Any
+from unittest.mock import patch
 
 from benchmarks.driver import ROOT
 from benchmarks.evaluations import LAZY, LEROBOT, LOOP, VARIANTS
@@ -146,9 +147,10 @@ def _first(prepare: str, measured: str, cache: str) -> float:
 
 
 def _tables(options: argparse.Namespace, suite: Suite) -> Iterator[str]:
-    before = os.environ.get("ENVHUB_CACHE")
-    with tempfile.TemporaryDirectory() as cache:
-        os.environ["ENVHUB_CACHE"] = cache
+    with (
+        tempfile.TemporaryDirectory() as cache,
+        patch.dict(os.environ, {"ENVHUB_CACHE": cache}),
+    ):
         for part in ("light", "heavy"):
             if part in options.parts:
                 rounds = options.rounds if part == "light" else max(options.rounds // 2, 1)
@@ -162,9 +164,6 @@ def _tables(options: argparse.Namespace, suite: Suite) -> Iterator[str]:
                 many = [replace(suite, tasks=n) for n in (10, 10, 40)]
                 sizes = [one.evaluate(variant, memory=True).peak_mb for one in many]
                 yield f"{variant}: 10 tasks {sizes[1]} MB, 40 tasks {sizes[2]} MB"
-    os.environ.pop("ENVHUB_CACHE")
-    if before is not None:
-        os.environ["ENVHUB_CACHE"] = before
     if "first" in options.parts:
         found = first_steps(options.rounds)
         base = statistics.median(found['python -c "import numpy, gymnasium"'])

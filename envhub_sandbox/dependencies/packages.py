@@ -18,6 +18,7 @@ from envhub_sandbox.errors import (
     ResolutionError,
     name_source,
 )
+from envhub_sandbox.hub.registered import reference as registered
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.system import progress
 from envhub_sandbox.system.log import DEPENDENCIES
@@ -25,6 +26,10 @@ from envhub_worker.protocol.records import dataclass
 
 if TYPE_CHECKING:
     from envhub_sandbox.dependencies.environments import Environment
+
+_CHECK_REFERENCE = (
+    "The reference names the package: is it spelt so, and has the index that version?"
+)
 
 Tell = Callable[[str], None]
 
@@ -108,5 +113,10 @@ def packages_for(
                 DEPENDENCIES.warning("%s: nothing is installed for it: %s", snapshot.label, error)
                 return None
     except DependencyError as error:
+        if snapshot.repo_type == registered.KIND and isinstance(error, ResolutionError):
+            fits = (
+                "The reference names the package: is it spelt so, and has the index that version?"
+            )
+            error.args = (f"{error}\n{fits}", *error.args[1:])
         name_source(error, snapshot.label)
         raise

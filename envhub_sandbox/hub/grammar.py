@@ -231,6 +231,14 @@ def _split_repo(repo: str, rest: str) -> tuple[str | None, str]:
         kind, prefix = _TYPE_OF_PREFIX[steps[0]], f"{steps[0]}/"
         steps = steps[1:]
     if len(steps) == 1 and steps[0]:
+        if not prefix and re.search(r"#.|-v\d+\Z", repo + rest):
+            package, _, env_id = (repo + rest).rpartition("#")
+            package = package.rpartition(":")[2] or "PACKAGE"
+            example = f"pypi:{package}#{env_id}"
+            raise Wrong("this names an environment of Gymnasium, not a repository", repr(example))
+        if not prefix and not rest and repo.endswith(".py"):
+            what = "this is the name of a file, and no such file is here"
+            raise Wrong(what, f"'./FOLDER/{repo}' or 'OWNER/NAME:{repo}'")
         local = "" if prefix or rest else f" (or './{repo}' for a local folder)"
         example = f"{prefix}OWNER/{steps[0]}{rest}"
         raise Wrong("the owner is missing", f"{example!r} with the owner's name{local}")

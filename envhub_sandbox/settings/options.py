@@ -366,7 +366,8 @@ def in_python(option: Option, value: Any) -> str:
 
 
 def on_command_line(known: Collection[str]) -> Spelling:
-    """``--dependencies host``, ``--profile no-userns``; in Python what a command does not have.
+    """``--dependencies host``, ``--profile no-userns``, an option again for each of a list; in
+    Python what a command does not have.
 
     Args:
         known: The options of the command.
@@ -378,7 +379,8 @@ def on_command_line(known: Collection[str]) -> Spelling:
             return f"{in_python(option, value)} in Python"
         if value is _NO_VALUE or value is True:
             return command
-        return f"{command} {shlex.quote(_text(value))}"
+        every = value if option.kind is list and isinstance(value, list) else [value]
+        return " ".join(f"{command} {shlex.quote(_text(one))}" for one in every)
 
     return spelling
 

@@ -72,8 +72,9 @@ def _batch_of_arrays(
     if array.shape != shape or (array.size and array.dtype.kind not in _kinds_for(space)):
         kind = ActionError if array.shape else ActionTypeError
         of = "all" if count is None else count
+        places = f"{of} sub-environment{'' if count == 1 else 's'}"
         raise kind(
-            f"{where}: expected {dtype} of shape {shape} for {space} in {of} sub-environments, "
+            f"{where}: expected {dtype} of shape {shape} for {space} in {places}, "
             f"got {array.dtype} of shape {array.shape}"
         )
     # an environment in this process would see the caller's own numbers

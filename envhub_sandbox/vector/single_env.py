@@ -18,6 +18,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import VectorEnv
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
+from envhub_sandbox.errors import ActionError
 from envhub_sandbox.vector.sandbox_view import SandboxView
 from envhub_sandbox.vector.tracebacks import short_traceback, shortened
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
@@ -276,10 +277,16 @@ class SingleEnv(gym.Env[Any, Any]):
 
     def _batch(self, action: Any) -> Any:
         space = self._vector.single_action_space
-        if type(action) in (int, float):
+        if type(action) in (bool, int, float):
             return [action]  # arrives as it is
         if isinstance(space, _PLAIN):
-            return np.asarray(action)[None]
+            array = np.asarray(action)
+            if array.shape != space.shape:
+                raise ActionError(
+                    f"action: expected {space.dtype} of shape {space.shape} for {space}, got "
+                    f"{array.dtype} of shape {array.shape}"
+                )
+            return array[None]
         return concatenate(space, [action], cast("Any", create_empty_array(space, 1)))
 
     def _first(self, batch: Any, which: Sequence[bool]) -> Any:

@@ -30,7 +30,6 @@ from envhub_sandbox import make_env as sandboxed
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.integrations import lerobot_eval
 from envhub_sandbox.integrations.lerobot.config import SpareSuites
-from tests.lerobot.repositories import REACH
 
 FOUND: dict[str, Any] = {}
 COMMITS: dict[str, str] = json.loads(sys.argv[1])
@@ -192,7 +191,7 @@ def freezes() -> None:
         FOUND["freezes"] = True
         return
     names: dict[str, Any] = {}
-    exec(REACH, names)
+    exec(sys.argv[4], names)
     os.environ.pop("REACHED")
     lengths = (2, 5, 3)
     theirs = SyncVectorEnv([lambda: wrapper(names["Reach"]())] * len(lengths))

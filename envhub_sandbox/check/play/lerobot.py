@@ -23,16 +23,25 @@ def lerobot_lacks(env: VectorEnv[Any, Any, Any]) -> Iterator[str]:
     observations, actions = env.single_observation_space, env.single_action_space
     lacks = []
     if not isinstance(observations, spaces.Dict) or not {*_SEEN} & {*observations.spaces}:
-        shown = printable(str(observations), _LONGEST)
         lacks.append(
-            f"a mapping with {', '.join(_SEEN[:-1])} or {_SEEN[-1]} to observe, not {shown}"
+            f"a mapping with {', '.join(_SEEN[:-1])} or {_SEEN[-1]} to observe, not "
+            f"{_named(observations)}"
         )
     if not isinstance(actions, spaces.Box) or len(actions.shape) != 1:
-        lacks.append(f"a vector (Box) for its action, not {printable(str(actions), _LONGEST)}")
+        lacks.append(f"a vector (Box) for its action, not {_named(actions)}")
     if not _has(env, "_max_episode_steps"):
         lacks.append("_max_episode_steps (gymnasium.wrappers.TimeLimit has it)")
     if lacks:
         yield f"loops of Gymnasium's vector environments play it; LeRobot needs {'; '.join(lacks)}"
+
+
+def _named(space: spaces.Space[Any]) -> str:
+    """A space without the bounds of its numbers, of which there may be many."""
+    if isinstance(space, spaces.Box):
+        return f"a Box of shape {space.shape}"
+    if isinstance(space, spaces.Dict):
+        return f"a Dict of {printable(', '.join(map(str, space.spaces)), _LONGEST)}"
+    return printable(str(space), _LONGEST)
 
 
 def _has(env: Any, name: str) -> bool:

@@ -15,6 +15,7 @@ import math
 import os
 import re
 import sys
+import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -89,12 +90,22 @@ def _end_of_line(text: str) -> str:
 
 @contextlib.contextmanager
 def guarded() -> Iterator[None]:
-    """Let CI systems obey nothing of what is written to stdout and stderr while it lasts."""
-    with (
-        contextlib.redirect_stdout(_SafeStream(sys.stdout)),
-        contextlib.redirect_stderr(_SafeStream(sys.stderr)),
-    ):
-        yield
+    """Let CI systems obey nothing of what is written to stdout and stderr while it lasts. A
+    warning of Python is a line without the place in this package's code that gave it.
+    """
+    before, warnings.showwarning = warnings.showwarning, _show_warning
+    try:
+        with (
+            contextlib.redirect_stdout(_SafeStream(sys.stdout)),
+            contextlib.redirect_stderr(_SafeStream(sys.stderr)),
+        ):
+            yield
+    finally:
+        warnings.showwarning = before
+
+
+def _show_warning(message: Warning | str, *_place: object, **_further: object) -> None:
+    say(f"Warning: {message}", "yellow")
 
 
 def console(*, stderr: bool = False) -> Console:

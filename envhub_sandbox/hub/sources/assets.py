@@ -16,7 +16,7 @@ from envhub_sandbox.errors import EnvHubError, HubReferenceError, SnapshotError
 from envhub_sandbox.hub.client import checked_endpoint
 from envhub_sandbox.hub.listing import DEFAULT_LIMITS, SnapshotLimits
 from envhub_sandbox.hub.logins import without_login
-from envhub_sandbox.hub.reference import DEFAULT_PATH, REPO_TYPES, HubRef
+from envhub_sandbox.hub.reference import DEFAULT_PATH, REPO_TYPES, HubRef, is_local
 from envhub_sandbox.hub.snapshot import Snapshot, fetch
 from envhub_sandbox.hub.sources.card import CARD, CardError, declared_assets
 from envhub_sandbox.settings.options import option_name
@@ -79,14 +79,15 @@ def _asset(text: str, snapshot: Snapshot, where: str) -> HubRef:
     masked = re.sub(r"://[^/]*@", "://***@", text)  # a pasted URL may carry a token
     shown = repr(masked[:200])
     names_file = re.search(r":(?!//)", masked) is not None
+    elsewhere = HubReferenceError(
+        f"{snapshot.label}: {where} holds {shown}; an asset is a repository of the Hub, as in "
+        "'org/data@COMMIT'"
+    )
+    if is_local(masked) or re.match(r"(git\+https|github|pypi|examples):", masked, re.IGNORECASE):
+        raise elsewhere
     try:
         ref = HubRef.parse(text)
         names_file |= ref.path != DEFAULT_PATH
-        if ref.repo_type not in (None, *REPO_TYPES):  # a card would choose the host that is asked
-            names_file = False
-            raise HubReferenceError(
-                "this is not on the Hub, and an asset is; write it as in 'org/data@COMMIT'"
-            )
     except HubReferenceError as error:
         if not names_file:
             error.args = (f"{snapshot.label}: {where} holds {shown}: {error}",)
@@ -96,6 +97,8 @@ def _asset(text: str, snapshot: Snapshot, where: str) -> HubRef:
             f"{snapshot.label}: {where} holds {shown}, which names a file; an asset is a whole "
             "repository, as in 'org/data@COMMIT'"
         )
+    if ref.repo_type not in (None, *REPO_TYPES):  # a card would choose the host that is asked
+        raise elsewhere
     if _may_be(ref, snapshot.repo_type, snapshot.repo_id.casefold()):
         raise HubReferenceError(
             f"{snapshot.label}: {where} holds {shown}, which is the environment's own repository; "

@@ -67,7 +67,9 @@ def _tree(text: str) -> Any:
     try:
         return yaml.compose(text, Loader=yaml.SafeLoader)
     except (yaml.YAMLError, ArithmeticError, RecursionError, ValueError) as error:
-        raise CardError(f"its YAML cannot be read: {type(error).__name__}") from None
+        mark = getattr(error, "problem_mark", None)
+        where = f" in line {mark.line + 2}" if mark else ""  # the first line is the ---
+        raise CardError(f"its YAML cannot be read: {type(error).__name__}{where}") from None
 
 
 def _value(node: Any, key: str) -> Any:

@@ -35,8 +35,8 @@ def test_a_repository_of_the_hub_runs(
     monkeypatch.setenv("HF_HUB_OFFLINE", "1")
     pinned = envhub("run", f"org/cli-runs@{commit}", "--episodes", "2", "--json", *hub)
     assert json.loads(pinned.stdout)["provenance"]["commit"] == commit
-    listed = envhub("cache", "list")
-    assert commit in listed.stdout.replace("\n", "")
+    listed = envhub("cache", "list", "--json")
+    assert [one["commit"] for one in json.loads(listed.stdout)["snapshots"]] == [commit]
 
 
 def test_ctrl_c_ends_a_download_that_hangs(hub_cache: Path) -> None:

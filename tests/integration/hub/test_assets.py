@@ -185,11 +185,14 @@ def test_an_asset_that_is_not_there_is_named(make: Make) -> None:
         ("Org/Repo@" + "a" * 40, "own repository"),
         (f"org/data@{DATA}:mesh.txt", "names a file"),
         ("org/../data@" + "a" * 40, "holds"),
-        ("/etc", "holds"),
+        ("/etc", "is a repository of the Hub"),
+        ("pypi:minigrid#MiniGrid-Empty-5x5-v0", "is a repository of the Hub"),
+        ("github:org/data", "is a repository of the Hub"),
+        ("git+https://github.com/org/data@" + "a" * 40, "is a repository of the Hub"),
         ("org/data@../../main", "holds"),
-        ("git+https://127.0.0.1:9/org/data@" + "a" * 40, "not on the Hub"),
-        ("github:org/data@" + "a" * 40, "not on the Hub"),
-        ("pypi:data#Data-v0", "not on the Hub"),
+        ("git+https://127.0.0.1:9/org/data@" + "a" * 40, "a repository of the Hub"),
+        ("github:org/data@" + "a" * 40, "a repository of the Hub"),
+        ("pypi:data#Data-v0", "a repository of the Hub"),
     ],
 )
 def test_what_is_no_asset_is_refused(make: Make, own: StubRepository, asset: str, why: str) -> None:

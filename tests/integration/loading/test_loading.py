@@ -468,12 +468,14 @@ class TestAFile:
             assert suites.provenance["repository"] == str((tmp_path / name).parent)
             assert suites.provenance["path"] == "env.py"
 
-    @pytest.mark.parametrize("name", ["env.py", "env.txt"])
+    @pytest.mark.parametrize(
+        ("name", "why"), [("env.py", "no such file is here"), ("env.txt", "owner is missing")]
+    )
     def test_what_is_no_python_file_here_is_a_hub_reference(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, why: str
     ) -> None:
         """A name alone is none."""
         (tmp_path / "env.txt").write_text("")
         monkeypatch.chdir(tmp_path)
-        with pytest.raises(HubReferenceError, match="owner is missing"):
+        with pytest.raises(HubReferenceError, match=why):
             make_env(name)

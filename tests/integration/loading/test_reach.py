@@ -69,7 +69,7 @@ def env(tmp_path_factory: pytest.TempPathFactory) -> Any:
 
 
 URL = "http://envhub.example/x"
-PIP = "[sys.executable, '-m', 'pip', 'install', 'requests']"
+PIP = "[sys.executable, '-m', 'pip', 'install', 'no-such-one']"
 
 
 @pytest.mark.parametrize(
@@ -80,7 +80,10 @@ PIP = "[sys.executable, '-m', 'pip', 'install', 'requests']"
         (f"urllib.request.urlopen({URL!r})", "assets=['org/repo@COMMIT'] names"),
         (f"subprocess.run(['git', 'clone', {URL!r}, '/tmp/x'], check=True)", "] names"),
         (f"subprocess.run({PIP}, check=True)", "dependencies={'extra': ['PACKAGE']}"),
-        ("subprocess.check_call('pip install -q requests', shell=True)", "requirements.txt"),
+        (
+            "subprocess.check_call('pip install -q no-such-one', shell=True)",
+            "requirements.txt",
+        ),
         ("socket.create_server(('127.0.0.1', 0))", "policy={'network': 'loopback'}"),
         ("socket.create_connection(('localhost', 1))", "policy={'network': 'loopback'}"),
         ("raise RuntimeError('could not connect to display')", "render to arrays"),

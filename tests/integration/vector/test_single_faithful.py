@@ -13,6 +13,7 @@ import pytest
 from gymnasium.wrappers import TimeAwareObservation
 
 from envhub_sandbox import SandboxEnv
+from envhub_sandbox.errors import ActionError
 from tests.support.compare import assert_same
 from tests.support.repositories import write_repository
 from tests.support.samples import make_env_of
@@ -205,3 +206,13 @@ def make_env(n_envs=1, use_async_envs=False):
         assert env.spec is None
     finally:
         env.close()
+
+
+def test_an_action_of_another_shape(env: SandboxEnv) -> None:
+    """The error has the shapes of one action, and a bool arrives as a bool."""
+    env.reset(seed=0)
+    with pytest.raises(ActionError, match=r"int64 of shape \(\) for Discrete\(4\), got .* \(1,\)"):
+        env.step([1])
+    for _ in range(3):
+        env.step(1)
+    assert env.step(True)[4]["kind"] == "bool"

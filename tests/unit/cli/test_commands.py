@@ -7,6 +7,7 @@ import inspect as python
 import json
 import os
 import shlex
+import warnings
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -186,6 +187,16 @@ def test_annotations_are_for_the_job_and_its_summary(
         findings.annotate(["::notice::one", "::error::two"], "after\n")
     assert capsys.readouterr().out == "::notice::one\n::error::two\n"
     assert summary.read_text() == "before\nafter\n"
+
+
+def test_a_warning_is_a_line(capsys: pytest.CaptureFixture[str]) -> None:
+    """Without the file and the line of this package that gave it; outside it is Python's again."""
+    before = warnings.showwarning
+    with warnings.catch_warnings(), guarded():
+        warnings.simplefilter("always")
+        warnings.warn("a stub stands in\n::error::obey", stacklevel=1)
+    assert capsys.readouterr().err == "Warning: a stub stands in\n:\\x3aerror::obey\n"
+    assert warnings.showwarning is before
 
 
 def test_versions_of_all_that_matters(monkeypatch: pytest.MonkeyPatch) -> None:

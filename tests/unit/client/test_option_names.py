@@ -43,6 +43,10 @@ _ROOT = Path(next(iter(envhub_sandbox.__path__)))
             *("profile", "container", "policy={'profile': 'container'}", "--profile container"),
             """--env.policy='{"profile": "container"}'""",
         ),
+        (
+            *("assets", ["a/b", "c/d"], "assets=['a/b', 'c/d']", "--assets a/b --assets c/d"),
+            """--env.assets='["a/b", "c/d"]'""",
+        ),
         ("gpu", True, "policy={'gpu': True}", "--gpu", """--env.policy='{"gpu": true}'"""),
         (
             *("startup_s", 600, "timeouts={'startup_s': 600}", "--timeout 600"),

@@ -49,6 +49,28 @@ def test_parts_that_the_hub_cannot_have(parts: grammar.Parts, what: str) -> None
     assert wrong.value.write
 
 
+@pytest.mark.parametrize(
+    ("text", "write"),
+    [
+        ("minigrid#MiniGrid-Empty-5x5-v0", "pypi:minigrid#MiniGrid-Empty-5x5-v0"),
+        ("pip:minigrid@3.0.0#MiniGrid-Empty-5x5-v0", "pypi:minigrid@3.0.0#MiniGrid-Empty-5x5-v0"),
+        ("CartPole-v1", "pypi:PACKAGE#CartPole-v1"),
+    ],
+)
+def test_an_environment_of_a_package(text: str, write: str) -> None:
+    """What is named as Gymnasium names environments leads to the reference of a package."""
+    with pytest.raises(grammar.Wrong, match="environment of Gymnasium") as wrong:
+        grammar.read(text)
+    assert write in wrong.value.write
+
+
+def test_a_file_that_is_not_here() -> None:
+    """A name of Python code is a file's, not a repository's."""
+    with pytest.raises(grammar.Wrong, match="no such file is here") as wrong:
+        grammar.read("env.py")
+    assert "OWNER/NAME:env.py" in wrong.value.write
+
+
 def test_folders_and_commits_are_told_from_names() -> None:
     """By their form alone."""
     assert all(map(grammar.is_local, [".", "./env", "../env", "/env", "~/env"]))
