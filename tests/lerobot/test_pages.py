@@ -84,7 +84,9 @@ def test_the_pages_hold(olah: OlahServer, tmp_path: Path) -> None:
     features = found.pop("features")
     features.pop("observation.forces", None)  # LeRobot 0.6 hands it on, 0.4 does not
     assert features == FEATURES
-    assert "jail" not in found.pop("stderr")
+    stub = "a stub stands in"  # where the jails have no LeRobot
+    said = [line for line in found.pop("stderr").splitlines() if stub not in line]
+    assert "jail" not in "\n".join(said)
     if "commands" in found:  # LeRobot 0.4 has other options, and asks no configuration
         pinned = f"models/robots/reach@{commits['reach']}"
         ours = ["SandboxedEnvConfig", pinned, "act"]
