@@ -30,6 +30,9 @@ settings.load_profile("ci" if "ENVHUB_CI" in os.environ else "local")
 if folders.why_distrusted(Path(tempfile.gettempdir()), Path("/nowhere")):
     os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", "/var/tmp")
 
+# It has been read. A test that runs pytest gives it options of its own.
+os.environ.pop("PYTEST_ADDOPTS", None)
+
 # Gymnasium colours its warnings also where nobody looks, such as in the summary of a run.
 gymnasium.logger.colorize = lambda text, *_, **__: text
 
