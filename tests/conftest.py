@@ -30,9 +30,6 @@ settings.load_profile("ci" if "ENVHUB_CI" in os.environ else "local")
 if folders.why_distrusted(Path(tempfile.gettempdir()), Path("/nowhere")):
     os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", "/var/tmp")
 
-# It has been read. A test that runs pytest gives it options of its own.
-os.environ.pop("PYTEST_ADDOPTS", None)
-
 # Gymnasium colours its warnings also where nobody looks, such as in the summary of a run.
 gymnasium.logger.colorize = lambda text, *_, **__: text
 
@@ -43,7 +40,11 @@ if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_finish() -> None:
-    """Ten thousand tests stay to the end: no collection of garbage looks through them again."""
+    """Ten thousand tests stay to the end: no collection of garbage looks through them again.
+
+    And PYTEST_ADDOPTS has been read by all workers: a test that runs pytest has options of its own.
+    """
+    os.environ.pop("PYTEST_ADDOPTS", None)
     gc.collect()
     gc.freeze()
 
