@@ -18,6 +18,8 @@ if TYPE_CHECKING:
     from envhub_sandbox.hub.reference import HubRef as HubRef
     from envhub_sandbox.integrations.gym import SandboxEnv as SandboxEnv
     from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox as DockerSandbox
+    from envhub_sandbox.sandboxes.fleet.fleet import Fleet as Fleet
+    from envhub_sandbox.sandboxes.ray.sandbox import RaySandbox as RaySandbox
     from envhub_sandbox.sandboxes.remote import RemoteSandbox as RemoteSandbox
     from envhub_sandbox.settings.policy import Limits as Limits
     from envhub_sandbox.settings.policy import Policy as Policy
@@ -30,9 +32,11 @@ if TYPE_CHECKING:
 _HOMES = {
     "DockerSandbox": "sandboxes.docker.sandbox",
     "EnvSuites": "vector.suites",
+    "Fleet": "sandboxes.fleet.fleet",
     "HubRef": "hub.reference",
     "Limits": "settings.policy",
     "Policy": "settings.policy",
+    "RaySandbox": "sandboxes.ray.sandbox",
     "RemoteSandbox": "sandboxes.remote",
     "SandboxEnv": "integrations.gym",
     "SandboxVectorEnv": "vector.vector_env",

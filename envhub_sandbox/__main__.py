@@ -10,8 +10,8 @@ import sys
 if __name__ == "__main__":
     if not (sys.flags.isolated or getattr(sys.flags, "safe_path", False)):
         sys.stderr.write(
-            "envhub: not run, since python -m looks for modules in the current folder first, which "
-            f"may be a stranger's. Use: envhub, or: {sys.executable} -I -m envhub_sandbox\n"
+            "envhub did not start: python -m imports modules from the current folder first, which "
+            f"may be untrusted. Use: envhub, or: {sys.executable} -I -m envhub_sandbox\n"
         )
         sys.exit(2)
 

@@ -1,4 +1,4 @@
-"""Every error that a caller can meet.
+"""Every error that a caller can get.
 
 ::
 
@@ -40,9 +40,9 @@
         RemoteAttributeError (AttributeError), RemoteValueError (ValueError), ...
         RemoteResetNeeded (gymnasium.error.ResetNeeded), ...
 
-A remote exception arrives as text. ``remote_error`` maps its builtin ancestor through a fixed
-table, so ``except AttributeError`` keeps working although nothing of the worker is imported. What
-the repository warns of is a ``RemoteEnvWarning``, whatever its category is there.
+A remote exception arrives as text. ``remote_error`` looks up its builtin base class in a fixed
+table, so ``except AttributeError`` works although nothing of the worker is imported. A warning of
+the repository, of any category, is a ``RemoteEnvWarning``.
 """
 
 from __future__ import annotations
@@ -64,11 +64,11 @@ from envhub_worker.protocol.text import continued
 
 
 class HubReferenceError(EnvHubError, ValueError):
-    """A hub reference cannot be read; the text says what to write instead."""
+    """A hub reference is invalid; the text says what to write instead."""
 
 
 class SnapshotError(EnvHubError):
-    """A repository's files could not be brought here."""
+    """A repository's files could not be downloaded, or are not usable."""
 
 
 class SnapshotTooLargeError(SnapshotError):
@@ -76,7 +76,7 @@ class SnapshotTooLargeError(SnapshotError):
 
 
 class SnapshotIntegrityError(SnapshotError):
-    """A file is not what the pinned commit says it is."""
+    """A file differs from the pinned commit."""
 
 
 class RepositoryUnavailableError(SnapshotError, OSError):
@@ -90,18 +90,18 @@ class PolicyError(EnvHubError, ValueError):
 
 
 class BundleError(EnvHubError, ValueError):
-    """This is no crash bundle, or one that breaks a rule."""
+    """This is not a valid crash bundle."""
 
 
 class LockError(EnvHubError, ValueError):
-    """A lock file cannot be read or written, or asks for what no lock of ours does."""
+    """A lock file cannot be read or written, or is not valid."""
 
 
 class LockDriftError(LockError):
-    """Something is not as it was locked; nothing of it is used.
+    """Something differs from the lock, and is not used.
 
     Attributes:
-        drifts: What, a line each.
+        drifts: The differences, one line each.
     """
 
     def __init__(self, message: str, drifts: tuple[str, ...] = ()) -> None:
@@ -114,15 +114,15 @@ class ActionError(EnvHubError, ValueError):
 
 
 class ActionTypeError(ActionError, TypeError):
-    """What cannot be a batch of anything, such as a single number."""
+    """The actions are not a batch, for example a single number."""
 
 
 class ObservationError(EnvHubError, ValueError):
-    """With ``validate=True``: an observation is outside of its space. The env is still usable.
+    """With ``validate=True``: an observation is outside its space. The env is still usable.
 
     Attributes:
-        index: The sub-environment's.
-        observation: What it gave.
+        index: Of the sub-environment.
+        observation: Its observation.
     """
 
     def __init__(self, message: str, *, index: int = 0, observation: object = None) -> None:
@@ -136,17 +136,17 @@ class SandboxUnavailableError(EnvHubError):
 
 
 class DependencyError(EnvHubError, ImportError):
-    """The repository needs a package that it does not get; nothing of it runs."""
+    """A package that the repository needs is missing; the repository does not run."""
 
     __str__ = Exception.__str__  # ImportError's does not look at args
 
 
 class RequirementError(DependencyError):
-    """What a repository declares cannot be taken; the text names the file and the line."""
+    """A declared requirement is not supported; the text names the file and the line."""
 
 
 class ResolutionError(DependencyError):
-    """No versions satisfy all that is required; the text says which requirements are in the way."""
+    """No versions satisfy all requirements; the text names those that conflict."""
 
 
 class IndexUnavailableError(DependencyError):
@@ -154,28 +154,28 @@ class IndexUnavailableError(DependencyError):
 
 
 class PackageIntegrityError(DependencyError):
-    """A package is not the one whose hash is known. Nothing of it was kept."""
+    """A package does not have the expected hash. It was not kept."""
 
 
 class PackagesTooLargeError(DependencyError):
-    """Packages have more bytes or files than this machine's user permits. None was made."""
+    """The packages have more bytes or files than permitted. Nothing was installed."""
 
 
 class InterpreterUnavailableError(DependencyError):
-    """No interpreter of this machine is one that the repository asks for."""
+    """No interpreter of this machine fits the repository."""
 
 
 class MissingModuleError(DependencyError, ModuleNotFoundError):
-    """It imports a module that its interpreter does not have."""
+    """The repository imports a module that its interpreter does not have."""
 
     __str__ = Exception.__str__
 
 
 class LoadError(EnvHubError):
-    """The repository's entry point cannot be imported, or returned something unusable.
+    """The repository's entry point cannot be imported, or returned no environment.
 
-    Also the builtin that LeRobot's loader would raise: ``AttributeError`` where there is no
-    ``make_env``, ``ValueError`` where it returned no environment, and else what the repository did.
+    It is also the builtin that LeRobot's loader would raise: ``AttributeError`` without a
+    ``make_env``, ``ValueError`` if it returned no environment, otherwise the repository's own.
     """
 
 
@@ -184,20 +184,20 @@ class WorkerError(EnvHubError):
 
 
 class WorkerStartupError(WorkerError):
-    """The worker did not come up."""
+    """The worker did not start."""
 
 
 class ServerBusyError(WorkerError):
-    """A server has no room for it at present: what a key may have is used up.
+    """A server has no room now: a quota of the client's key is used up. The env is unchanged.
 
-    ``RemoteSandbox(retry_s=...)`` waits in line instead. The env is as it was.
+    ``RemoteSandbox(retry_s=...)`` waits instead.
 
     Attributes:
-        quota: Which: ``"sessions"``, ``"jails"``, ``"runners"``, ``"memory"`` or ``"inflight"``
-            (bytes both); ``"draining"`` for a server that is about to end; empty if it did not say.
-        used: How much of it the same key's processes have.
-        limit: How much they may have.
-        retry_s: After how many seconds it is worth asking again.
+        quota: ``"sessions"``, ``"jails"``, ``"runners"``, ``"memory"`` or ``"inflight"`` (both in
+            bytes); ``"draining"`` if the server is ending; empty if it did not say.
+        used: How much of it the key uses.
+        limit: How much it may use.
+        retry_s: Seconds until the client may ask again.
     """
 
     def __init__(
@@ -217,14 +217,14 @@ class WorkerDiedError(WorkerError):
         exit_code: The exit code, or None when a signal ended it.
         signal: The name of the signal (``"SIGKILL"``), or None.
         reason: ``"exit"``, ``"signal"``, ``"out-of-memory"``, ``"cpu-limit"``, ``"disk-limit"``;
-            ``"protocol"``: it broke the rules of the wire; ``"zygote"``: the process that forks
+            ``"protocol"``: it sent an invalid message; ``"zygote"``: the process that forks
             workers ended; ``"unavailable"``: it could not be confined; ``"killed"``: it was
-            closed, or given up; ``"idle"``: it was unused for long; ``"server"``: the worker
-            server ended; ``"connection"``: the one to another host was lost; ``"gone"``: the
-            server does not know it any more.
+            closed, or given up; ``"idle"``: it was idle for ``idle_s``; ``"server"``: the worker
+            server ended; ``"connection"``: the connection to another host was lost; ``"gone"``:
+            the server does not know it any more.
         log_tail: The last lines of its output, control characters escaped.
         request: The operation that it was serving (``"step"``), or None.
-        detail: The numbers, where a limit was the reason.
+        detail: The numbers, if a limit was the reason.
         repository: The repository, commit and entry file, as in ``org/repo@0123456789ab:env.py``.
         bundle: The folder with everything that led there, for ``envhub replay``, or None.
     """
@@ -255,12 +255,12 @@ class WorkerTimeoutError(WorkerError, TimeoutError, multiprocessing.TimeoutError
     """The worker did not answer in time. ``reset()`` brings the environment back.
 
     Attributes:
-        request: The operation that was asked for (``"step"``), or None.
-        timeout_s: How long it was waited for.
-        worker: What the kernel says of its processes, one word each: ``"running"``,
-            ``"waiting"``, ``"stopped"`` or ``"gone"``. Empty if the server did not say.
+        request: The requested operation (``"step"``), or None.
+        timeout_s: How long the client waited.
+        worker: The state of each of its processes: ``"running"``, ``"waiting"``, ``"stopped"`` or
+            ``"gone"``. Empty if the server did not say.
         repository: The repository, commit and entry file, as in ``org/repo@0123456789ab:env.py``.
-        bundle: As with ``WorkerDiedError``, where the process was ended at once.
+        bundle: As in ``WorkerDiedError``, if the process was ended at once.
     """
 
     def __init__(
@@ -280,9 +280,9 @@ class RemoteEnvError(EnvHubError):
     Attributes:
         type_name: The class, as the worker named it (``"mypkg.Oops"``).
         message: ``str()`` of the exception.
-        traceback: The formatted traceback, which files of the repository have their names in.
-        where: The last line of the repository's own in it, as its author knows the file; may be
-            empty. It is at the end of ``str()`` too.
+        traceback: The formatted traceback, with the names of the repository's files.
+        where: Its last line in the repository's own files, under the author's name of the file;
+            may be empty. It is also at the end of ``str()``.
     """
 
     def __init__(self, type_name: str, message: str, traceback: str = "") -> None:
@@ -302,12 +302,12 @@ class RemoteEnvError(EnvHubError):
 
 
 class RemoteEnvWarning(UserWarning):
-    """The repository's code has warned. Trust: category and text are the worker's words.
+    """The repository's code warns. Trust: category and text come from the worker.
 
     Attributes:
-        label: Which repository.
+        label: The repository.
         category: The class, as the worker named it (``"DeprecationWarning"``).
-        text: What it says.
+        text: The warning.
     """
 
     def __init__(self, label: str, category: str, text: str) -> None:

@@ -1,6 +1,6 @@
-"""The table of checks: each once, what it means, and what cures it.
+"""The table of checks: what each means, and how to fix what it finds.
 
-The checks, their reports and ``docs/checks.md`` are all of this table.
+The checks, their reports and ``docs/checks.md`` use this table.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from functools import partial
 
 
 class Severity(str, Enum):
-    """How much a finding weighs, worst first; the words are SARIF's."""
+    """How severe a finding is, worst first; the words are SARIF's."""
 
     ERROR = "error"
     WARNING = "warning"
@@ -23,18 +23,18 @@ class Severity(str, Enum):
         return list(Severity).index(self)
 
     def reaches(self, other: Severity) -> bool:
-        """Whether it weighs at least as much."""
+        """Whether it is at least as severe."""
         return self.rank <= other.rank
 
 
 @dataclass(frozen=True)
 class Check:
-    """One question that is asked of a repository.
+    """One check of a repository.
 
     Attributes:
         id: Its name, in reports and for ``--allow``.
-        sentence: What holds where it passes.
-        cure: What an author changes where it does not.
+        sentence: What is true if it passes.
+        cure: What an author changes if it does not.
     """
 
     severity: Severity
@@ -50,30 +50,33 @@ CHECKS: dict[str, Check] = {
     for check in (
         _error(
             "requirements",
-            "What the repository declares can be read, resolved and installed.",
-            "Write plain requirements that do not contradict each other: names, versions, markers.",
+            "The declared packages can be read, resolved and installed.",
+            "Write plain requirements (names, versions, markers) that do not contradict each "
+            "other.",
         ),
         _error(
             "imports",
-            "Every package that its code imports is declared.",
-            "Add the package to requirements.txt, or import it within try and except ImportError.",
+            "Every imported package is declared.",
+            "Add the package to requirements.txt, or import it in a try block with except "
+            "ImportError.",
         ),
         _error(
             "loads",
             "The entry file can be imported, and its make_env returns vector environments.",
-            "Define make_env(n_envs, use_async_envs) and return a gymnasium.vector.VectorEnv, or "
-            "{suite: {task: VectorEnv}}.",
+            "Define make_env(n_envs, use_async_envs) and return a gymnasium.vector.VectorEnv, or"
+            " {suite: {task: VectorEnv}}.",
         ),
         _error(
             "runs",
-            "reset and step raise nothing, for actions sampled from the action space.",
-            "Mend what raises it: reset has to work at any time, and step for every member of the "
+            "reset and step raise no exception for actions sampled from the action space.",
+            "Fix what raises: reset must work at any time, and step for every member of the "
             "action space.",
         ),
         _error(
             "survives",
-            "No process of it dies, and each answer comes within its timeout.",
-            "Keep to the limits of memory, processes and time, or say which ones it needs.",
+            "No process dies, and each answer comes within its timeout.",
+            "Stay within the limits of memory, processes and time, or say in the card which are "
+            "needed.",
         ),
         _error(
             "observation-space",
@@ -82,78 +85,82 @@ CHECKS: dict[str, Check] = {
         ),
         _error(
             "observation-dtype",
-            "Each sub-environment gives observations of the dtype and shape that its space says; "
-            "Gymnasium casts what it puts into a batch, and so hides it.",
-            "Return what observation_space says: for a float32 Box, np.asarray(..., np.float32).",
+            "Each sub-environment returns observations with the dtype and shape of its space. "
+            "(Gymnasium casts them into a batch, which hides a difference.)",
+            "Return the dtype of observation_space: for a float32 Box, np.asarray(..., "
+            "np.float32).",
         ),
         _error(
             "observation-finite",
-            "Observations have no NaN and no infinity, also where a space without bounds has them.",
-            "Bound what they are computed from; give what is missing a value of its own.",
+            "Observations have no NaN and no infinity, also if the space has no bounds.",
+            "Bound the inputs of the computation, and give missing values a value of their own.",
         ),
         _error(
             "step-types",
-            "A step of one sub-environment gives a number, two bools and a dict, which Gymnasium "
-            "casts into a batch, and so hides.",
+            "step of one sub-environment returns a number, two bools and a dict. (Gymnasium "
+            "casts them into a batch, which hides other types.)",
             "Return float(reward), bool(terminated), bool(truncated) and a dict.",
         ),
         _warning(
             "num-envs",
-            "make_env returns as many sub-environments as n_envs says.",
+            "make_env returns n_envs sub-environments.",
             "Make n_envs of them: gym.vector.SyncVectorEnv([make] * n_envs).",
         ),
         _error(
             "deadline",
-            "All of it was judged within --deadline.",
-            "Load, reset and step faster; or judge less of it (--task, --steps, --resets), or give "
-            "it longer (--deadline).",
+            "Everything was judged within --deadline.",
+            "Load, reset and step faster; or judge less (--task, --steps, --resets), or raise "
+            "--deadline.",
         ),
         _error(
             "rewards",
             "Rewards are finite numbers.",
-            "Bound what the reward is computed from.",
+            "Bound the inputs of the reward.",
         ),
         _warning(
             "infos",
-            "Infos with a mask have an entry for each sub-environment, and so has the mask.",
-            "Let Gymnasium's vector environments gather them; '_name' are booleans, one for each.",
+            "Infos with a mask, and the mask, have an entry for each sub-environment.",
+            "Let Gymnasium's vector environments collect the infos; a mask '_name' has one "
+            "boolean for each.",
         ),
         _warning(
             "large-infos",
             "Half of the steps have less than 512 KiB of info for each sub-environment.",
-            "Put arrays into the observation, or give them by a method that is called for them.",
+            "Put arrays into the observation, or return them from a method that is called when "
+            "needed.",
         ),
         _error(
             "seeding",
-            "The same seed and the same actions give the same results in another process.",
-            "Draw from self.np_random alone, after super().reset(seed=seed).",
+            "The same seed and actions give the same results in another process.",
+            "Draw only from self.np_random, after super().reset(seed=seed).",
         ),
         _error(
             "seed-ignored",
-            "In one process the same seed and the same actions give the same results again, and so "
-            "do resets without a seed that follow. Gymnasium's check_env refuses what does not.",
-            "Let reset begin anew: super().reset(seed=seed), draw from self.np_random alone, and "
-            "keep nothing of past episodes (running statistics, curricula).",
+            "In one process, the same seed and actions give the same results again; so do the "
+            "resets without a seed that follow. (Gymnasium's check_env requires this, too.)",
+            "Let reset start anew: call super().reset(seed=seed), draw only from self.np_random,"
+            " and keep nothing of past episodes (running statistics, curricula).",
         ),
         _note(
             "seed-constant",
-            "Another seed begins another episode.",
-            "Nothing, where nothing is drawn by lot; else draw from self.np_random.",
+            "Another seed starts another episode.",
+            "If nothing is random, change nothing. Otherwise draw from self.np_random.",
         ),
         _warning(
             "seed-fixed",
-            "Resets without a seed begin different episodes, where resets with seeds do.",
-            "Seed only where reset is given a seed: super().reset(seed=seed) does it.",
+            "Resets without a seed start different episodes, if resets with seeds do.",
+            "Seed only if reset gets a seed: super().reset(seed=seed) does this.",
         ),
         _warning(
             "actions-ignored",
             "Other actions give other results.",
-            "Apply the action that step is given.",
+            "Apply the action that step receives.",
         ),
         _warning(
             "endless",
-            "Some episode ends within 10,000 steps by lot, as far as 30 seconds suffice for them.",
-            "Terminate or truncate; gymnasium.wrappers.TimeLimit does it.",
+            "With random actions an episode ends within 10,000 steps, or within 30 seconds of "
+            "them.",
+            "Terminate or truncate, for example with gymnasium.wrappers.TimeLimit.",
         ),
         _error(
             "workers",
@@ -163,7 +170,7 @@ CHECKS: dict[str, Check] = {
         _error(
             "autoreset",
             "It resets itself as metadata['autoreset_mode'] says.",
-            "Let Gymnasium's vector environments do it, or follow the mode that is stated.",
+            "Let Gymnasium's vector environments reset, or follow the stated mode.",
         ),
         _note(
             "autoreset-stated",
@@ -172,51 +179,54 @@ CHECKS: dict[str, Check] = {
         ),
         _error(
             "render",
-            "It renders what its mode says: rgb_array gives frames, uint8 of (height, width, 3), "
-            "rgb_array_list lists of them, ansi texts. So it does in each of these modes that "
-            "metadata['render_modes'] declares, where make_env takes a render_mode.",
-            "Return that from render(), or declare the modes that there are.",
+            "render returns what its mode requires: uint8 frames of (height, width, 3) for "
+            "rgb_array, lists of them for rgb_array_list, text for ansi. If make_env takes a "
+            "render_mode, this holds for each of these modes in metadata['render_modes'].",
+            "Return that from render(), or declare only the modes that work.",
         ),
         _warning(
             "render-fps",
-            "Where it renders frames, metadata['render_fps'] says how many make a second.",
+            "If it renders frames, metadata['render_fps'] is their number for each second.",
             "Set metadata['render_fps'] to a number; LeRobot and RecordVideo read it.",
         ),
         _note(
             "lerobot",
-            "LeRobot's policies can play it, beside loops of Gymnasium's vector environments.",
-            "Nothing, where it is not for LeRobot; else see what `envhub init --lerobot` writes: "
-            "agent_pos and pixels to observe, a Box of one dimension to act, _max_episode_steps.",
+            "LeRobot's policies can play it, not only code for Gymnasium's vector environments.",
+            "If it is not for LeRobot, change nothing. Otherwise see what `envhub init "
+            "--lerobot` writes: observations agent_pos and pixels, a Box of one dimension as "
+            "action, _max_episode_steps.",
         ),
         _warning(
             "slow-steps",
-            "Half of the steps take no longer than --slow-step says: a second.",
-            "Compute less in a step, or once in reset; and never wait for a clock.",
+            "Half of the steps take at most --slow-step, one second by default.",
+            "Compute less in a step, or once in reset; do not wait for a clock.",
         ),
         _warning(
             "slow-resets",
-            "A reset takes no longer than five times what --slow-step says: five seconds.",
-            "Load and compile once, when it is made, and not in each reset.",
+            "A reset takes at most five times --slow-step, five seconds by default.",
+            "Load and compile once, when the environment is made, and not in each reset.",
         ),
         _warning(
             "denied-network",
-            "It tries to reach no network that the policy denies.",
-            "Bring data along in the repository, and report nothing to anybody.",
+            "It does not try to use a network that the policy denies.",
+            "Put the data into the repository, and send nothing.",
         ),
         _warning(
             "denied-files",
-            "It asks to change no files but its own, and to read no homes, secrets or processes.",
-            "Keep to the repository's folder, to tempfile and to the home that it is given.",
+            "It does not try to change files outside its own folders, or to read homes, secrets "
+            "or other processes.",
+            "Use only the repository's folder, tempfile and the home that the jail has.",
         ),
         _warning(
             "denied-kernel",
-            "It tries no system call that the policy denies.",
-            "Do without: no tracing, mounting or namespaces is needed to compute a step.",
+            "It makes no system call that the policy denies.",
+            "Avoid the call: a step needs no tracing, mounting or namespaces.",
         ),
         _warning(
             "limits-reached",
-            "It uses up no limit: of processes and threads, open files, scratch, files in it.",
-            "Use less, or say in the card what it needs, so that its user raises that limit.",
+            "It reaches no limit of processes and threads, open files, scratch space, or files "
+            "there.",
+            "Use less, or say in the card what it needs, so that a user can raise the limit.",
         ),
         _error(
             "leaks-processes",
@@ -236,106 +246,111 @@ CHECKS: dict[str, Check] = {
         _error(
             "leaks-memory",
             "Resets and steps leave no memory behind.",
-            "Keep nothing of past episodes: no lists that grow, no caches without an end.",
+            "Keep nothing of past episodes: no growing lists, no caches without a limit.",
         ),
         _note(
             "pinned",
-            "The reference names a commit, so that what was judged is what will run.",
-            "Write org/repo@COMMIT; the report says which one was judged.",
+            "The reference names a commit, so the files that were judged are the files that will"
+            " run.",
+            "Write org/repo@COMMIT; the report says which commit was judged.",
         ),
         _note(
             "licence",
-            "A file says what one may do with it.",
+            "A file states the licence.",
             "Add a LICENSE file, or 'license:' at the head of README.md.",
         ),
-        _note("card", "There is a README.md.", "Say what the environment is, and how it ends."),
+        _note(
+            "card",
+            "There is a README.md.",
+            "Describe the environment, and how it ends.",
+        ),
         _note(
             "source-network",
-            "Its code opens no connections.",
-            "Bring data along in the repository: a sandbox has no network.",
+            "The code opens no connections.",
+            "Put the data into the repository: a sandbox has no network.",
         ),
         _note(
             "source-process",
-            "Its code starts no programs.",
-            "Do in Python what the program does, or say in the card which program it needs.",
+            "The code starts no programs.",
+            "Do the same in Python, or say in the card which program it needs.",
         ),
         _note(
             "source-dynamic",
-            "Its code is what is written: no eval, exec or compile of texts.",
+            "The code does not run text as code: no eval, exec or compile.",
             "Write the code out.",
         ),
         _note(
             "source-pickle",
-            "Its code loads no pickles, which are programs.",
-            "Keep weights and data as safetensors, npz without objects, or JSON.",
+            "The code loads no pickles, which can execute code.",
+            "Store weights and data as safetensors, npz without objects, or JSON.",
         ),
         _note(
             "source-native",
-            "It brings no machine code and calls none by address.",
-            "Depend on a package that brings the library along.",
+            "The repository has no machine code and calls none by address.",
+            "Depend on a package that has the library.",
         ),
         _error(
             "source-compiled",
-            "It brings nothing compiled that runs in place of its source, whatever that says.",
+            "The repository has no compiled Python, which runs instead of its source.",
             "Delete __pycache__, each .pyc, and each .so beside a .py of its name; in git with "
             "git rm -r --cached, and name them in .gitignore.",
         ),
         _error(
             "source-encoding",
-            "Python reads its code as UTF-8; another encoding can make code of a comment.",
+            "The code is UTF-8; with another encoding, a comment can be code.",
             "Save it as UTF-8, and name no encoding in its first two lines.",
         ),
         _error(
             "source-unparsed",
-            "All of its Python has been read: files of up to 256 KiB, and 16 MiB in all.",
-            "Put data into files of their own, and write what nests less deeply.",
+            "All Python files were parsed, up to 256 KiB each and 16 MiB in all.",
+            "Put data into other files, and nest the code less deeply.",
         ),
         _error(
             "source-uncommitted",
-            "The folder has what its commit has: no git repositories within it, no files that git "
-            "does not look at or converts, no pointers of git LFS in place of files.",
-            "Commit the files themselves, fetch them (git lfs pull), or have the commit judged.",
+            "The folder has what its commit has: no nested git repositories, no files that git "
+            "does not look at or converts, no git LFS pointers instead of files.",
+            "Commit the files themselves, download them (git lfs pull), or judge the commit.",
         ),
         _note(
             "source-ignored",
-            "Git ignores nothing in the folder. What it ignores is not judged, loaded or pushed.",
-            "Nothing, where it needs none of it; git add --force what it needs.",
+            "Git ignores nothing in the folder. Ignored files are not judged, loaded or pushed.",
+            "If it needs none of them, change nothing; otherwise git add --force what it needs.",
         ),
         _note(
             "source-outside",
-            "Its code names no places beyond its own: homes, /etc, /proc, other programs' tokens.",
-            "Keep to the repository's folder and to tempfile; take the rest as an argument.",
+            "The code names no paths outside its own: homes, /etc, /proc, other programs' tokens.",
+            "Use only the repository's folder and tempfile; take other paths as arguments.",
         ),
         _warning(
             "source-hidden",
-            "Its text is what one sees: no characters that are invisible, turn the order around, "
-            "or look like others.",
-            "Write them as escapes, such as \\u200b, or leave them out.",
+            "The text is what a reader sees: no characters that are invisible, reverse the "
+            "direction, or look like others.",
+            "Write them as escapes, such as \\u200b, or remove them.",
         ),
         _note(
             "source-obscure",
-            "Its code can be read: no lines of thousands of characters, no long texts of no words.",
-            "Put data into files, and code on lines.",
+            "The code is readable: no lines of thousands of characters, no long encoded texts.",
+            "Put data into files, and break long lines.",
         ),
         _note(
             "source-link",
-            "Each file is what its name says, and no link to another.",
+            "No file is a link to another.",
             "Put the file itself there.",
         ),
         _note(
             "source-unread",
-            "Each file could be read: no archives, and no Python of another version.",
-            "Bring no archives, and delete what no Python can run.",
+            "Each file can be read: no archives, and no Python of another version.",
+            "Remove archives, and files that no supported Python can parse.",
         ),
     )
 }
 
 _DECLARE = (
-    "Declare the package that the error names in requirements.txt, with the extra that it asks for."
+    "Declare the package that the error names in requirements.txt, with the extra that it needs."
 )
-_BRING = "Bring data along in the repository: a sandbox has no network."
-_MEMORY = "Use less memory, or say in the card how much it needs: its user raises --memory."
-_TIME = "Do less at once, or say in the card how long it takes: its user raises --timeout."
+_BRING = "Put the data into the repository: a sandbox has no network."
+_MEMORY = "Use less memory, or say in the card how much it needs: a user can raise --memory."
+_TIME = "Do less at once, or say in the card how long it takes: a user can raise --timeout."
 CURES = {
     **dict.fromkeys(("DependencyNotInstalled", "ImportError", "ModuleNotFoundError"), _DECLARE),
     **dict.fromkeys(
@@ -345,15 +360,15 @@ CURES = {
     **dict.fromkeys(("ConnectionError", "HTTPError", "URLError", "gaierror"), _BRING),
     **dict.fromkeys(("MemoryError", "out-of-memory"), _MEMORY),
     **dict.fromkeys(("TimeoutError", "timeout"), _TIME),
-    "FileNotFoundError": "Bring the file along in the repository, and find it from "
+    "FileNotFoundError": "Put the file into the repository, and open it relative to "
     "Path(__file__).parent.",
-    "PermissionError": "Write to the working folder, to tempfile or to the home that it is given.",
+    "PermissionError": "Write to the working folder, to tempfile or to the home that the jail has.",
     "NotImplementedError": "Implement the method that raises it.",
-    "ResetNeeded": "Let every sub-environment be reset before it is stepped or rendered.",
-    "cpu-limit": "Compute less, or say in the card how much: its user raises --cpu-time.",
-    "disk-limit": "Write less, or say in the card how much: its user raises --disk.",
-    "signal": "Look for a fault in native code: faulthandler.enable() prints where it is.",
+    "ResetNeeded": "Reset every sub-environment before it is stepped or rendered.",
+    "cpu-limit": "Compute less, or say in the card how much: a user can raise --cpu-time.",
+    "disk-limit": "Write less, or say in the card how much: a user can raise --disk.",
+    "signal": "Find the fault in native code: faulthandler.enable() prints its place.",
     "exit": "Raise an exception instead of ending the process.",
 }
-"""What cures a finding whose error says more than its check, by the error's class or the process's
-end."""
+"""How to fix a finding, by the class of its error or the end of its process, if that is more
+specific than its check."""

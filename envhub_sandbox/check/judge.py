@@ -16,7 +16,7 @@ from typing import Any
 
 from gymnasium.error import CustomSpaceError
 
-from envhub_sandbox import __version__
+from envhub_sandbox import RaySandbox, __version__
 from envhub_sandbox.check.checks import CHECKS
 from envhub_sandbox.check.findings import Report
 from envhub_sandbox.check.play.confinement import Confinement, denial_findings
@@ -107,7 +107,11 @@ class _Judge:
     def __init__(self, asked: JudgeOptions, snapshot: Snapshot, report: Report) -> None:
         self._asked, self._snapshot, self._report = asked, snapshot, report
         self._policy = policy_from(asked.arguments.get("policy"), asked.arguments.get("limits"))
-        self._is_here = asked.arguments.get("sandbox", "process") == "process"
+        self._arguments = dict(asked.arguments)
+        sandbox = asked.arguments.get("sandbox", "process")
+        self._is_here = sandbox == "process"
+        if sandbox == "ray":  # else one play would keep the room that the next one waits for
+            self._arguments["sandbox"] = RaySandbox(shared=True)
         self._files = parsing.read(snapshot)
         entry = self._files.get(snapshot.path)
         arguments = () if entry is None else entry.entries
@@ -138,7 +142,7 @@ class _Judge:
         is_moving = snapshot.repo_type != "local" and snapshot.commit not in reference
         if snapshot.repo_type == "pypi":
             is_moving = HubRef.parse(reference).revision is None
-        moving = f"{reference} may mean another commit or version tomorrow"
+        moving = f"{reference} can mean another commit or version tomorrow"
         self._report.judged("pinned", [moving] if is_moving else [])
         found = survey(self._snapshot, self._files).findings
         for finding in found:
@@ -177,11 +181,11 @@ class _Judge:
         # a death that a restart hides would be no finding
         record = record_denials or self._policy.record_denials
         policy = replace(self._policy, restart="never", record_denials=record)
-        given = {**self._asked.arguments, "cfg": self._report.reference, **changes}
+        given = {**self._arguments, "cfg": self._report.reference, **changes}
         suites = make_env(**{**given, "policy": policy, "limits": None})
         if suites.provenance["commit"] != self._snapshot.commit:  # a folder of this machine
             suites.close()
-            raise SnapshotError(f"{self._asked.reference} changed while it was judged; judge again")
+            raise SnapshotError(f"{self._asked.reference} changed during the check; check it again")
         return suites
 
     def _load(self) -> None:
@@ -240,7 +244,7 @@ class _Judge:
         That makes steps longer, so no time is measured in this play.
         """
         if not self._is_here:
-            self._unrecorded = "only --sandbox process has it recorded"
+            self._unrecorded = "only --sandbox process records them"
             return self.make(num_workers=1, validate=True)
         try:
             return self.make(record_denials=True, num_workers=1, validate=True)
@@ -260,7 +264,7 @@ class _Judge:
             found = [f"{error.type_name}: {error.message}" + (f" ({line})" if line else "")]
             self._report.judged("runs", found, task, cause=_cause(error))
         except (LoadError, DependencyError, RemoteProtocolError) as error:
-            found = [f"not as it did at first: {error}"]
+            found = [f"another result than the first time: {error}"]
             self._report.judged("loads", found, task, cause=_cause(error))
         except (WorkerDiedError, WorkerTimeoutError) as error:
             self._report.judged("survives", [str(error)], task, cause=_cause(error))

@@ -164,7 +164,7 @@ def workflow_commands(report: Report) -> Iterator[str]:
         yield workflow_command(_GITHUB[one.check.severity], title, text, place)
     if report.confinement is not None and report.confinement.is_partial:
         words = "\n".join(report.confinement.lines())
-        yield workflow_command("notice", "envhub check: what confined it", words)
+        yield workflow_command("notice", "envhub check: confinement", words)
 
 
 def workflow_command(level: str, title: str, text: str, place: str = "") -> str:

@@ -77,12 +77,16 @@ def read_settings(path: Path, known: Collection[str]) -> dict[str, Any]:
     """
     table = read_file(path).get("check", {})
     if not isinstance(table, Mapping):
-        raise PolicyError(f"check in {path} is a table: [check], with a line for each option")
+        raise PolicyError(
+            f"check in {path} is not a table; write [check] and below it a line for each option"
+        )
     asked = {name.replace("-", "_"): value for name, value in table.items()}
     unknown = sorted(set(asked) - set(known))
     if unknown:
         names = ", ".join(name.replace("_", "-") for name in sorted(known))
-        raise PolicyError(f"[check] of {path} knows no {', '.join(unknown)}; there are {names}")
+        raise PolicyError(
+            f"[check] in {path} has no option {', '.join(unknown)}; there are {names}"
+        )
     return asked
 
 
@@ -111,5 +115,5 @@ def read_file(path: Path) -> dict[str, Any]:
     try:
         document: dict[str, Any] = tomllib.loads(data.decode("utf-8"))
     except (ValueError, RecursionError) as error:
-        raise PolicyError(f"{path} is no TOML: {error}") from error
+        raise PolicyError(f"{path} is not valid TOML: {error}") from error
     return document

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from envhub_sandbox.cli.shared import options as opt
-from envhub_sandbox.cli.shared.console import out, print_json, safe_line, say, show_rows
+from envhub_sandbox.cli.shared.console import out, print_json, safe_line, say, show, show_rows
 from envhub_sandbox.cli.shared.exits import Exit, UsageError
 from envhub_worker.protocol.text import counted, size_text
 
@@ -98,6 +98,8 @@ def list_(
         return
     if found:
         _print(found)
+    if found and made:
+        out()
     if made:
         _print_environments(made)
     say(f"{_told(found, made)}, in {cache_root()}")
@@ -194,8 +196,8 @@ def _users_of(one: StoredSnapshot) -> str:
     if not users:
         return ""
     return (
-        f"the snapshot {one.repository}@{one.commit[:12]} is in use by {', '.join(users)}. "
-        "Close its environments there, or end it"
+        f"the snapshot {one.repository}@{one.commit[:12]} is in use by {', '.join(users)}. Close "
+        "its environments in that process, or end the process"
     )
 
 
@@ -205,7 +207,7 @@ def _chosen(
     everyone: list[StoredSnapshot | Environment] = [*found, *made]
     for name in names:
         if not any(one.answers_to(name) for one in everyone):
-            raise UsageError(f"nothing in the store is called {name!r}; see: envhub cache list")
+            raise UsageError(f"the cache has nothing named {name!r}; see: envhub cache list")
     oldest = None if unused_for is None else time.time() - unused_for * _DAY_S
     if not names and oldest is None:
         return [], []
@@ -239,8 +241,8 @@ def gc(
         items = [{"kind": one.kind, "name": one.name, "removed": one in removed} for one in found]
         print_json({"found": items, "unasked": unasked})
     for one in () if json else found:
-        done = "removed" if one in removed else "found" if dry_run else "could not remove"
-        out(f"{done}: {one.kind} {safe_line(one.name, 300)}")
+        done = "removed" if one in removed else "found" if dry_run else "not removed"
+        show(done, f"{one.kind} {one.name}")
     for engine, why in unasked.items():
         reason = safe_line(why, 500)
         say(f"{engine} could not be asked, so its containers are not known: {reason}")

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from envhub_sandbox.cli.shared import options as opt
-from envhub_sandbox.cli.shared.console import print_json, say, show
+from envhub_sandbox.cli.shared.console import DOUBTFUL, GOOD, out, print_json, say, show, show_rows
 from envhub_sandbox.cli.shared.exits import Exit
-from envhub_sandbox.cli.shared.findings import FailOn, level, show_finding
+from envhub_sandbox.cli.shared.findings import STYLES, FailOn, level
 from envhub_sandbox.cli.shared.progress import ProgressBar
 from envhub_worker.protocol.text import counted
 
@@ -17,8 +17,6 @@ if TYPE_CHECKING:
     from envhub_sandbox.check.static.changes import Change
     from envhub_sandbox.dependencies.locks.fingerprint import TaskFingerprint
     from envhub_sandbox.hub.snapshot import Snapshot
-
-_MARKS = {"new": "+", "gone": "-", "changed": "~", "renamed": ">"}
 
 
 @opt.with_options("env_kwargs", *opt.HUB)
@@ -88,10 +86,17 @@ def _tasks(
 def _print(then: str, now: str, found: list[Change]) -> None:
     show("from", then, "bold")
     show("to", now, "bold")
+    if not found:
+        say("Nothing differs.", GOOD)
+        return
+    out()
+    rows, styles = [("change", "what", "details")], {}
     for one in found:
-        mark = f"{_MARKS[one.how]} "
-        if one.finding is None:
-            show(f"{mark}{one.what}", one.text)
-        else:
-            show_finding(one.finding, mark)
-    say(f"{counted(len(found), 'change')}." if found else "Nothing differs.")
+        what, text = one.what, one.text
+        if one.finding is not None:
+            what = one.finding.check.severity.value
+            text = f"{one.finding.id}: {text}"
+            styles[len(rows)] = STYLES[what]
+        rows.append((one.how, what, text))
+    show_rows(rows, styles=styles)
+    say(f"{counted(len(found), 'change')}.", DOUBTFUL)

@@ -13,8 +13,6 @@ from envhub_sandbox.cli.shared.progress import ProgressBar
 from envhub_worker.protocol.text import counted
 
 if TYPE_CHECKING:
-    from envhub_sandbox.dependencies.request import PackageRequest
-    from envhub_sandbox.dependencies.resolve import Target
     from envhub_sandbox.hub.snapshot import Snapshot
 
 
@@ -70,40 +68,20 @@ def _build(
     network: str | None,
 ) -> dict[str, Any]:
     from envhub_sandbox.dependencies.request import Choice, request_of
-    from envhub_sandbox.dependencies.resolutions import versions_for
-    from envhub_sandbox.dependencies.resolve import resolve
     from envhub_sandbox.errors import DependencyError
     from envhub_sandbox.sandboxes.docker import image
-    from envhub_sandbox.sandboxes.docker.engines import find_engine, find_image
+    from envhub_sandbox.sandboxes.docker.engines import find_engine
 
     request = request_of(snapshot, Choice("own", exclude_newer=exclude_newer))
     assert request is not None
     if not (request.wanted or request.supports or request.guesses or system):
         raise DependencyError(
-            f"{snapshot.repo_id} declares no packages: it needs no image of its own. Use "
+            f"{snapshot.repo_id} declares no packages, so it needs no image of its own. Use "
             f"--sandbox docker:{base}"
         )
-    engine = find_engine(engine_name)
-    identity = find_image(engine, base)
-    target = image.target_of(engine, base)
-    _check_python(request, target)
-    lock, _ = versions_for(request, lambda asked: resolve(asked, target))
     is_local = snapshot.repo_type == "local"
     name = Path(snapshot.repo_id).name if is_local else snapshot.repo_id
-    tag = image.tag_for(name, identity, lock, system)
-    known = image.exists(engine, tag)
-    if not known:
-        image.build(engine, image.dockerfile(base, lock, system), lock, tag, network)
-    return {"image": tag, "built": not known, "lock": lock.digest, "packages": lock.packages}
-
-
-def _check_python(request: PackageRequest, target: Target) -> None:
-    from packaging.specifiers import SpecifierSet
-
-    from envhub_sandbox.errors import InterpreterUnavailableError
-
-    if not SpecifierSet(request.supports).contains(f"{target.version}.99"):
-        raise InterpreterUnavailableError(
-            f"{request.source} asks for Python {request.supports}, and the image has "
-            f"{target.version}: build envhub-worker from another base (docs/deployment.md)"
-        )
+    engine = find_engine(engine_name)
+    made = image.derived(engine, base, request, name=name, system=system, network=network)
+    lock = made.lock
+    return {"image": made.tag, "built": made.is_new, "lock": lock.digest, "packages": lock.packages}

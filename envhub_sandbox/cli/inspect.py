@@ -44,7 +44,7 @@ def inspect(
     ] = False,
     sarif: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="With --static: SARIF 2.1.0 of what is worth a look."),
+        typer.Option(metavar="FILE", help="With --static: the findings as SARIF 2.1.0."),
     ] = None,
     fail_on: FailOn = None,
     json: opt.Json = False,
@@ -112,7 +112,7 @@ def _print(found: list[dict[str, Any]], provenance: dict[str, Any], *, in_proces
             "render mode": env["render_mode"] or "None",
         }
         for name, value in (*lines.items(), *env["metadata"].items()):
-            show(f"  {safe_line(name, 40)}", value, width=19)
+            show(f"  {safe_line(name, 40):17}", value)
     out()
     print_provenance(provenance, in_process=in_process)
 

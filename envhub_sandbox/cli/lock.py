@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from envhub_sandbox.cli.shared import options as opt
-from envhub_sandbox.cli.shared.console import out, print_json, safe_line, say
+from envhub_sandbox.cli.shared.console import GOOD, out, print_json, safe_line, say, show
 from envhub_sandbox.cli.shared.exits import UsageError
 from envhub_sandbox.cli.shared.progress import ProgressBar
-from envhub_worker.protocol.text import counted
+from envhub_sandbox.errors import SandboxUnavailableError
+from envhub_sandbox.system.platform import IS_LINUX, NAME
 
 if TYPE_CHECKING:
     from envhub_sandbox.dependencies.locks.lockfile import LockFile
@@ -60,6 +61,7 @@ def lock(
     The packages are those of an environment of its own. To see its spaces the repository is loaded,
     in the sandbox.
     """
+    _check_platform()
     with ProgressBar(quiet=json) as bar:
         bar.begin(f"locking {ref}")
         from envhub_sandbox.dependencies.locks import drift, lockfile, making
@@ -101,6 +103,7 @@ def verify(
 
     Files, the packages on the index, Python, and, except with --no-spaces, its spaces.
     """
+    _check_platform()
     with ProgressBar(quiet=json) as bar:
         bar.begin(f"verifying {file}")
         from envhub_sandbox.dependencies.locks import drift, lockfile
@@ -115,7 +118,18 @@ def verify(
         print_json({"lock": str(file), "reference": snapshot.label, "drift": found})
     drift.refuse(found, snapshot.label)
     if not json:
-        say(f"{snapshot.label} is as it was locked in {file}.")
+        say(f"{snapshot.label} is as it was locked in {file}.", GOOD)
+
+
+def _check_platform() -> None:
+    """Raise ``SandboxUnavailableError``: no interpreter of this platform can be locked."""
+    if not IS_LINUX:
+        raise SandboxUnavailableError(
+            f"envhub lock and envhub verify are for --sandbox process, which needs Linux, and this "
+            f"is {NAME}: run this on a Linux machine, or in a container of one. With --sandbox "
+            "docker an image is locked by its digest, and with --sandbox tcp://HOST:PORT the "
+            "server's operator chooses the packages"
+        )
 
 
 def _path(output: Path | None, snapshot: Snapshot) -> Path:
@@ -126,7 +140,7 @@ def _path(output: Path | None, snapshot: Snapshot) -> Path:
     inside = Path(snapshot.repo_id).resolve() in path.parent.resolve().joinpath("x").parents
     if snapshot.repo_type == "local" and inside:
         raise UsageError(
-            f"{path} would be one of the files that it locks; name another folder: --output FILE"
+            f"{path} would be inside the folder that it locks; name another place: --output FILE"
         )
     return path
 
@@ -136,8 +150,8 @@ def _old(path: Path, upgrade: bool) -> LockFile | None:
         return None
     if not upgrade:
         raise UsageError(
-            f"there is {path} already. 'envhub lock --upgrade' chooses again and shows what "
-            "differs, 'envhub verify' says whether it still holds"
+            f"{path} exists. 'envhub lock --upgrade' chooses versions again and shows what "
+            "differs; 'envhub verify' compares it with the repository"
         )
     from envhub_sandbox.dependencies.locks import lockfile
 
@@ -152,7 +166,8 @@ def _choice(given: Any, old: LockFile | None) -> Choice:
         return chosen({}, None)[0] if old is None else making.again(old)
     if not isinstance(given, dict):
         raise UsageError(
-            "a lock is of an environment of its own; --dependencies takes auto or a JSON object"
+            "a lock always has an environment of its own; --dependencies takes auto or a JSON "
+            "object"
         )
     return chosen(given, None)[0]
 
@@ -184,7 +199,7 @@ def _reference(ref: str | None, locked: LockFile, file: Path) -> str:
 
     found = ref or lockfile.reference_of(locked)
     if found is None:
-        raise UsageError(f"{file} is of a folder; say which: envhub verify {file} ./FOLDER")
+        raise UsageError(f"{file} locks a folder; name it: envhub verify {file} ./FOLDER")
     return found
 
 
@@ -228,6 +243,7 @@ def _print(
     for line in changes:
         out(safe_line(line, 500))
     if was_there and not changes:
-        say("Nothing has changed.")
-    count, files = counted(len(made.packages), "package"), counted(len(made.files), "file")
-    say(f"{count} for {made.runner}, {files}, in {path}")
+        say("Nothing has changed.", GOOD)
+    show("files", len(made.files))
+    show("packages", f"{len(made.packages)}, for {made.runner}")
+    out(f"wrote {safe_line(path)}")

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from envhub_sandbox.cli.shared import options as opt
-from envhub_sandbox.cli.shared.console import out, print_json, safe_line, say
+from envhub_sandbox.cli.shared.console import out, print_json, safe_line, show
 from envhub_sandbox.cli.shared.progress import ProgressBar
-from envhub_worker.protocol.text import counted, size_text
+from envhub_worker.protocol.text import size_text
 
 if TYPE_CHECKING:
     from envhub_sandbox.dependencies.environments import Environment
@@ -78,7 +78,8 @@ def _print(snapshot: Snapshot, environment: Environment | None) -> None:
 
     out(safe_line(pinned(snapshot), 300))
     if environment is None:
-        say("It runs in this interpreter, which has all that it declares.")
+        show("packages", "this interpreter's, which are enough", stderr=True)
         return
-    packages = f"{counted(len(environment.pins), 'package')}, {size_text(environment.size)}"
-    say(f"{packages}, for Python {environment.version}, in {environment.home}")
+    count, size = len(environment.pins), size_text(environment.size)
+    show("packages", f"{count}, {size}, for Python {environment.version}", stderr=True)
+    show("in", environment.home, stderr=True)

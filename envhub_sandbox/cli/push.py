@@ -87,12 +87,9 @@ def _refuse_unfit(snapshot: Snapshot) -> None:
 def _unfit(path: str) -> str:
     *folders, name = path.split("/")
     if name in _SECRETS or name.endswith(_SECRET_SUFFIXES):
-        return (
-            "which looks like a secret, and what is once on the Hub stays in its history; put it "
-            "elsewhere"
-        )
+        return "which looks like a secret, and the Hub keeps its history; move it elsewhere"
     if name.endswith(_COMPILED):
-        return "which is compiled Python, and runs in place of its source; delete it"
+        return "which is compiled Python, and runs instead of its source; delete it"
     if ".cache" in folders:
         return "and huggingface_hub uploads nothing below .cache; delete that folder"
     return ""
@@ -153,7 +150,7 @@ def _publish(
     if missing:
         raise SnapshotIntegrityError(
             f"{where}: commit {commit} does not have {', '.join(missing[:_SHOWN])} as the folder "
-            "has it, so it is not what was checked; does a .gitignore leave that out?"
+            "has it, so it differs from what was checked; does a .gitignore leave it out?"
         )
     mine = {file.path for file in snapshot.files} | {_OF_THE_HUB}
     others = [file.path for file in found if file.path not in mine]

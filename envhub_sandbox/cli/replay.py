@@ -9,7 +9,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from envhub_sandbox.cli.shared import options as opt
-from envhub_sandbox.cli.shared.console import out, print_json, safe_line, safe_text, say
+from envhub_sandbox.cli.shared.console import (
+    BAD,
+    DOUBTFUL,
+    GOOD,
+    out,
+    print_json,
+    safe_line,
+    show,
+    show_rows,
+)
 from envhub_sandbox.cli.shared.exits import Exit, UsageError
 from envhub_sandbox.cli.shared.progress import ProgressBar
 
@@ -72,10 +81,10 @@ class _Replay:
         bundle = load_bundle(self._folder)
         self._refuse_wishes(bundle)
         for doubt in bundle.doubts:
-            say(f"This cannot be exact: {safe_text(doubt)}.")
+            show("not exact", doubt, "yellow", stderr=True)
         place = bundle.arguments.get("sandbox")
         if place != self._sandbox:
-            say(f"It died in sandbox {safe_line(place)}; this is sandbox {self._sandbox}.")
+            show("sandbox", f"it died in {place}; this is {self._sandbox}", "yellow", stderr=True)
         with ProgressBar(quiet=self._as_json) as bar:
             replayed = self._run(bundle, bar)
         self._print(bundle, replayed)
@@ -88,8 +97,8 @@ class _Replay:
         wanted = [wish for wish in wishes(bundle) if wish.partition("=")[0] not in self._given]
         if wanted and not self._grant:
             raise UsageError(
-                f"the bundle asks for more than an ordinary run: {', '.join(wanted)}. If that is "
-                "yours, or you trust where the bundle comes from, add --grant"
+                f"the bundle needs more permissions than an ordinary run: {', '.join(wanted)}. If "
+                "you trust its source, add --grant"
             )
 
     def _run(self, bundle: Bundle, bar: ProgressBar) -> ReplayResult:
@@ -114,7 +123,7 @@ class _Replay:
         envs = stack.enter_context(recipe.make())
         self._changed = list(changed_files(bundle.files, envs.provenance["files"]))
         if self._changed:
-            say(f"The files have changed since: {safe_line(', '.join(self._changed))}.")
+            show("changed", ", ".join(self._changed), "yellow", stderr=True)
         if bundle.task is None:
             opt.select_envs(envs, None, None)[0][2].np_random  # noqa: B018  # starts it, and changes nothing
             return None
@@ -146,13 +155,20 @@ class _Replay:
         if self._as_json:
             print_json(self._document(bundle, replayed))
             return
-        out(safe_line(bundle.label, 400), "bold")
-        out(f"then:  {_how(bundle.death)}, {_where(len(bundle.requests), bundle.steps)}")
-        now = "nothing died" if replayed.death is None else _how(replayed.death)
-        out(f"now:   {now}, {_where(replayed.requests, replayed.steps)}")
+        show("repository", bundle.label, "bold")
+        out()
+        show_rows(
+            [
+                ("", "request", "step", "how it ended"),
+                _row("recorded", len(bundle.requests), bundle.steps, bundle.death),
+                _row("replayed", replayed.requests, replayed.steps, replayed.death),
+            ],
+            right=(1, 2),
+        )
+        out()
         if replayed.note:
-            out(safe_text(replayed.note))
-        out(_SAID[replayed.verdict.value])
+            show("note", replayed.note)
+        out(*_CONCLUSIONS[replayed.verdict.value])
 
     def _document(self, bundle: Bundle, replayed: ReplayResult) -> dict[str, Any]:
         return {
@@ -171,11 +187,17 @@ class _Replay:
         }
 
 
-_SAID = {
-    "same": "It died again, in the same way and at the same request.",
-    "different": "It did not go the same way.",
-    "survived": "It did not die.",
+_CONCLUSIONS = {
+    "same": ("It died again, in the same way and at the same request.", GOOD),
+    "different": ("It ended in another way, or at another request.", BAD),
+    "survived": ("It did not die.", DOUBTFUL),
 }
+
+
+def _row(run: str, requests: int, steps: int, death: dict[str, Any] | None) -> tuple[str, ...]:
+    ended = "nothing died" if death is None else _how(death)
+    where = (str(requests), str(steps)) if requests else ("-", "-")
+    return (run, *where, ended if requests else f"{ended}, in make_env")
 
 
 def _how(death: dict[str, Any]) -> str:
@@ -186,7 +208,3 @@ def _how(death: dict[str, Any]) -> str:
     elif death["exit_code"] is not None:
         words += f" (exit code {death['exit_code']})"
     return words
-
-
-def _where(requests: int, steps: int) -> str:
-    return f"at request {requests} (step {steps})" if requests else "in make_env"

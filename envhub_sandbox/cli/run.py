@@ -57,14 +57,14 @@ def run(
         int, typer.Option("--episodes", "-e", min=1, help="Episodes of each task, exactly.")
     ] = 10,
     actions: Annotated[
-        ActionSource, typer.Option(help="Sampled, or as near to zero as the space allows.")
+        ActionSource, typer.Option(help="Random samples, or the values nearest to zero.")
     ] = ActionSource.RANDOM,
     seed: Annotated[
         int, typer.Option("--seed", "-s", min=0, help="The same seed gives the same result.")
     ] = 0,
     steps: Annotated[
         int | None,
-        typer.Option(min=1, help="Give up on a task after so many steps of each sub-environment."),
+        typer.Option(min=1, help="Stop a task after this many steps of each sub-environment."),
     ] = None,
     video: Annotated[
         Path | None,

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import os
 import re
+import shutil
 import stat
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -45,12 +46,12 @@ class Bounds:
         if size > self.bytes:
             raise PackagesTooLargeError(
                 f"{what} {size_text(size)}; at most {size_text(self.bytes)} are installed. No "
-                f"environment was made. If you want it, set {BYTES_VARIABLE} to more bytes"
+                f"environment was made. If you accept the size, set {BYTES_VARIABLE} to more bytes"
             )
         if files > self.files:
             raise PackagesTooLargeError(
                 f"{what} {files} files; at most {self.files} are installed. No environment was "
-                f"made. If you want it, set {FILES_VARIABLE} to more"
+                f"made. If you accept the size, set {FILES_VARIABLE} to more"
             )
 
 
@@ -83,13 +84,12 @@ class Watch:
         self.bounds.check(self._announced, 0, "its packages are downloads of")
         self.bounds.check(*measured(self._folder), "its packages have")
         for place in self._places:
-            found = os.statvfs(place)
-            free = found.f_bavail * found.f_frsize
+            free = shutil.disk_usage(place).free
             if free < LEFT_FREE:
                 raise DependencyError(
-                    f"the disk of {place} is full: {free // 2**20} MiB are left, and nothing is "
-                    f"installed below {LEFT_FREE // 2**20}. 'envhub cache remove --unused-for 30' "
-                    "frees what was not used for long, and 'uv cache prune' what uv keeps"
+                    f"the disk of {place} is full: {free // 2**20} MiB are free, and "
+                    f"{LEFT_FREE // 2**20} are needed. 'envhub cache remove --unused-for 30' "
+                    "removes what was not used for 30 days, 'uv cache prune' cleans uv's cache"
                 )
 
 
@@ -111,7 +111,7 @@ def checked(folder: Path) -> tuple[int, int]:
         mode = path.lstat().st_mode
         if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
             raise PackageIntegrityError(
-                f"a package brought {str(path.relative_to(folder))!r}, which is no file"
+                f"a package has {str(path.relative_to(folder))!r}, which is not a file"
             )
     return measured(folder)
 

@@ -138,9 +138,9 @@ def parse_requirement(text: str, where: str) -> WantedPackage:
             raise InvalidRequirement("a text that would be printed as something else")
     except (InvalidRequirement, RecursionError) as error:
         raise RequirementError(
-            f"{where} is {text[:200]!r}. Only plain requirements such as 'numpy>=2' are taken, "
-            "with hashes or without: options, links, paths and files can build and run code while "
-            f"they are installed. {_advice()}"
+            f"{where} is {text[:200]!r}. Only plain requirements such as 'numpy>=2' are supported, "
+            "with or without hashes: options, links, paths and files can run code during the "
+            f"installation. {_advice()}"
         ) from error
     if requirement.url is not None and of_git(requirement, where) is None:
         raise RequirementError(
@@ -188,7 +188,7 @@ def read(root: Path, name: str) -> tuple[list[WantedPackage], list[WantedPackage
                 (constraints if constrains else wanted).append(parse_requirement(line, where))
         _bounded(len(wanted) + len(constraints), name)
         if len(seen) > MAX_FILES:
-            raise RequirementError(f"{name} leads to more than {MAX_FILES} files. {_advice()}")
+            raise RequirementError(f"{name} includes more than {MAX_FILES} files. {_advice()}")
     return wanted, constraints
 
 
@@ -198,8 +198,8 @@ def _of_itself(root: Path, extras: str, where: str) -> Iterator[WantedPackage]:
     project = data.get("project")
     if not isinstance(project, dict):
         raise RequirementError(
-            f"{where} installs the repository itself, which is there already; what that needs is "
-            f"read in [project] of {PROJECT} alone, and there is none. {_advice()}"
+            f"{where} installs the repository itself, but its requirements are read only from "
+            f"[project] of {PROJECT}, which does not exist. {_advice()}"
         )
     yield from _list(project.get("dependencies", []), f"[project] of {PROJECT}")
     optional = project.get("optional-dependencies", {})
@@ -214,7 +214,7 @@ def _beside(root: Path, file: str, named: str, where: str) -> str:
     inside = not os.path.isabs(path) and path.split(os.sep)[0] != ".." and "://" not in named
     if not inside or not _is_file(root / path):
         raise RequirementError(
-            f"{where} names {named[:200]!r}, which is no file of the repository. {_advice()}"
+            f"{where} names {named[:200]!r}, which is not a file of the repository. {_advice()}"
         )
     return path
 
@@ -290,12 +290,12 @@ def _toml(text: str, where: str) -> dict[str, Any]:
     try:
         return toml.loads(text, MAX_BYTES)
     except ValueError as error:
-        raise RequirementError(f"{where} is no TOML: {error}. {_advice()}") from error
+        raise RequirementError(f"{where} is not valid TOML: {error}. {_advice()}") from error
 
 
 def _list(found: object, where: str) -> tuple[WantedPackage, ...]:
     if not isinstance(found, list) or not all(isinstance(item, str) for item in found):
-        raise RequirementError(f"dependencies in {where} is no list of texts. {_advice()}")
+        raise RequirementError(f"dependencies in {where} is not a list of strings. {_advice()}")
     _bounded(len(found), where)
     return tuple(parse_requirement(item, f"{item[:80]!r} in {where}") for item in found)
 
@@ -307,8 +307,8 @@ def _specifier(found: object, where: str) -> str:
         return str(SpecifierSet(found))
     except InvalidSpecifier as error:
         raise RequirementError(
-            f"requires-python in {where} is {str(found)[:80]!r}, which is no set of versions such "
-            f"as '>=3.11'. {_advice()}"
+            f"requires-python in {where} is {str(found)[:80]!r}, which is not a range of versions "
+            f"such as '>=3.11'. {_advice()}"
         ) from error
 
 
@@ -336,8 +336,7 @@ def _text(path: Path, name: str) -> str:
 
 def _advice() -> str:
     return (
-        "If you trust it, install the packages into an interpreter of your own and give that with "
-        f"{option_name('python', 'PATH')}, take this one as it is with "
-        f"{option_name('dependencies', 'host')}, or say what it needs yourself with "
+        f"If you trust it, use another interpreter with {option_name('python', 'PATH')}, this one "
+        f"with {option_name('dependencies', 'host')}, or your own list with "
         f"{option_name('dependencies', {'only': ['NAME']})}"
     )

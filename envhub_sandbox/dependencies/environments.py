@@ -37,13 +37,14 @@ from envhub_sandbox.errors import DependencyError
 from envhub_sandbox.hub.cache import BUILDING, CACHE_VARIABLE, cache_root, draft, remove_tree
 from envhub_sandbox.system import folders, locks
 from envhub_sandbox.system.locks import sharers
+from envhub_sandbox.system.platform import own_variables
 from envhub_worker.protocol.runtime import RECORD
 
 _FORMAT = 1
 _INSTALL_S = 3600.0
 _WAIT_S = 2 * 3600.0
 _COMPILE_S = 1800.0
-_FULL = "'envhub cache remove --unused-for 30' frees what was not used for long"
+_FULL = "'envhub cache remove --unused-for 30' removes what was not used for 30 days"
 _THERE = (errno.EEXIST, errno.ENOTEMPTY, errno.ENOTDIR)
 
 _BOOTSTRAP = Path(envhub_worker.protocol.__file__).parent.parent / "bootstrap.py"
@@ -125,8 +126,8 @@ def provide(
                 made = ready(key) or _made(key, lock, interpreter, descriptor, tell)
         except TimeoutError as error:
             raise DependencyError(
-                f"another process makes the same environment for {_WAIT_S / 3600:.0f} hours "
-                f"already, and holds {held}. End it, and try again"
+                f"another process has been making the same environment for {_WAIT_S / 3600:.0f} "
+                f"hours, and holds the lock {held}. End it, and try again"
             ) from error
         except OSError as error:
             full = error.errno in (errno.ENOSPC, errno.EDQUOT)
@@ -164,8 +165,8 @@ def remove(environment: Environment) -> str:
         who = ", ".join(f"process {pid} ({command})" for pid, command in users.items())
         return (
             f"the environment {environment.key[:12]} is in use by "
-            f"{who or 'a process that is not seen from here'}. Close its environments there, or "
-            "end it"
+            f"{who or 'a process that is not seen from here'}. Close its environments in that "
+            "process, or end the process"
         )
     except OSError:
         return ""  # another has removed it
@@ -299,7 +300,7 @@ def _compile(interpreter: Interpreter, packages: Path, held: int) -> None:
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             cwd="/",
-            env={},
+            env=own_variables(),
             pass_fds=(held,),
             timeout=_COMPILE_S,
         )
@@ -316,6 +317,6 @@ def _close(packages: Path) -> None:
 def _refuse_shared(place: Path) -> None:
     if why := folders.why_distrusted(place, cache_root()):
         raise DependencyError(
-            f"the environments in {root()} are not trusted, since other users can change what is "
-            f"in them: {why}; or set {CACHE_VARIABLE} to a folder of your own"
+            f"the environments in {root()} are not trusted, because other users can change them: "
+            f"{why}; or set {CACHE_VARIABLE} to a folder of your own"
         )

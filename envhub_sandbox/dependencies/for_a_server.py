@@ -48,6 +48,8 @@ BLOCK_BYTES = 4096
 """What the smallest file is charged: it takes disk, too."""
 _LOOK_S = 0.5
 _WAIT_S = 60.0
+_LOCKED_S = 1800.0
+"""For so long another server of this machine may be at work, where both share the folder."""
 _CLEANING_S = 2 * _WAIT_S
 _WHERE_CHARS = 200
 _SAID_CHARS = 3800
@@ -207,7 +209,7 @@ def _look(order: Mapping[str, Any]) -> None:
         raise PackagesTooLargeError(
             f"the packages of your key have {charged / 2**20:,.0f} MiB there, what is downloaded "
             f"for them included; the server's quota is {order['bytes'] / 2**20:,.0f} MiB "
-            "(--max-packages). None were made"
+            "(--max-packages). Nothing was installed"
         )
 
 
@@ -224,11 +226,16 @@ def _charged(folder: Path) -> int:
 def _alone(folder: Path) -> Iterator[int]:
     """Hold the lock of a client's folder: a killed server may have left a process there."""
     folder.mkdir(parents=True, exist_ok=True)
+
+    def waits() -> None:
+        _say({"progress": "waiting for another process, which makes packages there"})
+
     with contextlib.ExitStack() as stack:
         try:
-            descriptor = stack.enter_context(locks.held(folder / "lock", wait_s=_WAIT_S))
+            held = locks.held(folder / "lock", wait_s=_LOCKED_S, on_wait=waits)
+            descriptor = stack.enter_context(held)
         except TimeoutError:
-            raise DependencyError("another process makes packages there; ask again") from None
+            raise DependencyError("another process is making packages there; try again") from None
         yield descriptor
 
 

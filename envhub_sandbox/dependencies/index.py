@@ -15,6 +15,8 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
+from envhub_sandbox.system.platform import own_variables
+
 _KEPT = re.compile(
     r"HOME|USER|LOGNAME|PATH|TMPDIR|LANG|LC_.*|XDG_CACHE_HOME|XDG_DATA_HOME|XDG_RUNTIME_DIR|NETRC"
     r"|SSL_CERT_FILE|SSL_CERT_DIR|SSL_CLIENT_CERT|REQUESTS_CA_BUNDLE"
@@ -43,7 +45,8 @@ def environment(variables: Mapping[str, str] | None = None) -> dict[str, str]:
     kept = {name: value for name, value in given.items() if value and _KEPT.fullmatch(name)}
     if not any(name in kept for name in _CHOOSE_AN_INDEX):
         kept |= _as_uv_says(pip_settings(given), kept)
-    return {name: _from_here(name, value) for name, value in kept.items()} | _FIXED
+    ours = {name: _from_here(name, value) for name, value in kept.items()}
+    return own_variables() | ours | _FIXED
 
 
 def _from_here(name: str, value: str) -> str:

@@ -72,7 +72,7 @@ def own() -> Interpreter:
         base,
         sys.implementation.name,
         release(platform.python_version()),
-        os.uname().machine,
+        platform.machine(),
         platform.libc_ver()[1],
     )
 
@@ -107,9 +107,9 @@ def find(asked: str, declared: str = "", *, fetch: bool = False) -> Interpreter:
     named = option_name("dependencies", {"python": "/path/to/python3"})
     fetched = option_name("dependencies", {"python": asked or "3.12", "fetch_python": True})
     raise InterpreterUnavailableError(
-        f"{why}, and this machine has none that is 3.10 or later and fits; this one is "
-        f"{ours.version} ({ours.path}). Install one ('uv python install' does), have it "
-        f"downloaded with {fetched}, or name one: {named}"
+        f"{why}, and this machine has no such interpreter of 3.10 or later; this one is "
+        f"{ours.version} ({ours.path}). Install one ('uv python install'), let uv download it with "
+        f"{fetched}, or name one: {named}"
     )
 
 
@@ -151,7 +151,7 @@ def _at(path: str) -> Interpreter:
         Version(release(version))
     except (OSError, ValueError, subprocess.SubprocessError) as error:
         raise InterpreterUnavailableError(
-            f"{path} is no interpreter that answers: {error}"
+            f"{path} does not work as an interpreter: {error}"
         ) from error
     return Interpreter(real, implementation, release(version), *facts)
 

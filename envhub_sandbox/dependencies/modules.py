@@ -207,7 +207,7 @@ class MissingModule:
         here = f"It ran in this interpreter ({sys.executable})"
         if self.where == "host" and says is not None and says.wanted:
             host = option_name("dependencies", "host")
-            return f"{here}, as {host} says; leave that out, and it gets an environment of its own"
+            return f"{here}, as {host} says; leave that out to give it an environment of its own"
         return f"{here}; it gets an environment of its own, and the package in it, with {extra}"
 
     def _elsewhere(self, extra: str) -> str:
@@ -237,7 +237,7 @@ def _what(found: DeclaredPackages | None, snapshot: Snapshot) -> str:
     seen = not_read(snapshot.root, snapshot.path)
     if seen:
         return (
-            f"It has {', '.join(seen)}, which may say what it needs and was not read: "
+            f"It has {', '.join(seen)}, which may declare it and is not read: only "
             "requirements.txt, [project] of pyproject.toml and the metadata of a script are"
         )
     return "It declares no packages"

@@ -30,7 +30,6 @@ if TYPE_CHECKING:
 _CHECK_REFERENCE = (
     "The reference names the package: is it spelt so, and has the index that version?"
 )
-
 Tell = Callable[[str], None]
 
 
@@ -114,9 +113,6 @@ def packages_for(
                 return None
     except DependencyError as error:
         if snapshot.repo_type == registered.KIND and isinstance(error, ResolutionError):
-            fits = (
-                "The reference names the package: is it spelt so, and has the index that version?"
-            )
-            error.args = (f"{error}\n{fits}", *error.args[1:])
+            error.args = (f"{error}\n{_CHECK_REFERENCE}", *error.args[1:])
         name_source(error, snapshot.label)
         raise

@@ -74,8 +74,8 @@ def chosen(
         return (own, None) if python is None else (HOST, python)
     if not isinstance(dependencies, (str, os.PathLike)) or os.sep not in os.fspath(dependencies):
         raise PolicyError(
-            f"dependencies is {dependencies!r}; it is 'auto', 'declared', 'host', the path of an "
-            "interpreter or a virtual environment such as './.venv', or a mapping of "
+            f"dependencies is {dependencies!r}; it takes 'auto', 'declared', 'host', the path of "
+            "an interpreter or a virtual environment such as './.venv', or a mapping of "
             f"{', '.join(_NAMES)}"
         )
     if python is not None:
@@ -95,7 +95,9 @@ def _both() -> PolicyError:
 def _adjusted(given: Mapping[str, Any]) -> Choice:
     unknown = sorted(str(name) for name in given if name not in _NAMES)
     if unknown:
-        raise PolicyError(f"dependencies has no {', '.join(unknown)}; it takes {', '.join(_NAMES)}")
+        raise PolicyError(
+            f"dependencies has no key {', '.join(unknown)}; it takes {', '.join(_NAMES)}"
+        )
     fetch = given.get("fetch_python", False)
     if not isinstance(fetch, bool):
         raise PolicyError(f"fetch_python in dependencies is {fetch!r}; it takes True or False")

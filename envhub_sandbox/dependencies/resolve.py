@@ -216,8 +216,8 @@ def _pins(text: str) -> list[tuple[str, str, list[str]]]:
             found[-1][2].append(hashed[1])
         else:
             raise ResolutionError(
-                f"uv gave {line[:200]!r}, which is no pinned package with hashes: only packages of "
-                "an index that gives their hashes are installed"
+                f"uv returned {line[:200]!r}, which is not a pinned package with hashes: the index "
+                "must list the hashes of its packages"
             )
     return found
 
@@ -267,8 +267,7 @@ def advice(asked: str, tried: Sequence[str], error: ResolutionError) -> str:
     change = option_name("dependencies", {"override": ["NAME<2"], "without": ["NAME"]})
     return (
         f"{also}Change one of them in the repository, or for this run with {change};{others} or "
-        "install what fits into an interpreter of your own and give that with "
-        f"{option_name('python', 'PATH')}"
+        f"use an interpreter that has the packages, with {option_name('python', 'PATH')}"
     )
 
 

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import contextlib
 import re
-import resource
 import shutil
 import signal
 import subprocess
+import sys
 import tempfile
 import threading
 import time
@@ -31,7 +31,11 @@ from envhub_sandbox.errors import (
 from envhub_sandbox.hub.cache import remove_tree
 from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.system import locks
+from envhub_sandbox.system.platform import IS_WINDOWS
 from envhub_worker.protocol.text import printable
+
+if sys.platform == "linux":
+    import resource
 
 NO_BUILDS = ("--no-config", "--no-build")
 OLDEST = (0, 11, 16)
@@ -48,8 +52,8 @@ _SHOWN = 4000
 _KEPT_LINES = 400
 
 _NO_INDEX = (
-    "The package index did not answer. Look at the network, or name a mirror that can be reached "
-    "in UV_INDEX_URL or in pip's settings; what was made here before works offline"
+    "The package index did not answer. Check the network, or name a mirror in UV_INDEX_URL or in "
+    "pip's settings; environments that exist already work offline"
 )
 
 # What uv says, and what that means for the user; the first that is found counts.
@@ -57,22 +61,22 @@ _MEANINGS: tuple[tuple[str, type[DependencyError], str], ...] = (
     (
         r"No space left|os error 28|Disk quota|os error 122",
         DependencyError,
-        "The disk is full; 'envhub cache remove --unused-for 30' frees what was not used for long, "
-        "and 'uv cache prune' what uv keeps",
+        "The disk is full; 'envhub cache remove --unused-for 30' removes what was not used for "
+        "30 days, 'uv cache prune' cleans uv's cache",
     ),
     (
         r"Hash mismatch|hash mismatch",
         PackageIntegrityError,
-        "A package is not the one whose hash is known: it was replaced on the index, or on its way "
-        "here. Nothing of it was kept. If the index is right, resolve again: envhub prefetch "
-        "--upgrade REF",
+        "A package has another hash than the one that is known: it was replaced on the index or "
+        "during the download. It was not kept. If the index is right, resolve again: envhub "
+        "prefetch --upgrade REF",
     ),
     (r"network was disabled", IndexUnavailableError, _NO_INDEX),
     (
         r"yanked",
         ResolutionError,
-        "A release was taken back by its authors. Ask for another version, or name this one "
-        "exactly: 'name==version'",
+        "A release was yanked by its authors. Use another version, or name this one exactly: "
+        "'name==version'",
     ),
     (r"No solution found|unsatisfiable", ResolutionError, ""),
     (
@@ -128,7 +132,7 @@ def run(
             stderr=subprocess.PIPE,
             cwd=nowhere,
             env={**index.environment(), **variables},
-            pass_fds=tuple(keep),
+            pass_fds=() if IS_WINDOWS else tuple(keep),
             text=True,
             errors="replace",
         )
@@ -145,7 +149,7 @@ def run(
             finally:
                 process.kill()
                 listener.join()
-        if process.returncode == -signal.SIGXFSZ:
+        if sys.platform != "win32" and process.returncode == -signal.SIGXFSZ:
             raise PackagesTooLargeError(
                 f"{what}: a file was about to have more than {file_bytes} bytes"
             )
@@ -156,13 +160,12 @@ def run(
 
 
 def _limit_files(process: subprocess.Popen[str], largest: int) -> None:
-    if process.poll() is not None:
-        return
-    hard = resource.prlimit(process.pid, resource.RLIMIT_FSIZE)[1]
-    limit = largest if hard == resource.RLIM_INFINITY else min(largest, hard)
-    resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (limit, limit))
-    # no core of it either: the signal would leave one
-    resource.prlimit(process.pid, resource.RLIMIT_CORE, (0, 0))
+    if process.poll() is None and sys.platform == "linux":  # elsewhere ``watch`` measures alone
+        hard = resource.prlimit(process.pid, resource.RLIMIT_FSIZE)[1]
+        limit = largest if hard == resource.RLIM_INFINITY else min(largest, hard)
+        resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (limit, limit))
+        # no core of it either: the signal would leave one
+        resource.prlimit(process.pid, resource.RLIMIT_CORE, (0, 0))
 
 
 def _wait(process: subprocess.Popen[str], timeout_s: float, watch: Callable[[], None]) -> None:
@@ -196,9 +199,9 @@ def command() -> str:
         found = shutil.which("uv")
     if found is None:
         raise DependencyError(
-            "uv resolves and installs packages, and is not found: neither among this interpreter's "
-            "packages nor on PATH. Run: pip install uv. Or take the packages of this one as they "
-            f"are, with {option_name('dependencies', 'host')}"
+            "uv, which resolves and installs packages, is neither installed in this interpreter "
+            "nor on PATH. Run: pip install uv. Or use this interpreter's packages, with "
+            f"{option_name('dependencies', 'host')}"
         )
     _check_release(found)
     return found
@@ -217,7 +220,7 @@ def _check_release(path: str) -> None:
         oldest = ".".join(map(str, OLDEST))
         raise DependencyError(
             f"{path} is {printable(said.strip(), 80)!r}: uv before {oldest} lets a package write "
-            f"outside of its folder. Run: pip install 'uv>={oldest}'"
+            f"outside its folder. Run: pip install 'uv>={oldest}'"
         )
 
 

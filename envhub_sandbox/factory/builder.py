@@ -55,7 +55,7 @@ def _built(folder: Path, order: Mapping[str, Any]) -> dict[str, Any]:
     tools = _tools(folder / "tools")
     repository = _repository(folder, order)
     launcher = Launcher(repository, PROCESS, cache_root() / "snapshots")
-    with EnvFactory(launcher, 1, 0, SandboxVectorEnv, lambda manifest: None).make() as suites:
+    with EnvFactory([launcher], 1, 0, SandboxVectorEnv, lambda manifest: None).make() as suites:
         env = suites.env
         names = ("packages", "python", "backend", "backend_path", "known", "environment")
         asked = {name: order[name] for name in names}

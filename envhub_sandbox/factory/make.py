@@ -79,6 +79,7 @@ def make(make_env: Callable[..., EnvSuites], cfg: Any, given: Options) -> EnvSui
         Runtime(packages.python, packages.packages) if packages else wanted.runtime,
         options.lane,
         options.copy,
+        min_ready=options.min_ready,
         recipe=recipe,
         installed=packages.facts if packages else None,
         advice=MissingModule(
@@ -86,12 +87,22 @@ def make(make_env: Callable[..., EnvSuites], cfg: Any, given: Options) -> EnvSui
         ).advice,
     )
     return EnvFactory(
-        Launcher(repository, wanted.place, cache_root() / "snapshots"),
+        _launchers(repository, wanted.place, options),
         options.num_workers,
         _ahead(wanted, options),
         _face(options.validate),
         locks.checker(wanted.lock, snapshot.label, load.env_kwargs, config),
     ).make()
+
+
+def _launchers(repository: Repository, place: Sandbox, options: Options) -> list[Launcher]:
+    """One for each worker with a jail of its own."""
+    store, apart = cache_root() / "snapshots", options.min_ready is not None
+    count = options.num_workers or (options.n_envs if apart else None)
+    found = [Launcher(repository, one, store) for one in place.workers(count)]
+    if apart and len(found) == 1 and count is not None:
+        found += [found[0].another() for _ in range(1, count)]
+    return found
 
 
 @dataclass(frozen=True)
@@ -121,7 +132,8 @@ def _wanted(sandbox: str | Sandbox, options: Options) -> _Plan:
             "for servers on other hosts; this place has packages of its own"
         )
     runtime = Runtime(sandbox_spec.interpreter(python))
-    if sandbox == "process":
+    place.note_interpreter(runtime)
+    if place.is_here:
         sandbox_spec.check_executable(runtime.python)
         sandbox_spec.check_readable(policy.readable)
     return _Plan(place, policy, timeouts, choice, python, runtime, lock)

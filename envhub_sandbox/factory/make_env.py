@@ -23,7 +23,7 @@ def make_env(
     hub_cache_dir: str | Path | None = None,
     trust_remote_code: bool = False,
     *,
-    sandbox: str | Sandbox | None = "process",
+    sandbox: str | Sandbox | Sequence[str | Sandbox] | None = "process",
     env_kwargs: Mapping[str, Any] | None = None,
     policy: Policy | Mapping[str, Any] | None = None,
     timeouts: Timeouts | Mapping[str, Any] | None = None,
@@ -36,6 +36,7 @@ def make_env(
     assets: Sequence[str] = (),
     num_workers: int | None = None,
     prewarm: int | None = None,
+    min_ready: int | None = None,
     lane: str = "auto",
     copy: bool = True,
     validate: bool = False,
@@ -51,12 +52,14 @@ def make_env(
             ``hub_path``, whose ``vars()`` and public properties the repository's ``make_env``
             gets as ``cfg``.
         n_envs: Number of sub-environments, passed to the repository's ``make_env``.
-        use_async_envs: Passed on likewise; sub-environments may then run in several processes.
+        use_async_envs: Passed likewise; sub-environments may then run in several processes.
         hub_cache_dir: huggingface_hub's ``cache_dir``.
         trust_remote_code: Only for ``sandbox=None``.
         sandbox: ``"process"``; ``"docker"``, ``"docker:IMAGE"`` or a ``DockerSandbox``;
-            ``"tcp://HOST:PORT"`` or a ``RemoteSandbox``; or None to run the code here, as LeRobot
-            does, where nothing of what protects can be asked for.
+            ``"ray"`` or a ``RaySandbox``; ``"tcp://HOST:PORT"`` or a ``RemoteSandbox``; a list of
+            these, ``"file:PATH"``, ``"dns://HOST:PORT"`` or a ``Fleet``, over which the
+            sub-environments of each environment are spread (``docs/scaling.md``); or None to run
+            the code in this process without protection, as LeRobot does.
         env_kwargs: Further keyword arguments for the repository's ``make_env``.
         policy: What the code may reach; see ``Policy``.
         timeouts: How long operations may take; see ``Timeouts``.
@@ -65,30 +68,33 @@ def make_env(
         endpoint: As in huggingface_hub.
         python: The interpreter that runs the repository; this one by default. It needs cloudpickle,
             gymnasium, msgpack and numpy beside the repository's own packages.
-        dependencies: Where its packages come from. ``"auto"`` makes an environment of its own from
-            what it declares and what it imports besides, wheels only, where this interpreter lacks
-            some of that; ``"declared"`` takes only what it declares; ``"host"`` takes this
-            interpreter as it is; a path that interpreter or virtual environment. A mapping always
-            makes one: ``{"extra": ["scipy"], "python": "3.12", "exclude_newer": "2026-01-31"}``,
-            also with ``only``, ``without``, ``override`` and ``fetch_python``. See
-            ``docs/dependencies.md``; for ``sandbox="process"``.
-        lock: A file that ``envhub lock`` wrote: its packages are used and no others, and whatever
-            differs from it (commit, files, Python, spaces) is refused. For ``sandbox="process"``.
-        assets: Further repositories of the Hub that the code may read, sixteen at most, as in
-            ``["datasets/org/data@<commit>"]``; without a prefix a model, a dataset or a space. They
-            are verified as its own files are, and ``snapshot_download`` and ``hf_hub_download``
-            find them, in a jail without a network. See ``docs/authors.md``.
-        num_workers: Processes over which the sub-environments are spread; by default one, or with
-            ``use_async_envs`` as many as were fastest when the first uses tried them.
-        prewarm: How many of a suite's next tasks are started in the background when a task is first
-            reset, and so how many unused jails there are at most. By default one,
-            once tasks are seen to be closed before the next is reset, on this machine and without
-            a GPU; else none.
+        dependencies: Where its packages come from. ``"auto"`` installs what it declares and imports
+            into an environment of its own, if this interpreter lacks some of it; ``"declared"``
+            only what it declares; ``"host"`` uses this interpreter's packages; a path those of that
+            interpreter or virtual environment. A mapping always makes an environment:
+            ``{"extra": ["scipy"], "python": "3.12", "exclude_newer": "2026-01-31"}``, also with
+            ``only``, ``without``, ``override`` and ``fetch_python``. See ``docs/dependencies.md``.
+        lock: A file of ``envhub lock``: its packages are used, and any difference from it (commit,
+            files, Python, spaces) is an error. For ``sandbox="process"``.
+        assets: Other repositories of the Hub that the code may read, at most sixteen, as in
+            ``["datasets/org/data@<commit>"]``; without a prefix a model, a dataset or a Space. They
+            are verified like its own files, and ``snapshot_download`` and ``hf_hub_download`` find
+            them without a network. See ``docs/authors.md``.
+        num_workers: Processes for the sub-environments; by default one, or with
+            ``use_async_envs`` the number that was fastest in the first uses, and with several
+            places in ``sandbox`` one in each.
+        prewarm: How many of a suite's next tasks start in the background when a task is first
+            reset; this is also the maximum of unused jails. By default one, if tasks are closed
+            before the next is reset, on this machine and without a GPU; otherwise none.
+        min_ready: How many sub-environments ``env.recv`` waits for by default. Each sub-environment
+            then has its own worker, or ``num_workers`` workers share them: the sub-environments of
+            one worker are stepped together, and so are ready together. ``reset`` and ``step`` work
+            as before.
         lane: ``"auto"`` steps over shared memory where that is possible, ``"frames"`` never does.
-        copy: False lends observations instead of copying them, as in Gymnasium; still no later
-            step changes an array that somebody holds, but the worker could.
-        validate: Hold every action and observation against its space, value by value: for tests,
-            at the cost of speed. Shapes and dtypes are checked in any case.
+        copy: False returns observations in shared memory instead of copies. As in Gymnasium, no
+            later step changes an array that is still in use; but the worker can.
+        validate: Compare every action and observation with its space, value by value: for tests,
+            because it is slower. Shapes and dtypes are always checked.
         server_key: For ``sandbox="tcp://..."``: that server's public key.
 
     Returns:
@@ -97,13 +103,13 @@ def make_env(
 
     Raises:
         HubReferenceError: ``cfg`` cannot be read.
-        TypeError, ValueError: A plain argument that nothing can be made of.
-        SnapshotError: The files cannot be had, or are not what the commit says.
+        TypeError, ValueError: A plain argument is invalid.
+        SnapshotError: The files cannot be downloaded, or differ from the commit.
         PolicyError: An unknown or impossible policy, limit or timeout.
         SandboxUnavailableError: This host cannot enforce the policy.
-        LockError: The lock cannot be read; or something is not as it says (``LockDriftError``).
-        DependencyError: Its packages cannot be had, or it imports one that it does not declare.
-        LoadError: The repository failed to load, or returned something unusable.
+        LockError: The lock cannot be read; or something differs from it (``LockDriftError``).
+        DependencyError: Its packages cannot be installed, or it imports an undeclared one.
+        LoadError: The repository failed to load, or returned no environment.
         WorkerError: The worker did not come up, died, or took too long; or a server has no room
             (``ServerBusyError``).
         RuntimeError: ``sandbox=None`` without ``trust_remote_code=True``.

@@ -11,6 +11,7 @@ from pathlib import Path
 from envhub_sandbox.errors import SnapshotError
 from envhub_sandbox.system import folders
 from envhub_sandbox.system.files import write_whole_file
+from envhub_sandbox.system.platform import IS_WINDOWS
 
 CACHE_VARIABLE = "ENVHUB_CACHE"
 BUILDING = ".building-"
@@ -32,7 +33,7 @@ def cache_root() -> Path:
         return Path(platformdirs.user_cache_dir("envhub-sandbox", appauthor=False))
     except RuntimeError:
         raise SnapshotError(
-            f"this user has no home, and so no folder for a cache; set {CACHE_VARIABLE} to a folder"
+            f"this user has no home folder for the cache; set {CACHE_VARIABLE} to a folder"
         ) from None
 
 
@@ -62,7 +63,10 @@ def remove_tree(path: Path) -> None:
         with contextlib.suppress(OSError):
             for name in os.listdir(folder):
                 with contextlib.suppress(OSError):
-                    os.unlink(os.path.join(folder, name))
+                    file = os.path.join(folder, name)
+                    if IS_WINDOWS:  # which removes no file that cannot be written
+                        os.chmod(file, folders.PRIVATE_MODE)
+                    os.unlink(file)
             os.rmdir(folder)
 
 

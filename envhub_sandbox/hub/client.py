@@ -51,7 +51,7 @@ def checked_endpoint(endpoint: str | None) -> str:
     shown = without_login(chosen)
     if "@" in shown:
         raise HubReferenceError(
-            "endpoint: it has an @ behind the host; write a user or password with such characters "
+            "endpoint: it has an @ after the host; write a user or password with such characters "
             "percent-encoded, as in https://user:p%2Fw@hub.example"
         )
     if not re.match(r"https?://[^/]", shown):
@@ -112,7 +112,7 @@ class HubClient:
             idle = 0 if found else idle + 1
             if idle > MAX_IDLE_PAGES:
                 raise SnapshotIntegrityError(
-                    f"{repo.repo_id} on {self.public_endpoint}: its listing has no end: {idle} "
+                    f"{repo.repo_id} on {self.public_endpoint}: its listing does not end: {idle} "
                     "pages without a file. Check that the endpoint is a Hugging Face Hub"
                 )
             yield from found

@@ -33,7 +33,7 @@ class Kind(Enum):
     )
     NO_ENTRY = (
         "the {repo_type} repository {repo_id} lacks a file that its own listing names",
-        "Try again; if it stays, tell the repository's owner",
+        "Try again; if it persists, ask the repository's owner",
     )
     GATED = (
         "the {repo_type} repository {repo_id} is gated and you have no access yet{said}",
@@ -45,14 +45,14 @@ class Kind(Enum):
     )
     UNAUTHORIZED = (
         "the Hub refused your token (401){said}",
-        f"It may be expired or of another endpoint: {_LOG_IN}; {{no_token}} sends none",
+        f"It may have expired, or be for another endpoint: {_LOG_IN}; {{no_token}} sends none",
     )
     FORBIDDEN = (
         "your token may not read the {repo_type} repository {repo_id} (403){said}",
         "Give the token read access to it at {endpoint}/settings/tokens, or ask its owner",
     )
     NO_TOKEN = (
-        "a stored token was asked for, but no token is stored on this machine",
+        "token=True needs a stored token, and none is stored on this machine",
         f"To store one, {_LOG_IN}",
     )
     RATE_LIMITED = (
@@ -77,7 +77,7 @@ class Kind(Enum):
     )
     BROKEN_DOWNLOAD = (
         "the download broke off or had the wrong length",
-        "Try again; if it stays, something between you and the Hub changes files",
+        "Try again; if it persists, a proxy or a mirror changes the files",
     )
     DISK_FULL = ("the disk is full", "Free space, or put the Hub cache elsewhere (HF_HOME)")
     OTHER = (

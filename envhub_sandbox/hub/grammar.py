@@ -14,6 +14,7 @@ from typing import NamedTuple
 from urllib.parse import unquote, urlsplit
 
 from envhub_sandbox.settings.options import option_name
+from envhub_sandbox.system.platform import IS_WINDOWS
 
 DEFAULT_PATH = "env.py"
 REPO_TYPES = ("model", "space", "dataset")
@@ -68,7 +69,8 @@ def is_commit(revision: str) -> bool:
 def is_local(text: str) -> bool:
     """Whether it names a folder here: ``./env``, ``../env``, ``/env``, ``~/env``, ``examples:``."""
     here = ("./", "../", "/", "~/", ".\\", "..\\", "examples:")
-    return text in (".", "..", "~") or text.startswith(here)
+    drive = IS_WINDOWS and _DRIVE.match(text) is not None
+    return text in (".", "..", "~") or text.startswith(here) or drive
 
 
 def has_control_characters(text: str) -> bool:
@@ -96,7 +98,7 @@ def _check_repo_id(parts: Parts) -> None:
     for part in (owner, name):
         if not _NAME.fullmatch(part) or "--" in part or ".." in part:
             raise Wrong(
-                f"{part!r} cannot be a name on the Hub (letters, digits, '-', '_' and '.', at "
+                f"{part!r} is not a valid name on the Hub (letters, digits, '-', '_' and '.', at "
                 "most 96, no '--' or '..', neither '-' nor '.' at an end)",
                 GRAMMAR,
             )
@@ -145,7 +147,7 @@ def _check_suffix(parts: Parts, name: str) -> None:
     before, at, after = parts.path.rpartition("@")
     if at and before.endswith(".py") and parts.revision is None:
         swapped = parts._replace(revision=after, path=before)
-        raise Wrong("the revision stands behind the path", repr(join(swapped)))
+        raise Wrong("the revision comes before the path", repr(join(swapped)))
     if "." not in name:
         inside = f"{parts.path.rstrip('/')}/{DEFAULT_PATH}"
         raise Wrong("the path is a folder, not a .py file", _suggest(parts, inside))
@@ -237,7 +239,7 @@ def _split_repo(repo: str, rest: str) -> tuple[str | None, str]:
             example = f"pypi:{package}#{env_id}"
             raise Wrong("this names an environment of Gymnasium, not a repository", repr(example))
         if not prefix and not rest and repo.endswith(".py"):
-            what = "this is the name of a file, and no such file is here"
+            what = "this is the name of a file, which does not exist here"
             raise Wrong(what, f"'./FOLDER/{repo}' or 'OWNER/NAME:{repo}'")
         local = "" if prefix or rest else f" (or './{repo}' for a local folder)"
         example = f"{prefix}OWNER/{steps[0]}{rest}"
@@ -252,7 +254,7 @@ def _too_many_slashes(prefix: str, steps: list[str], rest: str) -> Wrong:
         return Wrong("a repository is owner/name, with one slash", GRAMMAR)
     path = "/".join(steps[2:])
     path = path if path.endswith(".py") else f"{path}/{DEFAULT_PATH}"
-    return Wrong("a path stands behind a colon", repr(f"{prefix}{'/'.join(steps[:2])}:{path}"))
+    return Wrong("the path comes after a colon", repr(f"{prefix}{'/'.join(steps[:2])}:{path}"))
 
 
 def _read_hf(text: str, rest: str) -> Parts:

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, Protocol, TypeVar
 
 from envhub_sandbox.errors import PolicyError, SnapshotError, SnapshotTooLargeError
 from envhub_sandbox.hub.grammar import REPO_TYPES, Parts, has_control_characters, join
+from envhub_sandbox.system.file_names import wrong_here
 from envhub_worker.protocol.runtime import is_cached_revision
 from envhub_worker.protocol.text import size_text
 
@@ -207,9 +208,9 @@ def listing_within_limits(
 def _too_large(title: str, what: str, name: str, limit: int) -> SnapshotTooLargeError:
     shown = f" ({size_text(limit)})" if name.endswith("_bytes") else ""
     return SnapshotTooLargeError(
-        f"{title}: {what}, over the limit {name}={limit}{shown}. If you trust it with the disk "
-        "space, fetch it once, which make_env then uses: envhub_sandbox.hub.snapshot.fetch("
-        f"HubRef.parse(...), limits=SnapshotLimits({name}=...))"
+        f"{title}: {what}, over the limit {name}={limit}{shown}. If you accept the size, download "
+        "it once, then make_env uses it: envhub_sandbox.hub.snapshot.fetch(HubRef.parse(...), "
+        f"limits=SnapshotLimits({name}=...))"
     )
 
 
@@ -220,12 +221,12 @@ def check_listing_names(files: Iterable[FileRecord], title: str) -> None:
     for file in files:
         wrong = _wrong_with_name(file.path) or ("is listed twice" if file.path in seen else None)
         if wrong is not None:
-            raise SnapshotError(f"{title}: refused, since the file {file.path!r} {wrong}")
+            raise SnapshotError(f"{title}: refused, because the file {file.path!r} {wrong}")
         seen.add(file.path)
         steps = file.path.split("/")
         folders.update("/".join(steps[:depth]) for depth in range(1, len(steps)))
     for path in sorted(seen & folders):
-        raise SnapshotError(f"{title}: refused, since {path!r} is both a file and a folder")
+        raise SnapshotError(f"{title}: refused, because {path!r} is both a file and a folder")
 
 
 def _wrong_with_name(path: str) -> str | None:
@@ -240,4 +241,4 @@ def _wrong_with_name(path: str) -> str | None:
         return f"has a name over {MAX_PATH_BYTES} bytes or {MAX_DEPTH} folders deep"
     if any(len(step.encode()) > MAX_NAME_BYTES for step in steps):
         return f"has a step over {MAX_NAME_BYTES} bytes in its name"
-    return None
+    return wrong_here(path)

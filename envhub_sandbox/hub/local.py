@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import posixpath
 import stat
 import sysconfig
 from collections.abc import Callable, Iterator
@@ -36,8 +37,8 @@ from envhub_worker.protocol.records import dataclass
 _GIT = ".git"
 _EXAMPLES = "examples:"
 _ALL_COUNTS = (
-    "It is in no git checkout, so every file in it counts. Move away what does not belong to the "
-    "repository, or run 'git init' there and name it in .gitignore"
+    "It is not in a git checkout, so every file in it is included. Move away what does not belong "
+    "to the repository, or run 'git init' there and name it in .gitignore"
 )
 
 
@@ -107,7 +108,7 @@ class LocalFolder:
             if f"{path}/".startswith(f"{one.path.rstrip('/')}/"):
                 what = f"has the file {path!r}, but git would not commit it"
                 if one.is_repository:
-                    return what, f"{one.path} is a git repository of its own; name that one"
+                    return what, f"{one.path} is a separate git repository; name that one"
                 return what, f"Run 'git add --force {path}', or take it out of .gitignore"
         return None
 
@@ -166,12 +167,12 @@ class LocalFolder:
         try:
             source = Path(os.path.realpath(item.path, strict=True))
         except OSError as error:
-            raise SnapshotError(f"{self}: the link {name!r} leads nowhere; remove it") from error
+            raise SnapshotError(f"{self}: the link {name!r} points nowhere; remove it") from error
         if not source.is_relative_to(self.root) or _GIT in source.relative_to(self.root).parts:
             self._refuse_environment(Path(item.path), name)
             raise SnapshotError(
-                f"{self}: the link {name!r} leaves the folder (to {source}), and a sandbox sees "
-                "nothing else of this machine; put a copy in its place"
+                f"{self}: the link {name!r} points outside the folder (to {source}), where a "
+                "sandbox cannot read; put a copy in its place"
             )
         return source
 
@@ -182,8 +183,8 @@ class LocalFolder:
         if found is not None:
             raise SnapshotError(
                 f"{self}: {name!r} belongs to a virtual environment. Move {found} elsewhere, or "
-                f"have git leave it out: name '{found.name}/' in .gitignore, after 'git init' "
-                "where this is no checkout yet"
+                f"have git ignore it: name '{found.name}/' in .gitignore, after 'git init' if this "
+                "is not a checkout yet"
             )
 
 
@@ -200,7 +201,7 @@ def split_local(text: str, path: str) -> tuple[Path, str]:
         text = str(_example(text))
     folder = Path(os.path.abspath(os.path.expanduser(text)))
     if folder.is_dir():
-        return folder, os.path.normpath(path)
+        return folder, _in_a_snapshot(path)
     if folder.is_file():
         if folder.suffix != ".py":
             raise RepositoryUnavailableError(
@@ -211,12 +212,17 @@ def split_local(text: str, path: str) -> tuple[Path, str]:
     if colon and before and after:
         inner = Path(os.path.abspath(os.path.expanduser(before)))
         if inner.is_dir():
-            return inner, os.path.normpath(after)
+            return inner, _in_a_snapshot(after)
     raise RepositoryUnavailableError(
         f"local folder {text!r}: there is no such folder or file here (looked for {folder}). "
         "Write './folder', './folder:path/env.py' or './folder/env.py'; a repository of the Hub "
         "is owner/name"
     )
+
+
+def _in_a_snapshot(path: str) -> str:
+    """A path as a snapshot has it; on Windows one may be written with backslashes."""
+    return posixpath.normpath(path.replace(os.sep, "/"))
 
 
 def _example(text: str) -> Path:
@@ -264,7 +270,8 @@ def copier(files: tuple[LocalFile, ...], title: str) -> Callable[[FileRecord, Pa
     def copy(record: FileRecord, target: Path) -> None:
         file = found[record.path]
         if file.link is not None:
-            target.write_bytes(file.link)
+            with target.open("xb") as out:
+                out.write(file.link)
             return
         try:
             copy_verified(file.source, target, record)

@@ -70,7 +70,7 @@ def snapshot_named(
         return fetch(ref, hub_cache_dir=hub_cache_dir, token=token, endpoint=endpoint)
     except (HubReferenceError, SnapshotError) as error:
         if os.path.exists(reference.partition(":")[0]):
-            hint = f"There is such a folder here; for it, write './{reference}'."
+            hint = f"There is a folder of that name here; for the folder, write './{reference}'."
             error.args = (f"{error}\n{hint}",)
         raise
 
@@ -303,7 +303,7 @@ class _Candidate:
             self._bring(slot)
             files = store.load(slot)
         if files is None:
-            raise SnapshotError(f"{slot.title}: somebody removed it from the store; try again")
+            raise SnapshotError(f"{slot.title}: it was removed from the store meanwhile; try again")
         return self._finished(slot, files)
 
     def resolved(self) -> str:
@@ -320,6 +320,7 @@ class _Candidate:
         with self.host.files(self.repo, slot.commit) as source:
             files = listing_within_limits(source.listing, self.limits, slot.title)
             check_listing_names(files, slot.title)
+            store.refuse_clashes(slot, files)  # the Hub's client has a folder of them, too
             self._require_entry(files)
             size = sum(file.size for file in files)
             SNAPSHOT.info("%s: downloading %d files, %d bytes", slot.title, len(files), size)
@@ -349,10 +350,10 @@ def _missing_entry(path: str, files: tuple[FileRecord, ...]) -> tuple[str, str]:
     names = [file.path for file in files if file.path.endswith(".py")]
     what = f"has no file {path!r}"
     if not names:
-        return what, "It has no .py file at all, so it is no environment"
+        return what, "It has no .py file, so it is not an environment"
     import difflib
 
     close = difflib.get_close_matches(path, names, n=1) or names
     shown = ", ".join(repr(name) for name in names[:_SHOWN_FILES])
     more = f" and {len(names) - _SHOWN_FILES} more" if len(names) > _SHOWN_FILES else ""
-    return what, f"Name the entry behind a colon, as in ':{close[0]}'; it has {shown}{more}"
+    return what, f"Name the entry file after a colon, as in ':{close[0]}'; it has {shown}{more}"

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import contextlib
 import errno
-import fcntl
 import hashlib
 import json
 import os
@@ -31,17 +30,16 @@ from envhub_sandbox.errors import SnapshotError, SnapshotIntegrityError
 from envhub_sandbox.hub.cache import BUILDING, cache_root, draft, remove_tree
 from envhub_sandbox.hub.hashing import HashMismatch, digest_of
 from envhub_sandbox.hub.listing import FileRecord
-from envhub_sandbox.system import folders
+from envhub_sandbox.system import file_names, folders, locks
 from envhub_sandbox.system.files import write_whole_file
-from envhub_sandbox.system.locks import sharers
 from envhub_sandbox.system.log import SNAPSHOT
+from envhub_sandbox.system.platform import IS_WINDOWS, open_flags
 from envhub_worker.protocol.records import dataclass
 
 _FORMAT = 1
 _ABANDONED_AFTER_S = 24 * 3600.0
 _MAX_NAME = 200
 _FILE_MODE = 0o444
-_OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 _TREE_FOLDER_MODE = 0o555
 
 
@@ -129,7 +127,7 @@ def load(slot: Slot) -> tuple[FileRecord, ...] | None:
         entry
         for entry, known in entries.items()
         if (status := found.get(entry.path)) is not None
-        and (status.st_mode & _OTHERS_WRITE or _fingerprint(status) != known)
+        and (folders.others_write(status) or _fingerprint(status) != known)
     ]
     _verify_again(slot, changed)
     if missing := sorted(recorded - found.keys()):
@@ -174,11 +172,11 @@ def _walk(slot: Slot, folder: Path | str, prefix: str) -> Iterator[tuple[str, os
         raise _damaged(slot, f"its folder {prefix or '.'!r} cannot be read ({error})") from error
     with listing:
         for item in listing:
-            status = item.stat(follow_symlinks=False)
+            status = os.lstat(item.path)  # an entry's own has no inode on Windows
             if not folders.is_trusted(status.st_uid):
                 raise _damaged(slot, f"{prefix + item.name!r} belongs to uid {status.st_uid}")
             if stat.S_ISDIR(status.st_mode):
-                if status.st_mode & _OTHERS_WRITE:
+                if folders.others_write(status):
                     raise _damaged(slot, f"others can write in {prefix + item.name!r}")
                 yield from _walk(slot, item.path, f"{prefix}{item.name}/")
             elif stat.S_ISREG(status.st_mode):
@@ -209,8 +207,8 @@ def _damaged(slot: Slot, what: str) -> SnapshotIntegrityError:
 def _damage(slot: Slot, what: str) -> str:
     return (
         f"{slot.title}: the copy in the store is not what was verified: {what}. Nothing of it was "
-        f"used. Remove it, and it is fetched again: chmod -R u+w '{slot.home}' && "
-        f"rm -r '{slot.home}'"
+        f"used. Remove it; the next use downloads it again: chmod -R u+w '{slot.home}' && rm -r "
+        f"'{slot.home}'"
     )
 
 
@@ -225,6 +223,7 @@ def publish(
     ``copy(record, target)`` writes the target and must raise unless it wrote what the record
     says. ``note`` is kept in the record (where the snapshot is from). Nothing stays if it fails.
     """
+    refuse_clashes(slot, files)
     try:
         folders.make(slot.folder)
         _refuse_shared_store(slot.folder)
@@ -240,19 +239,46 @@ def publish(
             with _opened(slot.folder) as handle:
                 # one at a time: no process moves away what another has just put there
                 with contextlib.suppress(OSError):  # not every file system has locks
-                    fcntl.flock(handle, fcntl.LOCK_EX)
+                    locks.lock(handle, wait=True)
                 _move_remains(slot)
                 _rename(building, slot.home)
     except OSError as error:
+        raise _unwritable(slot, error) from error
+
+
+def refuse_clashes(slot: Slot, files: Iterable[FileRecord]) -> None:
+    """Refuse files that the store's file system would keep as one, which differ in case alone.
+    Raises ``SnapshotError``: with their names and what to do.
+    """
+    clash = file_names.taken_as_one(file.path for file in files)
+    if clash is None:
+        return
+    try:
+        folders.make(slot.folder)
+        is_one = file_names.ignores_case(slot.folder)
+    except OSError as error:
+        raise _unwritable(slot, error) from error
+    if is_one:
         raise SnapshotError(
-            f"the snapshot store {slot.folder} cannot be written: {error}. Free space or fix its "
-            "permissions, or set ENVHUB_CACHE to another folder"
-        ) from error
+            f"{slot.title}: refused, because {clash[0]!r} and {clash[1]!r} are the same file in "
+            f"{cache_root()}, whose file system ignores case. Set ENVHUB_CACHE to a folder on one "
+            "that does not, such as a volume with case-sensitive APFS on macOS"
+        )
+
+
+def _unwritable(slot: Slot, error: OSError) -> SnapshotError:
+    return SnapshotError(
+        f"the snapshot store {slot.folder} cannot be written: {error}. Free space or fix its "
+        "permissions, or set ENVHUB_CACHE to another folder"
+    )
 
 
 @contextlib.contextmanager
 def _opened(folder: Path) -> Iterator[int]:
-    handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    if IS_WINDOWS:  # which opens no folder, and so has no lock of one
+        yield -1
+        return
+    handle = os.open(folder, os.O_RDONLY | open_flags("O_DIRECTORY", "O_CLOEXEC"))
     try:
         yield handle
     finally:
@@ -268,7 +294,7 @@ def _move_remains(slot: Slot) -> None:
     except HalfDeletedError as error:
         SNAPSHOT.warning("%s. It has been made again", str(error).partition(". Nothing of it")[0])
         aside = tempfile.mkdtemp(prefix=BUILDING, dir=slot.folder)
-        os.rename(slot.home, aside)
+        os.rename(slot.home, os.path.join(aside, "remains"))
         os.utime(aside)
 
 
@@ -276,10 +302,11 @@ def remove(home: Path) -> dict[int, str]:
     """Remove a snapshot, unless others use it (share a lock of its folder); these are returned."""
     with contextlib.suppress(FileNotFoundError), _opened(home) as handle:
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if handle >= 0:
+                locks.lock(handle)
             remove_tree(home)
         except BlockingIOError:
-            return sharers(home) or {0: "that is not seen from here"}
+            return locks.sharers(home) or {0: "that is not seen from here"}
     return {}
 
 
@@ -312,8 +339,8 @@ def _refuse_shared_store(place: Path) -> None:
         raise SnapshotError(f"the snapshot store {root} cannot be looked at: {error}") from error
     if why:
         raise SnapshotError(
-            f"the snapshot store {root} is not trusted, since other users can change what is in "
-            f"it: {why}; or set ENVHUB_CACHE to a folder of your own"
+            f"the snapshot store {root} is not trusted, because other users can change it: {why}; "
+            "or set ENVHUB_CACHE to a folder of your own"
         )
 
 

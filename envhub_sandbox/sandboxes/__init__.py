@@ -1,1 +1,1 @@
-"""The places that a worker can run in: one file each, and what each answers in ``sandbox``."""
+"""The places that a worker can run in: a file or folder each, and what each answers."""

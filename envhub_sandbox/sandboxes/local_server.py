@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -62,7 +63,8 @@ class LocalServer(WorkerServer):
                     self._process = start(ready_end)
                 finally:
                     os.close(ready_end)
-                self.process_fd = os.pidfd_open(self.process.pid)
+                if sys.platform == "linux":
+                    self.process_fd = os.pidfd_open(self.process.pid)
                 yield ready
             finally:
                 os.close(ready)

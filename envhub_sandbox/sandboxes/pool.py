@@ -11,7 +11,8 @@ Interrupts, finalizers, threads and forks come between any two statements (inter
   be repeated without harm, so ``release`` can be called until it comes through (rule 7).
 - The lock is reentrant: the garbage collector may close an environment in the middle of
   ``acquire``, and a signal handler in the middle of anything (rule 12).
-- A server is ended outside of the lock, so that a caller who wants a fresh one does not wait.
+- A server is started and ended outside of the lock, so that a caller who wants or gives back
+  another does not wait. Who wants the same one waits for its start by a lock of its own.
 - A fork sees its parent's servers under another pid, and leaves them alone.
 """
 
@@ -27,6 +28,8 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from time import monotonic
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
+from envhub_sandbox.system.platform import run_after_fork
+
 if TYPE_CHECKING:
     from envhub_sandbox.transport.tcp import TcpServer
 
@@ -41,14 +44,18 @@ class WorkerServer(ABC):
         fd_path: The socket that takes descriptors, or None where memory cannot be shared.
         layers: What confines the server itself, with all of its jails, one mapping a layer:
             ``layer``, ``enforced``, ``detail``.
+        silent_s: When it last did not answer to the end of a jail, by the monotonic clock.
         far: Its key and ours, where it is on another host and sees no file of this one.
+        is_ours: Whether we have started it, and end it.
     """
 
     endpoint: str
     process_fd: int
     fd_path: str | None = None
     layers: Sequence[Mapping[str, Any]] = ()
+    silent_s: float = float("-inf")
     far: TcpServer | None = None
+    is_ours = True
 
     @property
     @abstractmethod
@@ -119,6 +126,17 @@ class ServerUse(Generic[S_co]):
         self.release()  # interruption.md, rule 5
 
 
+_Place = tuple[int, Hashable, Hashable]
+"""The pid, the key and the group."""
+
+
+class _Start:
+    """The start of one server, which others who want it wait for: interruption.md, rule 12."""
+
+    def __init__(self) -> None:
+        self.lock = threading.RLock()
+
+
 class ServerPool(Generic[S]):
     """The servers of one kind. Thread-safe; a fork starts its own.
 
@@ -129,7 +147,8 @@ class ServerPool(Generic[S]):
 
     def __init__(self) -> None:
         self._changed = threading.Condition(threading.RLock())
-        self._used: dict[tuple[int, Hashable, Hashable], _Entry[S]] = {}
+        self._starts: weakref.WeakValueDictionary[_Place, _Start] = weakref.WeakValueDictionary()
+        self._used: dict[_Place, _Entry[S]] = {}
         self._idle: list[_Entry[S]] = []
         self._thread: threading.Thread | None = None
         self._ends = False
@@ -152,18 +171,23 @@ class ServerPool(Generic[S]):
         """
         place = os.getpid(), key, group
         with self._changed:
-            entry = self._used.get(place)
-            if entry is not None:
+            starting = self._starts.setdefault(place, _Start())
+        with starting.lock:
+            with self._changed:
+                entry = self._used.get(place)
+                if entry is not None:
+                    use = ServerUse(self, entry, idle_s)
+                    # the garbage collector may just have closed the one environment that used it
+                    if self._used.get(place) is entry and entry.server.runs:
+                        return use
+                    use.release()
+                entry = self._take(key)
+            entry = entry or _Entry(key, start())
+            with self._changed:
+                entry.group = group
                 use = ServerUse(self, entry, idle_s)
-                # the garbage collector may just have closed the one environment that used it
-                if self._used.get(place) is entry and entry.server.runs:
-                    return use
-                use.release()
-            entry = self._take(key) or _Entry(key, start())
-            entry.group = group
-            use = ServerUse(self, entry, idle_s)
-            self._used[place] = entry
-            return use
+                self._used[place] = entry
+                return use
 
     def give_back(self, use: ServerUse[S], entry: _Entry[S], idle_s: float | None) -> bool:
         """For ``ServerUse`` alone: end it, or go on where that was interrupted; True at the end."""
@@ -269,6 +293,7 @@ class ServerPool(Generic[S]):
     def forked(self) -> None:
         """In a fork no thread holds the lock, and none waits: interruption.md, rule 14."""
         self._changed = threading.Condition(threading.RLock())
+        self._starts.clear()
         self._thread = None
 
 
@@ -294,4 +319,4 @@ def _forked() -> None:
 
 
 atexit.register(_stop_all)
-os.register_at_fork(after_in_child=_forked)
+run_after_fork(_forked)

@@ -24,6 +24,7 @@ from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.system import processes
 from envhub_sandbox.system.log import WORKER
+from envhub_sandbox.system.platform import IS_LINUX, NAME
 from envhub_worker.protocol.runtime import OWN, Runtime
 
 if TYPE_CHECKING:
@@ -39,6 +40,7 @@ class ProcessSandbox(Sandbox):
     """Workers on this machine, confined by the kernel."""
 
     name = "process"
+    is_here = True
 
     def __init__(self) -> None:
         self._pool: ServerPool[LocalServer] = ServerPool()
@@ -53,13 +55,20 @@ class ProcessSandbox(Sandbox):
         self, store: Path, runtime: Runtime = OWN, idle_s: float | None = 0.0
     ) -> ServerUse[LocalServer]:
         """The server for this process, started if there is none."""
-        if not sys.platform.startswith("linux"):
-            raise SandboxUnavailableError(
-                f"{option_name('sandbox', 'process')} needs Linux, and this is {sys.platform}: "
-                "nothing here can confine a process. Run the worker in a container or on a Linux "
-                "host."
-            )
+        check_platform()
         return self._pool.acquire(store, partial(_start, store, runtime), idle_s)
+
+
+def check_platform() -> None:
+    """Raise ``SandboxUnavailableError``: nothing of this platform can confine a process."""
+    if not IS_LINUX:
+        raise SandboxUnavailableError(
+            f"{option_name('sandbox', 'process')} needs Linux, and this is {NAME}, where nothing "
+            f"can confine a process. Run it in a container, with {option_name('sandbox', 'docker')}"
+            " (build its image once, in a checkout: docker build -t envhub-worker .), or on a "
+            "Linux host where 'envhub-worker listen' runs, with "
+            f"{option_name('sandbox', 'tcp://HOST:PORT')}"
+        )
 
 
 def _start(store: Path, runtime: Runtime) -> LocalServer:

@@ -9,15 +9,13 @@ from __future__ import annotations
 
 import contextlib
 import os
+import socket
 import threading
-from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
 
-from envhub_sandbox.dependencies.packages import PackageSet
-from envhub_sandbox.dependencies.request import PackageRequest
 from envhub_sandbox.errors import DependencyError, EnvHubError, PolicyError
 from envhub_sandbox.sandboxes import remote_keys, remote_packages, upload
 from envhub_sandbox.sandboxes.pool import ServerPool, ServerUse, WorkerServer
@@ -36,8 +34,6 @@ _KEEP_ALIVE_S = 10.0
 _FIRST_S = 0.5
 _STOP_S = 1.0
 _CLOSE_S = 5.0
-_HELLO_S = 30.0
-_MAKE_S = 2 * 3600.0
 
 
 @dataclass
@@ -78,7 +74,12 @@ class RemoteSandbox(Sandbox):
         if not self.heartbeat_s > 0:
             raise PolicyError(f"heartbeat_s is {self.heartbeat_s!r}; it takes seconds above 0")
         if not 0 <= self.retry_s < float("inf"):
-            raise PolicyError(f"retry_s is {self.retry_s!r}; it takes seconds, or 0 for none")
+            raise PolicyError(f"retry_s is {self.retry_s!r}; it takes seconds, 0 or more")
+
+    @property
+    def address(self) -> str:
+        """Its endpoint."""
+        return self.endpoint
 
     def __getstate__(self) -> dict[str, Any]:
         """No secret key is in a pickle: its reader has one, or the file that is named."""
@@ -102,38 +103,14 @@ class RemoteSandbox(Sandbox):
         """
         check_policy(policy, runtime)
         order = self._orders[runtime.packages] if runtime.packages else None
-        given = self.endpoint, self.far(), snapshot, order, runtime.packages
+        given = snapshot, order, runtime.packages, self.endpoint, self.far()
         return RemoteRepository(*given, self.retry_s)
 
-    def package_target(self) -> RemoteSandbox:
+    def package_target(self) -> remote_packages.ServerPackages:
         """The server makes packages itself."""
-        return self
-
-    def meets(self, request: PackageRequest) -> bool:
-        """Unknown here: the server looks at its own packages when it is asked for some."""
-        return False
-
-    def make(self, request: PackageRequest, tell: Callable[[str], None]) -> PackageSet | None:
-        """The packages that the server makes; None where its own are enough.
-
-        Raises:
-            DependencyError: They cannot be made; the text says what to change.
-            PolicyError: The server's operator does not permit it.
-            ServerBusyError: Others of the same key are at it.
-        """
-        order = remote_packages.order_of(request)
-        use = _use_of(self.endpoint, self.far())
-        server = use.server
-        try:
-            client = WorkerConnection(self.endpoint, server.process_fd, far=server.far)
-            with contextlib.closing(client):
-                client.hello(Deadline(_HELLO_S))
-                made = remote_packages.request_packages(order, client, Deadline(_MAKE_S), tell)
-        finally:
-            use.release()
-        if made is not None:
-            self._orders[made.packages] = order
-        return made
+        return remote_packages.ServerPackages(
+            lambda: _use_of(self.endpoint, self.far()), self._orders
+        )
 
     def far(self) -> TcpServer:
         """The server's key and ours.
@@ -159,14 +136,14 @@ def check_policy(policy: Policy, runtime: Runtime) -> None:
     if runtime.python:
         raise PolicyError(
             f"{option_name('python', runtime.python)} is an interpreter of this machine, and a "
-            "remote server has its own: start it in the environment or image that the repository "
-            "needs"
+            "remote server has its own: start the server in the environment or image that the "
+            "repository needs"
         )
     if policy.readable:
         raise PolicyError(
-            f"{option_name('readable', list(policy.readable))} are paths of this machine, and a "
-            "remote server shows its jails the repository's files only: put what is needed into "
-            "the repository"
+            f"{option_name('readable', list(policy.readable))} are paths of this machine, and "
+            "jails on a remote server have the repository's files only: put the files into the "
+            "repository"
         )
 
 
@@ -174,33 +151,18 @@ def check_policy(policy: Policy, runtime: Runtime) -> None:
 
 
 @dataclass(eq=False)
-class RemoteRepository(Sandbox):
-    """The sandbox of one repository: its files on the other host.
+class UploadedRepository(Sandbox):
+    """The sandbox of one repository, whose files are brought to its server.
 
     Attributes:
         order: What the packages were made of that the server has made for it; None without any.
         packages: What the server called them.
     """
 
-    name = "remote"
-    endpoint: str
-    far: TcpServer
     snapshot: Path
     order: m.NeedPackages | None
     packages: str
-    retry_s: float = 0.0
-    _files: dict[Path, tuple[upload.Sent, ...]] = field(default_factory=dict)
-
-    def runs_on(self, runtime: Runtime) -> Runtime:
-        """The server, by its key, and the packages there."""
-        key = "" if self.far.server_key is None else self.far.server_key.hex()
-        return Runtime(f"{self.endpoint} {key}{self.packages and f' {self.packages}'}")
-
-    def acquire(
-        self, store: Path, runtime: Runtime = OWN, idle_s: float | None = 0.0
-    ) -> ServerUse[RemoteServer]:
-        """The server, which runs anyway; nothing is sent before a jail is opened."""
-        return _use_of(self.endpoint, self.far)
+    _files: dict[Path, tuple[upload.Sent, ...]] = field(default_factory=dict, init=False)
 
     def prepare(
         self, order: m.OpenJail, server: WorkerServer, client: WorkerConnection, deadline: Deadline
@@ -228,9 +190,35 @@ class RemoteRepository(Sandbox):
         made = remote_packages.request_packages(order, client, deadline)
         if made is None or made.packages != self.packages:
             raise DependencyError(
-                "the server has lost the packages that it had made, and would make others now: "
+                "the server no longer has these packages, and would choose other versions now: "
                 "make the environment again"
             )
+
+
+@dataclass(eq=False)
+class RemoteRepository(UploadedRepository):
+    """The sandbox of one repository: its files on the other host."""
+
+    name = "remote"
+    endpoint: str
+    far: TcpServer
+    retry_s: float = 0.0
+
+    @property
+    def address(self) -> str:
+        """Its endpoint."""
+        return self.endpoint
+
+    def runs_on(self, runtime: Runtime) -> Runtime:
+        """The server, by its key, and the packages there."""
+        key = "" if self.far.server_key is None else self.far.server_key.hex()
+        return Runtime(f"{self.endpoint} {key}{self.packages and f' {self.packages}'}")
+
+    def acquire(
+        self, store: Path, runtime: Runtime = OWN, idle_s: float | None = 0.0
+    ) -> ServerUse[RemoteServer]:
+        """The server, which runs anyway; nothing is sent before a jail is opened."""
+        return _use_of(self.endpoint, self.far)
 
 
 class RemoteServer(WorkerServer):
@@ -242,6 +230,7 @@ class RemoteServer(WorkerServer):
     """
 
     far: TcpServer
+    is_ours = False
 
     def __init__(self, endpoint: str, far: TcpServer) -> None:
         self.endpoint = endpoint
@@ -249,8 +238,9 @@ class RemoteServer(WorkerServer):
         self.uploading = threading.Lock()
         self._owner = OwnerProcess()
         self._ended = False
-        self._wakes: int | None
-        self.process_fd, self._wakes = os.pipe()
+        # of sockets, for ZeroMQ waits for nothing else on Windows
+        self.process_fd, wakes = (end.detach() for end in socket.socketpair())
+        self._wakes = [wakes]
         self._stop = threading.Event()
         self._thread = threading.Thread(
             target=self._keep_alive, name=f"envhub keep-alive {endpoint}", daemon=True
@@ -290,6 +280,11 @@ class RemoteServer(WorkerServer):
     def _connection(self) -> WorkerConnection:
         return WorkerConnection(self.endpoint, self.process_fd, far=self.far)
 
+    def _wake(self) -> None:
+        """End every wait for an answer. Any thread; idempotent."""
+        with contextlib.suppress(IndexError):
+            socket.close(self._wakes.pop())
+
     @property
     def runs(self) -> bool:
         """Always true; only a request can tell."""
@@ -305,13 +300,11 @@ class RemoteServer(WorkerServer):
             return
         self._close_jails()
         self._stop.set()
-        wakes, self._wakes = self._wakes, None
-        if wakes is not None:
-            os.close(wakes)  # wakes the thread, should it wait for an answer
+        self._wake()
         self._thread.join(_STOP_S)
         if not self._thread.is_alive():
             self._ended = True  # once: the number may be somebody else's a moment later
-            os.close(self.process_fd)
+            socket.close(self.process_fd)
 
 
 def _close(client: WorkerConnection | None) -> None:

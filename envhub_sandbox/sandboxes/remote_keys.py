@@ -20,19 +20,19 @@ CONFIG_VARIABLE = "ENVHUB_CONFIG"
 
 def address_of(endpoint: str) -> str:
     """``host:port`` of an endpoint. Raises ``PolicyError``: it is none."""
-    parts = urlsplit(endpoint)
-    if "@" in parts.netloc:
+    if "@" in endpoint:
         raise PolicyError(
-            "sandbox: a remote server knows its clients by their keys; leave the login before the "
-            f"@ out: {without_login(endpoint)!r}"
+            "sandbox: a remote server identifies clients by their keys; leave out the login "
+            f"before the @: {without_login(endpoint)!r}"
         )
     try:
-        port = parts.port
+        parts = urlsplit(endpoint)
+        host, port, is_whole = parts.hostname, parts.port, parts.scheme == "tcp" and not parts.path
     except ValueError:
-        port = None
-    if parts.scheme != "tcp" or not parts.hostname or port is None or parts.path:
+        host = None
+    if not host or port is None or not is_whole:
         raise PolicyError(f"sandbox is {endpoint!r}; a remote server is tcp://HOST:PORT")
-    return f"{parts.hostname}:{port}"
+    return f"{host}:{port}"
 
 
 def is_loopback(endpoint: str) -> bool:
@@ -61,8 +61,8 @@ def server_key(endpoint: str, given: str | None) -> bytes:
     text = given or os.environ.get(SERVER_KEY_VARIABLE) or _known(address_of(endpoint))
     if not text:
         raise SandboxUnavailableError(
-            f"the public key of {endpoint} is not known, and without it anybody could pretend to "
-            "be that server. It prints its key when it starts; pass it with "
+            f"the public key of {endpoint} is not known, and without it another program could "
+            "imitate that server. It prints its key when it starts; pass it with "
             f"{option_name('server_key')}, set {SERVER_KEY_VARIABLE}, or write "
             f"'{address_of(endpoint)} KEY' into {config_folder() / 'known_hosts'}"
         )
@@ -95,9 +95,10 @@ def client_key(given: str | os.PathLike[str] | None) -> bytes:
     text = given or os.environ.get(CLIENT_KEY_VARIABLE) or (default if default.exists() else None)
     if text is None:
         raise SandboxUnavailableError(
-            f"a remote server lets only known clients in, and we have no key: run 'envhub-worker "
-            f"keygen --out {default.parent}' and give the public key to the server's "
-            f"--authorized-clients, or set {CLIENT_KEY_VARIABLE} to the key that the server printed"
+            "a remote server accepts only clients with a listed key, and this client has no key: "
+            f"run 'envhub-worker keygen --out {default.parent}' and give the public key to the "
+            f"server's --authorized-clients, or set {CLIENT_KEY_VARIABLE} to the key that the "
+            "server printed"
         )
     path = Path(text)
     with contextlib.suppress(OSError):

@@ -6,6 +6,7 @@ there; what is made lies there, and no file of it comes here.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import time
 from collections.abc import Callable, Sequence
@@ -14,20 +15,63 @@ from typing import TYPE_CHECKING, Any, cast
 from envhub_sandbox.dependencies.packages import PackageSet
 from envhub_sandbox.dependencies.request import PackageRequest
 from envhub_sandbox.errors import PolicyError, RemoteProtocolError
+from envhub_sandbox.sandboxes.pool import ServerUse, WorkerServer
 from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.replies import expect_reply
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.text import printable
 
 if TYPE_CHECKING:
     from envhub_sandbox.dependencies.declared import WantedPackage
 
+_HELLO_S = 30.0
+_MAKE_S = 2 * 3600.0
 _POLL_S = 0.5
 _NAME_CHARS = 64
 _FACTS = ("lock", "packages")
 _MAX_PINS = 10_000
 _MAX_CHARS = 300
+
+
+@dataclass(frozen=True)
+class ServerPackages:
+    """Packages that a server makes itself: a ``PackageTarget``.
+
+    Attributes:
+        use: Gives the server.
+        orders: What each was made of, by the server's name for it; what is made is added.
+    """
+
+    use: Callable[[], ServerUse[WorkerServer]]
+    orders: dict[str, m.NeedPackages]
+
+    def meets(self, request: PackageRequest) -> bool:
+        """Unknown here: the server looks at its own packages when it is asked for some."""
+        return False
+
+    def make(self, request: PackageRequest, tell: Callable[[str], None]) -> PackageSet | None:
+        """The packages that the server makes; None where its own are enough.
+
+        Raises:
+            DependencyError: They cannot be made; the text says what to change.
+            PolicyError: The server's operator does not permit it.
+            ServerBusyError: Others of the same key are at it.
+        """
+        order = order_of(request)
+        use = self.use()
+        server = use.server
+        try:
+            client = WorkerConnection(server.endpoint, server.process_fd, far=server.far)
+            with contextlib.closing(client):
+                client.hello(Deadline(_HELLO_S))
+                made = request_packages(order, client, Deadline(_MAKE_S), tell)
+        finally:
+            use.release()
+        if made is not None:
+            self.orders[made.packages] = order
+        return made
 
 
 def order_of(request: PackageRequest) -> m.NeedPackages:

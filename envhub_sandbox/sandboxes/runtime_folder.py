@@ -20,6 +20,7 @@ from pathlib import Path
 
 from envhub_sandbox.errors import SandboxUnavailableError
 from envhub_sandbox.system.locks import LifeLock, is_held
+from envhub_sandbox.system.platform import IS_LINUX, IS_WINDOWS, boot_id, user_id
 
 SERVER = "envhub-"
 CONTAINER = "envhub-docker-"
@@ -42,7 +43,7 @@ class RuntimeFolder:
     def __init__(self, prefix: str) -> None:
         self.path = _made(prefix)
         try:
-            self._lock = LifeLock(self.path / _CLIENT_FILE, f"{_boot()} {os.getpid()}\n")
+            self._lock = LifeLock(self.path / _CLIENT_FILE, f"{boot_id()} {os.getpid()}\n")
         except BaseException:
             shutil.rmtree(self.path, ignore_errors=True)
             raise
@@ -53,8 +54,8 @@ class RuntimeFolder:
 
     def remove(self) -> None:
         """Remove it, with all that is in it. Idempotent."""
+        self._lock.release()  # first: Windows removes no file that is open
         shutil.rmtree(self.path, ignore_errors=True)
-        self._lock.release()
 
 
 def _made(prefix: str) -> Path:
@@ -67,9 +68,9 @@ def _made(prefix: str) -> Path:
             except OSError as error:
                 why = why or f" ({error.strerror}: {place})"
     raise SandboxUnavailableError(
-        f"there is no folder for sockets: their paths have {_SOCKET_BYTES} bytes at most, and "
-        f"{', '.join(map(str, places()))} are too long or cannot be written{why}; set TMPDIR to a "
-        "shorter one, or to one that can be written (in a container: --tmpfs /tmp)"
+        f"no folder can be used for sockets: their paths can have {_SOCKET_BYTES} bytes at most, "
+        f"and {', '.join(map(str, places()))} are too long or not writable{why}; set TMPDIR to a "
+        "shorter path, or to a writable folder (in a container: --tmpfs /tmp)"
     )
 
 
@@ -79,12 +80,14 @@ def places() -> list[Path]:
     with contextlib.suppress(FileNotFoundError):  # nothing can be written here
         found.append(Path(tempfile.gettempdir()))
     own = os.environ.get("XDG_RUNTIME_DIR", "")
-    if os.path.isabs(own) and os.geteuid() != 0:  # root's jails, another user, have to get through
+    if os.path.isabs(own) and user_id() != 0:  # root's jails, another user, have to get through
         found.append(Path(own))
-    return list(dict.fromkeys([*found, Path("/tmp")]))
+    return list(dict.fromkeys([*found, *([] if IS_WINDOWS else [Path("/tmp")])]))
 
 
 def _is_short(place: Path) -> bool:
+    if not IS_LINUX:  # there it holds no sockets
+        return True
     return len(os.fsencode(place) + os.fsencode(_LONGEST)) <= _SOCKET_BYTES
 
 
@@ -123,21 +126,14 @@ def is_in_use(path: Path) -> bool:
 
 def _is_elsewhere(path: Path) -> bool:
     with contextlib.suppress(FileNotFoundError):
-        return _boot() not in (path / _CLIENT_FILE).read_text()
+        return boot_id() not in (path / _CLIENT_FILE).read_text()
     return False
-
-
-def _boot() -> str:
-    return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
 
 
 def _belongs_to_us(path: Path) -> bool:
     status = path.lstat()
-    return (
-        stat.S_ISDIR(status.st_mode)
-        and status.st_uid == os.geteuid()
-        and status.st_mode & 0o066 == 0
-    )
+    mine = IS_WINDOWS or (status.st_uid == user_id() and status.st_mode & 0o066 == 0)
+    return stat.S_ISDIR(status.st_mode) and mine
 
 
 def _is_deserted(path: Path) -> bool:

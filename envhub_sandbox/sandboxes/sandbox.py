@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -22,10 +23,15 @@ class Sandbox:
 
     Attributes:
         name: How errors call it.
+        is_here: Whether jails run on this machine and see its files.
+        is_placed_anew: Whether it is another place, with a server of its own, each time that a
+            fleet names it.
         retry_s: For how long to wait for room in a place that others use, too.
     """
 
     name: str
+    is_here: bool = False
+    is_placed_anew: bool = False
     retry_s: float = 0.0
 
     def for_repository(
@@ -40,6 +46,23 @@ class Sandbox:
         ``SandboxUnavailableError``: there is no such place here.
         """
         return self
+
+    def workers(self, num_workers: int | None) -> Sequence[Sandbox]:
+        """The places of the workers that an environment is spread over, each with a jail of its
+        own; for most it is one jail, in which ``num_workers`` are processes."""
+        return [self]
+
+    @property
+    def address(self) -> str:
+        """Where it is, as far as that says more than its name."""
+        return self.name
+
+    def note_interpreter(self, runtime: Runtime) -> None:
+        """The interpreter of this machine that the caller named, before all else."""
+
+    def candidates(self) -> Iterator[Sandbox]:
+        """The places where a jail may be opened: the next one, if the one before has no room."""
+        yield self
 
     def runs_on(self, runtime: Runtime) -> Runtime:
         """What runs the repository there; a remembered manifest holds for this only."""

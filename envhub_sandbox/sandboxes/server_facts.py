@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-import os
+import socket
 from collections.abc import Iterator
 from dataclasses import dataclass
 from time import monotonic
@@ -84,14 +84,11 @@ def ask(sandbox: RemoteSandbox) -> ServerFacts:
 
 @contextlib.contextmanager
 def _connection(sandbox: RemoteSandbox) -> Iterator[WorkerConnection]:
-    never, ends = os.pipe()
-    try:
-        client = WorkerConnection(sandbox.endpoint, never, far=sandbox.far())
+    never, ends = socket.socketpair()
+    with never, ends:
+        client = WorkerConnection(sandbox.endpoint, never.fileno(), far=sandbox.far())
         with contextlib.closing(client):
             yield client
-    finally:
-        os.close(never)
-        os.close(ends)
 
 
 def facts_of(welcome: m.Welcome, answered_s: float, said: dict[Any, Any]) -> ServerFacts:

@@ -6,17 +6,17 @@ counts that only grow, also when environments are closed.
 
 from __future__ import annotations
 
-import os
 import threading
 import weakref
 from array import array
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
+from envhub_sandbox.system.platform import run_after_fork
 from envhub_sandbox.transport.lane import Lane
-from envhub_worker.protocol.lifecycle import Lifecycle
+from envhub_worker.protocol.lifecycle import State
 
 KEPT = 1024
 """Step latencies that are kept: the last ones. A power of two."""
@@ -118,6 +118,14 @@ class Row(NamedTuple):
     latencies_s: Any
 
 
+class HasState(Protocol):
+    """A ``Lifecycle``, or that of several workers."""
+
+    @property
+    def state(self) -> State:
+        """Where the environment is."""
+
+
 class Ledger:
     """The counters of all environments, living and gone. Thread-safe."""
 
@@ -127,10 +135,10 @@ class Ledger:
     def forget(self) -> None:
         """Drop all: in a fork, the environments are those of its parent."""
         self._lock = threading.RLock()  # interruption.md, rule 12
-        self._living: dict[int, tuple[Labels, Counters, Lifecycle]] = {}
+        self._living: dict[int, tuple[Labels, Counters, HasState]] = {}
         self._gone: dict[Labels, dict[str, float]] = {}
 
-    def add(self, env: object, labels: Labels, counters: Counters, lifecycle: Lifecycle) -> None:
+    def add(self, env: object, labels: Labels, counters: Counters, lifecycle: HasState) -> None:
         """Add an environment. Its counts stay when it goes."""
         key = id(env)
         with self._lock:
@@ -166,4 +174,4 @@ def _add(total: dict[str, Any], more: Mapping[str, float]) -> None:
 
 
 LEDGER = Ledger()
-os.register_at_fork(after_in_child=LEDGER.forget)  # interruption.md, rule 14
+run_after_fork(LEDGER.forget)  # interruption.md, rule 14

@@ -8,14 +8,13 @@ reset, closed, and abandoned in a fork. The rules for these are in docs/internal
 
 from __future__ import annotations
 
-import os
 import weakref
 from collections.abc import Sequence
 from typing import Any, cast
 
 from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerError, WorkerTimeoutError
 from envhub_sandbox.session.counters import LEDGER, Counters, Labels
-from envhub_sandbox.session.crash.history import History
+from envhub_sandbox.session.crash.history import History, PartHistory
 from envhub_sandbox.session.jails.sources import JailSource
 from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.session.prewarm import INTERRUPT_S, LOOK_S, Prewarm
@@ -26,6 +25,7 @@ from envhub_sandbox.session.survival.recovery import Recovery
 from envhub_sandbox.session.survival.restart_policy import Restarts
 from envhub_sandbox.session.use_lock import UseLock
 from envhub_sandbox.system.log import WORKER
+from envhub_sandbox.system.platform import run_after_fork
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import RunnersDiedError
 from envhub_sandbox.transport.results import Results
@@ -36,7 +36,7 @@ from envhub_worker.protocol.manifest.manifest import EnvManifest
 _USAGE = ("processes", "threads", "files", "memory_bytes")
 _MOST = 1 << 63
 """Of anything that there may be: a server on another host may send larger numbers."""
-_GRACE_S = 2.0
+GRACE_S = 2.0
 """How long ``reset`` waits for a late reply before it gives the jail up and starts another."""
 
 
@@ -49,6 +49,8 @@ class EnvSession:
     Args:
         bounds: The slices of its sub-environments, one for each shard.
         trials: Takes note of what its steps took.
+        whole: Where it is one worker of a fleet: the history of the whole environment. The fleet
+            then counts for all of them.
     """
 
     def __init__(
@@ -57,6 +59,7 @@ class EnvSession:
         manifest: EnvManifest,
         bounds: Sequence[tuple[int, int]],
         trials: ShardTrials,
+        whole: History | None = None,
     ) -> None:
         self.repository: Repository = jails.launcher.repository
         policy = self.repository.policy
@@ -64,7 +67,8 @@ class EnvSession:
         self.bounds = list(bounds)
         self.lifecycle = Lifecycle()
         self.counters = counters = Counters()
-        self.history = history = History(manifest, policy.crash_history)
+        history = History(manifest, policy.crash_history)
+        self.history = history = history if whole is None else PartHistory(manifest, whole)
         results = Results(manifest, self.bounds)
         self.lease = lease = Lease(jails, results, self.lifecycle, counters, trials)
         self._restarts = Restarts(policy, counters)
@@ -76,8 +80,12 @@ class EnvSession:
         self.prewarm = Prewarm(lease, use, history, recovery)
         self.requests = Requests(lease, use, self.prewarm, history, failures, recovery)
         labels = Labels(self.repository.label, manifest.suite, str(manifest.task))
-        LEDGER.add(self, labels, counters, self.lifecycle)
+        if whole is None:
+            LEDGER.add(self, labels, counters, self.lifecycle)
         _living.add(self)
+
+    jails = 1
+    """That it lives in at a time."""
 
     @property
     def closed(self) -> bool:
@@ -91,14 +99,24 @@ class EnvSession:
         known = all(type(one) is int and 0 <= one < _MOST for one in counts.values())
         return cast("dict[str, int]", counts) if known else {}
 
+    def report(self) -> list[dict[str, Any]]:
+        """The layers of its jail; none where there is none."""
+        return self.lease.report()
+
+    def denials(self) -> tuple[str, ...] | None:
+        """What its jail was denied; None where it is not recorded."""
+        return self.lease.denials()
+
     def stats(self) -> dict[str, Any]:
         """Counters, and its state."""
         return {**self.counters.snapshot(), "state": self.lifecycle.state.name}
 
     # --- brought back --------------------------------------------------------------------------
 
-    def recover(self) -> None:
+    def recover(self, grace: Deadline | None = None) -> None:
         """Before a reset: catch up with a late reply, or give up the jail that owes it.
+
+        ``grace`` is how long a late reply is waited for, where several environments share that.
 
         A reply whose wait was interrupted counts as late. After a death a fresh jail is started
         only if the policy says ``restart="on_reset"``.
@@ -117,18 +135,27 @@ class EnvSession:
             if self.lifecycle.state is State.EXPIRED:
                 self._forget()
             if self.lifecycle.state is State.LATE:
-                self._catch_up()
+                self._catch_up(grace or Deadline(GRACE_S))
             if self.lifecycle.state is State.DEAD and self._restarts.permitted:
                 self._restarts.spend("reset")
                 self._forget()
 
-    def _catch_up(self) -> None:
+    def notice_death(self) -> None:
+        """Before a reset, where another worker has died: find out whether this one has, too."""
+        if self.lifecycle.state is State.READY:
+            with self.use.hold("reset"):
+                try:
+                    self.lease.look("reset", Deadline(LOOK_S))
+                except WorkerDiedError as error:
+                    self._failures.dead(error)
+
+    def _catch_up(self, grace: Deadline) -> None:
         lane, request = self.lease.lane, self.lifecycle.request
         try:
             if lane is None or request is None:
                 raise WorkerError("the jail was given up, or how far the request came is not known")
             self.lease.forget_watched()  # also where it was interrupted before the wait
-            lane.catch_up(Deadline(_GRACE_S))
+            lane.catch_up(grace)
         except RunnersDiedError:
             pass  # the reset that follows meets them
         except (WorkerDiedError, WorkerTimeoutError) as error:
@@ -191,6 +218,10 @@ class EnvSession:
             finally:
                 self.use.lock.release()
 
+    def finalize(self) -> None:
+        """Close it in a finalizer."""
+        self.close()
+
     def _finish(self) -> None:
         if self.use.lock.acquire(blocking=False):  # else another thread is closing it
             try:
@@ -242,4 +273,4 @@ def _abandon_all() -> None:
         env.abandon()
 
 
-os.register_at_fork(after_in_child=_abandon_all)  # interruption.md, rule 14
+run_after_fork(_abandon_all)  # interruption.md, rule 14

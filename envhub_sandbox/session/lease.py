@@ -24,8 +24,8 @@ from envhub_sandbox.session.jails.retry_while_busy import (
     retry_while_busy,
 )
 from envhub_sandbox.session.jails.sources import JailSource
-from envhub_sandbox.session.refusals import closed_during
 from envhub_sandbox.session.repository import Repository
+from envhub_sandbox.session.survival.refusals import closed_during
 from envhub_sandbox.system.processes import OwnerProcess
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
 from envhub_sandbox.transport.lane import Lane
@@ -91,6 +91,11 @@ class Lease:
         """Whether other environments live in the same jail."""
         return self._jails.shared
 
+    @property
+    def place(self) -> str:
+        """What errors call the place where its jail is, or the next one will be."""
+        return self._launcher.where(self.loaded)
+
     def report(self) -> list[dict[str, Any]]:
         """The layers of the jail; none where there is none."""
         loaded = self.loaded  # another thread may give it back
@@ -123,6 +128,12 @@ class Lease:
         """Ask the server whether the jail lives. Raises ``WorkerDiedError``: it does not."""
         if self.loaded is not None:
             self.loaded.jail.output(operation, deadline)
+
+    def note_lost(self) -> None:
+        """The connection to the server was lost."""
+        loaded = self.loaded  # another thread may give it back
+        if loaded is not None:
+            loaded.lost = True
 
     def forget_watched(self) -> None:
         """A reply is lost that may have named changed attributes, of any environment there."""

@@ -14,13 +14,14 @@ import weakref
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import chain
+from typing import Protocol
 
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.session.crash.history import History
 from envhub_sandbox.session.jails.loaded import LoadedJail
 from envhub_sandbox.session.lease import Lease
-from envhub_sandbox.session.refusals import closed_during
 from envhub_sandbox.session.survival.recovery import Recovery
+from envhub_sandbox.session.survival.refusals import closed_during
 from envhub_sandbox.session.use_lock import UseLock
 from envhub_sandbox.system.log import WORKER
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
@@ -33,6 +34,23 @@ INTERRUPT_S = 10.0
 than it waits for the environment's own ``close``."""
 _GOING_S = 30.0
 """How long a jail that is given up may take to go: its ``close``, and its processes' ends."""
+
+
+class TaskPrewarm(Protocol):
+    """What ``SuitePrewarm`` asks of a task: a ``Prewarm``, or that of several workers."""
+
+    @property
+    def closed(self) -> bool:
+        """Whether the environment is closed for good."""
+
+    def on_first_use(self, first_use: Callable[[], None], make_room: Callable[[], bool]) -> None:
+        """See ``Prewarm``."""
+
+    def start(self) -> None:
+        """See ``Prewarm``."""
+
+    def cancel(self) -> bool:
+        """See ``Prewarm``."""
 
 
 class Prewarm:
@@ -62,11 +80,16 @@ class Prewarm:
         self._timeouts = lease.repository.timeouts
         self.starting: StartupDeadline | None = None
 
+    @property
+    def closed(self) -> bool:
+        """Whether the environment is closed for good."""
+        return self.lifecycle.closed
+
     # --- for a request -------------------------------------------------------------------------
 
-    def start_on_demand(self) -> None:
+    def start_on_demand(self, deadline: StartupDeadline | None = None) -> None:
         """Take a jail, and build the environment in it; raises as ``Lease.acquire`` does."""
-        self._start(StartupDeadline(self._timeouts.startup_s))
+        self._start(deadline or StartupDeadline(self._timeouts.startup_s))
 
     def adopt(self, loaded: LoadedJail) -> None:
         """Use a jail that is already loaded, instead of opening one later."""
@@ -170,7 +193,7 @@ class SuitePrewarm:
             so a use of just one task, or of all at once, starts nothing ahead.
     """
 
-    def __init__(self, suites: Sequence[Sequence[Prewarm]], count: int | None) -> None:
+    def __init__(self, suites: Sequence[Sequence[TaskPrewarm]], count: int | None) -> None:
         self._count = count
         # weak: an environment without an owner is closed
         self._suites = [[weakref.ref(task) for task in suite] for suite in suites]
@@ -178,9 +201,9 @@ class SuitePrewarm:
             hash(ref)  # computed now and kept: it cannot be once the task has gone
         self._lock = threading.Lock()
         self._cancelled = threading.Condition(self._lock)
-        self._wanted: list[weakref.ref[Prewarm]] = []
-        self._tried: set[weakref.ref[Prewarm]] = set()
-        self._ahead: list[weakref.ref[Prewarm]] = []  # started here and not used yet
+        self._wanted: list[weakref.ref[TaskPrewarm]] = []
+        self._tried: set[weakref.ref[TaskPrewarm]] = set()
+        self._ahead: list[weakref.ref[TaskPrewarm]] = []  # started here and not used yet
         self._cancelling = 0
         for suite in suites:
             for task in suite:
@@ -197,7 +220,7 @@ class SuitePrewarm:
             self._cancelled.wait_for(lambda: not self._cancelling, _GOING_S)
         return going or any(cancelled)
 
-    def _used(self, used: weakref.ref[Prewarm]) -> None:
+    def _used(self, used: weakref.ref[TaskPrewarm]) -> None:
         """A task has its first request."""
         with self._lock:
             self._tried.add(used)
@@ -222,7 +245,7 @@ class SuitePrewarm:
                 self._cancelled.notify_all()
                 return
 
-    def _following(self, used: weakref.ref[Prewarm]) -> Iterator[weakref.ref[Prewarm]]:
+    def _following(self, used: weakref.ref[TaskPrewarm]) -> Iterator[weakref.ref[TaskPrewarm]]:
         suite = next(suite for suite in self._suites if used in suite)
         index = suite.index(used)
         count = self._count
@@ -231,7 +254,7 @@ class SuitePrewarm:
         left = [one for one in suite[index + 1 :] if one in self._ahead or one not in self._tried]
         yield from [one for one in left if not _is_closed(one)][:count]
 
-    def _run(self, task: Prewarm, start: bool) -> None:
+    def _run(self, task: TaskPrewarm, start: bool) -> None:
         try:
             with contextlib.suppress(Exception):  # a request for it meets the same failure
                 task.start() if start else task.cancel()
@@ -242,7 +265,7 @@ class SuitePrewarm:
                     self._start_threads()
                     self._cancelled.notify_all()
 
-    def _next(self) -> tuple[Prewarm, bool] | None:
+    def _next(self) -> tuple[TaskPrewarm, bool] | None:
         """What to cancel (False) or start (True).
 
         All that are passed over come first, and nothing starts before they have gone: so there are
@@ -265,11 +288,11 @@ class SuitePrewarm:
         return None
 
 
-def _is_closed(ref: weakref.ref[Prewarm]) -> bool:
+def _is_closed(ref: weakref.ref[TaskPrewarm]) -> bool:
     task = ref()
-    return task is None or task.lifecycle.closed
+    return task is None or task.closed
 
 
-def _cancel(ref: weakref.ref[Prewarm]) -> bool:
+def _cancel(ref: weakref.ref[TaskPrewarm]) -> bool:
     task = ref()
     return task is not None and task.cancel()

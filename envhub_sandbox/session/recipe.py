@@ -7,7 +7,7 @@ travels, nor does a login in ``endpoint``: the other side uses its own.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -75,6 +75,7 @@ def provenance_of(
     report: list[dict[str, Any]],
     installed: dict[str, Any] | None = None,
     profile: str | None = None,
+    places: Sequence[str] = (),
 ) -> dict[str, Any]:
     """What ran, as plain data: enough to run the same again, or to see that it cannot be the same.
 
@@ -84,6 +85,7 @@ def provenance_of(
         report: The layers that confine it, once it runs.
         installed: What was installed for it: our own record.
         profile: Of its jails, once it runs.
+        places: Where each worker of an environment runs, or is to run; results do not depend on it.
     """
     return {
         "repository": snapshot.repo_id,
@@ -97,5 +99,6 @@ def provenance_of(
         "installed": installed,
         "protocol": VERSION,
         "profile": profile,
+        "places": list(places),
         "layers": [dict(layer) for layer in report],
     }

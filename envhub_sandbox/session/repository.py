@@ -7,6 +7,7 @@ import shlex
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import field
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -73,6 +74,8 @@ class Repository:
         warnings: Those that it gave, in any jail.
         latest_report: The layers of the jail that was opened last, for the provenance of what was
             made. Which of them hold for an environment, only its own jail says.
+        places: Where each worker of an environment runs, or is to run.
+        jail_numbers: Of the jails whose output goes to files of their own.
         latest_profile: Of that jail; in a container it may be less than the policy names.
     """
 
@@ -86,6 +89,7 @@ class Repository:
         lane: str,
         copy: bool,
         *,
+        min_ready: int | None = None,
         recipe: Recipe,
         installed: dict[str, Any] | None,
         advice: Callable[[str], str],
@@ -97,12 +101,16 @@ class Repository:
         self.timeouts = timeouts
         self.runtime = runtime
         self._in_use: list[SharedLock] = []
-        self.hold()
+        self._holders: set[object] = set()
+        self._lock_files()
         self.lane = lane
         self.copy = copy
+        self.min_ready = min_ready
         self.warnings = RemoteWarnings()
+        self.jail_numbers = count(1)
         self.latest_report: list[dict[str, Any]] = []
         self.latest_profile: str | None = None
+        self.places: list[str] = []
         self.recipe = recipe
         self.installed = installed
         self._advice = advice
@@ -117,8 +125,12 @@ class Repository:
         """Bounds on what a jail may send."""
         return limits_for(self.policy.limits.message_bytes)
 
-    def hold(self) -> None:
-        """Keep its files and packages from being removed, until ``let_go``."""
+    def hold(self, holder: object) -> None:
+        """Keep its files and packages from being removed, until each holder has let go."""
+        self._holders.add(holder)
+        self._lock_files()
+
+    def _lock_files(self) -> None:
         if self._in_use:
             return
         folders = [one.root.parent for one in (self.snapshot, *self.snapshot.assets)]
@@ -126,8 +138,12 @@ class Repository:
             folders.append(Path(self.runtime.packages).with_name(RECORD))
         self._in_use = [SharedLock(folder) for folder in folders]
 
-    def let_go(self) -> None:
-        """No environment may start a jail any more. Idempotent, also where it was interrupted."""
+    def let_go(self, holder: object) -> None:
+        """No environment of this holder may start a jail any more. Idempotent, also where it was
+        interrupted."""
+        self._holders.discard(holder)
+        if self._holders:
+            return
         for lock in self._in_use:
             lock.release()
         self._in_use = []
@@ -166,8 +182,8 @@ class Repository:
                 raise
             startup_s = self.timeouts.startup_s
             late = WorkerTimeoutError(
-                f"make_env has not finished after {startup_s} s and was ended; give it longer "
-                f"with {option_name('startup_s', 2 * (startup_s or 1))}, or make it again",
+                f"make_env has not finished after {startup_s} s and was ended; raise "
+                f"{option_name('startup_s', 2 * (startup_s or 1))}, or make it again",
                 request="make_env",
                 timeout_s=startup_s,
             )
@@ -200,7 +216,7 @@ class Repository:
             error=error,
             label=self.label,
             provenance=provenance_of(
-                self.snapshot, manifest, report, self.installed, self.latest_profile
+                self.snapshot, manifest, report, self.installed, self.latest_profile, self.places
             ),
             load=self.arguments.message(),
             options=self.recipe.options,

@@ -11,8 +11,10 @@ lifecycle moves before a message goes out and after its replies are in.
 from __future__ import annotations
 
 import contextlib
+from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any, NoReturn, TypeVar
+from contextlib import AbstractContextManager
+from typing import Any, NamedTuple, NoReturn, TypeVar
 
 from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError
 
@@ -28,15 +30,16 @@ from envhub_sandbox.session.attribute_cache import AttributeCache
 from envhub_sandbox.session.crash.history import History
 from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.session.prewarm import Prewarm
-from envhub_sandbox.session.refusals import refusal
+from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.session.survival.failures import Failures
 from envhub_sandbox.session.survival.recovery import Recovery
+from envhub_sandbox.session.survival.refusals import refusal
 from envhub_sandbox.session.use_lock import UseLock
-from envhub_sandbox.transport.deadline import Deadline, StepDeadline
+from envhub_sandbox.transport.deadline import Deadline, StepDeadline, deadline_of
 from envhub_sandbox.transport.jail import RunnersDiedError
 from envhub_sandbox.transport.lane import Lane, Request
 from envhub_sandbox.transport.replies import all_replies
-from envhub_sandbox.transport.results import StepResult
+from envhub_sandbox.transport.results import Results, StepResult
 from envhub_sandbox.transport.shard_trials import ENOUGH_STEPS
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.lifecycle import Event, State
@@ -52,47 +55,25 @@ _SHOWN = 64
 T = TypeVar("T")
 
 
-class Requests:
-    """The requests of one environment, whose jail is opened by the first of them.
+class RequestOrder(ABC):
+    """The caller's order of requests to one environment, in one jail or in several.
 
     Attributes:
         results: Makes of replies what Gymnasium returns.
-        attributes: Those that need no request.
-        use: A thread that asks something holds its lock until it has handled the answer;
-            between an ``*_async`` and its ``*_wait`` no thread does.
         closed: Whether the caller has called ``close``.
         waiting: The request of an ``*_async`` whose ``*_wait`` has not come yet.
         face: What the environment is called in the error after ``close``.
     """
 
-    def __init__(
-        self,
-        lease: Lease,
-        use: UseLock,
-        prewarm: Prewarm,
-        history: History,
-        failures: Failures,
-        recovery: Recovery | None,
-    ) -> None:
-        self.results = lease.results
-        self.attributes = AttributeCache(lease)
-        self.lifecycle = lease.lifecycle
+    def __init__(self, repository: Repository, results: Results) -> None:
+        self.results = results
         self.closed = False
         self.waiting: str | None = None
         self.face = "VectorEnv"
-        self._lease = lease
-        self.use = use
-        self._prewarm = prewarm
-        self._counters = lease.counters
-        self._history = history
-        self._failures = failures
-        self._recovery = recovery
-        self._repository = lease.repository
-        self._unshown = lease.repository.warnings.unshown
-        self._timeouts = lease.repository.timeouts
+        self._repository = repository
+        self._unshown = repository.warnings.unshown
+        self._timeouts = repository.timeouts
         self._step_deadline = StepDeadline(self._timeouts.step_s)
-
-    # --- the caller's order --------------------------------------------------------------------
 
     def refuse_if_busy(self, name: str) -> None:
         """Refuse a request while another waits for its ``*_wait``.
@@ -122,8 +103,6 @@ class Requests:
                 operation,
             )
         self.waiting = None
-
-    # --- requests ------------------------------------------------------------------------------
 
     def ask(self, operation: str, message_for: MessageFor) -> list[m.Value]:
         """One request, and the values of all shards."""
@@ -156,10 +135,110 @@ class Requests:
         kind: type[m.M] | tuple[type[m.M], ...],
         timeout_s: float | None,
     ) -> list[m.M]:
-        with self.use.lock:
+        with self.locked():
             self.refuse_if_busy(operation)
             self.submit(operation, message_for)
             return self.collect(timeout_s, kind)
+
+    @abstractmethod
+    def note_sent(self, actions: Any | None) -> None:
+        """Workers were sent a step; with these ``actions``, if all of them were."""
+
+    @abstractmethod
+    def locked(self) -> AbstractContextManager[Any]:
+        """Held by a thread from before it asks something until it has handled the answer."""
+
+    @abstractmethod
+    def submit(
+        self, operation: str, message_for: MessageFor, instead: MessageFor | None = None
+    ) -> None:
+        """With the lock held, send a request to every shard."""
+
+    @abstractmethod
+    def collect(
+        self, timeout: float | Deadline | None, kind: type[m.M] | tuple[type[m.M], ...]
+    ) -> list[m.M]:
+        """With the lock held, the shards' replies to the last ``submit``."""
+
+    def explain(self, error: BaseException) -> None:
+        """Before an error goes to the caller.
+
+        The repository's warnings come with it; a filter that makes an error of one must not hide a
+        Ctrl-C.
+        Raises ``ClosedEnvironmentError``: a ``close`` in another thread is the reason.
+        """
+        with contextlib.suppress(RemoteEnvWarning):
+            self.show_warnings()
+        if isinstance(error, WorkerDiedError):
+            self.refuse_if_closed()
+
+    def show_warnings(self) -> None:
+        """Show the repository's new warnings.
+
+        Only once the replies are in and handled: what the caller's filters raise is not the
+        worker's fault, and must leave no reply owed.
+        """
+        if self._unshown:
+            self._repository.show_warnings()
+
+
+class Packed(NamedTuple):
+    """A request that is ready to be sent; what ``sent`` differs is not repeated."""
+
+    request: Request
+    sent: Request
+
+
+class Requests(RequestOrder):
+    """The requests to one jail, which is opened by the first of them.
+
+    Attributes:
+        attributes: Those that need no request.
+        use: A thread that asks something holds its lock until it has handled the answer;
+            between an ``*_async`` and its ``*_wait`` no thread does.
+    """
+
+    def __init__(
+        self,
+        lease: Lease,
+        use: UseLock,
+        prewarm: Prewarm,
+        history: History,
+        failures: Failures,
+        recovery: Recovery | None,
+    ) -> None:
+        super().__init__(lease.repository, lease.results)
+        self.attributes = AttributeCache(lease)
+        self.lifecycle = lease.lifecycle
+        self._lease = lease
+        self.use = use
+        self._prewarm = prewarm
+        self._counters = lease.counters
+        self._history = history
+        self._failures = failures
+        self._recovery = recovery
+
+    def fall_behind(self) -> None:
+        """A request of all workers was not sent to this one: only a reset may follow."""
+        if self.lifecycle.state is State.READY:
+            self.lifecycle.on(Event.SUBMIT)
+            self.lifecycle.on(Event.TIMEOUT)  # with no request to be late: it begins anew
+
+    @property
+    def came_back(self) -> bool:
+        """Whether processes did, under the last request."""
+        return self._recovery is not None and bool(self._recovery.fresh)
+
+    def note_sent(self, actions: Any | None) -> None:
+        """See ``RequestOrder``; a step to all of them is noted where it is submitted."""
+        if actions is None:
+            self._history.skip()
+
+    def locked(self) -> AbstractContextManager[Any]:
+        """See ``RequestOrder``."""
+        return self.use.lock
+
+    # --- requests ------------------------------------------------------------------------------
 
     def submit(
         self, operation: str, message_for: MessageFor, instead: MessageFor | None = None
@@ -171,9 +250,33 @@ class Requests:
         Raises ``LocalProtocolError``: it cannot be sent; nothing was; ``WorkerError``: the
         environment is not in a state to take it.
         """
+        self._sending(operation, lambda: self._submit(operation, message_for, instead))
+
+    def make_ready(self, operation: str, start: Callable[[], object] | None = None) -> None:
+        """With the lock held, open the jail if there is none; raises as ``submit`` does.
+
+        ``start`` does so, or raises why it could not, where that was begun already.
+        """
+        if start is not None or self.lifecycle.state is not State.READY:
+            self._sending(operation, lambda: self._make_ready(operation, start))
+
+    def pack(
+        self, operation: str, message_for: MessageFor, instead: MessageFor | None = None
+    ) -> Packed:
+        """The first half of ``submit``: nothing is sent. Raises ``LocalProtocolError``."""
+        lane = self._lane()
+        request = self._request(lane, operation, message_for)
+        sent = request if instead is None else self._request(lane, operation, instead)
+        return Packed(request, sent)
+
+    def submit_packed(self, operation: str, packed: Packed) -> None:
+        """The second half, which leaves the history to the caller; raises as ``submit`` does."""
+        self._sending(operation, lambda: self._submit_packed(operation, packed))
+
+    def _sending(self, operation: str, send: Callable[[], None]) -> None:
         try:
             try:
-                self._submit(operation, message_for, instead)
+                send()
             except BaseException:
                 with self.use.hold(operation):  # on failure only: it costs some us
                     raise
@@ -186,17 +289,20 @@ class Requests:
     def _submit(self, operation: str, message_for: MessageFor, instead: MessageFor | None) -> None:
         if self.lifecycle.state is not State.READY:
             self._make_ready(operation)
-        lane = self._lane()
         try:
-            request = self._request(lane, operation, message_for)
-            sent = request if instead is None else self._request(lane, operation, instead)
+            packed = self.pack(operation, message_for, instead)
         except LocalProtocolError:
-            self._refuse_whole(operation, message_for)
+            if len(self.results.bounds) > 1:
+                self.refuse_whole(operation, message_for, self.results.manifest.num_envs)
             raise
-        self._send(operation, lambda: lane.send(sent))
+        self._submit_packed(operation, packed)
+        self._history.requested(packed.request)
+
+    def _submit_packed(self, operation: str, packed: Packed) -> None:
+        lane = self._lane()
+        self._send(operation, lambda: lane.send(packed.sent))
         if self._recovery is not None:
-            self._recovery.sent(request)
-        self._history.requested(request)
+            self._recovery.sent(packed.request)
         if self._prewarm.first_use is not None:
             self._prewarm.note_use()
 
@@ -204,14 +310,13 @@ class Requests:
         bounds = self.results.bounds
         return lane.request(operation, [message_for(lane.number, each) for each in bounds])
 
-    def _refuse_whole(self, operation: str, message_for: MessageFor) -> None:
+    def refuse_whole(self, operation: str, message_for: MessageFor, count: int) -> None:
         """Raise what cannot be sent as it is called in the caller's arguments, not in a shard's."""
-        if len(self.results.bounds) > 1:
-            lane = self._lane()
-            lane.request(operation, [message_for(lane.number, (0, self.results.manifest.num_envs))])
+        lane = self._lane()
+        lane.request(operation, [message_for(lane.number, (0, count))])
 
     def collect(
-        self, timeout_s: float | None, kind: type[m.M] | tuple[type[m.M], ...]
+        self, timeout: float | Deadline | None, kind: type[m.M] | tuple[type[m.M], ...]
     ) -> list[m.M]:
         """With the lock held, the shards' replies to the last ``submit``.
         Raises ``WorkerTimeoutError``: the environment is then LATE: ``reset`` brings it back;
@@ -221,7 +326,7 @@ class Requests:
         """
         try:
             try:
-                replies = self._collect(timeout_s, kind)
+                replies = self._collect(deadline_of(timeout), kind)
             except BaseException:
                 with self.use.judging("a request"):
                     raise
@@ -233,13 +338,11 @@ class Requests:
         self.show_warnings()
         return replies
 
-    def _collect(
-        self, timeout_s: float | None, kind: type[m.M] | tuple[type[m.M], ...]
-    ) -> list[m.M]:
+    def _collect(self, deadline: Deadline, kind: type[m.M] | tuple[type[m.M], ...]) -> list[m.M]:
         if self.lifecycle.state is not State.PENDING:
             raise self._nothing_pending()
         try:
-            replies = self._finish(self._lane().replies, Deadline(timeout_s))
+            replies = self._finish(self._lane().replies, deadline)
         except RunnersDiedError as deaths:
             if self._recovery is None:
                 raise self._failures.dead(deaths.first) from None
@@ -258,14 +361,14 @@ class Requests:
                 raise
 
     def finish_reset(
-        self, replies: list[m.ResetDone], timeout_s: float | None
+        self, replies: list[m.ResetDone], timeout: float | Deadline | None
     ) -> tuple[Any, dict[Any, Any]]:
         """What ``VectorEnv.reset`` returns, of the replies to one; raises as ``collect`` does."""
         try:
             return self.results.reset(replies)
         except batches.Misfit:
             with self.use.judging("a request"):
-                infos = self._infos_apart(Deadline(timeout_s))
+                infos = self._infos_apart(deadline_of(timeout))
                 if self._recovery is not None:
                     infos = self._recovery.mark(infos)
                 return self.results.reset(replies, infos)
@@ -282,6 +385,8 @@ class Requests:
             if lifecycle.state is not State.READY:
                 with self.use.hold("step"):
                     self._make_ready("step")
+            if self._recovery is not None:
+                self._recovery.fresh = ()
             try:
                 lane = self._lease.lane
                 assert lane is not None
@@ -298,14 +403,37 @@ class Requests:
             self.refuse_if_closed()  # a close() in another thread ended it
             raise
 
-    def collect_step(self, timeout_s: float | None) -> StepResult:
+    def takes_more(self) -> bool:
+        """Whether ``submit_ahead`` may be called while a step is pending; it is wanted."""
+        if self.lifecycle.state is not State.PENDING:
+            return False
+        lane = self._lane()
+        lane.expect_more()
+        return lane.takes_more
+
+    def submit_ahead(self, actions: Any) -> None:
+        """Send a further step before the answer to the last; raises as ``submit_step`` does.
+
+        The answer to that is collected first, and ``owe`` called after it.
+        """
+        with self.use.hold("step"):
+            self._lane().send_step(actions, ahead=True)
+            self._counters.requests += 1
+            self._history.step(actions)
+
+    def owe(self) -> None:
+        """After an answer: a step that was sent ahead is pending now."""
+        self.lifecycle.request = "step"
+        self.lifecycle.moved(Event.SUBMIT)
+
+    def collect_step(self, timeout: float | Deadline | None) -> StepResult:
         """What ``VectorEnv.step`` returns, with the lock held; raises as ``collect`` does."""
         try:
             deadline: Deadline = self._step_deadline
-            if timeout_s is deadline.timeout_s:
+            if timeout is deadline.timeout_s:
                 self._step_deadline.running = False
             else:
-                deadline = Deadline(timeout_s)
+                deadline = deadline_of(timeout)
             try:
                 lane = self._lease.lane
                 if lane is None or self.lifecycle.state is not State.PENDING:
@@ -342,6 +470,10 @@ class Requests:
 
     def _infos_apart(self, deadline: Deadline) -> dict[Any, Any]:
         """The last infos once more, of shards whose infos do not fit together."""
+        return self.results.joined_own(self.own_infos(deadline))
+
+    def own_infos(self, deadline: Deadline) -> list[m.Value]:
+        """The last infos of each sub-environment as it gave them, by shards."""
         lane = self._lane()
         self._send("step", lane.send_for_infos)
         try:
@@ -349,11 +481,21 @@ class Requests:
         except RunnersDiedError as deaths:
             self.lifecycle.answered()  # the next request meets the deaths
             raise deaths.first from None
-        return self.results.joined_own(all_replies(replies, m.Value))
+        return all_replies(replies, m.Value)
+
+    def checked_own_infos(self, deadline: Deadline) -> list[m.Value]:
+        """``own_infos`` of one worker of several: one that gives those of others is given up."""
+        with self.use.judging("a request"):
+            replies = self.own_infos(deadline)
+            self.results.own_pairs(replies)
+            return replies
 
     # --- out and back --------------------------------------------------------------------------
 
-    def _make_ready(self, operation: str) -> None:
+    def _make_ready(self, operation: str, start: Callable[[], object] | None = None) -> None:
+        if start is not None:
+            start()
+            return
         state, restart = self.lifecycle.state, self._repository.policy.restart
         # a request that is still pending here was interrupted before its wait began
         pending = state is State.PENDING
@@ -407,6 +549,8 @@ class Requests:
     def _failed(self, error: EnvHubError, deadline: Deadline) -> NoReturn:
         """Raise what a wait has ended in, and move on to the state that it leads to."""
         failures, operation = self._failures, self.lifecycle.request or "a request"
+        if isinstance(error, WorkerDiedError) and error.reason == "connection":
+            self._lease.note_lost()
         if isinstance(error, WorkerTimeoutError):
             raise failures.timed_out(operation, deadline) from error
         if isinstance(error, WorkerDiedError) and error.reason == "idle":
@@ -414,26 +558,3 @@ class Requests:
         if isinstance(error, WorkerError) and self._recovery and not self.lifecycle.closed:
             raise self._recovery.deaths_of_all(error) from error.__cause__
         raise failures.dead(error) from error.__cause__
-
-    # --- at the end of each --------------------------------------------------------------------
-
-    def explain(self, error: BaseException) -> None:
-        """Before an error goes to the caller.
-
-        The repository's warnings come with it; a filter that makes an error of one must not hide a
-        Ctrl-C.
-        Raises ``ClosedEnvironmentError``: a ``close`` in another thread is the reason.
-        """
-        with contextlib.suppress(RemoteEnvWarning):
-            self.show_warnings()
-        if isinstance(error, WorkerDiedError):
-            self.refuse_if_closed()
-
-    def show_warnings(self) -> None:
-        """Show the repository's new warnings.
-
-        Only once the replies are in and handled: what the caller's filters raise is not the
-        worker's fault, and must leave no reply owed.
-        """
-        if self._unshown:
-            self._repository.show_warnings()

@@ -115,7 +115,7 @@ def _assets(value: Any) -> tuple[str, ...]:
     if not isinstance(value, (list, tuple)) or not all(isinstance(one, str) for one in value):
         raise TypeError(f"`assets` is {value!r}; it takes a list such as ['org/data@COMMIT']")
     if len(value) > MAX_ASSETS:
-        raise ValueError(f"`assets` holds {len(value)} repositories; it takes {MAX_ASSETS} at most")
+        raise ValueError(f"`assets` has {len(value)} repositories; it takes {MAX_ASSETS} at most")
     return tuple(value)
 
 
@@ -126,7 +126,7 @@ def _keyword_arguments(value: Any) -> dict[str, Any]:
         raise TypeError(f"`env_kwargs` is {value!r}; it takes a mapping of names to values")
     for ours in ("n_envs", "use_async_envs"):
         if ours in value:
-            raise TypeError(f"`env_kwargs` holds {ours!r}, which is an argument of its own")
+            raise TypeError(f"`env_kwargs` has {ours!r}, which is a separate argument")
     return dict(value)
 
 
@@ -167,9 +167,9 @@ class Options:
     dependencies: str | os.PathLike[str] | Mapping[str, Any] = _option(
         "auto",
         "--dependencies",
-        "Where its packages come from: an environment of its own where this interpreter lacks "
-        "something that it declares or imports; only what it declares; this interpreter; another, "
-        "or a virtual environment; or one of its own, adjusted: "
+        "Where its packages come from. auto: an environment of its own, if this interpreter lacks "
+        "something that it declares or imports; declared: likewise, without mere imports; host: "
+        "this interpreter; PATH: another one or a virtual environment; JSON: its own, adjusted: "
         '\'{"extra": ["scipy"], "without": ["torch"], "python": "3.12"}\'.',
         metavar="auto|declared|host|PATH|JSON",
         sandboxed=True,
@@ -177,14 +177,14 @@ class Options:
     lock: str | os.PathLike[str] | None = _option(
         None,
         "--lock",
-        "What 'envhub lock' wrote: its packages, and nothing that differs from it.",
+        "A file of 'envhub lock': use its packages; any difference is an error.",
         metavar="FILE",
         sandboxed=True,
     )
     assets: Sequence[str] = _option(
         (),
         "--assets",
-        "A further repository of the Hub that it may read, as in datasets/org/data@COMMIT "
+        "Another repository of the Hub that it may read, as in datasets/org/data@COMMIT "
         "(repeatable).",
         metavar="REF",
         kind=list,
@@ -195,7 +195,7 @@ class Options:
     num_workers: int | None = _option(
         None,
         "--num-workers",
-        "Processes over which sub-environments are spread.",
+        "Processes for the sub-environments.",
         kind=int,
         least=1,
         sandboxed=True,
@@ -203,25 +203,26 @@ class Options:
     validate: bool = _option(
         False,
         "--validate",
-        "Hold every action and observation against its space, value by value.",
+        "Compare every action and observation with its space, value by value.",
         kind=bool,
         sandboxed=True,
     )
     prewarm: int | None = _option(None, kind=int, least=0, sandboxed=True)
+    min_ready: int | None = _option(None, kind=int, least=1, sandboxed=True)
     lane: str = _option("auto", check=_lane)
     copy: bool = _option(True, kind=bool)
     sandbox: Any = _option(
         "process",
         "--sandbox",
-        "Where it runs.",
-        metavar="process|docker[:IMAGE]|tcp://HOST:PORT",
+        "Where it runs; several places are separated by commas, or listed in a file or by DNS.",
+        metavar="process|docker[:IMAGE]|ray|tcp://HOST:PORT|file:PATH|dns://HOST:PORT",
         panel=_LIMITS,
     )
     server_key: str | None = _option(
         None,
         "--server-key",
-        "With --sandbox tcp://...: that server's public key; else $ENVHUB_SERVER_KEY, or "
-        "what known_hosts says.",
+        "With --sandbox tcp://...: that server's public key; otherwise $ENVHUB_SERVER_KEY or "
+        "known_hosts.",
         metavar="KEY",
         panel=_LIMITS,
         sandboxed=True,
@@ -240,8 +241,8 @@ class Options:
     token: str | bool | None = _option(
         None,
         "--token",
-        "For private repositories. Better: the variable HF_TOKEN, which no process list "
-        "shows, or 'hf auth login'.",
+        "For private repositories. Better: the variable HF_TOKEN, because process lists show "
+        "options, or 'hf auth login'.",
         panel=_HUB,
         travels=False,
     )
@@ -300,19 +301,18 @@ _KEYS: dict[str, dict[str, Option]] = {
         ),
         "network": Option("--network", "None by default.", "|".join(NETWORKS)),
         "display": Option(
-            "--display", "A display of its own, by Xvfb; none by default.", "|".join(DISPLAYS)
+            "--display", "An X display of its own, by Xvfb; none by default.", "|".join(DISPLAYS)
         ),
-        "gpu": Option("--gpu", "Grant all GPUs, or those, as nvidia-smi counts them.", "all|N[,N]"),
+        "gpu": Option("--gpu", "Grant all GPUs, or these, as nvidia-smi counts.", "all|N[,N]"),
         "readable": Option(
-            "--readable", "A further absolute path that it may read (repeatable).", "PATH", list
+            "--readable", "An absolute path that it may read (repeatable).", "PATH", list
         ),
         "environment": Option(
             "--environment", "A variable that it may see (repeatable).", "NAME", list
         ),
         "output": Option(
             "--worker-output",
-            "Write what the worker prints to this file, a further file for each further jail; "
-            "- is stderr.",
+            "Write the worker's output to this file, further jails' to further files; - is stderr.",
             "FILE|-",
             panel="What it logs",
         ),

@@ -33,20 +33,19 @@ RESTARTS = ("never", "on_reset", "transparent")
 
 @dataclass(frozen=True, kw_only=True)
 class Timeouts:
-    """Seconds that one operation may take; None waits for ever.
+    """Seconds that one operation may take; None sets no limit.
 
     Attributes:
-        startup_s: From forking a jail to the repository's ``make_env`` having returned.
+        startup_s: From the fork of a jail to the return of the repository's ``make_env``.
         reset_s: One ``reset``.
         step_s: One ``step``.
         call_s: One ``call``, ``get_attr``, ``set_attr`` or ``render``.
         close_s: The environment's own ``close``; afterwards its processes are killed.
-        idle_s: Between two requests; then its processes are ended, and the next ``reset`` starts
-            others (a step says so). None, the default, leaves them alone.
-        server_idle_s: For how long the worker server, or the container, is kept for the next
-            environment after the last one was closed; 0 ends it at once, and at the end of this
-            process it ends in any case. What is kept is one server and its warm interpreter, in
-            which no repository's code has run, and no jail.
+        idle_s: Between two requests. Then its processes are ended, and the next ``reset`` starts
+            new ones; any other request raises an error. None never ends them.
+        server_idle_s: How long the worker server, or the container, waits for the next environment
+            after the last one was closed; 0 ends it at once. It ends with this process at the
+            latest. It keeps a warm interpreter in which no repository's code has run, and no jail.
     """
 
     startup_s: float | None = 300.0
@@ -74,29 +73,29 @@ class Policy:
 
     Attributes:
         profile: Which layers must hold. ``"strict"`` needs all of them; ``"no-userns"`` and
-            ``"container"`` are weaker and must be asked for by name (``docs/threat-model.md``).
-        network: ``"none"``, ``"loopback"`` (its own, empty one) or ``"host"``.
-        display: ``"none"``, or ``"virtual"``: an X display of its own (Xvfb, which has to be
-            installed where the jail runs), inside the jail, for code that opens windows.
-        readable: Further absolute paths that the jail may read.
-        gpu: ``True`` grants all GPUs, ``[0, 2]`` those, counted as ``nvidia-smi`` does (NVIDIA's by
-            PCI address, then others): the device nodes for computing and rendering, and of
-            ``/sys`` the devices' own folders. Where one is missing, no jail can be had.
+            ``"container"`` are weaker and must be named (``docs/threat-model.md``).
+        network: ``"none"``, ``"loopback"`` (a loopback device of its own) or ``"host"``.
+        display: ``"none"``, or ``"virtual"``: an X display inside the jail, for code that opens
+            windows. It needs Xvfb where the jail runs.
+        readable: Additional absolute paths that the jail may read.
+        gpu: ``True`` grants all GPUs, ``[0, 2]`` these, in the order of ``nvidia-smi`` (NVIDIA's by
+            PCI address, then others): the device nodes for computing and rendering, and the
+            devices' own folders of ``/sys``. If one is missing, no jail starts.
         environment: Names of environment variables whose values the jail may see.
         limits: Hard caps.
-        restart: What happens after the worker has died: ``"never"``; a fresh one at the next
-            ``reset()`` with ``"on_reset"``; or ``"transparent"``: the sub-environments of the
-            process that died come back reset, reported as truncated (``docs/faults.md``).
-        restart_budget: How many such restarts one environment gets in its life.
+        restart: After the worker has died: ``"never"`` starts no new one; ``"on_reset"`` starts one
+            at the next ``reset()``; ``"transparent"`` restarts the process that died at once, and
+            reports its sub-environments as truncated (``docs/faults.md``).
+        restart_budget: Maximum number of such restarts of one environment.
         restart_backoff_s: Seconds to wait before a restart that follows another within a minute;
-            they double with each, up to half a minute.
-        output: What becomes of what the worker prints: ``"tail"`` keeps the last lines for error
-            messages; a path writes it to that file as well, a further file for each further jail;
-            ``"stderr"`` or ``"-"`` to this program's stderr.
-        record_denials: Have the jail's first process, instead of the kernel alone, deny the system
-            calls that are denied, and write down which were tried, and which files were asked for
-            that are not its own: ``env.sandbox.denials()``, and ``denied`` of the error that a jail
-            ends with. Each of them takes longer then, and so does opening a file.
+            they double each time, up to half a minute.
+        output: The worker's output: ``"tail"`` keeps the last lines for error messages; a path
+            also writes it to this file, and that of further jails to further files; ``"stderr"`` or
+            ``"-"`` prints it on this program's stderr.
+        record_denials: Record denied system calls, and requests for files outside the jail's own
+            folders, in ``env.sandbox.denials()`` and in ``denied`` of the error that ends a jail.
+            The jail's first process then answers these calls, which takes longer, also for opening
+            files.
         crash_history: How many requests since the last seeded reset are kept for a crash bundle
             (``docs/crashes.md``), within 8 MiB; 0 keeps none and writes no bundles.
         crash_folder: Where crash bundles are written; ``crashes`` in the cache by default.
@@ -131,7 +130,8 @@ class Policy:
         object.__setattr__(self, "gpu", _gpu(self.gpu))
         if not isinstance(self.record_denials, bool):
             raise PolicyError(
-                f"{option_name('record_denials')} is {self.record_denials!r}; it is True or False"
+                f"{option_name('record_denials')} is {self.record_denials!r}; it takes True or "
+                "False"
             )
         # frozen: this is how a field gets the form that the rest relies on
         object.__setattr__(self, "readable", _texts("readable", self.readable))
@@ -140,7 +140,7 @@ class Policy:
         for path in self.readable:
             if not os.path.isabs(path):
                 raise PolicyError(
-                    f"{option_name('readable')} holds {path!r}; it takes absolute paths"
+                    f"{option_name('readable')} has {path!r}; it takes absolute paths"
                 )
 
     def confinement(self) -> Confinement:
@@ -181,8 +181,8 @@ def policy_from(
         chosen = replace(policy.limits, **named)
     elif policy.limits not in (Limits(), chosen):
         raise PolicyError(
-            "limits is given beside the limits of the policy: give one of them, or a mapping "
-            "with those that are to be other than the policy's"
+            "limits and the limits of the policy are both given: give one of them, or a mapping "
+            "with the limits that differ from the policy's"
         )
     return replace(policy, limits=chosen)
 
@@ -208,7 +208,7 @@ def _from(cls: type[T], value: T | Mapping[str, Any] | None, what: str) -> T:
     unknown = [name for name in value if name not in known]
     if unknown:
         raise PolicyError(
-            f"{what} knows no {', '.join(map(str, unknown))}; it knows {', '.join(known)}"
+            f"{what} has no field {', '.join(map(str, unknown))}; it has {', '.join(known)}"
         )
     made = dict(value)
     if cls is Policy and isinstance(made.get("limits"), Mapping):

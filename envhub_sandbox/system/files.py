@@ -7,6 +7,10 @@ import os
 import secrets
 from pathlib import Path
 
+from envhub_sandbox.system.platform import open_flags
+
+_NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | open_flags("O_CLOEXEC")
+
 
 def write_whole_file(path: Path, data: bytes, *, mode: int = 0o600, durable: bool = False) -> None:
     """Write a file under another name, and rename it: meanwhile others read the old one.
@@ -19,7 +23,7 @@ def write_whole_file(path: Path, data: bytes, *, mode: int = 0o600, durable: boo
         OSError: It cannot be written. Nothing is left of it.
     """
     part = path.with_name(f".{path.name}-{secrets.token_hex(4)}")
-    descriptor = os.open(part, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
+    descriptor = os.open(part, _NEW, mode)
     try:
         with open(descriptor, "wb") as file:
             file.write(data)

@@ -2,19 +2,27 @@
 
 The umask says nothing about them: under 0 it would let others in, under 077 it would keep a worker
 of another user out. It belongs to the whole process, so it is never changed here.
+
+On Windows a mode says only whether a file can be written; whose it is, and who else may write it,
+its access list says, which it inherits: what lies in a user's own folders is that user's.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
-import grp
 import os
-import pwd
 import shlex
 import stat
+import sys
 from collections.abc import Iterator
 from pathlib import Path
+
+from envhub_sandbox.system.platform import IS_WINDOWS, user_id
+
+if sys.platform != "win32":
+    import grp
+    import pwd
 
 SHARED_MODE = 0o755
 PRIVATE_MODE = 0o700
@@ -62,7 +70,8 @@ def write_private(path: Path, content: bytes) -> None:
     """Write a new file that only its owner may read, whatever the umask is. Raises ``OSError``."""
     fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, _PRIVATE_FILE_MODE)
     with os.fdopen(fd, "wb") as file:
-        os.fchmod(fd, _PRIVATE_FILE_MODE)
+        if sys.platform != "win32":
+            os.fchmod(fd, _PRIVATE_FILE_MODE)
         file.write(content)
 
 
@@ -82,6 +91,9 @@ def why_distrusted(place: Path, ours: Path) -> str:
     Raises:
         OSError: A step cannot be looked at.
     """
+    if IS_WINDOWS:
+        place.stat()
+        return ""
     inner = os.path.realpath(ours)
     for path, status in _steps(place):
         strict = path == inner or path.startswith(f"{inner}/")
@@ -119,7 +131,7 @@ def _fault(path: str, status: os.stat_result, strict: bool) -> str:
     kind = "file" if stat.S_ISREG(status.st_mode) else kind
     quoted = shlex.quote(path)
     if not is_trusted(status.st_uid):
-        mend = f"If you trust them with it: chown {'-h ' * (kind == 'link')}{os.geteuid()} {quoted}"
+        mend = f"If you trust them with it: chown {'-h ' * (kind == 'link')}{user_id()} {quoted}"
         return f"the {kind} {path} belongs to {_user(status.st_uid)}. {mend}"
     mode = stat.S_IMODE(status.st_mode)
     if kind == "link" or not mode & _OTHERS_WRITE or (mode & stat.S_ISVTX and not strict):
@@ -136,48 +148,55 @@ def _fault(path: str, status: os.stat_result, strict: bool) -> str:
 def is_ours_alone(folder: Path) -> bool:
     """Whether only its owner, who is us or root, can write in a folder. Raises ``OSError``."""
     status = folder.stat()
-    return is_trusted(status.st_uid) and not status.st_mode & _OTHERS_WRITE
+    return is_trusted(status.st_uid) and not others_write(status)
+
+
+def others_write(status: os.stat_result) -> bool:
+    """Whether users beside the owner can write a file, or in a folder."""
+    return not IS_WINDOWS and bool(status.st_mode & _OTHERS_WRITE)
 
 
 def is_trusted(user: int) -> bool:
     """Whether a user could change our files anyway: ourselves, root, and the owner of ``/``.
 
-    The last is root, as it looks from inside a user namespace.
+    The last is root, as it looks from inside a user namespace. On Windows all have the number 0.
     """
-    return user in (0, os.geteuid(), os.lstat("/").st_uid)
+    return user in (0, user_id()) or user == os.lstat("/").st_uid
 
 
 def _is_own_group(path: str, status: os.stat_result) -> bool:
     """Whether a group is that of one user, who is us, and no access list adds others."""
-    if os.geteuid() == 0 or _has_access_list(path):
+    if user_id() == 0 or _has_access_list(path):
         return False
-    try:
-        group, owner = grp.getgrgid(status.st_gid), pwd.getpwuid(os.geteuid())
-    except KeyError:
-        return False
-    others = [user for user in pwd.getpwall() if user.pw_gid == group.gr_gid]
-    return (
-        group.gr_gid == owner.pw_gid
-        and set(group.gr_mem) <= {owner.pw_name}
-        and all(user.pw_uid == owner.pw_uid for user in others)
-    )
+    is_own = False
+    if sys.platform != "win32":
+        with contextlib.suppress(KeyError):
+            group, owner = grp.getgrgid(status.st_gid), pwd.getpwuid(user_id())
+            others = [user for user in pwd.getpwall() if user.pw_gid == group.gr_gid]
+            is_own = (
+                group.gr_gid == owner.pw_gid
+                and set(group.gr_mem) <= {owner.pw_name}
+                and all(user.pw_uid == owner.pw_uid for user in others)
+            )
+    return is_own
 
 
 def _has_access_list(path: str) -> bool:
-    with contextlib.suppress(OSError):
-        return _ACL in os.listxattr(path)
+    if sys.platform == "linux":
+        with contextlib.suppress(OSError):
+            return _ACL in os.listxattr(path)
     return False
 
 
 def _user(uid: int) -> str:
-    try:
-        return f"the user {pwd.getpwuid(uid).pw_name} (uid {uid})"
-    except KeyError:
-        return f"uid {uid}"
+    if sys.platform != "win32":
+        with contextlib.suppress(KeyError):
+            return f"the user {pwd.getpwuid(uid).pw_name} (uid {uid})"
+    return f"uid {uid}"
 
 
 def _group(gid: int) -> str:
-    try:
-        return f"{grp.getgrgid(gid).gr_name} (gid {gid})"
-    except KeyError:
-        return str(gid)
+    if sys.platform != "win32":
+        with contextlib.suppress(KeyError):
+            return f"{grp.getgrgid(gid).gr_name} (gid {gid})"
+    return str(gid)

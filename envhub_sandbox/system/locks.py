@@ -3,24 +3,67 @@
 All are ``flock``. Such a lock belongs to the open file description, and not to a process: a child
 that is given the descriptor holds the lock on, and so would a fork, which therefore closes its
 copies. A pid, or a start time, would say nothing in another namespace; a lock does.
+
+Windows locks bytes of a file, for its holder alone: a shared lock is none there.
 """
 
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
+import sys
 import time
 import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from envhub_sandbox.system.platform import open_flags, run_after_fork
+
+if sys.platform == "win32":
+    import msvcrt
+else:
+    import fcntl
+
 _POLL_S = 0.1
 _COMMAND_CHARS = 80
 _LOOKS = 5
 """The kernel gives the list of locks a page at a time, and skips some where others change it."""
-_READ = os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW | os.O_CLOEXEC
-_WRITE = os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW | os.O_CLOEXEC
+_READ = os.O_RDONLY | open_flags("O_NONBLOCK", "O_NOFOLLOW", "O_CLOEXEC")
+_WRITE = os.O_RDWR | os.O_CREAT | open_flags("O_NOFOLLOW", "O_CLOEXEC")
+_LOCKED_BYTE = 1 << 30
+"""On Windows, where what is locked cannot be read: far behind the end of every file of ours."""
+
+
+def lock(descriptor: int, *, shared: bool = False, wait: bool = False) -> None:
+    """Take the lock of an open file. Raises ``BlockingIOError``: another has it, and there is no
+    ``wait``; ``OSError``: its file system has no locks.
+    """
+    if sys.platform == "win32":
+        if not shared:
+            _lock_byte(descriptor, msvcrt.LK_NBLCK)
+    else:
+        kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
+        fcntl.flock(descriptor, kind if wait else kind | fcntl.LOCK_NB)
+
+
+def unlock(descriptor: int) -> None:
+    """Give it back, also where a fork has a copy of the descriptor, which would hold it on."""
+    if sys.platform == "win32":
+        _lock_byte(descriptor, msvcrt.LK_UNLCK)
+    else:
+        fcntl.flock(descriptor, fcntl.LOCK_UN)
+
+
+def _lock_byte(descriptor: int, how: int) -> None:
+    if sys.platform == "win32":
+        before = os.lseek(descriptor, 0, os.SEEK_CUR)
+        os.lseek(descriptor, _LOCKED_BYTE, os.SEEK_SET)
+        try:
+            msvcrt.locking(descriptor, how, 1)
+        except PermissionError as error:
+            raise BlockingIOError(*error.args) from error
+        finally:
+            os.lseek(descriptor, before, os.SEEK_SET)
 
 
 @contextlib.contextmanager
@@ -57,7 +100,7 @@ def held(
     try:
         yield descriptor
     finally:
-        fcntl.flock(descriptor, fcntl.LOCK_UN)  # a fork may have a copy, which would hold it on
+        unlock(descriptor)
         os.close(descriptor)
 
 
@@ -65,7 +108,7 @@ def _take(path: Path, mode: int) -> int | None:
     """Take it now; None if another has it, or has just removed the file."""
     descriptor = os.open(path, _WRITE, mode)
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_NB | fcntl.LOCK_EX)
+        lock(descriptor)
         if os.path.samestat(os.fstat(descriptor), os.stat(path)):
             return descriptor
     except (BlockingIOError, FileNotFoundError):
@@ -91,7 +134,7 @@ def unheld(path: Path) -> Iterator[bool]:
     """The opposite of ``is_held``; in this context the lock is not taken. Raises likewise."""
     descriptor = os.open(path, _READ)
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        lock(descriptor, shared=sys.platform != "win32")
         free = True
     except BlockingIOError:
         free = False
@@ -129,12 +172,14 @@ class LifeLock(_HeldLock):
 
     def __init__(self, path: Path, content: str = "") -> None:
         super().__init__()
-        new = path.with_name(f".{path.name}")
+        # Windows renames no open file
+        new = path if sys.platform == "win32" else path.with_name(f".{path.name}")
         self._held.append(os.open(new, _WRITE | os.O_EXCL, 0o600))
         with contextlib.suppress(OSError):
-            fcntl.flock(self._held[0], fcntl.LOCK_EX)
+            lock(self._held[0])
         os.write(self._held[0], content.encode())
-        os.rename(new, path)
+        if new != path:
+            os.rename(new, path)
 
 
 class SharedLock(_HeldLock):
@@ -147,15 +192,17 @@ class SharedLock(_HeldLock):
         super().__init__()
         with contextlib.suppress(OSError):
             self._held.append(os.open(path, _READ))
-            fcntl.flock(self._held[0], fcntl.LOCK_SH | fcntl.LOCK_NB)
+            lock(self._held[0], shared=True)
 
 
 def sharers(path: Path) -> dict[int, str]:
     """The processes that hold the lock of a file, as far as they are seen from here.
 
     Returns:
-        Pid to the first words of the command line.
+        Pid to the first words of the command line; none where the kernel has no list of locks.
     """
+    if sys.platform != "linux":
+        return {}
     status = path.stat()
     device = f"{os.major(status.st_dev):02x}:{os.minor(status.st_dev):02x}:{status.st_ino}"
     held: set[int] = set()
@@ -188,4 +235,4 @@ def _forked() -> None:
         lock.release()
 
 
-os.register_at_fork(after_in_child=_forked)
+run_after_fork(_forked)

@@ -2,9 +2,9 @@
 
 ``OwnerProcess`` is docs/internals/interruption.md, rule 14.
 
-A parent hands its child a pidfd of itself, which the child watches. The kernel's own signal at a
-parent's death would come when the thread ends that has started the child, and a change of user
-forgets it.
+A parent hands its child a pidfd of itself, which the child watches, or on macOS a pipe that ends
+with it. The kernel's own signal at a parent's death would come when the thread ends that started
+the child, and a change of user forgets it. Windows hands no descriptors on, and has none of this.
 """
 
 from __future__ import annotations
@@ -19,7 +19,11 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+from envhub_sandbox.system.platform import IS_LINUX, run_after_fork
+
 _STREAMS = 3
+_pipe: list[int] = []
+"""Of a process without a pidfd of itself: both ends, of which it alone has the second."""
 
 
 class OwnerProcess:
@@ -41,20 +45,34 @@ def fork_error_text(owner: int | None = None) -> str:
     whose = "this environment belongs to another process"
     if owner is not None:
         whose = f"this environment belongs to process {owner}"
-    return (
-        f"{whose}, and this is a fork of it ({os.getpid()}); call make_env here to get one of its "
-        "own"
-    )
+    return f"{whose}, and this is a fork of it ({os.getpid()}); call make_env in this process"
 
 
 @contextlib.contextmanager
 def pidfd() -> Iterator[int]:
-    """A pidfd of this process, for one that is started meanwhile with it in ``pass_fds``."""
-    ourselves = os.pidfd_open(os.getpid())
-    try:
-        yield ourselves
-    finally:
-        os.close(ourselves)
+    """A pidfd of this process, for one that is started meanwhile with it in ``pass_fds``.
+
+    Where there are none it is a pipe, of which the end comes with that of this process.
+    """
+    if sys.platform == "linux":
+        ourselves = os.pidfd_open(os.getpid())
+        try:
+            yield ourselves
+        finally:
+            os.close(ourselves)
+    else:
+        _pipe[:] = _pipe or os.pipe()
+        yield _pipe[0]
+
+
+def _forget_pipe() -> None:
+    """A fork would keep it open, and is told of its own by another."""
+    while _pipe:
+        os.close(_pipe.pop())
+
+
+if not IS_LINUX:
+    run_after_fork(_forget_pipe)
 
 
 def end_with(parent: int, patience_s: float) -> None:
@@ -70,17 +88,18 @@ def end_with(parent: int, patience_s: float) -> None:
 
 
 def _watch(parent: int, patience_s: float) -> None:
-    poll = select.poll()  # of descriptors beyond 1023, too
-    poll.register(parent, select.POLLIN)
-    while not poll.poll():
-        pass
-    if patience_s > 0:
-        # of all threads the one whose system call it has to interrupt
-        signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGTERM)
-        time.sleep(patience_s)
-    if os.getpgrp() == os.getpid():
-        os.killpg(0, signal.SIGKILL)
-    os.kill(os.getpid(), signal.SIGKILL)
+    if sys.platform != "win32":
+        poll = select.poll()  # of descriptors beyond 1023, too
+        poll.register(parent, select.POLLIN)
+        while not poll.poll():
+            pass
+        if patience_s > 0:
+            # of all threads the one whose system call it has to interrupt
+            signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGTERM)
+            time.sleep(patience_s)
+        if os.getpgrp() == os.getpid():
+            os.killpg(0, signal.SIGKILL)
+        os.kill(os.getpid(), signal.SIGKILL)
 
 
 def has_ended(pid: int) -> bool:

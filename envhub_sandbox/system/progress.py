@@ -1,4 +1,4 @@
-"""Progress lines while packages are chosen and installed: on a terminal or in a notebook.
+"""Progress lines of what takes long, such as packages: on a terminal or in a notebook.
 
 It is shown only if it takes a moment. Elsewhere (in CI, under a program) there is the log.
 """
@@ -6,6 +6,7 @@ It is shown only if it takes a moment. Elsewhere (in CI, under a program) there 
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import sys
 from collections.abc import Callable, Iterator
@@ -31,7 +32,9 @@ def progress_shown_by(show: Callable[[str], None]) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def progress_shown(title: str) -> Iterator[Callable[[str], None]]:
+def progress_shown(
+    title: str, log: logging.Logger = DEPENDENCIES
+) -> Iterator[Callable[[str], None]]:
     """Gives what takes a line for each thing that happens."""
     with contextlib.ExitStack() as stack:
         shows = list(_shown_by[-1:])
@@ -43,7 +46,7 @@ def progress_shown(title: str) -> Iterator[Callable[[str], None]]:
             shows = [lambda text: status.update(Text(text))]
 
         def tell(line: str) -> None:
-            DEPENDENCIES.info("%s: %s", title, line)
+            log.info("%s: %s", title, line)
             for show in shows:
                 show(f"{title}: {line}"[:_WIDTH])
 

@@ -7,11 +7,14 @@ import itertools
 import os
 import secrets
 import signal
+import sys
 from collections.abc import Sequence
+from typing import Any
 
 import zmq
 
 from envhub_sandbox.errors import (
+    EnvHubError,
     RemoteProtocolError,
     VersionMismatchError,
     WorkerDiedError,
@@ -31,9 +34,16 @@ from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _NOW = int(zmq.NOBLOCK)
 _MORE_NOW = int(zmq.SNDMORE) | _NOW
+_EVENTS, _READABLE = int(zmq.EVENTS), int(zmq.POLLIN)
 _KILLED_IN_A_CONTAINER = 128
 """And the signal's number: an engine's exit code, where the container's program got one."""
+_SIGKILL = 9
 SESSION = secrets.token_bytes(16)
+Source = Any
+"""What can be polled for input: a descriptor, or a ZeroMQ socket."""
+_Received = tuple[m.Message, list[Buffer]]
+_MOST_SOCKETS = 8192
+"""A connection over a network has three; by default there may be some 300 of these."""
 _contexts: dict[int, zmq.Context[zmq.Socket[bytes]]] = {}
 
 
@@ -47,7 +57,8 @@ def _context() -> zmq.Context[zmq.Socket[bytes]]:
     pid = os.getpid()
     if pid not in _contexts:
         _contexts.clear()
-        _contexts[pid] = zmq.Context()
+        _contexts[pid] = context = zmq.Context()
+        context.set(zmq.MAX_SOCKETS, _MOST_SOCKETS)
     return _contexts[pid]
 
 
@@ -68,7 +79,8 @@ class WorkerConnection:
 
     Attributes:
         patience_s: How long the server keeps the jails of a client that says nothing; 0: for ever.
-        torn: Whether an interrupt may have left half a message, which the next would be taken into.
+        torn: Whether an interrupt may have left half a message, which the next would be taken into;
+            or taken a reply that ``arrived`` has not kept.
     """
 
     def __init__(
@@ -95,7 +107,9 @@ class WorkerConnection:
         if self._link is not None:
             self._poller.register(self._link.monitor, zmq.POLLIN)
         self._sent: dict[int, tuple[int, list[Buffer]]] = {}
+        self._packed: tuple[m.Message | None, list[Buffer]] = (None, [])
         self._latest: Buffer = b""
+        self._arrived: dict[int, _Received | EnvHubError] = {}
         self.torn = False
         self._compression = ""
         self.patience_s = 0
@@ -136,7 +150,10 @@ class WorkerConnection:
         """Send a request; returns its id."""
         self.check_process()
         request_id = next(self._ids)
-        self._send(request_id, [*m.pack_header(message, request_id), *payload])
+        if message is not self._packed[0]:  # a step's is the same each time
+            self._packed = message, m.pack(message)
+        header, *buffers = self._packed[1]
+        self._send(request_id, [m.with_id(header, request_id), *buffers, *payload])
         return request_id
 
     def _send(self, request_id: int, frames: list[Buffer]) -> None:
@@ -160,6 +177,19 @@ class WorkerConnection:
         """
         self.check_process()
         while True:
+            found = self._arrived.pop(request_id, None)
+            if isinstance(found, EnvHubError):
+                raise found
+            reply, payload = found or self._receive(request_id, deadline)
+            if not self._must_say_hello(request_id, reply):
+                self._sent.pop(request_id, None)
+                return reply, payload
+            _, unanswered = self._sent.pop(request_id)
+            self.hello(deadline)
+            self._send(request_id, unanswered)
+
+    def _receive(self, request_id: int, deadline: Deadline) -> _Received:
+        while True:
             self._wait(request_id, deadline)
             frames = self._take()
             self._latest = frames[0]
@@ -168,18 +198,41 @@ class WorkerConnection:
                 with UNTRUSTED:
                     frames = compression.unpack_frames(frames, self._limits)
             reply_id, reply = m.unpack_header(frames[0], limits=self._limits)
-            if reply_id != request_id:
-                self._sent.pop(reply_id, None)
-                self.stale_replies += 1
-                if deadline.passed:  # a flood of these would be waited for without end
-                    raise WorkerTimeoutError("the worker did not answer in time")
-            elif not self._must_say_hello(request_id, reply):
-                self._sent.pop(request_id, None)
+            if reply_id == request_id:
                 return reply, frames[1:]
-            else:
-                _, unanswered = self._sent.pop(request_id)
-                self.hello(deadline)
-                self._send(request_id, unanswered)
+            self._sent.pop(reply_id, None)
+            self.stale_replies += 1
+            if deadline.passed:  # a flood of these would be waited for without end
+                raise WorkerTimeoutError("the worker did not answer in time")
+
+    def arrived(self, request_id: int) -> bool:
+        """Whether ``receive`` has its reply, or raises why there is none. Never waits."""
+        if request_id not in self._arrived:
+            try:
+                if not self._is_readable(request_id, 0):
+                    return False
+                self.torn = True  # interruption.md, rule 1
+                self._arrived[request_id] = self._receive(request_id, Deadline(0))
+            except WorkerTimeoutError:  # it was another reply
+                self.torn = False
+                return False
+            except EnvHubError as error:
+                self._arrived[request_id] = error
+            self.torn = False
+        return True
+
+    def peek(self, request_id: int) -> tuple[m.Message | None, list[Buffer]]:
+        """The reply that has ``arrived``, which stays there for ``receive``; None for an error."""
+        found = self._arrived.get(request_id)
+        return (None, []) if found is None or isinstance(found, EnvHubError) else found
+
+    def forget(self, request_id: int) -> None:
+        """Its reply is not wanted any more, whether or not it has ``arrived``."""
+        self._arrived.pop(request_id, None)
+
+    def sources(self) -> list[Source]:
+        """To be polled for input before ``arrived`` is asked again, at least twice a second."""
+        return [source for source, _ in self._poller.sockets]
 
     def reply_again(self, request_id: int, deadline: Deadline) -> m.Message:
         """The reply to a request, whose wait was interrupted before or after it came.
@@ -203,6 +256,7 @@ class WorkerConnection:
                 self._socket.send(frames[-1], _NOW, copy)
                 self.torn = False
             except zmq.Again:  # nothing of the message is left in the socket
+                self.torn = False
                 deadline = deadline or Deadline(_ROOM_S)
                 self._wait_for_room(deadline)
             else:
@@ -222,7 +276,8 @@ class WorkerConnection:
                 raise WorkerTimeoutError(f"the worker took no request for {_ROOM_S:.0f} s")
 
     def _has_ended(self) -> WorkerDiedError:
-        text = f"the worker server has ended{describe_exit(self._process_fd)}"
+        known = "" if self._far is None else self._far.why_ended()
+        text = f"the worker server has ended{known}{describe_exit(self._process_fd)}"
         return WorkerDiedError(text, reason="server")
 
     def _take(self) -> list[Buffer]:
@@ -241,16 +296,22 @@ class WorkerConnection:
         return unknown and request_id in self._sent
 
     def _wait(self, request_id: int, deadline: Deadline) -> None:
-        while True:
-            ready = dict(self._poller.poll(self._wait_ms(deadline)))
-            if self._socket in ready:
-                return
-            if self._process_fd in ready:
-                raise self._has_ended()
-            if self._link is not None and request_id in self._sent:
-                self._link.check(self._sent[request_id][0])
+        if int(self._socket.getsockopt(_EVENTS)) & _READABLE:
+            return  # as where several workers step side by side: a poll costs more than that
+        while not self._is_readable(request_id, self._wait_ms(deadline)):
             if deadline.passed:
                 raise WorkerTimeoutError("the worker did not answer in time")
+
+    def _is_readable(self, request_id: int, wait_ms: int | None) -> bool:
+        """Whether a message is there; raises why no reply to this request can come."""
+        ready = dict(self._poller.poll(wait_ms))
+        if self._socket in ready:
+            return True
+        if self._process_fd in ready:
+            raise self._has_ended()
+        if self._link is not None and request_id in self._sent:
+            self._link.check(self._sent[request_id][0])
+        return False
 
     def _wait_ms(self, deadline: Deadline) -> int | None:
         left = deadline.left_ms()
@@ -259,7 +320,7 @@ class WorkerConnection:
         return _LOOK_MS if left is None else min(left, _LOOK_MS)
 
     def hold(self, jail: int) -> None:
-        """A jail on another host is ours: keep-alives name it."""
+        """A jail on another host is ours: keep-alive messages name it."""
         if self._far is not None:
             self._far.held.add(jail)
 
@@ -292,16 +353,18 @@ def describe_exit(process_fd: int) -> str:
         process_fd: A pidfd of it, or of the monitor of its container.
     """
     status = None
-    with contextlib.suppress(OSError):  # it was reaped already, or it is no process
-        status = os.waitid(os.P_PIDFD, process_fd, os.WEXITED | os.WNOHANG | os.WNOWAIT)
+    if sys.platform == "linux":
+        with contextlib.suppress(OSError):  # it was reaped already, or it is no process
+            status = os.waitid(os.P_PIDFD, process_fd, os.WEXITED | os.WNOHANG | os.WNOWAIT)
+        if status is not None and status.si_code in (os.CLD_KILLED, os.CLD_DUMPED):
+            number = status.si_status
+            return f" by {_signal_name(number)}{_culprit(number)}. {_what_next()}"
     if status is None:
         return f". {_what_next()}"
-    if status.si_code in (os.CLD_KILLED, os.CLD_DUMPED):
-        return f" by {_signal_name(status.si_status)}{_culprit(status.si_status)}. {_what_next()}"
     number = status.si_status - _KILLED_IN_A_CONTAINER
     if number in signal.valid_signals():
         where = "; the container's own limit is DockerSandbox(memory=...) in Python"
-        why = _culprit(number) + (where if number == signal.SIGKILL else "")
+        why = _culprit(number) + (where if number == _SIGKILL else "")
         return f" with its container, by {_signal_name(number)}{why}. {_what_next()}"
     return f", with exit code {status.si_status}. {_what_next()}"
 
@@ -318,6 +381,6 @@ def _signal_name(number: int) -> str:
 
 
 def _culprit(number: int) -> str:
-    if number != signal.SIGKILL:
+    if number != _SIGKILL:
         return ""
     return ", by another process or by the kernel, as where memory runs out (dmesg says so)"

@@ -46,6 +46,11 @@ class Deadline:
         return self._at is not None and monotonic() >= self._at
 
 
+def deadline_of(timeout: float | Deadline | None) -> Deadline:
+    """A deadline so many seconds from now; one that several waits share is given as it is."""
+    return timeout if isinstance(timeout, Deadline) else Deadline(timeout)
+
+
 class StepDeadline(Deadline):
     """A deadline that serves every step, and counts from its first wait.
 

@@ -33,6 +33,10 @@ _UNSEEN_S = 5.0
 """For how long a Ctrl-C waits for the jail that it came before."""
 
 
+Unpack = Callable[[int, list[Buffer]], m.Message]
+"""Makes a message of the frames that came from the runner at a place of the request."""
+
+
 class RunnersDiedError(WorkerDiedError):
     """Runners of a kept jail have died; the others have answered.
 
@@ -141,12 +145,18 @@ class JailHandle:
         """``send`` for messages that are packed; ``deposited`` as in ``Relay``."""
         parts = tuple((runner, len(frames)) for runner, frames in requests)
         payload = [frame for _, frames in requests for frame in frames]
-        request_id = self.client.send(m.Relay(self.number, operation, parts, deposited), payload)
-        self._asked[request_id] = len(parts)
+        return self.send_relay(m.Relay(self.number, operation, parts, deposited), payload)
+
+    def send_relay(self, relay: m.Relay, payload: Sequence[Buffer]) -> int:
+        """Send frames to some runners; returns the request's id."""
+        request_id = self.client.send(relay, payload)
+        self._asked[request_id] = len(relay.parts)
         return request_id
 
-    def receive(self, request_id: int, deadline: Deadline) -> list[m.Message]:
-        """The runners' replies, in the order of the request.
+    def receive(
+        self, request_id: int, deadline: Deadline, unpack: Unpack | None = None
+    ) -> list[m.Message]:
+        """The runners' replies, in the order of the request; ``unpack`` makes messages of them.
 
         Raises:
             WorkerTimeoutError: The deadline came first.
@@ -157,22 +167,48 @@ class JailHandle:
         reply, payload = self.client.receive(request_id, deadline)
         asked = self._asked.pop(request_id, None)
         with UNTRUSTED:
-            if not (self.kept and isinstance(reply, m.RelayDonePartly)):
+            if type(reply) is not m.RelayDone and not (
+                self.kept and isinstance(reply, m.RelayDonePartly)
+            ):
                 reply = expect_reply(reply, m.RelayDone)
             parts = _cut(payload, reply.parts)
             if len(parts) != asked:
                 raise RemoteProtocolError(f"{asked} runners were asked, {len(parts)} answered")
             if isinstance(reply, m.RelayDonePartly):
-                raise self._died(reply.dead, parts)
+                raise self._died(reply.dead, parts, unpack or self._unpack_one)
+            if unpack is not None:
+                return [unpack(index, part) for index, part in enumerate(parts)]
             return [self._unpack(part) for part in parts]
 
-    def _died(self, dead: Sequence[int], parts: list[list[Buffer]]) -> RunnersDiedError:
+    def arrived(self, request_id: int) -> list[list[Buffer]]:
+        """What has arrived of each runner, and is not taken yet; nothing where that is an error."""
+        reply, payload = self.client.peek(request_id)
+        if type(reply) is not m.RelayDone:
+            return []
+        try:
+            with UNTRUSTED:
+                parts = _cut(payload, reply.parts)
+        except RemoteProtocolError:  # ``receive`` raises it
+            return []
+        return parts if len(parts) == self._asked.get(request_id) else []
+
+    def forget(self, request_id: int) -> None:
+        """What the runners answer is not wanted any more."""
+        self._asked.pop(request_id, None)
+        self.client.forget(request_id)
+
+    def _died(
+        self, dead: Sequence[int], parts: list[list[Buffer]], unpack: Unpack
+    ) -> RunnersDiedError:
         """The server says which runners have died; a runner cannot."""
         if not dead or not set(dead) <= set(range(len(parts))):
             raise RemoteProtocolError("the worker names dead runners that were not asked")
         deaths = {index: death(typed_reply(self._unpack(parts[index]), m.Death)) for index in dead}
-        living = [None if i in deaths else self._unpack(part) for i, part in enumerate(parts)]
+        living = [None if i in deaths else unpack(i, part) for i, part in enumerate(parts)]
         return RunnersDiedError(living, deaths)
+
+    def _unpack_one(self, index: int, frames: list[Buffer]) -> m.Message:
+        return self._unpack(frames)
 
     def _unpack(self, frames: Sequence[Buffer]) -> m.Message:
         if len(frames) > 1:  # with one frame there is nothing in front
@@ -262,6 +298,8 @@ class JailHandle:
 
 def _cut(payload: list[Buffer], counts: Sequence[int]) -> list[list[Buffer]]:
     """The frames of each part."""
+    if len(counts) == 1 and type(counts[0]) is int and counts[0] == len(payload) > 0:
+        return [payload]
     if any(type(count) is not int or count < 1 for count in counts) or sum(counts) != len(payload):
         raise RemoteProtocolError("the worker's frames do not add up")
     frames = iter(payload)

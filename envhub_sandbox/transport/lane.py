@@ -1,19 +1,21 @@
 """The way of an environment's requests to its runners: one interface, and the way over the server.
 
-There are two: ``RelayLane``, below, and ``SharedMemoryLane``. Which of them an environment has is
-decided once, when it is built (``session/jails/builder``). What a request means does not depend on
-the lane.
+There are three: ``RelayLane``, below; ``ServedLane``, which is the same with faster steps; and
+``SharedMemoryLane``. Which of them an environment has is decided once, when it is built
+(``session/jails/builder``). What a request means does not depend on the lane.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Callable, Sequence
 from time import perf_counter_ns
 from typing import Any, Protocol
 
 from envhub_sandbox.errors import EnvHubError, WorkerError
+from envhub_sandbox.transport.connection import Source
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.jail import JailHandle, RunnersDiedError
+from envhub_sandbox.transport.jail import JailHandle, RunnersDiedError, Unpack
 from envhub_sandbox.transport.replies import all_replies
 from envhub_sandbox.transport.results import Results, StepResult
 from envhub_sandbox.transport.values import pickles
@@ -22,6 +24,8 @@ from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.spaces import batches
 
 Frames = list[Buffer]
+RECHECK_MS = 2
+"""After how long to look once more where a doorbell may have crossed with our going to sleep."""
 
 
 class Request:
@@ -61,7 +65,8 @@ class Request:
 
 
 class Lane(Protocol):
-    """The way to the runners of one environment: one request at a time, and its answers.
+    """The way to the runners of one environment: one request at a time, and its answers; or
+    several steps one after the other, where it ``takes_more``.
 
     The order is the point. ``send_step`` or ``send`` comes first, then ``wait`` or ``replies``, for
     which a deadline is given that also bounds whatever else has to be fetched. Where that wait ends
@@ -83,8 +88,19 @@ class Lane(Protocol):
     number: int
     elapsed_ns: int
 
-    def send_step(self, actions: Any) -> None:
+    @property
+    def takes_more(self) -> bool:
+        """Whether a step can be sent while earlier ones are owed; answers come in that order."""
+
+    def expect_more(self) -> None:
+        """A step waits for the answer to the last. If the lane can, it ``takes_more`` next time."""
+
+    def send_step(self, actions: Any, *, ahead: bool = False) -> None:
         """Send a validated batch of actions: to each shard its slice.
+
+        Args:
+            actions: The batch.
+            ahead: Whether answers to earlier steps are owed, which ``takes_more`` permits.
 
         Raises:
             EnvHubError: Nothing was sent.
@@ -133,6 +149,19 @@ class Lane(Protocol):
     def replies(self, deadline: Deadline) -> list[m.Message]:
         """Every shard's reply to what was sent; raises as ``wait`` does."""
 
+    def answered(self) -> bool:
+        """Whether ``wait``, or ``replies``, has nothing to wait for: it returns, or raises.
+
+        Never waits itself, and takes nothing away. Where it says no, it is asked again once one of
+        its ``sources`` is readable, and at least twice a second; an end may be seen only then.
+        """
+
+    def sources(self) -> list[Source]:
+        """What becomes readable, at the latest ``RECHECK_MS`` late, when ``answered`` may say yes.
+
+        For as long as what was sent is owed.
+        """
+
     def catch_up(self, deadline: Deadline) -> None:
         """Take what is owed and drop it; raises as ``wait`` does.
 
@@ -178,23 +207,32 @@ class RelayLane:
         self._results = results
         self._asked_ns = 0
         self._answers: list[m.Message] = []
-        self._owed: int | None = None
+        self._owed: deque[tuple[int, int, Unpack | None]] = deque()  # requests, and since when
         self._sending = False
 
-    def send_step(self, actions: Any) -> None:
+    @property
+    def takes_more(self) -> bool:
+        """See ``Lane``; what a fresh runner may have to repeat is the last request alone."""
+        return len(self.runners) == 1 and not self.jail.kept
+
+    def expect_more(self) -> None:
+        """See ``Lane``."""
+
+    def send_step(self, actions: Any, *, ahead: bool = False) -> None:
         """See ``Lane``."""
         self._asked_ns = perf_counter_ns()
-        bounds = self._results.bounds
+        bounds = self._results.slices
         parts = [actions]
         if len(bounds) > 1:
             parts = batches.split(self._results.manifest.single_action_space, actions, bounds)
         messages = [m.Step(self.number, part) for part in parts]
-        self.send_some("step", self.runners, list(map(self.jail.pack, messages)))
+        self.send_some("step", self.runners, list(map(self.jail.pack, messages)), ahead=ahead)
 
     def wait(self, deadline: Deadline) -> None:
         """See ``Lane``."""
+        asked_ns = self._owed[0][1]
         self._answers = self.replies(deadline)
-        self.elapsed_ns = perf_counter_ns() - self._asked_ns
+        self.elapsed_ns = perf_counter_ns() - asked_ns
 
     def result(self, infos: dict[Any, Any] | None = None) -> StepResult:
         """See ``Lane``. Trust: input from the worker."""
@@ -216,12 +254,27 @@ class RelayLane:
         """See ``Lane``."""
         self.send_some(request.operation, self.runners, request.frames)
 
-    def send_some(self, operation: str, runners: Sequence[int], packed: Sequence[Frames]) -> None:
+    def send_some(
+        self,
+        operation: str,
+        runners: Sequence[int],
+        packed: Sequence[Frames],
+        *,
+        ahead: bool = False,
+    ) -> None:
         """Send some runners a message each; ``replies`` has what they answer."""
-        self._owed = None
+        parts = list(zip(runners, packed, strict=True))
+        self._send(lambda: self.jail.relay(operation, parts), ahead=ahead)
+
+    def _send(
+        self, relay: Callable[[], int], unpack: Unpack | None = None, *, ahead: bool = False
+    ) -> None:
+        """Send by ``relay``; ``unpack`` makes messages of the answers, where these are none."""
+        while self._owed and not ahead:  # such as infos, of a step that another has raised in
+            self.jail.forget(self._owed.popleft()[0])
         self._sending = True  # interruption.md, rule 1: half a message, or a whole one
         try:
-            self._owed = self.jail.relay(operation, list(zip(runners, packed, strict=True)))
+            self._owed.append((relay(), self._asked_ns, unpack))
         except EnvHubError:  # nothing was sent
             self._sending = False
             raise
@@ -234,20 +287,28 @@ class RelayLane:
 
     def replies(self, deadline: Deadline) -> list[m.Message]:
         """See ``Lane``."""
-        assert self._owed is not None
         try:
-            received = self.jail.receive(self._owed, deadline)
+            sent, _, unpack = self._owed[0]
+            received = self.jail.receive(sent, deadline, unpack)
         except RunnersDiedError:  # that was the answer
-            self._owed = None
+            self._owed.popleft()
             raise
-        self._owed = None
+        self._owed.popleft()
         return received
+
+    def answered(self) -> bool:
+        """See ``Lane``."""
+        return not self._owed or self.jail.client.arrived(self._owed[0][0])
+
+    def sources(self) -> list[Source]:
+        """See ``Lane``."""
+        return self.jail.client.sources()
 
     def catch_up(self, deadline: Deadline) -> None:
         """See ``Lane``."""
-        if self._sending:
-            raise WorkerError("the request was interrupted while it was being sent")
-        if self._owed is not None:
+        if self._sending or self.jail.client.torn:
+            raise WorkerError("the request was interrupted while it was sent, or its answer taken")
+        while self._owed:
             self.replies(deadline)
 
     def renew(self, dead: Sequence[int], fresh: Sequence[int], deadline: Deadline) -> None:

@@ -27,7 +27,7 @@ MOST = 100
 _PACKAGE = __name__.partition(".")[0]
 _NO_MORE = (
     "Warning",
-    f"there have been more than {MOST} different warnings: further ones are only in what it prints",
+    f"more than {MOST} different warnings: further ones are only in the worker's output",
 )
 
 

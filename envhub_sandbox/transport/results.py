@@ -29,6 +29,8 @@ class Results:
 
     Attributes:
         manifest, bounds: As given.
+        count: How many sub-environments these are: all, or those of one worker of a fleet.
+        slices: The same as ``bounds``, counted from the first of these.
         apart: Whether infos are to come as the only sub-environment gave them, which is what the
             environment is then built for; set before that.
     """
@@ -40,6 +42,9 @@ class Results:
         self._space = manifest.single_observation_space
         self._declared = manifest.shardable
         self._sizes = [stop - start for start, stop in bounds]
+        first = self.bounds[0][0]
+        self.slices = [(start - first, stop - first) for start, stop in bounds]
+        self.count = sum(self._sizes)
         self._restores = batches.restores(self._space)
 
     def step(self, replies: list[m.StepDone], infos: dict[Any, Any] | None = None) -> StepResult:
@@ -56,6 +61,31 @@ class Results:
             self.infos([reply.info for reply in replies]) if infos is None else infos,
         )
 
+    def joined_steps(
+        self, parts: Sequence[StepResult], infos: dict[Any, Any] | None = None
+    ) -> StepResult:
+        """One result of those of slices, each of which was held against its own; as ``step``."""
+        observations, rewards, terminations, truncations, own = zip(*parts, strict=True)
+        if len({part.shape[1:] for part in rewards}) > 1:
+            raise RemoteProtocolError("the workers sent rewards of different shapes")
+        return (
+            batches.join(self._space, observations),
+            np.concatenate(rewards),
+            np.concatenate(terminations),
+            np.concatenate(truncations),
+            batches.join_infos(own, self._sizes) if infos is None else infos,
+        )
+
+    def joined_resets(
+        self,
+        parts: Sequence[tuple[Any, dict[Any, Any]]],
+        infos: dict[Any, Any] | None = None,
+    ) -> tuple[Any, dict[Any, Any]]:
+        """Likewise of a reset."""
+        observations, own = zip(*parts, strict=True)
+        joined = batches.join_infos(own, self._sizes) if infos is None else infos
+        return batches.join(self._space, observations), joined
+
     def reset(
         self, replies: list[m.ResetDone], infos: dict[Any, Any] | None = None
     ) -> tuple[Any, dict[Any, Any]]:
@@ -71,18 +101,27 @@ class Results:
         Raises:
             RemoteEnvError: It would raise in Gymnasium, too.
         """
-        pairs, start = [], 0
-        for reply, size in zip(replies, self._sizes, strict=True):
-            pairs += [(start + index, info) for index, info in _own_infos(reply.value, size)]
-            start += size
+        pairs = self.own_pairs(replies)
         try:
-            infos = batches.join_pairs(pairs, start, DEFAULT_LIMITS.message_bytes)
+            infos = batches.join_pairs(pairs, self.count, DEFAULT_LIMITS.message_bytes)
         except FAULTS as error:
             if isinstance(error, (EnvHubError, MemoryError)):
                 raise
             name = type(error).__name__
             raise remote_error(name, name, one_line(str(error), _SHOWN)) from error
         return self._restored(infos)
+
+    def own_pairs(self, replies: list[m.Value]) -> list[tuple[int, dict[Any, Any]]]:
+        """Those infos, each with the place of its sub-environment. Trust: input from the worker.
+
+        Raises:
+            RemoteProtocolError: They are of others, or none.
+        """
+        pairs, start = [], 0
+        for reply, size in zip(replies, self._sizes, strict=True):
+            pairs += [(start + index, info) for index, info in _own_infos(reply.value, size)]
+            start += size
+        return pairs
 
     def reset_done(self, observation: Any, reply: m.Message) -> m.ResetDone:
         """A shard's reply to a reset, of which the observation has come another way."""
@@ -154,7 +193,7 @@ class Results:
                         f"the worker sent an observation that is not a batch of {self._space}"
                     )
         joined = parts[0] if len(parts) == 1 else batches.join(self._space, parts)
-        if not (self._restores and batches.conforms(self._space, joined, sum(self._sizes))):
+        if not (self._restores and batches.conforms(self._space, joined, self.count)):
             return joined
         return batches.restore_batch(self._space, joined)
 
@@ -163,9 +202,16 @@ class Results:
             shape = getattr(part, "shape", None)
             if not shape or shape[0] != size:
                 raise RemoteProtocolError(f"the worker sent {name} that do not fit num_envs")
-            if not (_numeric(part) and (not self._declared or name == "rewards" or _flags(part))):
+            if not (_numeric(part) and (not self._declared or self._is_own(name, part))):
                 raise RemoteProtocolError(f"the worker sent {name} of a wrong dtype or shape")
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+    def _is_own(self, name: str, part: Any) -> bool:
+        """Whether our own vector environments have such: it may be joined with that of others."""
+        if name != "rewards":
+            return _flags(part)
+        # several for each sub-environment are what AsyncVectorEnv permits
+        return bool(part.ndim == 1 or not self.manifest.sync)
 
     @staticmethod
     def _info(part: Any) -> dict[Any, Any]:

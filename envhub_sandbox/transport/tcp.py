@@ -6,6 +6,7 @@ that is out look alike. Its monitor knows; this turns what it says into errors.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import field
 from time import monotonic
 
@@ -20,12 +21,13 @@ CONNECT_S = 10.0
 _CUT_S = 3.0
 """For how long a server may end handshakes until that is no restart any more."""
 _ANOTHER_PROTOCOL = (
-    "it does not speak ZeroMQ with CURVE keys as we do: is it an envhub-worker, and are both of us "
-    "with keys, or both without (insecure_loopback)?"
+    "it does not speak ZeroMQ with CURVE keys: is it an envhub-worker, and do both sides use "
+    "keys, or neither (insecure_loopback)?"
 )
 _RECONNECT_MS = 100
 _RECONNECT_MAX_MS = 2_000
 _PINGS = 4
+_EVENTS_NOW, _READABLE = int(zmq.EVENTS), int(zmq.POLLIN)
 _EVENTS = (
     zmq.EVENT_HANDSHAKE_SUCCEEDED
     | zmq.EVENT_HANDSHAKE_FAILED_AUTH
@@ -48,18 +50,26 @@ class TcpServer:
         client_key: Our secret key; None likewise.
         heartbeat_s: After so long without a sign of life a connection counts as lost.
         held: The numbers of the jails that we have open there.
+        why_ended: Says what is known of its end, as the rest of a sentence; may wait some seconds.
     """
 
     server_key: bytes | None
     client_key: bytes | None = field(repr=False)
     heartbeat_s: float = 30.0
     held: set[int] = field(default_factory=set, compare=False)
+    why_ended: Callable[[], str] = field(default=str, compare=False, repr=False)
 
     def public_key(self) -> str:
         """Our public key, as the server's list of clients has it."""
         if self.client_key is None:
             return "none"
         return z85.decode(zmq.curve_public(z85.encode(self.client_key))).hex()
+
+
+def new_keys() -> tuple[bytes, bytes]:
+    """A CURVE key pair, public and secret, of 32 bytes each."""
+    public, secret = zmq.curve_keypair()
+    return z85.decode(public), z85.decode(secret)
 
 
 class TcpLink:
@@ -102,6 +112,8 @@ class TcpLink:
             SandboxUnavailableError: The server does not let us in, or is another one.
             WorkerDiedError: The same, after it had let us in before.
         """
+        if not int(self.monitor.getsockopt(_EVENTS_NOW)) & _READABLE:
+            return  # as nearly always, and without the exception that says so
         from zmq.utils.monitor import parse_monitor_message  # brings asyncio, and that ssl
 
         while True:
@@ -139,9 +151,9 @@ class TcpLink:
         if self._far.server_key is None:
             raise self._refused(_ANOTHER_PROTOCOL)
         raise UnreachableError(
-            f"{self._endpoint}: it has ended every handshake for {_CUT_S:.0f} s, as a server does "
-            "whose public key is another than the server_key that was given, and as one does that "
-            "restarts: compare the key with what it printed, and see whether it runs"
+            f"{self._endpoint}: it has ended every handshake for {_CUT_S:.0f} s. Either the server "
+            "has another public key than the given server_key, or it is restarting: compare the "
+            "key with the one that it printed, and check that it runs"
         )
 
     def _refused(self, why: str) -> EnvHubError:
@@ -161,7 +173,7 @@ class TcpLink:
         if number <= self._lost:
             raise WorkerDiedError(
                 f"the connection to {self._endpoint} was lost while an answer was awaited; the "
-                "server, the network or its peer's heartbeat has failed",
+                f"server, the network or its peer's heartbeat has failed{self._far.why_ended()}",
                 reason="connection",
             )
         if self._up or monotonic() - self._since < CONNECT_S:
@@ -169,7 +181,7 @@ class TcpLink:
         if self._number:
             raise WorkerDiedError(
                 f"the connection to {self._endpoint} was lost and has not come back after "
-                f"{CONNECT_S:.0f} s",
+                f"{CONNECT_S:.0f} s{self._far.why_ended()}",
                 reason="connection",
             )
         raise UnreachableError(

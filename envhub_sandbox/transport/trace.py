@@ -19,20 +19,12 @@ from typing import Any
 
 from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.lane import RelayLane, Request
-from envhub_sandbox.transport.shared_memory.lane import SharedMemoryLane
+from envhub_sandbox.transport.shared_memory.served_lane import ServedLane
 from envhub_worker.protocol import messages as m
 
 _VARIABLE = "ENVHUB_TRACE"
-_SENDING: dict[type, tuple[str, ...]] = {
-    WorkerConnection: ("send",),
-    RelayLane: ("send_step", "send", "send_for_infos"),
-    SharedMemoryLane: ("send_step", "send", "send_for_infos"),
-}
-_WAITING: dict[type, tuple[str, ...]] = {
-    WorkerConnection: ("receive",),
-    RelayLane: ("wait", "replies"),
-    SharedMemoryLane: ("wait", "replies"),
-}
+_SENDING = ("send_step", "send", "send_for_infos")
+_WAITING = ("wait", "replies")
 
 
 @functools.cache
@@ -43,11 +35,20 @@ def _start() -> None:
         passed_s = perf_counter() - began
         sys.stderr.write(f"+{passed_s:.6f} {threading.current_thread().name} {text}\n")
 
-    for cls, names in _SENDING.items():
-        for name in names:
+    lanes: list[type] = [RelayLane]
+    if sys.platform == "linux":
+        from envhub_sandbox.transport.shared_memory.lane import SharedMemoryLane
+
+        lanes.append(SharedMemoryLane)
+    of: dict[type, tuple[tuple[str, ...], tuple[str, ...]]] = {
+        WorkerConnection: (("send",), ("receive",)),
+        ServedLane: (("send_step",), ("wait",)),  # all else is RelayLane's
+        **dict.fromkeys(lanes, (_SENDING, _WAITING)),
+    }
+    for cls, (sends, waits) in of.items():
+        for name in sends:
             setattr(cls, name, _sending(getattr(cls, name), say))
-    for cls, names in _WAITING.items():
-        for name in names:
+        for name in waits:
             setattr(cls, name, _waiting(getattr(cls, name), say))
 
 

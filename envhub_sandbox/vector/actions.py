@@ -169,7 +169,9 @@ def _array(space: gym.Space[Any], value: Any, where: str) -> Any:
             value = value.detach().cpu()
         return np.asarray(value)
     except Exception as error:
-        raise ActionError(f"{where}: {_named(value)} is no batch for {space}: {error}") from error
+        raise ActionError(
+            f"{where}: {_named(value)} is not a batch for {space}: {error}"
+        ) from error
 
 
 def _named(value: Any) -> str:

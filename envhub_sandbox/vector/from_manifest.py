@@ -19,14 +19,14 @@ from envhub_worker.protocol.manifest.manifest import EnvManifest
 from envhub_worker.protocol.spaces.spaces import OpaqueSpace
 
 
-def action_reader(manifest: EnvManifest) -> Callable[[Any], Any]:
-    """Checks a batch of actions and makes it what the worker takes."""
+def action_reader(manifest: EnvManifest, count: int) -> Callable[[Any], Any]:
+    """Checks a batch of so many actions and makes it what the worker takes."""
     single, own = manifest.single_action_space, manifest.own_batch("action_space")
     if isinstance(single, OpaqueSpace):
         return lambda actions: actions
     if own is not None:
         return ActionReader(own, None).read
-    return ActionReader(single, manifest.num_envs).read
+    return ActionReader(single, count).read
 
 
 def metadata(manifest: EnvManifest) -> dict[str, Any]:

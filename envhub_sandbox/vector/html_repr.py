@@ -1,25 +1,36 @@
 """HTML for notebooks: tables of environments, in which all that comes from a worker is escaped.
 
-No request is sent. Names of suites and tasks and the spaces come from the manifest, and so from the
-worker: they are bounded here, and are text, never markup.
+No request is sent: a picture is of the frame that the caller has rendered last. Names of suites and
+tasks and the spaces come from the manifest, and so from the worker: they are bounded here, and are
+text, never markup; a frame is numbers, which are encoded here.
 """
 
 from __future__ import annotations
 
+import base64
 import html
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from envhub_sandbox.vector.pictures import is_frame, png, small_picture
 from envhub_worker.protocol.codec.inert import one_line
 
 _CHARS = 300
 _ROWS = 50
+_SIDE = 256
+"""Pixels of a picture."""
 _HEAD = ("suite", "task", "environments", "observations", "actions")
 
 
-def environment_html(env: Any, layers: Iterable[Mapping[str, Any]]) -> str:
-    """A table of one environment: its spaces, and the layers that confine it."""
-    names = [str(layer.get("layer")) for layer in layers if layer.get("enforced")]
+def environment_html(env: Any, layers: Iterable[Mapping[str, Any]], rendered: Any = None) -> str:
+    """A table of one environment: its spaces, and the layers that confine it.
+    ``rendered``: by the first sub-environment; a frame is shown below the table.
+    """
+    held: dict[str, bool] = {}  # by each of its workers
+    for layer in layers:
+        name = str(layer.get("layer"))
+        held[name] = held.get(name, True) and bool(layer.get("enforced"))
+    names = [name for name, holds in held.items() if holds]
     rows = [
         ("environments", env.num_envs),
         ("observations", env.single_observation_space),
@@ -30,7 +41,15 @@ def environment_html(env: Any, layers: Iterable[Mapping[str, Any]]) -> str:
     body = "".join(
         f"<tr><th>{_text(name)}</th><td>{_text(value)}</td></tr>" for name, value in rows
     )
-    return f"<code>{_text(repr(env))}</code><table>{body}</table>"
+    return f"<code>{_text(repr(env))}</code><table>{body}</table>{_picture(rendered)}"
+
+
+def _picture(rendered: Any) -> str:
+    """A frame as a small picture; nothing of anything else."""
+    if not is_frame(rendered):
+        return ""
+    data = base64.b64encode(png(small_picture(rendered, _SIDE))).decode()
+    return f'<img alt="The last frame" src="data:image/png;base64,{data}">'
 
 
 def suites_html(suites: Mapping[Any, Mapping[Any, Any]]) -> str:

@@ -4,46 +4,50 @@ from __future__ import annotations
 
 from typing import Any
 
-from envhub_sandbox.session.env_session import EnvSession
+from envhub_sandbox.session.parts.fleet_session import AnySession
 
 
 class SandboxView:
-    """What confines an environment, what that holds, was denied and has done.
+    """The confinement of an environment, what it uses, what it was denied, and counters.
 
-    The answers are the client's and its worker server's, never the repository's. Each method may
-    be called at any moment, from any thread, and answers for that moment.
+    The data come from the client and its worker server, never from the repository. Each method may
+    be called at any time, from any thread.
     """
 
-    def __init__(self, session: EnvSession) -> None:
+    def __init__(self, session: AnySession) -> None:
         self._session = session
 
     def report(self) -> list[dict[str, Any]]:
-        """One mapping per layer: ``layer``, ``enforced``, ``detail``. None unless it runs."""
-        return [dict(layer) for layer in self._session.lease.report()]
+        """One mapping per layer: ``layer``, ``enforced``, ``detail``; empty unless it runs."""
+        return [dict(layer) for layer in self._session.report()]
 
     def usage(self) -> dict[str, int]:
-        """What its jail holds right now, counted from outside of it by the worker server.
+        """What its jail uses now, counted by the worker server from outside.
 
         Returns:
-            ``processes`` and ``threads`` (beyond one for each process); of the processes that run
-            environments ``files``, which they have open, and ``memory_bytes``, what is theirs
-            alone. Empty unless it runs.
+            ``processes`` and ``threads`` (beyond one for each process); for the processes that run
+            environments also ``files`` (open ones) and ``memory_bytes`` (not shared). Empty unless
+            it runs.
         """
         return self._session.usage()
 
-    def denials(self) -> tuple[str, ...] | None:
-        """Which system calls its jail has tried and was denied: ``("ptrace", "socket AF_INET")``.
+    def memory_limit(self) -> int:
+        """Bytes that its processes may use by the policy: the limit of a jail, times its jails."""
+        return self._session.jails * self._session.repository.policy.limits.memory_bytes
 
-        And which files it has asked for that are not its own: ``"write /home/me/.profile"``, and
-        what it has tried with processes that are not: ``"kill OTHER_PROCESS"``. By the word of its
-        first process, which answers or sees them, and not by the repository's. Also which limits it
-        has used up when the server looks: ``"limit PROCESSES"``, ``OPEN_FILES``, ``DISK_BYTES`` or
-        ``DISK_FILES``. None unless it runs under a policy with ``record_denials``.
+    def denials(self) -> tuple[str, ...] | None:
+        """Denied attempts of its jail, recorded by the jail's first process.
+
+        Returns:
+            System calls (``"ptrace"``, ``"socket AF_INET"``), files outside its own folders
+            (``"write /home/me/.profile"``), other processes (``"kill OTHER_PROCESS"``), and limits
+            that it has reached now (``"limit PROCESSES"``, ``OPEN_FILES``, ``DISK_BYTES`` or
+            ``DISK_FILES``). None unless it runs under a policy with ``record_denials``.
         """
-        return self._session.lease.denials()
+        return self._session.denials()
 
     def stats(self) -> dict[str, Any]:
-        """Counters; asks nothing of the worker.
+        """Counters; sends no request.
 
         Returns:
             ``requests``, ``steps``, ``timeouts``, ``deaths``, ``restarts`` (after deaths),

@@ -212,8 +212,8 @@ class SingleEnv(gym.Env[Any, Any]):
         elif not self._is_local(name):
             if not is_servable(name):
                 raise AttributeError(
-                    f"a {type(self).__name__} does not set {name!r} in the environment, where it "
-                    f"is not read either; call set_wrapper_attr({name!r}, value)"
+                    f"a {type(self).__name__} does not set {name!r} in the environment, because it "
+                    f"does not read it there; call set_wrapper_attr({name!r}, value)"
                 )
             self._vector.set_attr(name, [value])  # type: ignore[attr-defined]
             return

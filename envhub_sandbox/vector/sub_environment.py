@@ -191,7 +191,7 @@ class SubEnvironment(gym.Env[Any, Any]):
         """An attribute, or a function that calls the method of that name."""
         if not is_servable(name):
             raise AttributeError(
-                f"a sub-environment shows no {name!r}; if it has one that is meant, ask "
+                f"a sub-environment shows no {name!r}; if the environment has one, use "
                 f"get_wrapper_attr({name!r})"
             )
         return self._get(name)

@@ -5,12 +5,15 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Mapping
 from types import TracebackType
-from typing import Any
+from typing import Any, TypeVar
 
 from gymnasium.vector import VectorEnv
 
 from envhub_sandbox.session.recipe import Recipe
+from envhub_sandbox.vector.task_map import TaskMap, live_tasks
+from envhub_sandbox.vector.vector_env import SandboxVectorEnv, leave_suite
 
+T = TypeVar("T")
 Envs = Mapping[str, Mapping[int | str, VectorEnv[Any, Any, Any]]]
 
 
@@ -77,6 +80,41 @@ class EnvSuites(dict[str, dict[Any, VectorEnv[Any, Any, Any]]]):
     def provenance(self) -> dict[str, Any]:
         """What runs: commit, file hashes, interpreter, packages, what was installed, layers."""
         return self._provenance()
+
+    def map(
+        self,
+        play: Callable[[str, Any, Any], T],
+        *,
+        max_live_tasks: int | None = None,
+        memory: int | str | None = None,
+    ) -> dict[str, dict[Any, T]]:
+        """Play every task, several at a time within a budget, and close each after it was played.
+
+        If there are more tasks than may live, one of the live tasks is the next one, which starts
+        while the others are played. Progress is shown on a terminal and in a notebook.
+
+        Args:
+            play: Called with the suite, the task and its environment. Tasks that are played at the
+                same time have a thread each.
+            max_live_tasks: How many tasks may have processes at the same time.
+            memory: Bytes that the limits of all live tasks may add up to, or a text such as
+                ``"16G"``. A task takes ``limits["memory_bytes"]``, in a fleet for each worker.
+
+        Returns:
+            What ``play`` returned, by suite and task.
+
+        Raises:
+            ValueError: Neither bound is given, or not one task fits.
+            Exception: The first that ``play`` raised. The tasks that were being played have ended,
+                no other was started, and all are closed.
+        """
+        each = [env for tasks in self.values() for env in tasks.values()]
+        sizes = [env.sandbox.memory_limit() for env in each if isinstance(env, SandboxVectorEnv)]
+        live = live_tasks(memory, max_live_tasks, max(sizes, default=0))
+        for env in each:
+            if isinstance(env, SandboxVectorEnv):
+                leave_suite(env)
+        return TaskMap(self, play, live).run()
 
     def _repr_html_(self) -> str:
         from envhub_sandbox.vector.html_repr import suites_html

@@ -6,8 +6,9 @@ values are not, because many environments leave their own bounds and train all t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from functools import partial
+from itertools import count
 from typing import Any
 
 import gymnasium as gym
@@ -16,7 +17,8 @@ from gymnasium import spaces
 from gymnasium.vector.utils import iterate
 
 from envhub_sandbox.errors import ActionError, ObservationError
-from envhub_sandbox.session.env_session import EnvSession
+from envhub_sandbox.session.parts.fleet_session import AnySession
+from envhub_sandbox.session.parts.in_flight import Received, Rows
 from envhub_sandbox.transport.results import StepResult
 from envhub_sandbox.vector.tracebacks import short_traceback
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
@@ -34,7 +36,7 @@ class ValidatedVectorEnv(SandboxVectorEnv):
         ObservationError: An observation is. The environment is still usable.
     """
 
-    def __init__(self, session: EnvSession) -> None:
+    def __init__(self, session: AnySession) -> None:
         super().__init__(session)
         # those of a batch that is no batch of the single space: it is one member of its own
         self._own_observations, own_actions = (
@@ -43,7 +45,12 @@ class ValidatedVectorEnv(SandboxVectorEnv):
         members = partial(_members, self.action_space, own_actions)
         space = self.single_action_space if own_actions is None else own_actions
         # not a bound method: it would refer to this environment (interruption.md, rule 13)
-        self._read_actions = partial(_read_and_check, self._read_actions, members, space)
+        self._checks = members, space
+        self._read_actions = partial(_read_and_check, self._read_actions, *self._checks)
+
+    def _read_rows(self, rows: Rows, actions: Any) -> Any:
+        read = partial(super()._read_rows, rows)
+        return _read_and_check(read, *self._checks, actions, rows.named)
 
     def _end_reset(self, timeout_s: float | None) -> tuple[Any, dict[Any, Any]]:
         """What both ``reset`` and ``reset_wait`` end with, checked."""
@@ -61,14 +68,21 @@ class ValidatedVectorEnv(SandboxVectorEnv):
         """As ``SandboxVectorEnv.step_wait``, checked."""
         return self._checked(super().step_wait(timeout))
 
-    def _checked(self, result: StepResult) -> StepResult:
-        self._check_batch("step", result[0])
+    @short_traceback
+    def recv(self, min_ready: int | None = None, timeout: float | None = None) -> Received:
+        """As ``SandboxVectorEnv.recv``, checked."""
+        received = super().recv(min_ready, timeout)
+        self._checked(received[:-1], received.env_ids.tolist())
+        return received
+
+    def _checked(self, result: StepResult, ids: Sequence[int] = ()) -> StepResult:
+        self._check_batch("step", result[0], ids)
         finals = result[4].get("final_obs")
         if isinstance(finals, np.ndarray) and finals.dtype == object:
-            self._check("the last step of an episode", finals)
+            self._check("the last step of an episode", finals, ids=ids)
         return result
 
-    def _check_batch(self, operation: str, observations: Any) -> None:
+    def _check_batch(self, operation: str, observations: Any, ids: Sequence[int] = ()) -> None:
         with self._session.repository.named():
             try:
                 members = list(
@@ -77,19 +91,23 @@ class ValidatedVectorEnv(SandboxVectorEnv):
             except Exception as error:  # a vector environment of the repository's own gave it
                 text = f"{operation} returned no batch of observations for {self.observation_space}"
                 raise ObservationError(text, observation=observations) from error
-        self._check(operation, members, self._own_observations)
+        self._check(operation, members, self._own_observations, ids)
 
     def _check(
-        self, operation: str, observations: Iterable[Any], own: gym.Space[Any] | None = None
+        self,
+        operation: str,
+        observations: Iterable[Any],
+        own: gym.Space[Any] | None = None,
+        ids: Sequence[int] = (),
     ) -> None:
+        """``ids``: of the sub-environments that gave them; of all in order for none."""
         space = self.single_observation_space if own is None else own
         with self._session.repository.named():
-            for index, observation in enumerate(observations):
+            for index, observation in zip(ids or count(), observations, strict=False):
                 if observation is not None and not holds(space, observation):
                     raise ObservationError(
-                        f"{operation} returned an observation outside of its space: "
-                        f"sub-environment {index} gave {_shown(observation)}, which is not in "
-                        f"{space}",
+                        f"{operation} returned an observation outside its space: sub-environment "
+                        f"{index} gave {_shown(observation)}, which is not in {space}",
                         index=index,
                         observation=observation,
                     )
@@ -122,9 +140,10 @@ def _read_and_check(
     members: Callable[[Any], Iterable[Any]],
     single: gym.Space[Any],
     actions: Any,
+    ids: Sequence[int] = (),
 ) -> Any:
     batch = read(actions)
-    for index, action in enumerate(members(batch)):
+    for index, action in zip(ids or count(), members(batch), strict=False):
         if not holds(single, action):
             raise ActionError(
                 f"the action of sub-environment {index} is outside of its space: "

@@ -19,6 +19,8 @@ from gymnasium.vector import VectorEnv
 
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.session.env_session import EnvSession
+from envhub_sandbox.session.parts.fleet_session import AnySession, FleetSession
+from envhub_sandbox.session.parts.in_flight import SENT, InFlight, Received, Rows
 from envhub_sandbox.session.requests import Bounds, MessageFor, OneMessageFor
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.remote_warnings import level_of_the_caller
@@ -37,7 +39,7 @@ from envhub_worker.protocol.untrusted import UNTRUSTED
 _NOT_CALLED = frozenset({"reset", "step", "close"})
 """What ``AsyncVectorEnv.call`` refuses: it would take one sub-environment from under the others."""
 
-_OURS = frozenset({"prewarm", "sandbox"})
+_OURS = frozenset({"prewarm", "recv", "sandbox", "send", "send_reset"})
 """Public names that Gymnasium's vector environments do not have."""
 
 
@@ -64,14 +66,17 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         sandbox: What confines it, and what that holds, was denied and has done.
     """
 
-    def __init__(self, session: EnvSession) -> None:
+    def __init__(self, session: AnySession) -> None:
         manifest = session.manifest
         self._session = session
         self._requests = session.requests
         self._requests.face = type(self).__name__
         self._manifest = manifest
         self._timeouts = session.repository.timeouts
-        self._read_actions = from_manifest.action_reader(manifest)
+        self._read_actions = from_manifest.action_reader(manifest, manifest.num_envs)
+        self._readers: dict[int, Callable[[Any], Any]] = {}
+        self._flight: InFlight | None = None
+        self._still: Any = None
         self.num_envs = manifest.num_envs
         self.single_observation_space = manifest.single_observation_space
         self.single_action_space = manifest.single_action_space
@@ -86,7 +91,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             self.env_fns = from_manifest.env_fns(manifest, session.repository.label)
             self.observation_mode = "same"
         # processes end with the last reference to the proxy; interruption.md, rule 13
-        weakref.finalize(self, session.close).atexit = False
+        weakref.finalize(self, session.finalize).atexit = False
         self._warn_of_hidden_names()
 
     def _warn_of_hidden_names(self) -> None:
@@ -149,7 +154,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         # and the next request refused, although no reset_wait can follow.
         self._note_first_use()
         with self._requests.use.lock:
-            self._requests.refuse_if_busy("reset_async")
+            self._refuse_if_busy_for_reset(options)
             self._send_reset(seed, options)
             return self._end_reset(self._timeouts.reset_s)
 
@@ -162,7 +167,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         """Send the reset; ``reset_wait`` returns its results."""
         self._note_first_use()
         with self._requests.use.lock:
-            self._requests.refuse_if_busy("reset_async")
+            self._refuse_if_busy_for_reset(options)
             self._send_reset(seed, options)
             self._requests.waiting = "reset"
 
@@ -172,6 +177,12 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         if prewarm.starting is not None and not self.closed:
             prewarm.note_use()
 
+    def _refuse_if_busy_for_reset(self, options: dict[str, Any] | None) -> None:
+        """A reset of all drops what was sent and not received."""
+        if self._requests.waiting == SENT and "reset_mask" not in (options or {}):
+            self._in_flight().drop()
+        self._requests.refuse_if_busy("reset_async")
+
     def _send_reset(self, seed: Any, options: dict[str, Any] | None) -> None:
         mask = None
         if options is not None and "reset_mask" in options:
@@ -180,6 +191,9 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             from_manifest.check_mask(mask, self.num_envs)
         seeds = self._seeds(seed)
         self._recover()
+        self._requests.submit("reset", self._reset_message(seeds, options, mask))
+
+    def _reset_message(self, seeds: Any, options: Any, mask: Any) -> MessageFor:
         sliced = self._manifest.shardable and seeds is not None
 
         def message(number: int, bounds: Bounds) -> m.Message:  # is kept: it must not refer to self
@@ -187,7 +201,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             some = seeds[start:stop] if sliced else seeds
             return m.Reset(number, some, options, None if mask is None else mask[start:stop])
 
-        self._requests.submit("reset", message)
+        return message
 
     def _recover(self) -> None:
         try:
@@ -266,6 +280,121 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             timeout_s = self._timeouts.step_s if timeout is None else timeout
             *done, infos = self._requests.collect_step(timeout_s)
         return (*done, self._requests.results.joined(infos))
+
+    # --- send and recv -------------------------------------------------------------------------
+
+    @short_traceback
+    def send(self, actions: Any, env_ids: Any = None) -> None:
+        """Send actions to some sub-environments; ``recv`` returns the results.
+
+        A worker steps all of its sub-environments together, so ``env_ids`` must have all or none of
+        them. With ``make_env(..., min_ready=...)`` each sub-environment has a worker of its own.
+
+        May be called again before the results are received, up to sixteen times for each
+        sub-environment, which takes the actions one after the other.
+
+        Args:
+            actions: A batch of ``n`` actions, in the order of ``env_ids``.
+            env_ids: Numbers of sub-environments: integers ``(n,)``, each at most once; None for
+                all.
+
+        Raises:
+            ActionError: A wrong shape, dtype or id; nothing was sent.
+            AlreadyPendingCallError: Another request is pending, or sixteen steps are.
+            WorkerError: A worker has died or is late; nothing was sent. ``env_ids`` of the error
+                are its sub-environments: send to others, or restart it by ``send_reset``.
+        """
+        flight = self._in_flight()
+        rows = flight.rows(env_ids)
+        flight.send(rows, self._read_rows(rows, actions))
+
+    @short_traceback
+    def send_reset(
+        self,
+        env_ids: Any = None,
+        *,
+        seed: int | Sequence[int | None] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> None:
+        """Send a reset to some sub-environments; ``recv`` returns its results, with rewards of 0.
+
+        A worker that has died or is late is first restarted, as by ``reset``.
+
+        Args:
+            env_ids: As in ``send``; nothing may be pending for them.
+            seed: One seed (sub-environment ``i`` gets ``seed + i``), one for each of ``env_ids``,
+                or None.
+            options: Passed to each sub-environment.
+
+        Raises: As ``send``.
+        """
+        if "reset_mask" in (options or {}):
+            raise ValueError(
+                "`send_reset` takes no `reset_mask`: name sub-environments by `env_ids`"
+            )
+        flight = self._in_flight()
+        rows = flight.rows(env_ids)
+        flight.send_reset(rows, self._reset_message(self._seeds_of(rows, seed), options, None))
+
+    def _seeds_of(self, rows: Rows, seed: Any) -> Any:
+        """A seed or None for each sub-environment of all, of which those of ``rows`` count."""
+        if seed is None or isinstance(seed, (int, np.integer)):
+            return self._seeds(seed)
+        given = list(seed)
+        if len(given) != len(rows.named):
+            raise ValueError(
+                f"`seed` has {len(given)} entries for {len(rows.named)} sub-environments"
+            )
+        by_id = dict(zip(rows.named, given, strict=True))
+        return self._seeds([by_id.get(index) for index in range(self.num_envs)])
+
+    @short_traceback
+    def recv(self, min_ready: int | None = None, timeout: float | None = None) -> Received:
+        """The results of the first sub-environments that are ready.
+
+        Takes the results of whole workers, in the order in which they became ready, until there are
+        ``min_ready`` sub-environments, or no more results to come. Other results stay for the next
+        call. Infos and autoreset are as in ``step``.
+
+        Args:
+            min_ready: How many sub-environments to wait for; by default the value given to
+                ``make_env``, otherwise all.
+            timeout: Seconds to wait, or None for no limit. Each step also has ``Timeouts.step_s``.
+
+        Returns:
+            ``observations, rewards, terminations, truncations, infos, env_ids``, each with ``n``
+            rows in the order of ``env_ids``: observations ``(n, *single_observation_space.shape)``,
+            rewards float64 ``(n,)``, both flags bool ``(n,)``, ``env_ids`` int64 ``(n,)`` and
+            ascending.
+
+        Raises:
+            NoAsyncCallError: Nothing was sent.
+            WorkerTimeoutError: ``timeout`` has passed, and nothing is lost; or the step of one
+                worker took longer than ``Timeouts.step_s``.
+            WorkerDiedError: The process of a worker ended.
+            RemoteEnvError: A sub-environment raised; it is still usable.
+
+        The last three have the worker's sub-environments in ``env_ids``, and no further result
+        comes for these. The others continue, and the next call has their results.
+        """
+        wanted = self._session.repository.min_ready if min_ready is None else min_ready
+        if wanted is not None and wanted < 1:
+            raise ValueError(f"`min_ready` is {wanted}, and must be at least 1")
+        return self._in_flight().recv(self.num_envs if wanted is None else wanted, timeout)
+
+    def _in_flight(self) -> InFlight:
+        if self._flight is None:
+            session = self._session
+            parts = session.parts if isinstance(session, FleetSession) else [session]
+            self._flight = InFlight(self._requests, parts)
+        return self._flight
+
+    def _read_rows(self, rows: Rows, actions: Any) -> Any:
+        """The batch of actions for these, checked as those of all are."""
+        count = len(rows.named)
+        if count not in self._readers:
+            self._readers[count] = from_manifest.action_reader(self._manifest, count)
+        return self._readers[count](actions)
 
     # --- everything else -----------------------------------------------------------------------
 
@@ -353,9 +482,12 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
     def render(self) -> tuple[Any, ...] | None:
         """What each sub-environment renders; None where the environment gives None."""
         replies = self._requests.ask("render", lambda number, _: m.Render(number))
-        if not self._manifest.shardable:
-            return cast("tuple[Any, ...] | None", replies[0].value)
-        return self._requests.one_each("render", replies)
+        if self._manifest.shardable:
+            rendered = self._requests.one_each("render", replies)
+        else:
+            rendered = cast("tuple[Any, ...]", replies[0].value)
+        self._still = rendered[0] if isinstance(rendered, tuple) and rendered else None
+        return rendered
 
     @property  # type: ignore[misc]  # there is nothing to set, as in SyncVectorEnv
     @short_traceback
@@ -396,7 +528,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
 
     def close(self, **kwargs: Any) -> None:
         """Close the sub-environments and end their processes, in bounded time. Idempotent."""
-        if self._requests.waiting is not None and not self.closed:
+        if self._requests.waiting not in (None, SENT) and not self.closed:
             warnings.warn(
                 f"Calling `close` while waiting for a pending call to `{self._requests.waiting}` "
                 "to complete.",
@@ -443,7 +575,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
     def _repr_html_(self) -> str:
         from envhub_sandbox.vector.html_repr import environment_html
 
-        return environment_html(self, self.sandbox.report())
+        return environment_html(self, self.sandbox.report(), self._still)
 
     __html__ = _repr_html_
 
@@ -452,12 +584,15 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
 
         None where the repository's own class joins them, or where it cannot be asked now.
         """
-        results, state = self._requests.results, self._session.lifecycle.state
-        if not self._manifest.shardable or self.num_envs != 1:
+        results, session = self._requests.results, self._session
+        if not isinstance(session, EnvSession) or not self._manifest.shardable:
             return None
-        with self._requests.use.hold("make_env"):
-            if not results.apart and (self._session.lease.lane is None or state is State.READY):
-                self._session.lease.take_apart(Deadline(self._timeouts.call_s))
+        if self.num_envs != 1:
+            return None
+        state = session.lifecycle.state
+        with session.use.hold("make_env"):
+            if not results.apart and (session.lease.lane is None or state is State.READY):
+                session.lease.take_apart(Deadline(self._timeouts.call_s))
         return VectorApart(self._reset, self._step, results.own) if results.apart else None
 
     def _ask_one(self, name: str, index: int, message: OneMessageFor) -> m.Message:
@@ -479,6 +614,11 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
                 f"num_envs={self.num_envs} but got length={len(seeds)}."
             )
         return seeds
+
+
+def leave_suite(env: SandboxVectorEnv) -> None:
+    """Have its first use start no other task of its suite: ``EnvSuites.map`` does that."""
+    env._session.prewarm.on_first_use(lambda: None, lambda: False)
 
 
 def _check_name(name: object) -> None:

@@ -26,6 +26,13 @@ snapshots in ``D``, by default below ``$XDG_STATE_HOME``. ``envhub-worker keygen
 makes a key pair, ``envhub-worker status`` says who uses a listening server, ``envhub-worker drain``
 ends it gently.
 
+A program that starts such a server for one client of its own adds ``--only-client KEY``, the public
+key of that client: the server's own pair is made for this one life and is on no disk, there is no
+note for the other commands. Such a server ends with that program by ``--client-pidfd N``, where
+what lies in ``D`` is shared with other such servers, or by ``--until-eof``. It says its public key
+once the endpoint is bound: after the endpoint, in the one line that ``--ready-fd N`` gets, or in
+that of ``--announce``.
+
 ``envhub-worker health [--port 5555] [--state-dir D]`` exits with 0 if a server of this container
 answers, else 1.
 """
@@ -110,7 +117,8 @@ def _add_others(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
 if __name__ == "__main__":
     if not (sys.flags.isolated or getattr(sys.flags, "safe_path", False)):
         sys.exit(
-            "envhub-worker: not run, since python -m looks for modules in the current folder "
-            f"first. Use: envhub-worker, or: {sys.executable} -I -m envhub_worker"
+            "envhub-worker did not start: python -m imports modules from the current folder "
+            f"first, which may be untrusted. Use: envhub-worker, or: {sys.executable} -I -m "
+            "envhub_worker"
         )
     sys.exit(main())

@@ -67,10 +67,10 @@ def why_file_unwritable(error: BaseException, root: str) -> str:
             "another file there, and os.chmod(path, 0o644) makes it this jail's own"
         )
     return (
-        f"{path} lies in {place}, which this jail only reads. Write to tempfile.mkdtemp(), or use "
-        'the profile "strict" on Linux 5.11 or later, where a jail writes to a copy of the '
-        "repository and of the packages of its own (dependencies=); `envhub doctor` says what this "
-        "host lacks"
+        f"{path} is in {place}, which is read-only in this jail. Write to tempfile.mkdtemp(), or "
+        'use the profile "strict" on Linux 5.11 or later, where a jail writes to its own copy of '
+        "the repository and of its packages (dependencies=); `envhub doctor` says what this host "
+        "lacks"
     )
 
 

@@ -40,11 +40,16 @@ class Loop:
         self._callbacks: dict[Any, Callable[[], None]] = {}
         self._stopped = False
         self._tick: Callable[[], None] | None = None
+        self._look: Callable[[], int | None] = _nothing
         self._failures = 0
 
     def tick(self, callback: Callable[[], None]) -> None:
         """Call back about once a second, from now on."""
         self._tick = callback
+
+    def look_by(self, callback: Callable[[], int | None]) -> None:
+        """Call back before each wait; it says how many milliseconds that may last, or None."""
+        self._look = callback
 
     def watch(self, source: Any, callback: Callable[[], None]) -> None:
         """Call back when there is something to read."""
@@ -82,13 +87,21 @@ class Loop:
         """Call back until ``stop``."""
         ticked = monotonic()
         while not self._stopped:
-            for ready, _ in self._poller.poll(_POLL_MS):
+            for ready, _ in self._poller.poll(self._wait_ms()):
                 callback = self._callbacks.get(ready)
                 if callback is not None:
                     self._call(callback)
             if self._tick is not None and monotonic() - ticked >= _POLL_MS / 1000:
                 ticked = monotonic()
                 self._call(self._tick)
+
+    def _wait_ms(self) -> int:
+        try:
+            wait_ms = self._look()
+        except Exception as error:  # as for a callback
+            self._failed(error)
+            return _POLL_MS
+        return _POLL_MS if wait_ms is None else wait_ms
 
     def _call(self, callback: Callable[[], None]) -> None:
         """One client's misfortune is not everybody's; what fails again and again is the end."""
@@ -101,6 +114,10 @@ class Loop:
             self._failed(error)
         else:
             self._failures = 0
+
+
+def _nothing() -> None:
+    """There is nothing to look at."""
 
 
 def has_message(socket: zmq.Socket[bytes]) -> bool:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import ctypes
 import os
 from collections.abc import Callable, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from envhub_worker.loop import Loop, has_message, send
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.kinds import Buffer
 from envhub_worker.protocol.errors import ProtocolError
-from envhub_worker.protocol.limits import DEFAULT_LIMITS, LARGE_BYTES, WireLimits
+from envhub_worker.protocol.limits import DEFAULT_LIMITS, LARGE_BYTES
 from envhub_worker.protocol.messages import compression
 from envhub_worker.protocol.text import shortage
 from envhub_worker.spawn.zygote_process import ZygoteProcess
@@ -45,13 +46,11 @@ class Server:
         runtime_dir: Path,
         readable_roots: Sequence[str],
         client_pidfd: int | None = None,
-        limits: WireLimits = DEFAULT_LIMITS,
         fd_path: Path | None = None,
         gate: Gate | None = None,
         ahead: ZygoteProcess | None = None,
     ) -> None:
         self._runtime_dir = runtime_dir
-        self._limits = limits
         self._gate: Gate = gate or LocalGate()
         self._sessions = Sessions()
         self._loop = Loop(self._gate.witness.failed)
@@ -66,7 +65,6 @@ class Server:
             self.reply,
             runtime_dir,
             readable_roots,
-            limits,
             fd_path or runtime_dir / "fds",
             ahead,
             self._gate.witness,
@@ -108,7 +106,7 @@ class Server:
     def _listen(self, endpoint: str) -> zmq.Socket[bytes]:
         router = self._context.socket(zmq.ROUTER)
         router.setsockopt(zmq.LINGER, 0)
-        router.setsockopt(zmq.MAXMSGSIZE, self._limits.frame_bytes)
+        router.setsockopt(zmq.MAXMSGSIZE, DEFAULT_LIMITS.frame_bytes)
         router.setsockopt(zmq.RCVHWM, _RCVHWM)
         router.setsockopt(zmq.ROUTER_HANDOVER, 0)
         router.setsockopt(zmq.IPV6, "[" in endpoint)
@@ -147,8 +145,8 @@ class Server:
         session = self._sessions.find(identity, key)
         try:
             if self._compression(identity, key):
-                frames[:] = compression.unpack_frames(frames, self._limits)
-            number, request = m.unpack_header(frames[0], limits=self._limits)
+                frames[:] = compression.unpack_frames(frames, DEFAULT_LIMITS)
+            number, request = m.unpack_header(frames[0])
         except Exception as error:
             self._refuse_unread(identity, key, frames[0], error)
             return
@@ -199,7 +197,10 @@ class Server:
     def reply(self, asker: Asker, message: m.Message, payload: Sequence[Buffer] = ()) -> None:
         """Answer a request."""
         self._gate.answered(asker, message)
-        frames = [*m.pack_header(message, asker.request_id), *payload]
+        header, *buffers = (
+            _packed_done(message.parts) if type(message) is m.RelayDone else m.pack(message)
+        )
+        frames = [m.with_id(header, asker.request_id), *buffers, *payload]
         if agreed := self._compression(asker.identity, asker.key):
             frames = compression.pack_frames(frames, agreed)
         copy = sum(map(len, payload)) < LARGE_BYTES
@@ -228,10 +229,16 @@ class Server:
         self._sessions.agree(asker.identity, asker.key, str(chosen))
 
 
+@lru_cache(maxsize=64)  # of small numbers, that the server has counted
+def _packed_done(parts: tuple[int, ...]) -> list[Buffer]:
+    return m.pack(m.RelayDone(parts))
+
+
 _HANDLERS: dict[type[m.Message], Callable[[Jails, Asker, Any], m.Message | None]] = {
     m.OpenJail: Jails.open,
     m.StartRunners: Jails.start_more,
     m.KeepJail: Jails.keep,
+    m.ShareSlabs: Jails.share,
     m.ExpireIdle: Jails.expire,
     m.CloseJail: Jails.close_jail,
     m.ReadOutput: Jails.read_output,

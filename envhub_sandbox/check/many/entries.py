@@ -72,9 +72,9 @@ def read_entries(file: IO[bytes], title: str) -> list[ListEntry]:
     if wrong:
         more = [f"and {len(wrong) - _SHOWN} more"] if len(wrong) > _SHOWN else []
         lines = "\n".join([*(f"{title}:{line}: {what}" for line, what in wrong[:_SHOWN]), *more])
-        raise HubReferenceError(f"nothing was run, for the list cannot be read:\n{lines}")
+        raise HubReferenceError(f"nothing was run, because the list cannot be read:\n{lines}")
     if not found:
-        raise HubReferenceError(f"{title} has no reference in it: one a line")
+        raise HubReferenceError(f"{title} has no reference; write one on each line")
     if len(found) > MOST:
         raise HubReferenceError(f"{title} has more than {MOST} references; divide it")
     return list(found.values())
@@ -89,21 +89,23 @@ def _read_into(found: dict[str, ListEntry], text: str) -> Iterator[tuple[int, st
         try:
             reference, meaning = _meaning(written)
         except (EnvHubError, OSError, ValueError) as error:
-            hint = "; a comment has a line of its own" if " #" in written else ""
+            hint = "; put a comment on its own line" if " #" in written else ""
             yield number, printable(f"{error}{hint}", _LONGEST)
             continue
         first = found.setdefault(meaning, ListEntry(reference, meaning, number))
         if first.line != number:
-            yield number, f"{reference} stands in line {first.line} already, as {first.reference}"
+            yield number, f"{reference} is already in line {first.line}, as {first.reference}"
 
 
 def _meaning(reference: str) -> tuple[str, str]:
     if len(reference) > _LONGEST or has_control_characters(reference):
-        raise HubReferenceError("this is no reference: too long, or with control characters")
+        raise HubReferenceError(
+            "this is not a reference: it is too long, or has control characters"
+        )
     if is_here(reference):
         folder, path = split_local(reference, DEFAULT_PATH)
         if path == os.pardir or path.startswith(f"{os.pardir}/") or os.path.isabs(path):
-            raise HubReferenceError(f"{reference}: its entry lies outside of its folder")
+            raise HubReferenceError(f"{reference}: its entry file is outside its folder")
         return reference, f"{folder.resolve()}:{path}"
     ref = HubRef.parse(reference)
     return str(ref), ref.meaning

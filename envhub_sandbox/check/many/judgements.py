@@ -11,6 +11,7 @@ import os
 import shutil
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Callable, Generator, Iterable, Mapping
 from dataclasses import dataclass
@@ -19,6 +20,7 @@ from typing import Any, Generic, TypeVar
 
 from envhub_sandbox.errors import WorkerStartupError
 from envhub_sandbox.system import processes
+from envhub_sandbox.system.platform import kill_group, own_group
 from envhub_worker.protocol.text import printable, size_text
 
 _TICK_S = 0.1
@@ -72,7 +74,7 @@ class _Job(Generic[T]):
                 stderr=err,
                 env={**os.environ, **variables},
                 pass_fds=(ourselves,),
-                start_new_session=True,  # Ctrl-C is for us, who then end it
+                **own_group(),  # Ctrl-C is for us, who then end it
             )
 
     @property
@@ -80,24 +82,25 @@ class _Job(Generic[T]):
         """Asked so that its number stays its own until its group is killed."""
         if self._process.returncode is not None:
             return True
-        try:
-            how = os.WEXITED | os.WNOHANG | os.WNOWAIT
-            return os.waitid(os.P_PID, self._process.pid, how) is not None
-        except ChildProcessError:  # SIGCHLD is ignored since before we started
-            return True
+        ended = True
+        if sys.platform == "linux":
+            with contextlib.suppress(ChildProcessError):  # SIGCHLD is ignored since before us
+                how = os.WEXITED | os.WNOHANG | os.WNOWAIT
+                ended = os.waitid(os.P_PID, self._process.pid, how) is not None
+        else:
+            ended = self._process.poll() is not None
+        return ended
 
     def terminate(self) -> None:
         """Ask it to end."""
-        self._signal(os.kill, signal.SIGTERM)
+        if self._process.returncode is None:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(self._process.pid, signal.SIGTERM)
 
     def kill(self) -> None:
         """End it by force, and what it has left in its group, also where it has ended itself."""
-        self._signal(os.killpg, signal.SIGKILL)
-
-    def _signal(self, send: Callable[[int, int], None], number: signal.Signals) -> None:
         if self._process.returncode is None:
-            with contextlib.suppress(ProcessLookupError):
-                send(self._process.pid, number)
+            kill_group(self._process)
 
     def reap(self) -> int | None:
         """Its exit code; None where the kernel cannot end it."""
@@ -126,7 +129,7 @@ class _Job(Generic[T]):
 
     def _too_much(self, most_s: float) -> str:
         if time.monotonic() - self._begun > most_s:
-            return f"there was no verdict within {most_s:g} s (--deadline)"
+            return f"there was no result within {most_s:g} s (--deadline)"
         if any(self._file(name).stat().st_size > _MOST_BYTES for name in ("out", "err")):
             return f"it printed more than {size_text(_MOST_BYTES)}"
         return ""
@@ -150,8 +153,8 @@ def _started(command: list[str], **how: Any) -> subprocess.Popen[bytes]:
         return subprocess.Popen(command, **how)
     except OSError as error:
         raise WorkerStartupError(
-            f"no judgement can be started: {error.strerror}. What has been judged is kept; let "
-            "fewer run at once, by --jobs"
+            f"no check can be started: {error.strerror}. Finished results are kept; run fewer at "
+            "once with --jobs"
         ) from error
 
 

@@ -129,14 +129,12 @@ class Results:
         self._folder.mkdir(parents=True, exist_ok=True)
         mark = self._folder / _MARK
         if not mark.exists() and any(self._folder.iterdir()):
-            raise FolderError(
-                f"{self._folder} has other things in it, and no results: name a new folder"
-            )
+            raise FolderError(f"{self._folder} has other files and no results: name a new folder")
         with contextlib.ExitStack() as lock:
             try:
                 lock.enter_context(held(mark, mode=0o666))
             except TimeoutError:
-                why = f"another run writes to {self._folder}; wait for its end"
+                why = f"another run is writing to {self._folder}; wait until it has ended"
                 raise FolderError(why) from None
             yield
 
@@ -160,14 +158,14 @@ class Results:
             return None
         data = content(path, MOST_BYTES)
         if data is None:
-            raise ForeignResultError(f"{path} is no file of ours")
+            raise ForeignResultError(f"{path} was not written by envhub")
         try:
             document = json.loads(data)
             how = document["judgement"]
             if how["settings"] != self._settings:
                 return None
             if how["reference"] != listed.meaning or how["page"] != self._digest(listed):
-                raise ValueError("not of this reference, or without its page")
+                raise ValueError("it is for another reference, or has no page")
             report, failures = reports.read_report(document)
             seconds, ended = _seconds(how["seconds"]), str(how["ended"])[:40]
         except (KeyError, TypeError, ValueError, RecursionError) as error:
@@ -191,7 +189,7 @@ class Results:
         try:
             report, failures = reports.read_report(document)
         except (KeyError, TypeError, ValueError) as error:
-            raise ForeignResultError(f"this is no report: {error}") from error
+            raise ForeignResultError(f"this is not a report: {error}") from error
         data = content(page, MOST_BYTES)
         if data is None:
             raise ForeignResultError("there is no page")

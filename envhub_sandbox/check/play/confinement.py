@@ -10,7 +10,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from envhub_worker.protocol.text import printable
+from envhub_worker.protocol.text import counted, printable
 
 _MOST, _LONGEST = 40, 300
 _WHOLE = "strict"
@@ -34,6 +34,7 @@ class Confinement:
     Attributes:
         asked: The profile that the caller named, or the default: no other is taken for it.
         profile: The one that its jails had; empty where it did not load.
+        held: How many layers held.
         missing: Layers that did not hold, by name, and why.
         unrecorded: Why what it tried was not recorded; empty where it was.
     """
@@ -42,6 +43,7 @@ class Confinement:
     profile: str
     missing: tuple[tuple[str, str], ...]
     unrecorded: str
+    held: int = 0
 
     @classmethod
     def of(cls, asked: str, provenance: Mapping[str, Any] | None, unrecorded: str) -> Confinement:
@@ -54,6 +56,7 @@ class Confinement:
             profile=ran.get("profile") or "",
             missing=tuple((_line(one.get("layer")), _line(one.get("detail"))) for one in missing),
             unrecorded=_line(unrecorded),
+            held=sum(one.get("enforced") is True for one in layers),
         )
 
     @property
@@ -61,18 +64,22 @@ class Confinement:
         """Whether a person should know that there was less than there can be."""
         return (self.profile or self.asked) != _WHOLE or bool(self.unrecorded)
 
-    def lines(self) -> Iterator[str]:
-        """In words, one line each."""
+    def rows(self) -> Iterator[tuple[str, str]]:
+        """In the words of ``envhub run``: what is said, and about what."""
         if not self.profile:
-            yield f"profile {self.asked}, as asked for; it did not load"
-        elif self.profile == self.asked:
-            yield f"profile {self.profile}, as asked for"
+            yield "confined by", f"{self.asked}; it did not load"
         else:
-            yield f"profile {self.profile}, within a container; {self.asked} was asked for"
+            layers = f"{self.profile}, {counted(self.held, 'layer')}"
+            other = f", in a container; {self.asked} was asked for"
+            yield "confined by", layers + other * (self.profile != self.asked)
         for layer, why in self.missing:
-            yield f"without {layer}: {why}"
+            yield "not enforced", f"{layer}: {why}"
         if self.unrecorded:
-            yield f"what it tried and was denied is not recorded: {self.unrecorded}"
+            yield "not recorded", f"denied attempts: {self.unrecorded}"
+
+    def lines(self) -> Iterator[str]:
+        """The same, one line each."""
+        yield from (f"{title}: {text}" for title, text in self.rows())
 
     def document(self) -> dict[str, Any]:
         """As plain data."""
@@ -102,10 +109,13 @@ def denial_findings(denied: Iterable[str]) -> dict[str, list[str]]:
 def _finding(one: str) -> tuple[str, str]:
     deed, _, path = one.partition(" ")
     if path.startswith("/"):
-        return "denied-files", f"asked to {_DEEDS.get(deed, deed)} {path}, which is not its own"
+        return (
+            "denied-files",
+            f"asked to {_DEEDS.get(deed, deed)} {path}, which is outside its own folders",
+        )
     if deed == "limit":
-        return "limits-reached", f"used up what limits permit of {path.lower()}"
+        return "limits-reached", f"reached the limit of {path.lower()}"
     if one.endswith(_OTHER):
-        return "denied-kernel", f"tried {deed} of a process that is not its own"
+        return "denied-kernel", f"tried {deed} on another process"
     is_network = one.startswith(_NETWORK) and one not in _LOCAL
-    return "denied-network" if is_network else "denied-kernel", f"tried {one}, and was refused"
+    return "denied-network" if is_network else "denied-kernel", f"tried {one}, which was denied"

@@ -264,8 +264,8 @@ def rollout(
             observe(counter)
     except gym.error.CustomSpaceError as error:
         raise RolloutError(
-            f"its action space is its own ({str(env.single_action_space)[:200]}), and no policy of "
-            "ours can make actions for it; drive it from Python"
+            f"its action space is a class of its own ({str(env.single_action_space)[:200]}), for "
+            "which envhub cannot make actions; use it from Python"
         ) from error
     result.steps, result.complete = counter.steps, counter.finished
     return result

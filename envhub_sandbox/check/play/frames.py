@@ -29,7 +29,7 @@ def wrong_frames(env: VectorEnv[Any, Any, Any]) -> Iterator[str]:
         return
     given = env.render()
     if not isinstance(given, (tuple, list)) or len(given) != env.num_envs:
-        yield f"{mode}: render() gave {kind(given)}, and nothing for each sub-environment"
+        yield f"{mode}: render() gave {kind(given)}, not one result for each sub-environment"
         return
     for index, one in enumerate(given):
         if not _fits(one, mode):

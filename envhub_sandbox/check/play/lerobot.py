@@ -19,20 +19,19 @@ _LONGEST = 100
 
 
 def lerobot_lacks(env: VectorEnv[Any, Any, Any]) -> Iterator[str]:
-    """At most one text: what an evaluation by LeRobot would miss, and who can play it instead."""
+    """At most one text: what an evaluation by LeRobot would miss."""
     observations, actions = env.single_observation_space, env.single_action_space
     lacks = []
     if not isinstance(observations, spaces.Dict) or not {*_SEEN} & {*observations.spaces}:
         lacks.append(
-            f"a mapping with {', '.join(_SEEN[:-1])} or {_SEEN[-1]} to observe, not "
-            f"{_named(observations)}"
+            f"observations with {', '.join(_SEEN[:-1])} or {_SEEN[-1]}, not {_named(observations)}"
         )
     if not isinstance(actions, spaces.Box) or len(actions.shape) != 1:
-        lacks.append(f"a vector (Box) for its action, not {_named(actions)}")
+        lacks.append(f"a vector (Box) as action, not {_named(actions)}")
     if not _has(env, "_max_episode_steps"):
         lacks.append("_max_episode_steps (gymnasium.wrappers.TimeLimit has it)")
     if lacks:
-        yield f"loops of Gymnasium's vector environments play it; LeRobot needs {'; '.join(lacks)}"
+        yield f"LeRobot cannot evaluate it, which needs {'; '.join(lacks)}"
 
 
 def _named(space: spaces.Space[Any]) -> str:

@@ -13,8 +13,9 @@ from gymnasium.vector import VectorEnv
 
 from envhub_sandbox.check.play import video
 from envhub_sandbox.check.play.episodes import Episode
-from envhub_sandbox.check.play.video import Frame, even, png, small_picture
+from envhub_sandbox.check.play.video import even
 from envhub_sandbox.errors import EnvHubError
+from envhub_sandbox.vector.pictures import Frame, png, small_picture
 from envhub_worker.protocol.text import printable
 
 _SIDE = 320
@@ -120,7 +121,7 @@ def film(env: VectorEnv[Any, Any, Any], *, seed: int, seconds: float = _SECONDS)
     chosen = np.linspace(0, len(frames) - 1, min(_STILLS, len(frames))).astype(int)
     stills = tuple(png(frames[at]) for at in chosen)
     if not frames or not video.can_encode():
-        ask = "pip install 'envhub-sandbox[video]' and judge again for a film of it"
+        ask = "pip install 'envhub-sandbox[video]' and check it again for a film"
         return Film(stills, frames=len(frames), lacks=lacks or ask)
     try:
         return Film(stills, video.encoded(frames, fps), len(frames), fps, lacks)

@@ -321,12 +321,12 @@ def _untyped(reward: Any, terminated: Any, truncated: Any, info: Any) -> Iterato
     """What Gymnasium's ``check_env`` refuses of a step. Trust: input from the worker."""
     is_vector = isinstance(reward, np.ndarray) and reward.size > 1  # as mo-gymnasium's
     if not is_vector and not isinstance(reward, (int, float, np.integer, np.floating)):
-        yield f"the reward is {frames.kind(reward)}, and no number"
+        yield f"the reward is {frames.kind(reward)}, not a number"
     for name, value in (("terminated", terminated), ("truncated", truncated)):
         if not isinstance(value, (bool, np.bool_)):
-            yield f"{name} is {frames.kind(value)}, and no bool"
+            yield f"{name} is {frames.kind(value)}, not a bool"
     if not isinstance(info, Mapping):
-        yield f"the info is {frames.kind(info)}, and no dict"
+        yield f"the info is {frames.kind(info)}, not a dict"
 
 
 def _can_be_guessed(space: spaces.Space[Any]) -> bool:

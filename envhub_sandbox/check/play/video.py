@@ -1,4 +1,4 @@
-"""Makes small pictures of rendered frames, and writes videos with imageio's bundled ffmpeg.
+"""Looks at rendered frames, and writes videos with imageio's bundled ffmpeg.
 
 Frames come from the worker, so they are judged before they go to an encoder.
 """
@@ -7,17 +7,15 @@ from __future__ import annotations
 
 import importlib.util
 import os
-import struct
-import zlib
 from collections.abc import Generator, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from envhub_sandbox.errors import EnvHubError, RemoteEnvError
+from envhub_sandbox.vector.pictures import Frame
 from envhub_worker.protocol.codec.inert import one_line
 
 MAX_SIDE = 4096
@@ -27,7 +25,6 @@ MIN_FPS = 0.1
 """Below, the times of frames are more than some containers can write."""
 MAX_FPS = 240.0
 SUFFIXES = (".mp4", ".mkv", ".mov")
-Frame = NDArray[np.uint8]
 
 
 class VideoError(EnvHubError):
@@ -38,8 +35,8 @@ def check_target(path: Path) -> None:
     """Refuse a target that cannot work, before anything is run. Raises ``VideoError``."""
     if not can_encode():
         raise VideoError(
-            "writing a video needs imageio's ffmpeg, which is not installed here; install it with: "
-            "pip install 'envhub-sandbox[video]'"
+            "writing a video needs imageio's ffmpeg, which is not installed; install it with: pip "
+            "install 'envhub-sandbox[video]'"
         )
     if path.suffix.lower() not in SUFFIXES:
         raise VideoError(f"{path}: a video is written as {', '.join(SUFFIXES)}")
@@ -104,7 +101,7 @@ def first_frame(rendered: Any, render_mode: str | None) -> Frame:
         frame = rendered[0]
     if not isinstance(frame, np.ndarray):
         gave = "None" if frame is None else f"a {type(frame).__name__}"
-        raise VideoError(f"render() gave {gave}, no frame. {_advice(render_mode)}")
+        raise VideoError(f"render() gave {gave}, which is not a frame. {_advice(render_mode)}")
     if frame.dtype != np.uint8 or frame.ndim != 3 or frame.shape[2] != 3:
         raise VideoError(
             f"render() gave {frame.dtype} of shape {frame.shape}; a video takes uint8 of shape "
@@ -183,38 +180,7 @@ class VideoWriter:
         self.close()
 
 
-# --- small pictures, encoded here of what was judged: no bytes of a worker are passed on --------
-
-
-def small_picture(frame: Frame, side: int) -> Frame:
-    """A frame of which no side is longer than that: the mean of each block of pixels."""
-    block = -(-max(frame.shape[:2]) // side)
-    if block <= 1:
-        return frame
-    # a side that is shorter than a block, of a frame of one line, is a block of its own
-    down, across = (min(block, length) for length in frame.shape[:2])
-    height, width = frame.shape[0] // down, frame.shape[1] // across
-    blocks = frame[: height * down, : width * across].reshape(height, down, width, across, 3)
-    small: Frame = blocks.mean((1, 3), np.float32).round().astype(np.uint8)
-    return small
-
-
 def even(frame: Frame) -> Frame:
     """A frame with even sides, as encoders need them: an odd one repeats its last row or column."""
     height, width, _ = frame.shape
     return np.pad(frame, ((0, height % 2), (0, width % 2), (0, 0)), mode="edge")
-
-
-def png(frame: Frame) -> bytes:
-    """A frame as PNG, uint8 ``(height, width, 3)``: eight bits, RGB, filter "Up"."""
-    height, width, _ = frame.shape
-    lines = np.ascontiguousarray(frame).reshape(height, width * 3)
-    above = np.vstack([np.zeros((1, width * 3), np.uint8), lines[:-1]])
-    filtered = np.hstack([np.full((height, 1), 2, np.uint8), lines - above])  # modulo 256
-    head = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    chunks = ((b"IHDR", head), (b"IDAT", zlib.compress(filtered.tobytes(), 6)), (b"IEND", b""))
-    return b"\x89PNG\r\n\x1a\n" + b"".join(_chunk(name, data) for name, data in chunks)
-
-
-def _chunk(name: bytes, data: bytes) -> bytes:
-    return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))

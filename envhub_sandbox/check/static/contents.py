@@ -44,7 +44,7 @@ _NO_ARCHIVES = (".npz", ".keras")
 _SAID = {
     "machine code": ("source-native", "a file of machine code"),
     "compiled Python": ("source-compiled", "compiled Python"),
-    "pickle": ("source-pickle", "a file that is, or may hold, a pickle"),
+    "pickle": ("source-pickle", "a file that is or may contain a pickle"),
     "archive": ("source-unread", "an archive: nothing in it has been read"),
     "LFS pointer": ("source-unread", "a pointer of git LFS, without the file that it means"),
 }
@@ -126,6 +126,6 @@ def hidden(name: str, text: str, *, is_code: bool) -> Iterator[Finding]:
 
 def _called(character: str) -> str:
     if len(character) > 1:
-        return f"holds {character!r}, with Latin and other letters that look like them"
+        return f"holds {character!r}, which mixes Latin letters with others that look like them"
     words = unicodedata.name(character, "a control character").lower()
     return f"holds U+{ord(character):04X}, {words}"

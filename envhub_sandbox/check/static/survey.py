@@ -108,9 +108,9 @@ def _in_code(record: FileRecord, parsed: ParsedFile | None) -> Iterator[Finding]
         yield Finding("source-unparsed", message, file=record.path)
         return
     if not parsed.is_python:
-        yield _unread(record, "it is no Python of this version")
+        yield _unread(record, "it is not Python of this version")
     if parsed.encoding is not None:
-        named = f"Python reads it as {parsed.encoding}" if parsed.encoding else "it is no UTF-8"
+        named = f"Python reads it as {parsed.encoding}" if parsed.encoding else "it is not UTF-8"
         yield Finding("source-encoding", f"{named}, and it has not been read", file=record.path)
     found = constructs(record.path, parsed)
     yield from itertools.islice(found, _MOST_OF_A_FILE)

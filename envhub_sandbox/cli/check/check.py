@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,11 +12,20 @@ import typer
 from envhub_sandbox.cli.check import options as own
 from envhub_sandbox.cli.check.deadline import DeadlineReached, deadline_alarm
 from envhub_sandbox.cli.shared import options as opt
-from envhub_sandbox.cli.shared.console import out, print_json, safe_line, say
+from envhub_sandbox.cli.shared.console import (
+    BAD,
+    DOUBTFUL,
+    GOOD,
+    out,
+    print_json,
+    safe_line,
+    say,
+    show,
+    show_rows,
+)
 from envhub_sandbox.cli.shared.exits import Exit, UsageError, reported
 from envhub_sandbox.cli.shared.findings import STYLES, annotate, level, show_finding, write_report
 from envhub_sandbox.cli.shared.progress import ProgressBar
-from envhub_worker.protocol.text import counted
 
 if TYPE_CHECKING:
     from envhub_sandbox.check.findings import Finding, Report
@@ -25,6 +34,7 @@ _PANEL = "What it says"
 _FILE = "FILE"
 _MAY = "What it may do"
 _LONG_S = 10.0
+_FIGURES = ("suite / task", "episodes", "steps", "a step", "slowest")
 
 
 def _with_settings(ctx: typer.Context, path: Path | None) -> Path | None:
@@ -216,7 +226,9 @@ def _known(names: Sequence[str]) -> Sequence[str]:
 
     for name in names:
         if name not in CHECKS:
-            raise UsageError(f"--allow names no check: {name!r}; there are {', '.join(CHECKS)}")
+            raise UsageError(
+                f"--allow {name!r}: there is no such check; there are: {', '.join(CHECKS)}"
+            )
     return names
 
 
@@ -264,22 +276,25 @@ def _write(report: Report, failures: list[Finding], *files: Path | None) -> None
 
 def _print_confinement(report: Report) -> None:
     """In the log of a workflow, too."""
-    for line in () if report.confinement is None else report.confinement.lines():
-        out(safe_line(line, 500), "dim")
+    for word, text in () if report.confinement is None else report.confinement.rows():
+        show(word, text)
 
 
 def _print(report: Report, failures: list[Finding]) -> None:
     out(safe_line(report.reference, 300), "bold")
     for one in report.findings:
         show_finding(one, fails=one in failures)
-    for task, figures in report.figures.items():
-        steps = counted(int(figures["steps"]), "step")
-        episodes = counted(int(figures["episodes"]), "episode")
-        out(
-            f"{safe_line(task)}: {steps}, {episodes}, "
-            f"a step takes {1e3 * figures['step_mean_s']:.2f} ms, the slowest "
-            f"{1e3 * figures['step_slowest_s']:.1f} ms",
-            "dim",
-        )
+    if report.figures:
+        out()
+        show_rows([_FIGURES, *map(_figures, report.figures.items())], right=range(1, 5))
+    out()
     _print_confinement(report)
-    say(f"{report.verdict(failures)}.")
+    unsure = DOUBTFUL if report.is_unjudged(failures) else BAD
+    say(f"{report.verdict(failures)}.", unsure if failures else GOOD)
+
+
+def _figures(of: tuple[str, Mapping[str, float]]) -> list[str]:
+    task, figures = of
+    means, most = 1e3 * figures["step_mean_s"], 1e3 * figures["step_slowest_s"]
+    counts = [f"{int(figures[name]):,}" for name in ("episodes", "steps")]
+    return [task, *counts, f"{means:.2f} ms", f"{most:.1f} ms"]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
-import os
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -28,14 +27,24 @@ from envhub_sandbox.check.many.results import (
 from envhub_sandbox.check.settings import merged_settings, read_file
 from envhub_sandbox.cli.check.options import refuse_options_of_the_judged
 from envhub_sandbox.cli.shared import options as opt
-from envhub_sandbox.cli.shared.console import print_json, safe_line, say, show
+from envhub_sandbox.cli.shared.console import (
+    BAD,
+    DOUBTFUL,
+    GOOD,
+    print_json,
+    safe_line,
+    say,
+    show,
+)
 from envhub_sandbox.cli.shared.exits import Exit, UsageError
 from envhub_sandbox.cli.shared.findings import annotate, write_report
 from envhub_sandbox.cli.shared.memory import free_memory_bytes
 from envhub_sandbox.cli.shared.versions import versions
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.hub.snapshot import commit_of
+from envhub_sandbox.sandboxes.ray import cluster
 from envhub_sandbox.settings.policy import policy_from
+from envhub_sandbox.system.platform import IS_WINDOWS, cores
 from envhub_worker.protocol.text import duration_text, size_text
 
 if TYPE_CHECKING:
@@ -104,6 +113,11 @@ class ListRun:
         """
         if self.output is None:
             raise UsageError("--all needs --output DIR, where reports and their index go")
+        if IS_WINDOWS:
+            raise UsageError(
+                "--all starts processes that must end with this one, which Windows cannot ensure: "
+                "check one reference after the other, or run it in WSL"
+            )
         self.of = {one: Result(listed=one) for one in self._listed()}
         places = {"--settings": self.settings, "--policy": self.policy, "--output": self.output}
         for one in self.of:
@@ -129,14 +143,17 @@ class ListRun:
             self._recall(one)
         self._write_index()
         token = self.make.given["token"]
+        # a token is handed on where no list of processes shows it
+        variables = {"HF_TOKEN": token, "HF_HUB_DISABLE_IMPLICIT_TOKEN": "0"} if token else {}
+        if self._is_on_ray:
+            variables["RAY_ADDRESS"] = cluster.shared_address()
         ended = judgements(
             self._waiting(),
             lambda one, place, ourselves: self._command(one, place, ourselves, policy),
             folder=running,
             jobs=jobs,
             most_s=self.deadline + _GRACE_S,
-            # a token is handed on where no list of processes shows it
-            variables={"HF_TOKEN": token, "HF_HUB_DISABLE_IMPLICIT_TOKEN": "0"} if token else {},
+            variables=variables,
         )
         try:
             with contextlib.closing(ended):
@@ -170,7 +187,8 @@ class ListRun:
                 show(one.verdict.value, one.listed.reference, _COLOURS.get(one.verdict))
                 for line in one.why:
                     show("", line, "dim")
-        say(f"{index.counts(results)}.")
+        style = {Exit.OK: GOOD, Exit.UNJUDGED: DOUBTFUL}.get(self.exit, BAD)
+        say(f"{index.counts(results)}.", style)
 
     @property
     def exit(self) -> Exit:
@@ -207,7 +225,7 @@ class ListRun:
             seconds=outcome.seconds,
             ended=now,
             said=outcome.said.removeprefix("Error: ")
-            or f"it ended with {outcome.code}, and gave no report",
+            or f"it ended with {outcome.code}, without a report",
         )
 
     def _say(self, listed: ListEntry, how: str = "") -> None:
@@ -239,6 +257,8 @@ class ListRun:
 
     def _at_once(self) -> int:
         """How many are judged at once: by cores, and by the limits of their jails together."""
+        if self._is_on_ray:  # which counts its nodes' cores, and has the others wait
+            return self.jobs or cluster.cpus()
         given = self.make.arguments()["policy"]
         says = {} if self.policy is None else read_file(self.policy)
         one = policy_from(merged_settings(says, given), None).limits.memory_bytes
@@ -251,12 +271,16 @@ class ListRun:
                 f"--max-memory {self.max_memory} is too little: {needs}. "
                 "Give more, or less to each by --memory"
             )
-        asked = self.jobs or max(1, len(os.sched_getaffinity(0)) // 2)
+        asked = self.jobs or max(1, cores() // 2)
         jobs = min(asked, budget // each)
         if self.jobs is not None and jobs < self.jobs:
             of = f"{needs}, of {size_text(budget)}"
             say(f"{jobs} at once: {of}; see --memory and --max-memory.")
         return jobs
+
+    @property
+    def _is_on_ray(self) -> bool:
+        return bool(self.make.given["sandbox"] == "ray")
 
     def _digest(self, policy: bytes) -> str:
         """A digest of all that a verdict depends on beside the repository; of no secret."""

@@ -33,7 +33,7 @@ Output = Annotated[
     Path | None,
     typer.Option(
         metavar="DIR",
-        help="With --all: where the reports and their index go. A run goes on from what is there.",
+        help="With --all: the folder for reports and their index. A run continues there.",
         rich_help_panel=_PANEL,
     ),
 ]
@@ -85,6 +85,6 @@ def refuse_options_of_the_judged(
     for option, path in places.items():
         if path is not None and is_judged(path, reference):
             raise UsageError(
-                f"{option} {path} lies in what is judged, {reference}{where}, and no repository "
-                "has a say in that: take a place outside"
+                f"{option} {path} is inside the repository that is checked, {reference}{where}, "
+                "and no repository has a say in that: take a place outside"
             )

@@ -2,7 +2,8 @@
 
 Each profile is tried with the environment of ``envhub init`` in a jail of its own, self-test
 included: nothing is concluded from versions or settings. A jail stops at the first layer that is
-missing, so the layers are also tried one by one, to name all of them at once.
+missing, so the layers are also tried one by one, to name all of them at once. On macOS and Windows
+there are no jails but in containers: there the profile that is asked for is tried in one.
 """
 
 from __future__ import annotations
@@ -25,15 +26,28 @@ import typer
 
 from envhub_sandbox.cli.init.starter import starter
 from envhub_sandbox.cli.shared import options as opt
-from envhub_sandbox.cli.shared.console import out, print_json, safe_line, safe_text, show
+from envhub_sandbox.cli.shared.console import (
+    BAD,
+    GOOD,
+    out,
+    print_json,
+    safe_line,
+    safe_text,
+    show_rows,
+)
 from envhub_sandbox.cli.shared.exits import Exit, UsageError, describe
 from envhub_sandbox.cli.shared.memory import free_memory_bytes
 from envhub_sandbox.cli.shared.progress import ProgressBar
 from envhub_sandbox.cli.shared.versions import versions
 from envhub_sandbox.errors import EnvHubError, SandboxUnavailableError, SnapshotError
+from envhub_sandbox.system.platform import IS_LINUX, NAME, user_id
 from envhub_worker.protocol.confinement import PROFILES
 
 _PROBE_S = 60.0
+_PROFILES = ("profile", "available", "first step", "enforces", "without")
+_LAYERS = ("layer", "state", "what it does")
+_NOTHING_PROBED: dict[str, Any] = {"layers": [], "apparmor_profile": None, "gpu": None}
+_SANDBOX = "process" if IS_LINUX else "docker"
 
 
 @dataclass(frozen=True)
@@ -109,13 +123,13 @@ def doctor(
         )
     with ProgressBar(quiet=json) as bar, _scratch_folder() as folder:
         (folder / "idle").mkdir()
-        (folder / "idle" / "env.py").write_text(starter("idle", 2026)["env.py"])
+        (folder / "idle" / "env.py").write_text(starter("idle", 2026)["env.py"], "utf-8")
         trials = []
-        for name in PROFILES:
+        for name in PROFILES if IS_LINUX else (profile,):
             bar.begin(f"trying {name}")
             trials.append(examine(str(folder / "idle"), name))
         bar.begin("trying each layer")
-        probed = probe()
+        probed = probe() if IS_LINUX else dict(_NOTHING_PROBED)
     cache = _cache_problem(by_others=profile != "strict" or not trials[0].available)
     if json:
         here = {"host": host(), "versions": versions(), "engine": engine(), **resources(cache)}
@@ -141,8 +155,8 @@ def _scratch_folder() -> Iterator[Path]:
         made = tempfile.TemporaryDirectory(prefix="envhub-doctor-")
     except OSError as error:
         raise SandboxUnavailableError(
-            f"there is no folder for temporary files that can be written ({error.strerror}); set "
-            "TMPDIR to one, or start a read-only container with --tmpfs /tmp"
+            f"no folder for temporary files is writable ({error.strerror}); set TMPDIR to one, or "
+            "start a read-only container with --tmpfs /tmp"
         ) from error
     before = os.environ.get(CACHE_VARIABLE)
     with made as folder:
@@ -171,10 +185,10 @@ def _cache_problem(*, by_others: bool) -> str | None:
     if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
         return f"{root} cannot be written: {cure}"
     closed = [path for path in (there, *there.parents) if not path.stat().st_mode & 0o001]
-    if os.geteuid() == 0 and by_others and closed:
+    if IS_LINUX and user_id() == 0 and by_others and closed:
         return (
-            f"{root} cannot be read by the user of root's jails, since {closed[-1]} is closed to "
-            f"others: {cure}"
+            f"{root} cannot be read by the user of root's jails, because {closed[-1]} is closed to "
+            f"other users: {cure}"
         )
     return None
 
@@ -184,7 +198,7 @@ def host() -> dict[str, Any]:
     return {
         "system": f"{platform.system()} {platform.release()}",
         "machine": platform.machine(),
-        "root": os.geteuid() == 0,
+        "root": user_id() == 0,
         "python": f"{platform.python_implementation()} {platform.python_version()}",
     }
 
@@ -224,19 +238,18 @@ def probe() -> dict[str, Any]:
         done = subprocess.run(command, capture_output=True, timeout=_PROBE_S, check=True, cwd="/")
         found = json_format.loads(done.stdout)
     except (OSError, subprocess.SubprocessError, ValueError):
-        # what the profiles say still stands
-        return {"layers": [], "apparmor_profile": None, "gpu": None}
+        return dict(_NOTHING_PROBED)  # what the profiles say still stands
     kept = {name: found[name] for name in ("layers", "apparmor_profile")}
     return {**kept, "gpu": found["host"]["gpu"]}
 
 
 def examine(folder: str, profile: str) -> Trial:
-    """Run the idle environment under a profile."""
+    """Run the idle environment under a profile, in the place that this platform has."""
     from envhub_sandbox.factory.make_env import make_env
 
     begun = time.perf_counter()
     try:
-        with make_env(folder, policy={"profile": profile}) as suites:
+        with make_env(folder, policy={"profile": profile}, sandbox=_SANDBOX) as suites:
             env = suites.env
             env.reset(seed=0)
             env.step(env.action_space.sample())
@@ -254,22 +267,40 @@ def _print(trials: list[Trial], asked: str) -> None:
     facts = host()
     user = "root" if facts["root"] else "a plain user"
     out(f"{facts['system']} on {facts['machine']}, as {user}, {facts['python']}")
-    for trial in sorted(trials, key=lambda one: one.profile != asked):
+    if not IS_LINUX:
         out()
+        out(
+            f"On {NAME} nothing can confine a process: there is no --sandbox process. What follows "
+            "is --sandbox docker; the other way is a Linux host where 'envhub-worker listen' runs, "
+            "with --sandbox tcp://HOST:PORT (check it with: envhub doctor tcp://HOST:PORT)."
+        )
+    trials = sorted(trials, key=lambda one: one.profile != asked)
+    out()
+    bad = {number: "red" for number, one in enumerate(trials, 1) if not one.available}
+    show_rows([_PROFILES, *map(_profile, trials)], right=(2,), styles=bad)
+    for trial in trials:
         if trial.problem is not None:
-            out(f"{trial.profile}: not available here", "bold red")
+            out()
+            out(f"{trial.profile}: not available here", BAD)
             _indented(trial.problem, "  ")
-            continue
-        took = f"first step after {trial.first_step_s:.2f} s"
-        out(f"{trial.profile}: available ({took})", "bold green")
-        if trial.profile != asked:
-            lacks = [safe_line(one.get("layer")) for one in trial.layers if not one.get("enforced")]
-            all_layers, without = len(trial.layers), ", ".join(lacks) or "none"
-            out(f"  {all_layers - len(lacks)} of {all_layers} layers hold; missing: {without}")
-            continue
-        for layer in trial.layers:
-            mark = "holds" if layer.get("enforced") else "none"
-            show(f"  {mark:6} {safe_line(layer.get('layer'))}", layer.get("detail"), width=26)
+        elif trial.profile == asked:
+            out()
+            out(f"{trial.profile}: available", GOOD)
+            show_rows([_LAYERS, *map(_layer, trial.layers)])
+
+
+def _profile(trial: Trial) -> list[str]:
+    """A row of the table: whether it can be had, and which layers it goes without."""
+    if not trial.available:
+        return [trial.profile, "no", "", "", ""]
+    lacks = [str(one.get("layer")) for one in trial.layers if not one.get("enforced")]
+    holds = f"{len(trial.layers) - len(lacks)} of {len(trial.layers)} layers"
+    return [trial.profile, "yes", f"{trial.first_step_s:.2f} s", holds, ", ".join(lacks)]
+
+
+def _layer(layer: dict[str, Any]) -> list[str]:
+    mark = "holds" if layer.get("enforced") else "missing"
+    return [str(layer.get("layer")), mark, str(layer.get("detail"))]
 
 
 def _indented(text: str, margin: str) -> None:
@@ -285,7 +316,7 @@ def _print_missing(probed: dict[str, Any]) -> None:
     missing = [layer for layer in probed["layers"] if not layer["available"]]
     if missing:
         out()
-        out("Layers that are missing here, each tried by itself:", "bold")
+        out("Layers that are missing here, each tried on its own:", "bold")
     for layer in missing:
         out(f"  {safe_line(layer['layer'])}: {safe_line(layer['detail'])}")
         _indented(layer["fix"], "    ")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
-from envhub_sandbox.cli.shared.console import out, print_json, safe_line
+from envhub_sandbox.cli.shared.console import BAD, out, print_json, safe_line, show, show_rows
 from envhub_sandbox.cli.shared.exits import Exit
 from envhub_sandbox.sandboxes.remote import RemoteSandbox
 from envhub_sandbox.sandboxes.server_facts import ServerFacts, ask
@@ -38,7 +38,7 @@ def examine(server: RemoteSandbox, profile: str, *, json: bool) -> Exit:
 
 def _verdict(facts: ServerFacts, profile: str) -> tuple[Exit, str | None]:
     if facts.draining:
-        return Exit.WORKER, "it is about to end, and lets nothing new in"
+        return Exit.WORKER, "it drains: it accepts nothing new"
     if not facts.detailed or facts.enforces(profile):
         return Exit.OK, None
     return Exit.SANDBOX, (
@@ -49,33 +49,33 @@ def _verdict(facts: ServerFacts, profile: str) -> tuple[Exit, str | None]:
 
 def print_facts(server: RemoteSandbox, facts: ServerFacts, problem: str | None) -> None:
     """Print what a server says, and what keeps it from having a jail. Trust: the server's word."""
+    release = f"envhub-worker {facts.version}, protocol {facts.protocol}"
+    out(f"{safe_line(server.endpoint)}: {release}", "bold")
     let_in = "asks for no key" if server.insecure_loopback else "knows our key"
-    out(
-        f"{safe_line(server.endpoint)}: envhub-worker {facts.version}, protocol {facts.protocol}; "
-        f"it {let_in}, and answered after {facts.answered_s:.2f} s"
-    )
-    if not facts.detailed:
-        out("It is older than this client, and does not say what it can enforce.")
+    show("answered", f"after {facts.answered_s:.2f} s; it {let_in}")
+    if facts.detailed:
+        granted = {"network": facts.network, "gpu": facts.gpu, "dependencies": facts.dependencies}
+        show("python", facts.python)
+        show("profiles", f"{facts.profile} at most; policies may ask for {facts.weakest_profile}")
+        show("permits", ", ".join(name for name, given in granted.items() if given) or "no more")
     else:
-        granted = [name for name in ("network", "gpu") if getattr(facts, name)]
-        out(
-            f"Python {facts.python}; jails there can have the profile {facts.profile} at most, and "
-            f"a policy may ask for {facts.weakest_profile} at least"
-            + (f", and for: {', '.join(granted)}" if granted else "")
-            + ("; it installs what repositories declare" if facts.dependencies else "")
-        )
-    for line in _quotas(facts):
-        out(f"  {line}")
+        out("It is older than this client, and does not say what it can enforce.")
+    if facts.quotas:
+        out()
+        show_rows([("quota", "used", "limit"), *_quotas(facts)], right=(1, 2))
     if problem is not None:
-        out(problem, "bold red")
+        out()
+        out(problem, BAD)
 
 
-def _quotas(facts: ServerFacts) -> list[str]:
+def _quotas(facts: ServerFacts) -> list[tuple[str, str, str]]:
     used: dict[str, Any] = facts.used
     return [
-        f"{_name(name)}: {_amount(name, used.get(_USED[name], 0))} of {_amount(name, limit)}"
-        if name in _USED
-        else f"{_name(name)}: at most {_amount(name, limit)}"
+        (
+            _name(name),
+            _amount(name, used.get(_USED[name], 0)) if name in _USED else "",
+            _amount(name, limit),
+        )
         for name, limit in facts.quotas.items()
     ]
 

@@ -52,8 +52,8 @@ def repository_name(folder: Path) -> str:
     name = folder.absolute().name
     if not _NAME.fullmatch(name) or "--" in name or ".." in name or name.endswith(".git"):
         raise UsageError(
-            f"{name!r} cannot be a name on the Hub: it takes letters, digits, '-', '_' and '.', "
-            "with a letter or digit at both ends, and no '--' or '..'"
+            f"{name!r} is not a valid name on the Hub: use letters, digits, '-', '_' and '.', with "
+            "a letter or digit at both ends, and no '--' or '..'"
         )
     return name
 
@@ -62,7 +62,7 @@ def _write(folder: Path, files: dict[str, str]) -> None:
     """Every file, or none. Raises ``UsageError``."""
     try:
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            raise UsageError(f"{folder} is there already, and is no empty folder; take another")
+            raise UsageError(f"{folder} exists and is not empty; choose another folder")
         for path, text in files.items():
             target = folder / path
             target.parent.mkdir(parents=True, exist_ok=True)

@@ -14,7 +14,9 @@ import json
 import math
 import os
 import re
+import shutil
 import sys
+import textwrap
 import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -27,6 +29,12 @@ if TYPE_CHECKING:
 _PLAIN_WIDTH = 120
 """Columns where there is no terminal to ask; only progress bars and boxes obey it."""
 _LINE, _LONGEST = 200, 2_000
+_WORD = 12
+"""Columns of what stands in front of a line: the kind of a fact, the severity of a finding."""
+_NARROWEST = 20
+"""Columns of the last cell in a table, below which it is not wrapped."""
+GOOD, DOUBTFUL, BAD = "bold green", "bold yellow", "bold red"
+"""Styles of what a command concludes."""
 _MOST = 1 << 20
 """Characters of one text: a flood is no message."""
 _BREAK = "\n\r\v\f\x1c-\x1e\x85\u2028\u2029"
@@ -136,26 +144,45 @@ def say(text: str, style: str | None = None) -> None:
     console(stderr=True).print(safe_text(text, _MOST), style=style, soft_wrap=True)
 
 
-def show(word: str, text: object = "", style: str | None = None, *, width: int = 11) -> None:
-    """Print a line on stdout: a word of ours, and what may be a stranger's."""
-    out(f"{word:{width}} {safe_line(text, _LONGEST)}".rstrip(), style)
+def show(word: str, text: object = "", style: str | None = None, *, stderr: bool = False) -> None:
+    """Print a line: a word of ours, and what may be a stranger's."""
+    line = f"{word:{_WORD}} {safe_line(text, _LONGEST)}".rstrip()
+    say(line, style) if stderr else out(line, style)
 
 
-def show_rows(rows: Sequence[Sequence[str]], *, right: Collection[int] = ()) -> None:
+def show_rows(
+    rows: Sequence[Sequence[str]],
+    *,
+    right: Collection[int] = (),
+    styles: Mapping[int, str] | None = None,
+) -> None:
     """Print a table on stdout, a line each row, the first of which has the names of the columns.
+    In a terminal the last cell is wrapped below itself.
 
     Args:
         rows: Cells, which may be a stranger's.
         right: Columns of numbers.
+        styles: Of rows, by their index.
     """
-    lines = [[safe_line(cell) for cell in row] for row in rows]
+    lines = [[*map(safe_line, row[:-1]), safe_line(row[-1], _LONGEST)] for row in rows]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    begin = sum(widths[:-1]) + 2 * len(widths[:-1])
+    room = _columns() - begin
     for number, line in enumerate(lines):
         cells = [
             cell.rjust(width) if column in right else cell.ljust(width)
             for column, (cell, width) in enumerate(zip(line, widths, strict=True))
         ]
-        out("  ".join(cells).rstrip(), None if number else "bold")
+        text = "  ".join(cells).rstrip()
+        if len(text) > begin + room and room >= _NARROWEST:
+            wrapped = textwrap.wrap(line[-1], room, break_on_hyphens=False)
+            text = text[:begin] + f"\n{' ' * begin}".join(wrapped)
+        out(text, (styles or {}).get(number, None if number else "bold"))
+
+
+def _columns() -> int:
+    """Of the terminal on stdout; more than any table has where it is none."""
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() else _MOST
 
 
 def command(line: str) -> None:

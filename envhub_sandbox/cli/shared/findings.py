@@ -29,11 +29,11 @@ FailOn = Annotated[
 ]
 
 
-def show_finding(one: Finding, mark: str = "", *, fails: bool = False) -> None:
+def show_finding(one: Finding, *, fails: bool = False) -> None:
     """Print what was found, and what cures it where it fails the whole."""
     severity = one.check.severity.value
     where = f"{one.task}: " if one.task else ""
-    show(f"{mark}{severity}", f"{one.id}: {where}{one.text}", STYLES[severity])
+    show(severity, f"{one.id}: {where}{one.text}", STYLES[severity])
     if fails:
         show("", one.cure, "dim")
 

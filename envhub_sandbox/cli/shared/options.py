@@ -179,8 +179,8 @@ class MakeOptions:
             raise UsageError("this command needs a sandbox; leave out --sandbox none")
         if not self.given["trust_remote_code"]:
             raise UsageError(
-                f"--sandbox none runs the code of {self.ref} in this process, with everything that "
-                "you may do. If you trust it, add --trust-remote-code. Otherwise leave out "
+                f"--sandbox none runs the code of {self.ref} in this process, with all your "
+                "permissions. If you trust it, add --trust-remote-code. Otherwise leave out "
                 "--sandbox none: the sandbox needs no trust."
             )
 
@@ -273,7 +273,7 @@ def _json_object(option: str, text: str) -> dict[str, Any]:
     try:
         value: dict[str, Any] = json.loads(text)  # it starts with a brace: an object or an error
     except ValueError as error:
-        raise UsageError(f"{option} is {text!r}, which is no JSON: {error}") from error
+        raise UsageError(f"{option} is {text!r}, which is not valid JSON: {error}") from error
     return value
 
 

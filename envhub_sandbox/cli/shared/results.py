@@ -15,7 +15,6 @@ if TYPE_CHECKING:
 
 _SHOWN_DIGITS = 12
 _SHOWN_PACKAGES = ("gymnasium", "numpy")
-_WIDTH = 12
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,18 +127,18 @@ def _mean(stats: dict[str, float] | None, *, spread: bool = False) -> str:
 
 def print_provenance(provenance: dict[str, Any], *, in_process: bool) -> None:
     """Where the code came from, what ran it, and what confined it."""
-    show("repository", _repository(provenance), width=_WIDTH)
+    show("repository", _repository(provenance))
     for asset in provenance.get("assets") or ():
-        show("could read", str(asset), width=_WIDTH)
+        show("could read", str(asset))
     interpreter = provenance.get("interpreter") or {}
     if interpreter:
         shown = {*_SHOWN_PACKAGES}
         if provenance["repo_type"] == "pypi":  # which says no version, or only in the reference
             shown.add(_canonical(re.split(r"[\[@#]", provenance["repository"])[0]))
         text = _interpreter(interpreter, provenance.get("packages") or {}, shown)
-        show("ran on", text, width=_WIDTH)
+        show("ran on", text)
     for title, text in _confinement(provenance, in_process):
-        show(title, text, width=_WIDTH)
+        show(title, text)
 
 
 def _repository(provenance: dict[str, Any]) -> str:

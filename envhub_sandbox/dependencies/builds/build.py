@@ -75,8 +75,8 @@ def _under_way(source: Source) -> Iterator[None]:
     chain = (*above, source.name)
     if source.name in above or len(chain) > _DEEPEST:
         raise ResolutionError(
-            f"{source.name} cannot be built: there are no wheels of what it is built with, which "
-            f"is built with it in turn ({' <- '.join(chain)})"
+            f"{source.name} cannot be built: its build requirement has no wheel, and is built with "
+            f"it in turn ({' <- '.join(chain)})"
         )
     if next(_BUILDS.get()) > _MOST:
         raise ResolutionError(f"{chain[0]} needs more than {_MOST} packages to be built")

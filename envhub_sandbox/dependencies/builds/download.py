@@ -66,7 +66,7 @@ def _opened(url: str) -> IO[bytes]:
     if parts.scheme == "file" or not parts.scheme:
         path = Path(unquote(parts.path))  # of a folder that the user has named
         if not path.is_file():
-            raise ValueError("it is no file")
+            raise ValueError("it is not a file")
         return path.open("rb")
     if parts.scheme not in ("https", "http"):
         raise ValueError(f"{parts.scheme} is neither https nor http")

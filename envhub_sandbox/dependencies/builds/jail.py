@@ -41,7 +41,7 @@ def build(order: Mapping[str, Any], folder: Path) -> Path | tuple[str, ...]:
     if isinstance(further, list) and 0 < len(further) <= _MOST_REQUIRED:
         return tuple(text for text in further if isinstance(text, str))
     if not isinstance(name, str):
-        raise BuildFailedError("its backend gave no wheel")
+        raise BuildFailedError("its build backend produced no wheel")
     return folder / "wheel" / os.path.basename(name)
 
 

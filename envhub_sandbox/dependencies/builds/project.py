@@ -41,7 +41,7 @@ def read(tree: Path, title: str) -> Project:
     if not isinstance(backend, str) or not all(
         map(str.isidentifier, backend.replace(":", ".", 1).split("."))
     ):
-        raise RequirementError(f"{where}: {str(backend)[:200]!r} is no build backend")
+        raise RequirementError(f"{where}: {str(backend)[:200]!r} is not a build backend")
     return Project(tuple(parse_requirement(text, where) for text in requires), backend, paths)
 
 

@@ -101,7 +101,7 @@ def unpack_tree(archive: Path, folder: Path, title: str) -> Path:
     tops = list(folder.iterdir())
     if len(tops) != 1 or not tops[0].is_dir():
         raise PackageIntegrityError(
-            f"{title} is no source distribution: one holds a single folder, and this has "
+            f"{title} is not a source distribution, which has a single folder: this has "
             f"{len(tops)} entries"
         )
     return tops[0]

@@ -141,7 +141,7 @@ def _record(archive: zipfile.ZipFile, path: str) -> None:
     there = {one.filename for one in archive.infolist() if not one.is_dir()}
     signatures = {path, f"{path}.jws", f"{path}.p7s"}
     if there - said.keys() - signatures or said.keys() - there - signatures:
-        raise PackageIntegrityError("its RECORD names other files than it holds")
+        raise PackageIntegrityError("its RECORD lists other files than it has")
     for name in sorted(there - signatures):
         if said[name] != _digest(archive, name):
             raise PackageIntegrityError(f"{name[:200]!r} is not the file that its RECORD says")

@@ -36,8 +36,8 @@ def refuse(found: Sequence[str], label: str) -> None:
     more = [f"and {len(found) - _SHOWN} more"] if len(found) > _SHOWN else []
     lines = "\n".join(f"  {line}" for line in [*found[:_SHOWN], *more])
     raise LockDriftError(
-        f"{label}: not as it was locked:\n{lines}\nTake what was locked, or lock what is there "
-        "now: envhub lock --upgrade",
+        f"{label}: differs from its lock:\n{lines}\nUse what was locked, or lock the present "
+        "state: envhub lock --upgrade",
         tuple(found),
     )
 

@@ -81,7 +81,7 @@ def with_spaces(
     """The same with what a repository's ``make_env`` returned for these arguments."""
     arguments = lockfile.arguments_text(env_kwargs)
     if arguments is None:
-        raise LockError("env_kwargs have no plain form that a lock could hold")
+        raise LockError("env_kwargs have values that a lock cannot record")
     return replace(lock, spaces=Spaces(arguments, tasks_of(suites)))
 
 

@@ -98,7 +98,7 @@ def described(lock: Lock, python: str) -> tuple[PylockPackage, ...]:
         if not wheels:
             raise PackageIntegrityError(
                 f"the index has {package.name}=={package.version}, but no file of it for {python} "
-                "with a hash that was chosen. Choose again: envhub lock --upgrade"
+                "with the hash that was chosen. Choose again: envhub lock --upgrade"
             )
         kept.append(PylockPackage(package.name, package.version, wheels))
     return tuple(kept)
@@ -128,29 +128,29 @@ def document(text: str, where: str) -> dict[str, Any]:
     try:
         return toml.loads(text, MAX_CHARACTERS, generated=True)
     except ValueError as error:
-        raise LockError(f"{where} is no TOML of a lock file: {error}") from error
+        raise LockError(f"{where} is not valid TOML: {error}") from error
 
 
 def read(document: Mapping[str, Any], where: str) -> tuple[PylockPackage, ...]:
     """The packages in a lock file, sorted by name. Raises ``LockError``."""
     if document.get("lock-version") != "1.0":
-        raise LockError(f"{where} is no lock file of version 1.0")
+        raise LockError(f"{where} is not a lock file of version 1.0")
     given = document.get("packages")
     if not isinstance(given, list) or len(given) > MAX_PACKAGES:
-        raise LockError(f"packages in {where} is no list of at most {MAX_PACKAGES}")
+        raise LockError(f"packages in {where} is not a list of at most {MAX_PACKAGES}")
     found = [_package(one, where) for one in given]
     names = [package.name for package in found]
     if len(set(names)) != len(names):
-        raise LockError(f"{where} names a package twice; a lock of ours is for one interpreter")
+        raise LockError(f"{where} names a package twice; a lock of envhub is for one interpreter")
     return tuple(sorted(found, key=lambda package: package.name))
 
 
 def _package(given: object, where: str) -> PylockPackage:
     if not isinstance(given, dict):
-        raise LockError(f"a package in {where} is no table")
+        raise LockError(f"a package in {where} is not a table")
     name, version = given.get("name"), given.get("version")
     if not _is(name, _NAME):
-        raise LockError(f"{str(name)[:80]!r} in {where} is no normalized name of a package")
+        raise LockError(f"{str(name)[:80]!r} in {where} is not a normalized name of a package")
     try:
         if not _is(version, _VERSION):
             raise InvalidVersion("no text")
@@ -198,7 +198,7 @@ def _origin(given: Mapping[str, Any], name: str, version: str, where: str) -> Wh
         return None
     wheel, environment = ours.get("wheel"), ours.get("environment")
     if not _is(wheel, _SHA256) or not _is(environment, _SHA256):
-        raise LockError(f"{name} in {where} has no hashes of what was built")
+        raise LockError(f"{name} in {where} has no hashes of the built files")
     if vcs := table(given, "vcs"):
         return WheelOrigin(_of_git(vcs, name, version, where), environment, wheel)
     sdist = table(given, "sdist")

@@ -28,8 +28,8 @@ def opened(
     """
     if python is not None or dependencies != "auto":
         raise PolicyError(
-            f"{option_name('lock')} says which packages there are; leave out "
-            f"{option_name('python')} and {option_name('dependencies')}"
+            f"{option_name('lock')} has the packages already; leave out {option_name('python')} "
+            f"and {option_name('dependencies')}"
         )
     if sandbox != "process":
         raise PolicyError(

@@ -85,11 +85,12 @@ def check(parts: Parts) -> None:
         raise Wrong("this is a git remote of the Hub", repr(repo.removesuffix(".git") or GRAMMAR))
     too_few = host == "github.com" and not re.fullmatch(r"[^/]+/[^/]+", repo)
     if too_few or not is_url(parts.repo_id) or {"", ".", ".."} & set(repo.split("/")):
-        raise Wrong(f"{parts.repo_id[:200]!r} is no address of a repository", GRAMMAR)
+        raise Wrong(f"{parts.repo_id[:200]!r} is not the address of a repository", GRAMMAR)
     check_revision(parts)
     if parts.revision is not None and not REVISION.fullmatch(parts.revision):
         example = repr(join(parts._replace(revision="main")))
         raise Wrong(
-            f"{parts.revision!r} is no commit, tag or branch of git", f"such a one, as in {example}"
+            f"{parts.revision!r} is not a commit, tag or branch of git",
+            f"such a one, as in {example}",
         )
     check_path(parts)

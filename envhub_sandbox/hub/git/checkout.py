@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 from envhub_sandbox.errors import SnapshotError
 from envhub_sandbox.system.log import SNAPSHOT
+from envhub_sandbox.system.platform import user_id
 from envhub_worker.protocol.records import dataclass
 
 TIMEOUT_S = 20.0
@@ -139,7 +140,7 @@ def _repository_of(folder: Path) -> _Repository | None:
         common = own / _text_of(own / "commondir").strip()
         is_one = (own / "HEAD").is_file() and (common / "objects").is_dir()
         is_one = is_one and not _SHA256.search(_text_of(common / "config"))
-        owners = (folder.stat().st_uid, os.geteuid(), 0)
+        owners = (folder.stat().st_uid, user_id(), 0)
         is_trusted = (top / ".git").lstat().st_uid in owners
     except (OSError, ValueError):  # also a path with a null byte
         return None

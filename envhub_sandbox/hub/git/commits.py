@@ -7,14 +7,12 @@ content, so that a full commit names all of them. Snapshots and sources of packa
 
 from __future__ import annotations
 
-import contextlib
 import io
 import os
 import re
-import resource
 import shutil
-import signal
 import subprocess
+import sys
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -26,7 +24,11 @@ from envhub_sandbox.errors import HubReferenceError, SnapshotError, SnapshotTooL
 from envhub_sandbox.hub.failures import HubFailure, Kind
 from envhub_sandbox.hub.git import address
 from envhub_sandbox.hub.grammar import is_commit
+from envhub_sandbox.system.platform import IS_LINUX, kill_group, own_group, own_variables
 from envhub_worker.protocol.text import printable, size_text
+
+if sys.platform != "win32":
+    import resource
 
 MAX_BYTES = 2 * 2**30
 """Of a file that git writes: what it fetches, and all files of a commit, unpacked."""
@@ -44,7 +46,7 @@ _SETTINGS = (
     *("gc.auto=0", "maintenance.auto=false", "core.askPass=true"),
 )
 _LIMITED = 'ulimit -f "$1" && ulimit -v "$2" && shift 2 && exec "$@"'
-"""What ``sh`` does first: git's own children have the same limits."""
+"""What ``sh`` does first: git's own children have the same limits. Windows has none."""
 _MEMORY_KIB = 4 * 2**20
 _ALONE = {"GIT_TERMINAL_PROMPT": "0", "GIT_NO_LAZY_FETCH": "1", "GIT_CEILING_DIRECTORIES": "/"}
 
@@ -63,7 +65,9 @@ def resolve(url: str, revision: str, variables: Variables | None = None) -> str:
     if is_commit(revision):
         return revision
     if not address.REVISION.fullmatch(revision):
-        raise HubReferenceError(f"{revision[:200]!r} is no commit, tag or branch of {url[:200]!r}")
+        raise HubReferenceError(
+            f"{revision[:200]!r} is not a commit, tag or branch of {url[:200]!r}"
+        )
     names = [f"refs/tags/{revision}^{{}}", f"refs/tags/{revision}", f"refs/heads/{revision}"]
     names = ["HEAD"] if revision == "HEAD" else names
     with tempfile.TemporaryDirectory(prefix="envhub-git-") as place:
@@ -195,8 +199,8 @@ def _blobs(rows: Iterable[bytes], title: str, submodules: list[str]) -> Iterator
 def _checked(url: str) -> str:
     if not address.is_url(url):
         raise HubReferenceError(
-            f"{printable(url, 200)!r} is no address that files are taken from: git+https://, a "
-            "host and a path, without a login"
+            f"{printable(url, 200)!r} is not a supported address: git+https://, a host and a path, "
+            "without a login"
         )
     return url
 
@@ -217,15 +221,16 @@ class _Git:
         """
         program = shutil.which("git")
         if program is None:
-            what = "files of a repository of git are needed, and there is no git here"
+            what = "a git repository has to be downloaded, and git is not installed"
             raise HubFailure(Kind.OTHER, what, "Install it, as in 'apt-get install git'")
         settings = [*_SETTINGS, *(f"protocol.{name}.allow=always" for name in address.PROTOCOLS)]
         command = [program, *(word for one in settings for word in ("-c", one)), *arguments]
         store = self._store
         with tempfile.TemporaryFile(dir=store) as said, tempfile.TemporaryFile(dir=store) as kept:
             try:
-                words = ["/bin/sh", "-c", _LIMITED, "sh", *_limits(), *command]
-                self._run_to_its_end(words, given, stdout=output or kept, stderr=said)
+                self._run_to_its_end(
+                    [*_limited(), *command], given, stdout=output or kept, stderr=said
+                )
             except (OSError, subprocess.SubprocessError) as error:
                 said.seek(max(0, said.seek(0, os.SEEK_END) - _SAID_BYTES))
                 text = said.read(_SAID_BYTES).decode("utf-8", "replace") or _why(error)
@@ -249,13 +254,12 @@ class _Git:
             stderr=stderr,
             cwd=self._store,
             env=self._environment,
-            start_new_session=True,
+            **own_group(),
         ) as process:
             try:
                 process.communicate(given, TIMEOUT_S)
             finally:
-                with contextlib.suppress(ProcessLookupError):
-                    os.killpg(process.pid, signal.SIGKILL)
+                kill_group(process)
         if process.returncode:
             raise subprocess.CalledProcessError(process.returncode, "git")
 
@@ -265,15 +269,19 @@ def _why(error: Exception) -> str:
     return f"it took longer than {TIMEOUT_S:.0f} s" if late else str(error)
 
 
-def _limits() -> tuple[str, str]:
-    """Of a file in blocks of 512 bytes, and of memory in KiB."""
-    _, most = resource.getrlimit(resource.RLIMIT_FSIZE)
-    file_bytes = MAX_BYTES if most == resource.RLIM_INFINITY else min(MAX_BYTES, most)
-    return str(file_bytes // 512), str(_MEMORY_KIB)
+def _limited() -> tuple[str, ...]:
+    """What runs a command in limits: of a file in blocks of 512 bytes, and of memory in KiB."""
+    words: tuple[str, ...] = ()
+    if sys.platform != "win32":
+        _, most = resource.getrlimit(resource.RLIMIT_FSIZE)
+        file_bytes = MAX_BYTES if most == resource.RLIM_INFINITY else min(MAX_BYTES, most)
+        memory = str(_MEMORY_KIB) if IS_LINUX else "unlimited"  # macOS knows no such limit
+        words = "/bin/sh", "-c", _LIMITED, "sh", str(file_bytes // 512), memory
+    return words
 
 
 def _to_the_network(variables: Variables) -> dict[str, str]:
-    kept = {
+    kept = own_variables() | {
         name: value
         for name, value in variables.items()
         if name in ("PATH", "LANG") or name.lower().endswith("_proxy")

@@ -71,7 +71,7 @@ class _FetchedFiles:
                     write_verified(stream, target, record)
             except HashMismatch as mismatch:
                 raise SnapshotIntegrityError(
-                    f"{title}: git gave {mismatch.found} as {record.path!r}, which is "
+                    f"{title}: git returned {mismatch.found} as {record.path!r}, which is "
                     f"{record.digest}. Nothing of it was used; try again, with another git"
                 ) from mismatch
 

@@ -40,12 +40,12 @@ def check(parts: Parts) -> None:
     """Raise ``Wrong`` unless an index and a registry could have it."""
     package, env_id = parts.repo_id.partition("#")[::2]
     if not _PACKAGE.fullmatch(package):
-        raise Wrong(f"{package[:200]!r} is no name of a package", GRAMMAR)
+        raise Wrong(f"{package[:200]!r} is not the name of a package", GRAMMAR)
     if parts.revision is not None and not _VERSION.fullmatch(parts.revision):
         plain = repr(join(parts._replace(revision=None)))
-        raise Wrong(f"{parts.revision[:200]!r} is no version, such as '3.0.0'", plain)
+        raise Wrong(f"{parts.revision[:200]!r} is not a version, such as '3.0.0'", plain)
     if not _ID.fullmatch(env_id):
-        raise Wrong(f"{env_id[:200]!r} is no id of an environment", GRAMMAR)
+        raise Wrong(f"{env_id[:200]!r} is not the id of an environment", GRAMMAR)
 
 
 def requirement(parts: Parts) -> str:

@@ -68,8 +68,8 @@ def _declared(snapshot: Snapshot) -> list[HubRef]:
     for ref in refs:
         if not ref.is_pinned:
             raise HubReferenceError(
-                f"{snapshot.label}: its {CARD} declares the asset {str(ref)!r}; a card takes full "
-                "commits only, as in 'org/data@<40 hex digits>'. Give the asset with "
+                f"{snapshot.label}: its {CARD} declares the asset {str(ref)!r}; a card can name "
+                "full commits only, as in 'org/data@<40 hex digits>'. Give the asset with "
                 f"{option_name('assets')} instead"
             )
     return refs
@@ -102,7 +102,7 @@ def _asset(text: str, snapshot: Snapshot, where: str) -> HubRef:
     if _may_be(ref, snapshot.repo_type, snapshot.repo_id.casefold()):
         raise HubReferenceError(
             f"{snapshot.label}: {where} holds {shown}, which is the environment's own repository; "
-            "its files are there already"
+            "its files are already available"
         )
     return ref
 

@@ -12,16 +12,19 @@ from __future__ import annotations
 
 import ast
 import codecs
+import faulthandler
 import io
 import json
 import re
-import resource
 import signal
 import sys
 import tokenize
 import warnings
 from collections.abc import Iterator
 from typing import Any
+
+if sys.platform != "win32":
+    import resource
 
 MEMORY = 1 << 30
 """Bytes: Python's parser takes a thousand for each of a hostile text."""
@@ -47,17 +50,36 @@ _WORDLESS = re.compile(r"(?<![A-Za-z0-9+/=_\\-])[A-Za-z0-9+/=_\\-]{1000,}")
 
 
 def bound() -> None:
-    """From here on the kernel ends us, or refuses us memory."""
-    for what, most in (
-        (resource.RLIMIT_AS, MEMORY),
-        (resource.RLIMIT_FSIZE, OUTPUT),
-        (resource.RLIMIT_CORE, 0),
-        (resource.RLIMIT_NOFILE, 8),
-    ):
-        hard = resource.getrlimit(what)[1]
-        least = most if hard == resource.RLIM_INFINITY else min(most, hard)
-        resource.setrlimit(what, (least, least))
-    signal.signal(signal.SIGPROF, signal.SIG_DFL)
+    """From here on the kernel ends us, or refuses us memory: as far as there are limits.
+
+    Where there are none, a file's size bounds what it takes: some 256 MiB for the largest that is
+    read.
+    """
+    if sys.platform != "win32":
+        for what, most in (
+            (resource.RLIMIT_AS, MEMORY),
+            (resource.RLIMIT_FSIZE, OUTPUT),
+            (resource.RLIMIT_CORE, 0),
+            (resource.RLIMIT_NOFILE, 8),
+        ):
+            hard = resource.getrlimit(what)[1]
+            least = most if hard == resource.RLIM_INFINITY else min(most, hard)
+            try:
+                resource.setrlimit(what, (least, least))
+            except (OSError, ValueError):
+                if sys.platform == "linux":
+                    raise  # macOS takes no limit of memory below what a process has mapped
+        signal.signal(signal.SIGPROF, signal.SIG_DFL)
+
+
+def begin_file() -> None:
+    """From here on one file has its share of time: of the processor's, or where that is not
+    counted of the clock's.
+    """
+    if sys.platform == "win32":
+        faulthandler.dump_traceback_later(CPU_S, exit=True)  # a thread that waits for no other
+    else:
+        signal.setitimer(signal.ITIMER_PROF, CPU_S)
 
 
 def described(data: bytes) -> dict[str, Any] | None:
@@ -307,7 +329,7 @@ def main() -> None:
     warnings.simplefilter("ignore")  # the parser shows a stranger's lines with its own
     while head := sys.stdin.buffer.read(4):
         data = sys.stdin.buffer.read(int.from_bytes(head, "big"))
-        signal.setitimer(signal.ITIMER_PROF, CPU_S)
+        begin_file()
         line = json.dumps(described(data))
         sys.stdout.write(f"{line}\n")
         sys.stdout.flush()

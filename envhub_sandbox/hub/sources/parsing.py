@@ -19,6 +19,7 @@ from typing import IO, Any
 
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.hub.sources import parser
+from envhub_sandbox.system.platform import open_flags, own_variables
 
 MOST_BYTES = 256 << 10
 """Of one file."""
@@ -105,7 +106,7 @@ def content(path: Path, most: int) -> bytes | None:
     It is opened once: what was looked at is what is read, and a link is not followed.
     """
     try:
-        fd = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
+        fd = os.open(path, os.O_RDONLY | open_flags("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC"))
     except OSError:
         return None
     try:
@@ -155,7 +156,7 @@ def _run(given: IO[bytes], taken: IO[bytes]) -> None:
             stdout=taken,
             stderr=subprocess.DEVNULL,
             cwd="/",
-            env={},
+            env=own_variables(),
             timeout=_PATIENCE_S,
             check=False,
         )

@@ -137,8 +137,8 @@ class SandboxedEnvConfig(EnvConfig):
         endpoint = self._options()["endpoint"]
         if endpoint is not None and without_login(endpoint) != endpoint:
             raise HubReferenceError(
-                "env.endpoint holds a login, and LeRobot prints and saves configurations; put it "
-                "into the environment variable HF_ENDPOINT"
+                "env.endpoint contains a login, and LeRobot prints and saves configurations; put "
+                "it into the environment variable HF_ENDPOINT"
             )
         n_envs, use_async_envs = _expected()
         suites = self._made(n_envs, use_async_envs)
@@ -163,8 +163,9 @@ class SandboxedEnvConfig(EnvConfig):
             RuntimeError: Always.
         """
         raise RuntimeError(
-            "this LeRobot asks no configuration for its environments: run lerobot-eval-sandboxed "
-            "instead of lerobot-eval, or call envhub_sandbox.integrations.lerobot.install()"
+            "this version of LeRobot does not let a configuration make its environments: run "
+            "lerobot-eval-sandboxed instead of lerobot-eval, or call "
+            "envhub_sandbox.integrations.lerobot.install()"
         )
 
     @property
@@ -204,8 +205,8 @@ class SandboxedEnvConfig(EnvConfig):
         for env in others:
             if (env.single_observation_space, env.single_action_space) != spaces:
                 raise ValueError(
-                    f"{self.repo}: its tasks have different spaces, and LeRobot's features are "
-                    "those of all: choose one by env.suite and env.task"
+                    f"{self.repo}: its tasks have different spaces, and LeRobot has one set of "
+                    "features for all: choose one by env.suite and env.task"
                 )
         features, names = features_of(*spaces, others=ASKS_CONFIGS)
         if not self.features:

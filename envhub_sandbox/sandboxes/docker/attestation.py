@@ -31,7 +31,7 @@ def parse(line: bytes) -> Surroundings:
             return Surroundings.read(json.loads(line))
     except RemoteProtocolError as error:
         raise WorkerStartupError(
-            "the container's program is no envhub-worker of this version; build the image again"
+            "the image has another version of envhub-worker; build it again"
         ) from error
 
 
@@ -55,10 +55,9 @@ def profile_for(wanted: str, found: Surroundings) -> str:
     if "container" in found.profiles and found.landlock >= 1:
         return "container"
     raise SandboxUnavailableError(
-        "in this container neither namespaces nor Landlock can be had, so that nothing but a "
-        "system call filter would stand between the repository and the server that runs it. If the "
-        "container's own walls are enough for you, say so: "
-        f"{option_name('profile', 'container')}."
+        "this container permits neither namespaces nor Landlock, so only a system call filter "
+        "would separate the repository from the server that runs it. If the container's own "
+        f"confinement is enough, use {option_name('profile', 'container')}."
     )
 
 
@@ -85,7 +84,7 @@ def layers(wanted: Container, found: Surroundings, title: str) -> list[dict[str,
 
 
 def _network(wanted: Container, found: Surroundings) -> list[tuple[str, bool, str]]:
-    if wanted.network != "none":
+    if wanted.network != "none" or wanted.only_client:
         return []
     return [("container-network", set(found.devices) <= {"lo"}, "no device but its own loopback")]
 
@@ -121,7 +120,11 @@ def _amount(name: str, most: float) -> str:
 def _absent(wanted: Container) -> list[dict[str, Any]]:
     """What the caller has gone without."""
     missing = []
-    if wanted.network != "none":
+    if wanted.only_client:
+        who = "jails have none of it" if wanted.network == "none" else "and jails, by choice"
+        bridge = f"a bridge, for the port that is published on loopback; {who}"
+        missing.append(("container-network", bridge))
+    elif wanted.network != "none":
         missing.append(("container-network", "the host's network, by explicit choice"))
     if wanted.runtime not in _NATIVE_RUNTIMES:
         missing.append(("container-seccomp", f"the runtime {wanted.runtime} has rules of its own"))
@@ -134,8 +137,8 @@ def _does_not_hold(layer: str, wanted: Container, found: Surroundings) -> Sandbo
     what = f"the engine started the container, but {layer} does not hold in it"
     if layer in ("container-memory", "container-pids", "container-cpus"):
         return SandboxUnavailableError(
-            f"{what}: this host's control groups do not give the engine that limit. Enable them, "
-            "or go without the container's own limits: DockerSandbox(cgroups=False). Each jail's "
-            "limits hold all the same."
+            f"{what}: this host's control groups do not permit that limit. Enable them, or use no "
+            "limits of the container: DockerSandbox(cgroups=False). Each jail still has its own "
+            "limits."
         )
     return SandboxUnavailableError(f"{what}: {found}, wanted {wanted.user}. Nothing was run.")

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import os
-import resource
 import shutil
 import subprocess
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -15,6 +15,10 @@ from typing import Any
 
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError
 from envhub_sandbox.settings.options import option_name
+from envhub_sandbox.system.platform import IS_LINUX, own_variables
+
+if sys.platform == "linux":
+    import resource
 
 ENGINES = ("docker", "podman")
 _ANSWER_S = 60.0
@@ -35,6 +39,8 @@ class Engine:
         rootless: Whether it runs as a plain user.
         remapped: Whether it maps the users of containers to others (``userns-remap``).
         passed_over: Why it is this one, where another one would come first.
+        machine: Its architecture, which on macOS and Windows is that of a virtual machine.
+        cpus: Likewise the number of its processors; 0 for unknown.
     """
 
     kind: str
@@ -43,6 +49,8 @@ class Engine:
     rootless: bool
     remapped: bool = False
     passed_over: str = ""
+    machine: str = ""
+    cpus: int = 0
 
     def run(self, *arguments: str) -> str:
         """What a command prints. Raises ``EngineError``: it failed, or did not answer."""
@@ -51,7 +59,7 @@ class Engine:
 
 def environment() -> dict[str, str]:
     """What the engine's program needs of ours; a token of the Hub is not among it."""
-    return {
+    return own_variables() | {
         name: value
         for name, value in os.environ.items()
         if name in _KEPT or name.startswith(_KEPT_PREFIXES)
@@ -95,17 +103,17 @@ def find_engine(name: str | None) -> Engine:
 def is_elsewhere(name: str) -> bool:
     """Whether an engine is set to work on another machine: nothing of ours can be there."""
     host = os.environ.get("DOCKER_HOST")
-    return name == "docker" and bool(host) and not str(host).startswith("unix:")
+    return name == "docker" and bool(host) and not str(host).startswith(("unix:", "npipe:"))
 
 
 @lru_cache(maxsize=8)
 def _engine(name: str, path: str | None, host: str | None) -> Engine:
     command = shutil.which(name, path=path)
     if command is None:
-        raise SandboxUnavailableError(f"there is no {name} on PATH; run: {_INSTALL[name]}.")
+        raise SandboxUnavailableError(f"there is no {name} on PATH; {_INSTALL[name]}.")
     if is_elsewhere(name):
         raise SandboxUnavailableError(
-            f"DOCKER_HOST is {host}: a container over there cannot share memory with this process. "
+            f"DOCKER_HOST is {host}: a container on another host shares nothing with this process. "
             "Run the worker there, and connect to it with "
             f"{option_name('sandbox', 'tcp://HOST:PORT')}."
         )
@@ -120,10 +128,17 @@ def _described(kind: str, command: str) -> Engine:
     try:
         facts = json.loads(_run(command, "info", "--format", "{{json .}}"))
     except ValueError as error:
-        raise EngineError(f"its answer is no JSON: {error}") from error
+        raise EngineError(f"its answer is not JSON: {error}") from error
     if kind == "podman":
         rootless = bool(_at(facts, "host", "security", "rootless"))
-        return Engine(kind, command, str(_at(facts, "version", "Version")), rootless)
+        return Engine(
+            kind,
+            command,
+            str(_at(facts, "version", "Version")),
+            rootless,
+            machine=str(_at(facts, "host", "arch") or ""),
+            cpus=_count(_at(facts, "host", "cpus")),
+        )
     if not facts.get("ServerVersion"):  # podman's docker answers by failing; docker may not
         raise EngineError(" ".join(map(str, facts.get("ServerErrors") or ["it does not answer"])))
     options = " ".join(facts.get("SecurityOptions") or [])
@@ -133,7 +148,13 @@ def _described(kind: str, command: str) -> Engine:
         str(facts["ServerVersion"]),
         rootless="name=rootless" in options,
         remapped="name=userns" in options,
+        machine=str(facts.get("Architecture") or ""),
+        cpus=_count(facts.get("NCPU")),
     )
+
+
+def _count(said: object) -> int:
+    return said if type(said) is int and said > 0 else 0
 
 
 def _at(facts: Mapping[str, Any], *path: str) -> Any:
@@ -144,18 +165,27 @@ def _at(facts: Mapping[str, Any], *path: str) -> Any:
 
 
 _INSTALL = {
-    "docker": "sudo apt-get install docker.io (or see docs.docker.com/engine/install)",
-    "podman": "sudo apt-get install podman",
+    "docker": "run: sudo apt-get install docker.io (or see docs.docker.com/engine/install)",
+    "podman": "run: sudo apt-get install podman",
 }
+_START = "it does not run. Run: sudo systemctl start docker."
+if not IS_LINUX:
+    _INSTALL = {
+        "docker": "install Docker Desktop (docs.docker.com/desktop)",
+        "podman": "install it (podman.io/docs/installation), and run: podman machine init",
+    }
+    _START = "it does not run. Start Docker Desktop, or for podman run: podman machine start."
 _EXPLAINED = (
     (
         "permission denied while trying to connect",
         "you may not use it. Run: sudo usermod -aG docker $USER, and log in again (members of that "
         "group can become root on this machine), or use podman, which needs no such right.",
     ),
-    ("Cannot connect to the Docker daemon", "it does not run. Run: sudo systemctl start docker."),
-    ("Is the docker daemon running", "it does not run. Run: sudo systemctl start docker."),
-    ("dial unix", "it does not run. Run: sudo systemctl start docker."),
+    ("Cannot connect to the Docker daemon", _START),
+    ("Is the docker daemon running", _START),
+    ("dial unix", _START),
+    ("docker_engine", _START),
+    ("Cannot connect to Podman", _START),
     (
         "nknown or invalid runtime name",
         "it has no such runtime. Install it and name it in /etc/docker/daemon.json "
@@ -168,18 +198,18 @@ _EXPLAINED = (
     ),
     (
         "Range of CPUs",
-        "it has fewer processors than were asked for; see DockerSandbox(cpus=...) in Python.",
+        "it has fewer processors than requested; see DockerSandbox(cpus=...) in Python.",
     ),
     (
         "bind source path does not exist",
-        "it does not see this machine's files (an engine in a virtual machine, or one that was "
-        "installed as a snap): run the worker on a server, and name that as the sandbox.",
+        "it cannot access this machine's files (an engine in a virtual machine, or one that was "
+        "installed as a snap): use DockerSandbox(published=True) in Python.",
     ),
     (
         "cgroup",
-        "it cannot limit memory, processes and time here. Delegate control groups to it, or go "
-        "without the container's own limits: DockerSandbox(cgroups=False) in Python. Each jail's "
-        "hold.",
+        "it cannot limit memory, processes and time here. Delegate control groups to it, or use "
+        "no limits of the container: DockerSandbox(cgroups=False) in Python. Each jail still has "
+        "its own limits.",
     ),
 )
 
@@ -209,14 +239,14 @@ def _last_line(text: str) -> str:
 
 def own_limits(engine: Engine) -> tuple[str, ...]:
     """For ``--ulimit``: podman would raise ours to numbers of its own, which not all may."""
-    if engine.kind != "podman":
-        return ()
-    _, files = resource.getrlimit(resource.RLIMIT_NOFILE)
-    _, processes = resource.getrlimit(resource.RLIMIT_NPROC)
-    # it has taken that much of this one from itself by then
-    highest = int(Path("/proc/sys/kernel/pid_max").read_text())
-    processes = highest if processes < 0 else min(processes, highest)
-    return f"nofile={files}:{files}", f"nproc={processes}:{processes}"
+    if engine.kind == "podman" and sys.platform == "linux":
+        _, files = resource.getrlimit(resource.RLIMIT_NOFILE)
+        _, processes = resource.getrlimit(resource.RLIMIT_NPROC)
+        # it has taken that much of this one from itself by then
+        highest = int(Path("/proc/sys/kernel/pid_max").read_text())
+        processes = highest if processes < 0 else min(processes, highest)
+        return f"nofile={files}:{files}", f"nproc={processes}:{processes}"
+    return ()
 
 
 def find_image(engine: Engine, image: str) -> str:
@@ -226,7 +256,7 @@ def find_image(engine: Engine, image: str) -> str:
     """
     if not image.isprintable() or not image or image.startswith("-") or " " in image:
         raise PolicyError(
-            f"{image!r} is no name of an image: it is empty, begins with '-', or holds blanks"
+            f"{image!r} is not the name of an image: it is empty, begins with '-', or has spaces"
         )
     try:
         return engine.run("image", "inspect", "--format", "{{.Id}}", image).strip()

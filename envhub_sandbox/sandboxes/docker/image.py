@@ -9,16 +9,22 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import os
 import re
 import subprocess
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
-from envhub_sandbox.dependencies.resolve import Lock, Target
-from envhub_sandbox.errors import DependencyError
-from envhub_sandbox.sandboxes.docker.engines import Engine, EngineError, environment
-from envhub_sandbox.sandboxes.docker.packages import image_packages
+from envhub_sandbox.dependencies import interpreters
+from envhub_sandbox.dependencies.packages import PackageSet
+from envhub_sandbox.dependencies.request import PackageRequest
+from envhub_sandbox.dependencies.resolutions import versions_for
+from envhub_sandbox.dependencies.resolve import Lock, Target, resolve
+from envhub_sandbox.errors import DependencyError, InterpreterUnavailableError
+from envhub_sandbox.sandboxes.docker.engines import Engine, EngineError, environment, find_image
+from envhub_sandbox.sandboxes.docker.packages import ImageTarget, image_packages
 
 LOCK_LABEL = "dev.envhub.lock"
 _PACKAGE = re.compile(r"[a-z0-9][a-z0-9.+-]+")
@@ -59,7 +65,7 @@ def dockerfile(base: str, lock: Lock, system: Sequence[str]) -> str:
     """
     for name in system:
         if not _PACKAGE.fullmatch(name):
-            raise DependencyError(f"{name!r} is no name of a Debian package")
+            raise DependencyError(f"{name!r} is not the name of a Debian package")
     install = ""
     if system:
         install = (
@@ -71,11 +77,82 @@ def dockerfile(base: str, lock: Lock, system: Sequence[str]) -> str:
     )
 
 
+class DerivedImage(NamedTuple):
+    """An image with a repository's packages: its name, whether it was made just now, its packages,
+    and the modules for which some were taken that nothing declares.
+    """
+
+    tag: str
+    is_new: bool
+    lock: Lock
+    taken: tuple[str, ...]
+
+
+def derived(
+    engine: Engine,
+    base: str,
+    request: PackageRequest,
+    *,
+    name: str = "packages",
+    system: Sequence[str] = (),
+    network: str | None = None,
+    tell: Callable[[str], None] = lambda line: None,
+) -> DerivedImage:
+    """The image for what a repository is to have, built unless the engine has it.
+
+    Args:
+        name: The repository's, for people.
+        system: Debian packages that it needs, too.
+        network: That of the build, as engines call it.
+
+    Raises:
+        DependencyError: It cannot be made; the text says what to change.
+        SandboxUnavailableError: The base is no image of ours, or is not there.
+    """
+    identity, target = find_image(engine, base), target_of(engine, base)
+    _check_python(request, target)
+    tell(f"choosing versions for {request.source}")
+    lock, guesses = versions_for(request, lambda asked: resolve(asked, target, tell=tell))
+    tag = tag_for(name, identity, lock, system)
+    is_new = not exists(engine, tag)
+    if is_new:
+        tell(f"building the image {tag}")
+        build(engine, dockerfile(base, lock, system), lock, tag, network)
+    return DerivedImage(tag, is_new, lock, tuple(one.module for one in guesses))
+
+
+def _check_python(request: PackageRequest, target: Target) -> None:
+    from packaging.specifiers import SpecifierSet
+
+    asked = interpreters.versions(request.python) & SpecifierSet(request.supports)
+    if os.sep in request.python or not asked.contains(f"{target.version}.99"):
+        raise InterpreterUnavailableError(
+            f"{request.source} asks for Python {request.python or request.supports}, and the image "
+            f"has {target.version}: build envhub-worker from another base (docs/deployment.md)"
+        )
+
+
+class BuiltImageTarget(ImageTarget):
+    """The Python of an image, from which one with the packages is derived."""
+
+    def __init__(self, engine: Callable[[], Engine], image: str, network: str | None) -> None:
+        super().__init__(engine, image)
+        self._network = network
+
+    def make(self, request: PackageRequest, tell: Callable[[str], None]) -> PackageSet:
+        """An image, whose name stands for its packages; raises as ``derived``."""
+        engine = self._engine()
+        made = derived(engine, self._image, request, network=self._network, tell=tell)
+        facts = {"lock": f"sha256:{made.lock.digest}", "packages": made.lock.packages}
+        inferred = [one.facts for one in request.guesses if one.module in made.taken]
+        return PackageSet(made.tag, facts | ({"inferred": inferred} if inferred else {}))
+
+
 def build(engine: Engine, recipe: str, lock: Lock, tag: str, network: str | None) -> None:
     """Build the image; what the engine says goes to stderr. Raises ``DependencyError``."""
     with tempfile.TemporaryDirectory(prefix="envhub-image-") as folder:
-        (Path(folder) / "Dockerfile").write_text(recipe)
-        (Path(folder) / "requirements.lock").write_text(lock.text)
+        (Path(folder) / "Dockerfile").write_bytes(recipe.encode())
+        (Path(folder) / "requirements.lock").write_bytes(lock.text.encode())
         command = [engine.command, "build", "--tag", tag]
         command += [] if network is None else ["--network", network]
         done = subprocess.run(

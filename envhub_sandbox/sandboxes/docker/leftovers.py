@@ -29,6 +29,7 @@ from envhub_sandbox.sandboxes.docker.engines import (
 )
 from envhub_sandbox.sandboxes.docker.run_arguments import FOLDER_LABEL, USER_LABEL
 from envhub_sandbox.system.locks import is_held, unheld
+from envhub_sandbox.system.platform import user_id
 
 _CGROUPS = Path("/sys/fs/cgroup")
 _ENDED = frozenset({"exited", "stopped", "dead"})
@@ -127,7 +128,7 @@ def _is_deserted_container(said: dict[str, Any]) -> bool:
 
 
 def _is_mine(user: str | None) -> bool:
-    return os.geteuid() == 0 or user == str(os.geteuid())
+    return user_id() == 0 or user == str(user_id())
 
 
 def stale_groups(root: Path) -> Iterator[Leftover]:

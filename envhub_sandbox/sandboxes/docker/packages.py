@@ -94,7 +94,9 @@ def image_packages(engine: Engine, image: str) -> tuple[Interpreter, dict[str, I
             for name, (version, requires) in there.items()
         }
     except (EngineError, ValueError, TypeError, AttributeError) as error:
-        raise SandboxUnavailableError(f"{image!r} is no image of envhub-worker: {error}") from error
+        raise SandboxUnavailableError(
+            f"{image!r} is not an image of envhub-worker: {error}"
+        ) from error
     facts = (str(implementation), release(str(version)), str(machine), str(libc))
     return Interpreter(_INTERPRETER, *facts), installed
 
@@ -112,16 +114,16 @@ def interpreter_fitting(theirs: Interpreter, request: PackageRequest) -> Interpr
     if not theirs.fits(asked) or (request.python and not _is_asked(theirs, request.python)):
         wanted = request.python or str(asked)
         raise InterpreterUnavailableError(
-            f"it is to run in Python {wanted}, and the image has {theirs.version}: build "
-            "envhub-worker from another base (docs/deployment.md)"
+            f"it needs Python {wanted}, and the image has {theirs.version}: build envhub-worker "
+            "from another base (docs/deployment.md)"
         )
     minor = ".".join(theirs.version.split(".")[:2])
     try:
         ours = interpreters.find(minor)
     except InterpreterUnavailableError as error:
         raise InterpreterUnavailableError(
-            f"packages for the image's Python {minor} are made with one of this machine, which has "
-            f"none. {_remedy()}"
+            f"packages for the image's Python {minor} need the same Python on this machine, which "
+            f"does not have it. {_remedy()}"
         ) from error
     alike = (ours.implementation, ours.machine) == (theirs.implementation, theirs.machine)
     if not alike or not ours.libc or not theirs.libc or Version(ours.libc) > Version(theirs.libc):
@@ -141,6 +143,6 @@ def _is_asked(theirs: Interpreter, asked: str) -> bool:
 def _remedy() -> str:
     return (
         "Build an image with its packages (envhub image build REF, then "
-        f"{option_name('sandbox', 'docker:IMAGE')}), or take those of the image as they are with "
+        f"{option_name('sandbox', 'docker:IMAGE')}), or use the image's packages with "
         f"{option_name('dependencies', 'host')}"
     )

@@ -24,6 +24,12 @@ SNAPSHOT = f"{SNAPSHOTS}/this"
 """Where the repository's files lie inside: their path outside stays unknown there."""
 PACKAGES = "/packages"
 """Where packages lie inside that were made for the repository."""
+PORT = 5555
+"""Where a server listens inside whose port is published."""
+IMAGE_USER = 65532
+"""The image's own user, who owns ``STATE``."""
+STATE = "/var/lib/envhub-worker"
+"""Where such a server keeps what it is sent."""
 
 _MIB = 1024 * 1024
 _OVERHEAD_BYTES = 1024 * _MIB
@@ -58,6 +64,9 @@ class Container:
         runtime: The engine's runtime, or None for its default.
         gpus: What ``--gpus`` takes, or None.
         ulimits: What ``--ulimit`` takes, besides that no core is dumped.
+        only_client: The public key of the client, as text, where it comes over a port that is
+            published on loopback; then nothing of the host is mounted, and the first two are empty.
+        profile: The weakest one that such a server permits.
     """
 
     name: str
@@ -78,6 +87,8 @@ class Container:
     ulimits: tuple[str, ...] = ()
     packages: str = ""
     assets: tuple[str, ...] = ()
+    only_client: str = ""
+    profile: str = "strict"
 
 
 def run_arguments(engine: Engine, wanted: Container) -> list[str]:
@@ -92,9 +103,26 @@ def run_arguments(engine: Engine, wanted: Container) -> list[str]:
         *_devices(engine, wanted),
         *([] if wanted.runtime is None else ["--runtime", wanted.runtime]),
         wanted.image,
+        *(_listen(wanted) if wanted.only_client else _serve()),
+        *("--until-eof", "--announce"),
+    ]
+
+
+def _serve() -> list[str]:
+    return [
         *("serve", "--endpoint", f"ipc://{SOCKETS}/server", "--fd-path", f"{SOCKETS}/fds"),
         *("--runtime-dir", "/tmp/envhub-worker", "--readable-root", SNAPSHOTS),
-        *("--until-eof", "--announce"),
+    ]
+
+
+def _listen(wanted: Container) -> list[str]:
+    return [
+        *("listen", "--bind", f"tcp://0.0.0.0:{PORT}", "--only-client", wanted.only_client),
+        *("--log-level", "warning"),
+        # as it is by default where there is Landlock; the caller may choose it where there is none
+        *(["--weakest-profile", wanted.profile] if wanted.profile != "strict" else []),
+        *(["--allow-network"] if wanted.network == "host" else []),
+        *(["--allow-gpu"] if wanted.gpus is not None else []),
     ]
 
 
@@ -105,11 +133,13 @@ def _confinement(engine: Engine, wanted: Container) -> list[str]:
     # the masks would hide is root's, whom no process in there can become, and jails see none of it.
     unmasked = "unmask=ALL" if podman else "systempaths=unconfined"
     words = ["--network", wanted.network, "--read-only", "--cap-drop", "ALL"]
+    if wanted.only_client:  # a port needs a network
+        words[1:2] = ["bridge", "--publish", f"127.0.0.1::{PORT}"]
     words += ["--security-opt", "no-new-privileges", "--security-opt", f"seccomp={wanted.seccomp}"]
     words += ["--security-opt", unmasked, "--ipc", "private", "--user", f"{user}:{group}"]
     if podman:
         words.append("--read-only-tmpfs=false")
-        if engine.rootless:
+        if engine.rootless and not wanted.only_client:
             words += ["--userns", "keep-id"]
     elif engine.remapped:
         words += ["--userns", "host"]
@@ -131,6 +161,10 @@ def _limits(wanted: Container) -> list[str]:
 
 
 def _files(wanted: Container) -> list[str]:
+    scratch = f"rw,nosuid,nodev,size={wanted.scratch},mode=1777"
+    own = ["--tmpfs", f"/tmp:{scratch}", "--shm-size", str(_SHARED_MEMORY_BYTES)]
+    if wanted.only_client:
+        return [*own, "--mount", f"type=volume,dst={STATE}"]  # without a name: it goes, too
     mounts = [
         _mount(wanted.sockets, SOCKETS, read_only=False),
         _mount(wanted.snapshot, SNAPSHOT, read_only=True),
@@ -138,11 +172,7 @@ def _files(wanted: Container) -> list[str]:
         *(_mount(path, place, read_only=True) for path, place in asset_places(wanted.assets)),
         *(_mount(path, path, read_only=True) for path in wanted.readable),
     ]
-    scratch = f"rw,nosuid,nodev,size={wanted.scratch},mode=1777"
-    return [
-        *("--tmpfs", f"/tmp:{scratch}", "--shm-size", str(_SHARED_MEMORY_BYTES)),
-        *(word for mount in mounts for word in ("--mount", mount)),
-    ]
+    return [*own, *(word for mount in mounts for word in ("--mount", mount))]
 
 
 def asset_places(assets: Iterable[str]) -> Iterator[tuple[str, str]]:
@@ -186,6 +216,6 @@ def check_readable(paths: tuple[str, ...]) -> None:
         parts = [part for part in path.split("/") if part]
         if ".." in parts or not parts or (len(parts) == 1 and parts[0] in _OWN):
             raise PolicyError(
-                f"{option_name('readable')} holds {path!r}, which a container has of its own; name "
-                "what is needed below it"
+                f"{option_name('readable')} has {path!r}, which a container replaces by its own; "
+                "name the paths below it that are needed"
             )

@@ -18,6 +18,8 @@ from envhub_sandbox.errors import SandboxUnavailableError
 
 #: What ``os.uname`` calls a machine, and what a profile calls it.
 ARCHITECTURES = {"x86_64": "SCMP_ARCH_X86_64", "aarch64": "SCMP_ARCH_AARCH64"}
+_OTHER_NAMES = {"amd64": "x86_64", "arm64": "aarch64"}
+"""As engines have them."""
 
 _MEMORY = """
     brk get_mempolicy madvise mbind membarrier memfd_create mincore mlock mlock2 mlockall mmap
@@ -84,6 +86,7 @@ def profile(machine: str | None = None) -> dict[str, Any]:
     Raises ``SandboxUnavailableError``: there is no profile for the machine.
     """
     machine = machine or platform.machine()
+    machine = _OTHER_NAMES.get(machine.lower(), machine)
     if machine not in ARCHITECTURES:
         raise SandboxUnavailableError(
             f"there is no system call profile for {machine}; containers run on x86-64 and aarch64"

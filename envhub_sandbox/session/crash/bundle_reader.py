@@ -82,7 +82,7 @@ def load_bundle(folder: Path) -> Bundle:
             raise BundleError(f"it is not of format {FORMAT}")
         return _bundle(folder, document)
     except _UNREADABLE as error:
-        raise BundleError(f"{folder} is no crash bundle that can be read: {error}") from error
+        raise BundleError(f"{folder} cannot be read as a crash bundle: {error}") from error
 
 
 def _bundle(folder: Path, document: dict[str, Any]) -> Bundle:
@@ -110,18 +110,21 @@ def _doubts(
     if dropped:
         yield f"{dropped} requests had been forgotten before it died (crash_history of the policy)"
     elif history.get("mixed"):
-        yield "what was set or called before a transparent restart need not hold everywhere"
+        yield (
+            "attributes and calls before a transparent restart may not apply to all "
+            "sub-environments"
+        )
     elif not _member(history, "exact", bool):
         yield (
-            "some requests held objects that only pickle could carry; plain values or descriptions "
-            "stand for them"
+            "some requests had objects that can only be pickled; the bundle has plain values or "
+            "descriptions instead"
         )
     if not _member(arguments, "exact", bool):
         yield "make_env was given objects that only pickle could carry"
     if document.get("task") is not None and not _member(history, "seeded", bool):
         yield "no reset had seeded every sub-environment, so chance may decide otherwise"
     if document.get("shared_jail"):
-        yield "other environments lived in the same process; what was asked of them is not known"
+        yield "other environments were in the same process; their requests are not recorded"
 
 
 def _reference(provenance: dict[str, Any]) -> str:
@@ -131,7 +134,7 @@ def _reference(provenance: dict[str, Any]) -> str:
     if kind == "local" and not os.path.isabs(repository):
         raise BundleError("a local folder's path is not absolute")
     if kind not in ("local", "pypi") and not is_commit(commit):
-        raise BundleError(f"{commit} is no commit")
+        raise BundleError(f"{commit} is not a commit")
     return pinned(kind, repository, commit, path)
 
 
@@ -217,7 +220,7 @@ def _array(folder: Path, name: str) -> Any:
     except Exception as error:  # numpy reads the header with Python's own tokenizer and parser
         raise BundleError(f"{name} is no file of actions: {error}") from error
     if array.dtype != dtypes[name] or not array.ndim:
-        raise BundleError(f"{name} does not hold what it says")
+        raise BundleError(f"{name} is not what its header says")
     return np.array(array)
 
 
@@ -229,7 +232,7 @@ def _read(folder: Path, name: str, most: int = MAX_FILE_BYTES) -> bytes:
 def _check_file(path: Path, most: int = MAX_FILE_BYTES) -> None:
     found = path.lstat()
     if not stat.S_ISREG(found.st_mode):
-        raise BundleError(f"{path} is no regular file")
+        raise BundleError(f"{path} is not a regular file")
     if found.st_size > most:
         raise BundleError(f"{path} has {found.st_size} bytes; at most {most} are read")
 

@@ -146,6 +146,10 @@ class History:
     def _any_step(self, actions: Any) -> None:
         self._add(m.Step(0, _copied(actions)))
 
+    def skip(self) -> None:
+        """Something was asked of some sub-environments that is not kept."""
+        self._dropped += 1
+
     def requested(self, request: Request) -> None:
         """Record another request, as it was sent."""
         if not self._capacity:
@@ -232,10 +236,40 @@ class History:
         return found
 
 
+class PartHistory(History):
+    """What one worker of a fleet adds to the history of the whole environment.
+
+    The fleet records each request once, for all workers; a crash bundle of any of them has the
+    whole. ``whole``: that history.
+    """
+
+    def __init__(self, manifest: EnvManifest, whole: History) -> None:
+        self._whole = whole
+        super().__init__(manifest, 0)
+
+    def started(self) -> None:
+        """This worker is fresh, and the others may not be."""
+        super().started()
+        self._whole.revived()
+
+    def revived(self) -> None:
+        """See ``History``."""
+        self._whole.revived()
+
+    def requested(self, request: Request) -> None:
+        """A request that was for this worker alone."""
+        self._whole.requested(request)
+
+    def recording(self) -> Recording:
+        """See ``History``: that of the whole."""
+        return self._whole.recording()
+
+
 def _entry(request: Request) -> RecordedRequest:
     """What is kept of a request: what one shard was sent, where that is all of it."""
     first = request.messages[0]
-    is_whole = len(request.messages) == 1 or not isinstance(first, _SLICED)
+    all_of_it = len(request.messages) == 1 and request.bounds[0][0] == 0
+    is_whole = all_of_it or not isinstance(first, _SLICED)
     if request.plain and is_whole:
         return RecordedRequest(_operation(first), request.kept()[0], exact=True)
     return encoded(_whole(request.messages, request.bounds))

@@ -13,8 +13,7 @@ from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.lane import Lane, RelayLane
 from envhub_sandbox.transport.replies import typed_reply
 from envhub_sandbox.transport.results import Results
-from envhub_sandbox.transport.shared_memory.attachment import Attachment
-from envhub_sandbox.transport.shared_memory.lane import SharedMemoryLane
+from envhub_sandbox.transport.shared_memory.served_lane import ServedLane
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest.manifest import EnvManifest, decode_env
 
@@ -53,7 +52,7 @@ class Builder:
         self._check_manifest(loaded)
         relay = RelayLane(loaded.jail, runners, self._number, self._results)
         self._build(relay, range(len(runners)), deadline)
-        return self._fast_lane(relay, loaded, deadline) or relay
+        return self._fast_lane(relay, loaded, deadline)
 
     def rebuild(
         self, loaded: LoadedJail, lane: Lane, dead: Sequence[int], deadline: Deadline
@@ -102,21 +101,24 @@ class Builder:
         if built.num_envs != count or _kind(built) != _kind(wanted):
             self._refuse()
 
-    def _fast_lane(
-        self, relay: RelayLane, loaded: LoadedJail, deadline: Deadline
-    ) -> SharedMemoryLane | None:
-        """Agree with the runners on slabs and doorbells; None where the relay has to serve.
+    def _fast_lane(self, relay: RelayLane, loaded: LoadedJail, deadline: Deadline) -> Lane:
+        """Agree with the runners on slabs and doorbells; the relay where there can be none.
 
         This is the one place that decides which lane an environment has.
         """
         server = loaded.server
-        if server.fd_path is None or self._repository.lane == "frames":
-            return None
         if not self._manifest.shardable or not self._own:
-            return None  # a runner has one lane, and environments of one jail share theirs
+            return relay  # a runner has one lane, and environments of one jail share theirs
+        if server.fd_path is None or self._repository.lane == "frames":
+            return ServedLane.open(relay, self._results, deadline)
+        # late, for Linux alone has what they import
+        from envhub_sandbox.transport.shared_memory.attachment import Attachment
+        from envhub_sandbox.transport.shared_memory.lane import SharedMemoryLane
+
         attachment = Attachment(server.fd_path, loaded.jail.number, server.process_fd)
         copy = self._repository.copy
-        return SharedMemoryLane.open(relay, self._results, attachment, deadline, copy=copy)
+        lane = SharedMemoryLane.open(relay, self._results, attachment, deadline, copy=copy)
+        return lane or relay
 
     def _check_manifest(self, loaded: LoadedJail) -> None:
         key = (self._manifest.suite, self._manifest.task)
@@ -128,9 +130,8 @@ class Builder:
         self._jails.forget_manifest()
         key = (self._manifest.suite, self._manifest.task)
         raise LoadError(
-            f"make_env returned another environment for {key} than before: its result must "
-            "not change between calls. The remembered description has been dropped; call "
-            "make_env again"
+            f"make_env returned another environment for {key} than before: its result must not "
+            "change between calls. The cached description has been removed; call make_env again"
         )
 
 

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
 import re
 from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
-from itertools import count
 from pathlib import Path
+from time import monotonic
 from typing import Any
 
 from envhub_sandbox.errors import EnvHubError, LoadError, WorkerDiedError, WorkerTimeoutError
+from envhub_sandbox.sandboxes.fleet.refusals import may_go_elsewhere, worst_of
 from envhub_sandbox.sandboxes.pool import ServerUse, WorkerServer
 from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.session.jails.loaded import ExpectedManifest, LoadedJail
@@ -31,6 +31,11 @@ from envhub_worker.protocol.manifest.manifest import EnvManifest, decode_manifes
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _CLOSE_S = 5.0
+_LOST_S = 1.0
+"""Likewise, where the connection to the server was lost: one that lives ends by itself a jail that
+no client holds."""
+_SILENT_S = 30.0
+"""For how long a server that has not answered then is not asked again for the end of a jail."""
 _STATUS_S = 1.0
 _DENIED_S = 10.0
 """A caller who has denials recorded wants to know them, also of a host that is busy."""
@@ -63,8 +68,19 @@ class Launcher:
         self.runs_on = place.runs_on(runtime)
         self.retry_s = place.retry_s
         self._store = store
-        self._hold = ServerHold(self._acquire, repository.hold, repository.let_go)
-        self._jail_numbers = count(1)
+        self._worker = len(repository.places)
+        repository.places.append(place.address)
+        ours = object()
+        hold, let_go = partial(repository.hold, ours), partial(repository.let_go, ours)
+        self._hold = ServerHold(self._acquire, hold, let_go)
+
+    def another(self) -> Launcher:
+        """For a further worker in the same place."""
+        return Launcher(self.repository, self._sandbox, self._store)
+
+    def where(self, loaded: LoadedJail | None) -> str:
+        """What errors call the place of a jail, or of the next one."""
+        return self._sandbox.address if loaded is None else loaded.address
 
     def hold(self) -> Callable[[], None]:
         """Keep the server between two jails; returns what gives it back."""
@@ -89,19 +105,43 @@ class Launcher:
             LoadError: The repository failed to load, or returned something unusable.
             WorkerError: The jail did not come up, died, or took too long.
         """
-        use = self._acquire()
+        failures: list[EnvHubError] = []
+        for place in self._sandbox.candidates():
+            try:
+                return self._open_at(place, deadline, known)
+            except EnvHubError as error:
+                if not may_go_elsewhere(error):
+                    raise
+                WORKER.info("%s: %s: %s", self.repository.label, place.address, error)
+                failures.append(error)
+        raise worst_of(failures)
+
+    def _open_at(
+        self, place: Sandbox, deadline: Deadline, known: ExpectedManifest | None
+    ) -> LoadedJail:
+        idle_s = self.repository.timeouts.server_idle_s
+        began = monotonic()
+        use = place.acquire(self._store, self.repository.runtime, idle_s)
+        if use.server.far is not None:
+            deadline.postpone(monotonic() - began)  # a cluster may have started a machine for it
         try:  # interruption.md, rule 4
             # one on another host runs anyway
-            if self.repository.timeouts.server_idle_s != 0 and use.server.far is None:
+            if self.repository.timeouts.server_idle_s != 0 and use.server.is_ours:
                 self._hold.keep(use.server)
             with self.repository.starting(deadline):
-                return self._open(use, deadline, known)
+                loaded = self._open(use, place, deadline, known)
+                self.repository.places[self._worker] = loaded.address = place.address
+                return loaded
         except BaseException:
             use.release()
             raise
 
     def _open(
-        self, use: ServerUse[WorkerServer], deadline: Deadline, known: ExpectedManifest | None
+        self,
+        use: ServerUse[WorkerServer],
+        place: Sandbox,
+        deadline: Deadline,
+        known: ExpectedManifest | None,
     ) -> LoadedJail:
         server = use.server
         wanted = self._wanted_output()
@@ -110,7 +150,7 @@ class Launcher:
             client.hello(deadline)
             # all at once, where they will load what is known: else it is asked for, and then again
             order = self._order(known.shards if known else 1)
-            order = self._sandbox.prepare(order, server, client, deadline)
+            order = place.prepare(order, server, client, deadline)
             jail = open_jail(client, order, self.repository.wire_limits, deadline)
         except BaseException:
             client.close()
@@ -182,7 +222,7 @@ class Launcher:
         if output in ("stderr", "-"):
             return OutputSinks(self.repository.label, None, stderr=True)
         path = None if output == "tail" else Path(output)
-        number = next(self._jail_numbers)
+        number = next(self.repository.jail_numbers)
         if path is not None and number > 1:
             path = path.with_name(f"{path.stem}-{number}{path.suffix}")
         return OutputSinks(self.repository.label, path)
@@ -221,7 +261,7 @@ class Launcher:
             raise
         jail = loaded.jail.through(client)
         shown = loaded.manifest, loaded.value, loaded.loaded
-        return LoadedJail(jail, *shown, use, self.disconnect)
+        return LoadedJail(jail, *shown, use, self.disconnect, loaded.address)
 
     def disconnect(self, loaded: LoadedJail) -> None:
         """Drop a further connection. Idempotent."""
@@ -251,7 +291,7 @@ class Launcher:
             loaded.closing = False
 
     def _end(self, loaded: LoadedJail, *, wait: bool) -> None:
-        if not loaded.ending and not loaded.jail.client.torn:
+        if not loaded.ending and not loaded.lost and not loaded.jail.client.torn:
             loaded.ending = True
             WORKER.debug("%s: jail %x closes", self.repository.label, loaded.jail.number)
             wait_for_end = partial(loaded.jail.ask_to_close(), Deadline(_CLOSE_S))
@@ -309,8 +349,14 @@ class Launcher:
     def interrupt(self, loaded: LoadedJail) -> None:
         """End a jail over a connection of its own, while another thread waits on the first."""
         loaded.jail.before_end()
-        with contextlib.suppress(EnvHubError):  # the server has gone, and the jail with it
-            self._ask(loaded.server, m.CloseJail(loaded.jail.number), Deadline(_CLOSE_S))
+        server = loaded.server
+        if loaded.lost and monotonic() - server.silent_s < _SILENT_S:
+            return
+        deadline = Deadline(_LOST_S if loaded.lost else _CLOSE_S)
+        try:
+            self._ask(server, m.CloseJail(loaded.jail.number), deadline)
+        except EnvHubError:  # the server has gone, and the jail with it
+            server.silent_s = monotonic()
 
     def _ask(self, server: WorkerServer, message: m.Message, deadline: Deadline) -> m.Message:
         client = self._client(server)

@@ -36,11 +36,13 @@ class LoadedJail:
         manifest: What ``make_env`` returned, checked.
         loaded: Runners that have called it.
         use: That of the server that it is in.
+        address: What errors call the place of that.
         give_back: Gives it back: see ``Launcher.close`` and ``disconnect``.
         ending: Whether its end was begun.
         closing: Whether a call of ``Launcher.close`` is at it.
         ended: Whether it was asked for, so that only the server's use is left.
         closed: Whether all was given back.
+        lost: Whether the connection to its server was.
         changed: Whether it returned something else in one of them than the manifest says.
     """
 
@@ -50,10 +52,12 @@ class LoadedJail:
     loaded: set[int]
     use: ServerUse[WorkerServer]
     give_back: Callable[[LoadedJail], None]
+    address: str = ""
     ending: bool = False
     closing: bool = False
     ended: bool = False
     closed: bool = False
+    lost: bool = False
     changed: bool = False
     owner: OwnerProcess = field(default_factory=OwnerProcess)
 
@@ -65,6 +69,8 @@ class LoadedJail:
     def __del__(self) -> None:
         # interruption.md, rule 5. At the end of the process no server is in use any more: nothing
         # is closed one by one there (rule 13).
+        if "owner" not in vars(self):  # the last field: an interrupt came before there was a jail
+            return
         if not self.closed and self.use.live and self.owner.is_here:
             self.ending = True  # its connection may have gone before it
             self.give_back(self)

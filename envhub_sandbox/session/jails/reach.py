@@ -50,12 +50,12 @@ def _advice(text: str, policy: Policy) -> str:
     if policy.network != "host":
         if _HUB.search(text):
             return (
-                "A jail has no network, and finds no repository of the Hub but its own and its "
-                f"assets: name this one with {option_name('assets', ['org/repo@COMMIT'])}"
+                "A jail has no network, and of the Hub it has its own repository and its assets "
+                f"only: name this one with {option_name('assets', ['org/repo@COMMIT'])}"
             )
         if _INSTALL.search(text):
             return (
-                "A jail has no network, and installs nothing: name the packages in the "
+                "A jail has no network and cannot install packages: name the packages in the "
                 "repository's requirements.txt, or with "
                 f"{option_name('dependencies', {'extra': ['PACKAGE']})}"
             )

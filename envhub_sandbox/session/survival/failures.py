@@ -5,7 +5,7 @@ from __future__ import annotations
 from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerTimeoutError
 from envhub_sandbox.session.crash.history import History
 from envhub_sandbox.session.lease import Lease
-from envhub_sandbox.session.refusals import closed_during, expiry
+from envhub_sandbox.session.survival.refusals import closed_during, expiry
 from envhub_sandbox.system.log import WORKER
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_worker.protocol.lifecycle import Event

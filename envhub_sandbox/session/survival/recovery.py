@@ -37,7 +37,9 @@ RowsOf = Callable[[m.Message, int], m.Message]
 
 
 class Recovery:
-    """Brings back the dead shards of one environment."""
+    """Brings back the dead shards of one environment.
+    ``fresh``: those that came back in the last request.
+    """
 
     def __init__(
         self,
@@ -49,7 +51,6 @@ class Recovery:
         manifest = lease.results.manifest
         self._lease = lease
         self._lifecycle = lease.lifecycle
-        self._num_envs = manifest.num_envs
         self._bounds = lease.results.bounds
         self._restarts = restarts
         self._failures = failures
@@ -59,7 +60,7 @@ class Recovery:
         self._settings = Settings()
         self._setting: tuple[str, list[list[bytes]]] | None = None  # what is being set
         self._asked: Sequence[m.Message] = ()
-        self._fresh: tuple[int, ...] = ()  # shards that came back in the last request
+        self.fresh: tuple[int, ...] = ()
 
     # --- what is asked -------------------------------------------------------------------------
 
@@ -70,7 +71,7 @@ class Recovery:
     def sent(self, request: Request) -> None:
         """Remember the seeds and attributes of a request that has gone out."""
         self._asked = messages = request.messages
-        self._setting, self._fresh = None, ()
+        self._setting, self.fresh = None, ()
         for message, (start, _) in zip(messages, self._bounds, strict=True):
             if isinstance(message, m.Reset):
                 self._seeds.remember(message, start)
@@ -114,9 +115,10 @@ class Recovery:
 
     def mark(self, infos: dict[Any, Any]) -> dict[Any, Any]:
         """All infos of the last request, of which those of the fresh shards say that they are."""
-        if not self._fresh:
+        if not self.fresh:
             return infos
-        return mark_revived(infos, self._num_envs, [self._bounds[index] for index in self._fresh])
+        results = self._lease.results
+        return mark_revived(infos, results.count, [results.slices[index] for index in self.fresh])
 
     def _of_survivors(self, deaths: RunnersDiedError) -> list[m.Message | None]:
         """What the others answered; None in the place of the dead.
@@ -157,7 +159,7 @@ class Recovery:
             lifecycle.request = None
             raise
         lifecycle.request = None
-        self._fresh = tuple(fresh)
+        self.fresh = tuple(fresh)
         self._counters.deaths += len(fresh)
         self._history.revived()
         lifecycle.moved(Event.REVIVAL)
@@ -193,7 +195,7 @@ class Recovery:
         """Log a death that the caller sees in the infos only."""
         rows = [row for index in sorted(deaths.deaths) for row in range(*self._bounds[index])]
         why, label = str(deaths.first).partition("\n")[0], self._lease.repository.label
-        WORKER.info("%s: %s; sub-environments %s begin anew in fresh processes", label, why, rows)
+        WORKER.info("%s: %s; sub-environments %s start again in new processes", label, why, rows)
 
     def _set_again(self, lane: Lane, dead: Sequence[int], deadline: Deadline) -> None:
         """Set attributes in fresh runners; what one's setter raises is only logged."""

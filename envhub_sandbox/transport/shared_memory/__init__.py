@@ -1,1 +1,1 @@
-"""The lane for workers on this machine: steps over memory that both sides map."""
+"""Lanes that step through slabs, which a runner shares with the client or with the server."""

@@ -10,9 +10,9 @@ from time import monotonic, sleep
 from envhub_sandbox.errors import WorkerDiedError
 from envhub_sandbox.transport.connection import SESSION
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.shared_memory.doorbell import Watch
 from envhub_sandbox.transport.shared_memory.shard import LaneShard
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.shared_memory.doorbell import Watch
 
 _ANSWER_S = 20.0
 _LEAST_S = 0.1

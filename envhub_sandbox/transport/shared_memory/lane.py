@@ -11,7 +11,8 @@ from collections.abc import Sequence
 from time import perf_counter_ns
 from typing import Any
 
-from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
+from envhub_sandbox.errors import EnvHubError, RemoteProtocolError, WorkerDiedError
+from envhub_sandbox.transport.connection import Source
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import RunnersDiedError
 from envhub_sandbox.transport.lane import Frames, RelayLane, Request
@@ -20,7 +21,8 @@ from envhub_sandbox.transport.results import Results, StepResult
 from envhub_sandbox.transport.shared_memory.attachment import Attachment
 from envhub_sandbox.transport.shared_memory.cores import CPUS, Cores
 from envhub_sandbox.transport.shared_memory.observations import RING, ObservationSlab
-from envhub_sandbox.transport.shared_memory.shard import LaneShard, Outcome
+from envhub_sandbox.transport.shared_memory.shard import LaneShard
+from envhub_sandbox.transport.shared_memory.shard_slabs import Outcome, ShardSlabs
 from envhub_sandbox.transport.shared_memory.spin import SpinChooser
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.shared_memory import slabs
@@ -58,6 +60,7 @@ class SharedMemoryLane:
     """
 
     name = "shared memory"
+    takes_more = False  # there is one slab for what is asked, and one for what is answered
 
     def __init__(
         self,
@@ -76,7 +79,7 @@ class SharedMemoryLane:
         self._results = results
         self._attachment = attachment
         self._watch = attachment.watch
-        self._bounds = results.bounds
+        self._bounds = results.slices
         self._action_space = manifest.single_action_space
         leaves = layouts[0].actions
         self._flat_actions = len(leaves) == 1 and not leaves[0].path
@@ -84,10 +87,14 @@ class SharedMemoryLane:
         self._answers = _NOTHING
         self._steps = 0
         self._step_bytes = sum(one.action_bytes for one in layouts), observed.batch_bytes
-        may_spin = _ORDERED_STORES and len(CPUS) > 1
+        # as many workers of the same environment are on this machine, or may be
+        workers = -(-manifest.num_envs // results.count)
+        may_spin = _ORDERED_STORES and workers < len(CPUS)
         self._spin = self._step_spin = SpinChooser(may_spin)
         self._talk_spin = SpinChooser(may_spin)  # messages take another time than steps
         self._asked_ns = 0
+        self._fetching: tuple[int, Sequence[int]] = 0, ()  # for which request, of which shards
+        self._listens = False
         # One core is the client's. Shards that find no other sleep until they are asked, then run
         # on the client's while it sleeps: so it waits for those first, and for the others awake.
         self._cores = Cores(len(self.shards))
@@ -114,9 +121,9 @@ class SharedMemoryLane:
         """
         manifest = results.manifest
         slots = 1 if copy else 1 + RING
-        space, count = manifest.single_observation_space, manifest.num_envs
-        observed = slabs.observation_layout(space, count, slots)
-        sizes = [stop - start for start, stop in results.bounds]
+        space = manifest.single_observation_space
+        observed = slabs.observation_layout(space, results.count, slots)
+        sizes = [stop - start for start, stop in results.slices]
         layouts = [slabs.layout_of(manifest.single_action_space, size) for size in sizes]
         known = [layout for layout in layouts if layout is not None]
         own = [manifest.own_batch(name) for name in ("action_space", "observation_space")]
@@ -172,7 +179,10 @@ class SharedMemoryLane:
     def _shard(self, layout: slabs.Layout) -> LaneShard:
         return LaneShard(layout, self.observations.fd)
 
-    def send_step(self, actions: Any) -> None:
+    def expect_more(self) -> None:
+        """See ``Lane``."""
+
+    def send_step(self, actions: Any, *, ahead: bool = False) -> None:
         """See ``Lane``."""
         self._owed = _STEP  # interruption.md, rule 1: first
         self._steps += 1
@@ -218,7 +228,8 @@ class SharedMemoryLane:
     def _with_fetched(self, outcomes: list[Outcome], deadline: Deadline) -> list[Outcome]:
         """The same with the infos that did not fit; what one has raised comes before them."""
         kinds = [kind for kind, _ in outcomes]
-        if slabs.FETCH not in kinds or slabs.RAISED in kinds:
+        asked = self._fetching[0] == self._asked_ns  # then they are taken: warnings come with them
+        if slabs.FETCH not in kinds or (slabs.RAISED in kinds and not asked):
             return outcomes
         missing = [index for index, kind in enumerate(kinds) if kind == slabs.FETCH]
         try:
@@ -231,9 +242,14 @@ class SharedMemoryLane:
 
     def _fetch(self, shards: Sequence[int], deadline: Deadline) -> list[m.Message]:
         """What some shards' runners could not put into their slabs."""
+        if self._fetching != (self._asked_ns, shards):  # else ``answered`` has asked for it
+            self._ask_for(shards)
+        self._fetching = 0, ()
+        return self._relay.replies(deadline)
+
+    def _ask_for(self, shards: Sequence[int]) -> None:
         packed = [self.jail.pack(m.FetchInfos(self.number))] * len(shards)
         self._relay.send_some(self._owed, [self.runners[index] for index in shards], packed)
-        return self._relay.replies(deadline)
 
     # --- messages ------------------------------------------------------------------------------
 
@@ -299,6 +315,37 @@ class SharedMemoryLane:
         """The rows of each shard."""
         space = self._results.manifest.single_observation_space
         return list(batches.split(space, self.observations.take(), self._bounds))
+
+    def answered(self) -> bool:
+        """See ``Lane``. What has to be fetched is asked for here: a runner may never give it."""
+        if self._owed == _BY_SERVER:
+            return self._relay.answered()
+        for shard in self.shards:
+            if not shard.answered():
+                return self._listens and self._watch.wait(0)
+        if self._fetching[0] != self._asked_ns:
+            self._listen(False)
+            shards = [i for i, shard in enumerate(self.shards) if shard.has_more_elsewhere()]
+            try:
+                if shards:
+                    self._ask_for(shards)
+            except EnvHubError:  # whoever waits asks again, and meets the same
+                return True
+            self._fetching = self._asked_ns, shards
+        return not self._fetching[1] or self._relay.answered()
+
+    def sources(self) -> list[Source]:
+        """See ``Lane``."""
+        if self._owed == _BY_SERVER or self._fetching[0] == self._asked_ns:
+            return self._relay.sources()
+        if not self._listens:
+            self._listen(True)
+        return [self._watch.fileno()]
+
+    def _listen(self, wanted: bool) -> None:
+        self._listens = wanted
+        for shard in self.shards:
+            shard.listen(wanted)
 
     def catch_up(self, deadline: Deadline) -> None:
         """See ``Lane``."""
@@ -417,7 +464,7 @@ def _fits(frames: Frames) -> bool:
     return sum(memoryview(frame).nbytes + _FRAME_BYTES for frame in frames) < _ROOM
 
 
-def infos_of(shard: LaneShard, outcome: Outcome, results: Results) -> dict[Any, Any]:
+def infos_of(shard: ShardSlabs, outcome: Outcome, results: Results) -> dict[Any, Any]:
     """A shard's infos of a step, all of which are here. Trust: input from the worker.
 
     Raises:

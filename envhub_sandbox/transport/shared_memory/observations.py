@@ -20,7 +20,6 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
-from envhub_sandbox.transport.shared_memory.memfd import sealed_memfd
 from envhub_worker.protocol.shared_memory import slabs
 
 RING = 4
@@ -34,17 +33,29 @@ class ObservationSlab:
     Args:
         space: The single observation space.
         layout: Where everything lies.
+        received: Its memory, where that is shared with nobody; there is one slot then.
 
     Attributes:
-        fd: Its descriptor, for the runners.
+        fd: Its descriptor, for the runners; -1 where there is none.
         layout: Where everything lies.
         chosen: The slot of the last batch.
     """
 
-    def __init__(self, space: gym.Space[Any], layout: slabs.ObservationLayout) -> None:
+    def __init__(
+        self,
+        space: gym.Space[Any],
+        layout: slabs.ObservationLayout,
+        received: memoryview | None = None,
+    ) -> None:
         self.layout = layout
-        self._memory, self._file = sealed_memfd("observations", layout.total_bytes)
-        self.fd = self._file.fileno()
+        self._memory: Any = received
+        self.fd = -1
+        if received is None:
+            # late, for Linux alone has what it imports
+            from envhub_worker.protocol.shared_memory.memfd import sealed_memfd
+
+            self._memory, self._file = sealed_memfd("observations", layout.total_bytes)
+            self.fd = self._file.fileno()
         self._assemble = slabs.assembler(space)
         if layout.slots == 1:
             self._slots = [self._memory]
@@ -95,7 +106,7 @@ class ObservationSlab:
         self._file.close()
 
 
-def _copier(slot: mmap.mmap, leaf: slabs.Leaf) -> Callable[[], Any]:
+def _copier(slot: Any, leaf: slabs.Leaf) -> Callable[[], Any]:
     if leaf.dtype.kind == "b":
         # a hostile byte of 2 would make a boolean that is neither
         return partial(slabs.view(slot, leaf, np.dtype(np.uint8)).astype, np.bool_)

@@ -108,7 +108,6 @@ def not_here(*args: Any, reference: str = "", **kwargs: Any) -> NoReturn:
     """
     where = f", {reference}" if reference else ""
     raise gym.error.Error(
-        f"this is of an environment in a sandbox{where}: to make one here would need its code "
-        "in this process, which it never enters. Use envhub_sandbox.make_env with that repository, "
-        "or copy.deepcopy(env) for another one like it"
+        f"this describes an environment in a sandbox{where}, whose code never enters this process. "
+        "Use envhub_sandbox.make_env with that repository, or copy.deepcopy(env) for a copy"
     )

@@ -60,5 +60,5 @@ class Drain:
         if self._until is not None:
             raise BusyError(
                 Busy(DRAINING, 0, 0, RETRY_S),
-                "the server is about to end, and takes nothing new: another in its place will",
+                "the server drains and accepts nothing new: try again when its replacement runs",
             )

@@ -114,9 +114,9 @@ class AuthorizedClients:
         names = {**_parse(text, path), **self._known}
         if self._most is not None and len(names) > self._most:
             raise ValueError(
-                f"{path}: {len(names)} clients, and without Landlock a jail of the "
-                "profile 'container' could read the files of all of them: leave one on the "
-                "list (one server for each), or use --weakest-profile no-userns or strict"
+                f"{path}: {len(names)} clients are listed, and without Landlock a jail of the "
+                "profile 'container' could read the files of all: leave one on the list (one "
+                "server for each), or use --weakest-profile no-userns or strict"
             )
         return names
 

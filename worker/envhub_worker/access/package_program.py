@@ -101,6 +101,7 @@ def why_impossible() -> str:
         return ""
     said = done.stderr.decode(errors="replace").strip().splitlines() or ["no word"]
     return (
-        f"packages are made by envhub-sandbox itself, which is not ready beside this worker "
-        f"({sys.executable}): {said[-1][:500]}. Run: {sys.executable} -m pip install envhub-sandbox"
+        "packages are installed by envhub-sandbox, which does not work in this worker's "
+        f"interpreter ({sys.executable}): {said[-1][:500]}. Run: {sys.executable} -m pip install "
+        "envhub-sandbox"
     )

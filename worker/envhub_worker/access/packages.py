@@ -21,6 +21,7 @@ from typing import Any
 from envhub_worker.access.package_program import PackageProgram
 from envhub_worker.access.quotas import BusyError, Quotas
 from envhub_worker.access.store.blob_store import make_passable
+from envhub_worker.access.store.shared_use import SHARED
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.messages.busy import Busy
 from envhub_worker.protocol.runtime import Runtime
@@ -74,10 +75,20 @@ News = tuple[bytes, float, Mapping[str, Any]]
 
 
 class Packages:
-    """The packages of all clients."""
+    """The packages of all clients.
+    ``shared``: other servers of this machine use the folder, too, and all clients are one user's.
+    """
 
-    def __init__(self, folder: Path | None, quotas: Quotas, make_s: float = MAKE_S) -> None:
+    def __init__(
+        self,
+        folder: Path | None,
+        quotas: Quotas,
+        make_s: float = MAKE_S,
+        *,
+        shared: bool = False,
+    ) -> None:
         self._folder = folder
+        self._shared = shared
         self._quotas = quotas
         self._make_s = make_s
         self._line: OrderedDict[Place, Order] = OrderedDict()
@@ -104,7 +115,7 @@ class Packages:
         if self._folder is None:
             return _not_here(request)
         plain = checked(request)
-        home = key.hex()[:32] or "local"
+        home = self._home(key)
         place = home, hashlib.sha256(json.dumps(plain).encode()).hexdigest()
         self.look(in_use)
         found = self._outcomes.get(place)
@@ -125,12 +136,15 @@ class Packages:
 
     def runtime(self, key: bytes, name: str) -> Runtime:
         """What a client's packages are, and their interpreter. Raises ``RefusedError``."""
-        found = self._handed.get((key.hex()[:32] or "local", name))
+        found = self._handed.get((self._home(key), name))
         if found is None or not os.path.isdir(found[0].packages):
             raise RefusedError(
                 "WorkerError", "this server has no such packages; ask for them first"
             )
         return found[0]
+
+    def _home(self, key: bytes) -> str:
+        return SHARED if self._shared else key.hex()[:32] or "local"
 
     def look(self, in_use: Collection[str]) -> None:
         """Take what is done, give up what is not asked for, and begin the next."""
@@ -254,7 +268,7 @@ class Packages:
         work.close()
         if work.ended_at is not None:
             text = (
-                f"they were not made in time: the server gives an order {self._make_s:.0f} s "
+                f"they were not installed in time: the server permits {self._make_s:.0f} s "
                 "(--packages-s)"
             )
             said = {"error": "IndexUnavailableError", "said": text}
@@ -316,7 +330,7 @@ def _not_here(request: m.NeedPackages) -> m.Packages:
     if request.always:
         raise RefusedError(
             "PolicyError",
-            "dependencies: this server makes no environments of a repository's own; start it "
-            "with --dependencies, or in an interpreter that has the packages",
+            "dependencies: this server installs no packages; start it with --dependencies, or in "
+            "an interpreter that has them",
         )
     return m.Packages("own", "", {}, "this server makes no environments (--dependencies)")

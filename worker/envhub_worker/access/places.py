@@ -20,7 +20,7 @@ from envhub_worker.supervisor.records import Asker
 
 _PATIENCE_S = 5.0
 _MAX_WAITING = 1024
-_PLACE_NEEDED = "its client has gone, and its key needed the place"
+_PLACE_NEEDED = "its client is gone, and its key needed the place"
 
 
 @dataclass

@@ -23,12 +23,12 @@ from envhub_worker.access.session_expiry import SessionExpiry
 from envhub_worker.access.sessions import WATCHER, Sessions
 from envhub_worker.access.store.uploads import PREFIX, Uploads, wrong_with_path
 from envhub_worker.lockdown.spec import confinement_from_wire
+from envhub_worker.lockdown.surroundings import own_runtime
 from envhub_worker.loop import Loop
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import ProtocolError
 from envhub_worker.protocol.keys import KEY_BYTES, key_text
 from envhub_worker.protocol.records import dataclass
-from envhub_worker.protocol.runtime import OWN
 from envhub_worker.supervisor.jails import Jails
 from envhub_worker.supervisor.records import Asker, JailRecord, RefusedError
 
@@ -175,7 +175,7 @@ class RemoteGate(Gate):
         if wrong:
             raise RefusedError("PolicyError", f"the entry file {wrong}")
         packages = request.runtime.packages
-        runtime = self._packages.runtime(key, packages) if packages else OWN
+        runtime = self._packages.runtime(key, packages) if packages else own_runtime()
         use = Use(confinement.limits.memory_bytes, request.runners)
         copies = self._hub_copies(key, request)
         self._places.for_jail(asked.asker, use, asked.sessions, asked.jails)

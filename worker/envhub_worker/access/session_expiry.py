@@ -36,10 +36,10 @@ class SessionExpiry:
         self.end_deserted(sessions, jails)
         for session in sessions.idle(self._idle_s or _FORGOTTEN_S):
             if self._idle_s:
-                why = f"nothing was heard of its client for {self._idle_s} s"
+                why = f"its client has sent nothing for {self._idle_s} s"
                 self.end(session, sessions, jails, why)
             elif not jails.open_ones(session.owner):
-                self.drop(session, sessions, "nothing was heard of it for long")
+                self.drop(session, sessions, "it has sent nothing for too long")
         if self._idle_s:
             self._end_unheld(sessions, jails)
 

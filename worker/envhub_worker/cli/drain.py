@@ -48,8 +48,8 @@ def _server(chosen: Path | None) -> tuple[int, bool]:
     facts = status.of_server(*address)
     if not facts["pid_namespace"] or facts["pid_namespace"] != pid_namespace():
         raise status.UnreachableError(
-            "the server runs in a container, where processes have other numbers than here: stop it "
-            "as containers are stopped, or run this inside"
+            "the server runs in a container, where process ids are different: stop the container, "
+            "or run this command in it"
         )
     pidfd = os.pidfd_open(facts["pid"])
     try:

@@ -27,7 +27,7 @@ class Identity:
 
     Attributes:
         keys: The server's pair; None only behind ``--insecure-loopback``.
-        client: The one client that was made, if there is no such file.
+        client: The one client that was named, or made if there is no such file.
         fresh: Whether that was made just now.
         profile: The strongest profile that jails can have here.
     """
@@ -48,9 +48,16 @@ class Identity:
 def identity_of(arguments: argparse.Namespace, state: Path) -> Identity:
     """What the arguments say, with keys of the state folder where they name none."""
     if arguments.insecure_loopback:
-        if arguments.key or arguments.authorized_clients:
-            raise UsageError("--insecure-loopback has no keys: leave --key and others out")
+        if arguments.key or arguments.authorized_clients or arguments.only_client:
+            raise UsageError(
+                "--insecure-loopback has no keys: leave out --key and the other options for keys"
+            )
         return Identity(None)
+    if arguments.only_client and arguments.authorized_clients:
+        raise UsageError("--only-client is instead of --authorized-clients: leave one out")
+    if arguments.only_client:
+        pair = keys.load(arguments.key) if arguments.key else keys.generate()  # for this life only
+        return Identity(pair, client=KeyPair(arguments.only_client, b""))
     pair = keys.load(arguments.key) if arguments.key else _kept_pair(state, "server")[0]
     if arguments.authorized_clients:
         return Identity(pair, arguments.authorized_clients)
@@ -85,6 +92,9 @@ def announcement(endpoint: str, identity: Identity) -> str:
     lines.append("")
     if identity.client is None:
         lines.append(f"Clients: those in {identity.authorized}. A client writes:")
+        secret = "<its secret key, or the file that holds it>"
+    elif not identity.client.secret:
+        lines.append("Clients: the one of --only-client. It writes:")
         secret = "<its secret key, or the file that holds it>"
     elif identity.fresh:
         lines.append(f"No --authorized-clients: one client key was made ({identity.client_file}).")

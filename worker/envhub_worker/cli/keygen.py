@@ -27,8 +27,8 @@ def run(arguments: argparse.Namespace) -> int:
         secret, public = keys.save(pair, arguments.out, arguments.name)
     except FileExistsError as error:
         sys.stderr.write(
-            f"envhub-worker keygen: {error.filename} is there already, and is not replaced: its "
-            "key may be in use. Choose another --name or --out, or move it away first\n"
+            f"envhub-worker keygen: {error.filename} exists and is not replaced: its key may be in "
+            "use. Choose another --name or --out, or move it away first\n"
         )
         return 1
     except OSError as error:

@@ -44,6 +44,7 @@ from envhub_worker.cli.state_folder import Note, ServerNote, state_folder
 from envhub_worker.lockdown import probe, surroundings
 from envhub_worker.lockdown.mechanisms import landlock, locked_folder
 from envhub_worker.lockdown.mechanisms.locked_folder import LockedFolder
+from envhub_worker.protocol.messages.surroundings import Surroundings
 from envhub_worker.server import Server
 
 _MAX_OPEN_FILES = 65_536
@@ -64,6 +65,7 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _listen(arguments: argparse.Namespace, state: Path) -> int:
     check_bind(arguments.bind, arguments.insecure_loopback)
+    around = surroundings.surroundings() if arguments.announce else None
     if arguments.dependencies and (why := why_impossible()):
         raise UsageError(f"--dependencies: {why}")
     strongest = surroundings.profiles(probe.probe()["layers"], landlock.version())
@@ -74,7 +76,7 @@ def _listen(arguments: argparse.Namespace, state: Path) -> int:
         log.say("no_jail_possible", "error", why=why)
     _raise_file_limit()
     with _watched(arguments.metrics, log, usable=not why) as publish:
-        return _serve(arguments, state, identity, log, publish)
+        return _serve(arguments, state, identity, log, publish, around)
 
 
 def _serve(
@@ -83,6 +85,7 @@ def _serve(
     identity: Identity,
     log: Log,
     publish: Publish | None,
+    around: Surroundings | None,
 ) -> int:
     place = locked_folder.place_for_sockets()
     locked_folder.remove_deserted(place)
@@ -90,9 +93,13 @@ def _serve(
     try:
         gate = _gate(arguments, state, identity, log, publish)
         store = state / "store"
-        server = Server(arguments.bind, runtime.path, [str(store)], gate=gate)
+        ended = arguments.client_pidfd  # readable once that process has ended
+        if arguments.until_eof:
+            ended = 0  # stdin is readable at its end
+        server = Server(arguments.bind, runtime.path, [str(store)], ended, gate=gate)
         key_file = (arguments.key or state / "server.key").absolute()
-        note = Note(state, ServerNote(server.endpoint, identity.public, str(key_file)))
+        noted = ServerNote(server.endpoint, identity.public, str(key_file))
+        note = None if arguments.only_client else Note(state, noted)
     except zmq.ZMQError as error:
         runtime.remove()
         raise UsageError(f"--bind {arguments.bind}: {error.strerror}") from None
@@ -105,7 +112,13 @@ def _serve(
     server.stop_on(*ends, gently=(signal.SIGTERM,))
     began = time.monotonic()
     try:
-        if arguments.log_format == "text" or identity.authorized is None:  # a client needs it
+        if arguments.ready_fd is not None:
+            with contextlib.suppress(BrokenPipeError):  # who started us has gone: the loop sees it
+                os.write(arguments.ready_fd, f"{server.endpoint} {identity.public}\n".encode())
+            os.close(arguments.ready_fd)
+        elif around is not None:
+            print(surroundings.announcement(around, server_key=identity.public), flush=True)
+        elif arguments.log_format == "text" or identity.authorized is None:  # a client needs it
             print(announcement(server.endpoint, identity), flush=True)
         log.say(
             "listening",
@@ -123,7 +136,8 @@ def _serve(
         return 1
     finally:
         log.say("stopped", "info", seconds=time.monotonic() - began)
-        note.remove()
+        if note is not None:
+            note.remove()
         runtime.remove()
     return 0
 
@@ -187,10 +201,10 @@ def _gate(
     operators = frozenset[bytes]() if pair is None else frozenset({pair.public})
     quotas = quotas_of(arguments)
     # one, where nothing keeps a jail from the other clients' files
-    shared = arguments.weakest_profile == "container" and landlock.version() < 1
+    single = arguments.weakest_profile == "container" and landlock.version() < 1
     rules = Rules(
         keys=identity.keys,
-        authorized=AuthorizedClients(identity.authorized, known, 1 if shared else None),
+        authorized=AuthorizedClients(identity.authorized, known, 1 if single else None),
         operators=operators,
         quotas=quotas,
         permissions=Permissions(
@@ -205,5 +219,8 @@ def _gate(
         profile=identity.profile,
     )
     folder = state / "packages" if arguments.dependencies else None
-    packages = Packages(folder, quotas, arguments.packages_s)
-    return RemoteGate(rules, Uploads(state / "store", quotas), packages, log, publish)
+    # with those that programs of one user start, each with a key of its own for that program
+    shared = bool(arguments.only_client) and arguments.client_pidfd is not None
+    packages = Packages(folder, quotas, arguments.packages_s, shared=shared)
+    uploads = Uploads(state / "store", quotas, shared=shared)
+    return RemoteGate(rules, uploads, packages, log, publish)

@@ -15,6 +15,7 @@ from envhub_worker.access.port.connection_limit import MAX_CONNECTIONS
 from envhub_worker.access.quotas import Quotas
 from envhub_worker.lockdown.mechanisms import landlock
 from envhub_worker.protocol.confinement import PROFILES
+from envhub_worker.protocol.keys import parse_key
 from envhub_worker.protocol.text import parse_size, size_text
 
 DEFAULT_BIND = "tcp://127.0.0.1:5555"
@@ -39,7 +40,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--max-connections",
         type=_count,
         default=MAX_CONNECTIONS,
-        help=f"connections of all together, strangers included (default: {MAX_CONNECTIONS})",
+        help=f"connections of all clients and unknown hosts (default: {MAX_CONNECTIONS})",
     )
     parser.add_argument(
         "--bind",
@@ -53,6 +54,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         type=Path,
         metavar="FILE",
         help="clients' public keys, one a line; without it one is made and printed",
+    )
+    parser.add_argument(
+        "--only-client",
+        type=_key,
+        metavar="KEY",
+        help="the public key of the one client, instead of a file",
     )
     parser.add_argument("--insecure-loopback", action="store_true", help="no keys; loopback only")
     parser.add_argument("--state-dir", type=Path, help="keys and snapshots; private, writable")
@@ -107,6 +114,16 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         default="info",
         help="the least important events in the log (default: info)",
     )
+    parser.add_argument("--until-eof", action="store_true", help="end when stdin ends")
+    parser.add_argument(
+        "--announce",
+        action="store_true",
+        help="print one line of JSON for the program that started this, instead of the line for "
+        "the client: the public key, and what confines the server",
+    )
+    # of a program that starts a server for itself: see the head of __main__.py
+    for name in ("--client-pidfd", "--ready-fd"):
+        parser.add_argument(name, type=int, help=argparse.SUPPRESS)
     _add_quotas(parser)
 
 
@@ -132,6 +149,13 @@ def quotas_of(arguments: argparse.Namespace) -> Quotas:
 
 def _count(text: str) -> int:
     return _at_least(1, text)
+
+
+def _key(text: str) -> bytes:
+    try:
+        return parse_key(text)
+    except ValueError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
 
 def _size(unit: str, text: str) -> int:

@@ -14,8 +14,8 @@ from envhub_worker.access.audit.figures import REFUSALS
 from envhub_worker.protocol.confinement import REASONS
 
 MISSING = (
-    "--metrics needs prometheus_client, which is not installed in this interpreter: "
-    "pip install 'envhub-sandbox[metrics]', or prometheus-client where the worker stands alone"
+    "--metrics needs prometheus_client, which is not installed in this interpreter: pip install "
+    "'envhub-sandbox[metrics]', or prometheus-client if only the worker is installed"
 )
 STALE_S = 30.0
 """A server publishes every second. One that has not for so long is stuck."""
@@ -68,11 +68,11 @@ class MetricsPage:
         if published is None:
             return "it has only just been started"
         age_s = self._clock() - published[0]
-        return f"nothing was heard of its loop for {age_s:.0f} s" if age_s > STALE_S else ""
+        return f"its loop has not run for {age_s:.0f} s" if age_s > STALE_S else ""
 
     def _unready(self, published: tuple[float, Mapping[str, Any]] | None) -> str:
         if published is not None and _drains(published[1]):
-            return "it drains: nothing new is let in"
+            return "it drains: it accepts nothing new"
         return "" if self._usable else "no jail can be opened here: see its log, or envhub doctor"
 
 
@@ -85,9 +85,9 @@ def _drains(figures: Mapping[str, Any]) -> bool:
 # the metric (counters without the _total that the exposition adds), the figures' key, the help
 _GAUGES = (
     ("envhub_server_start_time_seconds", "started", "When it was started, in Unix time."),
-    ("envhub_server_ready", "ready", "1 while it lets new clients in."),
-    ("envhub_server_connections", "connections", "Open connections, strangers' included."),
-    ("envhub_server_connections_limit", "max_connections", "How many are let in."),
+    ("envhub_server_ready", "ready", "1 while it accepts new clients."),
+    ("envhub_server_connections", "connections", "Open connections, of unknown hosts too."),
+    ("envhub_server_connections_limit", "max_connections", "Maximum number of connections."),
 )
 _CLIENT_GAUGES = (
     ("envhub_server_sessions", "sessions", "Processes of a client that are connected."),

@@ -100,4 +100,4 @@ def _ahead(arguments: argparse.Namespace) -> ZygoteProcess | None:
 def _announced() -> str:
     from envhub_worker.lockdown import surroundings
 
-    return surroundings.announcement()
+    return surroundings.announcement(surroundings.surroundings())

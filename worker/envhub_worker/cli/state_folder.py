@@ -64,9 +64,9 @@ def _make_private(folder: Path) -> None:
     found = folder.stat()
     if found.st_uid != os.getuid() or found.st_mode & 0o022:
         raise PermissionError(
-            f"the state folder {folder} holds keys, and others can change what is in it: it "
-            f"belongs to uid {found.st_uid} and has mode {stat.S_IMODE(found.st_mode):04o}. Give "
-            f"it to uid {os.getuid()} and chmod go-w it, or let --state-dir name a new one"
+            f"the state folder {folder} holds keys, and others can change it: it belongs to uid "
+            f"{found.st_uid} and has mode {stat.S_IMODE(found.st_mode):04o}. Give it to uid "
+            f"{os.getuid()} and chmod go-w it, or let --state-dir name a new one"
         )
 
 

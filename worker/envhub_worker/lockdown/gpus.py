@@ -51,7 +51,7 @@ def granted(gpu: bool | tuple[int, ...], host: HostFiles) -> GpuGrant:
             "gpu",
             "the policy grants the GPU, and there is none here: no /dev/dri/renderD* and no "
             "/dev/nvidia0",
-            "Install its driver, or in a container hand it in (docker run --gpus all); or grant "
+            "Install its driver, or give it to the container (docker run --gpus all), or grant "
             "no GPU.",
         )
     missing = [index for index in wanted if index >= len(found)]

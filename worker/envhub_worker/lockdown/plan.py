@@ -12,7 +12,7 @@ from envhub_worker.protocol.confinement import LEAST_LANDLOCK, MIB, NETWORKS, PR
 from envhub_worker.protocol.records import dataclass
 
 #: What the kernel counts per user and does not bound per jail.
-SHARED_QUOTAS = "pages of pipes, descriptors under way in sockets, epoll watches"
+SHARED_QUOTAS = "pages of pipes, descriptors in flight in sockets, epoll watches"
 
 # Without a pid namespace Landlock must itself guard signals: from this ABI on it does. Before it,
 # init sends the jail's signals.
@@ -52,7 +52,7 @@ def plan(confinement: Confinement, facts: HostFacts) -> tuple[Layer, ...]:
         *_user_layers(facts, namespaced),
         *(_namespace_layers(confinement) if namespaced else _without_namespaces(confinement)),
         Layer("capabilities", True, "none in any set"),
-        Layer("no-new-privileges", True, "set-user-id programs gain nothing"),
+        Layer("no-new-privileges", True, "no rights from set-user-id programs"),
         _landlock_layer(facts.landlock_abi),
         *_signal_layers(facts, namespaced),
         Layer("seccomp", True, f"allow-list for {facts.machine}{ignored}"),
@@ -79,26 +79,26 @@ def _check(confinement: Confinement, facts: HostFacts) -> None:
         raise LayerUnavailableError(
             "landlock",
             f"the profile {confinement.profile} needs Landlock ABI {least}, this kernel has {have}",
-            "ABI 1 came with Linux 5.13, 3 with 6.2; it must be in the kernel's lsm= list, and a "
-            "container's seccomp profile must allow it.",
+            "ABI 1 needs Linux 5.13, ABI 3 Linux 6.2; it must be in the kernel's lsm= list, and "
+            "a container's seccomp profile must allow it.",
         )
     if confinement.profile != "strict" and confinement.network == "loopback":
         raise LayerUnavailableError(
             "network-namespace",
-            f"the profile {confinement.profile} has no network of its own to give",
+            f"the profile {confinement.profile} has no network namespace",
             'Use profile "strict", or the network "none".',
         )
     if confinement.profile != "strict" and confinement.display != "none":
         raise LayerUnavailableError(
             "display",
-            f"the profile {confinement.profile} has no sockets by name, which a display needs",
+            f"the profile {confinement.profile} permits no socket files, which a display needs",
             'Use profile "strict", or leave the display out.',
         )
 
 
 def _user_layers(facts: HostFacts, namespaced: bool) -> list[Layer]:
-    user = Layer("unprivileged-user", True, "a user id that owns and runs nothing")
-    namespace = Layer("user-namespace", True, "one user, and no capability over any other")
+    user = Layer("unprivileged-user", True, "a user id without files and processes")
+    namespace = Layer("user-namespace", True, "one user, without capabilities outside")
     return [user] * facts.root + [namespace] * namespaced
 
 
@@ -107,22 +107,22 @@ def _namespace_layers(confinement: Confinement) -> list[Layer]:
     network = {
         "host": "the host's network, by explicit choice",
         "loopback": "only a loopback device",
-    }.get(confinement.network, "no device that is up")
+    }.get(confinement.network, "no active device")
     scratch = f"one tmpfs of {limits.disk_bytes // MIB} MiB and {limits.disk_files} files"
     return [
-        Layer("pid-namespace", True, "sees, signals and outlives no process but its own"),
+        Layer("pid-namespace", True, "sees and signals only its own processes"),
         Layer("mount-namespace", True, "a private read-only root; other files do not exist"),
         Layer("scratch", True, scratch),
         Layer("network-namespace", confinement.network != "host", network),
         Layer("ipc-namespace", True, "its own System V and POSIX objects"),
-        Layer("uts-namespace", True, "a host name that says nothing"),
-        Layer("cgroup-namespace", True, "does not see where it is counted"),
+        Layer("uts-namespace", True, "a neutral host name"),
+        Layer("cgroup-namespace", True, "its own view of control groups"),
     ]
 
 
 def _without_namespaces(confinement: Confinement) -> list[Layer]:
     why = f"the profile {confinement.profile} goes without"
-    network = Layer("network", True, "no socket can be made but connected local pairs")
+    network = Layer("network", True, "only connected local socket pairs")
     if confinement.network == "host":
         network = Layer("network", False, "the host's network, by explicit choice")
     return [

@@ -17,6 +17,7 @@ from envhub_worker.lockdown import probe
 from envhub_worker.lockdown.mechanisms import landlock
 from envhub_worker.protocol.confinement import LEAST_LANDLOCK
 from envhub_worker.protocol.messages.surroundings import Surroundings
+from envhub_worker.protocol.runtime import OWN, Runtime
 
 ENVIRONMENT = Path("/opt/environment/bin/python")
 """The interpreter of jails in an image that was derived for a repository."""
@@ -24,9 +25,14 @@ _CGROUPS = Path("/sys/fs/cgroup")
 _NAMESPACED = frozenset({"user-namespace", "namespaces", "mount-namespace", "landlock", "seccomp"})
 
 
-def announcement() -> str:
-    """One line of JSON for the client that started the container."""
-    return json.dumps({"envhub-worker": __version__, **vars(surroundings())})
+def announcement(found: Surroundings, **more: str) -> str:
+    """One line of JSON for the client that started the container. ``more``: of a server there."""
+    return json.dumps({"envhub-worker": __version__, **vars(found), **more})
+
+
+def own_runtime() -> Runtime:
+    """What jails run on where nothing else is said: in a derived image its environment."""
+    return Runtime(str(ENVIRONMENT)) if ENVIRONMENT.exists() else OWN
 
 
 def surroundings() -> Surroundings:
@@ -44,7 +50,7 @@ def surroundings() -> Surroundings:
         memory=memory_limit(_CGROUPS),
         pids=pids_limit(_CGROUPS),
         cpus=cpus_limit(_CGROUPS),
-        python=str(ENVIRONMENT) if ENVIRONMENT.exists() else "",
+        python=own_runtime().python,
     )
 
 

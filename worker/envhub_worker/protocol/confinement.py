@@ -40,22 +40,22 @@ REASONS: tuple[Reason, ...] = get_args(Reason)
 
 @dataclass(frozen=True, kw_only=True)
 class Limits:
-    """Hard caps of one jail. ``None`` where a cap may be lifted means no cap of ours.
+    """Hard caps of one jail. None, where it is permitted, sets no cap.
 
-    What is in bytes may also be a text such as ``"4G"``, which ``Policy`` reads.
+    ``Policy`` also takes texts such as ``"4G"`` for bytes.
 
     Attributes:
         memory_bytes: All memory of all processes of the jail, shared memory included.
         processes: Processes and threads alive at once.
-        cpu_time_s: CPU seconds that one process of the jail may burn, or None.
+        cpu_time_s: CPU seconds that one process of the jail may use, or None.
         open_files: File descriptors of one process.
         disk_bytes: Bytes in the jail's scratch (home, temporary files, working directory).
         disk_files: Files and folders in that scratch.
         file_bytes: Size of one file, or None for ``disk_bytes``.
-        output_bytes: Bytes of stdout and stderr that are kept (the last ones).
+        output_bytes: Last bytes of stdout and stderr that are kept.
         message_bytes: Size of one message from the jail.
-        elements: What all spaces of a repository may cost the client, in elements of a float32
-            ``Box`` (ten bytes each). Boxes that are alike count once.
+        elements: Memory of all spaces of a repository in the client, in elements of a float32
+            ``Box`` (ten bytes each). Equal Boxes count once.
     """
 
     memory_bytes: int = 8 * GIB

@@ -9,9 +9,11 @@ class EnvHubError(Exception):
     Attributes:
         denied: What the jail was denied that it ends, in the words of
             ``env.sandbox.denials()``; None where it is not recorded, or no jail has ended.
+        env_ids: Of ``send`` and ``recv``: the sub-environments of the worker that it is about.
     """
 
     denied: tuple[str, ...] | None = None
+    env_ids: tuple[int, ...] = ()
 
 
 class ProtocolError(EnvHubError):

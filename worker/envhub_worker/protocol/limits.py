@@ -52,5 +52,8 @@ def limits_for(message_bytes: int) -> WireLimits:
     return WireLimits(frame_bytes=message_bytes, message_bytes=message_bytes)
 
 
+MAX_IN_FLIGHT = 16
+"""Requests that one runner may owe the answers to. A client sends further steps before the answer
+to the first, and a late answer after a timeout may still be under way."""
 LARGE_BYTES = 64 * KIB
 """Below this a copy costs less than to keep the owner of the bytes until they are gone."""

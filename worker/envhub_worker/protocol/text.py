@@ -96,7 +96,7 @@ def _escaped(char: str) -> str:
     return char.encode("unicode_escape", "backslashreplace").decode("ascii")
 
 
-_SPACE = "free space, or remove files where only their number is used up (df -h; df -i)"
+_SPACE = "free space, or remove files if their number is used up (df -h; df -i)"
 _CURES = {
     errno.EMFILE: "raise the limit on open files (ulimit -n; of a service LimitNOFILE=)",
     errno.ENFILE: "raise the machine's limit on open files (sysctl fs.file-max)",

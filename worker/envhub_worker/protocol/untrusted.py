@@ -70,11 +70,11 @@ def is_fault(error: BaseException) -> bool:
 def blamed(error: BaseException) -> RemoteProtocolError:
     """The error to raise for it. Trust: its text may hold the peer's own."""
     if isinstance(error, MemoryError):
-        return MessageTooLargeError("there is not enough memory for what the peer sent")
+        return MessageTooLargeError("there is not enough memory for the peer's message")
     try:
         text = one_line(str(error), _MAX_CHARS)
     except Exception:  # a text is made of values, and these are the peer's
         text = "..."
     return RemoteProtocolError(
-        f"what the peer sent cannot be handled: {type(error).__name__}: {text}"
+        f"the peer's message cannot be handled: {type(error).__name__}: {text}"
     )

@@ -124,6 +124,6 @@ def _check_arguments(parameters: Parameters, taken: dict[str, Any], given: dict[
     ]
     if missing:
         raise ArgumentsError(
-            f"make_env needs {', '.join(missing)}; pass env_kwargs, or a config object where it is "
+            f"make_env needs {', '.join(missing)}; pass it in env_kwargs, or a config object for "
             "cfg"
         )

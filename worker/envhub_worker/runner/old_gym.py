@@ -262,7 +262,7 @@ def space_of(space: Any) -> Any:
             return _SPACES[cls.__name__](space)
     raise OldSpaceError(
         f"a space of gym is a {type(space).__module__}.{type(space).__qualname__}, which Gymnasium "
-        f"has not; what can be taken over is {', '.join(_SPACES)}"
+        f"does not have; supported are {', '.join(_SPACES)}"
     )
 
 

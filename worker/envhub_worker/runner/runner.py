@@ -287,8 +287,8 @@ class Runner:
         except AttributeError:
             kind = type(self._envs[request.env]).__qualname__
             raise AttributeError(
-                f"a {kind} shows no sub-environments; ask it for one value each, by get_attr or "
-                "call"
+                f"a {kind} shows no sub-environments; use get_attr or call, which return one value "
+                "for each"
             ) from None
 
     def get_random(self, request: m.GetRandom) -> m.Message:

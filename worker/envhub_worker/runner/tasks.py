@@ -91,7 +91,7 @@ def tasks_of(result: Any, n_envs: int, use_async_envs: bool, again: EnvFn) -> li
         return [make.task(_suite_name(result), 0, result, lambda value: value)]
     tasks = [make.task(suite, task, env, pick) for suite, task, env, pick in _entries(result)]
     if not tasks:
-        raise ResultError("make_env returned an empty mapping; it holds no environment")
+        raise ResultError("make_env returned an empty mapping, without an environment")
     return tasks
 
 

@@ -63,7 +63,7 @@ class _Finder(MetaPathFinder, Loader):
         if not self._said:
             self._said = True
             warnings.warn(
-                "lerobot is not installed in the jail: a stub stands in, with EnvConfig, "
+                "lerobot is not installed in the jail: a stub replaces it, with EnvConfig, "
                 "HubEnvConfig, PolicyFeature, FeatureType and the constants of observations",
                 stacklevel=2,
             )

@@ -103,8 +103,8 @@ def _main(order: Order) -> Callable[[socket.socket, JailSpec, list[int]], int | 
             return _resolve(config.target)
     except ModuleNotFoundError as error:
         raise SystemExit(
-            f"ModuleNotFoundError: {error}, in {config.packages}. What every jail imports of it "
-            "is cloudpickle, gymnasium, msgpack and numpy: make the environment anew with these"
+            f"ModuleNotFoundError: {error}, in {config.packages}. Every jail imports cloudpickle, "
+            "gymnasium, msgpack and numpy from it: make the environment again with these"
         ) from None
 
 

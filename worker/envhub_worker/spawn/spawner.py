@@ -188,7 +188,7 @@ class Spawner:
     def spawn(self, spec: JailSpec) -> Jail:
         """Ask for a jail. Requests wait until the zygote is ready. Raises ``RuntimeError``."""
         if self._exited:
-            raise RuntimeError("the zygote has gone")
+            raise RuntimeError("the zygote has ended")
         self._count += 1
         # Mounts and Landlock know real paths only.
         spec = replace(spec, snapshot=os.path.realpath(spec.snapshot))

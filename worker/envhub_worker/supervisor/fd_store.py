@@ -63,12 +63,16 @@ class FdStore:
                 connection.send(m.NOT_YET)
                 return
             assert isinstance(request, m.Deposit)
-            key = request.jail, request.runner
-            close_fds(self._waiting.pop(key, []))
-            self._waiting[key], fds = fds, []
+            self.put(request.jail, request.runner, fds)
+            fds = []
             socket.send_fds(connection, [m.TAKEN], [pidfd])
         finally:
             close_fds(fds)
+
+    def put(self, jail: int, runner: int, fds: list[int]) -> None:
+        """Keep descriptors for a runner, in the place of those that are there; takes them over."""
+        close_fds(self._waiting.pop((jail, runner), []))
+        self._waiting[jail, runner] = fds
 
     def take(self, jail: int, runner: int) -> list[int]:
         """The descriptors for a runner; the caller closes them."""

@@ -11,7 +11,7 @@ import os
 from collections.abc import Sequence
 from time import monotonic
 
-from envhub_worker.protocol.shared_memory import SEQUENCE
+from envhub_worker.protocol.shared_memory.words import SEQUENCE
 from envhub_worker.spawn.channel import close_fds
 
 _WORD = 8

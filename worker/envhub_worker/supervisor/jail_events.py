@@ -29,6 +29,7 @@ from envhub_worker.supervisor.records import (
     whole_jail,
 )
 from envhub_worker.supervisor.runner_stream import RunnerLink
+from envhub_worker.supervisor.served_slabs import ServedSlabs, ServedSteps
 from envhub_worker.supervisor.witness import Witness
 
 MAX_DEAD = 256
@@ -55,6 +56,9 @@ class JailEvents:
         self._fds = fds
         self._witness = witness
         self.deaths: Counter[str] = Counter()
+        self._steps = ServedSteps()
+        loop.watch(self._steps.fileno(), self._steps.rung)
+        loop.look_by(self._steps.look)
         self._outer_limit = SurroundingLimit()
 
     def follow(self, entry: JailRecord) -> None:
@@ -67,6 +71,9 @@ class JailEvents:
         self._watch(entry, entry.links[runner].fileno(), lambda: self._runner_ready(entry, runner))
 
     def _watch(self, entry: JailRecord, fd: int, callback: Callable[[], None]) -> None:
+        self._loop.watch(fd, self._guarded(entry, callback))
+
+    def _guarded(self, entry: JailRecord, callback: Callable[[], None]) -> Callable[[], None]:
         """Whatever goes wrong with a jail is its own end, and not the server's."""
 
         def guarded() -> None:
@@ -77,7 +84,36 @@ class JailEvents:
                 what = f"an error of the worker server: {type(error).__name__}: {error}"
                 self.end(entry, whole_jail("killed", detail=what))
 
-        self._loop.watch(fd, guarded)
+        return guarded
+
+    def share(self, link: RunnerLink, slabs: ServedSlabs) -> None:
+        """The server takes a runner's steps, by these slabs."""
+        self._part_with(link)
+        link.slabs = slabs
+        self._steps.add(slabs)
+
+    def _part_with(self, link: RunnerLink) -> None:
+        if link.slabs is not None:
+            self._steps.forget(link.slabs)
+            link.slabs = None
+
+    def step(self, entry: JailRecord, link: RunnerLink, frame: bytes, owner: object) -> None:
+        """Have a runner take a step."""
+        assert link.slabs is not None
+        link.sent += len(frame)
+        link.slabs.ask(frame, owner)
+        self._steps.owe(link.slabs, self._guarded(entry, lambda: self._stepped(entry, link)))
+
+    def _stepped(self, entry: JailRecord, link: RunnerLink) -> None:
+        """A runner has answered; nobody may wait for that any more."""
+        if link.slabs is None or link.slabs.owner is None or not link.slabs.answered:
+            return
+        (pending, index), frames = link.slabs.take()
+        link.received += sum(map(len, frames))
+        if entry.idle is not None:
+            entry.idle.begin()
+        pending.replies[index] = frames
+        self.gather(pending)
 
     def follow_writes(self, link: RunnerLink) -> None:
         """Send the rest when its socket takes it, if there is a rest."""
@@ -183,6 +219,7 @@ class JailEvents:
 
     def close(self) -> None:
         """Nothing happens any more."""
+        self._steps.close()
         self._outer_limit.close()
 
     def _runner_died(self, entry: JailRecord, death: m.Death) -> None:
@@ -207,9 +244,11 @@ class JailEvents:
             entry.idle.forget(death.runner)
         link = entry.drop(death.runner)
         self._loop.unwatch(link.fileno())
-        for pending, index in link.pending.values():
+        self._stepped(entry, link)  # it may have answered before
+        for pending, index in link.owed:
             pending.lost(index, death)
             self.gather(pending)
+        self._part_with(link)
         link.close()
         for opening in [one for one in entry.opening if death.runner in one.waiting]:
             entry.opening.remove(opening)
@@ -222,6 +261,8 @@ class JailEvents:
             return
         self.deaths[death.reason] += 1
         self._hear_last(entry)
+        for link in entry.links.values():
+            self._stepped(entry, link)  # it may have answered before
         entry.output.read()
         entry.death = death = m.replace(death, tail=entry.output.text())
         for pending in waiting(entry):
@@ -280,15 +321,18 @@ class JailEvents:
 
     def _release(self, entry: JailRecord) -> None:
         entry.released = True
+        self._fds.drop(entry.number)  # its client may have brought some while it ended
+        unanswered = waiting(entry)  # before the slabs go, whose steps are among them
         for link in entry.links.values():
             self._loop.unwatch(link.fileno())
+            self._part_with(link)
             link.close()
         self._loop.unwatch(entry.output.fileno())
         entry.output.close()
         self._unwatch_control(entry)
         if entry.idle is not None:
             entry.idle.close()
-        for pending in waiting(entry):
+        for pending in unanswered:
             death = whole_jail("killed", detail="the jail was closed")
             self._reply(pending.asker, m.replace(death, operation=pending.operation))
         # the oldest dead, where there are many: their clients do not come back for them

@@ -16,7 +16,8 @@ from envhub_worker.lockdown.mechanisms.procfs import Children
 from envhub_worker.lockdown.spec import JailSpec, confinement_from_wire
 from envhub_worker.loop import Loop
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.limits import WireLimits, limits_for
+from envhub_worker.protocol.limits import DEFAULT_LIMITS, MAX_IN_FLIGHT, WireLimits, limits_for
+from envhub_worker.protocol.shared_memory import words
 from envhub_worker.spawn.channel import close_fds
 from envhub_worker.spawn.zygote_process import ZygoteProcess
 from envhub_worker.supervisor.fd_store import FdStore
@@ -35,7 +36,8 @@ from envhub_worker.supervisor.records import (
     status_of,
     whole_jail,
 )
-from envhub_worker.supervisor.runner_stream import MAX_PENDING, RunnerLink
+from envhub_worker.supervisor.runner_stream import RunnerLink
+from envhub_worker.supervisor.served_slabs import ServedSlabs
 from envhub_worker.supervisor.usage import CountLimit, reached, usage_of
 from envhub_worker.supervisor.witness import Witness
 from envhub_worker.supervisor.zygotes import Zygotes
@@ -62,14 +64,12 @@ class Jails:
         reply: Reply,
         runtime_dir: Path,
         readable_roots: Sequence[str],
-        limits: WireLimits,
         fd_path: Path,
         ahead: ZygoteProcess | None,
         witness: Witness,
         *,
         local: bool,
     ) -> None:
-        self._limits = limits
         self._local = local
         self._jails: dict[int, JailRecord] = {}
         self._packet_ids = itertools.count(1)
@@ -132,7 +132,7 @@ class Jails:
     def _wire_limits(self, entry: JailRecord) -> WireLimits:
         """What its client permits; where that is somebody on another host, no more than ours."""
         wanted = entry.jail.spec.confinement.limits.message_bytes
-        return limits_for(wanted if self._local else min(wanted, self._limits.message_bytes))
+        return limits_for(wanted if self._local else min(wanted, DEFAULT_LIMITS.message_bytes))
 
     def _start_runners(self, asker: Asker, entry: JailRecord, count: int) -> None:
         runners = []
@@ -149,14 +149,20 @@ class Jails:
         targets = _targets(entry, request, payload)
         if targets is None:
             raise RefusedError("LocalProtocolError", "the parts of Relay do not fit its frames")
-        if any(owes(entry, runner) >= MAX_PENDING for runner, _ in targets):
-            raise RefusedError("WorkerError", f"a runner owes {MAX_PENDING} answers already")
+        for runner, frames in targets:
+            if request.stepped and not _can_step(entry.links.get(runner), frames):
+                raise RefusedError("LocalProtocolError", "a runner has no slabs, or owes a step")
+            if owes(entry, runner) >= MAX_IN_FLIGHT:
+                raise RefusedError("WorkerError", f"a runner owes {MAX_IN_FLIGHT} answers already")
         pending = Pending(asker, request.operation, [None] * len(targets))
         for index, (runner, frames) in enumerate(targets):
             if runner in entry.lost:
                 pending.lost(index, entry.lost[runner])
                 continue
             link = entry.links[runner]
+            if request.stepped:
+                self._events.step(entry, link, frames[0], (pending, index))
+                continue
             fds = self._fds.take(entry.number, runner) if request.deposited else []
             try:
                 link.send(next(self._packet_ids), frames, (pending, index), fds)
@@ -169,6 +175,34 @@ class Jails:
             entry.idle.begin()
         if pending.dead:
             self._events.gather(pending)
+
+    def share(self, asker: Asker, request: m.ShareSlabs) -> m.Message:
+        """Make slabs for runners; each takes its own along with its ``Attach``."""
+        entry = self._owned(asker, request.jail)
+        most = self._wire_limits(entry).message_bytes
+        room = entry.jail.spec.confinement.limits.memory_bytes
+        asked: set[int] = set()
+        for part in request.slabs:
+            if type(part) is not tuple or list(map(type, part)) != [int] * 4:
+                raise RefusedError("LocalProtocolError", "slabs are four whole numbers each")
+            runner, leaves, request_bytes, observation_bytes = part
+            if runner in entry.lost:
+                continue  # the request that follows is answered with its death
+            if runner not in entry.links or runner in asked:
+                raise RefusedError("LocalProtocolError", f"no runner {runner}, or named twice")
+            asked.add(runner)
+            if owes(entry, runner):
+                raise RefusedError("LocalProtocolError", f"runner {runner} owes an answer")
+            if not words.served(leaves, request_bytes, observation_bytes, most):
+                raise RefusedError("WorkerError", f"no slabs are made as in {part}")
+            # what the server touches first is charged to the server, whatever bounds the jail
+            if _shared_bytes(entry, runner) + request_bytes + observation_bytes > room:
+                raise RefusedError("WorkerError", "its slabs would be more than memory_bytes")
+            slabs = ServedSlabs(leaves, request_bytes, observation_bytes)
+            self._events.share(entry.links[runner], slabs)
+            deposit, slabs.deposit = slabs.deposit, []
+            self._fds.put(entry.number, runner, deposit)
+        return m.Done()
 
     def keep(self, asker: Asker, request: m.KeepJail) -> m.Message:
         """From now on the death of a runner does not end the jail."""
@@ -184,7 +218,7 @@ class Jails:
     def look(self) -> None:
         """End the jails that have done nothing for longer than they may; about once a second."""
         for entry in self.open_ones():
-            busy = any(link.pending for link in entry.links.values())
+            busy = any(link.owed for link in entry.links.values())
             if entry.idle is not None and entry.idle.passed(busy):
                 self.end(entry, f"it was idle for more than {entry.idle.limit_s:g} s")
 
@@ -293,6 +327,20 @@ def _note_limits(entry: JailRecord, usage: dict[str, int]) -> None:
     for name in sorted(found):
         if f"limit {name}" not in entry.denied:
             entry.denied.insert(0, f"limit {name}")
+
+
+def _shared_bytes(entry: JailRecord, but: int) -> int:
+    """Of the slabs that there are for its runners; those of one are about to be replaced."""
+    others = (link.slabs for runner, link in entry.links.items() if runner != but)
+    return sum(slabs.shared_bytes for slabs in others if slabs is not None)
+
+
+def _can_step(link: RunnerLink | None, frames: list[bytes]) -> bool:
+    """Whether a runner can be asked that; one that has died is answered for."""
+    if link is None:
+        return True
+    slabs = link.slabs
+    return slabs is not None and slabs.owner is None and len(frames) == 1 and slabs.fits(frames[0])
 
 
 def _targets(

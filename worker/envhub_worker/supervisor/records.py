@@ -134,16 +134,16 @@ def waiting(entry: JailRecord) -> list[Pending]:
     """Everything that runners owe an answer to; they owe it no more."""
     found = {}
     for link in entry.links.values():
-        for pending, _ in link.pending.values():
+        for pending, _ in link.owed:
             found[id(pending)] = pending
-        link.pending.clear()
+        link.owe_nothing()
     return list(found.values())
 
 
 def owes(entry: JailRecord, runner: int) -> int:
     """How many answers a runner owes; one that has died owes none any more."""
     link = entry.links.get(runner)
-    return 0 if link is None else len(link.pending)
+    return 0 if link is None else len(link.owed)
 
 
 def whole_jail(reason: Reason, **how: Any) -> m.Death:
@@ -174,7 +174,7 @@ def _state_of(pid: int) -> str:
 
 def status_of(entry: JailRecord) -> dict[str, object]:
     """What a jail is doing, for ``Status``."""
-    owed = [pending for link in entry.links.values() for pending, _ in link.pending.values()]
+    owed = [pending for link in entry.links.values() for pending, _ in link.owed]
     oldest = min(owed, key=lambda pending: pending.since, default=None)
     # in the order of the runners: they come up side by side, and say so in any order
     pids = tuple(entry.pids[runner] for runner in sorted(entry.pids))

@@ -12,10 +12,8 @@ from envhub_worker.protocol.codec.kinds import Buffer
 from envhub_worker.protocol.errors import RemoteProtocolError
 from envhub_worker.protocol.limits import LARGE_BYTES, WireLimits
 from envhub_worker.protocol.stream import Packet, StreamReader, pack_packet
+from envhub_worker.supervisor.served_slabs import ServedSlabs
 
-MAX_PENDING = 16
-"""Requests that one runner may owe: a client waits for its answer before it asks again, but a
-late one after a timeout may still be under way."""
 _MAX_IOVECS = 512
 
 
@@ -26,12 +24,14 @@ class RunnerLink:
     Attributes:
         pending: By the ids of the requests that it owes an answer to, oldest first.
         watched: Whether somebody waits until it can be written to.
+        slabs: Where the server takes the runner's steps.
     """
 
     sock: socket.socket
     limits: WireLimits
     pending: collections.OrderedDict[int, Any] = field(default_factory=collections.OrderedDict)
     watched: bool = False
+    slabs: ServedSlabs | None = None
     sent: int = 0
     received: int = 0
     _unsent: collections.deque[memoryview] = field(default_factory=collections.deque)
@@ -43,6 +43,20 @@ class RunnerLink:
     def fileno(self) -> int:
         """The stream's descriptor."""
         return self.sock.fileno()
+
+    @property
+    def owed(self) -> list[Any]:
+        """The owners of all that it owes, the oldest first; of a step, the last."""
+        owners = list(self.pending.values())
+        if self.slabs is not None and self.slabs.owner is not None:
+            owners.append(self.slabs.owner)
+        return owners
+
+    def owe_nothing(self) -> None:
+        """Nobody waits for it any more."""
+        self.pending.clear()
+        if self.slabs is not None:
+            self.slabs.owner = None
 
     @property
     def wants_write(self) -> bool:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import operator
 import os
 import shutil
 import stat
 import tempfile
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Iterator
 from itertools import takewhile
 from pathlib import Path
 
@@ -130,13 +131,24 @@ class BlobStore:
             for folder, _, _ in os.walk(building, topdown=False):
                 if folder != str(building):
                     os.chmod(folder, 0o555)
-            os.rename(building, tree)
+            with _another_is_faster():
+                os.rename(building, tree)
             os.chmod(tree, 0o555)  # not before: a folder that cannot be written cannot be moved
         finally:
             if building.exists():
                 remove_tree(str(building))
         self._trees[digest] = _charge_on_disk(tree)
         self.held += self._trees[digest]
+
+
+@contextlib.contextmanager
+def _another_is_faster() -> Iterator[None]:
+    """Another server that shares the store may have laid out the same tree meanwhile."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in (errno.EEXIST, errno.ENOTEMPTY):
+            raise
 
 
 def _is_there(path: Path, size: int) -> bool:

@@ -7,10 +7,14 @@
 
 Each client key has a store of its own: else a client that knows another's hashes would see its
 files. A snapshot is named by the digest of its listing, so the same listing is the same tree.
+
+A store may be shared with other servers of this machine, where all their clients are one user's:
+then what one has brought is there for all, and only a server that is alone removes anything.
 """
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -28,6 +32,7 @@ from envhub_worker.access.store.blob_store import (
     make_passable,
     tree_charge,
 )
+from envhub_worker.access.store.shared_use import SHARED, SharedUse
 from envhub_worker.lockdown.mechanisms.scratch import remove_tree
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.text import size_text
@@ -76,16 +81,21 @@ class Offer:
 
 
 class Uploads:
-    """The snapshots of all clients."""
+    """The snapshots of all clients.
+    ``shared``: other servers of this machine use the folder, too, and all clients are one user's.
+    """
 
-    def __init__(self, folder: Path, quotas: Quotas) -> None:
+    def __init__(self, folder: Path, quotas: Quotas, *, shared: bool = False) -> None:
         self.folder = folder
         self._quotas = quotas
         self._offers: dict[bytes, Offer] = {}
         self._partial: dict[tuple[bytes, bytes], Partial] = {}
         make_passable(folder)
-        for left in [*folder.glob("*/parts"), *folder.glob("*/trees/.building-*")]:
-            remove_tree(str(left))
+        self._use = SharedUse(folder / "in-use") if shared else None
+        with self._alone() as alone:
+            if alone:
+                for left in [*folder.glob("*/parts"), *folder.glob("*/trees/.building-*")]:
+                    remove_tree(str(left))
         # counted now: later everybody would wait for it
         self._stores = {home.name: BlobStore(home) for home in folder.iterdir() if home.is_dir()}
 
@@ -200,8 +210,12 @@ class Uploads:
         """What a client's files are charged, and what it has offered to bring."""
         return self._charged(self._store(key))
 
+    def _alone(self) -> contextlib.AbstractContextManager[bool]:
+        """Whether no other server uses the folder, nor begins to in this context."""
+        return contextlib.nullcontext(True) if self._use is None else self._use.alone()
+
     def _store(self, key: bytes) -> BlobStore:
-        name = key.hex()[:32] or "local"
+        name = SHARED if self._use is not None else key.hex()[:32] or "local"
         if name not in self._stores:
             self._stores[name] = BlobStore(self.folder / name)
         return self._stores[name]
@@ -216,13 +230,9 @@ class Uploads:
         """Remove the longest unused snapshots until all that is offered fits, whole."""
         if self._fits(store):
             return
-        keep = {sha256 for offer in self._offered(store) for sha256 in offer.needed}
-        store.remove_unlinked(keep)
-        for digest in store.unused(in_use):
-            if self._fits(store):
-                return
-            store.remove(digest)
-            store.remove_unlinked(keep)
+        with self._alone() as alone:
+            if alone:
+                self._remove_unused(store, in_use)
         if not self._fits(store):
             raise RefusedError(
                 "WorkerError",
@@ -231,6 +241,15 @@ class Uploads:
                 f"{MAX_TREES}; open environments use the others, or other processes of yours bring "
                 "them",
             )
+
+    def _remove_unused(self, store: BlobStore, in_use: Collection[str]) -> None:
+        keep = {sha256 for offer in self._offered(store) for sha256 in offer.needed}
+        store.remove_unlinked(keep)
+        for digest in store.unused(in_use):
+            if self._fits(store):
+                return
+            store.remove(digest)
+            store.remove_unlinked(keep)
 
     def _fits(self, store: BlobStore) -> bool:
         trees = store.trees + len(self._offered(store))

@@ -28,8 +28,8 @@ def choose() -> int | None:
     if kernel.capget()[0] & needed != needed:
         raise LayerUnavailableError(
             "unprivileged-user",
-            "this root was started without the right to become another user",
-            "Start as a plain user (in a container: --user 1000:1000), or give it back: "
+            "root has no capability here to become another user",
+            "Start as a plain user (in a container: --user 1000:1000), or add the capabilities: "
             "--cap-add CHOWN --cap-add SETGID --cap-add SETUID.",
         )
     return unused_uid()

@@ -84,7 +84,8 @@ def _unmountable(error: OSError, spec: JailSpec, common: Common) -> LayerUnavail
             return LayerUnavailableError(
                 "mount-namespace",
                 f"{what} {path} was removed after this server began to use it",
-                "Close what uses it and call make_env again: what is missing is fetched anew.",
+                "Close the environments that use it and call make_env again, which downloads it "
+                "again.",
             )
     if error.errno == errno.ENOSPC:
         return LayerUnavailableError(
@@ -107,7 +108,7 @@ def _has_content(folder: str) -> bool:
 
 def working_view(view: View) -> Layer:
     """How a jail sees what it shares with others, for its report."""
-    detail = "the repository and its packages, copy on write: the scratch takes what is written"
+    detail = "the repository and its packages, copy on write: changes go to the scratch"
     if view.refused:
         path, why = next(iter(view.refused.items()))
         detail = f"links into the repository; {path} is read-only: {why}"
@@ -119,7 +120,7 @@ def _check_snapshot(spec: JailSpec, common: Common) -> None:
         raise LayerUnavailableError(
             "mount-namespace",
             f"the snapshot {spec.snapshot} is in none of the readable roots",
-            "Start the worker with --readable-root for the folder that snapshots lie in.",
+            "Start the worker with --readable-root for the folder with the snapshots.",
         )
 
 

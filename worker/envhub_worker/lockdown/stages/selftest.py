@@ -107,6 +107,6 @@ def _hold(claim: str, holds: bool) -> None:
     if not holds:
         raise LayerUnavailableError(
             "self-test",
-            f"it does not hold that {claim}",
+            f"this is not true: {claim}",
             "Nothing was run. Please report this with the output of `envhub doctor --json`.",
         )

@@ -160,9 +160,9 @@ def _check_interpreter() -> None:
         if not os.access(path, os.R_OK):
             raise LayerUnavailableError(
                 "unprivileged-user",
-                f"root must run jails as another user, and that one may not read {path}",
-                'Use an interpreter that all users may read, the profile "strict", or start as '
-                "a plain user.",
+                f"root's jails run as another user, who may not read {path}",
+                "Use an interpreter that all users may read (with umask 077, run 'umask 022' "
+                'before you install it), the profile "strict", or start as a plain user.',
             )
 
 
@@ -182,7 +182,7 @@ def _unreadable_packages(folder: str, why: str) -> LayerUnavailableError:
     return LayerUnavailableError(
         "packages",
         f"the folder of packages {folder} {why}",
-        f"The jails run as uid {os.getuid()} here. Make it anew, or readable to all users: "
+        f"The jails run as uid {os.getuid()} here. Make it again, or readable for all users: "
         f"chmod -R a+rX {folder}",
     )
 

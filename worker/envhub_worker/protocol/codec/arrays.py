@@ -159,14 +159,6 @@ class ArrayReader:
         return frame
 
 
-def own(raw: Buffer, dtype: np.dtype[Any], shape: tuple[int, ...]) -> Array:
-    """An array of its own memory, of numbers. Trust: input from the worker."""
-    array: Array = np.ndarray(shape, dtype, bytearray(raw))
-    if dtype.kind == "b":
-        check_content(array)
-    return array
-
-
 def describe_dtype(dtype: np.dtype[Any]) -> bytes:
     """Returns the code of a dtype, followed by its parameter where it has one.
 

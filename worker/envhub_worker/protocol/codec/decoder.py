@@ -50,8 +50,7 @@ class _Head:
 class Decoder:
     """Rebuilds one value; msgpack calls its hooks in the order of the document.
 
-    The arguments are those of ``codec.decode``, with the parts of ``split_frames``; ``arrays``
-    stands in for the ``ArrayReader`` of these.
+    The arguments are those of ``codec.decode``, with the parts of ``split_frames``.
     """
 
     __slots__ = (
@@ -68,11 +67,10 @@ class Decoder:
         tensors: TensorMaker | None,
         things: ThingReader | None = None,
         copy: bool = True,
-        arrays: Any = None,
     ) -> None:
         self._tail, self._buffers, self.limits, self._copy = tail, buffers, limits, copy
         self.unpickler, self.tensors, self.things = unpickler, tensors, things
-        self._arrays: ArrayReader | None = arrays
+        self._arrays: ArrayReader | None = None
         self._make: Callable[[int, object], object] | None = None
         self._heads = self._hashed_keys = 0
 
@@ -234,9 +232,9 @@ def _read_pickle(decoder: Decoder, payload: Buffer) -> object:
         return decoder.unpickler(payload)
     except ModuleNotFoundError as error:
         raise RemoteProtocolError(
-            f"An object of the client cannot be loaded: {error}. There is no such module "
-            "where the environment runs. Hand over plain data, or have the module's code travel "
-            f"along: cloudpickle.register_pickle_by_value({error.name})"
+            f"An object of the client cannot be loaded: {error}. The module is not installed where "
+            "the environment runs. Pass plain data, or send the module's code along: "
+            f"cloudpickle.register_pickle_by_value({error.name})"
         ) from error
     except Exception as error:
         raise RemoteProtocolError(f"An object of the client cannot be loaded: {error}") from error

@@ -39,7 +39,7 @@ def unpicklable(name: str, value: object, error: Exception, pickler: Pickler) ->
     reason = one_line(f"{type(error).__name__}: {error}", 500)
     return (
         f"{one_line(text)} cannot be sent: a {type_name(type(culprit))} cannot be pickled "
-        f"({reason}). Hand over plain data, or a function that makes it there."
+        f"({reason}). Pass plain data, or a function that makes the object there."
     )
 
 

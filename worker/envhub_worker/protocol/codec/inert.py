@@ -35,8 +35,7 @@ class RemoteObject:
         kind = self.__dict__.get("type_name", "object")
         raise AttributeError(
             f"a {type(self).__name__} has no attribute {name!r}: it is the description of a {kind} "
-            "that stays in the worker. Ask the environment for a part of it that is plain data, by "
-            "get_attr, or by call of a method there"
+            "that stays in the worker. Use get_attr or call for a part of it that is plain data"
         )
 
 

@@ -71,8 +71,8 @@ def absent(owner: object, name: str, ask: str) -> AttributeError:
     if name not in PROBED:
         return AttributeError(f"{kind!r} object has no attribute {name!r}")
     return AttributeError(
-        f"a {kind} does not serve the attribute {name!r}, which libraries look for in any object; "
-        f"if it is meant, call {ask}({name!r})"
+        f"a {kind} does not serve the attribute {name!r}, which libraries look for in every "
+        f"object; if you need it, call {ask}({name!r})"
     )
 
 

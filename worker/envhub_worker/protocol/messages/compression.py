@@ -44,10 +44,11 @@ def _packed(frame: Buffer, block: Any) -> bytes | None:
         return None
     view = memoryview(frame).cast("B")
     middle = max(0, len(view) // 2 - _SAMPLE // 2)
-    sample = view[middle : middle + _SAMPLE]
+    # copied first: what lies in shared memory may change while it is read
+    sample = bytes(view[middle : middle + _SAMPLE])
     if len(block.compress(sample, store_size=False)) > _WORTH * len(sample):
         return None
-    made: bytes = block.compress(view, store_size=False)
+    made: bytes = block.compress(bytes(view), store_size=False)
     return made if len(made) <= _WORTH * len(view) else None
 
 

@@ -19,7 +19,7 @@ from envhub_worker.protocol.codec.codec import encode
 from envhub_worker.protocol.codec.decoder import Decoder, TensorMaker, ThingReader, Unpickler
 from envhub_worker.protocol.codec.encoder import Describer, Pickler
 from envhub_worker.protocol.codec.frames import split_frames
-from envhub_worker.protocol.codec.kinds import Buffer
+from envhub_worker.protocol.codec.kinds import DOCUMENT_BYTES, Buffer
 from envhub_worker.protocol.errors import LocalProtocolError, RemoteProtocolError
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 from envhub_worker.protocol.messages.base import KINDS, Message, check_fields, values_of
@@ -30,6 +30,8 @@ _NUMBER = struct.Struct(">Q")
 _MOST = (1 << 63) - 1
 _OUTGOING: forms.Forms[Any, forms.Outgoing] = forms.Forms()
 _INCOMING: forms.Forms[bytes, forms.Incoming[Message]] = forms.Forms()
+_HEADERS: forms.Forms[bytes, forms.Incoming[Message]] = forms.Forms()
+"""The same by the whole header, where that is nothing but the document."""
 
 
 def pack(
@@ -50,20 +52,19 @@ def pack(
     values = values_of(message)
     if pickler is not None and cls.HANDED:
         values = _handed(message, values, pickler, limits)
-    found = forms.outline(values)
-    if found is None:
+    outline = forms.outline(values)
+    if outline is None:
         return _encoded(message, values, pickler, limits, describer, reduces=reduces)
-    outline, arrays = found
     form = _OUTGOING.get((cls, outline))
     if form is not None and form.limits is limits:
-        return form.frames(arrays)
+        return list(form.frames)
     try:
         frames = _encoded(message, values, pickler, limits)
     except LocalProtocolError:
         if not reduces:
             raise
         return _encoded(message, values, pickler, limits, describer, reduces=True)
-    _OUTGOING.met((cls, outline), lambda: forms.Outgoing(frames, arrays, limits))
+    _OUTGOING.met((cls, outline), lambda: forms.Outgoing(list(frames), limits))
     return frames
 
 
@@ -122,12 +123,13 @@ def unpack(
     """The message of some frames. Raises ``RemoteProtocolError``: the peer broke the rules."""
     with UNTRUSTED:
         document, tail, buffers = split_frames(frames, limits)
-        form = _INCOMING.get(document)
+        bare = not (tail or buffers)
+        form = _INCOMING.get(document) if bare else None
         if form is not None and form.limits is limits:
-            return form.message(tail, buffers)
+            return form.message()
         decoder = Decoder(tail, buffers, limits, unpickler, tensors, things)
         message = _checked(decoder.value(document))
-        if len(document) <= forms.MAX_DOCUMENT_BYTES:
+        if bare and len(document) <= forms.MAX_DOCUMENT_BYTES:
             _INCOMING.met(document, lambda: forms.Incoming(document, type(message), limits))
         return message
 
@@ -135,7 +137,12 @@ def unpack(
 def pack_header(message: Message, number: int) -> list[Buffer]:
     """The frames of a message between client and server, with its id in front."""
     header, *buffers = pack(message)
-    return [_NUMBER.pack(number) + header, *buffers]
+    return [with_id(header, number), *buffers]
+
+
+def with_id(header: Buffer, number: int) -> Buffer:
+    """A header with the id of its request in front."""
+    return _NUMBER.pack(number) + header
 
 
 def unpack_header(frame: Buffer, *, limits: WireLimits = DEFAULT_LIMITS) -> tuple[int, Message]:
@@ -145,7 +152,17 @@ def unpack_header(frame: Buffer, *, limits: WireLimits = DEFAULT_LIMITS) -> tupl
     number = id_of(frame)
     if number is None:
         raise RemoteProtocolError("a header starts with the id of its request")
-    return number, unpack([without_id(frame)], limits=limits)
+    header = without_id(frame)
+    if type(header) is not bytes:
+        return number, unpack([header], limits=limits)
+    known = _HEADERS.get(header)
+    if known is not None and known.limits is limits:
+        return number, known.message()
+    message = unpack([header], limits=limits)
+    form = _INCOMING.get(header[DOCUMENT_BYTES.size :])
+    if form is not None:
+        _HEADERS.met(header, lambda: form)
+    return number, message
 
 
 def without_id(frame: Buffer) -> Buffer:

@@ -101,6 +101,10 @@ class Relay(Message, kind=7):
     parts: tuple[object, ...]
     deposited: bool = False
     """Whether the descriptors of each runner's last ``Deposit`` go with its frames: ``Attach``."""
+    stepped: bool = False
+    """Whether each runner's one frame is for its request slab, which the server writes: the words
+    from ``SPIN`` to the last dtype, and the actions. Its part of the reply is then the words
+    ``OUTCOME`` and ``LENGTH``, the infos, and the observation slab: see ``ShareSlabs``."""
 
 
 class RelayDone(Message, kind=8):
@@ -334,3 +338,16 @@ class Packages(Message, kind=32):
     name: str
     facts: dict[str, object]
     progress: str
+
+
+class ShareSlabs(Message, kind=33):
+    """Make slabs and doorbells for runners.
+
+    Each is ``(runner, leaves, request_bytes, observation_bytes)``: leaves of the actions, and the
+    sizes of two slabs. They wait as a ``Deposit`` does, for ``Attach``; from then on the server
+    takes the steps that a ``Relay`` says are ``stepped``. Reply: ``Done``, or ``Refusal`` where
+    they are too large.
+    """
+
+    jail: int
+    slabs: tuple[object, ...]

@@ -1,6 +1,6 @@
 """What a server in a container announces of its surroundings: the one message that is no frame.
 
-It is a line of JSON on stdout, before a client can connect. The worker fills it in
+It is a line of JSON on stdout, before the first request is read. The worker fills it in
 (``lockdown/surroundings.py``), the client holds it against what it asked the engine for.
 """
 

@@ -29,43 +29,18 @@ import numpy.typing as npt
 from gymnasium import spaces
 
 from envhub_worker.protocol.records import dataclass
-from envhub_worker.protocol.shared_memory import SEQUENCE as SEQUENCE
+from envhub_worker.protocol.shared_memory.words import *  # noqa: F403 - seen from outside as here
+from envhub_worker.protocol.shared_memory.words import (
+    HEADER_BYTES,
+    INFO_BYTES,
+    LINE,
+    MAX_LEAVES,
+    REPLY_BYTES,
+)
 from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES
 
-LINE = 64
-"""Bytes of a cache line: words that two cores poll must not share one."""
-INFO_BYTES = 64 * 1024
-"""Room for a step's infos, or for what it raised, or for a message or its answer. What is larger
-goes through the server."""
 MAX_SLAB_BYTES = 1 << 31
 """Above this the frames lane serves: a slab is pinned memory."""
-
-# word numbers in the headers (a word is 8 bytes, a line holds 8 of them); ``SEQUENCE`` is first
-PARKED = 8
-"""1 while this slab's writer sleeps in poll and wants its doorbell rung."""
-OUTCOME = 16
-"""Reply: ``DONE``, ``RAISED``, ``FETCH`` or ``COLUMNS``."""
-LENGTH = 17
-"""Reply: bytes of the encoded infos, or of what was raised; 0 for an empty info."""
-SPIN = 16
-"""Request: nanoseconds that the shard may wait for the next request without sleeping."""
-SLOT = 17
-"""Request: the slot of the observation slab that the shard writes."""
-CPU = 18
-"""Request: one more than the number of the core that the shard should keep to; 0 for any."""
-CHANGES = 19
-"""Request: grows with every change of ``SPIN``, ``SLOT``, ``CPU`` and the dtypes."""
-MESSAGE = 20
-"""Request: bytes of the encoded message; 0 for a step."""
-DTYPES = 24
-"""Request: the dtype code of each action leaf, one word each, up to ``MAX_LEAVES``."""
-MAX_LEAVES = 64
-HEADER_WORDS = DTYPES + MAX_LEAVES
-HEADER_BYTES = HEADER_WORDS * 8
-
-DONE, RAISED, FETCH, COLUMNS = 1, 2, 3, 4
-"""Results and encoded infos are in the slab; an encoded ``RaisedException`` is; the infos must be
-fetched; the infos are columns (see ``columns``)."""
 
 ACTION_DTYPES = tuple(
     np.dtype(name)
@@ -170,7 +145,7 @@ def layout_of(action: gym.Space[Any], count: int) -> Layout | None:
     if request_bytes > MAX_SLAB_BYTES:
         return None
     infos, answer = HEADER_BYTES, HEADER_BYTES + INFO_BYTES
-    return Layout(count, actions, message, request_bytes, infos, answer, answer + INFO_BYTES)
+    return Layout(count, actions, message, request_bytes, infos, answer, REPLY_BYTES)
 
 
 def observation_layout(space: gym.Space[Any], count: int, slots: int) -> ObservationLayout | None:
@@ -227,11 +202,6 @@ def results(buffer: Any, layout: ObservationLayout) -> tuple[Array, Array]:
     start = layout.results + rewards.nbytes
     flags: Array = np.frombuffer(buffer, np.uint8, 2 * layout.count, start)
     return rewards, flags
-
-
-def words(buffer: Any) -> memoryview:
-    """The header of a mapped slab, as words."""
-    return memoryview(buffer)[:HEADER_BYTES].cast("Q")
 
 
 def assembler(space: gym.Space[Any]) -> Callable[[list[Any]], Any]:

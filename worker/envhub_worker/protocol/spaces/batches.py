@@ -68,6 +68,18 @@ def split(space: gym.Space[Any], batch: Any, bounds: Bounds) -> list[Any]:
     return [batch[start:stop] for start, stop in bounds]
 
 
+def reordered(space: gym.Space[Any], batch: Any, order: Sequence[int]) -> Any:
+    """The same members of a batch in another order; lists and tuples stay what they are."""
+    if isinstance(space, spaces.Dict):
+        return {key: reordered(sub, batch[key], order) for key, sub in space.spaces.items()}
+    if isinstance(space, spaces.Tuple):
+        pairs = zip(space.spaces, batch, strict=True)
+        return tuple(reordered(sub, item, order) for sub, item in pairs)
+    if isinstance(batch, np.ndarray):
+        return batch[np.asarray(order)]
+    return type(batch)(batch[index] for index in order)
+
+
 def join(space: gym.Space[Any], parts: Sequence[Any]) -> Any:
     """One batch out of the shards' slices, in order."""
     if isinstance(space, ARRAY_SPACES):
@@ -107,6 +119,11 @@ class Misfit(RemoteProtocolError):
 
 APART: dict[Any, Any] = {None: None}
 """What a shard says in place of infos that it cannot join without knowing the other shards'."""
+
+
+def is_apart(infos: dict[Any, Any]) -> bool:
+    """Whether they are ``APART``. Trust: they may be anything."""
+    return len(infos) == 1 and infos.get(None, APART) is None
 
 
 APART_SCALARS = -1
@@ -174,6 +191,90 @@ def _join_part(joined: dict[Any, Any], part: dict[Any, Any], window: slice, coun
         if (array.dtype, array.shape[1:]) != (value.dtype, value.shape[1:]):
             raise ValueError("an entry is of another dtype or shape in another shard")
         array[window] = value
+
+
+def gather_infos(
+    parts: Sequence[dict[Any, Any]], sizes: Sequence[int], max_bytes: int
+) -> dict[Any, Any]:
+    """``join_infos`` in which no part changes what another has said.
+
+    An entry whose dtype, shape or kind differs between parts is an object array of each
+    sub-environment's own, and so is one that would take more than ``max_bytes`` as a column.
+    Each part must be one that ``check_infos`` takes.
+    """
+    joined: dict[Any, Any] = {}
+    start, count = 0, sum(sizes)
+    for part, size in zip(parts, sizes, strict=True):
+        _gather_part(joined, part, slice(start, start + size), count, max_bytes)
+        start += size
+    return joined
+
+
+def check_infos(part: dict[Any, Any], size: int) -> None:
+    """Whether these are infos of so many sub-environments. Raises ``Misfit``."""
+    for value in part.values():
+        if isinstance(value, dict):
+            check_infos(value, size)
+        elif type(value) is not np.ndarray or value.shape[:1] != (size,):
+            raise Misfit("an entry of the infos does not have one value per sub-environment")
+
+
+def _gather_part(
+    joined: dict[Any, Any], part: dict[Any, Any], window: slice, count: int, max_bytes: int
+) -> None:
+    for key, value in part.items():
+        known: Any = joined.get(key)
+        if isinstance(value, dict) and (known is None or isinstance(known, dict)):
+            _gather_part(joined.setdefault(key, {}), value, window, count, max_bytes)
+            continue
+        is_array = isinstance(value, np.ndarray)
+        if known is None and is_array and value.nbytes * count <= max_bytes * len(value):
+            known = joined[key] = _blank(value, count)
+        if not (is_array and _is_like(known, value)):
+            if not _is_like(known, _NOTHING):
+                known = joined[key] = _members(joined, key, count)
+            value = _members(part, key, window.stop - window.start)
+        known[window] = value
+
+
+_NOTHING = np.full(1, None, dtype=object)
+
+
+def _is_like(column: Any, value: Any) -> bool:
+    """Whether these are arrays whose rows are of the same form."""
+    if not isinstance(column, np.ndarray):
+        return False
+    return (column.dtype, column.shape[1:]) == (value.dtype, value.shape[1:])
+
+
+def _members(infos: dict[Any, Any], key: Any, count: int) -> Any:
+    """What each sub-environment has of an entry: object ``(count,)``, None where it has nothing."""
+    value: Any = infos.get(key)
+    members = np.full(count, None, dtype=object)
+    if value is None:
+        return members
+    if isinstance(value, dict):
+        names = [name for name in value if not _is_mask(name, value)]
+        columns = {name: _members(value, name, count) for name in names}
+        value = [
+            {name: column[index] for name, column in columns.items() if _has(value, name, index)}
+            for index in range(count)
+        ]
+    for index in range(count):
+        if _has(infos, key, index):
+            members[index] = value[index]
+    return members
+
+
+def _is_mask(name: Any, infos: dict[Any, Any]) -> bool:
+    return type(name) is str and name[:1] == "_" and name[1:] in infos
+
+
+def _has(infos: dict[Any, Any], key: Any, index: int) -> bool:
+    """Whether a sub-environment gave it. Trust: what stands for a mask may be anything."""
+    mask: Any = infos.get(f"_{key}")
+    is_mask = isinstance(mask, np.ndarray) and mask.dtype == np.bool_ and mask.ndim == 1
+    return not is_mask or bool(mask[index])
 
 
 def _blank(value: Any, count: int) -> Any:

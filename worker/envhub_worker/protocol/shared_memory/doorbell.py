@@ -107,6 +107,10 @@ class Watch:
                 return True
         return False
 
+    def fileno(self) -> int:
+        """Readable when there is something to wait for: it can be polled among others."""
+        return self._epoll.fileno()
+
     def close(self) -> None:
         """Stop watching."""
         self._epoll.close()

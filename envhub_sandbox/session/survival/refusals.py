@@ -32,7 +32,7 @@ def refusal(
     if state in (State.LATE, State.PENDING) and interrupted is not None:
         text = (
             f"cannot {operation}: the last {interrupted} was interrupted, by Ctrl-C or a stopped "
-            "cell, and where the environment is now is not known; call reset() first"
+            "cell, so the state of the environment is unknown; call reset() first"
         )
         return WorkerTimeoutError(text, request=operation)
     if state in (State.LATE, State.PENDING):

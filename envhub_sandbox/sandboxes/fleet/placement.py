@@ -1,0 +1,210 @@
+"""Which worker of a fleet goes where.
+
+A worker goes where the fewest workers of its fleet are, among the places that answer and have room;
+of several such, where there is most room, and then by the order of the list. It comes back where it
+was, if that place answers. A place that refuses it, or does not answer, is followed by the next:
+all are tried before a worker has none. Results never depend on it.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from time import monotonic
+
+from envhub_sandbox.errors import EnvHubError
+from envhub_sandbox.sandboxes.fleet.member import ForRepository, Member
+from envhub_sandbox.sandboxes.fleet.place_list import PlaceList
+from envhub_sandbox.sandboxes.fleet.rooms import Room, Rooms
+from envhub_sandbox.sandboxes.pool import ServerUse, WorkerServer
+from envhub_sandbox.sandboxes.sandbox import Sandbox
+from envhub_sandbox.settings.policy import Policy
+from envhub_sandbox.system.log import WORKER
+from envhub_worker.protocol.runtime import OWN, Runtime
+
+_ASKED = 32
+"""Servers that are asked for their room at the same time."""
+Resolve = Callable[["str | Sandbox"], Sandbox]
+
+
+class Placement:
+    """The places of the workers of one ``make_env``. Thread-safe.
+
+    Args:
+        places: Which there are.
+        resolve: Makes a sandbox of a place's name.
+        runtime: Makes what the jails of a place run on.
+    """
+
+    def __init__(
+        self, places: PlaceList, resolve: Resolve, runtime: Callable[[Member], Runtime]
+    ) -> None:
+        self._places = places
+        self._resolve = resolve
+        self._runtime = runtime
+        self._lock = threading.RLock()  # interruption.md, rule 12
+        self._known: dict[object, Member] = {}
+        self._last: list[Member] = []
+        self._at: dict[int, Member] = {}
+        self._placed_s: dict[int, float] = {}
+        self._repository: ForRepository | None = None
+        self._rooms: Rooms | None = None
+
+    def members(self) -> list[Member]:
+        """The places that there are now, each once, with its weight.
+
+        Raises ``EnvHubError``: one is none, at first. Later it is left out.
+        """
+        with self._lock:
+            found: dict[Member, int] = {}
+            for entry in self._places.read():
+                try:
+                    member = self._member(entry if isinstance(entry, str) else id(entry), entry)
+                    while member in found and member.sandbox.is_placed_anew:
+                        member = self._member(member, entry)
+                except EnvHubError as error:
+                    if not self._last:
+                        raise
+                    WORKER.warning("a place of the fleet is left out: %s", error)
+                    continue
+                found[member] = found.get(member, 0) + 1
+            for member, weight in found.items():
+                member.weight = weight
+            self._last = list(found) or self._last
+            return list(self._last)
+
+    def _member(self, key: object, entry: str | Sandbox) -> Member:
+        if key not in self._known:
+            self._known[key] = Member(self._resolve(entry), self._runtime)
+        return self._known[key]
+
+    def seats(self, num_workers: int | None) -> list[Seat]:
+        """One for each worker; by default as many as the list has places."""
+        count = num_workers or sum(member.weight for member in self.members())
+        return [Seat(self, number) for number in range(count)]
+
+    def open_for(self, repository: ForRepository) -> None:
+        """Make the places of a repository; of one that joins the list later, when it is used."""
+        with self._lock:
+            if self._repository is None:
+                for member in self.members():
+                    member.open_for(repository)
+                self._rooms = Rooms(repository.policy.limits.memory_bytes)
+                self._repository = repository
+
+    def runs_on(self, runtime: Runtime) -> Runtime:
+        """What runs it, on all places together."""
+        each = dict.fromkeys(member.runs_on(runtime) for member in self._opened())
+        if len(each) == 1:
+            return next(iter(each))
+        return Runtime(" ".join(sorted(f"{one.python} {one.packages}" for one in each)))
+
+    def at(self, number: int) -> Member:
+        """Where a worker is, or will be as far as is known."""
+        with self._lock:
+            if number not in self._at:
+                members = self._opened()
+                return members[number % len(members)]
+            return self._at[number]
+
+    def candidates(self, number: int) -> Iterator[Member]:
+        """Where a worker may go: the best place first, each of the others if that has refused."""
+        tried: list[Member] = []
+        while True:
+            members = self._opened()
+            left = [member for member in members if member not in tried]
+            if not left:
+                return
+            best = self._best(number, left)
+            tried.append(best)
+            yield best
+
+    def _best(self, number: int, members: list[Member]) -> Member:
+        """The best of these, and note that the worker goes there."""
+        order = {member: place for place, member in enumerate(members)}
+        with self._lock:
+            members = sorted(members, key=self._ranks(number, order, {}))
+        # some are asked, and more only if none of these has room: there may be a thousand
+        for some in (members[start : start + _ASKED] for start in range(0, len(members), _ASKED)):
+            rooms = self._rooms.ask(some) if self._rooms and len(members) > 1 else {}
+            with self._lock:
+                rank = self._ranks(number, order, rooms)
+                best = min(some, key=rank)
+                full = rank(best)[:2] != (False, False)
+                if not full or some[-1] is members[-1]:
+                    self._at[number], self._placed_s[number] = best, monotonic()
+                    return best
+        raise AssertionError("there are no places")
+
+    def _opened(self) -> list[Member]:
+        members, repository = self.members(), self._repository
+        if repository is None:
+            return members
+        opened: list[Member] = []
+        for member in members:
+            try:
+                member.open_for(repository)
+            except EnvHubError as error:
+                WORKER.warning("%s joins the fleet in vain: %s", member.address, error)
+            else:
+                opened.append(member)
+        return opened or [one for one in self._known.values() if one.is_open]
+
+    def _ranks(
+        self, number: int, order: dict[Member, int], rooms: dict[Member, Room]
+    ) -> Callable[[Member], tuple[object, ...]]:
+        """What the best place for a worker has least of."""
+        placed: dict[Member, list[float]] = {}
+        for worker, at in self._at.items():
+            if worker != number:
+                placed.setdefault(at, []).append(self._placed_s[worker])
+
+        def rank(member: Member) -> tuple[object, ...]:
+            room, here = rooms.get(member, Room()), placed.get(member, [])
+            left = room.workers - sum(at_s > room.known_s for at_s in here)
+            moves, share = self._at.get(number) is not member, len(here) / member.weight
+            return not room.answers, left < 1, moves, share, -left, order[member]
+
+        return rank
+
+
+class Seat(Sandbox):
+    """The place of one worker of a fleet, wherever that is at present."""
+
+    name = "fleet"
+
+    def __init__(self, placement: Placement, number: int) -> None:
+        self._placement = placement
+        self._number = number
+
+    @property
+    def retry_s(self) -> float:  # type: ignore[override]
+        """The longest of all places."""
+        return max(member.retry_s for member in self._placement.members())
+
+    @property
+    def address(self) -> str:
+        """See ``Sandbox``."""
+        return self._placement.at(self._number).address
+
+    def for_repository(
+        self, snapshot: Path, policy: Policy, runtime: Runtime, assets: tuple[Path, ...] = ()
+    ) -> Seat:
+        """See ``Sandbox``; ``runtime`` is each place's own."""
+        self._placement.open_for(ForRepository(snapshot, policy, assets))
+        return self
+
+    def runs_on(self, runtime: Runtime) -> Runtime:
+        """See ``Sandbox``."""
+        return self._placement.runs_on(runtime)
+
+    def candidates(self) -> Iterator[Sandbox]:
+        """See ``Sandbox``."""
+        return self._placement.candidates(self._number)
+
+    def acquire(
+        self, store: Path, runtime: Runtime = OWN, idle_s: float | None = 0.0
+    ) -> ServerUse[WorkerServer]:
+        """See ``Sandbox``: where it is."""
+        return self._placement.at(self._number).acquire(store, runtime, idle_s)

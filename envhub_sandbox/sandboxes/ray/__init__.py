@@ -1,0 +1,1 @@
+"""``sandbox="ray"``: worker servers on the nodes of a Ray cluster, where Ray places them."""

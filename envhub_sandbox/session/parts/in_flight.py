@@ -1,0 +1,300 @@
+"""What was sent to the workers of an environment, and not received: ``send`` and ``recv``.
+
+The sub-environments of a worker are stepped together, so they are ready together. A worker's
+answers are taken in the order of its requests: what a sub-environment gives depends on its own
+actions and seeds alone. Time decides only in which batch its results come.
+
+Followed: EnvPool's ``send`` and ``recv``, and PufferLib's, for the ids beside the results.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
+from functools import partial
+from itertools import accumulate, pairwise
+from typing import Any, NamedTuple
+
+import numpy as np
+from gymnasium.error import NoAsyncCallError
+
+from envhub_sandbox.errors import ActionError, WorkerTimeoutError
+from envhub_sandbox.session.env_session import EnvSession
+from envhub_sandbox.session.parts.worker_queue import WorkerQueue
+from envhub_sandbox.session.requests import MessageFor, RequestOrder
+from envhub_sandbox.session.survival.refusals import refusal
+from envhub_sandbox.session.use_lock import all_held
+from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.readiness import answered_first
+from envhub_sandbox.transport.results import StepResult
+from envhub_worker.protocol.lifecycle import State
+from envhub_worker.protocol.limits import DEFAULT_LIMITS, LARGE_BYTES
+from envhub_worker.protocol.spaces import batches
+
+SENT = "send"
+"""What is pending then, as ``RequestOrder.waiting`` calls it."""
+
+
+class Received(NamedTuple):
+    """Results of ``n`` sub-environments, in the order of their ids.
+
+    Attributes:
+        observations: ``(n, *single_observation_space.shape)``.
+        rewards: float64 ``(n,)``; 0 after a reset.
+        terminations, truncations: bool ``(n,)``; False after a reset.
+        infos: As in ``step``, with ``n`` rows. If workers return different dtypes or shapes for an
+            entry, it is an object array that keeps each of them.
+        env_ids: int64 ``(n,)``, ascending.
+    """
+
+    observations: Any
+    rewards: Any
+    terminations: Any
+    truncations: Any
+    infos: dict[Any, Any]
+    env_ids: Any
+
+
+class Rows(NamedTuple):
+    """Which sub-environments something is for.
+
+    Attributes:
+        named: Their ids, as they were named.
+        workers: The places of their workers, all of whose sub-environments they are.
+        order: Where each of them was named, by ascending ids; None if in that order.
+    """
+
+    named: list[int]
+    workers: list[int]
+    order: list[int] | None
+
+
+class InFlight:
+    """The requests that were sent and not received, of all workers of an environment.
+
+    Used by one thread at a time. A ``close`` may come from another: a wait holds the locks of the
+    workers that it waits for, so it is ended as any request is (interruption.md, rule 11).
+
+    Args:
+        order: The environment's requests.
+        parts: The session of each worker, in the order of their sub-environments.
+    """
+
+    def __init__(self, order: RequestOrder, parts: Sequence[EnvSession]) -> None:
+        self._order = order
+        self._queues = [WorkerQueue(part, sliced=len(parts) > 1) for part in parts]
+        self._space = order.results.manifest.single_observation_space
+        self._actions = order.results.manifest.single_action_space
+        self._worker_of = [at for at, queue in enumerate(self._queues) for _ in range(queue.count)]
+        self._ready: deque[tuple[int, StepResult]] = deque()
+        self._sends = False
+
+    # --- there ---------------------------------------------------------------------------------
+
+    def rows(self, env_ids: Any) -> Rows:
+        """Those of these ids; of all for None.
+
+        Raises:
+            ActionError: There is no such sub-environment, one is named twice, or a worker has
+                another one beside these.
+        """
+        count = len(self._worker_of)
+        if env_ids is None:
+            return Rows(list(range(count)), list(range(len(self._queues))), None)
+        ids = np.asarray(env_ids)
+        if ids.ndim != 1 or not ids.size or ids.dtype.kind not in "iu":
+            raise ActionError(f"env_ids is {env_ids!r}; it takes a list such as [0, 3]")
+        named: list[int] = ids.tolist()
+        ordered = sorted(named)
+        if ordered[0] < 0 or ordered[-1] >= count:
+            raise ActionError(f"env_ids holds {named}; there are 0 to {count - 1}")
+        if len(set(named)) < len(named):
+            raise ActionError(f"env_ids holds one twice: {named}")
+        order = None if named == ordered else sorted(range(len(named)), key=named.__getitem__)
+        return Rows(named, self._workers_of(ordered), order)
+
+    def _workers_of(self, ordered: list[int]) -> list[int]:
+        workers: list[int] = []
+        at = 0
+        while at < len(ordered):
+            workers.append(self._worker_of[ordered[at]])
+            start, stop = self._queues[workers[-1]].rows
+            given = ordered[at : at + stop - start]
+            if given != list(range(start, stop)):
+                missing = min(set(range(start, stop)) - set(given))
+                raise ActionError(
+                    f"sub-environments {start} to {stop - 1} are stepped together, by one worker, "
+                    f"and env_ids lacks {missing}: name all of them, or give each a worker of its "
+                    "own, with num_workers"
+                )
+            at += stop - start
+        return workers
+
+    def send(self, rows: Rows, actions: Any) -> None:
+        """Send each worker its slice of a validated batch, as its rows were named.
+
+        Raises as ``Requests.submit_step`` does, and nothing was sent then. Where a worker fails
+        after others were sent theirs, ``recv`` raises that.
+        """
+        if rows.order is not None:
+            actions = batches.reordered(self._actions, actions, rows.order)
+        if not isinstance(actions, np.ndarray) or actions.nbytes >= LARGE_BYTES:
+            actions = copy.deepcopy(actions)  # what is large is sent later, from where it lies
+        queues = self._of(rows)
+        slices = list(pairwise(accumulate((queue.count for queue in queues), initial=0)))
+        parts = [actions] if len(slices) == 1 else batches.split(self._actions, actions, slices)
+        with self._sending("send", queues, WorkerQueue.prepare):
+            for queue, part in zip(queues, parts, strict=True):
+                queue.step(part)
+            self._order.note_sent(actions if len(queues) == len(self._queues) else None)
+
+    def send_reset(self, rows: Rows, message_for: MessageFor) -> None:
+        """Send each worker a reset of all of its sub-environments; raises as ``send``."""
+        queues = self._of(rows)
+        with self._sending("send_reset", queues, WorkerQueue.prepare_reset):
+            for queue in queues:
+                queue.reset(message_for)
+            self._order.note_sent(None)
+
+    def _of(self, rows: Rows) -> list[WorkerQueue]:
+        return [self._queues[worker] for worker in rows.workers]
+
+    @contextmanager
+    def _sending(
+        self, name: str, queues: Sequence[WorkerQueue], prepare: Callable[[WorkerQueue], None]
+    ) -> Iterator[None]:
+        """Before anything is sent, all must be able to take it."""
+        with _held(queues):
+            if self._order.waiting != SENT:
+                self._order.refuse_if_busy(name)
+            self._order.refuse_if_closed()
+            self._refuse_if_interrupted(name)
+            for queue in queues:
+                prepare(queue)
+            self._order.waiting, self._sends = SENT, True  # interruption.md, rule 1
+            yield
+            self._sends = False
+            self._note()
+
+    def _refuse_if_interrupted(self, name: str) -> None:
+        """Whom a send has reached, or whose results are lost, is not known then."""
+        if self._sends or any(queue.interrupted for queue in self._queues):
+            restart = self._queues[0].part.repository.policy.restart
+            refused = refusal(State.PENDING, name, restart, "send or recv")
+            assert refused is not None
+            raise refused
+
+    def _note(self) -> None:
+        """Other requests are refused for as long as something is in flight."""
+        self._order.waiting = SENT if self._is_pending() else None
+
+    def _is_pending(self) -> bool:
+        return bool(self._ready) or self._sends or any(queue.busy for queue in self._queues)
+
+    # --- and back ------------------------------------------------------------------------------
+
+    def recv(self, min_ready: int, timeout_s: float | None) -> Received:
+        """The results of the first sub-environments that are ready, of each at most one.
+
+        Raises:
+            NoAsyncCallError: Nothing was sent.
+            WorkerTimeoutError: ``timeout_s`` came first, and nothing is lost; or a worker's own
+                timeout did, as ``Requests.collect_step`` says.
+        """
+        self._order.refuse_if_closed()
+        if not self._is_pending():
+            if self._order.waiting == SENT:  # an interrupt came before this was noted
+                self._note()
+            raise NoAsyncCallError("Calling `recv` without any prior call to `send`.", "recv")
+        self._refuse_if_interrupted("recv")
+        deadline = Deadline(timeout_s)
+        with _held([queue for queue in self._queues if queue.busy]):
+            try:
+                while (taken := self._first(min_ready)) is None:
+                    for place in self._wait(deadline):
+                        self._queues[place].take(partial(self._keep, place))
+                return self._joined(taken)
+            finally:
+                self._note()
+
+    def _wait(self, deadline: Deadline) -> list[int]:
+        """Sleep until workers have answered, or are late; which. Raises ``WorkerTimeoutError``."""
+        busy = [place for place, queue in enumerate(self._queues) if queue.busy]
+        lanes = [self._queues[place].lane for place in busy]
+        ended = [place for place, lane in zip(busy, lanes, strict=True) if lane is None]
+        if ended:
+            return ended
+        lefts = [deadline.left_s(), *(self._queues[place].left_s for place in busy)]
+        until = Deadline(min((left for left in lefts if left is not None), default=None))
+        found = answered_first([lane for lane in lanes if lane is not None], until)
+        late = [at for at, place in enumerate(busy) if self._queues[place].left_s == 0]
+        if not found and not late and deadline.passed:
+            raise WorkerTimeoutError(
+                f"fewer sub-environments than `min_ready` were ready after {deadline.timeout_s} s; "
+                "nothing is lost: call `recv` again",
+                request="recv",
+                timeout_s=deadline.timeout_s,
+            )
+        return [busy[at] for at in found or late]
+
+    def _keep(self, place: int, result: StepResult) -> None:
+        self._ready.append((place, result))
+
+    def _first(self, min_ready: int) -> dict[int, StepResult] | None:
+        """Results by workers, in the order in which they were taken; None while these are too few.
+
+        As many as there are, where no more are to come.
+        """
+        self._order.refuse_if_closed()
+        oldest: dict[int, StepResult] = {}
+        for place, result in self._ready:
+            oldest.setdefault(place, result)
+        owing = any(queue.busy for at, queue in enumerate(self._queues) if at not in oldest)
+        taken: dict[int, StepResult] = {}
+        rows = 0
+        for place, result in oldest.items():
+            taken[place] = result
+            rows += self._queues[place].count
+            if rows >= min_ready:
+                return taken
+        return None if owing else taken
+
+    def _joined(self, taken: dict[int, StepResult]) -> Received:
+        """One batch, by ids. The results that it is made of are taken away."""
+        places = sorted(taken)
+        queues = [self._queues[place] for place in places]
+        env_ids = np.concatenate([np.arange(*queue.rows) for queue in queues])
+        results = [taken[place] for place in places]
+        observations, rewards, terminations, truncations, infos = zip(*results, strict=True)
+        if len(results) == 1:
+            received = Received(*results[0], env_ids)
+        else:
+            sizes = [queue.count for queue in queues]
+            received = Received(
+                batches.join(self._space, observations),
+                np.concatenate(rewards),
+                np.concatenate(terminations),
+                np.concatenate(truncations),
+                batches.gather_infos(infos, sizes, DEFAULT_LIMITS.message_bytes),
+                env_ids,
+            )
+        self._ready = deque(one for one in self._ready if taken.get(one[0]) is not one[1])
+        return received
+
+    def drop(self) -> None:
+        """Wait for what is owed, and forget it with all that was not received."""
+        with _held(self._queues):
+            try:
+                for queue in self._queues:
+                    queue.drop()
+                self._ready.clear()
+                self._sends = False
+            finally:
+                self._note()
+
+
+def _held(queues: Sequence[WorkerQueue]) -> AbstractContextManager[None]:
+    """The locks of these workers: interruption.md, rule 10."""
+    return all_held([queue.part.use.lock for queue in queues])

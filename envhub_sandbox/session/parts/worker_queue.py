@@ -1,0 +1,251 @@
+"""The requests of one worker that ``send`` has made, in their order, and their answers.
+
+docs/internals/interruption.md holds for the worker's session. ``taking`` is what its rule 1 asks
+for here: set before an answer is taken, and cleared once it is kept and the next request noted.
+"""
+
+from __future__ import annotations
+
+import copy
+from collections import deque
+from collections.abc import Callable
+from contextlib import suppress
+from functools import partial
+from typing import Any
+
+import numpy as np
+from gymnasium.error import AlreadyPendingCallError
+
+from envhub_sandbox.errors import (
+    EnvHubError,
+    RemoteEnvWarning,
+    RemoteProtocolError,
+    remote_error,
+)
+from envhub_sandbox.session.env_session import EnvSession
+from envhub_sandbox.session.parts.naming import name_part, rows_of
+from envhub_sandbox.session.requests import MessageFor
+from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.lane import Lane
+from envhub_sandbox.transport.results import StepResult
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.lifecycle import State
+from envhub_worker.protocol.limits import MAX_IN_FLIGHT
+from envhub_worker.protocol.spaces import batches
+
+
+class WorkerQueue:
+    """What one worker owes, and what it is to be sent after that.
+
+    A worker is sent a further step before it has answered the last one where its lane can carry
+    that, which hides the way there and back. Elsewhere the step waits here.
+
+    Args:
+        part: Its session.
+        sliced: Whether there are other workers, with whose infos its own are joined.
+
+    Attributes:
+        part: Its session.
+        rows: The first of its sub-environments, and the one after the last.
+        count: How many they are.
+        failure: What the sending of a step that had waited has ended in.
+        taking: Whether an answer is being taken; else an interrupt came into that.
+    """
+
+    def __init__(self, part: EnvSession, *, sliced: bool) -> None:
+        self.part = part
+        self.rows = rows_of(part)
+        self.failure: EnvHubError | None = None
+        self.count = self.rows[1] - self.rows[0]
+        self._requests = part.requests
+        self._timeouts = part.repository.timeouts
+        self._sliced = sliced
+        self._owed: deque[str] = deque()
+        self._waiting: deque[Any] = deque()
+        self._deadline = Deadline(None)
+        self.taking = False
+
+    @property
+    def busy(self) -> bool:
+        """Whether an answer is to come, or a failure is to be raised."""
+        return bool(self._owed or self._waiting) or self.taking or self.failure is not None
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether an interrupt came into an answer, or into a message to the worker."""
+        lane = self.part.lease.lane
+        return self.taking or (lane is not None and lane.jail.client.torn)
+
+    @property
+    def lane(self) -> Lane | None:
+        """The way to it, where something is owed; else ``take`` has nothing to wait for."""
+        return self.part.lease.lane if self._owed else None
+
+    @property
+    def left_s(self) -> float | None:
+        """Seconds that its oldest request may still take; None for any number."""
+        return self._deadline.left_s()
+
+    # --- there ---------------------------------------------------------------------------------
+
+    def prepare(self) -> None:
+        """With the lock held, before ``step``; nothing is sent. Raises as ``Requests.submit`` does.
+
+        Raises:
+            AlreadyPendingCallError: It owes as many answers as it may.
+        """
+        if len(self._owed) + len(self._waiting) >= MAX_IN_FLIGHT:
+            raise AlreadyPendingCallError(
+                f"`send` was called {MAX_IN_FLIGHT} times for sub-environment {self.rows[0]} whose "
+                "results were not received: call `recv` first",
+                "send",
+            )
+        if not self.busy:
+            try:
+                self._requests.make_ready("step")
+            except EnvHubError as error:
+                self._name(error)
+                raise
+
+    def prepare_reset(self) -> None:
+        """Likewise before ``reset``: what has died or is late is brought back, as ``reset`` does.
+
+        Raises:
+            AlreadyPendingCallError: It owes an answer.
+        """
+        if self.busy:
+            raise AlreadyPendingCallError(
+                f"Calling `send_reset` for sub-environment {self.rows[0]}, whose results were not "
+                "received: call `recv` first, or `reset` for all",
+                "send",
+            )
+        try:
+            self.part.recover()
+            self._requests.make_ready("reset")
+        except EnvHubError as error:
+            self._name(error)
+            raise
+
+    def step(self, actions: Any) -> None:
+        """After ``prepare``, send it a step. Where that fails, ``take`` raises it."""
+        if not self._owed:
+            self._try("step", partial(self._requests.submit_step, actions))
+        elif not self._waiting and self._requests.takes_more():
+            self._try("step", partial(self._requests.submit_ahead, actions))
+        else:
+            self._waiting.append(copy.deepcopy(actions))  # its owner may write the next ones there
+
+    def reset(self, message_for: MessageFor) -> None:
+        """After ``prepare_reset``, send it a reset; as ``step``."""
+
+        def send() -> None:
+            packed = self._requests.pack("reset", message_for)
+            self._requests.submit_packed("reset", packed)
+
+        self._try("reset", send)
+
+    def _try(self, operation: str, send: Callable[[], None]) -> None:
+        try:
+            send()
+        except EnvHubError as error:  # nothing was sent
+            self.failure = error
+            self._waiting.clear()
+            return
+        self._owed.append(operation)
+        if len(self._owed) == 1:
+            self._begin()
+
+    def _begin(self) -> None:
+        """The worker is at the oldest request now."""
+        is_step = self._owed[0] == "step"
+        self._deadline = Deadline(self._timeouts.step_s if is_step else self._timeouts.reset_s)
+
+    # --- and back ------------------------------------------------------------------------------
+
+    def take(self, keep: Callable[[StepResult], None]) -> None:
+        """With the lock held, ``keep`` the oldest request's results; rewards are 0 for a reset.
+
+        Raises as ``Requests.collect_step`` and ``collect`` do; the error names the
+        sub-environments. Where the worker is not ready afterwards, it owes nothing any more.
+        """
+        if not self._owed:
+            failure, self.failure = self.failure, None
+            assert failure is not None
+            self._name(failure)
+            raise failure
+        self.taking = True  # interruption.md, rule 1
+        try:
+            result = self._take()
+            if self._sliced:
+                self._check(result)
+            keep(result)
+        except EnvHubError as error:
+            self._go_on()
+            self._name(error)
+            raise
+        except RemoteEnvWarning:
+            self._go_on()
+            raise
+        self._go_on()
+
+    def _name(self, error: EnvHubError) -> None:
+        """Have it say whose it is."""
+        name_part(error, self.part)
+        error.env_ids = tuple(range(*self.rows))
+
+    def _take(self) -> StepResult:
+        if self._owed[0] == "step":
+            *result, infos = self._requests.collect_step(self._deadline)
+            return (*result, self._requests.results.joined(infos))
+        replies = self._requests.collect(self._deadline, m.ResetDone)
+        observation, infos = self._requests.finish_reset(replies, self._deadline)
+        no = np.zeros(self.count, np.bool_)
+        infos = self._requests.results.joined(infos)
+        return observation, np.zeros(self.count), no, no.copy(), infos
+
+    def _check(self, result: StepResult) -> None:
+        """Whether it can be joined with others' results. Trust: input from the worker."""
+        try:
+            if result[1].ndim != 1:
+                raise RemoteProtocolError("the worker sent rewards that are not one number each")
+            if batches.is_apart(result[4]):
+                start, stop = self.rows
+                name = ValueError.__name__
+                text = f"the infos of sub-environments {start} to {stop - 1} do not go together"
+                raise remote_error(name, name, text)
+            batches.check_infos(result[4], self.count)
+        except BaseException:
+            with self._requests.use.judging("recv"):  # on failure only: it costs some us
+                raise
+
+    def _go_on(self) -> None:
+        """After an answer: to the next request, if the worker is able to."""
+        self._owed.popleft()
+        if self.part.lifecycle.state is not State.READY:
+            self.forget()
+        elif self._owed:
+            self._requests.owe()
+            self._begin()
+        elif self._waiting:
+            self._try("step", partial(self._requests.submit_step, self._waiting.popleft()))
+        while self._waiting and self._requests.takes_more():
+            self._try("step", partial(self._requests.submit_ahead, self._waiting.popleft()))
+        self.taking = False
+
+    def drop(self) -> None:
+        """With the lock held, wait for what is owed, and forget it."""
+        self._waiting.clear()
+        while self._owed and not self.interrupted:
+            with suppress(EnvHubError):  # a reset that follows meets what is wrong
+                self.take(_ignore)
+        self.forget()
+
+    def forget(self) -> None:
+        """Expect nothing: the session has ended, or is to be recovered."""
+        self._owed.clear()
+        self._waiting.clear()
+        self.failure, self.taking = None, False
+
+
+def _ignore(result: StepResult) -> None:
+    """They are not wanted any more."""

@@ -1,0 +1,80 @@
+"""Calls side by side, in threads that nothing has to wait for."""
+
+from __future__ import annotations
+
+import contextlib
+import queue
+import threading
+from collections import deque
+from collections.abc import Callable, Sequence
+from time import monotonic
+from typing import Generic, TypeVar, cast
+
+T = TypeVar("T")
+_AT_ONCE = 64
+_LOOK_S = 1.0
+
+
+class Call(Generic[T]):
+    """One of several calls.
+
+    Attributes:
+        done: Whether it has returned or raised.
+        value: What it returned; None before that, and where it raised.
+        error: What it raised.
+    """
+
+    def __init__(self, call: Callable[[], T], finished: queue.SimpleQueue[None]) -> None:
+        self.done = False
+        self.value: T | None = None
+        self.error: Exception | None = None
+        self._call, self._finished = call, finished
+
+    def result(self) -> T:
+        """What it returned; raises what it raised. Once it is done."""
+        if self.error is not None:
+            raise self.error
+        return cast("T", self.value)
+
+    def run(self) -> None:
+        """In a thread."""
+        try:
+            self.value = self._call()
+        except Exception as error:
+            self.error = error
+        finally:
+            self.done = True
+            self._finished.put(None)
+
+
+class Calls(Generic[T]):
+    """Runs calls at the same time, in daemon threads: 64 at once, the others after these.
+    ``each``: the calls, in their order.
+    Raises ``RuntimeError``: the system has no thread left; those that it had go on.
+    """
+
+    def __init__(self, calls: Sequence[Callable[[], T]]) -> None:
+        self._finished: queue.SimpleQueue[None] = queue.SimpleQueue()
+        self.each = [Call(call, self._finished) for call in calls]
+        self._left = deque(self.each)
+        for _ in self.each[:_AT_ONCE]:
+            threading.Thread(target=self._run, name="envhub-calls", daemon=True).start()
+
+    def _run(self) -> None:
+        """In each thread."""
+        with contextlib.suppress(IndexError):  # nothing is left
+            while True:
+                self._left.popleft().run()
+
+    def wait(self, timeout_s: float | None = None) -> bool:
+        """Until all are done, or so many seconds; whether they are. If interrupted, they go on."""
+        until = None if timeout_s is None else monotonic() + timeout_s
+        while not all(one.done for one in self.each):
+            left_s = _LOOK_S if until is None else min(_LOOK_S, until - monotonic())
+            if left_s <= 0:
+                return False
+            try:
+                self._finished.get(timeout=left_s)
+            except queue.Empty:
+                continue
+        return True

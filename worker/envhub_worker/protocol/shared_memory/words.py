@@ -1,0 +1,75 @@
+"""The header of a slab: 64-bit words, by their numbers. No numpy: the server reads these, too.
+
+Each slab starts with one. Words that the other side polls have a cache line of their own.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+LINE = 64
+"""Bytes of a cache line: words that two cores poll must not share one."""
+INFO_BYTES = 64 * 1024
+"""Room for a step's infos, or for what it raised, or for a message or its answer. What is larger
+goes through the server."""
+
+# a word is 8 bytes, a line holds 8 of them
+SEQUENCE = 0
+"""Counts requests, or replies; polled by the other side."""
+PARKED = 8
+"""1 while this slab's writer sleeps in poll and wants its doorbell rung."""
+OUTCOME = 16
+"""Reply: ``DONE``, ``RAISED``, ``FETCH`` or ``COLUMNS``."""
+LENGTH = 17
+"""Reply: bytes of the encoded infos, or of what was raised; 0 for an empty info."""
+SPIN = 16
+"""Request: nanoseconds that the shard may wait for the next request without sleeping."""
+SLOT = 17
+"""Request: the slot of the observation slab that the shard writes."""
+CPU = 18
+"""Request: one more than the number of the core that the shard should keep to; 0 for any."""
+CHANGES = 19
+"""Request: grows with every change of ``SPIN``, ``SLOT``, ``CPU`` and the dtypes."""
+MESSAGE = 20
+"""Request: bytes of the encoded message; 0 for a step."""
+KNOWN = 21
+"""Request: bytes of the infos that the client knows the columns of. For the server alone, where it
+takes the steps: so much it sends of infos that came as columns."""
+DTYPES = 24
+"""Request: the dtype code of each action leaf, one word each, up to ``MAX_LEAVES``."""
+MAX_LEAVES = 64
+HEADER_WORDS = DTYPES + MAX_LEAVES
+HEADER_BYTES = HEADER_WORDS * 8
+
+DONE, RAISED, FETCH, COLUMNS = 1, 2, 3, 4
+"""Results and encoded infos are in the slab; an encoded ``RaisedException`` is; the infos must be
+fetched; the infos are columns (see ``columns``)."""
+
+OWN_BYTES = SPIN * 8
+"""Where the client's own words begin in the request slab. Before them stand those of who announces
+the request: the client, or the server in its place."""
+REPLY_BYTES = HEADER_BYTES + 2 * INFO_BYTES
+"""A reply slab: header, infos, the answer to a message."""
+_MAX_SERVED_REQUEST_BYTES = 1 << 20
+_MAX_SERVED_BYTES = 1 << 26
+
+
+def words(buffer: Any) -> memoryview:
+    """The header of a mapped slab."""
+    return memoryview(buffer)[:HEADER_BYTES].cast("Q")
+
+
+def served(leaves: int, request_bytes: int, observation_bytes: int, message_bytes: int) -> bool:
+    """Whether a server makes slabs of these sizes for a runner, and takes its steps.
+
+    Args:
+        leaves: Of the actions; what a client sends is its words, of which so many are dtypes, and
+            the actions.
+        message_bytes: What a message between client and runner may have.
+    """
+    least, most = HEADER_BYTES + INFO_BYTES, min(_MAX_SERVED_BYTES, message_bytes)
+    return (
+        0 <= leaves <= MAX_LEAVES
+        and least <= request_bytes <= _MAX_SERVED_REQUEST_BYTES
+        and 0 < observation_bytes <= most - INFO_BYTES
+    )

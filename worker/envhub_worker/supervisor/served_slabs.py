@@ -1,0 +1,209 @@
+"""Slabs of a runner whose client shares no memory with it: the server takes the steps for it.
+
+The client is on another host, or has chosen frames. It sends its half of the request slab; what
+comes back is what the runner wrote into the other two. The server reads three words of those and
+understands none of the rest.
+
+Trust: a jail holds all of this, and the server is many clients'. Each word is read once; only its
+client's own bytes and bounded numbers decide what is sent. Nothing here waits: rings are sent and
+heard as ``doorbell`` says, and a hole that is punched costs a fault for each page, of slabs whose
+size is bounded. A large observation is sent from where it lies. An honest runner writes it again
+only for the next step, which its client asks for when it has all of this one; another one decides
+what its client reads anyway.
+"""
+
+from __future__ import annotations
+
+import os
+import select
+import struct
+from collections.abc import Callable
+from time import perf_counter_ns
+from typing import Any
+
+from envhub_worker.protocol.codec.kinds import Buffer
+from envhub_worker.protocol.limits import LARGE_BYTES
+from envhub_worker.protocol.shared_memory import words
+from envhub_worker.protocol.shared_memory.doorbell import OwnBell, RunnerBell
+from envhub_worker.protocol.shared_memory.memfd import SEAL_FUTURE_WRITE, sealed_memfd
+from envhub_worker.spawn.channel import close_fds
+
+_HEAD = struct.Struct("<QQ")
+_WORD = struct.Struct("<Q")
+_HEAD_AT = words.OUTCOME * _WORD.size
+_SPIN_AT = words.SPIN * _WORD.size - words.OWN_BYTES
+_KNOWN_AT = words.KNOWN * _WORD.size - words.OWN_BYTES
+_CHUNK_BYTES = 1 << 19
+"""One frame of a large observation: while one is encrypted, the one before it is decrypted."""
+_MAX_SPIN_NS = 400_000
+_TURN_NS = 20_000
+"""For how long the server looks at nothing but slabs."""
+_RECHECK_MS = 2
+_MAY_SPIN = os.uname().machine == "x86_64" and len(os.sched_getaffinity(0)) > 1
+"""Elsewhere a core may see the sequence word before the data it announces; one core is not two."""
+_MAX_VAIN = 16
+"""Rings of a runner, one after the other, that announce nothing."""
+
+
+class ServedSlabs:
+    """The slabs and doorbells of one runner, and at most one step that it owes.
+
+    Attributes:
+        deposit: What the runner gets, to be taken once: three slabs, its doorbell, ours.
+        owner: Whom the step that it owes is for; None if it owes none.
+        awake_until: Until when an answer is worth waiting for awake.
+        shared_bytes: Of the two slabs whose size the client chooses.
+    """
+
+    def __init__(self, leaves: int, request_bytes: int, observation_bytes: int) -> None:
+        self.shared_bytes = request_bytes + observation_bytes
+        self._request, request = sealed_memfd("request", request_bytes, SEAL_FUTURE_WRITE)
+        self._reply, reply = sealed_memfd("reply", words.REPLY_BYTES)
+        observed, observations = sealed_memfd("observations", observation_bytes)
+        self._observed = memoryview(observed)
+        self._words = (words.DTYPES - words.SPIN + leaves) * _WORD.size
+        self._room = self._words + request_bytes - words.HEADER_BYTES
+        self._runner_bell, self.bell = RunnerBell(), OwnBell()
+        ends = [one.fileno() for one in (request, reply, observations)]
+        ends += [self._runner_bell.theirs, self.bell.fileno()]
+        self.deposit: list[int] = []
+        try:
+            for end in ends:
+                self.deposit.append(os.dup(end))
+        except OSError:  # there is none left: these would be lost, and with them the server
+            close_fds(self.deposit)
+            raise
+        self._runner_bell.handed_over()
+        self._asks, self._tells = words.words(self._request), words.words(self._reply)
+        self._sequence = self._known = 0
+        self.owner: Any = None
+        self.awake_until = 0
+        self.vain = 0
+
+    def fits(self, frame: bytes) -> bool:
+        """Whether a client's half of the request slab is one."""
+        return self._words <= len(frame) <= self._room
+
+    def ask(self, frame: bytes, owner: Any) -> None:
+        """Announce a step."""
+        self.owner = owner
+        asks, cut = self._asks, self._words
+        self._request[words.OWN_BYTES : words.OWN_BYTES + cut] = frame[:cut]
+        start = words.HEADER_BYTES
+        self._request[start : start + len(frame) - cut] = frame[cut:]
+        self._known = min(_WORD.unpack_from(frame, _KNOWN_AT)[0], words.INFO_BYTES)
+        spin_ns = min(_WORD.unpack_from(frame, _SPIN_AT)[0], _MAX_SPIN_NS)
+        if not _MAY_SPIN:
+            asks[words.SPIN] = spin_ns = 0
+        self.awake_until = perf_counter_ns() + spin_ns if spin_ns else 0
+        asks[words.PARKED] = not spin_ns
+        self._sequence += 1
+        asks[words.SEQUENCE] = self._sequence
+        if self._tells[words.PARKED]:
+            self._runner_bell.ring()
+
+    def park(self) -> None:
+        """From here on our doorbell has to be rung."""
+        self.awake_until = 0
+        self._asks[words.PARKED] = 1
+
+    @property
+    def answered(self) -> bool:
+        """Whether the answer to the last step is there."""
+        return bool(self._tells[words.SEQUENCE] == self._sequence)
+
+    def take(self) -> tuple[Any, list[Buffer]]:
+        """Whom the step was for, and the frames of the answer. Trust: input from the jail.
+
+        How it went and how long its infos are, these, and the observation slab. What cannot be is
+        the client's to refuse.
+        """
+        owner, self.owner, self.vain = self.owner, None, 0
+        head = self._reply[_HEAD_AT : _HEAD_AT + _HEAD.size]
+        outcome, length = _HEAD.unpack(head)
+        size = self._known if outcome == words.COLUMNS else min(length, words.INFO_BYTES)
+        first = head + self._reply[words.HEADER_BYTES : words.HEADER_BYTES + size]
+        observed = self._observed
+        if len(observed) <= LARGE_BYTES:
+            return owner, [first + observed]
+        starts = range(0, len(observed), _CHUNK_BYTES)
+        return owner, [first, *(observed[start : start + _CHUNK_BYTES] for start in starts)]
+
+    def close(self) -> None:
+        """Give everything back. Idempotent."""
+        deposit, self.deposit = self.deposit, []
+        for fd in deposit:
+            os.close(fd)
+        self._runner_bell.close()
+        self.bell.close()
+        self._observed.release()
+        self._asks.release()
+        self._tells.release()
+
+
+class ServedSteps:
+    """All steps that runners owe the server, and what takes the answer to each."""
+
+    def __init__(self) -> None:
+        self._epoll = select.epoll()
+        self._by_bell: dict[int, ServedSlabs] = {}
+        self._owed: dict[ServedSlabs, Callable[[], None]] = {}
+
+    def fileno(self) -> int:
+        """Readable when a runner has rung."""
+        return self._epoll.fileno()
+
+    def add(self, slabs: ServedSlabs) -> None:
+        """Hear its rings."""
+        self._by_bell[slabs.bell.fileno()] = slabs
+        self._epoll.register(slabs.bell, select.EPOLLIN | select.EPOLLET)
+
+    def forget(self, slabs: ServedSlabs) -> None:
+        """Hear it no more, and close it: the jail has a copy of the bell, and may go on ringing."""
+        self._owed.pop(slabs, None)
+        self._deafen(slabs)
+        slabs.close()
+
+    def _deafen(self, slabs: ServedSlabs) -> None:
+        if self._by_bell.pop(slabs.bell.fileno(), None) is not None:
+            self._epoll.unregister(slabs.bell)
+
+    def owe(self, slabs: ServedSlabs, take: Callable[[], None]) -> None:
+        """It was asked a step; ``take`` is called once when the answer is there."""
+        self._owed[slabs] = take
+
+    def rung(self) -> None:
+        """Take the rings. A runner that only rings is heard no more: each would wake the server."""
+        for fd, _ in self._epoll.poll(0):
+            slabs = self._by_bell.get(fd)
+            if slabs is not None:
+                slabs.vain += 1
+                if slabs.vain > _MAX_VAIN:
+                    self._deafen(slabs)
+
+    def look(self) -> int | None:
+        """Take all answers that are there, and wait a moment for those that come at once.
+
+        Returns:
+            For how many milliseconds the server may sleep; None for as long as it likes.
+        """
+        turn, wait_ms = perf_counter_ns() + _TURN_NS, None
+        while self._owed:
+            for slabs in [one for one in self._owed if one.answered]:
+                if take := self._owed.pop(slabs, None):  # an answer may be the end of others
+                    take()
+            awake = [one for one in self._owed if one.awake_until]
+            if not awake:
+                return wait_ms
+            now = perf_counter_ns()
+            for slabs in awake:
+                if slabs.awake_until < now:
+                    slabs.park()
+                    wait_ms = _RECHECK_MS  # its answer may cross with that: look again soon, once
+            if now > turn:
+                return 0
+        return wait_ms
+
+    def close(self) -> None:
+        """Stop hearing."""
+        self._epoll.close()
