@@ -130,13 +130,24 @@ def _client(endpoint: str, server_key: str, environments: str, stays: str) -> in
 class Server:
     """A server on loopback, with a temporary folder of its own."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, *options: str) -> None:
         self._folder = folder
         self._state, self._place = folder / "state", folder / "place"
         self._place.mkdir(mode=0o711)
         folder.chmod(0o711)
+        self._options = options
+        self._endpoint = "tcp://127.0.0.1:*"
+        self._start()
+        self._public = (self._state / "server.pub").read_text().strip()
+        self._variables = {
+            **os.environ,
+            "ENVHUB_CLIENT_KEY": str(self._state / "client.key"),
+            "ENVHUB_CACHE": str(folder / "cache"),
+        }
+
+    def _start(self) -> None:
         command = [sys.executable, "-I", str(BOOTSTRAP), "worker", "listen"]
-        options = ["--bind", "tcp://127.0.0.1:*", "--state-dir", str(self._state)]
+        options = ["--bind", self._endpoint, "--state-dir", str(self._state), *self._options]
         more = ["--max-sessions", "1024", "--max-jails", "256", "--log-level", "error"]
         variables = {**os.environ, "TMPDIR": str(self._place)}
         self.process = subprocess.Popen(
@@ -153,12 +164,17 @@ class Server:
         found = re.search(r"tcp://\S+", said)
         assert found is not None
         self._endpoint = found[0]
-        self._public = (self._state / "server.pub").read_text().strip()
-        self._variables = {
-            **os.environ,
-            "ENVHUB_CLIENT_KEY": str(self._state / "client.key"),
-            "ENVHUB_CACHE": str(folder / "cache"),
-        }
+
+    def killed_and_started(self) -> None:
+        """End it without a warning, and start another at its address, with its keys."""
+        self.process.kill()
+        self.process.wait()
+        self._start()
+
+    @property
+    def endpoint(self) -> str:
+        """Where it listens."""
+        return self._endpoint
 
     def __enter__(self) -> Server:
         return self

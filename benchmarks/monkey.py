@@ -1,9 +1,10 @@
 """Random operations with kills on many environments at once, each result against a model.
 
-    python -m benchmarks.monkey [--seconds 3600] [--places process tcp] [--kill-every 100]
+    python -m benchmarks.monkey [--seconds 3600] [--places process tcp fleet] [--kill-every 100]
 
 Each place has a process of its own. In it a monkey opens, resets, steps, asks, kills, lets go and
-closes, whichever environment it comes upon; most are in the middle of something. The model is a
+closes, whichever environment it comes upon; most are in the middle of something. In a fleet it
+also kills servers, and starts them again. The model is a
 ``SyncVectorEnv`` of the same class in the same process, with the same seeds and actions, and knows
 which environments may have died. What it does not allow is a mismatch, and is printed.
 
@@ -40,7 +41,7 @@ from benchmarks.soak import EXIT, HANG, LIVE, MIB, SLOW, SLOW_S, same
 from envhub_sandbox import errors, make_env
 from tests.support import inside
 
-PLACES = ("process", "tcp")
+PLACES = ("process", "tcp", "fleet")
 REPOSITORIES = Path(__file__).parent / "repositories"
 NAMES = ("walk", "cartpole")
 _WARM_UP = 0.1
@@ -67,7 +68,8 @@ class Subject:
     def __init__(self, rng: np.random.Generator, sandbox: Any) -> None:
         self.name = str(rng.choice(NAMES))
         self.n_envs = int(rng.integers(1, 5))
-        self.workers = int(rng.integers(1, min(self.n_envs, 2) + 1))
+        most = 2 if isinstance(sandbox, str) else 3
+        self.workers = int(rng.integers(1, min(self.n_envs, most) + 1))
         self.lane = str(rng.choice(["auto", "frames"]))
         policy = {"restart": "on_reset", "restart_budget": 10**9, "restart_backoff_s": 0}
         self.suites = make_env(
@@ -84,14 +86,23 @@ class Subject:
         self.ready = False
         self.pending: Any = None
         self.doubt = 0
+        self.others = 0
+        """Deaths that a reset may meet after the first: of workers that had answered by then."""
 
     def doubted(self) -> None:
         """One of its processes was killed: from now on it may turn out to be dead."""
         self.doubt = self.doubt or 1
+        self.others = len(inside.leases(self.env)) - 1
 
     def lost(self) -> None:
         """What it was in the middle of is gone; a reset brings it back."""
         self.ready, self.pending = False, None
+
+
+def _servers(subject: Subject) -> list[Any]:
+    """Those that it has a jail in."""
+    loaded = [one.loaded for one in inside.leases(subject.env)]
+    return [one.server for one in loaded if one is not None]
 
 
 class Mismatch(Exception):
@@ -101,8 +112,16 @@ class Mismatch(Exception):
 class Monkey:
     """What does one thing after another, and how often it did."""
 
-    def __init__(self, sandbox: Any, environments: int, seed: int, kill_every: int) -> None:
+    def __init__(
+        self,
+        sandbox: Any,
+        environments: int,
+        seed: int,
+        kill_every: int,
+        far: Sequence[clients.Server] = (),
+    ) -> None:
         self._sandbox, self._most = sandbox, environments
+        self._far = {server.endpoint: server for server in far}
         self._rng = np.random.default_rng(seed)
         self._subjects: list[Subject] = []
         self._kill_every = kill_every
@@ -128,7 +147,9 @@ class Monkey:
             action(subject)
         except errors.WorkerDiedError:
             if not subject.doubt:
-                raise
+                if not subject.others or action != self._reset:
+                    raise
+                subject.others -= 1
             self.counts["deaths"] += 1
             subject.doubt = 0
             subject.lost()
@@ -190,7 +211,7 @@ class Monkey:
         seed = int(self._rng.integers(2**31))
         got = subject.env.reset(seed=seed)
         if not subject.ready:  # it may have found out by itself, and has another jail then
-            subject.ready, subject.doubt = True, 0
+            subject.ready, subject.doubt, subject.others = True, 0, 0
         self._compare(got, subject.model.reset(seed=seed))
 
     def _reset_some(self, subject: Subject) -> None:
@@ -264,15 +285,15 @@ class Monkey:
         self._end(subject, pids)
 
     def _pids(self, subject: Subject) -> list[int]:
-        """None where it has no jail; or where that may have died, which it has not noticed so."""
-        if not subject.ready or inside.loaded(subject.env) is None:
-            return []
-        try:
-            return inside.pids(subject.env)
-        except (errors.WorkerDiedError, StopIteration):
-            if not subject.doubt:
-                raise
-            return []
+        """None where it has no jail; or where that may have died, which it has not noticed so; or
+        where a server is too busy to answer within the second that a status waits for.
+        """
+        leases = inside.leases(subject.env) if subject.ready else []
+        answers = [one.status() for one in leases if one.loaded]
+        found = [pid for answer in answers for pid in answer.get("pids", ())]
+        if leases and all(answers) and not found and not subject.doubt:
+            raise Mismatch("its processes are not there, and none was killed")
+        return found
 
     def _end(self, subject: Subject, pids: Sequence[int]) -> None:
         if not pids:
@@ -285,19 +306,25 @@ class Monkey:
 
     def _kill_server(self, subject: Subject) -> None:
         """Where it is this process's own: all environments that it serves die with it."""
-        if not subject.ready or inside.loaded(subject.env) is None:
+        servers = _servers(subject) if subject.ready else []
+        if not servers:
             return
-        process = getattr(inside.server(subject.env), "process", None)
-        if process is None:
+        server = servers[self._rng.integers(len(servers))]
+        far = self._far.get(server.endpoint)
+        process = getattr(server, "process", None)
+        if far is None and process is None:
             self._kill(subject)
             return
         self.counts["servers killed"] += 1
         for one in self._subjects:
             # one that has no jail has nothing to lose, and need not notice
-            if inside.loaded(one.env) and inside.server(one.env).process is process:
+            if server in _servers(one):
                 one.doubted()
-        process.kill()
-        process.wait()  # whoever asks next must not be given one that is about to end
+        if far is not None:
+            far.killed_and_started()
+        elif process is not None:
+            process.kill()
+            process.wait()  # whoever asks next must not be given one that is about to end
 
     def _exit(self, subject: Subject) -> None:
         self._badly(subject, EXIT, None)
@@ -363,12 +390,20 @@ class Monkey:
 class Place:
     """Where the environments are: what is to be looked at there."""
 
-    def __init__(self, folder: Path, server: clients.Server | None) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        server: clients.Server | None,
+        others: Sequence[clients.Server] = (),
+    ) -> None:
         self._folder, self._server = folder, server
+        self.others = others
+        """Further servers of a fleet, which are killed and started."""
 
     def sandbox(self) -> Any:
         """What ``make_env`` is given."""
-        return self._server.sandbox() if self._server else "process"
+        one = self._server.sandbox() if self._server else "process"
+        return [one, *(server.sandbox() for server in self.others)] if self.others else one
 
     def footprint(self, subject: Subject) -> dict[str, float]:
         """Of this process, and of the server of an environment."""
@@ -396,6 +431,13 @@ def _place(name: str) -> Iterator[Place]:
             server = stack.enter_context(clients.Server(folder))
             yield Place(server.place, server)
             return
+        if name == "fleet":
+            folders = [folder / name for name in ("stays", "a", "b")]
+            for one in folders:
+                one.mkdir()
+            found = [stack.enter_context(clients.Server(one)) for one in folders]
+            yield Place(found[0].place, found[0], found[1:])
+            return
         # of this process, which was started for it alone
         os.environ["TMPDIR"], tempfile.tempdir = str(folder), str(folder)
         yield Place(folder, None)
@@ -411,7 +453,7 @@ def run(arguments: argparse.Namespace, name: str) -> dict[str, Any]:
     begun = time.monotonic()
     with _place(name) as place:
         sandbox, many = place.sandbox(), arguments.environments
-        monkey = Monkey(sandbox, many, arguments.seed, arguments.kill_every)
+        monkey = Monkey(sandbox, many, arguments.seed, arguments.kill_every, place.others)
         _play(monkey, arguments, begun, _WARM_UP)
         before = monkey.look(place)
         _play(monkey, arguments, begun, 1)

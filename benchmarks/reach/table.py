@@ -1,4 +1,4 @@
-"""The outcomes as Markdown, and their place in ``docs/dependencies.md``."""
+"""The outcomes as Markdown, and their place in ``docs/internals/packages-tried.md``."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 from benchmarks.reach.measure import EQUAL, Outcome
 
-DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "dependencies.md"
+DOCUMENT = Path(__file__).resolve().parents[2] / "docs" / "internals" / "packages-tried.md"
 BEGIN = "<!-- python -m benchmarks.reach --write -->\n"
 END = "<!-- end of what it writes -->\n"
 HEAD = {
