@@ -25,7 +25,7 @@ NOT_STOPPED: dict[str, dict[str, str]] = {
         "strict": _FLOCK,
         "no-userns": _FLOCK,
     },
-    "use up the user's descriptors under way": {
+    "use up the user's descriptors in flight": {
         PLAIN: "the kernel counts them per user, and compares with each sender's own limit",
     },
     "use up the user's pages of pipes": {

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from envhub_sandbox import RemoteSandbox, make_env
 from envhub_sandbox.errors import WorkerDiedError
@@ -168,15 +169,45 @@ def test_the_compose_file_keeps_its_clients(engine: Engine, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("version", ["1.30", "1.37"])
-def test_the_manifests_are_what_kubernetes_takes(version: str, tmp_path: Path) -> None:
+def test_the_pods_of_the_ray_cluster_are_what_kubernetes_takes(
+    version: str, tmp_path: Path
+) -> None:
+    """Its own schemas know no RayCluster, and each pod that this makes; and what else is there."""
+    if shutil.which("kubernetes-validate") is None:
+        pytest.skip("needs kubernetes-validate")
+
+    def code(*documents: object) -> int:
+        path = tmp_path / "manifests.yaml"
+        path.write_text(yaml.safe_dump_all(documents))
+        words = ["kubernetes-validate", "--strict", "--kubernetes-version", version, str(path)]
+        return subprocess.run(words, capture_output=True, timeout=60).returncode
+
+    *others, cluster = sorted(
+        yaml.safe_load_all((DEPLOYMENT / "ray.yaml").read_text()),
+        key=lambda one: one["kind"] == "RayCluster",
+    )
+    groups = [cluster["spec"]["headGroupSpec"], *cluster["spec"]["workerGroupSpecs"]]
+    named = {"apiVersion": "v1", "kind": "Pod"}
+    pods = [named | one["template"] | {"metadata": {"name": "pod"}} for one in groups]
+    assert len(pods) == 2
+    assert code(*others, *pods) == 0
+    pods[1]["spec"]["hostUser"] = pods[1]["spec"].pop("hostUsers")
+    assert code(*others, *pods) != 0
+
+
+@pytest.mark.parametrize("manifests", ["kubernetes.yaml", "fleet.yaml"])
+@pytest.mark.parametrize("version", ["1.30", "1.37"])
+def test_the_manifests_are_what_kubernetes_takes(
+    version: str, manifests: str, tmp_path: Path
+) -> None:
     """By its own schemas, where a field that is misspelt, or of another type, is refused."""
     if shutil.which("kubernetes-validate") is None:
         pytest.skip("needs kubernetes-validate")
-    good = (DEPLOYMENT / "kubernetes.yaml").read_text()
+    good = (DEPLOYMENT / manifests).read_text()
     texts = [good]
     for part, instead in (
         ("readOnlyRootFilesystem", "readonlyRootFilesystem"),
-        ("replicas: 1", "replicas: one"),
+        ("replicas: ", "replicas: one"),
         ("policyTypes: [Ingress, Egress]", "policyTypes: Ingress"),
     ):
         assert part in good

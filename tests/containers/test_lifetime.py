@@ -159,10 +159,12 @@ def test_client_and_monitor_killed_together_leave_no_container(engine: Engine) -
         made.process.kill()
         monitor.kill()
         assert nothing_left(engine, made.process.pid)
-        [folder] = folders(made.process.pid)
-        found = [one for one in leftovers.find().leftovers if one.name == str(folder)]
-        assert [one.remove() for one in found] == [True]
-        assert not folder.exists()
+        # a client that publishes a container removes what others have left, and may be first
+        left = set(map(str, folders(made.process.pid)))
+        for one in leftovers.find().leftovers:
+            if one.name in left:
+                one.remove()
+        assert not folders(made.process.pid)
 
 
 def test_a_killed_container_is_a_dead_worker(docker: DockerSandbox, engine: Engine) -> None:

@@ -175,7 +175,9 @@ _CACHED = """
 def reset(self, **kwargs):
     path = pathlib.Path(tempfile.gettempdir(), "map.npy")
     if not path.exists():
-        np.save(path, np.arange(9.0))
+        with tempfile.TemporaryDirectory() as own:  # several processes may be at it
+            np.save(pathlib.Path(own, path.name), np.arange(9.0))
+            pathlib.Path(own, path.name).replace(path)
     self.map = np.load(path)
     return super().reset(**kwargs)
 

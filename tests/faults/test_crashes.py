@@ -41,16 +41,19 @@ def play(env: Any, steps: int = 2000) -> errors.WorkerDiedError:
     pytest.fail("it does not die")
 
 
-SHARDS = [(1, 1), (3, 1), (3, 2)]
+SHARDS: list[tuple[int, int, Any]] = [
+    *((1, 1, "process"), (3, 1, "process"), (3, 2, "process")),
+    (3, 2, ["process", "process"]),
+]
 
 
 @pytest.mark.parametrize("lane", ["auto", "frames"])
-@pytest.mark.parametrize(("n_envs", "shards"), SHARDS)
+@pytest.mark.parametrize(("n_envs", "shards", "sandbox"), SHARDS)
 def test_a_replay_dies_at_the_same_step(
-    tmp_path: Path, lane: str, n_envs: int, shards: int
+    tmp_path: Path, lane: str, n_envs: int, shards: int, sandbox: Any
 ) -> None:
-    """Over both lanes, with autoresets, masks, calls and attributes on the way."""
-    place = {"use_async_envs": True, "num_workers": shards, "lane": lane}
+    """Over both lanes and in a fleet, with autoresets, masks, calls and attributes on the way."""
+    place = {"use_async_envs": True, "num_workers": shards, "lane": lane, "sandbox": sandbox}
     with brittle(tmp_path, n_envs=n_envs, **place) as suites:
         env = suites.env
         env.set_attr("weight", 0.5)

@@ -114,8 +114,8 @@ def test_ctrl_c_in_sending_a_step_leaves_a_late_reply(
                 half = partial(_half, jail.client)
                 patch.setattr(*inside.sending(jail.client), half)
             else:
-                relay = jail.relay
-                patch.setattr(jail, "relay", lambda *all_of_it: interrupted(relay(*all_of_it)))
+                send = jail.send_relay  # a message's, or a step's that the server takes
+                patch.setattr(jail, "send_relay", lambda *both: interrupted(send(*both)))
             with pytest.raises(KeyboardInterrupt):
                 env.step([0, 0])
         with pytest.raises(errors.WorkerTimeoutError, match=r"step was interrupted.*call reset"):

@@ -255,7 +255,7 @@ def make_env(n_envs=1, use_async_envs=False):
 
 
 def test_a_masked_reset_brings_back_whom_it_does_not_name(env: Any) -> None:
-    """A shard that dies in it has lost all its rows: the others begin anew, and are marked."""
+    """A shard that dies in it has lost all its rows: the others start again, and are marked."""
     env.step(ALL_LIVE)
     mask = np.array([False, False, True, False])
     seeds = [None, None, 99, None]
@@ -340,10 +340,10 @@ def test_an_attribute_that_cannot_be_set_again_is_left_out(
 
 
 def test_a_death_that_is_mended_is_logged(env: Any, caplog: pytest.LogCaptureFixture) -> None:
-    """How it died and whose rows begin anew: the caller sees it in the infos only."""
+    """How it died and whose rows start again: the caller sees it in the infos only."""
     with caplog.at_level("INFO", "envhub_sandbox.worker"):
         env.step(LAST_DIES)
-    told = [one for one in caplog.messages if "begin anew" in one]
+    told = [one for one in caplog.messages if "start again" in one]
     assert len(told) == 1
     assert "the worker process died during step: it exited (exit code" in told[0]
     assert "sub-environments [2, 3]" in told[0]

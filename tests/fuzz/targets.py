@@ -9,7 +9,7 @@ from __future__ import annotations
 import random
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -280,7 +280,7 @@ def manifest(dice: Dice) -> None:
         for space in (env.single_observation_space, env.single_action_space):
             repr(space)
             demand(space == space, "a space that is not itself")
-        from_manifest.action_reader(replace(env, num_envs=min(env.num_envs, 64)))
+        from_manifest.action_reader(env, min(env.num_envs, 64))
 
 
 def built(dice: Dice) -> None:

@@ -20,6 +20,7 @@ SHORT = {
     "doorbells --rounds 1 --trips 20": "of eventfds",
     "recording --rounds 1 --count 5": "| its own |",
     "remote 0.01 plain": "| plain, n=1 |",
+    "remote driver 0.01": "| 16 |",
     "suites first --rounds 1 --tasks 2": "| cold make_env and first reset |",
 }
 

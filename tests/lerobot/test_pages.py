@@ -84,7 +84,7 @@ def test_the_pages_hold(olah: OlahServer, tmp_path: Path) -> None:
     features = found.pop("features")
     features.pop("observation.forces", None)  # LeRobot 0.6 hands it on, 0.4 does not
     assert features == FEATURES
-    stub = "a stub stands in"  # where the jails have no LeRobot
+    stub = "a stub replaces it"  # where the jails have no LeRobot
     said = [line for line in found.pop("stderr").splitlines() if stub not in line]
     assert "jail" not in "\n".join(said)
     if "commands" in found:  # LeRobot 0.4 has other options, and asks no configuration

@@ -18,7 +18,7 @@ def test_a_training_is_the_same(olah: OlahServer, tmp_path: Path) -> None:
     file.write_text(REACH)
     found = run("training_program.py", olah, tmp_path, "robots/trained", str(file))
     if not found["asks configs"]:
-        pytest.skip("this LeRobot asks no configuration for its environments")
+        pytest.skip("this LeRobot lets no configuration make its environments")
     here = found["here"]
     assert found["executed by LeRobot"]  # the control: that code was in that process
     assert len(here["evaluations"]) == 2

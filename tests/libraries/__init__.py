@@ -25,6 +25,11 @@ _EXAMPLES = Path(__file__).parents[2] / "examples"
 # What is installed, whose versions are told, and what the example prints when it has done its work.
 WANTED = {
     "rllib": (("torch", "ray[rllib]"), ("ray", "gymnasium"), "vector_entry_point: trained on "),
+    "rllib_cluster": (
+        ("torch", "ray[rllib]"),
+        ("ray", "gymnasium"),
+        "reached a mean return of 150",
+    ),
     "torchrl": (("torch", "torchrl"), ("torchrl", "torch", "gymnasium"), "a rollout of 40 steps"),
     "tianshou": (("torch", "tianshou"), ("tianshou", "gymnasium"), "SubprocVectorEnv: 200 steps"),
     "hydra": (("hydra-core",), ("hydra-core", "omegaconf", "gymnasium"), "100 steps are equal"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -49,3 +50,15 @@ def peer(server: Listening, pair: KeyPair, *, routing_id: bytes = b"") -> Iterat
             socket.setsockopt(zmq.ROUTING_ID, routing_id)
         socket.connect(server.endpoint)
         yield Peer(socket)
+
+
+def brought(client: Peer, code: bytes) -> str:
+    """The name of a snapshot that has this file."""
+    sha256 = hashlib.sha256(code).digest()
+    offer = m.OfferSnapshot((("env.py", len(code), sha256),))
+    client.ask(offer)
+    client.ask(m.PutBlob(sha256, 0), code)
+    wanted = client.ask(offer)
+    assert isinstance(wanted, m.MissingBlobs)
+    assert not wanted.hashes
+    return wanted.snapshot

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
@@ -18,7 +17,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import Confinement
 from envhub_worker.protocol.keys import key_text
 from tests.remote.listening import Listening, listening
-from tests.remote.peers import Peer, peer
+from tests.remote.peers import Peer, brought, peer
 from tests.support import inside
 from tests.support.started import started
 
@@ -125,17 +124,6 @@ def test_another_repository_is_a_snapshot_that_the_client_has_brought(
     for tree in ("/etc", "sha256:../../etc", "sha256:" + "0" * 64):
         assert "no such snapshot" in mallory.refused(order(tree)).message
     assert isinstance(mallory.ask(order(mine)), m.JailOpened)
-
-
-def brought(client: Peer, code: bytes) -> str:
-    """The name of a snapshot that has this file."""
-    sha256 = hashlib.sha256(code).digest()
-    offer = m.OfferSnapshot((("env.py", len(code), sha256),))
-    client.ask(offer)
-    client.ask(m.PutBlob(sha256, 0), code)
-    wanted = client.ask(offer)
-    assert isinstance(wanted, m.MissingBlobs)
-    return wanted.snapshot
 
 
 def test_more_bytes_than_may_be_in_flight_are_refused(alice: Any, mallory: Peer) -> None:

@@ -22,7 +22,8 @@ from envhub_sandbox.check.play import confinement
 from envhub_sandbox.dependencies import environments, interpreters, modules, resolutions
 from envhub_sandbox.factory import make
 from envhub_sandbox.sandboxes import remote
-from envhub_sandbox.sandboxes.docker import sandbox
+from envhub_sandbox.sandboxes.docker import container
+from envhub_sandbox.sandboxes.fleet import place_list
 from envhub_sandbox.session import env_session
 from envhub_sandbox.session.counters import Ledger
 from envhub_sandbox.session.crash import bundle_writer
@@ -30,6 +31,7 @@ from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.jails import launcher as launcher_module
 from envhub_sandbox.session.jails.launcher import Launcher
 from envhub_sandbox.session.jails.loaded import LoadedJail
+from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.session.recipe import Recipe
 from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.system import folders
@@ -51,6 +53,7 @@ from envhub_worker.protocol.lifecycle import Lifecycle, State
 from envhub_worker.protocol.manifest.manifest import EnvManifest
 from envhub_worker.protocol.messages import packing, prefix
 from envhub_worker.spawn.spawner import Spawner
+from envhub_worker.supervisor import served_slabs
 
 Spot = tuple[Any, str]
 
@@ -63,9 +66,26 @@ def session(env: Any) -> EnvSession:
     return found
 
 
+def parts(env: Any) -> list[EnvSession]:
+    """The workers of an environment that is spread over several."""
+    found: list[EnvSession] = env._session.parts
+    return found
+
+
+def leases(env: Any) -> list[Lease]:
+    """Its hold on a jail, or that of each of its workers."""
+    found = env._session
+    return [part.lease for part in getattr(found, "parts", [found])]
+
+
 def state(env: Any) -> State:
     """Where it is in its life."""
     return session(env).lifecycle.state
+
+
+def freshness_of_dns() -> Spot:
+    """For how long an answer about a fleet's places holds."""
+    return place_list, "_FRESH_S"
 
 
 def choice_of_runtime() -> Spot:
@@ -135,6 +155,32 @@ def hurried(env: Any, **timeouts: float) -> Iterator[None]:
 def launcher(env: Any) -> Launcher:
     """What opens its jails."""
     return session(env).lease._launcher
+
+
+@contextlib.contextmanager
+def hurried_parts(env: Any, **timeouts: float) -> Iterator[None]:
+    """``hurried``, for what its workers are sent one by one."""
+    found = parts(env)
+    before = found[0].repository.timeouts
+    now = replace(before, **timeouts)
+    queues = env._in_flight()._queues
+    try:
+        for owner in (*(part.requests for part in found), *queues):
+            owner._timeouts = now
+        yield
+    finally:
+        for owner in (*(part.requests for part in found), *queues):
+            owner._timeouts = before
+
+
+def part_pids(part: EnvSession) -> list[int]:
+    """The processes of one worker's jail; asked over a connection of its own."""
+    return list(part.lease.status()["pids"])
+
+
+def use_lock_of(part: EnvSession) -> Any:
+    """What a thread holds while it asks one worker something."""
+    return part.use.lock
 
 
 def recipe(suites: Any) -> Recipe | None:
@@ -261,7 +307,7 @@ def send_half(connection: WorkerConnection, frames: Sequence[Buffer]) -> None:
 
 # --- spots -------------------------------------------------------------------------------------
 
-LATE_REPLY_GRACE: Spot = (env_session, "_GRACE_S")
+LATE_REPLY_GRACE: Spot = (env_session, "GRACE_S")
 """For how long ``reset`` waits for a late reply."""
 CLOSE_PATIENCE: Spot = (env_session, "INTERRUPT_S")
 """For how long ``close`` waits for another thread."""
@@ -275,13 +321,15 @@ CGROUP_WRITE: Spot = (cgroups, "_write")
 """What writes a file of a control group."""
 DECODING: Spot = (packing, "_checked")
 """What makes a message of a decoded document that has no form yet."""
+MAY_SPIN: Spot = (served_slabs, "_MAY_SPIN")
+"""Whether a server and a runner wait awake for one another on this machine."""
 FORMS: tuple[Spot, Spot] = ((packing, "_OUTGOING"), (packing, "_INCOMING"))
 """What is remembered of the shape of messages, each way."""
 CHECK_OF_WARNINGS: Spot = (prefix.WARNINGS, "_check")
 """What looks at each warning of a worker's."""
-CONTAINERS: Spot = (sandbox, "_POOL")
+CONTAINERS: Spot = (container, "_POOL")
 """The containers of this process."""
-CONTAINER_STARTS: Spot = (sandbox.RepositoryContainer, "_start")
+CONTAINER_STARTS: Spot = (container.RepositoryContainer, "_start")
 """What starts one."""
 
 
@@ -342,7 +390,7 @@ def packet(frames: Sequence[Buffer]) -> bytes:
 
 def monitor_script() -> Path:
     """The script that ends a container after its client."""
-    return sandbox._MONITOR
+    return container._MONITOR
 
 
 def is_own_group(path: Path) -> bool:

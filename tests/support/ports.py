@@ -1,10 +1,13 @@
-"""Ports for programs that bind them themselves."""
+"""Ports of loopback: those for programs that bind them themselves, and small HTTP servers."""
 
 from __future__ import annotations
 
 import contextlib
 import random
 import socket
+import threading
+from collections.abc import Iterator
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 
 def lasting_port() -> int:
@@ -14,3 +17,24 @@ def lasting_port() -> int:
         with contextlib.suppress(OSError), socket.socket() as sock:
             sock.bind(("127.0.0.1", number))
             return number
+
+
+class QuietHandler(BaseHTTPRequestHandler):
+    """Logs nothing."""
+
+    def log_message(self, format: str, *args: object) -> None:
+        """Called with each request."""
+
+
+@contextlib.contextmanager
+def serving(handler: type[BaseHTTPRequestHandler]) -> Iterator[str]:
+    """An HTTP server, in a thread; its address."""
+    server = ThreadingHTTPServer(("127.0.0.1", 0), handler)
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    try:
+        yield f"http://127.0.0.1:{server.server_address[1]}"
+    finally:
+        server.shutdown()
+        thread.join()
+        server.server_close()

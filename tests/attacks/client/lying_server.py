@@ -105,7 +105,7 @@ class LyingServer(WorkerServer):
         self.heard += b"".join(frames)
         request_id, request = m.unpack_header(frames[0])
         relayed = isinstance(request, m.Relay)
-        if relayed:
+        if relayed and not request.stepped:
             request = m.unpack(frames[1:], unpickler=lambda data: data)
         self.asked.append(request)
         asked = Asked(request_id, request, relayed, honest(request))
@@ -190,6 +190,7 @@ def honest(request: m.Message) -> m.Message:
         m.Hello: m.Welcome(m.VERSION, "0", os.getpid()),
         m.OpenJail: m.JailOpened(1, (1,), ()),
         m.StartRunners: m.JailOpened(1, (2,), ()),
+        m.ShareSlabs: m.Refusal("WorkerError", "it takes no steps itself", "", ""),
         m.CloseJail: m.Done(),
         m.ReadOutput: m.Output(""),
         m.GetStatus: m.Status(()),

@@ -51,6 +51,9 @@ class Three(Plain):
 
 def lie(self, packet):
     request = m.unpack(packet.frames)
+    if isinstance(request, m.Attach):
+        list(map(os.close, self.descriptors))
+        return m.pack(m.Value(False))  # so that steps come as messages
     if not isinstance(request, m.Step):
         return honest(self, packet)
     if MODE == "frames":

@@ -363,6 +363,9 @@ class Trap(gym.vector.SyncVectorEnv):
 
     __html__ = _repr_html_
 
+    def render(self):
+        return ({script!r},) * self.num_envs
+
     def __deepcopy__(self, memo):
         self.loot = repr(memo)
         return self
@@ -386,6 +389,7 @@ def attempts(env: Any, canary: Path) -> dict[str, bool]:
     copied[1].close()
     with contextlib.suppress(Exception):
         gym.make(env.spec)
+    assert env.render()[0] == SCRIPT  # of which a notebook shows frames alone
     return {
         "have a deep copy hand over what else is copied": TOKEN in env.loot,
         "put script into the caller's notebook": SCRIPT in "".join(displayed(env).values()),

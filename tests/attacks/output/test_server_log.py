@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import re
 from dataclasses import asdict
@@ -16,7 +15,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import Confinement
 from envhub_worker.protocol.keys import key_text
 from tests.remote.listening import Listening, listening
-from tests.remote.peers import Peer, peer
+from tests.remote.peers import Peer, brought, peer
 from tests.support.processes import eventually
 
 MALLORY = keys.generate()
@@ -108,18 +107,6 @@ def test_a_hostile_client_and_its_environment_forge_nothing(tmp_path: Path, form
     assert not forged(said, form)
     assert said.isascii()
     assert "\x1b" not in said
-
-
-def brought(client: Peer, code: bytes) -> str:
-    """The name of a snapshot that has this file."""
-    sha256 = hashlib.sha256(code).digest()
-    offer = m.OfferSnapshot((("env.py", len(code), sha256),))
-    client.ask(offer)
-    client.ask(m.PutBlob(sha256, 0), code)
-    wanted = client.ask(offer)
-    assert isinstance(wanted, m.MissingBlobs)
-    assert not wanted.hashes
-    return wanted.snapshot
 
 
 def died_in(client: Peer, server: Listening, name: str, snapshot: str) -> None:

@@ -14,6 +14,7 @@ from envhub_sandbox.check.static.static import static
 from envhub_sandbox.hub.git.checkout import read_checkout
 from envhub_sandbox.hub.snapshot import snapshot_named
 from tests.hub.olah_server import GitRepository
+from tests.support.packages.git_server import ran
 
 pytestmark = [
     pytest.mark.short,
@@ -28,23 +29,6 @@ def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> GitRepository:
     made = GitRepository(tmp_path / "hostile")
     made.commit({"env.py": "def make_env(): pass", "far/data.txt": "x", "sub/x.py": ""})
     return made
-
-
-@pytest.fixture
-def program(tmp_path: Path) -> Path:
-    """What the stranger wants to run: it leaves a mark."""
-    path = tmp_path / "program"
-    path.write_text(f"#!/bin/sh\ntouch '{tmp_path}/ran'\n")
-    path.chmod(0o755)
-    return path
-
-
-def ran(program: Path) -> bool:
-    """Whether it has, since this was asked last."""
-    mark = program.parent / "ran"
-    found = mark.exists()
-    mark.unlink(missing_ok=True)
-    return found
 
 
 def watched(repository: GitRepository, program: Path) -> list[str]:

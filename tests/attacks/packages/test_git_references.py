@@ -14,7 +14,7 @@ import threading
 import tracemalloc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 from pathlib import Path
 
 import pytest
@@ -29,7 +29,8 @@ from envhub_sandbox.hub.failures import HubFailure
 from envhub_sandbox.hub.git import address, commits
 from envhub_sandbox.hub.reference import HubRef
 from envhub_sandbox.hub.snapshot import Snapshot, snapshot_named
-from tests.support.packages.git_server import commit, git, git_served, make_repository
+from tests.support.packages.git_server import commit, git, git_served, make_repository, ran
+from tests.support.ports import QuietHandler, serving
 from tests.support.repositories import CARTPOLE
 
 pytestmark = [
@@ -53,29 +54,12 @@ def repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return made
 
 
-@pytest.fixture
-def program(tmp_path: Path) -> Path:
-    """What the stranger wants to run: it leaves a mark."""
-    path = tmp_path / "program"
-    path.write_text(f"#!/bin/sh\ntouch '{tmp_path}/ran'\n")
-    path.chmod(0o755)
-    return path
-
-
-def ran(program: Path) -> bool:
-    """Whether it has, since this was asked last."""
-    mark = program.parent / "ran"
-    found = mark.exists()
-    mark.unlink(missing_ok=True)
-    return found
-
-
 @contextmanager
 def canary(status: int = 404) -> Iterator[tuple[str, list[BaseHTTPRequestHandler]]]:
     """A server that nobody should ask: its address, and who did."""
     asked: list[BaseHTTPRequestHandler] = []
 
-    class Handler(BaseHTTPRequestHandler):
+    class Handler(QuietHandler):
         def do_GET(self) -> None:
             asked.append(self)
             self.send_response(status)
@@ -85,18 +69,8 @@ def canary(status: int = 404) -> Iterator[tuple[str, list[BaseHTTPRequestHandler
 
         do_POST = do_GET
 
-        def log_message(self, format: str, *args: object) -> None:
-            pass
-
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    thread = threading.Thread(target=server.serve_forever)
-    thread.start()
-    try:
-        yield f"http://127.0.0.1:{server.server_address[1]}", asked
-    finally:
-        server.shutdown()
-        thread.join()
-        server.server_close()
+    with serving(Handler) as where:
+        yield where, asked
 
 
 def plain_git(*arguments: str) -> subprocess.CompletedProcess[bytes]:
@@ -218,7 +192,7 @@ def test_alternates_are_not_followed(repository: Path, tmp_path: Path) -> None:
 def served_plainly(folder: Path) -> Iterator[str]:
     """Its files, below any first step of a path, as a server that knows nothing of git."""
 
-    class Handler(BaseHTTPRequestHandler):
+    class Handler(QuietHandler):
         def do_GET(self) -> None:
             path = folder / self.path.partition("?")[0].strip("/").partition("/")[2]
             data = path.read_bytes() if path.is_file() else None
@@ -227,18 +201,8 @@ def served_plainly(folder: Path) -> Iterator[str]:
             self.end_headers()
             self.wfile.write(data or b"")
 
-        def log_message(self, format: str, *args: object) -> None:
-            pass
-
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    thread = threading.Thread(target=server.serve_forever)
-    thread.start()
-    try:
-        yield f"http://127.0.0.1:{server.server_address[1]}"
-    finally:
-        server.shutdown()
-        thread.join()
-        server.server_close()
+    with serving(Handler) as where:
+        yield where
 
 
 def test_no_login_is_sent(

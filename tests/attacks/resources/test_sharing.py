@@ -136,7 +136,7 @@ made = libc.mq_open(name, os.O_CREAT | os.O_RDWR, 0o600, None)
 libc.mq_unlink(name)
 sys.exit(made < 0)
 """,
-    "descriptors under way": """
+    "descriptors in flight": """
 resource.setrlimit(resource.RLIMIT_NOFILE, (1024, 1024))
 ours, theirs = socket.socketpair()
 try:

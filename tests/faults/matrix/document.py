@@ -1,4 +1,4 @@
-"""Writes the rows of ``docs/faults.md`` from the table: ``python -m tests.faults.matrix.document``.
+"""``docs/internals/faults-tried.md``, from the table: ``python -m tests.faults.matrix.document``.
 
 The seconds are the median cell of a row in one full run, kept in ``measured.json``.
 """
@@ -11,7 +11,7 @@ from pathlib import Path
 from tests.faults.matrix.table import FAULTS, MOMENTS, ROWS, Row
 from tests.support.documents.written import DOCS, filled
 
-DOCUMENT = DOCS / "faults.md"
+DOCUMENT = DOCS / "internals" / "faults-tried.md"
 _MEASURED = Path(__file__).with_name("measured.json")
 
 

@@ -1,6 +1,6 @@
 """The fault matrix: what goes wrong, when, and what the user is then promised to see.
 
-``test_matrix.py`` tries every row; ``docs/faults.md`` is written from them.
+``test_matrix.py`` tries every row; ``docs/internals/faults-tried.md`` is written from them.
 """
 
 from __future__ import annotations

@@ -213,5 +213,5 @@ def test_every_moment_and_fault_is_in_the_table() -> None:
 
 
 def test_document_is_written_from_the_table() -> None:
-    """``docs/faults.md`` says what the rows say."""
+    """``docs/internals/faults-tried.md`` says what the rows say."""
     assert DOCUMENT.read_text() == document()

@@ -53,9 +53,9 @@ def test_a_make_env_that_takes_too_long(tmp_path: Path) -> None:
     """Where a command has no such option, Python's is named as such."""
     folder = write_repository(tmp_path / "slow", _SLOW)
     text = said("run", folder, "--timeout", "1")
-    assert "give it longer with --timeout 2.0" in text
+    assert "raise --timeout 2.0" in text
     assert not _IN_PYTHON.search(text)
-    with pytest.raises(EnvHubError, match=r"longer with timeouts=\{'startup_s': 2"):
+    with pytest.raises(EnvHubError, match=r"raise timeouts=\{'startup_s': 2"):
         make_env(folder, timeouts={"startup_s": 1})
 
 
@@ -65,8 +65,8 @@ def test_a_make_env_that_takes_too_long(tmp_path: Path) -> None:
         (["--profile", "lax"], "--profile is 'lax'; it is one of strict"),
         (["--memory", "0"], "--memory is 0; it takes a whole number above 0"),
         (["--memory", "much"], "--memory is 'much'; it takes a size such as 512M"),
-        (["--python", "/nowhere"], "--python is '/nowhere', which is no program"),
-        (["--readable", "/nowhere"], "--readable holds '/nowhere'"),
+        (["--python", "/nowhere"], "--python is '/nowhere', which is not a program"),
+        (["--readable", "/nowhere"], "--readable has '/nowhere'"),
         (["--server-key", "k"], "--server-key is for --sandbox tcp://HOST:PORT"),
         (
             ["--python", "/usr/bin/python3", "--dependencies", '{"extra": []}'],

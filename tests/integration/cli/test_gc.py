@@ -64,7 +64,7 @@ def test_a_running_client_is_left_alone_in_every_namespace() -> None:
 def test_a_dry_run_removes_nothing(tmp_path: Path) -> None:
     """It names what it found."""
     folder = left_behind(tmp_path)
-    assert f"found: folder {folder}" in gc(tmp_path, "--dry-run").stdout
+    assert f"found        folder {folder}" in gc(tmp_path, "--dry-run").stdout
     assert folder.exists()
 
 

@@ -4,32 +4,17 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from envhub_sandbox import errors, make_env
 from tests.hub.olah_server import OlahServer
 from tests.support.command_line import envhub
+from tests.support.output.bundles import crashed
 from tests.support.repositories import STILL, write_repository
 from tests.support.samples import sample
 
 pytestmark = pytest.mark.same_for("users")
-
-_KWARGS = {"moment": "step", "fault": "exit"}
-
-
-def crashed(folder: Path, reference: Any, **options: Any) -> Path:
-    """The bundle of an environment that dies in its third step."""
-    policy = {"crash_folder": str(folder), **options.pop("policy", {})}
-    with make_env(reference, env_kwargs=_KWARGS, policy=policy, **options) as suites:
-        env = next(iter(next(iter(suites.values())).values()))
-        env.reset(seed=1)
-        env.step([0])
-        env.step([0])
-        with pytest.raises(errors.WorkerDiedError) as caught:
-            env.step([1])
-    return Path(str(caught.value.bundle))
 
 
 def test_the_pinned_commit_runs_again(
@@ -51,7 +36,7 @@ def test_the_pinned_commit_runs_again(
         done = envhub("replay", bundle, *option)
         assert done.returncode == 0, done.stderr
         assert f"org/cli-replays@{commit[:12]}" in done.stdout
-        assert done.stdout.count("exit (exit code 7), at request 4 (step 3)") == 2
+        assert done.stdout.count("  4     3  exit (exit code 7)\n") == 2
 
 
 def test_a_weaker_policy_is_not_granted_by_the_bundle(tmp_path: Path) -> None:

@@ -221,7 +221,7 @@ def test_where_nothing_can_be_mounted_the_error_names_file_and_cure(how: str) ->
             root = cell.jail.spec.snapshot
             created, opened = outcome(cell, ADVICE.format(root=root))
             for text, path in ((created, f"{root}/new"), (opened, f"{root}/env.py")):
-                assert f"{path} lies in the repository, which this jail only reads" in text
+                assert f"{path} is in the repository, which is read-only in this jail" in text
                 assert "on Linux 5.11 or later" in text
             report = cell.wait_for(RunnerStarted).report
             [view] = [layer["detail"] for layer in report if layer["layer"] == "working-view"]

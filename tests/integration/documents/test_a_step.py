@@ -64,7 +64,7 @@ def test_the_page_lists_the_files_of_a_step(checkout: Path) -> None:
     ("lane", "step"),
     [
         ("auto", "> SharedMemoryLane.send_step\n< SharedMemoryLane.wait"),
-        ("frames", "> RelayLane.send_step\n> WorkerConnection.send Relay step"),
+        ("frames", "> ServedLane.send_step\n> WorkerConnection.send Relay step"),
     ],
 )
 def test_a_trace_names_each_message(lane: str, step: str) -> None:

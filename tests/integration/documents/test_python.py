@@ -48,7 +48,9 @@ def python_of(document: str) -> list[str]:
     return [text for text in texts if "import pytest" not in text]
 
 
-@pytest.mark.parametrize("document", ["docs/observing.md", "docs/authors.md", "docs/quickstart.md"])
+@pytest.mark.parametrize(
+    "document", ["docs/async.md", "docs/observing.md", "docs/authors.md", "docs/quickstart.md"]
+)
 def test_the_python_of_a_document_runs(document: str, tmp_path: Path) -> None:
     """All of its blocks, one after the other."""
     text = _IMPORTED + "\n".join(python_of(document))

@@ -16,6 +16,7 @@ pytestmark = pytest.mark.same_for("users")
     ("script", "needs", "printed"),
     [
         ("with_cleanrl.py", "torch", "the weights are the same, to the last bit: True"),
+        ("with_cleanrl_async.py", "torch", "episodes: the first last"),
         ("with_sb3.py", "stable_baselines3", "trained for 512 steps"),
         ("with_torchrl.py", "torchrl", "a rollout of 40 steps"),
     ],

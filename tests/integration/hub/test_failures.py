@@ -244,7 +244,7 @@ def test_missing_stored_token_says_how_to_store_one(
 ) -> None:
     """token=True without a stored token gets the login command."""
     monkeypatch.setattr("huggingface_hub.constants.HF_TOKEN_PATH", str(tmp_path / "none"))
-    assert "no token is stored" in str(failure(get, token=True))
+    assert "none is stored" in str(failure(get, token=True))
 
 
 @pytest.mark.parametrize("endpoint", ["huggingface.co", "ftp://huggingface.co", "https://"])

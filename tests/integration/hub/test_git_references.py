@@ -120,7 +120,7 @@ def test_links_and_submodules(ref: str, repository: Path, caplog: pytest.LogCapt
 @pytest.mark.parametrize(
     ("behind", "said"),
     [
-        ("", "has no file 'env.py'. Name the entry behind a colon, as in ':envs/env.py'"),
+        ("", "has no file 'env.py'. Name the entry file after a colon, as in ':envs/env.py'"),
         ("@v9:envs/env.py", "no tag or branch 'v9'. Of a commit write all 40 digits"),
         ("@0123456:envs/env.py", "write all 40 digits"),
         (f"@{'1' * 40}:envs/env.py", "git fetch failed"),
@@ -152,6 +152,6 @@ def test_commands_know_it(ref: str, repository: Path, tmp_path: Path) -> None:
     assert "later.txt" in json.dumps(changes)
     assert envhub("inspect", pin)["provenance"]["repo_type"] == "git"
     judged = CliRunner().invoke(app, ["check", f"{ref}@main:envs/env.py", "--steps", "20"])
-    assert "may mean another commit" in " ".join(judged.output.split())
+    assert "can mean another commit" in " ".join(judged.output.split())
     listed = [one["repository"] for one in envhub("cache", "list")["snapshots"]]
     assert set(listed) == {ref}

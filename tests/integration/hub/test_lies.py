@@ -327,7 +327,7 @@ def test_endless_pages_without_files_are_left(
     monkeypatch.setattr("envhub_sandbox.hub.client.MAX_IDLE_PAGES", 20)
     monkeypatch.setattr(repository, "tree", lambda: folders)
     stub_hub.page_size = 1
-    with pytest.raises(SnapshotIntegrityError, match="listing has no end"):
+    with pytest.raises(SnapshotIntegrityError, match="listing does not end"):
         get()
     assert len([request for request in stub_hub.requests if "/tree/" in request]) == 21
 
@@ -401,6 +401,6 @@ def test_a_login_in_a_bad_endpoint_is_not_shown() -> None:
 
 def _run_advice(message: str) -> None:
     """Carry out the command that an error ends with."""
-    command = message.rpartition("fetched again: ")[2]
+    command = message.rpartition("downloads it again: ")[2]
     assert command.startswith("chmod -R u+w ")
     subprocess.run(command, shell=True, check=True)

@@ -5,18 +5,15 @@ Python looks for signals where a function begins, so these are the moments that 
 
 from __future__ import annotations
 
-import gc
-import os
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
 
 from envhub_sandbox import make_env
-from tests.support import inside
 from tests.support.in_process.interrupts import at_call
-from tests.support.processes import eventually
 from tests.support.samples import sample
+from tests.support.started import nothing_more_held
 
 pytestmark = [
     pytest.mark.same_for("users"),
@@ -28,25 +25,11 @@ _STARTS, _CLOSES = 41, 13
 lanes = pytest.mark.parametrize("lane", ["auto", "frames"])
 
 
-def _held(neighbour: Any) -> tuple[int, int, int]:
-    """Uses of a server and jails in it, and descriptors of ours."""
-    gc.collect()
-    uses, jails = inside.users(neighbour), inside.jails(neighbour)
-    return uses, jails, len(os.listdir("/proc/self/fd"))
-
-
 @pytest.fixture
 def nothing_more() -> Iterator[Callable[[], bool]]:
     """Whether nothing is held beyond what one environment does, which runs beside those tried."""
-    with make_env(sample("echo"), n_envs=2) as suites:
-        suites.env.reset()
-        before = _held(suites.env)
-
-        def as_before() -> bool:
-            now = _held(suites.env)
-            return all(one <= other for one, other in zip(now, before, strict=True))
-
-        yield lambda: eventually(as_before)
+    with nothing_more_held() as question:
+        yield question
 
 
 def _made(lane: str) -> Any:

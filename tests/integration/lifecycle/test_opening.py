@@ -34,7 +34,8 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 @pytest.mark.parametrize("shards", [1, 2, 3])
 def test_all_shards_start_and_load_side_by_side(asked: list[str], shards: int) -> None:
-    """However many there are, it is as many requests: to open, load, build, attach and reset."""
+    """However many there are, it is as many requests: to open, load, build, share slabs,
+    attach, reset and call."""
     options: dict[str, Any] = {"n_envs": 3, "use_async_envs": True, "num_workers": shards}
     with make_env(sample("counter"), **options):
         pass  # its manifest is remembered
@@ -43,7 +44,7 @@ def test_all_shards_start_and_load_side_by_side(asked: list[str], shards: int) -
         suites.env.reset(seed=0)
         assert len(suites.env.call("get_wrapper_attr", "spec")) == 3
         asked_until_now = Counter(asked)
-    assert asked_until_now == {"Hello": 1, "OpenJail": 1, "Relay": 4}
+    assert asked_until_now == {"Hello": 1, "OpenJail": 1, "ShareSlabs": 1, "Relay": 5}
 
 
 def test_a_request_in_between_takes_no_descriptors(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -324,7 +324,7 @@ class TestWhatMakeEnvReturns:
             ("empty", "empty"),
             ("suite of None", "None"),
             ("task of int", "42"),
-            ("empty suite", "no environment"),
+            ("empty suite", "without an environment"),
             ("tuple key", "tuple"),
         ],
     )
@@ -469,7 +469,7 @@ class TestAFile:
             assert suites.provenance["path"] == "env.py"
 
     @pytest.mark.parametrize(
-        ("name", "why"), [("env.py", "no such file is here"), ("env.txt", "owner is missing")]
+        ("name", "why"), [("env.py", "does not exist here"), ("env.txt", "owner is missing")]
     )
     def test_what_is_no_python_file_here_is_a_hub_reference(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, why: str

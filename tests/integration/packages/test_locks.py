@@ -141,7 +141,7 @@ def test_a_lock_does_not_lie_in_what_it_locks(folder: Path) -> None:
     """It would be one of the files."""
     done = RUNNER.invoke(app, ["lock", str(folder), "-o", str(folder / "pylock.repo.toml")])
     assert done.exit_code == 2
-    assert "one of the files that it locks" in " ".join(done.output.split())
+    assert "inside the folder that it locks" in " ".join(done.output.split())
     assert not (folder / "pylock.repo.toml").exists()
 
 

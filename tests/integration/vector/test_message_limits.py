@@ -62,6 +62,6 @@ def test_a_larger_limit_lets_more_through(tmp_path: Path) -> None:
 def test_a_large_space_names_the_limit(tmp_path: Path) -> None:
     """And is made with a higher one."""
     folder = _repository(tmp_path, 100 << 10)
-    with pytest.raises(RemoteProtocolError, match=r"raise that limit.*elements"):
+    with pytest.raises(RemoteProtocolError, match=r"raise the limit.*elements"):
         make_env(folder, limits={"elements": 10_000}).close()
     make_env(folder, limits={"elements": 1_000_000}).close()

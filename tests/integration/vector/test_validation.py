@@ -145,7 +145,7 @@ def test_envhub_run_validates(leaver: Path) -> None:
     for validate, code in ((), 0), (("--validate",), 1):
         done = envhub("run", leaver, *kwargs, "--episodes", "1", *validate)
         assert done.returncode == code, done.stderr
-    assert "outside of its space: sub-environment 0" in done.stderr
+    assert "outside its space: sub-environment 0" in done.stderr
 
 
 _SHAPELESS = """

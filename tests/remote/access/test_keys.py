@@ -9,23 +9,29 @@ import os
 import signal
 import socket
 import stat
+import subprocess
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 import zmq
 from zmq.utils import z85
 
 from envhub_sandbox import RemoteSandbox, make_env
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError
+from envhub_sandbox.sandboxes import server_facts
 from envhub_worker.access import keys
 from envhub_worker.access.audit.log import CLIENT_LINES, LINES, Log
 from envhub_worker.access.keys import AuthorizedClients
 from envhub_worker.cli import identity as identities
 from envhub_worker.cli import listen_options, state_folder, status
 from envhub_worker.protocol.keys import key_text, parse_key
-from tests.remote.listening import Listening, listening, worker
+from tests.remote.listening import WORKER, Listening, listening, worker
 from tests.support import inside
+from tests.support.command_line import below, gone
 from tests.support.processes import eventually
 from tests.support.started import started
 
@@ -63,12 +69,12 @@ def test_keygen_writes_a_secret_that_nobody_else_reads(tmp_path: Path) -> None:
     assert "secret" not in repr(pair).replace("KeyPair", "")
     again = worker(*command)
     assert again.returncode == 1
-    assert "client.key is there already" in again.stderr
+    assert "client.key exists" in again.stderr
     assert "Errno" not in again.stderr
     assert keys.load(secret) == pair
     secret.unlink()
     again = worker(*command)
-    assert "client.pub is there already" in again.stderr
+    assert "client.pub exists" in again.stderr
     assert not secret.exists()
 
 
@@ -183,6 +189,53 @@ def test_a_second_start_keeps_the_keys_and_does_not_print_the_secret(tmp_path: P
     with listening(tmp_path / "same") as second:
         assert (second.public, second.client_key) == (first.public, first.client_key)
         assert second.client_key not in second.said()
+
+
+def test_a_server_for_one_client_has_its_keys_in_memory_alone(
+    tmp_path: Path, repository: Path
+) -> None:
+    """Who starts it reads its endpoint and its key; another client is refused; nothing is left."""
+    ours, stranger = keys.generate(), keys.generate()
+    ready, ready_end = os.pipe()
+    with os.fdopen(ready) as answer, started_for_one(tmp_path, ours, ready_end) as process:
+        endpoint, public = answer.readline().split()
+        place = RemoteSandbox(endpoint, server_key=public, client_key=key_text(ours.secret))
+        with started(repository, sandbox=place):
+            jails = below(process.pid)
+            assert jails
+            wrong = dataclasses.replace(place, client_key=key_text(stranger.secret))
+            with pytest.raises(SandboxUnavailableError, match="does not know our key"):
+                server_facts.ask(wrong)
+            assert not list(tmp_path.rglob("*.key"))
+            assert not (tmp_path / "state" / "endpoint").exists()
+            # an own process stands for the one that started it: its end is the server's
+            process.parents()[0].kill()
+            assert eventually(lambda: gone([process, *jails]))
+
+
+@contextlib.contextmanager
+def started_for_one(folder: Path, client: keys.KeyPair, ready: int) -> Iterator[psutil.Process]:
+    """A server as a program starts it for a client; its parent can be killed."""
+    words = [
+        *(*WORKER, "listen", "--bind", "tcp://127.0.0.1:*", "--state-dir", str(folder / "state")),
+        *("--only-client", key_text(client.public), "--ready-fd", str(ready)),
+    ]
+    starter = (
+        "import os, subprocess, sys\n"
+        "ended = os.pidfd_open(os.getpid())\n"
+        "given = [*sys.argv[2:], '--client-pidfd', str(ended)]\n"
+        "subprocess.run(given, pass_fds=(int(sys.argv[1]), ended))\n"
+    )
+    parent = subprocess.Popen(
+        [sys.executable, "-c", starter, str(ready), *words], pass_fds=(ready,)
+    )
+    try:
+        os.close(ready)
+        assert eventually(lambda: bool(below(parent.pid)))
+        yield below(parent.pid)[0]
+    finally:
+        parent.kill()
+        parent.wait(60)
 
 
 def test_keys_are_found_in_the_configuration_folder(

@@ -81,7 +81,9 @@ def test_a_refusal_between_looking_and_sending_is_no_wait(
 def test_another_servers_key_is_refused_at_once(server: Listening, repository: Path) -> None:
     """Nobody but the server that was meant can answer."""
     other = key_text(keys.generate().public)
-    with pytest.raises(SandboxUnavailableError, match=r"is another than the\s+server_key"):
+    with pytest.raises(
+        SandboxUnavailableError, match=r"another public key than the given\s+server_key"
+    ):
         make_env(repository, sandbox=server.sandbox(server_key=other))
     assert eventually(lambda: "handshake_failed" in server.said())
 

@@ -29,14 +29,19 @@ DRAWN = "the site's build takes it, and the browser draws it"
 # What executes blocks of shell and Python that the tests in tests/integration/documents do not: by
 # document and beginning.
 _CONTAINERS, _LEROBOT = "tests/containers/test_documents.py", "tests/lerobot/test_pages.py"
+_RAY = "tests/remote/ray/test_documents.py"
 APART = {
     ("README.md", "python3 -m venv .venv"): ".ci/steps/readme.sh",
     ("README.md", "./test"): ".ci/steps/readme.sh",
     ("docs/deployment.md", "docker build"): _CONTAINERS,
     ("docs/deployment.md", "from envhub_sandbox import DockerSandbox"): _CONTAINERS,
+    ("docs/deployment.md", 'make_env("org/repo@<commit>", sandbox="docker")'): _CONTAINERS,
     ("docs/deployment.md", "docker run"): "tests/containers/test_deployment.py",
     ("docs/lerobot.md", "lerobot-"): _LEROBOT,
     ("docs/lerobot.md", "from lerobot"): _LEROBOT,
+    ("docs/scaling.md", "sbatch"): "tests/integration/fleet/test_slurm.py",
+    ("docs/ray.md", "import ray"): _RAY,
+    ("docs/ray.md", "envhub run"): _RAY,
     ("plugins/lerobot_env_envhub_sandbox/README.md", "lerobot-"): _LEROBOT,
 }
 # Why others are not executed as they stand there.
@@ -52,8 +57,13 @@ NOT_EXECUTED = {
     ("benchmarks/README.md", "python -m"): _LONG,
     ("docs/deployment.md", "envhub image build"): _DERIVED,
     ("docs/lerobot.md", "pip install"): _INSTALLS,
-    ("docs/speed.md", "python -m benchmarks"): _LONG,
-    ("docs/lerobot.md", "python -m tests.lerobot"): _LONG,
+    ("docs/async.md", "python -m benchmarks"): _LONG,
+    ("docs/ray.md", "pip install"): _INSTALLS,
+    ("docs/benchmarks.md", "python -m benchmarks"): _LONG,
+    (
+        "docs/scaling.md",
+        "envhub run org",
+    ): "needs servers; tests/integration/fleet runs lists of them",
 }
 _EVERYWHERE = {"sh": RUN, "": SHOWN, "text": SHOWN, "mermaid": DRAWN}
 TABLE = {
@@ -61,8 +71,9 @@ TABLE = {
     **{
         (document, "python"): RUN
         for document in (
-            *("README.md", "docs/authors.md", "docs/deployment.md", "docs/integrations.md"),
-            *("docs/observing.md", "docs/quickstart.md"),
+            *("README.md", "docs/async.md", "docs/authors.md", "docs/deployment.md"),
+            *("docs/integrations.md", "docs/observing.md", "docs/quickstart.md"),
+            "docs/scaling.md",
         )
     },
 }

@@ -17,7 +17,7 @@ from tests.support.documents.written import DOCS, filled
 
 DOCUMENT = DOCS / "checks.md"
 _CHECKS = (
-    "| Check | Severity | What holds where it passes | What cures it |\n| --- | --- | --- | --- |"
+    "| Check | Severity | What is true if it passes | How to fix it |\n| --- | --- | --- | --- |"
 )
 _CORPUS = "| Repositories | Number | Right | Missed | False |\n| --- | --- | --- | --- | --- |"
 
@@ -49,7 +49,7 @@ def _judged() -> Iterator[str]:
         yield f"| {name} | {len(entries)} | {right} | {missed} | {false} |"
     for name, entry in {**HONEST, **FAULTS}.items():
         if entry.expected != entry.right:
-            yield f"\nNot right is “{name}”: {entry.why}"
+            yield f"\nNot found: “{name}”: {entry.why}"
 
 
 if __name__ == "__main__":

@@ -5,12 +5,14 @@ Write it again with ``python -m tests.support.documents.options``.
 
 from __future__ import annotations
 
+import argparse
 import importlib
 import inspect
 import pkgutil
 import re
 import typing
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Collection, Iterator
 from enum import Enum
 from typing import Any, Literal
 
@@ -22,30 +24,48 @@ from tests.support.documents.written import DOCS, filled
 
 DOCUMENT = DOCS / "options.md"
 Row = tuple[str, str, str]
+_SHARED = 2
+"""How many commands have an option for it to stand with those that are shared."""
+_TITLE = "Shared options"
 
 
 def document() -> str:
     """What the file has to hold."""
-    parts = [*_commands()]
+    commands = [*_commands()]
+    counted = Counter(row for *_, rows in commands for row in rows)
+    often = [row for row, count in counted.items() if count >= _SHARED and row[0][:2] == "--"]
+    shared = list({row[0].split(" ")[0]: row for row in reversed(often)}.values())[::-1]
+    parts = [f"## {_TITLE}\n", *_table(shared)]
+    for name, what, rows in commands:
+        parts += _part(name, what, rows, shared)
     for name in sorted(module.name for module in pkgutil.iter_modules(cli.__path__)):
         module = importlib.import_module(f"{cli.__name__}.{name}")
         if hasattr(module, "add_arguments") and name != "serve":
-            module.add_arguments(told := _Told())
-            parts += _part(f"envhub-worker {name}", module.run.__doc__, told.rows)
+            module.add_arguments(given := _Arguments())
+            parts += _part(f"envhub-worker {name}", module.run.__doc__, given.rows)
     return filled(DOCUMENT, written="\n".join(parts))
 
 
-def _commands() -> Iterator[str]:
-    """The commands of the program, and those that are below others."""
+def _commands() -> Iterator[tuple[str, str | None, list[Row]]]:
+    """The commands of the program, and those that are below others: name, help and options."""
     for name in typer.main.get_command(app).commands:  # type: ignore[attr-defined]
         for one, function in functions(name).items():
             words = name if one == name else f"{name} {one}"
-            yield from _part(f"envhub {words}", function.__doc__, list(_options(function)))
+            yield f"envhub {words}", function.__doc__, list(_options(function))
 
 
-def _part(name: str, what: str | None, rows: list[Row]) -> Iterator[str]:
+def _part(
+    name: str, what: str | None, rows: list[Row], shared: Collection[Row] = ()
+) -> Iterator[str]:
     yield f"## `{name}`\n"
     yield f"{_cell((what or '').partition(chr(10) * 2)[0])}\n"
+    yield from _table([row for row in rows if row not in shared])
+    names = [_code(row[0].split(" ")[0].rstrip(",")) for row in rows if row in shared]
+    if names:
+        yield f"[{_TITLE}](#{_TITLE.lower().replace(' ', '-')}): {', '.join(names)}.\n"
+
+
+def _table(rows: list[Row]) -> Iterator[str]:
     if rows:
         yield "| option | default | what it is |\n|---|---|---|"
         yield from (
@@ -62,8 +82,8 @@ def _options(function: Callable[..., Any]) -> Iterator[Row]:
             continue
         kind, info = _annotated(hints[name])
         default = _plain(parameter.default)
-        told = isinstance(default, str | int | float) and not isinstance(default, bool)
-        shown = _code(str(default)) if told and default != "" else ""
+        plain = isinstance(default, str | int | float) and not isinstance(default, bool)
+        shown = _code(str(default)) if plain and default != "" else ""
         choices = [str(_plain(one)) for one in _choices(kind)]
         value = info.metavar or "|".join(choices)
         if isinstance(info, typer.models.ArgumentInfo):
@@ -77,7 +97,7 @@ def _options(function: Callable[..., Any]) -> Iterator[Row]:
 
 
 def _annotated(hint: Any) -> tuple[Any, Any]:
-    """The type of an option and what it is told; Python 3.10 may say Optional around both."""
+    """The type of an option and its metadata; Python 3.10 may say Optional around both."""
     while not hasattr(hint, "__metadata__"):
         hint = typing.get_args(hint)[0]
     return typing.get_args(hint)[0], hint.__metadata__[0]
@@ -96,15 +116,17 @@ def _plain(value: Any) -> Any:
     return value.value if isinstance(value, Enum) else value
 
 
-class _Told:
-    """What a command of the worker tells of its options; their defaults stand in the help."""
+class _Arguments:
+    """Collects the options of a command of the worker; their defaults are in the help."""
 
     def __init__(self) -> None:
         self.rows: list[Row] = []
 
     def add_argument(self, *names: str, **of: Any) -> None:
-        """As a parser is told."""
-        # what depends on the host is explained elsewhere
+        """As a parser has it."""
+        if of["help"] == argparse.SUPPRESS:
+            return
+        # defaults that depend on the host are explained elsewhere
         text = re.sub(r" \(default here: .*\)$", "", of["help"])
         default = re.search(r" \(default: ([^)]*)\)", text)
         value = of.get("metavar") or "|".join(of.get("choices", ())) or "VALUE"

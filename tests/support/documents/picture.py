@@ -1,8 +1,8 @@
 """``docs/assets/run.svg``: the README's command in a terminal, beside the film that it wrote.
 
 The command is run in a terminal of its own; what it prints and the frames of its film become one
-picture that moves by itself and loads nothing. Draw it again with
-``python -m tests.support.documents.picture``.
+picture that moves by itself and loads nothing. ``docs/assets/doctor.svg`` is what ``envhub doctor``
+prints. ``python -m tests.support.documents.picture`` draws both again.
 """
 
 from __future__ import annotations
@@ -29,6 +29,7 @@ from tests.support.documents.blocks import CHECKOUT
 from tests.support.documents.written import DOCS
 
 DOCUMENT = DOCS / "assets" / "run.svg"
+DOCTOR = DOCS / "assets" / "doctor.svg"
 MAX_BYTES = 300_000
 COLUMNS = 88
 _CELL, _LINE, _MARGIN, _TOP = 7.25, 19, 18, 44
@@ -37,6 +38,8 @@ _TYPED_S, _RAN_S, _BETWEEN_S = 2.0, 3.2, 0.08
 _GRID, _EVERY, _COLORS = 10, 2, 32
 """The film is 10 x 10 of its frames, every second one, in 32 colours."""
 _BOLD, _DIM = "#ffffff", "#8b93a7"
+_COLOURS = {"(1)": "#ff8a80", "(2)": "#7ee0a3", "(3)": "#f2c14e"}
+"""Of the numbers that a terminal's colours have: red, green, yellow."""
 _STYLE = """
 text{font:12px ui-monospace,SFMono-Regular,Menlo,Consolas,"DejaVu Sans Mono",monospace;fill:#d6dae4;
 white-space:pre}
@@ -61,7 +64,13 @@ def command() -> str:
 def played(words: list[str], folder: Path) -> tuple[str, Path]:
     """What the command prints in a terminal, once its progress bar is gone, and its film."""
     film = folder / words[-1]
-    program = [sys.executable, "-I", "-m", "envhub_sandbox", *words[1:-1], str(film)]
+    text = printed([*words[1:-1], str(film)])
+    return text.replace(str(film), words[-1]), film
+
+
+def printed(words: list[str]) -> str:
+    """What a command prints on stdout, a terminal, without this machine's paths."""
+    program = [sys.executable, "-I", "-m", "envhub_sandbox", *words]
     ours, theirs = pty.openpty()
     sized = {**os.environ, "COLUMNS": str(COLUMNS), "TERM": "xterm-256color"}
     with subprocess.Popen(
@@ -74,13 +83,9 @@ def played(words: list[str], folder: Path) -> tuple[str, Path]:
     os.close(ours)
     assert process.returncode == 0, read.decode()
     text = read.decode().replace("\r\n", "\n")
-    for path, name in (
-        (film, words[-1]),
-        (sys.executable, ".venv/bin/python"),
-        (CHECKOUT, "~/envhub-sandbox"),
-    ):
+    for path, name in ((sys.executable, ".venv/bin/python"), (CHECKOUT, "~/envhub-sandbox")):
         text = text.replace(str(path), name)
-    return text.strip("\n"), film
+    return text.strip("\n")
 
 
 def _read(end: int) -> bytes:
@@ -116,7 +121,12 @@ def spans(line: str) -> Iterator[tuple[int, str, str]]:
     )
     for start, end in itertools.pairwise(edges):
         style = marks.get(start, "")
-        yield start, text.plain[start:end], _BOLD if "bold" in style else _DIM * ("dim" in style)
+        colour = next((code for name, code in _COLOURS.items() if name in style), "")
+        yield (
+            start,
+            text.plain[start:end],
+            (colour or (_BOLD if "bold" in style else _DIM * ("dim" in style))),
+        )
 
 
 def _written(line: str, number: int) -> str:
@@ -136,16 +146,16 @@ def _written(line: str, number: int) -> str:
     return "".join(parts)
 
 
-def drawn(said: str, printed: str, frames: bytes, fps: float) -> str:
+def drawn(said: str, shown: str, frames: bytes, fps: float) -> str:
     """The picture.
 
     Args:
         said: The command.
-        printed: What it printed, with a terminal's colours.
+        shown: What it printed, with a terminal's colours.
         frames: A PNG of 10 x 10 frames.
         fps: How many of them are shown in a second.
     """
-    lines = printed.splitlines()
+    lines = shown.splitlines()
     left = _MARGIN * 2 + COLUMNS * _CELL
     width, height = left + _FILM[0] + _MARGIN, _TOP + (len(lines) + 1) * _LINE + _MARGIN
     typed = (len(said) + 2) * _CELL
@@ -162,7 +172,7 @@ def drawn(said: str, printed: str, frames: bytes, fps: float) -> str:
     style = _STYLE.strip()
     for name, value in of_style.items():
         style = style.replace(name, str(value))
-    shown = [
+    late = [
         f'<g class="late" style="animation-delay:{_RAN_S + number * _BETWEEN_S:.2f}s">'
         f"{_written(line, number + 2)}</g>"
         for number, line in enumerate(lines)
@@ -181,7 +191,7 @@ viewBox="0 0 {width:.0f} {height}">
 <text x="{_MARGIN}" y="{_TOP}" style="fill:#7ee0a3">$</text>{_written("  " + said, 0)}
 <rect id="cover" x="{_MARGIN + 2 * _CELL}" y="{_TOP - 14}" width="{typed:.1f}" height="{_LINE}" \
 fill="#171a23" transform="translate({typed:.1f})"/>
-{chr(10).join(shown)}
+{chr(10).join(late)}
 <g>
 <text x="{x}" y="{y - 8}" style="fill:{_DIM}">{escape(film)}</text>
 <svg x="{x}" y="{y}" width="{_FILM[0]}" height="{_FILM[1]}"><g id="row"><g id="column">\
@@ -192,17 +202,44 @@ href="data:image/png;base64,{image}"/></g></g></svg>
 """
 
 
+def still(said: str, shown: str) -> str:
+    """A command and what it prints, without a film."""
+    lines = [f"  {said}", "", *shown.splitlines()]
+    width = _MARGIN * 2 + max(map(len, map(_plain, lines))) * _CELL
+    height = _TOP + len(lines) * _LINE
+    texts = "\n".join(_written(line, number) for number, line in enumerate(lines) if line)
+    return f"""<svg xmlns="http://www.w3.org/2000/svg" role="img" \
+viewBox="0 0 {width:.0f} {height}">
+<title>{escape(said)}: what it prints</title>
+<style>{_STYLE.strip().partition("@media")[0]}</style>
+<rect width="100%" height="100%" rx="10" fill="#171a23"/>
+<g fill="#3b4256"><circle cx="20" cy="16" r="5"/><circle cx="36" cy="16" r="5"/>\
+<circle cx="52" cy="16" r="5"/></g>
+<text x="{_MARGIN}" y="{_TOP}" style="fill:#7ee0a3">$</text>
+{texts}
+</svg>
+"""
+
+
+def _plain(line: str) -> str:
+    return Text.from_ansi(line).plain
+
+
 def main() -> None:
-    """Run the command, and draw."""
+    """Run the commands, and draw."""
     said = command()
     with tempfile.TemporaryDirectory() as folder:
-        printed, film = played(shlex.split(said), Path(folder))
+        shown, film = played(shlex.split(said), Path(folder))
         frames, fps = sheet(film)
-    text = drawn(said, printed, frames, fps)
-    assert len(text) < MAX_BYTES, len(text)
-    DOCUMENT.parent.mkdir(exist_ok=True)
-    DOCUMENT.write_text(text)
-    print(f"{DOCUMENT}: {len(text) >> 10} KiB")
+    doctor = re.sub(r"Linux \S+", "Linux", printed(["doctor"]), count=1)
+    pictures = {
+        DOCUMENT: drawn(said, shown, frames, fps),
+        DOCTOR: still("envhub doctor", doctor),
+    }
+    for document, text in pictures.items():
+        assert len(text) < MAX_BYTES, len(text)
+        document.write_text(text)
+        print(f"{document}: {len(text) >> 10} KiB")
 
 
 if __name__ == "__main__":

@@ -49,6 +49,7 @@ _PARTS = (
         ),
         "deployment.md#servers-on-other-hosts",
     ),
+    ("A Ray cluster", ("envhub_sandbox/sandboxes/ray",), "ray.md"),
     (
         "Environments in use",
         (
@@ -92,7 +93,7 @@ _CURE = re.compile(
     rf"{_BEFORE}{_UNLESS}"
     rf"(?:(?:{'|'.join(f'[{one[0]}{one[0].upper()}]{one[1:]}' for one in _ORDERS)})(?![\w-]|=)"
     r"|(?:it|--\w+) takes |it is (?:one of |True or False|'[a-z]+',)"
-    r"|there are:? (?:\(suite/task\): )?…|it knows …|reset\(\) brings |['`]envhub |is 'envhub"
+    r"|there are:? (?:\(suite/task\): )?…|it has …|reset\(\) brings |['`]envhub |is 'envhub"
     r"|whoever runs it starts )"
     r"|needs a server that was started |must (?:return|expose) "
 )
@@ -109,9 +110,10 @@ _NO_FILES = (
     "envhub_sandbox/cli/init/starter.py",
     "envhub_sandbox/dependencies/locks/lockfile.py",
 )
-# Nor is this: parts of other formats, and what is said after success.
+# Nor is this: parts of other formats, what is said after success, and answers to our own client.
 _NO_ERRORS = re.compile(
     r"^(?:RUN |FROM |Connection: |make a CURVE key pair$|end the server that listens here, gently$)"
+    r"|^(?:say Hello first|check membership of)$|^\[\[|; (?:offer it|ask for them) first$"
     r"|\b(?:Use|Try) it: "
 )
 
@@ -133,6 +135,11 @@ class Message:
     apart: bool = field(default=False, compare=False)
 
     @property
+    def text(self) -> str:
+        """All of it; a fragment of a message is also found as a part of the message."""
+        return self.cure if self.apart else self.says + self.cure
+
+    @property
     def fixed(self) -> list[str]:
         """What is the same each time, as it stands in the source."""
         whole = [self.says, self.cure] if self.apart else [self.says + self.cure]
@@ -141,9 +148,11 @@ class Message:
 
 def document() -> str:
     """What the file has to hold."""
-    parts, all_messages = list[str](), list(messages())
+    parts, found = list[str](), list(messages())
+    texts = {one.text for one in found}
+    whole = [one for one in found if not any(one.text in text != one.text for text in texts)]
     for title, _, more in _PARTS:
-        rows = sorted({_row(one) for one in all_messages if _part(one.place) == title})
+        rows = sorted({_row(one) for one in whole if _part(one.place) == title})
         parts += [f"## {title}\n\nMore in [{more.partition('#')[0]}]({more}).\n"]
         parts += ["| The error says | What to do |\n| --- | --- |"]
         parts += [*(f"| {says} | {cure} |" for says, cure in rows), ""]

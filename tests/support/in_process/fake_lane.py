@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import os
+from collections.abc import Callable, Sequence
 from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 
 from envhub_sandbox.errors import WorkerTimeoutError
+from envhub_sandbox.session.crash.history import History
 from envhub_sandbox.session.env_session import EnvSession
+from envhub_sandbox.session.parts.fleet_session import FleetSession
 from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.settings.policy import Policy, Timeouts
 from envhub_sandbox.transport.deadline import Deadline
@@ -25,24 +28,56 @@ from tests.attacks.client.lying_server import NUM_ENVS, OBSERVATION, env_manifes
 class FakeLane:
     """A lane to one shard: see ``transport.lane.Lane``.
 
+    Args:
+        count: How many sub-environments it has.
+
     Attributes:
+        infos: Of the next steps.
         sent: The messages that came, in order.
         answer: What a request other than a reset is answered.
         fails: Raised by the next wait.
         owed: What was sent and not answered.
+        silent: Whether it has not answered yet.
+        listened: Whether it was asked what to poll.
+        on_look, on_listen: Called before it is asked whether it has answered, and what to poll.
     """
 
     name = "fake"
+    takes_more = False
 
-    def __init__(self) -> None:
+    def __init__(self, count: int = NUM_ENVS) -> None:
         ignore = lambda *_: None  # noqa: E731
-        self.jail = SimpleNamespace(watched=WatchedAttributes(), send=ignore, receive=ignore)
+        client = SimpleNamespace(torn=False)
+        watched = WatchedAttributes()
+        self.jail = SimpleNamespace(watched=watched, send=ignore, receive=ignore, client=client)
         self.runners, self.number, self.elapsed_ns = [1], 7, 1
+        self._count = count
+        self.infos: dict[Any, Any] = {}
         self.sent: list[m.Message] = []
         self.answer: m.Message = m.Value((None,) * NUM_ENVS)
         self.fails: BaseException | None = None
         self.owed: m.Message | None = None
-        self.closed = False
+        self.closed = self.silent = self.listened = False
+        self.on_look: Callable[[], object] = lambda: None
+        self.on_listen: Callable[[], object] = lambda: None
+        self._bell: list[int] = []
+
+    def answered(self) -> bool:
+        """Unless it is silent."""
+        self.on_look()
+        return not self.silent
+
+    def sources(self) -> list[int]:
+        """A pipe."""
+        self._bell = self._bell or list(os.pipe())
+        self.listened = True
+        self.on_listen()
+        return [self._bell[0]]
+
+    def ring(self) -> None:
+        """Make it readable, for ever."""
+        self.sources()
+        os.write(self._bell[1], b"!")
 
     def request(self, operation: str, messages: Sequence[m.Message]) -> Request:
         """Ready to be sent."""
@@ -53,9 +88,12 @@ class FakeLane:
         """Owe an answer."""
         self._owe(request.messages[0])
 
-    def send_step(self, actions: Any) -> None:
+    def expect_more(self) -> None:
+        """It takes no more."""
+
+    def send_step(self, actions: Any, *, ahead: bool = False) -> None:
         """Owe a step."""
-        self._owe(m.Step(self.number, actions))
+        self._owe(m.Step(self.number, np.array(actions)))
 
     def _owe(self, message: m.Message) -> None:
         assert self.owed is None, "the answer to an earlier request would be taken for this one's"
@@ -71,15 +109,15 @@ class FakeLane:
 
     def result(self, infos: dict[Any, Any] | None = None) -> StepResult:
         """Of one step."""
-        no = np.zeros(NUM_ENVS, np.bool_)
-        return _observation(), np.zeros(NUM_ENVS), no, no, {}
+        no = np.zeros(self._count, np.bool_)
+        return _observation(self._count), np.zeros(self._count), no, no, self.infos
 
     def replies(self, deadline: Deadline) -> list[m.Message]:
         """The answer that is owed."""
         asked = self.owed
         self.wait(deadline)
         if isinstance(asked, m.Reset):
-            return [m.ResetDone(_observation(), {})]
+            return [m.ResetDone(_observation(self._count), {})]
         return [self.answer]
 
     def catch_up(self, deadline: Deadline) -> None:
@@ -95,6 +133,8 @@ class FakeLane:
     def close(self) -> None:
         """Nothing is used any more."""
         self.closed = True
+        while self._bell:
+            os.close(self._bell.pop())
 
 
 class FakeRepository(Repository):
@@ -105,22 +145,40 @@ class FakeRepository(Repository):
         self.snapshot = cast("Any", SimpleNamespace(**known))
         self.policy, self.timeouts = Policy(crash_history=8), Timeouts()
         self.warnings, self.recipe, self.copy = RemoteWarnings(), None, True
+        self.min_ready = None
 
     def keep_crash(self, *_: object, **__: object) -> None:
         """There is none."""
 
 
-def _observation() -> Any:
-    return np.zeros((NUM_ENVS, *OBSERVATION.shape), OBSERVATION.dtype)
+def _observation(count: int) -> Any:
+    return np.zeros((count, *OBSERVATION.shape), OBSERVATION.dtype)
 
 
-def session_over(lane: FakeLane) -> EnvSession:
-    """A session that is READY, with its environment behind this lane."""
+def fleet_over(lanes: Sequence[FakeLane]) -> FleetSession:
+    """A session over two workers, with a sub-environment each."""
     repository = FakeRepository()
-    launcher = SimpleNamespace(repository=repository, stay=lambda: lambda: None)
+    history = History(env_manifest(), repository.policy.crash_history)
+    parts = [
+        session_over(lane, (row, row + 1), repository, history) for row, lane in enumerate(lanes)
+    ]
+    return FleetSession(parts, history)
+
+
+def session_over(
+    lane: FakeLane,
+    rows: tuple[int, int] = (0, NUM_ENVS),
+    repository: FakeRepository | None = None,
+    whole: History | None = None,
+) -> EnvSession:
+    """A session that is READY, with its environment behind this lane."""
+    repository = repository or FakeRepository()
+    here = {"stay": lambda: lambda: None, "where": lambda _: "here"}
+    launcher = SimpleNamespace(repository=repository, **here)
     jails = SimpleNamespace(launcher=launcher, shared=False)
     trials = SimpleNamespace(note=lambda *_: None)
-    session = EnvSession(cast("Any", jails), env_manifest(), [(0, NUM_ENVS)], cast("Any", trials))
+    given = cast("Any", jails), env_manifest(), [rows], cast("Any", trials)
+    session = EnvSession(*given, whole)
     session.lease.lane = cast("Any", lane)
     session.lifecycle.state = State.READY
     return session

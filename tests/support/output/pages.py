@@ -12,7 +12,7 @@ from envhub_sandbox.check.many.results import Result, Verdict
 from envhub_sandbox.check.play.confinement import Confinement
 from envhub_sandbox.check.play.episodes import Episode
 from envhub_sandbox.check.play.plays import Film, Play
-from envhub_sandbox.check.play.video import png
+from envhub_sandbox.vector.pictures import png
 
 FRAME = np.full((4, 6, 3), 200, np.uint8)
 HOSTILE = (

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import os
 import subprocess
-import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
+
+from tests.support.ports import QuietHandler, serving
 
 _OURS = {"GIT_CONFIG_GLOBAL": os.devnull, "GIT_CONFIG_NOSYSTEM": "1"}
 
@@ -53,7 +53,7 @@ def git_served(
     ``rewritten`` is what a lying server makes of a request before it answers.
     """
 
-    class Handler(BaseHTTPRequestHandler):
+    class Handler(QuietHandler):
         def do_GET(self) -> None:
             path, _, query = self.path.partition("?")
             body = rewritten(self.rfile.read(int(self.headers.get("Content-Length") or 0)))
@@ -86,15 +86,13 @@ def git_served(
 
         do_POST = do_GET
 
-        def log_message(self, format: str, *args: object) -> None:
-            pass
+    with serving(Handler) as where:
+        yield where
 
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    thread = threading.Thread(target=server.serve_forever)
-    thread.start()
-    try:
-        yield f"http://127.0.0.1:{server.server_address[1]}"
-    finally:
-        server.shutdown()
-        thread.join()
-        server.server_close()
+
+def ran(program: Path) -> bool:
+    """Whether a program that leaves a mark beside it has run, since this was asked last."""
+    mark = program.parent / "ran"
+    found = mark.exists()
+    mark.unlink(missing_ok=True)
+    return found

@@ -11,11 +11,12 @@ import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from importlib import metadata
 from pathlib import Path
 
 import pytest
+
+from tests.support.ports import QuietHandler, serving
 
 WORKERS = {"cloudpickle": "3.1.0", "gymnasium": "1.2.0", "msgpack": "1.1.0", "numpy": "2.1.0"}
 """Versions of what the worker imports, which stand-ins of these names have."""
@@ -154,7 +155,7 @@ def served(folder: Path) -> Iterator[Index]:
     """Serve a folder as an index on loopback."""
     index = Index(folder)
 
-    class Handler(BaseHTTPRequestHandler):
+    class Handler(QuietHandler):
         def do_GET(self) -> None:
             body = None if index.broken else index.answer(self.path)
             self.send_response(index.broken or (200 if body is not None else 404))
@@ -167,20 +168,12 @@ def served(folder: Path) -> Iterator[Index]:
 
         do_HEAD = do_GET
 
-        def log_message(self, format: str, *args: object) -> None:
-            pass
-
-    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
-    index.url = f"http://127.0.0.1:{server.server_address[1]}/simple"
-    thread = threading.Thread(target=server.serve_forever)
-    thread.start()
-    try:
-        yield index
-    finally:
-        index.let_go()
-        server.shutdown()
-        thread.join()
-        server.server_close()
+    with serving(Handler) as where:
+        index.url = f"{where}/simple"
+        try:
+            yield index
+        finally:
+            index.let_go()
 
 
 @contextmanager

@@ -114,8 +114,8 @@ def test_brackets_are_in_some_help() -> None:
         ("check x --fail-on ", {"error", "warning", "note"}),
         ("inspect x --fail-on w", {"warning"}),
         ("run x --dependencies ", {"auto", "declared", "host"}),
-        ("run x --sandbox ", {"process", "docker", "tcp://", "none"}),
-        ("check x --sandbox ", {"process", "docker", "tcp://"}),
+        ("run x --sandbox ", {"process", "docker", "ray", "tcp://", "file:", "dns://", "none"}),
+        ("check x --sandbox ", {"process", "docker", "ray", "tcp://", "file:", "dns://"}),
     ],
 )
 def test_values_are_completed(words: str, completed: set[str]) -> None:

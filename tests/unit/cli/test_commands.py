@@ -40,22 +40,22 @@ def said(*words: str) -> tuple[int, str]:
 
 _NO_FOLDER = "there is no such folder or file here"
 _REFUSED = [
-    ("lock a/b/c/d", 2, "a path stands behind a colon"),
+    ("lock a/b/c/d", 2, "the path comes after a colon"),
     ("verify ./gone.toml", 2, "'envhub lock REF' writes one"),
     ("image build ./gone", 3, _NO_FOLDER),
-    ("replay ./gone", 2, "is no crash bundle that can be read"),
+    ("replay ./gone", 2, "cannot be read as a crash bundle"),
     ("diff ./gone ./gone", 3, _NO_FOLDER),
     ("run ./gone", 3, _NO_FOLDER),
     ("run 'no spaces allowed'", 2, "Error: hub reference 'no spaces allowed'"),
-    ("run org/repo/sub/dir", 2, "a path stands behind a colon"),
+    ("run org/repo/sub/dir", 2, "the path comes after a colon"),
     ("push ./gone owner/name", 3, _NO_FOLDER),
     ("push . no-owner", 2, "the owner is missing"),
     ("prefetch ./gone", 3, _NO_FOLDER),
-    ("cache remove gone", 2, "nothing in the store is called 'gone'"),
+    ("cache remove gone", 2, "the cache has nothing named 'gone'"),
     ("doctor --profile gone", 2, "it is one of strict, no-userns, container"),
     ("doctor tcp://host", 2, "a remote server is tcp://HOST:PORT"),
-    ("doctor tcp://127.0.0.1:9", 6, "anybody could pretend to be that server"),
-    ("init a--b", 2, "cannot be a name on the Hub"),
+    ("doctor tcp://127.0.0.1:9", 6, "another program could imitate that server"),
+    ("init a--b", 2, "is not a valid name on the Hub"),
     ("inspect ./gone", 3, _NO_FOLDER),
     ("inspect ./gone --sarif x", 2, "--sarif means nothing here"),
     ("inspect ./gone --static --render", 2, "No such option"),
@@ -144,7 +144,7 @@ def test_a_repository_has_the_name_of_its_folder(name: str) -> None:
 @pytest.mark.parametrize("name", ["-a", "a.", "a..b", "a--b", "a.git", ".env", "x" * 97, "é"])
 def test_other_names_are_refused(name: str) -> None:
     """Before anything is written."""
-    with pytest.raises(exits.UsageError, match="cannot be a name on the Hub"):
+    with pytest.raises(exits.UsageError, match="is not a valid name on the Hub"):
         init.repository_name(Path(name))
 
 

@@ -65,7 +65,7 @@ def test_a_repository_is_read(tmp_path: Path) -> None:
     assert (finding["check"], finding["file"], finding["line"]) == ("source-dynamic", "env.py", 5)
     shown = envhub("inspect", "--static", folder).stdout
     assert "make_env(n_envs=1, use_async_envs=False, size=8)" in shown
-    assert "note        source-dynamic: env.py:5: calls eval" in shown
+    assert "note         source-dynamic: env.py:5: calls eval" in shown
 
 
 def test_nothing_of_it_runs(tmp_path: Path) -> None:

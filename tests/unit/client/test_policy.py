@@ -37,11 +37,11 @@ def test_values_are_frozen_and_by_name_only(cls: type) -> None:
 @pytest.mark.parametrize(
     ("make", "complaint"),
     [
-        (lambda: policy_from({"netwrok": "host"}, None), "policy knows no netwrok; it knows prof"),
-        (lambda: limits_from({"memory": 1}), "limits knows no memory; it knows memory_bytes"),
-        (lambda: timeouts_from({"step": 1}), "timeouts knows no step; it knows startup_s"),
-        (lambda: policy_from({"limits": {"memory": 1}}, None), "limits knows no memory"),
-        (lambda: policy_from({1: 2}, None), "policy knows no 1"),
+        (lambda: policy_from({"netwrok": "host"}, None), "policy has no field netwrok; it has"),
+        (lambda: limits_from({"memory": 1}), "limits has no field memory; it has memory_bytes"),
+        (lambda: timeouts_from({"step": 1}), "timeouts has no field step; it has startup_s"),
+        (lambda: policy_from({"limits": {"memory": 1}}, None), "limits has no field memory"),
+        (lambda: policy_from({1: 2}, None), "policy has no field 1"),
     ],
 )
 def test_unknown_names_are_refused(make: Any, complaint: str) -> None:

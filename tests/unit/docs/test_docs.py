@@ -19,7 +19,7 @@ from envhub_worker.protocol.lifecycle import TABLE, Event, State
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, MAX_NUM_ENVS
 from envhub_worker.protocol.manifest.manifest import MAX_ENVS
 from envhub_worker.protocol.manifest.names import MAX_NAME
-from tests.support.documents import options, picture, settings
+from tests.support.documents import charts, options, picture, settings
 from tests.unit.docs.test_imports import folder
 
 pytestmark = pytest.mark.same_for("users")
@@ -216,6 +216,16 @@ def joined_literals() -> str:
     return re.sub(r'(?<!\\)"\s*\n?\s*f?"', "", sources())
 
 
+def test_the_pages_before_internals_are_few_enough_to_read() -> None:
+    """At most 40,000 words by hand: what is written from the source is looked up, and not read."""
+    contents = (CHECKOUT / "mkdocs.yml").read_text().partition("\nnav:")[2]
+    pages = re.findall(r"[\w/-]+\.md$", contents.partition("- Internals:")[0], re.MULTILINE)
+    beside = {"index.md": "README.md", "SECURITY.md": "SECURITY.md"}
+    texts = [(CHECKOUT / beside.get(page, f"docs/{page}")).read_text() for page in pages]
+    by_hand = re.sub(r"<!-- (\w+) -->.*?<!-- /\1 -->", "", "\n".join(texts), flags=re.DOTALL)
+    assert 20_000 < len(by_hand.split()) <= 40_000
+
+
 def links(text: str) -> Iterator[str]:
     """The targets of all links that stay in the project."""
     for target in re.findall(r"\]\(([^)\s]+)\)", text):
@@ -313,9 +323,9 @@ def test_error_tree_is_the_tree() -> None:
     assert {name for name in errors.__all__ if name.endswith("Error")} <= shown
 
 
-@pytest.mark.parametrize("written", [settings, options])
+@pytest.mark.parametrize("written", [settings, options, charts])
 def test_what_is_written_from_the_source_is_up_to_date(written: Any) -> None:
-    """``python -m tests.support.documents.settings``, or ``options``, writes them again."""
+    """``python -m tests.support.documents.settings``, ``options`` or ``charts`` writes it."""
     assert written.DOCUMENT.read_text() == written.document()
 
 

@@ -20,7 +20,7 @@ def attack(kind, name):
         "inotify instances": _inotify,
         "queued signals": _signals,
         "message queues": lambda: _queues(name),
-        "descriptors under way": _descriptors,
+        "descriptors in flight": _descriptors,
         "pages of pipes": _pipes,
     }[kind]()
 

@@ -56,7 +56,7 @@ def test_what_confined_it_is_text(text: str) -> None:
     provenance = {"profile": "container", "layers": [held, *layers]}
     made.confinement = Confinement.of("strict", provenance, text * 1_000)
     lines = list(made.confinement.lines())
-    assert lines[0] == "profile container, within a container; strict was asked for"
+    assert lines[0] == "confined by: container, 1 layer, in a container; strict was asked for"
     assert (len(lines), max(map(len, lines)) < 1_000) == (42, True)
     assert all(len(line.splitlines()) == 1 and printable(line) == line for line in lines)
     [command] = reports.workflow_commands(made)
@@ -75,7 +75,7 @@ def test_all_that_there_can_be_is_a_line_and_no_notice() -> None:
     for profile in ("strict", ""):
         made.confinement = Confinement.of("strict", {"profile": profile, "layers": []}, "")
         [line] = made.confinement.lines()
-        assert line.startswith("profile strict, as asked for")
+        assert line.startswith("confined by: strict")
         assert list(reports.workflow_commands(made)) == []
         assert made.confinement.document()["recorded"] is True
 
@@ -204,7 +204,7 @@ def test_a_verdict_is_a_sentence(found: list[str], allowed: list[str], says: str
         ("DependencyNotInstalled", "requirements.txt"),
         ("ModuleNotFoundError", "requirements.txt"),
         ("NamespaceNotFound", "Import the package that registers"),
-        ("FileNotFoundError", "Bring the file along"),
+        ("FileNotFoundError", "Put the file into"),
         ("out-of-memory", "--memory"),
         ("timeout", "--timeout"),
         ("ZeroDivisionError", CHECKS["runs"].cure),

@@ -213,7 +213,7 @@ def test_an_interpreter_by_its_path(tmp_path: Path) -> None:
     """It is asked what it is; what does not answer is none."""
     ours = interpreters.own()
     assert interpreters.find(ours.path) == ours
-    with pytest.raises(InterpreterUnavailableError, match="no interpreter"):
+    with pytest.raises(InterpreterUnavailableError, match="does not work as an interpreter"):
         interpreters.find(str(tmp_path / "python"))
 
 

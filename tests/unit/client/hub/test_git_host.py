@@ -72,7 +72,9 @@ def test_files_are_read_in_any_order(serve: dict[str, bytes], tmp_path: Path) ->
 def test_other_bytes_than_those_named_are_refused(serve: dict[str, bytes], tmp_path: Path) -> None:
     """The error names the file, and what was expected."""
     serve |= {"env.py": b"good", "!data": b"0123"}
-    with pytest.raises(SnapshotIntegrityError, match=r"org/repo: git gave .* as 'data', which is"):
+    with pytest.raises(
+        SnapshotIntegrityError, match=r"org/repo: git returned .* as 'data', which is"
+    ):
         read(tmp_path)
 
 

@@ -28,7 +28,7 @@ def test_what_is_read_is_written_again(text: str) -> None:
     [
         (grammar.Parts("name"), "owner is missing"),
         (grammar.Parts("owner/name.git"), "does not end in '.git'"),
-        (grammar.Parts("owner/a--b"), "cannot be a name"),
+        (grammar.Parts("owner/a--b"), "is not a valid name"),
         (grammar.Parts("owner/name", ""), "revision after '@' is empty"),
         (grammar.Parts("owner/name", "a..b"), "cannot be a revision"),
         (grammar.Parts("owner/name", path="../env.py"), "has '..'"),
@@ -37,7 +37,7 @@ def test_what_is_read_is_written_again(text: str) -> None:
         (grammar.Parts("owner/name", path="C:/env.py"), "drive letter"),
         (grammar.Parts("owner/name", path="env.txt"), "not a .py file"),
         (grammar.Parts("owner/name", path="envs"), "a folder"),
-        (grammar.Parts("owner/name", path="env.py@main"), "stands behind the path"),
+        (grammar.Parts("owner/name", path="env.py@main"), "comes before the path"),
         (grammar.Parts("owner/name", repo_type="paper"), "no repository type"),
     ],
 )
@@ -66,7 +66,7 @@ def test_an_environment_of_a_package(text: str, write: str) -> None:
 
 def test_a_file_that_is_not_here() -> None:
     """A name of Python code is a file's, not a repository's."""
-    with pytest.raises(grammar.Wrong, match="no such file is here") as wrong:
+    with pytest.raises(grammar.Wrong, match="does not exist here") as wrong:
         grammar.read("env.py")
     assert "OWNER/NAME:env.py" in wrong.value.write
 

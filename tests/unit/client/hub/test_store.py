@@ -158,7 +158,7 @@ def test_damage_is_refused_with_the_command_that_repairs(
     damage(published)
     with pytest.raises(SnapshotIntegrityError, match=said) as caught:
         store.load(published)
-    command = str(caught.value).rpartition("fetched again: ")[2]
+    command = str(caught.value).rpartition("downloads it again: ")[2]
     subprocess.run(command, shell=True, check=True)
     assert store.load(published) is None
     store.publish(published, records(), write, {})

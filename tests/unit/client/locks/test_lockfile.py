@@ -259,8 +259,8 @@ def put(old: str, new: str) -> Callable[[str], str]:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (put('name = "one"', 'name = "one\\n--index-url http://evil"'), "no normalized name"),
-        (put('name = "one"', 'name = "--index-url"'), "no normalized name"),
+        (put('name = "one"', 'name = "one\\n--index-url http://evil"'), "not a normalized name"),
+        (put('name = "one"', 'name = "--index-url"'), "not a normalized name"),
         (put('\nversion = "1.0"', '\nversion = "1.0 \\\\\\n--pre"'), "no version"),
         (put('\nversion = "1.0"', '\nversion = "1.0\\n-e ./evil"'), "no version"),
         (put(A, "a" * 63 + "\\n"), "no SHA-256"),
@@ -278,12 +278,12 @@ def put(old: str, new: str) -> Callable[[str], str]:
         (put('commit = "0', 'commit = "../'), "commit"),
         (put("format = 1", "format = 2"), "another release"),
         (put("[tool.envhub]\n", "[tool.other]\n"), "another program"),
-        (put('lock-version = "1.0"', 'lock-version = "9"'), "no lock file"),
+        (put('lock-version = "1.0"', 'lock-version = "9"'), "not a lock file"),
         (put("task = 0", "task = 0.5"), "tasks"),
         (put("[[packages]]", f"[[packages]]\n{'.'.join('a' * 3000)} = 1"), "dots"),
         (put('"env.py"', '"""env.py"""'), "several lines"),
-        (lambda text: text + "[" * 5000, "no TOML"),
-        (lambda text: "", "no lock file"),
+        (lambda text: text + "[" * 5000, "not valid TOML"),
+        (lambda text: "", "not a lock file"),
     ],
 )
 def test_what_is_no_lock_of_ours_is_refused(

@@ -232,7 +232,7 @@ def test_an_unknown_action_space_is_explained() -> None:
     env: VectorEnv[Any, Any, Any] = scripted("NextStep", 1)
     env.action_space = env.single_action_space = Own()
     for actions in ("random", "zero"):
-        with pytest.raises(RolloutError, match="action space is its own"):
+        with pytest.raises(RolloutError, match="action space is a class of its own"):
             rollout(env, episodes=1, seed=0, actions=actions)
 
 

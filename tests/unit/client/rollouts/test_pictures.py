@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from envhub_sandbox.check.play.video import png, small_picture
+from envhub_sandbox.vector.pictures import png, small_picture
 
 
 def pixels(data: bytes) -> NDArray[np.uint8]:

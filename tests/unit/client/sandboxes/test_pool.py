@@ -11,8 +11,9 @@ from typing import Any
 import pytest
 
 from envhub_sandbox.sandboxes import pool as pool_module
-from envhub_sandbox.sandboxes.docker import sandbox as docker
+from envhub_sandbox.sandboxes.docker import container as docker
 from envhub_sandbox.sandboxes.docker.engines import Engine
+from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
 from envhub_sandbox.sandboxes.pool import ServerPool, ServerUse, WorkerServer
 from envhub_sandbox.settings.policy import Policy, timeouts_from
 from tests.support import inside
@@ -105,6 +106,34 @@ def test_what_does_not_start_is_not_remembered(pool: Pool) -> None:
     with pytest.raises(KeyboardInterrupt):
         pool.acquire("key", fails)
     assert pool.acquire("key", Server).users() == 1
+
+
+def test_a_start_delays_only_those_who_want_the_same(pool: Pool) -> None:
+    """A place that waits for room may wait for what another gives back; and one is started once."""
+    other = pool.acquire("other", Server)
+    begun, may_start, started = threading.Event(), threading.Event(), list[Server]()
+
+    def start() -> Server:
+        begun.set()
+        assert may_start.wait(60)
+        started.append(Server())
+        return started[-1]
+
+    uses = list[ServerUse[Server]]()
+    threads = [
+        threading.Thread(target=lambda: uses.append(pool.acquire("slow", start))) for _ in range(3)
+    ]
+    for thread in threads:
+        thread.start()
+    assert begun.wait(60)
+    other.release()
+    assert other.server.ends == here()
+    assert pool.acquire("third", Server).users() == 1
+    may_start.set()
+    for thread in threads:
+        thread.join(60)
+    assert len(started) == 1
+    assert {use.server for use in uses} == set(started)
 
 
 def test_all_are_ended_at_exit_and_none_is_kept(pool: Pool) -> None:
@@ -328,7 +357,7 @@ def test_a_container_changes_hands_only_when_it_is_idle(
     engine = Engine("docker", "/usr/bin/docker", "1", rootless=False)
 
     def sandbox(snapshot: str = "/one", **policy: Any) -> docker.RepositoryContainer:
-        options, made = docker.DockerSandbox(), Policy(**policy)
+        options, made = DockerSandbox(), Policy(**policy)
         return docker.RepositoryContainer(options, engine, "sha256:0", Path(snapshot), made)
 
     first, second = sandbox(), sandbox()

@@ -112,7 +112,7 @@ def test_a_folder_for_sockets_has_a_short_path(
         made.remove()
     assert not made.path.exists()
     monkeypatch.setattr(runtime_folder, "places", lambda: [long])
-    with pytest.raises(SandboxUnavailableError, match="set TMPDIR to a shorter one"):
+    with pytest.raises(SandboxUnavailableError, match="set TMPDIR to a shorter path"):
         runtime_folder.RuntimeFolder(runtime_folder.SERVER)
 
 

@@ -16,6 +16,7 @@ class _Task:
     """One environment of a suite, as far as this concerns it."""
 
     lifecycle = Lifecycle()
+    closed = False
 
     def __init__(self) -> None:
         self.warm, self.cancelled = threading.Event(), threading.Event()

@@ -1,4 +1,4 @@
-"""How a worker server has ended is told, with what to do; and it stays to be reaped."""
+"""Replies are taken as they arrive; how a worker server has ended is told, with what to do."""
 
 from __future__ import annotations
 
@@ -10,16 +10,20 @@ from contextlib import contextmanager
 
 import pytest
 
-from envhub_sandbox.transport.connection import describe_exit
+from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
+from envhub_sandbox.transport.connection import WorkerConnection, describe_exit
+from envhub_sandbox.transport.deadline import Deadline
+from envhub_worker.protocol import messages as m
+from tests.attacks.client.lying_server import Asked, Frames, LyingServer, lying
+from tests.support.processes import eventually
 
 
 @contextmanager
 def process(script: str) -> Iterator[tuple[subprocess.Popen[bytes], int]]:
-    """One that has ended, and a pidfd of it."""
+    """One, and a pidfd of it."""
     with subprocess.Popen(["sh", "-c", script]) as child:
         pidfd = os.pidfd_open(child.pid)
         try:
-            assert select.select([pidfd], [], [], 120)[0]
             yield child, pidfd
         finally:
             os.close(pidfd)
@@ -38,6 +42,7 @@ def process(script: str) -> Iterator[tuple[subprocess.Popen[bytes], int]]:
 def test_its_end_is_told(script: str, says: str, code: int) -> None:
     """By itself, or as an engine tells of its container's program."""
     with process(script) as (child, pidfd):
+        assert select.select([pidfd], [], [], 120)[0]
         told = describe_exit(pidfd)
         assert told.startswith(says)
         assert told.endswith("starts another")
@@ -55,3 +60,102 @@ def test_what_another_has_reaped_ended_somehow() -> None:
         assert describe_exit(living).startswith(". The next")
     finally:
         os.close(living)
+
+
+@contextmanager
+def connected() -> Iterator[tuple[LyingServer, WorkerConnection]]:
+    """A server that can be made to lie, and a connection to it."""
+    with lying() as server:
+        connection = WorkerConnection(server.endpoint, server.process_fd)
+        try:
+            yield server, connection
+        finally:
+            connection.close()
+
+
+def test_a_reply_is_there_once_it_has_arrived() -> None:
+    """To ask for it takes nothing away, and it is received as it would have been."""
+    held: list[Frames] = []
+
+    def hold(asked: Asked) -> list[Frames]:
+        held.append(asked.answer(asked.honest))
+        return []
+
+    with connected() as (server, connection):
+        server.lies[m.ReadOutput] = hold
+        first = connection.send(m.ReadOutput(1, ""))
+        assert eventually(lambda: bool(held))
+        assert not connection.arrived(first)
+        server.lies[m.GetStatus] = lambda asked: [*held, asked.answer(asked.honest)]
+        second = connection.send(m.GetStatus())
+        assert eventually(lambda: connection.arrived(first))
+        assert connection.arrived(first)
+        for _ in range(2):
+            assert connection.peek(first) == (m.Output(""), [])
+        assert connection.peek(second) == (None, [])
+        assert connection.receive(first, Deadline(0))[0] == m.Output("")
+        assert connection.peek(first) == (None, [])
+        assert eventually(lambda: connection.arrived(second))
+        assert connection.receive(second, Deadline(0))[0] == m.Status(())
+        third = connection.send(m.GetStatus())
+        assert eventually(lambda: connection.arrived(third))
+        connection.forget(third)
+        assert not connection.arrived(third)
+
+
+def test_other_replies_are_dropped_while_one_is_looked_for() -> None:
+    """As many as there are, and counted; the one that follows them is found."""
+
+    def flood(asked: Asked) -> list[Frames]:
+        stale = [asked.answer(m.Output("stale"), asked.request_id + 1000 + i) for i in range(50)]
+        return [*stale, asked.answer(asked.honest)]
+
+    with connected() as (server, connection):
+        server.lies[m.ReadOutput] = flood
+        sent = connection.send(m.ReadOutput(1, ""))
+        assert eventually(lambda: connection.arrived(sent))
+        assert connection.stale_replies == 50
+        assert connection.receive(sent, Deadline(0))[0] == m.Output("")
+
+
+def test_what_is_no_reply_is_raised_where_it_is_received() -> None:
+    """And not by the look."""
+    with connected() as (server, connection):
+        server.lies[m.ReadOutput] = lambda asked: [[b"noise"]]
+        sent = connection.send(m.ReadOutput(1, ""))
+        assert eventually(lambda: connection.arrived(sent))
+        assert connection.peek(sent) == (None, [])
+        with pytest.raises(RemoteProtocolError):
+            connection.receive(sent, Deadline(0))
+
+
+def test_an_interrupt_in_a_look_is_noted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The reply may be lost then; after any other look nothing is."""
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with connected() as (_, connection):
+        sent = connection.send(m.GetStatus())
+        assert eventually(lambda: connection.arrived(sent))
+        assert not connection.arrived(sent + 1)
+        assert not connection.torn
+        again = connection.send(m.GetStatus())
+        monkeypatch.setattr("envhub_sandbox.transport.connection.Deadline", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            eventually(lambda: connection.arrived(again))
+        assert connection.torn
+
+
+def test_the_end_of_a_server_has_arrived_as_well() -> None:
+    """There is nothing to wait for any more."""
+    with process("sleep 1000") as (child, pidfd), lying() as server:
+        server.lies[m.ReadOutput] = lambda asked: []
+        connection = WorkerConnection(server.endpoint, pidfd)
+        sent = connection.send(m.ReadOutput(1, ""))
+        assert not connection.arrived(sent)
+        child.kill()
+        assert eventually(lambda: connection.arrived(sent))
+        with pytest.raises(WorkerDiedError, match="by SIGKILL"):
+            connection.receive(sent, Deadline(0))
+        connection.close()

@@ -1,11 +1,17 @@
-"""Values of attributes that are watched: known until a reply says that they have changed."""
+"""Watched attributes are known until they change; what has arrived stays until it is taken."""
 
 from __future__ import annotations
 
-from envhub_sandbox.transport.jail import WatchedAttributes
+from typing import Any, cast
+from unittest.mock import Mock
+
+from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.jail import JailHandle, WatchedAttributes
+from envhub_sandbox.transport.lane import RelayLane
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
 from envhub_worker.protocol.messages.prefix import CHANGES
+from tests.support.in_process.fake_server import FakeServer
 
 REPLY = m.pack(m.Value(1))
 
@@ -27,3 +33,49 @@ def test_what_can_change_without_a_word_is_not_kept() -> None:
     cache.note(7, "task", ("a", "b"))
     assert cache.take(REPLY * DEFAULT_LIMITS.frames) == REPLY * DEFAULT_LIMITS.frames
     assert cache.values(7, "task") is None
+
+
+def test_what_has_arrived_is_shown_and_stays() -> None:
+    """As the frames of each runner; nothing of a reply that is refused when it is taken."""
+    server = FakeServer()
+    jail = JailHandle(cast("Any", server), 1, [1, 2], [], DEFAULT_LIMITS)
+    wrong: list[m.Message] = [
+        m.RelayDone((1,)),
+        m.RelayDone((3,)),
+        m.RelayDone((1, 1)),
+        m.RelayDone((4, -1)),
+        m.RelayDone((1, 1, 1)),
+        m.RelayDonePartly((1, 2), (0,)),
+        m.Death(1, "exit", 1),
+        m.Done(),
+    ]
+    for reply in wrong:
+        sent = jail.relay("step", [(1, REPLY), (2, REPLY)])
+        assert jail.arrived(sent) == []
+        server.reply(reply, REPLY, [b"a", b"b"], to=sent)
+        assert jail.arrived(sent) == []
+    sent = jail.relay("step", [(1, REPLY), (2, REPLY)])
+    server.answer(REPLY, REPLY)
+    for _ in range(2):
+        assert jail.arrived(sent) == [REPLY, REPLY]
+    assert jail.receive(sent, Deadline(0)) == [m.Value(1)] * 2
+    assert jail.arrived(sent) == []
+
+
+def test_what_the_next_request_makes_useless_is_not_kept() -> None:
+    """A runner that can have infos asked for, and then not taken, fills no memory with them."""
+    server = FakeServer()
+    jail = JailHandle(cast("Any", server), 1, [1], [], DEFAULT_LIMITS)
+    results = Mock(slices=[(0, 1)])
+    lane = RelayLane(jail, [1], 7, results)
+    for _ in range(100):
+        lane.send_some("step", [1], [REPLY])
+        server.answer(REPLY)
+        assert lane.answered()
+        assert server.untaken == 1
+    lane.send_some("step", [1], [REPLY], ahead=True)
+    server.answer(REPLY)
+    assert server.untaken == 2
+    for _ in range(2):
+        assert lane.replies(Deadline(0)) == [m.Value(1)]
+    assert server.untaken == 0

@@ -71,7 +71,7 @@ def test_one_that_ends_every_handshake_is_refused(
         threading.Thread(target=serve, daemon=True).start()
         with linked(listener.getsockname()[1], far) as link:
             error = UnreachableError if keys else SandboxUnavailableError
-            said = "server_key that was given, and as one does that restarts" if keys else "both"
+            said = "given server_key, or it is restarting" if keys else "both"
             with pytest.raises(error, match=said):
                 eventually(lambda: link.drain() is not None)
         listener.shutdown(socket.SHUT_RDWR)

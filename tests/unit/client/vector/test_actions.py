@@ -114,7 +114,7 @@ def test_tensors_are_taken() -> None:
         (BOX, np.zeros(2, np.float32), r"got float32 of shape \(2,\)"),
         (BOX, np.zeros((2, 2), complex), "got complex128"),
         (BOX, np.full((2, 2), None), "got object"),
-        (BOX, [[0.5], [1, 2]], "no batch for"),
+        (BOX, [[0.5], [1, 2]], "not a batch for"),
         (IMAGE, np.zeros((2, 2, 2), np.float32), "got float32"),
         (DICT, [0, 1], "expected a mapping .*, got builtins.list"),
         (DICT, {"move": np.zeros((2, 2))}, "'grip'. missing"),
@@ -142,7 +142,7 @@ def test_objects_that_fail_to_be_arrays_are_refused() -> None:
         def __array__(self, dtype: Any = None, copy: Any = None) -> Any:
             raise OSError("no")
 
-    with pytest.raises(ActionError, match=r"Broken is no batch for .*: no") as caught:
+    with pytest.raises(ActionError, match=r"Broken is not a batch for .*: no") as caught:
         batch_of(BOX, Broken(), 2)
     assert isinstance(caught.value.__cause__, OSError)
 

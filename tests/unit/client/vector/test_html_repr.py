@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import base64
+import re
 from html.parser import HTMLParser
 from types import SimpleNamespace
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
+import pytest
 
 from envhub_sandbox.vector.html_repr import environment_html, suites_html
+from envhub_sandbox.vector.pictures import png
 
 SCRIPT = "<script>steal()</script><img src=x onerror=steal()>\x1b[2J"
 OURS = {"table", "tr", "th", "td", "code", "p"}
@@ -49,6 +53,28 @@ def test_spaces_and_layers_are_shown() -> None:
         assert word in text
     assert "cgroup" not in text
     assert "does not run" in Tags(environment_html(an_env(), [])).text
+
+
+def test_a_rendered_frame_is_a_picture() -> None:
+    """Encoded here, and small however large the frame is."""
+    frame = np.full((600, 900, 3), 7, np.uint8)
+    shown = environment_html(an_env(), [], frame)
+    [data] = re.findall(
+        r'<img alt="The last frame" src="data:image/png;base64,([\w+/=]+)">$', shown
+    )
+    assert base64.b64decode(data) == png(frame[:150, :225])
+
+
+@pytest.mark.parametrize(
+    "rendered",
+    [
+        *(None, SCRIPT, 5, [[[1, 2, 3]]], np.zeros((4, 6, 3))),
+        *(np.zeros((4, 6, 4), np.uint8), np.zeros((0, 6, 3), np.uint8), np.zeros(3, np.uint8)),
+    ],
+)
+def test_what_is_no_frame_is_not_shown(rendered: object) -> None:
+    """Texts, other shapes and dtypes."""
+    assert environment_html(an_env(), [], rendered) == environment_html(an_env(), [])
 
 
 def test_each_task_has_its_line() -> None:

@@ -156,14 +156,14 @@ def test_a_form_that_cannot_be_made_is_none(monkeypatch: pytest.MonkeyPatch) -> 
         assert m.unpack(m.pack(m.Value({"a": 1}))) == m.Value({"a": 1})
 
 
-def test_arrays_of_a_recurring_message_are_the_receivers_own() -> None:
+def test_what_can_be_changed_of_a_recurring_message_is_the_receivers_own() -> None:
     """What one receiver writes, no other sees."""
-    frames = m.pack(m.Value({"a": np.zeros(3)}))
+    frames = m.pack(m.Value({"a": [1]}))
     values = [m.unpack(frames).value for _ in range(4)]  # type: ignore[attr-defined]
     for number, value in enumerate(values):
-        value["a"][:] = number
+        value["a"][:] = [number]
         value["more"] = number
-    assert [value["a"].tolist() for value in values] == [[float(n)] * 3 for n in range(4)]
+    assert [value["a"] for value in values] == [[number] for number in range(4)]
 
 
 def _known(value: object) -> bytes:
@@ -171,7 +171,7 @@ def _known(value: object) -> bytes:
     for _ in range(3):
         frames = m.pack(m.Value(value))
         m.unpack(frames)
-    assert list(inside.forms(INCOMING).values()) != [None]
+    assert inside.forms(INCOMING)
     [header] = frames
     return bytes(header)
 
@@ -179,45 +179,36 @@ def _known(value: object) -> bytes:
 @pytest.mark.parametrize("change", [lambda raw: raw[:-1], lambda raw: raw + b"x"])
 def test_the_bytes_of_a_known_message_are_counted(change: Any) -> None:
     """Too few, too many, or a frame that nothing describes."""
-    header = _known(np.arange(4.0))
+    header = _known("known")
     with pytest.raises(RemoteProtocolError):
         m.unpack([change(header)])
     with pytest.raises(RemoteProtocolError):
         m.unpack([header, b"more"])
 
 
-def test_the_bytes_of_a_known_message_are_looked_at() -> None:
-    """A boolean of 2 would reach outside of an array."""
-    header = _known(np.zeros(4, bool))
-    with pytest.raises(RemoteProtocolError, match="boolean"):
-        m.unpack([header[:-1] + b"\2"])
-
-
 def test_the_limits_of_a_known_message_hold() -> None:
     """A form is for the limits under which it was made, and no others."""
-    header = _known(np.arange(4.0))
+    value = ["a" * 20, 1]
+    header = _known(value)
     with pytest.raises(MessageTooLargeError):
         m.unpack([header], limits=WireLimits(header_bytes=20))
     with pytest.raises(MessageTooLargeError):
         m.unpack([header], limits=WireLimits(depth=0))
     with pytest.raises(LocalProtocolError):
-        m.pack(m.Value(np.arange(4.0)), limits=WireLimits(header_bytes=20))
+        m.pack(m.Value(value), limits=WireLimits(header_bytes=20))
 
 
-def test_large_arrays_of_a_known_message_have_frames() -> None:
-    """Their sizes are checked as ever."""
-    limits = WireLimits(frame_bytes=200_000)
-    for size in (50_000, 50_000, 50_000, 200_000, 200_000, 200_000):
-        value = np.full(size, size % 7, np.uint8)
-        frames = m.pack(m.Value(value), limits=limits)
-        assert len(frames) == 2
-        message = m.unpack(frames, limits=limits)
-        assert alike(message, m.Value(value)) or np.array_equal(message.value, value)  # type: ignore[attr-defined]
+def test_a_known_header_is_read_with_any_id() -> None:
+    """The whole of it is known then; one byte more, and it is another."""
+    message = m.Relay(3, "step", ((1, 1),), stepped=True)
+    for number in range(1, 5):
+        [header] = m.pack_header(message, number)
+        assert m.unpack_header(bytes(header)) == (number, message)
+        assert m.unpack_header(memoryview(header)) == (number, message)
     with pytest.raises(RemoteProtocolError):
-        m.unpack([frames[0], bytes(199_999)], limits=limits)
-    for _ in range(3):
-        with pytest.raises(LocalProtocolError):
-            m.pack(m.Value(np.zeros(200_001, np.uint8)), limits=limits)
+        m.unpack_header(bytes(header) + b"x")
+    with pytest.raises(MessageTooLargeError):
+        m.unpack_header(bytes(header), limits=WireLimits(header_bytes=20))
 
 
 def test_pickled_objects_and_tensors_never_have_a_form() -> None:

@@ -140,4 +140,4 @@ def test_what_cannot_be_sent_is_named(message: m.Message, words: str) -> None:
     with pytest.raises(LocalProtocolError, match=words) as caught:
         m.pack(message, pickler=framed)
     if message.HANDED:
-        assert "Hand over plain data" in str(caught.value)
+        assert "Pass plain data" in str(caught.value)

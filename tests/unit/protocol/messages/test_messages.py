@@ -36,7 +36,7 @@ SAMPLES: list[m.Message] = [
     ),
     m.JailOpened(3, (1, 2), ({"layer": "seccomp", "enforced": True, "detail": "x"},)),
     m.StartRunners(3, 1),
-    m.Relay(3, "step", ((1, 2), (2, 1))),
+    m.Relay(3, "step", ((1, 2), (2, 1)), stepped=True),
     m.RelayDone((2, 1)),
     m.Death(1, "signal", None, "SIGKILL", "", "last words", "step"),
     m.CloseJail(3),
@@ -57,6 +57,7 @@ SAMPLES: list[m.Message] = [
     m.Sessions(({"client": "a", "session": "b", "heard_s": 0.5, "jails": ()},), {"pid": 7}),
     m.ExpireIdle(3, 60_000),
     m.KeepJail(3),
+    m.ShareSlabs(3, ((1, 2, 66_368, 256), (2, 2, 66_368, 128))),
     m.NeedPackages(
         (("scipy>=1.11", "line 1 of requirements.txt"),),
         *(">=3.10", "3.12", "", True),

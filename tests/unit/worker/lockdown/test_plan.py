@@ -28,16 +28,16 @@ def layers(confinement: Confinement, facts: HostFacts) -> list[tuple[str, bool, 
 def test_strict_as_a_user_has_every_layer() -> None:
     """In the order in which they are entered."""
     assert layers(STRICT, USER) == [
-        ("user-namespace", True, "one user, and no capability over any other"),
-        ("pid-namespace", True, "sees, signals and outlives no process but its own"),
+        ("user-namespace", True, "one user, without capabilities outside"),
+        ("pid-namespace", True, "sees and signals only its own processes"),
         ("mount-namespace", True, "a private read-only root; other files do not exist"),
         ("scratch", True, "one tmpfs of 64 MiB and 10 files"),
-        ("network-namespace", True, "no device that is up"),
+        ("network-namespace", True, "no active device"),
         ("ipc-namespace", True, "its own System V and POSIX objects"),
-        ("uts-namespace", True, "a host name that says nothing"),
-        ("cgroup-namespace", True, "does not see where it is counted"),
+        ("uts-namespace", True, "a neutral host name"),
+        ("cgroup-namespace", True, "its own view of control groups"),
         ("capabilities", True, "none in any set"),
-        ("no-new-privileges", True, "set-user-id programs gain nothing"),
+        ("no-new-privileges", True, "no rights from set-user-id programs"),
         ("landlock", True, "ABI 7: files, TCP, signals and abstract sockets"),
         ("seccomp", True, "allow-list for x86_64"),
         ("rlimits", True, "512 processes, 1024 open files, no core dumps"),
@@ -50,7 +50,7 @@ def test_strict_as_a_user_has_every_layer() -> None:
         (
             "user-quotas",
             False,
-            "shared with this user's programs: pages of pipes, descriptors under way in sockets, "
+            "shared with this user's programs: pages of pipes, descriptors in flight in sockets, "
             "epoll watches",
         ),
     ]
@@ -59,7 +59,7 @@ def test_strict_as_a_user_has_every_layer() -> None:
 def test_root_becomes_somebody_else_first() -> None:
     """The first layer as root; memory by control group where there is one."""
     made = layers(STRICT, replace(USER, root=True, memory="cgroup-v1"))
-    assert made[0] == ("unprivileged-user", True, "a user id that owns and runs nothing")
+    assert made[0] == ("unprivileged-user", True, "a user id without files and processes")
     assert made[-2:] == [
         ("memory", True, "1024 MiB, counted by the kernel (cgroup v1); not counted: file locks"),
         ("user-quotas", True, "its own: no other program runs as this user"),
@@ -84,7 +84,7 @@ def test_weaker_profile_lists_what_it_goes_without() -> None:
     assert made[:3] == [
         ("pid-namespace", False, f"{why}: processes of the host are visible"),
         ("mount-namespace", False, f"{why}: names and sizes of the host's files are visible"),
-        ("network", True, "no socket can be made but connected local pairs"),
+        ("network", True, "only connected local socket pairs"),
     ]
     assert made[-1] == ("scratch", True, "64 MiB, measured by the jail's init")
 

@@ -12,6 +12,7 @@ import pytest
 from envhub_worker.cli import health
 from envhub_worker.lockdown import surroundings
 from envhub_worker.protocol.messages.surroundings import Surroundings
+from envhub_worker.protocol.runtime import OWN, Runtime
 
 
 def layers(*names: str) -> list[dict[str, object]]:
@@ -83,9 +84,20 @@ def test_the_network_is_what_the_kernel_lists() -> None:
 
 def test_the_announcement_is_one_line_of_json() -> None:
     """The client reads one line and no more, and finds every field in it."""
-    said = surroundings.announcement()
+    said = surroundings.announcement(surroundings.surroundings(), server_key="00")
     assert "\n" not in said
-    assert set(json.loads(said)) == {"envhub-worker", *vars(Surroundings.read(json.loads(said)))}
+    found = vars(Surroundings.read(json.loads(said)))
+    assert set(json.loads(said)) == {"envhub-worker", "server_key", *found}
+
+
+def test_a_derived_image_brings_the_interpreter_of_its_jails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of servers for clients on other hosts, too, who cannot name one; else it is the server's."""
+    monkeypatch.setattr(surroundings, "ENVIRONMENT", tmp_path / "python")
+    assert surroundings.own_runtime() == OWN
+    (tmp_path / "python").touch()
+    assert surroundings.own_runtime() == Runtime(str(tmp_path / "python"))
 
 
 @pytest.mark.parametrize(("greeting", "healthy"), [(b"\xff", True), (b"H", False), (b"", False)])

@@ -181,6 +181,6 @@ def test_what_every_jail_imports_is_named_where_it_is_missing(
         cell = new_cell(spawner, make_snapshot(folder), confinement)
         cell.start()
         assert cell.wait_for(RunnerExited).code == 1
-        cell.wait_for_output(b"make the environment anew with these")
+        cell.wait_for_output(b"make the environment again with these")
     assert runtime.packages.encode() in cell.output
     assert b"Traceback" not in cell.output

@@ -7,7 +7,7 @@ import struct
 
 import pytest
 
-from envhub_worker.protocol.shared_memory import SEQUENCE
+from envhub_worker.protocol.shared_memory.words import SEQUENCE
 from envhub_worker.supervisor import idle_timer
 from envhub_worker.supervisor.idle_timer import IdleTimer
 

@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+import socket
 from typing import Any
 
+import pytest
+
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.limits import DEFAULT_LIMITS
+from envhub_worker.protocol.shared_memory import words
 from envhub_worker.spawn.jail import CallDenied, RunnerExited
+from envhub_worker.spawn.spawner import JailExited
 from envhub_worker.supervisor.jail_events import JailEvents
-from envhub_worker.supervisor.records import JailRecord, whole_jail
+from envhub_worker.supervisor.records import JailRecord, Pending, whole_jail
+from envhub_worker.supervisor.runner_stream import RunnerLink
+from envhub_worker.supervisor.served_slabs import ServedSlabs
 from envhub_worker.supervisor.witness import Witness
 
 
@@ -74,3 +83,34 @@ def test_a_jail_that_cannot_be_heard_any_more_ends_alone() -> None:
         assert entry.death is not None
     finally:
         events.close()
+
+
+@pytest.mark.parametrize("stepped", [True, False])
+def test_who_waits_for_a_jail_that_another_closes_hears_of_it(stepped: bool) -> None:
+    """A thread that waits for a step, which the server takes or the runner's stream does."""
+    jail: Any = _Jail()
+    silent: Any = _Silent()
+    entry = JailRecord(7, "one", b"", jail, (), silent)
+    said: list[tuple[Any, m.Message]] = []
+    events = JailEvents(
+        silent, lambda asker, reply, *_: said.append((asker, reply)), {7: entry}, silent, Witness()
+    )
+    ours, theirs = socket.socketpair()
+    link = entry.links[1] = RunnerLink(ours, DEFAULT_LIMITS)
+    pending: Any = Pending("who steps", "step", [None])  # type: ignore[arg-type]
+    try:
+        if stepped:
+            size = words.HEADER_BYTES + words.INFO_BYTES
+            events.share(link, ServedSlabs(0, size, 64))
+            events.step(entry, link, bytes((words.DTYPES - words.SPIN) * 8), (pending, 0))
+        else:
+            link.pending[1] = pending, 0
+        entry.closing.append("who closes")  # type: ignore[arg-type]
+        events.jail_gone(JailExited(jail, 0, None))
+        assert [asker for asker, _ in said] == ["who steps", "who closes"]
+        death = said[0][1]
+        assert isinstance(death, m.Death)
+        assert (death.operation, death.detail) == ("step", "the jail was closed")
+    finally:
+        events.close()
+        theirs.close()

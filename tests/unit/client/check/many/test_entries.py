@@ -45,8 +45,8 @@ def test_no_login_is_told() -> None:
     ("text", "says"),
     [
         ("org/repo\nrepo\n", "list.txt:2: .*owner is missing"),
-        ("org/repo\n\norg/repo@main\n", "list.txt:3: .* line 1 already"),
-        ("https://huggingface.co/org/repo\norg/repo", "list.txt:2: .* line 1 already"),
+        ("org/repo\n\norg/repo@main\n", "list.txt:3: .* already in line 1"),
+        ("https://huggingface.co/org/repo\norg/repo", "list.txt:2: .* already in line 1"),
         ("./nowhere-to-be-found", "list.txt:1: .*no such folder"),
         ("../../etc/\x1b[2J", "list.txt:1: .*control characters"),
         ("org/../../etc", "list.txt:1: "),
@@ -54,11 +54,11 @@ def test_no_login_is_told() -> None:
         ("org/" + "x" * 5_000, "list.txt:1: "),
         (b"org/repo\n\xff\n", "list.txt:2: .*UTF-8"),
         ("org/repo\rrepo\r", "list.txt:2: .*owner is missing"),
-        ("org/repo # ours", "list.txt:1: .*a comment has a line of its own"),
-        ("./:../env.py", "list.txt:1: .*outside of its folder"),
-        ("./:sub/../../env.py", "list.txt:1: .*outside of its folder"),
-        ("./:/etc/env.py", "list.txt:1: .*outside of its folder"),
-        ("# nothing\n", "no reference"),
+        ("org/repo # ours", "list.txt:1: .*put a comment on its own line"),
+        ("./:../env.py", "list.txt:1: .*outside its folder"),
+        ("./:sub/../../env.py", "list.txt:1: .*outside its folder"),
+        ("./:/etc/env.py", "list.txt:1: .*outside its folder"),
+        ("# nothing\n", "has no reference"),
         ("#" * 2_000_000, "larger than"),
         ("\n".join(f"a/r{number}" for number in range(2_001)), "more than 2000"),
     ],
@@ -84,7 +84,7 @@ def test_the_same_folder_by_another_way_is_told(tmp_path: Path) -> None:
     """By a link, or from elsewhere."""
     (tmp_path / "env").mkdir()
     (tmp_path / "link").symlink_to(tmp_path / "env")
-    with pytest.raises(HubReferenceError, match=r":2: .* line 1 already"):
+    with pytest.raises(HubReferenceError, match=r":2: .* already in line 1"):
         read(f"{tmp_path}/env\n{tmp_path}/x/../link\n")
 
 

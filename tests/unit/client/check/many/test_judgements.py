@@ -106,7 +106,7 @@ def of_group(process: psutil.Process, group: int) -> bool:
 def test_what_cannot_be_started_is_told(tmp_path: Path) -> None:
     """In words of its own: the folder of results is not at fault."""
     found = judgements(["x"], lambda *_: [str(tmp_path / "nothing")], folder=tmp_path, **_HOW)
-    with pytest.raises(WorkerStartupError, match="no judgement can be started: No such file"):
+    with pytest.raises(WorkerStartupError, match="no check can be started: No such file"):
         next(found)
 
 

@@ -176,7 +176,7 @@ def test_one_run_has_a_folder(folder: Path) -> None:
 def test_a_folder_with_other_things_is_refused(tmp_path: Path) -> None:
     """Such as a project's, whose index.html would be overwritten."""
     (tmp_path / "index.html").write_text("mine")
-    with pytest.raises(FolderError, match="other things"), Results(tmp_path, "").held():
+    with pytest.raises(FolderError, match="other files"), Results(tmp_path, "").held():
         pass
     assert [path.name for path in tmp_path.iterdir()] == ["index.html"]
 

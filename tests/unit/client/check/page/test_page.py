@@ -11,7 +11,7 @@ import pytest
 from envhub_sandbox.check.findings import Report
 from envhub_sandbox.check.page.page import page
 from envhub_sandbox.check.play.plays import Film, Play
-from envhub_sandbox.check.play.video import png
+from envhub_sandbox.vector.pictures import png
 from envhub_worker.protocol.text import printable
 from tests.support.output.pages import FRAME, HOSTILE, Page, report_of
 

@@ -21,7 +21,7 @@ FRAME = np.zeros((4, 6, 3), np.uint8)
         ("rgb_array_list", [[FRAME], ()], ""),
         ("ansi", ("a", ""), ""),
         ("human", None, ""),
-        ("rgb_array", FRAME, r"uint8 \(4, 6, 3\), and nothing for each"),
+        ("rgb_array", FRAME, r"uint8 \(4, 6, 3\), not one result for each"),
         ("rgb_array", (FRAME, FRAME.astype(float)), "sub-environment 1 gave float64"),
         ("rgb_array", (FRAME[:0], FRAME), "sub-environment 0"),
         ("rgb_array_list", [[FRAME], FRAME], "sub-environment 1"),

@@ -37,15 +37,15 @@ def test_nothing_is_said_of_what_it_can_play() -> None:
 @pytest.mark.parametrize(
     ("env", "lacking"),
     [
-        (vector(VECTOR), "a mapping with agent_pos, environment_state or pixels to observe, not a"),
+        (vector(VECTOR), "observations with agent_pos, environment_state or pixels, not a"),
         (vector(spaces.Dict({"image": VECTOR})), "not a Dict of image"),
-        (vector(actions=spaces.Discrete(3)), r"a vector \(Box\) for its action, not Discrete\(3\)"),
+        (vector(actions=spaces.Discrete(3)), r"a vector \(Box\) as action, not Discrete\(3\)"),
         (vector(actions=spaces.Box(0, 1, (2, 2))), r"not a Box of shape \(2, 2\)"),
         (vector(limited=False), "_max_episode_steps"),
     ],
 )
 def test_what_it_lacks_is_one_text(env: Any, lacking: str) -> None:
-    """It names who can play it instead."""
+    """It names all that is missing."""
     [text] = lerobot_lacks(env)
-    assert text.startswith("loops of Gymnasium's vector environments play it; LeRobot needs ")
+    assert text.startswith("LeRobot cannot evaluate it, which needs ")
     assert re.search(lacking, text)

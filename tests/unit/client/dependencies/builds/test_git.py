@@ -70,7 +70,7 @@ def test_a_full_commit_is_not_asked_for() -> None:
 @pytest.mark.parametrize("revision", ["v2", "1234567", "main~1"])
 def test_what_is_not_there(url: str, revision: str) -> None:
     """The error says what to write."""
-    with pytest.raises((IndexUnavailableError, RequirementError), match=r"40 digits|no commit"):
+    with pytest.raises((IndexUnavailableError, RequirementError), match=r"40 digits|not a commit"):
         git.resolve(url, revision)
 
 
@@ -97,7 +97,7 @@ def test_a_name_that_is_an_option(url: str, revision: str) -> None:
 )
 def test_only_https_without_a_login(url: str, target: Path) -> None:
     """Nothing else reaches git."""
-    with pytest.raises(RequirementError, match="no address"):
+    with pytest.raises(RequirementError, match="not a supported address"):
         git.check_out(url, "a" * 40, target, print)
 
 

@@ -71,7 +71,7 @@ def test_an_interpreter_of_its_kind_fits() -> None:
         (replace(NEWER, libc=""), "glibc unknown"),
         (replace(NEWER, machine="s390x"), "s390x"),
         (replace(NEWER, implementation="pypy"), "cannot be used"),
-        (replace(NEWER, version="3.99.0"), "which has none"),
+        (replace(NEWER, version="3.99.0"), "which does not have it"),
     ],
 )
 def test_one_of_another_kind_does_not(theirs: interpreters.Interpreter, said: str) -> None:

@@ -14,9 +14,10 @@ import pytest
 
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerStartupError
 from envhub_sandbox.sandboxes.docker import attestation, engines, run_arguments, seccomp_profile
+from envhub_sandbox.sandboxes.docker.container import ContainerServer
 from envhub_sandbox.sandboxes.docker.engines import Engine
 from envhub_sandbox.sandboxes.docker.run_arguments import Container
-from envhub_sandbox.sandboxes.docker.sandbox import ContainerServer, DockerSandbox
+from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
 from envhub_sandbox.settings.policy import Limits, Policy
 from envhub_worker.lockdown.seccomp import policy as seccomp_policy
 from envhub_worker.protocol.messages.surroundings import Surroundings
@@ -227,7 +228,7 @@ def test_a_jail_that_nothing_parts_from_the_server_is_refused(
 )
 def test_an_announcement_that_is_none_is_refused(line: bytes) -> None:
     """Another program, or another version."""
-    with pytest.raises(WorkerStartupError, match="build the image"):
+    with pytest.raises(WorkerStartupError, match="build it again"):
         attestation.parse(line)
 
 
@@ -301,7 +302,7 @@ def test_what_is_no_name_of_an_image_reaches_no_engine(
     """It would be an option, or a line of a recipe; a name is asked for as it stands."""
     asked = list[str]()
     monkeypatch.setattr(Engine, "run", lambda _, *words: asked.extend(words) or "sha256:1\n")
-    with pytest.raises(PolicyError, match="no name of an image"):
+    with pytest.raises(PolicyError, match="not the name of an image"):
         engines.find_image(DOCKER, image)
     assert asked == []
     assert engines.find_image(DOCKER, "reg.example:5000/a/b_c@sha256:0") == "sha256:1"

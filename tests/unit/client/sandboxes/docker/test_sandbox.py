@@ -12,8 +12,9 @@ from typing import Any, cast
 import pytest
 
 from envhub_sandbox.errors import EnvHubError
+from envhub_sandbox.sandboxes.docker.container import RepositoryContainer
 from envhub_sandbox.sandboxes.docker.engines import Engine
-from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox, RepositoryContainer
+from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
 from envhub_sandbox.settings.policy import Policy
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_worker.protocol import messages as m
@@ -76,7 +77,11 @@ def test_an_order_names_assets_as_they_lie_inside(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("what", "said"),
-    [("fails", "no such runtime"), ("shares nothing", "no socket"), ("is open", "container-files")],
+    [
+        ("fails", "no such runtime"),
+        ("shares nothing", "whose socket this process cannot use"),
+        ("is open", "container-files"),
+    ],
 )
 def test_a_start_that_fails_leaves_nothing(
     tmp_path: Path, what: str, said: str, monkeypatch: pytest.MonkeyPatch

@@ -83,6 +83,7 @@ def launcher(client: _Client, place: _Place) -> Launcher:
     repository = session_over(FakeLane()).repository
     repository.policy = type(repository.policy)(record_denials=True)
     repository.runtime = cast("Any", SimpleNamespace(python="", packages=""))
+    repository.places = []
     return Launcher(repository, place, Path())
 
 

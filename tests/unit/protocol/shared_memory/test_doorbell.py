@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from envhub_sandbox.transport.shared_memory.doorbell import OwnBell, RunnerBell, Watch
+from envhub_worker.protocol.shared_memory.doorbell import OwnBell, RunnerBell, Watch
 
 
 @pytest.fixture

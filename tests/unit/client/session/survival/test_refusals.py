@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from envhub_sandbox.errors import WorkerDiedError, WorkerError, WorkerTimeoutError
-from envhub_sandbox.session.refusals import refusal
+from envhub_sandbox.session.survival.refusals import refusal
 from envhub_worker.protocol.lifecycle import State
 
 

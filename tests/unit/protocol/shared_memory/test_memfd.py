@@ -7,7 +7,7 @@ import os
 
 import pytest
 
-from envhub_sandbox.transport.shared_memory.memfd import SEAL_FUTURE_WRITE, sealed_memfd
+from envhub_worker.protocol.shared_memory.memfd import SEAL_FUTURE_WRITE, sealed_memfd
 
 
 @pytest.mark.parametrize("size", [0, 1 << 20])

@@ -1,0 +1,180 @@
+"""One server of a fleet is hostile: its answers are refused, and no other's rows change.
+
+It may end what it serves, which costs the caller an error. The rows of the others are as they were,
+and their workers go on.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from envhub_sandbox import make_env
+from envhub_sandbox.errors import EnvHubError, LoadError, RemoteProtocolError
+from envhub_sandbox.transport.results import Results
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.manifest.manifest import Manifest, encode_env, encode_manifest
+from tests.attacks.client.lies import refuses, relayed
+from tests.attacks.client.lying_server import (
+    ACTION,
+    NUM_ENVS,
+    OBSERVATION,
+    LyingSandbox,
+    LyingServer,
+    env_manifest,
+    lying,
+    step_done,
+)
+from tests.support import inside, wire
+
+pytestmark = pytest.mark.short
+
+ALL = 2 * NUM_ENVS
+"""Rows of the fleet: the first are the liar's, the others those of an honest server."""
+HONEST = slice(NUM_ENVS, ALL)
+ACTIONS = [0] * ALL
+TRUE = {"observation": np.full((NUM_ENVS, 3), 0.5, np.float32), "rewards": np.full(NUM_ENVS, 7.0)}
+INFO = {"a": np.arange(NUM_ENVS), "_a": np.ones(NUM_ENVS, bool)}
+
+
+@pytest.fixture
+def honest() -> Iterator[LyingServer]:
+    """A server that says what is true."""
+    with lying() as server:
+        yield server
+
+
+@contextmanager
+def fleet(liar: LyingServer, honest: LyingServer, folder: str, **policy: Any) -> Iterator[Any]:
+    """An environment whose first rows are the liar's, after a reset."""
+    whole = {"sync": True, "type_name": "gymnasium.vector.SyncVectorEnv"}
+    described = wire.env_manifest(OBSERVATION, ACTION, ALL, **whole)
+    for server in (liar, honest):
+        manifest = encode_manifest(Manifest(envs=(described,), lazy=True))
+        server.lies[m.Load] = relayed(m.LoadDone(manifest))
+        server.lies[m.LoadTask] = relayed(m.Value((ALL, True)))
+        server.lies[m.Step] = relayed(step_done(**TRUE, info=INFO))
+        server.lies[m.Call] = relayed(m.Value(("true",) * NUM_ENVS))
+    options: dict[str, Any] = {
+        "timeouts": {"startup_s": 20.0, "step_s": 20.0, "reset_s": 20.0, "close_s": 1.0},
+        "policy": policy,
+    }
+    places = [LyingSandbox(liar), LyingSandbox(honest)]
+    with make_env(folder, n_envs=ALL, sandbox=places, **options) as suites:
+        suites.env.reset()
+        yield suites.env
+
+
+def states(env: Any) -> list[str]:
+    """Those of the liar's worker and of the honest one's."""
+    return [part.lifecycle.state.name for part in inside.parts(env)]
+
+
+def _zeros(*shape: int, dtype: Any = np.float32) -> Any:
+    return np.zeros(shape, dtype)
+
+
+LIES: dict[str, dict[str, Any]] = {
+    "observations of all rows": {"observation": _zeros(ALL, 3)},
+    "observations of one row": {"observation": _zeros(1, 3)},
+    "observations of another space": {"observation": _zeros(NUM_ENVS, 4)},
+    "observations of another dtype": {"observation": _zeros(NUM_ENVS, 3, dtype=np.float64)},
+    "rewards of all rows": {"rewards": np.zeros(ALL)},
+    "several rewards for each row": {"rewards": np.zeros((NUM_ENVS, 3))},
+    "the ends of all rows": {"terminations": np.ones(ALL, bool)},
+    "no truncations": {"truncations": np.ones(0, bool)},
+}
+
+
+def test_what_is_not_checked_changes_the_others_rows(liar: LyingServer) -> None:
+    """The control: the same lie, joined as it comes, is taken for rows that are not its own."""
+    described = wire.env_manifest(OBSERVATION, ACTION, ALL, sync=True)
+    joins = Results(described, [(0, NUM_ENVS), (NUM_ENVS, ALL)])
+    lie = step_done(**(TRUE | LIES["observations of all rows"]))
+    true = step_done(**TRUE)
+    parts = [(x.observation, x.rewards, x.terminations, x.truncations, {}) for x in (lie, true)]
+    observations = joins.joined_steps(parts)[0]
+    assert not np.array_equal(observations[HONEST], TRUE["observation"])
+
+
+@pytest.mark.parametrize("what", LIES)
+def test_rows_that_are_not_its_own_are_refused(
+    liar: LyingServer, honest: LyingServer, folder: str, what: str
+) -> None:
+    """The error names the liar's rows; the honest worker goes on where it was."""
+    with fleet(liar, honest, folder, restart="on_reset") as env:
+        before = liar.lies[m.Step]
+        liar.lies[m.Step] = relayed(step_done(**(TRUE | LIES[what])))
+        error = refuses(lambda: env.step(ACTIONS))
+        assert isinstance(error, RemoteProtocolError)
+        assert f"sub-environments 0 to {NUM_ENVS - 1} of {ALL}" in str(error)
+        assert states(env) == ["DEAD", "READY"]
+        liar.lies[m.Step] = before
+        opened = sum(isinstance(one, m.OpenJail) for one in honest.asked)
+        env.reset()
+        observations, rewards, *_ = env.step(ACTIONS)
+        assert np.array_equal(observations[HONEST], TRUE["observation"])
+        assert rewards[HONEST].tolist() == [7.0] * NUM_ENVS
+        assert sum(isinstance(one, m.OpenJail) for one in honest.asked) == opened
+
+
+def test_values_for_others_are_refused(liar: LyingServer, honest: LyingServer, folder: str) -> None:
+    """One value each, and no more: else all that follow would be another's."""
+    with fleet(liar, honest, folder) as env:
+        assert env.call("x", 1) == ("true",) * ALL  # the control
+        liar.lies[m.Call] = relayed(m.Value(("lie",) * ALL))
+        assert isinstance(refuses(lambda: env.call("x", 1)), RemoteProtocolError)
+        assert states(env) == ["DEAD", "READY"]
+
+
+OWN: dict[str, Any] = {
+    "of a row of the other's": ((NUM_ENVS, {"a": -1}), (0, {"a": -1})),
+    "of a row before the first": ((-1, {"a": -1}),),
+    "of none": 3,
+    "that are no mapping": ((0, [1]),),
+}
+
+
+@pytest.mark.parametrize("what", OWN)
+def test_infos_of_others_are_refused(
+    liar: LyingServer, honest: LyingServer, folder: str, what: str
+) -> None:
+    """Where infos do not fit together they are asked for one by one, and each is of a row."""
+    with fleet(liar, honest, folder) as env:
+        honest.lies[m.FetchInfosApart] = relayed(m.Value(((0, {"a": 1}), (1, {"a": 2}))))
+        liar.lies[m.Step] = relayed(step_done(**TRUE, info={"a": np.zeros(ALL)}))
+        liar.lies[m.FetchInfosApart] = relayed(m.Value(((0, {"a": 8}), (1, {"a": 9}))))
+        assert env.step(ACTIONS)[4]["a"].tolist() == [8, 9, 1, 2]  # the control
+        liar.lies[m.FetchInfosApart] = relayed(m.Value(OWN[what]))
+        error = refuses(lambda: env.step(ACTIONS))
+        assert isinstance(error, RemoteProtocolError)
+        assert states(env) == ["DEAD", "READY"]
+
+
+def test_another_space_is_refused_before_the_first_step(
+    liar: LyingServer, honest: LyingServer, folder: str
+) -> None:
+    """All workers have the spaces that the first one has described, or none is used."""
+    other = spaces.Box(-1, 1, (4,), np.float32)
+    built = env_manifest(single_observation_space=other)
+    honest.lies[m.Build] = relayed(m.BuildDone(encode_env(built)))
+    with pytest.raises(LoadError, match="another environment"), fleet(liar, honest, folder):
+        pass
+    del honest.lies[m.Build]
+    with fleet(liar, honest, folder):  # the control
+        pass
+
+
+def test_more_rows_are_refused_before_the_first_step(
+    liar: LyingServer, honest: LyingServer, folder: str
+) -> None:
+    """A worker that has built all of them has not built its own."""
+    built = wire.env_manifest(OBSERVATION, ACTION, ALL, sync=True)
+    liar.lies[m.Build] = relayed(m.BuildDone(encode_env(built)))
+    with pytest.raises(EnvHubError), fleet(liar, honest, folder):
+        pass

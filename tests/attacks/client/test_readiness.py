@@ -1,0 +1,262 @@
+"""A hostile worker among others: ready always, or never, or twice. The others' results come.
+
+The jail of one sub-environment replaces our code in its process. Control: a step, which waits for
+all, is held up by the same worker, so it does what it is meant to.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from envhub_sandbox import make_env
+from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerError, WorkerTimeoutError
+from envhub_worker.protocol.spaces import batches
+from tests.attacks.harness import TIMEOUTS, Arena
+from tests.attacks.repositories import write_environment
+from tests.remote.listening import listening
+from tests.support.compare import assert_same
+
+FAMILY = "The client, from inside a jail"
+HOSTILE, COUNT, STEPS = 1, 3, 40
+PATIENCE_S = 6.0
+
+_ENV = """
+import os, threading, time
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.shared_memory import slabs
+from envhub_worker.runner import lane, runner
+
+MODE = {mode!r}
+BY_MESSAGE = ("twice by message", "never by message", "unlike")  # no slabs, so that steps are these
+LARGE = "x" * 300_000
+
+class Counting(Plain):
+    def __init__(self, index):
+        self.index, self.count = index, 0
+        if index == {hostile}:
+            become_hostile()
+
+    def reset(self, *, seed=None, options=None):
+        self.count = 0
+        return super().reset(seed=seed)
+
+    def step(self, action):
+        self.count += 1
+        seen = np.full(2, self.count * (self.index + 1) / 1e6, np.float32)
+        return seen, float(action), False, False, {{"count": self.count}}
+
+def make_env(n_envs=1, use_async_envs=False):
+    return VECTOR([lambda i=i: Counting(i) for i in range(n_envs)])
+
+def become_hostile():
+    honest_serve, honest_answer = lane.Lane.serve, runner.Runner.answer
+    threads = []
+
+    def serve(self):
+        stepping = not self._asked[slabs.MESSAGE]
+        if self._asked[slabs.SEQUENCE] == self._served or not stepping:
+            return honest_serve(self)
+        told, asked = self._told, self._asked
+        if MODE == "never":
+            time.sleep(600)
+        if MODE == "always" and not threads:
+            def keep_up():
+                while True:
+                    told[slabs.OUTCOME], told[slabs.LENGTH] = slabs.DONE, 0
+                    told[slabs.SEQUENCE] = asked[slabs.SEQUENCE]
+            threads.append(threading.Thread(target=keep_up, daemon=True))
+            threads[0].start()
+        if MODE in ("always", "rings"):
+            while True:
+                try:
+                    os.write(self._client_bell, (1).to_bytes(8, "little"))
+                except OSError:
+                    os.read(self._client_bell, 8)
+        if MODE == "twice":
+            self._served = asked[slabs.SEQUENCE]
+            told[slabs.OUTCOME], told[slabs.LENGTH] = slabs.DONE, 0
+            told[slabs.SEQUENCE] = self._served + 1
+            os.write(self._client_bell, (2).to_bytes(8, "little"))
+            return True
+        if MODE in ("elsewhere", "whole", "impossible"):
+            self._served = asked[slabs.SEQUENCE]
+            kind = 77 if MODE == "impossible" else slabs.FETCH
+            told[slabs.OUTCOME], told[slabs.LENGTH] = kind, 0
+            told[slabs.SEQUENCE] = self._served
+            os.write(self._client_bell, (1).to_bytes(8, "little"))
+            return True
+        return honest_serve(self)
+
+    def answer(self, packet):
+        request = m.unpack(packet.frames)
+        if isinstance(request, m.FetchInfos) and MODE == "elsewhere":
+            time.sleep(600)
+        if isinstance(request, m.FetchInfos) and MODE == "whole":
+            nothing = np.zeros(1, bool)
+            return m.pack(m.StepDone("lie", np.full(9, 7.0), nothing, nothing, {{}}))
+        if isinstance(request, m.Attach) and MODE in BY_MESSAGE:
+            list(map(os.close, self.descriptors))
+            return m.pack(m.Value(False))
+        if not isinstance(request, m.Step):
+            return honest_answer(self, packet)
+        if MODE == "twice by message":
+            frames = honest_answer(self, packet)
+            stream = next(fd for fd in range(3, 64) if is_stream(fd))
+            os.write(stream, b"".join(map(bytes, runner.pack_packet(packet.request_id, frames))))
+            return frames
+        if MODE == "unlike":
+            nothing = np.zeros(1, bool)
+            infos = {{"count": np.zeros((1, 50_000)), "_count": np.ones((1, 3)), "x": {{}}}}
+            seen = np.zeros((1, 2), np.float32)
+            return m.pack(m.StepDone(seen, np.zeros((1, 9)), nothing, nothing, infos))
+        time.sleep(600)
+
+    def is_stream(fd):
+        import stat
+        try:
+            return stat.S_ISSOCK(os.fstat(fd).st_mode)
+        except OSError:
+            return False
+
+    lane.Lane.serve, runner.Runner.answer = serve, answer
+"""
+
+
+def liar(folder: Path, mode: str) -> str:
+    """A repository of which one sub-environment is hostile."""
+    return str(write_environment(folder / mode, _ENV.format(mode=mode, hostile=HOSTILE)))
+
+
+class Among:
+    """An environment with a hostile worker, once it is at its step."""
+
+    def __init__(self, env: Any) -> None:
+        self.env = env
+        env.reset(seed=1)
+
+    def others_go_on(self) -> list[Any]:
+        """Steps of the honest ones, for as long as they need; what came of the hostile one."""
+        env = self.env
+        env.send(np.zeros(COUNT, np.int64))
+        of_it: list[Any] = []
+        counts = dict.fromkeys((0, 2), 0)
+        while min(counts.values()) < STEPS:
+            try:
+                received = env.recv(1)
+            except EnvHubError as error:
+                of_it.append(_of_the_hostile(error))
+                continue
+            again = []
+            for place, index in enumerate(received.env_ids.tolist()):
+                if index == HOSTILE:
+                    of_it.append(received.infos)
+                    continue
+                counts[index] += 1
+                again.append(index)
+                seen = np.full(2, counts[index] * (index + 1) / 1e6, np.float32)
+                assert_same(seen, received.observations[place], "observation")
+                assert received.infos["count"][place] == counts[index]
+            if again:
+                env.send(np.full(len(again), 3), again)
+        return of_it
+
+
+def _of_the_hostile(error: EnvHubError) -> EnvHubError:
+    assert error.env_ids == (HOSTILE,)
+    return error
+
+
+@contextmanager
+def among(arena: Arena, folder: str, lane: str, **options: Any) -> Iterator[Any]:
+    """Three sub-environments, each with a worker of its own; the way to them may be TCP."""
+    given = {"min_ready": 1, "policy": {"profile": arena.profile}, **options}
+    with ExitStack() as stack:
+        if lane == "tcp":
+            with_keys = stack.enter_context(listening(Path(folder).parent / "server"))
+            given["sandbox"] = with_keys.sandbox()
+        else:
+            given["lane"] = lane
+        timeouts = {**TIMEOUTS, "step_s": PATIENCE_S}
+        yield stack.enter_context(make_env(folder, COUNT, timeouts=timeouts, **given))
+
+
+NEVER = [
+    *(("auto", mode) for mode in ("never", "rings", "elsewhere", "twice")),
+    *(("frames", mode) for mode in ("never", "rings", "elsewhere", "never by message")),
+    ("tcp", "elsewhere"),
+]
+
+
+@pytest.mark.short("strict")
+@pytest.mark.parametrize(("lane", "mode"), NEVER)
+def test_who_is_never_ready_holds_nobody_up(arena: Arena, home: Path, lane: str, mode: str) -> None:
+    """The others' results come while it is waited for; then it alone is late."""
+    folder = liar(home, mode)
+    with among(arena, folder, lane) as suites:
+        found = Among(suites.env)
+        late = found.others_go_on()  # unless they took longer than a step may
+        if not late:
+            with pytest.raises(WorkerTimeoutError) as caught:
+                found.env.recv(COUNT)
+            late = [_of_the_hostile(caught.value)]
+        assert [type(one) for one in late] == [WorkerTimeoutError]
+    with among(arena, folder, lane, min_ready=None, num_workers=COUNT) as suites:
+        suites.env.reset(seed=1)
+        with pytest.raises(WorkerTimeoutError):
+            suites.env.step(np.zeros(COUNT, np.int64))  # the control: it holds up a step of all
+
+
+def test_who_is_always_ready_has_its_own_results_alone(arena: Arena, tmp_path: Path) -> None:
+    """They are its lie; the others' are theirs, and come in time."""
+    with among(arena, liar(tmp_path, "always"), "auto") as suites:
+        found = Among(suites.env)
+        of_it = found.others_go_on()
+        while not of_it:
+            received = found.env.recv(1)
+            of_it += [received.infos] if HOSTILE in received.env_ids else []
+        assert "count" not in of_it[0], "the control: it has answered a step that it never made"
+
+
+BROKEN = [
+    ("frames", "twice by message"),
+    ("frames", "unlike"),
+    *((lane, mode) for lane in ("auto", "frames") for mode in ("impossible", "whole")),
+]
+
+
+@pytest.mark.short("strict")
+@pytest.mark.parametrize(("lane", "mode"), BROKEN)
+def test_who_breaks_a_rule_is_given_up_alone(
+    arena: Arena, tmp_path: Path, lane: str, mode: str
+) -> None:
+    """By the client or the server; the others never notice."""
+    with among(arena, liar(tmp_path, mode), lane) as suites:
+        found = Among(suites.env)
+        errors = found.others_go_on()
+        deadline = time.monotonic() + 120
+        while not any(isinstance(one, EnvHubError) for one in errors):
+            assert time.monotonic() < deadline
+            try:
+                if HOSTILE in found.env.recv(1).env_ids:
+                    found.env.send(np.zeros(1, np.int64), [HOSTILE])
+            except EnvHubError as error:
+                errors.append(error)
+        assert errors[-1].env_ids == (HOSTILE,)
+        with pytest.raises(WorkerError) as refused:
+            found.env.send(np.zeros(1, np.int64), [HOSTILE])
+        assert isinstance(refused.value, WorkerDiedError)
+
+
+def test_the_lie_about_infos_would_break_a_batch() -> None:
+    """The control: joined with others' as they are, these raise."""
+    lie = {"count": np.zeros((1, 50_000)), "_count": np.ones((1, 3)), "x": {}}
+    honest = {"count": np.ones(1, np.int64), "_count": np.ones(1, np.bool_)}
+    with pytest.raises(batches.Misfit):
+        batches.join_infos([lie, honest], [1, 1])

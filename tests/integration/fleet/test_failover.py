@@ -1,0 +1,207 @@
+"""A server of a fleet goes: its rows come back elsewhere, or an error says which they are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from envhub_sandbox.errors import WorkerDiedError, WorkerTimeoutError
+from tests.integration.fleet.conftest import DIES, places
+from tests.remote.hosts import OtherHost, other_host
+from tests.remote.listening import Listening
+from tests.support import inside
+from tests.support.ports import lasting_port
+from tests.support.processes import eventually
+from tests.support.started import started
+
+STILL = np.zeros(6, np.int64)
+
+
+def _two(serve: Callable[..., Listening], **more: Any) -> tuple[Listening, Listening]:
+    return serve("stays", **more), serve("goes", **more)
+
+
+def _is_at(env: Any, server: Listening) -> np.ndarray:
+    """Which rows are on a server."""
+    found = np.zeros(env.num_envs, bool)
+    for worker in env.sandbox.stats()["workers"]:
+        found[slice(*worker["rows"])] = worker["place"] == server.endpoint
+    return found
+
+
+def test_its_rows_come_back_elsewhere(rows: Path, serve: Callable[..., Listening]) -> None:
+    """Truncated, and reset with seeds derived of theirs; the others' episodes go on."""
+    stays, goes = _two(serve)
+    sandbox = [stays.sandbox(), goes.sandbox()]
+    options: dict[str, Any] = {"n_envs": 6, "num_workers": 4, "policy": {"restart": "transparent"}}
+    with started(rows, sandbox=sandbox, seed=7, **options) as env:
+        env.set_attr("gain", [float(row) for row in range(6)])
+        env.step(STILL)
+        lost = _is_at(env, goes)
+        assert lost.sum() == 3
+        goes.process.kill()
+        observations, rewards, terminations, truncations, infos = env.step(STILL)
+        assert truncations.tolist() == lost.tolist()
+        assert not terminations.any()
+        assert infos["worker_restarted"].tolist() == lost.tolist()
+        assert infos["row"].tolist() == list(range(6))
+        assert observations[:, 0].tolist() == list(range(6))
+        assert observations[:, 1].tolist() == np.where(lost, 0, 2).tolist()
+        assert rewards.tolist() == np.where(lost, 0, range(6)).tolist()
+        assert set(places(env)) == {stays.endpoint}
+        env.step(STILL)  # in which the truncated rows are reset, as after any episode
+        observations, rewards, *_ = env.step(STILL)
+        assert observations[:, 1].tolist() == np.where(lost, 1, 4).tolist()
+        assert rewards.tolist() == list(range(6)), "attributes were set again"
+        numbers = env.sandbox.stats()
+        assert (numbers["deaths"], numbers["restarts"]) == (2, 2)
+    assert eventually(lambda: stays.jails() == 0)
+
+
+def test_what_follows_a_loss_can_be_had_again(rows: Path, serve: Callable[..., Listening]) -> None:
+    """The same seeds, actions and losses give the same observations, on whichever server."""
+    stays = serve("stays")
+    found = []
+    for name in ("first", "second"):
+        goes = serve(name)
+        sandbox = [stays.sandbox(), goes.sandbox()][:: 1 if name == "first" else -1]
+        with started(
+            rows, n_envs=2, sandbox=sandbox, seed=3, policy={"restart": "transparent"}
+        ) as env:
+            row = 0 if name == "first" else 1
+            assert _is_at(env, goes)[1 - row]
+            goes.process.kill()
+            env.step(STILL[:2])
+            found.append(env.step(STILL[:2])[0][1 - row, 2])
+    assert found[0] != found[1], "another row has another seed"
+
+
+def test_reset_has_them_elsewhere(rows: Path, serve: Callable[..., Listening]) -> None:
+    """``restart="on_reset"``: an error first, which names place and rows; then they are back."""
+    stays, goes = _two(serve)
+    options: dict[str, Any] = {"n_envs": 6, "num_workers": 2, "policy": {"restart": "on_reset"}}
+    with started(rows, sandbox=[stays.sandbox(), goes.sandbox()], **options) as env:
+        expected = env.reset(seed=5)[0]
+        goes.process.kill()
+        where = rf"\(sub-environments \d to \d of 6, on {goes.endpoint}\)"
+        with pytest.raises(WorkerDiedError, match=where):
+            env.step(STILL)
+        with pytest.raises(WorkerDiedError, match=rf"call reset\(\) first {where}"):
+            env.step(STILL)
+        assert np.array_equal(env.reset(seed=5)[0], expected)
+        assert places(env) == [stays.endpoint] * 2
+        env.step(STILL)
+
+
+def test_without_restarts_it_stays_dead(rows: Path, serve: Callable[..., Listening]) -> None:
+    """The text names the rows, the place and what to do; close() is quick and leaves nothing."""
+    stays, goes = _two(serve)
+    with started(rows, n_envs=6, sandbox=[stays.sandbox(), goes.sandbox()]) as env:
+        goes.process.kill()
+        with pytest.raises(WorkerDiedError, match=rf"was lost .*on {goes.endpoint}"):
+            env.step(STILL)
+        with pytest.raises(WorkerDiedError, match=r"make the environment again.*of 6, on tcp"):
+            env.reset()
+        assert inside.state(env).name == "DEAD"
+    assert eventually(lambda: stays.jails() == 0)
+
+
+def test_one_process_that_ends_takes_no_other_along(rows: Path, servers: list[Listening]) -> None:
+    """A row's process dies; its worker comes back on the same server, and no other begins anew."""
+    sandbox = [server.sandbox() for server in servers]
+    options: dict[str, Any] = {"n_envs": 6, "policy": {"restart": "transparent"}}
+    with started(rows, sandbox=sandbox, **options) as env:
+        before = places(env)
+        actions = STILL.copy()
+        actions[3] = DIES
+        *_, truncations, infos = env.step(actions)
+        assert truncations.tolist() == [False, False, True, True, False, False]
+        assert infos["worker_restarted"].tolist() == truncations.tolist()
+        assert places(env) == before
+        assert [one["restarts"] for one in env.sandbox.stats()["workers"]] == [0, 1, 0]
+        assert env.step(STILL)[0][:, 1].tolist() == [2, 2, 0, 0, 2, 2]
+
+
+def test_every_worker_is_waited_for_where_one_fails(rows: Path, servers: list[Listening]) -> None:
+    """The one that fails first is not the end of the step: no other owes an answer afterwards."""
+    sandbox = [server.sandbox() for server in servers]
+    options: dict[str, Any] = {"n_envs": 6, "policy": {"restart": "on_reset"}}
+    with started(rows, sandbox=sandbox, **options) as env:
+        actions = np.array([DIES, 0, 0, 0, 50, 50])
+        with pytest.raises(WorkerDiedError, match="sub-environments 0 to 1 of 6"):
+            env.step(actions)
+        states = [part.lifecycle.state.name for part in inside.parts(env)]
+        assert states == ["DEAD", "READY", "READY"]
+        expected = env.reset(seed=9)[0]
+        assert np.array_equal(env.reset(seed=9)[0], expected)
+        assert env.sandbox.stats()["stale_replies"] == 0
+
+
+def test_all_workers_share_one_timeout(rows: Path, servers: list[Listening]) -> None:
+    """Three that are late are no later than one; reset() catches up with them all."""
+    sandbox = [server.sandbox() for server in servers]
+    options: dict[str, Any] = {"n_envs": 6, "timeouts": {"step_s": 0.5}}
+    with started(rows, sandbox=sandbox, **options) as env:
+        expected = env.reset(seed=2)[0]
+        late = r"step has not finished after 0.5 s .*sub-environments \d to \d of 6, on tcp"
+        with pytest.raises(WorkerTimeoutError, match=late):
+            env.step(np.full(6, 60))
+        assert {part.lifecycle.state.name for part in inside.parts(env)} == {"LATE"}
+        with pytest.raises(WorkerTimeoutError, match="call reset"):
+            env.step(STILL)
+        assert np.array_equal(env.reset(seed=2)[0], expected)
+        assert env.step(STILL)[0][:, 1].tolist() == [1] * 6
+
+
+def test_a_server_that_comes_back_gets_workers_again(
+    rows: Path, serve: Callable[..., Listening]
+) -> None:
+    """At the same address, with the same key: the next workers that start go there, too."""
+    stays = serve("stays")
+    bind = f"tcp://127.0.0.1:{lasting_port()}"
+    goes = serve("goes", bind=bind)
+    sandbox = [stays.sandbox(), goes.sandbox()]
+    options: dict[str, Any] = {"n_envs": 2, "policy": {"restart": "on_reset"}}
+    with started(rows, sandbox=sandbox, **options) as env:
+        goes.process.kill()
+        goes.process.wait()
+        with pytest.raises(WorkerDiedError):
+            env.step(STILL[:2])
+        env.reset(seed=1)
+        assert places(env) == [stays.endpoint] * 2
+        serve("goes", bind=bind)
+        with started(rows, sandbox=sandbox, **options) as other:
+            assert sorted(places(other)) == sorted([stays.endpoint, goes.endpoint])
+
+
+@pytest.fixture
+def far() -> Iterator[OtherHost]:
+    """Another host."""
+    with other_host() as host:
+        yield host
+
+
+@pytest.mark.same_for("users")  # it needs root for a cable between namespaces
+def test_a_partition_moves_the_rows(
+    rows: Path, far: OtherHost, serve: Callable[..., Listening]
+) -> None:
+    """A cable is out: the heartbeat says so, and the rows come back here; there nothing remains."""
+    here = serve("here")
+    bind = f"tcp://{far.address}:5555"
+    there = serve("there", "--idle-s", "20", bind=bind, prefix=far.prefix)
+    sandbox = [here.sandbox(), there.sandbox(heartbeat_s=1.0)]
+    options: dict[str, Any] = {"n_envs": 6, "policy": {"restart": "transparent"}}
+    with started(rows, sandbox=sandbox, **options) as env:
+        lost = _is_at(env, there)
+        far.unplug()
+        observations, *_, truncations, _ = env.step(STILL)
+        assert truncations.tolist() == lost.tolist()
+        assert observations[:, 1].tolist() == np.where(lost, 0, 1).tolist()
+        assert set(places(env)) == {here.endpoint}
+        far.plug()
+        assert env.step(STILL)[0][:, 1].tolist() == np.where(lost, 0, 2).tolist()
+        assert eventually(lambda: there.jails() == 0), "the client names its jails no longer"

@@ -1,0 +1,277 @@
+"""Deaths, time-outs, Ctrl-C and ``close`` while workers are at what they were sent."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium.error import ClosedEnvironmentError, NoAsyncCallError
+
+from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerError, WorkerTimeoutError
+from envhub_sandbox.session import requests
+from envhub_sandbox.session.parts import in_flight, worker_queue
+from envhub_sandbox.transport import connection
+from envhub_sandbox.transport import lane as relay_lane
+from envhub_sandbox.transport.shared_memory import served_lane
+from envhub_worker.protocol.lifecycle import State
+from tests.support import inside
+from tests.support.in_process.interrupts import before_line
+from tests.support.objects.gates import DIE, Gates, ids, send
+from tests.support.processes import eventually
+
+pytestmark = [
+    pytest.mark.same_for("users"),
+    pytest.mark.parametrize("lane", ["auto", "frames"]),
+]
+
+
+@pytest.fixture
+def gates(tmp_path: Path, lane: str) -> Iterator[Gates]:
+    """Environments with a worker for each sub-environment."""
+    with ExitStack() as stack:
+        yield Gates(tmp_path, stack, lane=lane, min_ready=1)
+
+
+def kill(env: Any, worker: int) -> None:
+    """End the processes of one of its workers."""
+    part = inside.parts(env)[worker]
+    for pid in inside.part_pids(part):
+        os.kill(pid, signal.SIGKILL)
+
+
+def test_a_death_is_its_own(gates: Gates) -> None:
+    """The others go on, without a reset; who has died takes nothing more."""
+    env = gates.env(3)
+    send(env, 1, 2, 3)
+    kill(env, 1)
+    with pytest.raises(WorkerDiedError, match=r"\(sub-environment 1 of 3, on process\)") as caught:
+        env.recv(3)
+    assert caught.value.env_ids == (1,)
+    gates.open(1, 3)
+    assert ids(env.recv(2)) == [0, 2]
+    with pytest.raises(WorkerDiedError, match="cannot step: the worker process has died") as again:
+        send(env, 0, 0, 0)
+    assert again.value.env_ids == (1,)
+    send(env, 0, 4, ids=[0, 2])
+    assert ids(env.recv(1)) == [0]
+    gates.open(4)
+    assert ids(env.recv(3)) == [2]
+
+
+@pytest.mark.parametrize("of_itself", [True, False])
+def test_a_death_is_survived(gates: Gates, of_itself: bool) -> None:
+    """With ``restart="transparent"`` its rows are cut off, and say so; the others go on."""
+    env = gates.env(3, policy={"restart": "transparent"})
+    send(env, 1, 2, 3)
+    if of_itself:
+        gates.open(2)
+        env.recv(1)
+        send(env, 0, ids=[1], what=DIE)
+    else:
+        kill(env, 1)
+    received = env.recv(1)
+    assert ids(received) == [1]
+    assert received.truncations.tolist() == [True]
+    assert received.rewards.tolist() == [0.0]
+    assert received.infos["worker_restarted"].tolist() == [True]
+    for steps in (0, 1):  # the first is the autoreset
+        send(env, 0, ids=[1])
+        assert env.recv(1).observations[0, 0] == steps
+    gates.open(1, 3)
+    received = env.recv(3)
+    assert (ids(received), received.rewards.tolist()) == ([0, 2], [1.0, 3.0])
+    assert "worker_restarted" not in received.infos
+
+
+def test_a_worker_is_brought_back_alone(gates: Gates) -> None:
+    """With ``restart="on_reset"``, while the others are at their steps."""
+    env = gates.env(2, policy={"restart": "on_reset"})
+    send(env, 1, 2)
+    kill(env, 1)
+    with pytest.raises(WorkerDiedError):
+        env.recv(2)
+    env.send_reset([1], seed=50)
+    received = env.recv(1)
+    assert (ids(received), received.observations.tolist()) == ([1], [[0, 51]])
+    send(env, 0, ids=[1])
+    assert ids(env.recv(1)) == [1]
+    gates.open(1)
+    assert env.recv(2).observations.tolist() == [[1, 1]]
+
+
+def test_what_was_sent_ahead_goes_with_the_worker(gates: Gates) -> None:
+    """One error for all of it; nothing is owed any more."""
+    env = gates.env(2, policy={"restart": "on_reset"})
+    for _ in range(3):
+        send(env, 1, ids=[0])
+    kill(env, 0)
+    with pytest.raises(WorkerDiedError):
+        env.recv()
+    with pytest.raises(NoAsyncCallError):
+        env.recv()
+    env.send_reset([0])
+    assert env.recv().observations.tolist() == [[0, -1]]
+
+
+def test_a_step_may_take_too_long(gates: Gates) -> None:
+    """Its worker is late, and is brought back by a reset; the others' results come."""
+    env = gates.env(2)
+    with inside.hurried_parts(env, step_s=2.0):
+        send(env, 0, 1)
+        with pytest.raises(WorkerTimeoutError, match=r"step has not finished after 2\.0 s") as late:
+            env.recv(2)
+        assert late.value.env_ids == (1,)
+        assert ids(env.recv(2)) == [0]
+        send(env, 0, ids=[0])
+        assert ids(env.recv(2)) == [0]
+        with pytest.raises(WorkerTimeoutError, match="late") as again:
+            send(env, 0, ids=[1])
+        assert again.value.env_ids == (1,)
+    gates.open(1)
+    env.send_reset([1], seed=1)
+    assert ids(env.recv(2)) == [1]
+    send(env, 0, 0)
+    assert ids(env.recv(2)) == [0, 1]
+
+
+def test_who_has_answered_in_time_is_not_late(gates: Gates) -> None:
+    """Whenever the answer is taken: a learner may think for longer than a step may take."""
+    env = gates.env(2)
+    with inside.hurried_parts(env, step_s=2.0):
+        send(env, 0, 0)
+        threading.Event().wait(2.5)
+        assert ids(env.recv(2)) == [0, 1]
+
+
+def test_close_ends_a_wait(gates: Gates) -> None:
+    """From another thread; whoever waits hears that it was closed."""
+    env = gates.env(3)
+    send(env, 1, 2, ids=[0, 2])
+    heard: list[BaseException] = []
+
+    def wait() -> None:
+        try:
+            env.recv(2)
+        except BaseException as error:
+            heard.append(error)
+
+    thread = threading.Thread(target=wait)
+    thread.start()
+    assert eventually(lambda: not inside.use_lock_of(inside.parts(env)[2]).acquire(blocking=False))
+    env.close()
+    thread.join(60)
+    assert [type(error) for error in heard] == [ClosedEnvironmentError]
+    assert all(part.lifecycle.state is State.CLOSED for part in inside.parts(env))
+    assert all(part.lease.loaded is None for part in inside.parts(env))
+
+
+def test_ctrl_c_ends_a_wait_and_loses_nothing(gates: Gates) -> None:
+    """A wait takes nothing away: what was sent is received as ever."""
+    env = gates.env(2)
+    send(env, 1, 2)
+    threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT)).start()
+    with pytest.raises(KeyboardInterrupt):
+        env.recv()
+    gates.open(1, 2)
+    assert ids(env.recv(2)) == [0, 1]
+
+
+_OVER_A_SERVER = [module.__file__ for module in (served_lane, relay_lane, connection)]
+_PLACES = [
+    *((one.__file__, ahead) for one in (in_flight, worker_queue, requests) for ahead in (1, 2)),
+    *((file, 2) for file in _OVER_A_SERVER),
+]
+
+
+class Loop:
+    """Some steps of two sub-environments, each known by its reward."""
+
+    def __init__(self, env: Any, gates: Gates, first: int, ahead: int) -> None:
+        self.env, self._gates, self._first, self._ahead = env, gates, first, ahead
+        self.sent: dict[int, list[int]] = {0: [], 1: []}
+        self.got: dict[int, list[int]] = {0: [], 1: []}
+
+    def receive(self) -> None:
+        """Whatever comes next."""
+        received = self.env.recv(1)
+        for index, reward in zip(ids(received), received.rewards, strict=True):
+            self.got[index].append(int(reward))
+
+    def run(self) -> None:
+        """Send all, and receive all."""
+        for step in range(self._ahead):
+            for index in (0, 1):
+                number = self._first + step
+                self.sent[index].append(number)
+                self._gates.open(number)
+                send(self.env, number, ids=[index])
+        while sum(map(len, self.got.values())) < 2 * self._ahead:
+            self.receive()
+
+
+@pytest.mark.parametrize(
+    ("file", "ahead"), _PLACES, ids=[f"{Path(file).stem}-{ahead}" for file, ahead in _PLACES]
+)
+def test_ctrl_c_anywhere_gives_no_step_anothers_results(
+    gates: Gates, lane: str, file: str, ahead: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is received afterwards are results of what was sent, in order; else it is refused until
+    a reset, after which all is as ever."""
+    monkeypatch.setattr(*inside.LATE_REPLY_GRACE, 0.5)  # where one is lost
+    env = gates.env(2)
+    # between two moments that are tried, of some hundreds
+    lines = 11 if file in _OVER_A_SERVER else 3
+    line, came = 0, True
+    while came:
+        number = 3 * line % 990 + 1
+        loop = Loop(env, gates, number, ahead)
+        came = before_line(file, line, loop.run)
+        with contextlib.suppress(EnvHubError, NoAsyncCallError):
+            while True:
+                loop.receive()
+        for index in (0, 1):
+            expected = [one for one in loop.sent[index] if one in loop.got[index]]
+            assert loop.got[index] == expected, line
+        env.reset(seed=3)
+        gates.open(number + 2)
+        results = env.step(np.array([[number + 2, 0]] * 2))
+        assert results[1].tolist() == [number + 2] * 2, line
+        line += lines
+    assert line > 2 * lines or (file in _OVER_A_SERVER and lane == "auto")
+
+
+def test_a_worker_that_was_restarted_has_what_was_set(gates: Gates) -> None:
+    """As ``step`` does it."""
+    env = gates.env(2, policy={"restart": "transparent"})
+    env.set_attr("steps", [10, 20])
+    send(env, 0, 1)
+    kill(env, 1)
+    received = [env.recv(1), env.recv(1)]
+    assert sorted(map(ids, received)) == [[0], [1]]
+    send(env, 0, 0)
+    assert env.recv(2).observations[:, 0].tolist() == [12, 20]
+
+
+Call = Callable[[], object]
+
+
+def test_refusals_name_the_worker(gates: Gates) -> None:
+    """The worker, its place and what to do."""
+    env = gates.env(2)
+    send(env, 1, ids=[0])
+    kill(env, 0)
+    with pytest.raises(WorkerError, match="sub-environment 0 of 2, on process"):
+        env.recv()
+    calls: list[Call] = [lambda: send(env, 0, ids=[0]), lambda: env.send_reset([0])]
+    for call in calls:
+        with pytest.raises(WorkerError, match="make the environment again") as caught:
+            call()
+        assert caught.value.env_ids == (0,)

@@ -1,0 +1,118 @@
+"""A server that a program starts for one client, and that ends with that program."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from envhub_sandbox import RemoteSandbox, make_env
+from envhub_sandbox.errors import SandboxUnavailableError
+from envhub_sandbox.sandboxes.docker import attestation
+from envhub_sandbox.transport.tcp import new_keys
+from envhub_worker.protocol.keys import key_text
+from tests.remote.listening import WORKER, worker
+from tests.support.ports import lasting_port
+from tests.support.samples import sample
+
+pytestmark = pytest.mark.same_for("versions")
+
+
+@pytest.fixture
+def keys() -> tuple[str, str]:
+    """A client's keys, public and secret."""
+    public, secret = new_keys()
+    return key_text(public), key_text(secret)
+
+
+@contextlib.contextmanager
+def announcing(public: str, state: Path) -> Iterator[tuple[subprocess.Popen[str], dict[str, Any]]]:
+    """Such a server, and the one line that it has printed."""
+    words = ("--bind", f"tcp://127.0.0.1:{lasting_port()}", "--state-dir", str(state))
+    process = subprocess.Popen(
+        [*WORKER, "listen", *words, "--only-client", public, "--announce", "--until-eof"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        text=True,
+    )
+    assert process.stdout is not None
+    with process:
+        try:
+            yield process, {**json.loads(process.stdout.readline()), "endpoint": words[1]}
+        finally:
+            process.terminate()
+
+
+@pytest.fixture
+def announced(
+    keys: tuple[str, str], tmp_path: Path
+) -> Iterator[tuple[subprocess.Popen[str], dict[str, Any]]]:
+    """One for these keys."""
+    with announcing(keys[0], tmp_path / "state") as found:
+        yield found
+
+
+def test_the_one_client_comes_in_and_no_other(
+    announced: tuple[subprocess.Popen[str], dict[str, Any]], keys: tuple[str, str]
+) -> None:
+    """By its key alone; the server has no secret of the client's, and prints none of its own."""
+    _, said = announced
+    assert attestation.parse(json.dumps(said).encode()).profiles
+    for secret, comes_in in ((keys[1], True), (key_text(new_keys()[1]), False)):
+        sandbox = RemoteSandbox(said["endpoint"], server_key=said["server_key"], client_key=secret)
+        refused = pytest.raises(SandboxUnavailableError, match="does not know our key")
+        expected = contextlib.nullcontext() if comes_in else refused
+        with expected, make_env(sample("counter"), sandbox=sandbox) as suites:
+            suites.env.reset(seed=0)
+
+
+def test_the_files_of_two_clients_are_apart(tmp_path: Path) -> None:
+    """Of two servers with the same state folder: who knows a hash has not brought that file."""
+    state = tmp_path / "state"
+    brought = set()
+    for _ in range(2):
+        public, secret = map(key_text, new_keys())
+        with announcing(public, state) as (_, said):
+            given = {"server_key": said["server_key"], "client_key": secret}
+            sandbox = RemoteSandbox(said["endpoint"], **given)
+            with make_env(sample("counter"), sandbox=sandbox) as suites:
+                suites.env.reset(seed=0)
+        brought.add(public[:32])
+        assert {path.name for path in (state / "store").iterdir() if path.is_dir()} == brought
+
+
+def test_it_ends_with_its_stdin(
+    announced: tuple[subprocess.Popen[str], dict[str, Any]], tmp_path: Path
+) -> None:
+    """As when the program that started it is killed; no key of a client was made."""
+    process, _ = announced
+    assert process.stdin is not None
+    assert process.poll() is None
+    process.stdin.close()
+    assert process.wait(60) == 0
+    assert not list((tmp_path / "state").glob("client*"))
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (("--only-client", "nonsense"), "hexadecimal"),
+        (("--only-client", "00" * 32, "--authorized-clients", "file"), "leave one out"),
+        (("--only-client", "00" * 32, "--insecure-loopback"), "has no keys"),
+    ],
+)
+def test_what_contradicts_itself_is_refused(
+    tmp_path: Path, words: tuple[str, ...], text: str
+) -> None:
+    """With what to leave out."""
+    done = worker(
+        "listen", "--bind", "tcp://127.0.0.1:*", "--state-dir", tmp_path / "state", *words
+    )
+    assert done.returncode == 2
+    assert text in done.stderr

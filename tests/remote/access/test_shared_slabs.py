@@ -1,0 +1,100 @@
+"""What a client on another host may have a server make for its runners."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+from envhub_sandbox import make_env
+from envhub_sandbox.transport.deadline import Deadline
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.shared_memory import words
+from tests.remote.listening import Listening
+from tests.support import inside
+from tests.support.processes import eventually
+from tests.support.samples import sample
+
+MIB = 1 << 20
+REQUEST_BYTES = words.HEADER_BYTES + words.INFO_BYTES
+LIMIT_BYTES = 320 * MIB
+MANY = 200
+
+
+@contextmanager
+def opened(server: Listening) -> Iterator[Any]:
+    """An environment there, of six runners."""
+    options: dict[str, Any] = {"n_envs": 6, "num_workers": 6}
+    limits = {"limits": {"memory_bytes": LIMIT_BYTES}}
+    with make_env(sample("counter"), sandbox=server.sandbox(), **limits, **options) as suites:
+        suites.env.reset(seed=0)
+        yield suites.env
+
+
+@pytest.fixture
+def env(server: Listening) -> Iterator[Any]:
+    """One for a test."""
+    with opened(server) as found:
+        yield found
+
+
+def share(env: Any, slabs: list[tuple[int, int]]) -> m.Message:
+    """Ask for observation slabs of so many bytes, each for the runner at that place."""
+    jail = inside.jail(env)
+    parts = tuple((jail.runners[at], 0, REQUEST_BYTES, size) for at, size in slabs)
+    return jail.client.request(m.ShareSlabs(jail.number, parts), deadline=Deadline(60))[0]
+
+
+def files(server: Listening) -> int:
+    """How many descriptors the server has."""
+    return len(os.listdir(f"/proc/{server.process.pid}/fd"))
+
+
+def test_one_request_makes_slabs_once_for_each_runner(env: Any) -> None:
+    """Each takes time of a server that others use, and one request could ask for 40,000."""
+    refused = share(env, [(0, 64)] * 2)
+    assert isinstance(refused, m.Refusal), refused
+    assert refused.error == "LocalProtocolError"
+    assert isinstance(share(env, [(at, 64) for at in range(6)]), m.Done)
+
+
+def test_slabs_are_no_memory_beside_the_limit(env: Any) -> None:
+    """What the server reads of them first is its own memory, which no limit of the jail bounds."""
+    most = 63 * MIB
+    assert isinstance(share(env, [(0, most), (1, most), (2, most)]), m.Done)
+    refused = share(env, [(3, most), (4, most), (5, most)])
+    assert isinstance(refused, m.Refusal), refused
+    assert "memory_bytes" in refused.message
+    # the same again is no more than there was
+    assert isinstance(share(env, [(0, most)]), m.Done)
+
+
+def test_slabs_that_are_made_again_leave_nothing(env: Any, server: Listening) -> None:
+    """Nor do those that no runner has taken."""
+    share(env, [(0, 64)])
+    before = files(server)
+    for _ in range(MANY):
+        assert isinstance(share(env, [(0, 64)]), m.Done)
+    assert files(server) < before + MANY, (
+        "a connection may have come; each slab would be there still"
+    )
+
+
+def test_what_is_made_for_a_jail_that_ends_goes_with_it(server: Listening) -> None:
+    """Its end takes a moment, in which its client may go on asking."""
+    left = list[int]()
+    for asks in (False, True):
+        with opened(server) as env:
+            jail = inside.jail(env)
+            client, runners = jail.client, jail.runners
+            parts = tuple((runner, 0, REQUEST_BYTES, 64) for runner in runners)
+            closing = client.send(m.CloseJail(jail.number))
+            sharing = client.send(m.ShareSlabs(jail.number, parts)) if asks else None
+            replies = [client.receive(one, Deadline(60))[0] for one in (sharing, closing) if one]
+            assert isinstance(replies[-1], m.Done)
+        assert eventually(lambda: server.jails() == 0)
+        left.append(files(server))
+    assert left[1] <= left[0] + len(parts), "descriptors of a jail that has ended"

@@ -1,0 +1,1 @@
+"""Clients on macOS and on Windows, as far as this machine can be one, of a server on Linux."""

@@ -1,0 +1,209 @@
+"""A client without Linux: what it does with a server on another host, and what it says."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import time
+from pathlib import Path
+
+import pytest
+
+from envhub_sandbox.cli.shared.exits import Exit
+from tests.remote.listening import Listening, counting
+from tests.support.elsewhere.kit import SYSTEMS, command, elsewhere, ran
+from tests.support.processes import eventually
+from tests.support.repositories import write_repository
+from tests.support.samples import sample
+
+pytestmark = [pytest.mark.parametrize("system", SYSTEMS), pytest.mark.same_for("versions")]
+
+# the compliance suite and everything else that a client of such a server is asked
+_SUITES = ("tests/remote/test_parity.py", "tests/remote/test_assets.py")
+_QUIET = ("-p", "no:cacheprovider", "--capture=no", "-q", "-n", "0")
+_CONNECT = """
+import os, sys
+from envhub_sandbox import RemoteSandbox, make_env
+sandbox = RemoteSandbox(sys.argv[1], server_key=sys.argv[2], client_key=sys.argv[3])
+"""
+_LIFE = f"""{_CONNECT}
+import numpy as np
+with make_env(sys.argv[4], n_envs=2, sandbox=sandbox, policy={{"restart": "on_reset"}}) as suites:
+    env = suites.env
+    env.reset(seed=1)
+    assert env.call("number") == (0, 0), env.call("number")
+    assert env.step(np.array([0, 0]))[1].tolist() == [1.0, 1.0]
+    env.set_attr("offset", 5)
+    assert env.call("number") == (6, 6)
+    try:
+        env.step(np.array([9, 0]))
+    except Exception as error:
+        print(type(error).__name__)
+    env.reset(seed=1)
+    assert env.step(np.array([0, 0]))[1].tolist() == [1.0, 1.0]
+env.close()
+print(sys.platform)
+"""
+_DIES = """
+import os
+import gymnasium as gym
+
+class Dies(gym.Env):
+    observation_space = action_space = gym.spaces.Discrete(10)
+    offset = count = 0
+    def number(self):
+        return self.count + self.offset
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.count = 0
+        return 0, {}
+    def step(self, action):
+        if action == 9:
+            os._exit(3)
+        self.count += 1
+        return 0, float(self.count), False, False, {}
+
+def make_env(n_envs=1, use_async_envs=False):
+    return gym.vector.SyncVectorEnv([Dies] * n_envs)
+"""
+_INTERRUPTED = f"""{_CONNECT}
+import numpy as np, time
+with make_env(sys.argv[4], sandbox=sandbox) as suites:
+    env = suites.env
+    env.reset()
+    print("steps", flush=True)
+    begun = time.monotonic()
+    try:
+        env.step(np.array([99]))
+    except KeyboardInterrupt:
+        print("interrupted", time.monotonic() - begun < 9, flush=True)
+    env.reset()
+    print(env.step(np.array([0]))[0].tolist())
+"""
+
+
+def words(server: Listening) -> tuple[str, str, str]:
+    """A server's address and the keys."""
+    return server.endpoint, server.public, server.client_key
+
+
+def variables(server: Listening) -> dict[str, str]:
+    """The keys, for a command."""
+    return {"ENVHUB_SERVER_KEY": server.public, "ENVHUB_CLIENT_KEY": server.client_key}
+
+
+@pytest.mark.parametrize("suite", _SUITES)
+def test_the_tests_of_clients_pass(system: str, suite: str) -> None:
+    """The same steps, bit for bit, and all else that they ask, by a client without Linux."""
+    done = ran(system, "-m", "pytest", *_QUIET, suite, code=None)
+    assert done.returncode == 0, done.stdout[-6000:]
+    assert " passed" in done.stdout
+
+
+def test_an_environment_lives_dies_and_starts_again(
+    system: str, server: Listening, tmp_path: Path
+) -> None:
+    """Reset, step, call, set_attr, a death, a restart, and two closes."""
+    repository = write_repository(tmp_path / "repo", _DIES)
+    said = elsewhere(system, _LIFE, *words(server), repository)
+    assert said.split() == ["WorkerDiedError", system]
+
+
+def test_ctrl_c_interrupts_a_step(system: str, server: Listening, tmp_path: Path) -> None:
+    """Long before the step's end; the environment goes on after a reset."""
+    repository = counting(tmp_path / "repo")
+    process = subprocess.Popen(
+        command(system, "-c", _INTERRUPTED, *words(server), repository),
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    with process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "steps\n"
+        time.sleep(0.5)  # so that it waits; sooner is an interrupt, too
+        process.send_signal(signal.SIGINT)
+        said = process.stdout.read()
+    assert said == "interrupted True\n[[1.0]]\n"
+    assert process.returncode == 0
+
+
+def test_ctrl_c_ends_a_command(system: str, server: Listening, tmp_path: Path) -> None:
+    """With the code of one that was interrupted; the server has nothing of it left."""
+    repository = counting(tmp_path / "repo")
+    run = ("run", repository, "--sandbox", server.endpoint, "--verbose")
+    process = subprocess.Popen(
+        command(system, *_ENVHUB, *run),
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ, **variables(server)},
+    )
+    with process:
+        assert process.stderr is not None
+        while "opened" not in process.stderr.readline():
+            assert process.poll() is None
+        process.send_signal(signal.SIGINT)
+        process.stderr.read()
+    assert process.returncode == Exit.INTERRUPTED
+    assert eventually(lambda: not server.jails())
+
+
+def test_commands_work(system: str, server: Listening, tmp_path: Path) -> None:
+    """``run``, ``inspect``, ``check`` with its reports, ``doctor`` of a server, and ``cache``."""
+    with_keys = variables(server) | {"ENVHUB_CACHE": str(tmp_path / "cache")}
+    where = ("--sandbox", server.endpoint)
+    run = ran(system, *_ENVHUB, "run", sample("cartpole"), "--episodes", "1", *where, **with_keys)
+    assert "confined by  strict" in run.stdout
+    shown = ran(system, *_ENVHUB, "inspect", sample("cartpole"), *where, **with_keys)
+    assert "Discrete(2)" in shown.stdout
+    reports = ("--html", tmp_path / "page.html", "--junit", tmp_path / "junit.xml")
+    checked = ran(system, *_ENVHUB, "check", sample("cartpole"), *where, *reports, **with_keys)
+    assert "passed" in checked.stderr
+    assert (tmp_path / "page.html").read_text("utf-8").startswith("<!doctype html>")
+    asked = ran(system, *_ENVHUB, "doctor", server.endpoint, **with_keys)
+    assert "it knows our key" in asked.stdout
+    assert "1 snapshot" in ran(system, *_ENVHUB, "cache", "list", **with_keys).stderr
+    removed = ran(system, *_ENVHUB, "cache", "remove", "--all", **with_keys)
+    assert "Removed 1 snapshot" in removed.stderr
+    assert not list((tmp_path / "cache").rglob("env.py"))
+
+
+_ENVHUB = ("-m", "envhub_sandbox")
+
+
+def test_the_default_says_what_there_is_instead(system: str) -> None:
+    """Before anything is downloaded; both other ways are named, by a command's options, too."""
+    name = {"darwin": "macOS", "win32": "Windows"}[system]
+    done = ran(system, *_ENVHUB, "run", "nobody/nothing", code=Exit.SANDBOX)
+    for text in (f"this is {name}", "--sandbox docker", "--sandbox tcp://HOST:PORT"):
+        assert text in done.stderr
+    locked = ran(system, *_ENVHUB, "lock", sample("cartpole"), code=Exit.SANDBOX)
+    assert "run this on a Linux machine" in locked.stderr
+
+
+def test_doctor_says_what_there_is(system: str, tmp_path: Path) -> None:
+    """No engine answers here: it says so, and how to get one that runs on such a system."""
+    done = ran(system, *_ENVHUB, "doctor", code=Exit.SANDBOX, PATH=str(tmp_path), DOCKER_HOST="")
+    assert "there is no --sandbox process" in done.stdout
+    assert "there is no docker on PATH; install Docker Desktop" in done.stdout
+    assert "envhub doctor tcp://HOST:PORT" in done.stdout
+
+
+def test_help_is_there(system: str) -> None:
+    """Of the program and of each of its commands."""
+    for words in ((), ("run",), ("check",), ("doctor",), ("cache", "list"), ("image", "build")):
+        assert "Usage:" in ran(system, *_ENVHUB, *words, "--help").stdout
+
+
+def test_a_client_leaves_nothing_but_its_cache(
+    system: str, server: Listening, tmp_path: Path
+) -> None:
+    """Which lies where that system has it; in the temporary folder nothing is left."""
+    home, temporary = tmp_path / "home", tmp_path / "temporary"
+    temporary.mkdir()
+    folders = {"HOME": str(home), "TMPDIR": str(temporary), "ENVHUB_CACHE": ""}
+    repository = write_repository(tmp_path / "repo", _DIES)
+    elsewhere(system, _LIFE, *words(server), repository, **folders)
+    assert not list(temporary.iterdir())
+    cache = {"darwin": "Library/Caches/envhub-sandbox", "win32": "AppData/Local/envhub-sandbox"}
+    assert {path.name for path in (home / cache[system]).rglob("env.py")} == {"env.py"}

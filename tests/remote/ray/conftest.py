@@ -1,0 +1,22 @@
+"""One cluster of two nodes for all tests of this folder that leave it as it was."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from tests.remote.ray.clusters import cluster_of
+
+
+@pytest.fixture(scope="package")
+def cluster() -> Iterator[Any]:
+    """This process is connected to it. Each node has two CPUs and a resource of its own."""
+    ray = pytest.importorskip("ray")
+    with cluster_of({"one": 8}, {"two": 8}) as found:
+        ray.init(address=found.address, log_to_driver=False)
+        try:
+            yield found
+        finally:
+            ray.shutdown()

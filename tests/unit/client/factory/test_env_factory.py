@@ -1,0 +1,136 @@
+"""Environments out of a first jail, or of what is remembered of it; held against each jail."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from envhub_sandbox.errors import LoadError
+from envhub_sandbox.factory.env_factory import EnvFactory
+from envhub_sandbox.hub.snapshot import local
+from envhub_sandbox.session.jails.builder import Builder
+from envhub_sandbox.session.jails.launcher import Launcher
+from envhub_sandbox.session.jails.sources import JailSource
+from envhub_sandbox.session.repository import LoadArguments, Repository
+from envhub_sandbox.settings.policy import Policy, Timeouts
+from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.results import Results
+from envhub_sandbox.vector.vector_env import SandboxVectorEnv
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.manifest.manifest import Manifest, encode_env, encode_manifest
+from envhub_worker.protocol.runtime import OWN
+from tests.attacks.client.lying_server import (
+    ACTION,
+    NUM_ENVS,
+    LyingSandbox,
+    LyingServer,
+    env_manifest,
+    lying,
+)
+
+
+@pytest.fixture
+def server() -> Iterator[LyingServer]:
+    """Honest, until a test has a lie."""
+    with lying() as found:
+        yield found
+
+
+@pytest.fixture
+def launcher(server: LyingServer, tmp_path: Path, snapshot_store: Path) -> Launcher:
+    """Opens jails of a repository there."""
+    (tmp_path / "repo").mkdir()
+    (tmp_path / "repo" / "env.py").write_text("")
+    given: Any = (local(tmp_path / "repo"), LoadArguments(n_envs=NUM_ENVS), Policy(), Timeouts())
+    more: Any = {"recipe": None, "installed": None, "advice": str}
+    repository = Repository(*given, OWN, "frames", True, **more)
+    return Launcher(repository, LyingSandbox(server), snapshot_store)
+
+
+def suites(launcher: Launcher, agrees: Callable[[Manifest], None] = lambda _: None) -> Any:
+    """What a caller gets."""
+    return EnvFactory([launcher], None, 0, SandboxVectorEnv, agrees).make()
+
+
+def asked(server: LyingServer, kind: type[m.Message]) -> int:
+    """How often."""
+    return sum(isinstance(one, kind) for one in server.asked)
+
+
+def says(server: LyingServer, request: type[m.Message], answer: m.Message) -> None:
+    """From now on."""
+    server.lies[request] = lambda about: [about.answer(answer)]
+
+
+def test_the_second_time_no_jail_is_opened(launcher: Launcher, server: LyingServer) -> None:
+    """What the first returned is remembered; the first use opens one then, and describes less."""
+    with suites(launcher) as first:
+        assert first.env.reset()[0].shape == (NUM_ENVS, 3)
+        assert asked(server, m.OpenJail) == asked(server, m.Load) == 1
+    assert asked(server, m.CloseJail) == 1
+    with suites(launcher) as second:
+        assert asked(server, m.OpenJail) == 1
+        assert second.env.single_action_space == ACTION
+        second.env.reset()
+        assert (asked(server, m.OpenJail), asked(server, m.Load)) == (2, 1)
+
+
+def test_what_does_not_agree_leaves_no_jail(launcher: Launcher, server: LyingServer) -> None:
+    """Neither a first one, nor one of what is remembered."""
+
+    def refuses(manifest: Manifest) -> None:
+        raise LoadError(f"{len(manifest.envs)} was not locked")
+
+    for _ in range(2):
+        with pytest.raises(LoadError, match="1 was not locked"):
+            suites(launcher, refuses)
+    assert asked(server, m.OpenJail) == asked(server, m.CloseJail) == 1
+
+
+@pytest.mark.parametrize("lazy", [True, False])
+def test_a_suite_shares_a_jail_unless_it_is_lazy(
+    launcher: Launcher, server: LyingServer, lazy: bool
+) -> None:
+    """A lazy one gives each task a jail of its own, and the first, which described it, ends."""
+    envs = tuple(env_manifest(task=task) for task in range(2))
+    says(server, m.Load, m.LoadDone(encode_manifest(Manifest(envs=envs, lazy=lazy))))
+    with suites(launcher) as made:
+        assert asked(server, m.CloseJail) == int(lazy)
+        for task in range(2):
+            made["env"][task].reset()
+        assert asked(server, m.OpenJail) == (3 if lazy else 1)
+    assert asked(server, m.CloseJail) == asked(server, m.OpenJail)
+
+
+@pytest.mark.parametrize(
+    ("changes", "described"),
+    [
+        ({"num_envs": NUM_ENVS + 1}, False),
+        ({"autoreset_mode": "SameStep"}, False),
+        ({"task": 7}, True),
+        ({"num_envs": NUM_ENVS + 1}, True),
+    ],
+)
+def test_another_environment_is_refused_and_forgotten(
+    launcher: Launcher, server: LyingServer, changes: dict[str, Any], described: bool
+) -> None:
+    """Where the jail describes another, or builds another than it has described."""
+    other, forgotten = env_manifest(**changes), list[bool]()
+    if described:
+        manifest = encode_manifest(Manifest(envs=(other,), lazy=True))
+        says(server, m.Load, m.LoadDone(manifest))
+    else:
+        says(server, m.Build, m.BuildDone(encode_env(other)))
+    source = JailSource(launcher, lambda: forgotten.append(True))
+    builder = Builder(source, Results(env_manifest(), [(0, NUM_ENVS)]))
+    loaded = launcher.open(Deadline(60))
+    try:
+        with pytest.raises(LoadError, match=r"another environment for \('env', 0\)"):
+            builder.build(loaded, Deadline(60))
+    finally:
+        launcher.close(loaded)
+    assert forgotten == [True]
+    assert asked(server, m.Build) == int(not described)

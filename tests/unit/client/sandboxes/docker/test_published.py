@@ -1,0 +1,217 @@
+"""A container that is reached by a port, with a program for an engine that makes none."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerStartupError
+from envhub_sandbox.sandboxes.docker import attestation, engines, published, run_arguments
+from envhub_sandbox.sandboxes.docker.engines import Engine
+from envhub_sandbox.sandboxes.docker.image import BuiltImageTarget
+from envhub_sandbox.sandboxes.docker.packages import ImageTarget
+from envhub_sandbox.sandboxes.docker.published import PublishedContainer
+from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
+from envhub_sandbox.settings.policy import Policy
+from envhub_worker.protocol.runtime import Runtime
+from tests.support.processes import descendants, eventually
+from tests.unit.client.sandboxes.docker.test_run_arguments import DOCKER, PODMAN, SAID, WANTED
+
+_KEY = "00" * 32
+_ENGINE = """#!{python} -S
+import json, sys
+given = dict(zip(sys.argv, sys.argv[1:]))
+what = "{what}"
+if sys.argv[1] == "port":
+    others = {{"publishes elsewhere": "0.0.0.0:4711", "publishes nothing": ""}}
+    print(others.get(what, "127.0.0.1:9"))
+    sys.exit()
+if what == "fails":
+    print("no such runtime")
+    sys.exit(125)
+said = {{
+    "envhub-worker": "0", "profiles": ["container"], "landlock": 7, "capabilities": 0,
+    "user": int(given["--user"].partition(":")[0]), "no_new_privileges": True, "seccomp": True,
+    "read_only": what != "is open", "devices": ["lo", "eth0"], "memory": int(given["--memory"]),
+    "pids": int(given["--pids-limit"]), "cpus": float(given["--cpus"]), "python": "",
+}}
+print("Unable to find something\\n" + json.dumps(
+    said if what == "has no key" else {{**said, "server_key": "{key}"}}
+), flush=True)
+if what != "stays":
+    sys.stdin.read()
+"""
+PUBLISHED = replace(
+    WANTED, sockets="", snapshot="", readable=(), user=(65532, 65532), only_client=_KEY
+)
+
+
+@pytest.fixture
+def temporary(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """An empty folder for temporary files, of a short name."""
+    with tempfile.TemporaryDirectory(prefix="eh") as folder:
+        monkeypatch.setattr(tempfile, "tempdir", folder)
+        yield Path(folder)
+
+
+@pytest.fixture
+def sandbox(tmp_path: Path) -> Callable[[str], PublishedContainer]:
+    """That of a repository whose engine does this."""
+
+    def made(what: str) -> PublishedContainer:
+        program = tmp_path / "docker"
+        program.write_text(_ENGINE.format(python=sys.executable, what=what, key=_KEY))
+        program.chmod(0o755)
+        engine = Engine("docker", str(program), "28", rootless=False, machine="aarch64", cpus=3)
+        return PublishedContainer(
+            DockerSandbox(published=True), engine, "sha256:0", tmp_path, Policy()
+        )
+
+    return made
+
+
+def test_the_command_line_is_this_one() -> None:
+    """Word for word: what stands here is what confines, and what others on the machine can see."""
+    assert run_arguments.run_arguments(DOCKER, PUBLISHED) == [
+        *("run", "--rm", "--interactive", "--pull", "never", "--log-driver", "none"),
+        *("--no-healthcheck", "--name", "envhub-0", "--hostname", "sandbox", "--workdir", "/"),
+        *("--label", "dev.envhub.client=1:2:3:4"),
+        *(
+            "--network",
+            "bridge",
+            "--publish",
+            "127.0.0.1::5555",
+            "--read-only",
+            "--cap-drop",
+            "ALL",
+        ),
+        *("--security-opt", "no-new-privileges", "--security-opt", "seccomp=/tmp/f/seccomp.json"),
+        *("--security-opt", "systempaths=unconfined", "--ipc", "private", "--user", "65532:65532"),
+        *("--ulimit", "core=0:0", "--memory", "1073741824", "--memory-swap", "1073741824"),
+        *("--pids-limit", "99", "--cpus", "1.5"),
+        *("--tmpfs", "/tmp:rw,nosuid,nodev,size=1048576,mode=1777", "--shm-size", "1073741824"),
+        *("--mount", "type=volume,dst=/var/lib/envhub-worker"),
+        "sha256:1",
+        *("listen", "--bind", "tcp://0.0.0.0:5555", "--only-client", _KEY),
+        *("--log-level", "warning", "--until-eof", "--announce"),
+    ]
+
+
+def test_a_policy_is_permitted_there() -> None:
+    """A weaker profile, the container's network and a GPU, where the policy says so."""
+    words = run_arguments.run_arguments(
+        PODMAN, replace(PUBLISHED, network="host", gpus="all", profile="container")
+    )
+    assert words[words.index("--network") + 1] == "bridge"
+    assert "keep-id" not in words
+    assert words[words.index("warning") + 1 :] == [
+        *("--weakest-profile", "container", "--allow-network", "--allow-gpu"),
+        *("--until-eof", "--announce"),
+    ]
+
+
+def test_the_report_says_that_there_is_a_network() -> None:
+    """It does not hold, and no device is missed."""
+    said = {**SAID, "user": 65532, "devices": ["lo", "eth0"]}
+    found = attestation.parse(json.dumps(said).encode())
+    rows = {row["layer"]: row["enforced"] for row in attestation.layers(PUBLISHED, found, "title")}
+    assert rows["container-network"] is False
+    assert rows["container-user"] is rows["container-files"] is True
+
+
+def test_a_container_serves_until_it_is_given_back(
+    sandbox: Callable[[str], PublishedContainer], temporary: Path, tmp_path: Path
+) -> None:
+    """Its processors are the engine's; then its process and its folder are gone."""
+    before = descendants()
+    use = sandbox("serves").acquire(tmp_path)
+    server = use.server
+    assert isinstance(server, published.PublishedServer)
+    assert (server.endpoint, server.profile) == ("tcp://127.0.0.1:9", "container")
+    assert server.is_ours
+    assert server.far.server_key == bytes(32)
+    details = {row["layer"]: row["detail"] for row in server.layers}
+    assert details["container-cpus"] == "the time of 3 processors"
+    [folder] = temporary.iterdir()
+    assert "SCMP_ARCH_AARCH64" in (folder / "seccomp.json").read_text()
+    assert server.runs
+    use.release()
+    assert not server.runs
+    assert not list(temporary.iterdir())
+    assert eventually(lambda: not descendants() - before)
+    server.stop()  # idempotent
+
+
+@pytest.mark.parametrize(
+    ("what", "kind", "text"),
+    [
+        ("fails", SandboxUnavailableError, "no such runtime"),
+        ("is open", SandboxUnavailableError, "container-files does not hold"),
+        ("has no key", WorkerStartupError, "build the image again"),
+        ("publishes elsewhere", SandboxUnavailableError, "does not publish"),
+        ("publishes nothing", SandboxUnavailableError, "does not publish"),
+    ],
+)
+def test_what_does_not_start_leaves_nothing(
+    sandbox: Callable[[str], PublishedContainer],
+    temporary: Path,
+    tmp_path: Path,
+    what: str,
+    kind: type[Exception],
+    text: str,
+) -> None:
+    """And says why; a port that other machines could reach is none."""
+    before = descendants()
+    with pytest.raises(kind, match=text):
+        sandbox(what).acquire(tmp_path)
+    assert not list(temporary.iterdir())
+    assert eventually(lambda: not descendants() - before)
+
+
+def test_a_fork_does_not_keep_a_container(
+    sandbox: Callable[[str], PublishedContainer], tmp_path: Path
+) -> None:
+    """It has no copy of the other end of its stdin, and does not end it either."""
+    use = sandbox("serves").acquire(tmp_path)
+    fork = os.fork()
+    if fork == 0:
+        use.server.stop()
+        time.sleep(3600)
+        os._exit(0)
+    try:
+        assert use.server.runs
+        use.release()
+        assert not use.server.runs
+    finally:
+        os.kill(fork, 9)
+        os.waitpid(fork, 0)
+
+
+def test_an_engine_in_a_virtual_machine_says_what_that_has() -> None:
+    """Other engines than this machine's have other processors; a pipe of Windows is here."""
+    assert published.seccomp_profile.profile("arm64")["architectures"] == ["SCMP_ARCH_AARCH64"]
+    with pytest.MonkeyPatch.context() as patch:
+        for host, elsewhere in (("npipe:////./pipe/docker_engine", False), ("ssh://there", True)):
+            patch.setenv("DOCKER_HOST", host)
+            assert engines.is_elsewhere("docker") is elsewhere
+
+
+def test_packages_become_an_image_where_nothing_is_mounted() -> None:
+    """Elsewhere they are made here."""
+    assert isinstance(DockerSandbox(published=True).package_target(), BuiltImageTarget)
+    assert type(DockerSandbox().package_target()) is ImageTarget
+
+
+def test_paths_of_this_machine_are_refused(tmp_path: Path) -> None:
+    """Before the engine is asked for anything."""
+    policy = Policy(readable=("/data",))
+    with pytest.raises(PolicyError, match="put what is needed into the repository"):
+        DockerSandbox(published=True).for_repository(tmp_path, policy, Runtime(""))

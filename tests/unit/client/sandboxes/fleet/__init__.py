@@ -1,0 +1,1 @@
+"""The places of a fleet, one module at a time."""

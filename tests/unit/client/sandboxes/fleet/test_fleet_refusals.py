@@ -1,0 +1,61 @@
+"""When another place of a fleet is worth a try, and what is said where none takes a worker."""
+
+from __future__ import annotations
+
+import pytest
+
+from envhub_sandbox.errors import (
+    EnvHubError,
+    LoadError,
+    PolicyError,
+    SandboxUnavailableError,
+    ServerBusyError,
+    WorkerDiedError,
+    WorkerStartupError,
+    WorkerTimeoutError,
+)
+from envhub_sandbox.sandboxes.fleet.refusals import may_go_elsewhere, worst_of
+from envhub_sandbox.transport.tcp import UnreachableError
+
+BUSY = ServerBusyError("a: no room")
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        BUSY,
+        UnreachableError("nothing answers"),
+        WorkerStartupError("it did not start"),
+        WorkerDiedError("lost", reason="connection"),
+        WorkerDiedError("ended", reason="server"),
+        WorkerTimeoutError("the worker did not answer in time"),
+    ],
+)
+def test_a_place_that_is_full_or_not_there_is_followed_by_the_next(error: EnvHubError) -> None:
+    """The same worker may start elsewhere."""
+    assert may_go_elsewhere(error)
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        LoadError("the repository failed"),
+        WorkerDiedError("it was killed", reason="signal"),
+        WorkerTimeoutError("make_env takes too long", request="make_env"),
+        SandboxUnavailableError("the server does not know our key"),
+        PolicyError("not permitted"),
+    ],
+)
+def test_what_would_be_the_same_elsewhere_is_not_tried_again(error: EnvHubError) -> None:
+    """Or is a mistake that has to be known."""
+    assert not may_go_elsewhere(error)
+
+
+def test_the_error_for_all_is_one_that_may_pass() -> None:
+    """With what each place has said; a single place's error stays as it is."""
+    lost = WorkerDiedError("b: lost\nmore of it", reason="connection")
+    found = worst_of([lost, BUSY])
+    assert found is BUSY
+    assert str(found) == "a: no room\nThe other places of the fleet:\nb: lost"
+    assert worst_of([lost]) is lost
+    assert str(lost) == "b: lost\nmore of it"

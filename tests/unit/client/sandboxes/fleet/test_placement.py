@@ -1,0 +1,148 @@
+"""Which worker goes where: fewest of the fleet first, then most room; then the next place."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from envhub_sandbox.errors import PolicyError
+from envhub_sandbox.sandboxes.fleet import placement as module
+from envhub_sandbox.sandboxes.fleet.member import Member
+from envhub_sandbox.sandboxes.fleet.place_list import PlaceList
+from envhub_sandbox.sandboxes.fleet.placement import Placement
+from envhub_sandbox.sandboxes.fleet.rooms import Room
+from envhub_sandbox.sandboxes.sandbox import Sandbox
+from envhub_sandbox.settings.policy import Policy
+from envhub_worker.protocol.runtime import Runtime
+
+
+class _Place(Sandbox):
+    def __init__(self, name: str) -> None:
+        self.name = name
+
+
+class _Rooms:
+    """The rooms that a test says."""
+
+    def __init__(self, memory_bytes: int) -> None:
+        self.said: dict[str, Room] = {}
+
+    def ask(self, members: list[Member]) -> dict[Member, Room]:
+        """Those that it has said."""
+        return {one: self.said[one.name] for one in members if one.name in self.said}
+
+
+@pytest.fixture
+def rooms(monkeypatch: pytest.MonkeyPatch) -> dict[str, Room]:
+    """By the name of the place."""
+    made = _Rooms(0)
+    monkeypatch.setattr(module, "Rooms", lambda memory_bytes: made)
+    return made.said
+
+
+def _placement(names: list[str]) -> Placement:
+    known = {name: _Place(name) for name in names}
+
+    def resolve(place: Any) -> Sandbox:
+        return known[place]
+
+    return Placement(PlaceList(names), resolve, lambda member: Runtime(""))
+
+
+def _opened(names: list[str]) -> Placement:
+    made = _placement(names)
+    [seat, *_] = made.seats(None)
+    seat.for_repository(Path(), Policy(), Runtime(""))
+    return made
+
+
+def _first(placement: Placement, number: int) -> str:
+    return next(placement.candidates(number)).name
+
+
+def test_one_worker_each_by_default(rooms: dict[str, Room]) -> None:
+    """As many as the list has places, also where one stands there twice."""
+    assert len(_placement(["a", "b", "a"]).seats(None)) == 3
+    assert len(_placement(["a", "b"]).seats(5)) == 5
+
+
+def test_they_are_spread(rooms: dict[str, Room]) -> None:
+    """Evenly, by how often a place is in the list."""
+    placement = _opened(["a", "b", "a"])
+    found = [_first(placement, number) for number in range(6)]
+    assert sorted(found) == ["a", "a", "a", "a", "b", "b"]
+
+
+def test_of_equal_places_the_one_with_most_room(rooms: dict[str, Room]) -> None:
+    """Other processes with the same key may have taken the rest."""
+    rooms |= {"a": Room(workers=3), "b": Room(workers=60)}
+    assert _first(_opened(["a", "b"]), 0) == "b"
+
+
+def test_what_is_full_comes_after_what_is_not(rooms: dict[str, Room]) -> None:
+    """And what does not answer after that."""
+    rooms |= {"a": Room(workers=0), "b": Room(answers=False, workers=0), "c": Room(workers=1)}
+    placement = _opened(["a", "b", "c"])
+    assert [one.name for one in placement.candidates(0)] == ["c", "a", "b"]
+
+
+def test_room_that_was_given_away_since_is_gone(rooms: dict[str, Room]) -> None:
+    """Workers that start at the same time are told of the same room."""
+    rooms |= {"a": Room(workers=1), "b": Room(workers=9)}
+    placement = _opened(["a", "b"])
+    assert [_first(placement, number) for number in range(4)] == ["b", "a", "b", "b"]
+
+
+def test_a_claim_of_endless_room_attracts_no_more(rooms: dict[str, Room]) -> None:
+    """A server may say what it likes: it gets its share of the workers."""
+    rooms |= {"a": Room(workers=1 << 62), "b": Room(workers=8)}
+    placement = _opened(["a", "b"])
+    assert sorted(_first(placement, number) for number in range(8)) == ["a"] * 4 + ["b"] * 4
+
+
+def test_a_worker_comes_back_to_where_it_was(rooms: dict[str, Room]) -> None:
+    """Also where another has more room; but not where that does not answer, or is full."""
+    placement = _opened(["a", "b"])
+    assert _first(placement, 0) == "a"
+    rooms |= {"a": Room(workers=1), "b": Room(workers=9)}
+    assert _first(placement, 0) == "a"
+    rooms["a"] = Room(answers=False, workers=0)
+    assert _first(placement, 0) == "b"
+
+
+def test_where_a_worker_is(rooms: dict[str, Room]) -> None:
+    """Before it was placed, where it would go as far as is known."""
+    placement = _opened(["a", "b"])
+    assert [placement.at(number).name for number in range(3)] == ["a", "b", "a"]
+    tries = placement.candidates(0)
+    assert [next(tries).name, next(tries).name] == ["a", "b"]
+    assert placement.at(0).name == "b"
+
+
+def test_what_it_runs_on_is_that_of_all_places(rooms: dict[str, Room]) -> None:
+    """Of places that are alike that of one: a remembered manifest then holds for both."""
+    placement = _opened(["a", "b"])
+    assert placement.runs_on(Runtime("")) == Runtime("")
+
+
+def test_a_place_that_is_wrong_later_is_left_out(tmp_path: Path, rooms: dict[str, Room]) -> None:
+    """A line that is half written when it is read ends no worker that can go elsewhere."""
+    known = {name: _Place(name) for name in "ab"}
+
+    def resolve(place: Any) -> Sandbox:
+        if place not in known:
+            raise PolicyError(f"sandbox is {place!r}")
+        return known[place]
+
+    path = tmp_path / "places"
+    path.write_text("b\n")
+    made = Placement(PlaceList(path), resolve, lambda member: Runtime(""))
+    made.members()
+    path.write_text("a\ntcp://10.0.\nb\n")
+    assert [member.name for member in made.members()] == ["a", "b"]
+    path.write_text("tcp://10.0.\n")
+    assert [member.name for member in made.members()] == ["a", "b"], "the last ones hold"
+    with pytest.raises(PolicyError, match="10"):
+        Placement(PlaceList(path), resolve, lambda member: Runtime("")).members()

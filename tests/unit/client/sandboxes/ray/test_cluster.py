@@ -1,0 +1,104 @@
+"""What is believed of an actor's answer, and of Ray's own words."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import sys
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerStartupError
+from envhub_sandbox.sandboxes.ray import cluster
+
+
+@pytest.mark.parametrize(
+    "lie",
+    [
+        *(b"", b"{", b"[]", b"7", b"null", b"{" * 70_000, b"[" * 30_000, b"\xff"),
+        *({"endpoint": "x"}, "{}", None, 7, pickle.dumps({})),
+        json.dumps({"log": "x" * 70_000}).encode(),
+    ],
+)
+def test_an_answer_that_is_none_is_refused(lie: Any) -> None:
+    """Whatever Ray has made of it; nothing but JSON in bytes is read."""
+    with pytest.raises(WorkerStartupError, match="none of ours"):
+        cluster.read_answer(lie)
+
+
+def test_bytes_of_json_are_an_answer() -> None:
+    """And a subclass is none."""
+    assert cluster.read_answer(b'{"code": 3}') == {"code": 3}
+    with pytest.raises(WorkerStartupError):
+        cluster.read_answer(type("Bytes", (bytes,), {})(b"{}"))
+
+
+class Ray:
+    """Stands for Ray: whether this process is connected, and what becomes of ``init``."""
+
+    def __init__(self, *, running: bool = False, connected: str = "") -> None:
+        self.running, self.connected = running, connected
+        self.asked: list[str] = []
+
+    def is_initialized(self) -> bool:
+        """As Ray says it."""
+        return bool(self.connected)
+
+    def init(self, address: str, **_: Any) -> None:
+        """Fails as Ray does, where no cluster runs."""
+        self.asked.append(address)
+        if address != "local" and not self.running:
+            raise ConnectionError("Could not find\x1b any running Ray instance")
+        self.connected = f"{address}:1"
+
+    def get_runtime_context(self) -> Any:
+        """With the address that it is connected to."""
+        return SimpleNamespace(gcs_address=self.connected, get_job_id=lambda: "01000000")
+
+    def cluster_resources(self) -> dict[str, float]:
+        """Of a small machine."""
+        return {"CPU": 2.0}
+
+
+def use(ray: Ray, monkeypatch: pytest.MonkeyPatch) -> Ray:
+    """Have it be the Ray of this process."""
+    monkeypatch.setitem(sys.modules, "ray", ray)  # type: ignore[arg-type]
+    monkeypatch.setattr(cluster, "check_installed", lambda: None)
+    return ray
+
+
+def test_a_local_ray_is_started_where_none_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Which is said, once."""
+    ray = use(Ray(), monkeypatch)
+    with pytest.warns(RuntimeWarning, match=r"a local Ray with 2 CPUs was started"):
+        cluster.connect()
+    cluster.connect()
+    assert ray.asked == ["auto", "local"]
+    assert (cluster.cpus(), cluster.shared_address(), cluster.job()) == (2, "local:1", "01000000")
+
+
+def test_a_cluster_that_runs_is_used_without_a_word(monkeypatch: pytest.MonkeyPatch) -> None:
+    """``ray.init`` is the user's; and none is started beside it."""
+    ray = use(Ray(running=True), monkeypatch)
+    assert cluster.job() is None
+    cluster.connect()
+    assert ray.asked == ["auto"]
+
+
+def test_an_address_without_a_cluster_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is started in its place; Ray's words are shown, and do nothing to a terminal."""
+    ray = use(Ray(), monkeypatch)
+    with pytest.raises(SandboxUnavailableError, match=r"10\.0\.0\.1:6379.*\\x1b"):
+        cluster.connect("10.0.0.1:6379")
+    assert ray.asked == ["10.0.0.1:6379"]
+
+
+def test_another_cluster_than_the_connected_one_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It cannot be used at once."""
+    use(Ray(connected="10.0.0.1:6379"), monkeypatch)
+    for good in ("", "auto", "10.0.0.1:6379"):
+        cluster.connect(good)
+    with pytest.raises(PolicyError, match=r"10\.0\.0\.1:6379"):
+        cluster.connect("10.0.0.2:6379")

@@ -1,0 +1,1 @@
+"""What joins the workers of a fleet, one module at a time."""

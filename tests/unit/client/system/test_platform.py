@@ -1,0 +1,239 @@
+"""What stands in on macOS and Windows for what Linux alone has."""
+
+from __future__ import annotations
+
+import configparser
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import psutil
+import pytest
+
+from envhub_sandbox.system import platform
+from tests.support.elsewhere import interpreter
+from tests.support.elsewhere.kit import SYSTEMS, command, elsewhere, ran
+from tests.support.processes import eventually
+
+pytestmark = pytest.mark.same_for("versions")
+
+_SETTINGS = Path(__file__).parents[4] / ".ci" / "elsewhere.ini"
+_FACES = ("envhub_sandbox.integrations",)  # of libraries that look at the platform themselves
+_IMPORT = """
+import importlib, json, pkgutil, sys
+import envhub_sandbox
+alone = sys.argv[1:]
+for one in pkgutil.walk_packages(envhub_sandbox.__path__, "envhub_sandbox."):
+    if not any(f"{one.name}.".startswith(f"{name}.") for name in alone):
+        importlib.import_module(one.name)
+print(json.dumps(sorted(sys.modules)))
+"""
+_AS_OURS = """
+import sys
+for text in sys.argv[1:]:
+    try:
+        exec(text, {"__name__": "envhub_sandbox.pretended"})
+        print(text)
+    except (AttributeError, ImportError, OSError) as error:
+        continue
+"""
+_GONE = {
+    "darwin": (
+        *("import os; os.memfd_create", "import os; os.pidfd_open", "import os; os.eventfd"),
+        *("import os; os.sched_getaffinity", "import socket; socket.SO_PEERCRED"),
+        *("import ctypes; ctypes.CDLL(None).prctl", "open('/proc/self/status')"),
+        *("import os; os.stat('/proc/self')", "from pathlib import Path; Path('/sys').stat()"),
+    ),
+    "win32": (
+        *("import fcntl", "import pwd", "import resource", "import os; os.fork"),
+        *("import os; os.geteuid", "import os; os.register_at_fork", "import os; os.O_NOFOLLOW"),
+        *("import socket; socket.AF_UNIX", "import signal; signal.SIGALRM"),
+        *("import select; select.poll", "import os; os.open('/tmp', os.O_RDONLY)"),
+    ),
+}
+_HOLDS = """
+import sys
+from pathlib import Path
+from envhub_sandbox.system.locks import LifeLock, held
+path = Path(sys.argv[1])
+life = LifeLock(path / "alive", "words")
+with held(path / "lock"):
+    print("holds", flush=True)
+    sys.stdin.read()
+"""
+_ASKS = """
+import sys
+from pathlib import Path
+from envhub_sandbox.system.locks import held, is_held
+path = Path(sys.argv[1])
+taken = []
+for name in ("alive", "lock"):
+    taken.append(is_held(path / name))
+try:
+    with held(path / "lock"):
+        taken.append(False)
+except TimeoutError:
+    taken.append(True)
+print(taken, (path / "alive").read_text())
+"""
+_STARTS = """
+import os, subprocess, sys, time
+from envhub_sandbox.system import processes
+with processes.pidfd() as ourselves:
+    command = [sys.executable, "-I", "-c", sys.argv[1], str(ourselves)]
+    child = subprocess.Popen(command, pass_fds=(ourselves,), start_new_session=True)
+fork = os.fork()
+if fork == 0:
+    os.dup2(os.open(os.devnull, os.O_RDWR), 1)
+    time.sleep(3600)
+print(child.pid, fork, flush=True)
+time.sleep(3600)
+"""
+_FOLLOWS = """
+import sys, time
+from envhub_sandbox.system import processes
+processes.end_with(int(sys.argv[1]), 0.0)
+time.sleep(3600)
+"""
+_ALARMED = """
+import _thread, threading, time
+from envhub_sandbox.cli.check.deadline import DeadlineReached, deadline_alarm
+
+def wait():  # Windows interrupts one sleep, Linux only what follows it
+    for _ in range(600):
+        time.sleep(0.1)
+
+try:
+    with deadline_alarm(0.2):
+        wait()
+except DeadlineReached:
+    print("reached")
+with deadline_alarm(60):
+    threading.Timer(0.2, _thread.interrupt_main).start()
+    try:
+        wait()
+    except DeadlineReached:
+        print("wrong")
+    except KeyboardInterrupt:
+        print("interrupted")
+"""
+_PARSES = """
+import time
+from envhub_sandbox.hub.sources import parser
+parser.CPU_S = 0.5
+whole = parser.described
+parser.described = lambda data: time.sleep(60) if b"slow" in data else whole(data)
+parser.main()
+"""
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_every_module_can_be_imported(system: str) -> None:
+    """And none of them imports what only Linux uses."""
+    alone = interpreter.LINUX_ALONE
+    found = json.loads(elsewhere(system, _IMPORT, *alone, *_FACES))
+    assert "envhub_sandbox.sandboxes.docker.published" in found
+    assert not [name for name in found if name in alone]
+
+
+def test_type_checkers_know_the_same_modules() -> None:
+    """What they pass over elsewhere is what no client there imports."""
+    settings = configparser.ConfigParser()
+    settings.read(_SETTINGS)
+    named = {
+        section.removeprefix("mypy-").removesuffix(".*")
+        for section in settings.sections()
+        if settings.getboolean(section, "ignore_errors", fallback=False)
+    }
+    assert named == set(interpreter.LINUX_ALONE)
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_what_is_not_there_is_not_there(system: str) -> None:
+    """The control: our own modules would find it here, and do not in that interpreter."""
+    for text in _GONE[system]:
+        exec(text, {"__name__": "envhub_sandbox.pretended"})
+    assert elsewhere(system, _AS_OURS, *_GONE[system], "import os").split("\n") == ["import os", ""]
+
+
+def test_this_platform_is_linux() -> None:
+    """Of which everything is there."""
+    assert (platform.IS_LINUX, platform.IS_WINDOWS, platform.NAME) == (True, False, "linux")
+    assert platform.user_id() == os.geteuid()
+    assert platform.cores() == len(os.sched_getaffinity(0))
+    assert platform.open_flags("O_NOFOLLOW", "O_NONSENSE") == os.O_NOFOLLOW
+    assert platform.own_variables() == {}
+    assert platform.boot_id() == Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+
+
+def test_programs_on_windows_get_what_they_need() -> None:
+    """None starts without it; nothing else of the environment is handed on."""
+    program = "from envhub_sandbox.system import platform; print(*platform.own_variables())"
+    names = elsewhere("win32", program, HF_TOKEN="secret").split()
+    assert "SYSTEMROOT" in names
+    assert "HF_TOKEN" not in names
+
+
+def test_a_folder_with_a_drive_is_here_on_windows() -> None:
+    """Elsewhere it is a reference that says what is wrong with it."""
+    program = r"from envhub_sandbox.hub.reference import is_local; print(is_local('C:\\env'))"
+    assert [elsewhere(system, program).strip() for system in SYSTEMS] == ["False", "True"]
+
+
+@pytest.mark.parametrize("system", SYSTEMS)
+def test_locks_hold_between_processes(system: str, tmp_path: Path) -> None:
+    """And are given back by the end of the one that had them; what a file holds can be read."""
+    holder = subprocess.Popen(
+        command(system, "-c", _HOLDS, tmp_path),
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert holder.stdout is not None
+    with holder:
+        assert holder.stdout.readline() == "holds\n"
+        assert elsewhere(system, _ASKS, tmp_path).strip() == "[True, True, True] words"
+        holder.kill()
+    assert elsewhere(system, _ASKS, tmp_path).strip() == "[False, False, False] words"
+
+
+def test_a_child_on_macos_ends_with_its_parent() -> None:
+    """By a pipe in place of a pidfd, which a fork of the parent does not keep open."""
+    parent = subprocess.Popen(
+        command("darwin", "-c", _STARTS, _FOLLOWS), stdout=subprocess.PIPE, text=True
+    )
+    assert parent.stdout is not None
+    with parent:
+        child, fork = map(int, parent.stdout.readline().split())
+        assert psutil.pid_exists(child)
+        parent.kill()
+    try:
+        assert eventually(lambda: not psutil.pid_exists(child))
+        assert psutil.pid_exists(fork)
+    finally:
+        psutil.Process(fork).kill()
+
+
+def test_a_deadline_comes_on_windows_too() -> None:
+    """As a thread's interrupt; a Ctrl-C before it stays one."""
+    assert elsewhere("win32", _ALARMED).split() == ["reached", "interrupted"]
+
+
+def test_a_parser_ends_on_windows_too() -> None:
+    """By the clock; what it has answered before counts."""
+    texts = [b"import numpy", b"slow", b"import torch"]
+    given = b"".join(len(text).to_bytes(4, "big") + text for text in texts)
+    done = subprocess.run(
+        command("win32", "-c", _PARSES), input=given, capture_output=True, timeout=120, check=False
+    )
+    assert done.returncode != 0
+    [line] = done.stdout.splitlines()
+    assert json.loads(line)["imports"][0][2] == ["numpy"]
+
+
+def test_the_interpreter_runs_modules() -> None:
+    """With their arguments, as a command does."""
+    assert "usage" in ran("darwin", "-m", "json.tool", "--help").stdout
+    assert sys.platform == "linux"

@@ -1,0 +1,168 @@
+"""Infos of workers that are ready at different times: none changes what another has said."""
+
+from __future__ import annotations
+
+import itertools
+import warnings
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from envhub_worker.protocol.spaces.batches import (
+    APART,
+    Misfit,
+    check_infos,
+    gather_infos,
+    is_apart,
+    join_infos,
+    join_pairs,
+)
+from tests.compliance.test_join_infos import INFO
+from tests.support.compare import assert_same
+
+pytestmark = pytest.mark.short
+_ROOM = 1 << 20
+
+
+def cut(infos: list[dict[str, Any]], data: st.DataObject) -> list[list[dict[str, Any]]]:
+    """Into parts."""
+    cuts = data.draw(st.sets(st.integers(1, max(1, len(infos) - 1))))
+    edges = [0, *sorted(one for one in cuts if one < len(infos)), len(infos)]
+    return [infos[start:stop] for start, stop in itertools.pairwise(edges)]
+
+
+def joined(infos: list[dict[str, Any]]) -> dict[Any, Any]:
+    """Those of one worker."""
+    return join_pairs(list(enumerate(infos)), len(infos))
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(INFO, min_size=1, max_size=6), st.data())
+def test_what_goes_together_is_joined_as_ever(
+    infos: list[dict[str, Any]], data: st.DataObject
+) -> None:
+    """As ``join_infos`` does it, which is as Gymnasium does it."""
+    parts = cut(infos, data)
+    sizes = [len(part) for part in parts]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        try:
+            each = [joined(part) for part in parts]
+            wanted = join_infos(each, sizes)
+        except Exception:
+            return
+    assert_same(wanted, gather_infos(each, sizes, _ROOM), "infos")
+
+
+ANY = st.one_of(
+    st.integers(-9, 9),
+    st.floats(allow_nan=False, width=32),
+    st.booleans(),
+    st.text(max_size=3),
+    st.none(),
+    st.integers(0, 3).map(lambda n: np.full(n, n, np.int16)),
+    # in one order: a column has one for all
+    st.fixed_dictionaries({}, optional={"a": st.integers(0, 9), "b": st.text(max_size=1)}).map(
+        lambda one: dict(sorted(one.items()))
+    ),
+)
+UNLIKE = st.fixed_dictionaries({}, optional={"one": ANY, "other": ANY})
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(UNLIKE, min_size=1, max_size=6))
+def test_each_has_its_own_whatever_the_others_say(infos: list[dict[str, Any]]) -> None:
+    """Also where one has a mapping and another an array, and where dtypes differ."""
+    each, sizes = [joined([info]) for info in infos], [1] * len(infos)
+    gathered = gather_infos(each, sizes, _ROOM)
+    for index, info in enumerate(infos):
+        for key in ("one", "other"):
+            assert_same(info.get(key), member(gathered, key, index), key)
+
+
+def member(infos: dict[Any, Any], key: str, index: int) -> Any:
+    """What a sub-environment gave; None if nothing."""
+    if key not in infos or not infos[f"_{key}"][index]:
+        return None
+    value = infos[key]
+    if isinstance(value, dict):
+        names = sorted(name for name in value if not name.startswith("_"))
+        return {name: member(value, name, index) for name in names if value[f"_{name}"][index]}
+    return plain(value[index])
+
+
+def plain(value: Any) -> Any:
+    """A number of Python's."""
+    if isinstance(value, dict):
+        return {key: plain(item) for key, item in value.items()}
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def test_a_few_bytes_make_no_large_column() -> None:
+    """A worker's large array is its own; as a column of all it would be a hundred times that."""
+    large = joined([{"large": np.zeros(1 << 17, np.uint8)}])
+    few = joined([{"large": np.ones(1 << 17, np.uint8)}])
+    gathered = gather_infos([large, *[few] * 99], [1] * 100, _ROOM)
+    assert gathered["large"].dtype == object
+    assert [int(one[0]) for one in gathered["large"]] == [0, *[1] * 99]
+    assert gather_infos([large, few], [1, 1], _ROOM)["large"].shape == (2, 1 << 17)
+
+
+@pytest.mark.parametrize(
+    "mask", [np.zeros((1, 3)), np.array(["x"]), np.array([None]), np.zeros((1, 0), bool)]
+)
+def test_lies_about_masks_do_no_harm(mask: Any) -> None:
+    """They are the worker's own; the others keep theirs."""
+    lie = {"x": np.array([1]), "_x": mask}
+    honest = joined([{"x": 0.5}])
+    for each in ([lie, honest], [honest, lie]):
+        gathered = gather_infos(each, [1, 1], _ROOM)
+        at = each.index(honest) if each[0] is honest else 1
+        assert gathered["x"][at] == 0.5
+        assert bool(gathered["_x"][at])
+
+
+def test_the_control_does_not_fit() -> None:
+    """Where dtypes differ, ``join_infos`` asks for each one's own."""
+    with pytest.raises(Misfit):
+        join_infos([joined([{"x": 1}]), joined([{"x": 0.5}])], [1, 1])
+
+
+_ODD = st.sampled_from(
+    [
+        *(np.zeros((1, *shape), kind) for shape in [(), (0,), (3,), (2, 2)] for kind in "?bfUO"),
+        np.array([[1, [2, 3]]], object)[:, 0],
+        np.array([None, [1, [2]]], object)[1:],
+        np.array([{}, {"a": 1}], object)[1:],
+        {},
+        {"_": np.zeros(1), "x": {"y": np.ones(1, object)}},
+    ]
+)
+_KEYS = st.sampled_from([None, 0, 1.5, "", "_", "x", "_x", "__x", b"x", ("x",)])
+_LIES = st.dictionaries(_KEYS, st.recursive(_ODD, lambda some: st.dictionaries(_KEYS, some)))
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(_LIES, min_size=2, max_size=4))
+def test_nothing_that_is_let_in_keeps_others_back(lies: list[dict[Any, Any]]) -> None:
+    """Whatever workers say, if it has a row for each of their sub-environments, it is gathered."""
+    for lie in lies:
+        check_infos(lie, 1)
+    gather_infos(lies, [1] * len(lies), _ROOM)
+
+
+@pytest.mark.parametrize("value", [1, "x", [1], None, np.zeros(2), np.zeros(()), {"y": [1]}])
+def test_what_has_no_row_for_each_is_refused(value: Any) -> None:
+    """As is what is no array."""
+    with pytest.raises(Misfit):
+        check_infos({"x": value}, 1)
+
+
+def test_what_is_to_be_asked_for_apart_is_known() -> None:
+    """Also beside a lie that only looks like it."""
+    assert is_apart(dict(APART))
+    for lie in ({}, {None: np.zeros(2)}, {None: 0}, {None: None, "x": 1}, {"x": None}):
+        assert not is_apart(lie)

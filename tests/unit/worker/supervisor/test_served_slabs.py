@@ -1,0 +1,268 @@
+"""The server takes a runner's steps: asks, hears and copies, and never waits for the runner."""
+
+from __future__ import annotations
+
+import errno
+import mmap
+import os
+import select
+import struct
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from envhub_worker.protocol.shared_memory import words
+from envhub_worker.supervisor.served_slabs import ServedSlabs, ServedSteps
+from tests.support import inside
+
+LEAVES, ACTION = 1, b"actions!"
+OBSERVATION = bytes(range(128))
+HALF = (words.DTYPES - words.SPIN + LEAVES) * 8
+
+
+class Runner:
+    """The jail's end: what was deposited, mapped as a runner maps it."""
+
+    def __init__(self, slabs: ServedSlabs, observation_bytes: int) -> None:
+        self.fds, slabs.deposit = slabs.deposit, []
+        request, reply, observations, self.bell, self.servers_bell = self.fds
+        size = os.fstat(request).st_size
+        self.request = mmap.mmap(request, size, prot=mmap.PROT_READ)
+        self.reply = mmap.mmap(reply, words.REPLY_BYTES)
+        self.observations = mmap.mmap(observations, observation_bytes)
+        self.asked, self.tells = words.words(self.request), words.words(self.reply)
+
+    def answer(self, outcome: int = words.DONE, length: int = 0, infos: bytes = b"") -> None:
+        """Write an answer, and ring if the server sleeps."""
+        self.reply[words.HEADER_BYTES : words.HEADER_BYTES + len(infos)] = infos
+        self.tells[words.OUTCOME], self.tells[words.LENGTH] = outcome, length
+        self.tells[words.SEQUENCE] = self.asked[words.SEQUENCE]
+        if self.asked[words.PARKED]:
+            self.ring()
+
+    def ring(self) -> None:
+        """Whether there is something to hear or not."""
+        os.eventfd_write(self.servers_bell, 1)
+
+
+@pytest.fixture
+def steps(monkeypatch: pytest.MonkeyPatch) -> Iterator[ServedSteps]:
+    """Of no runner yet, on a machine of several cores."""
+    monkeypatch.setattr(*inside.MAY_SPIN, True)
+    made = ServedSteps()
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def slabs(steps: ServedSteps) -> ServedSlabs:
+    """One runner's."""
+    made = ServedSlabs(LEAVES, words.HEADER_BYTES + 64 + words.INFO_BYTES, len(OBSERVATION))
+    steps.add(made)
+    return made
+
+
+@pytest.fixture
+def runner(slabs: ServedSlabs) -> Runner:
+    """Which has taken its descriptors."""
+    made = Runner(slabs, len(OBSERVATION))
+    made.observations[:] = OBSERVATION
+    return made
+
+
+def frame(*, spin_ns: int = 0, known: int = 0) -> bytes:
+    """What a client sends for a step."""
+    own = [0] * (HALF // 8)
+    own[0], own[words.KNOWN - words.SPIN], own[-1] = spin_ns, known, 7
+    return struct.pack(f"<{len(own)}Q", *own) + ACTION
+
+
+def ask(slabs: ServedSlabs, steps: ServedSteps, **own: int) -> list[Any]:
+    """A step; the list gets its answer."""
+    taken: list[Any] = []
+    slabs.ask(frame(**own), "owner")
+    steps.owe(slabs, lambda: taken.append(slabs.take()))
+    return taken
+
+
+def test_a_step_is_written_and_answered(
+    slabs: ServedSlabs, steps: ServedSteps, runner: Runner
+) -> None:
+    """The client's words and actions arrive; what comes back is the outcome and the batch."""
+    runner.tells[words.PARKED] = 1
+    taken = ask(slabs, steps)
+    assert os.read(runner.bell, 8) == (1).to_bytes(8, "little")
+    assert (runner.asked[words.SEQUENCE], runner.asked[words.DTYPES]) == (1, 7)
+    start = words.HEADER_BYTES
+    assert runner.request[start : start + len(ACTION)] == ACTION
+    assert steps.look() is None
+    assert taken == []
+    runner.answer()
+    steps.look()
+    assert taken == [("owner", [struct.pack("<QQ", words.DONE, 0) + OBSERVATION])]
+    assert slabs.owner is None
+    steps.look()
+    assert len(taken) == 1
+
+
+def test_a_runner_that_is_awake_is_not_rung(
+    slabs: ServedSlabs, steps: ServedSteps, runner: Runner
+) -> None:
+    """Nor does one ring a server that looks."""
+    os.set_blocking(runner.bell, False)
+    taken = ask(slabs, steps, spin_ns=60_000_000_000)
+    with pytest.raises(BlockingIOError):
+        os.read(runner.bell, 8)
+    assert steps.look() == 0, "a server that is awake sleeps"
+    assert runner.asked[words.PARKED] == 0
+    runner.answer()
+    steps.look()
+    assert len(taken) == 1
+    assert not select.select([steps.fileno()], [], [], 0)[0]
+
+
+def test_a_server_sleeps_when_an_answer_takes_long(
+    slabs: ServedSlabs, steps: ServedSteps, runner: Runner
+) -> None:
+    """It looks once more soon, for the ring may cross with that; then it is rung."""
+    taken = ask(slabs, steps, spin_ns=1)
+    assert steps.look() == 2
+    assert runner.asked[words.PARKED] == 1
+    assert steps.look() is None
+    runner.answer()
+    assert select.select([steps.fileno()], [], [], 60)[0]
+    steps.rung()
+    steps.look()
+    assert len(taken) == 1
+
+
+def test_both_sides_sleep_where_waiting_awake_is_not_permitted(
+    slabs: ServedSlabs, steps: ServedSteps, runner: Runner, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On one core, or on one that may see the announcement before what is announced."""
+    monkeypatch.setattr(*inside.MAY_SPIN, False)
+    ask(slabs, steps, spin_ns=60_000_000_000)
+    assert (runner.asked[words.SPIN], runner.asked[words.PARKED]) == (0, 1)
+    assert steps.look() is None
+
+
+@pytest.mark.parametrize("rings", [0, 1, 1000])
+def test_rings_that_announce_nothing_are_not_heard_for_long(
+    slabs: ServedSlabs, steps: ServedSteps, runner: Runner, rings: int
+) -> None:
+    """A server that woke at each of them would be the jail's; its answer is found without."""
+    taken = ask(slabs, steps)
+    heard = 0
+    for _ in range(rings):
+        runner.ring()
+        if select.select([steps.fileno()], [], [], 0)[0]:
+            heard += 1
+            steps.rung()
+            steps.look()
+    assert heard == min(rings, 17)
+    assert taken == []
+    runner.answer()
+    steps.look()
+    assert len(taken) == 1
+
+
+@pytest.mark.parametrize("length", [1, words.INFO_BYTES, words.INFO_BYTES + 1, 2**64 - 1])
+def test_infos_are_as_long_as_they_may_be(
+    slabs: ServedSlabs, steps: ServedSteps, runner: Runner, length: int
+) -> None:
+    """Whatever the runner says that they are; the client reads what it said."""
+    taken = ask(slabs, steps)
+    runner.answer(length=length, infos=b"\xff" * words.INFO_BYTES)
+    steps.look()
+    [(_, [first])] = taken
+    infos = b"\xff" * min(length, words.INFO_BYTES)
+    assert first == struct.pack("<QQ", words.DONE, length) + infos + OBSERVATION
+
+
+@pytest.mark.parametrize("known", [0, 24, words.INFO_BYTES, 2**64 - 1])
+def test_columns_are_as_long_as_the_client_knows(
+    slabs: ServedSlabs, steps: ServedSteps, runner: Runner, known: int
+) -> None:
+    """Not as the runner says, and never more than there is."""
+    taken = ask(slabs, steps, known=known)
+    runner.answer(words.COLUMNS, length=7)
+    steps.look()
+    [(_, [first])] = taken
+    assert len(first) == 16 + min(known, words.INFO_BYTES) + len(OBSERVATION)
+
+
+def test_a_large_batch_comes_in_pieces(steps: ServedSteps) -> None:
+    """From where it lies; together they are the slab."""
+    size = (3 << 19) + 8
+    slabs = ServedSlabs(LEAVES, words.HEADER_BYTES + 64 + words.INFO_BYTES, size)
+    steps.add(slabs)
+    runner = Runner(slabs, size)
+    runner.observations[:] = os.urandom(size)
+    taken = ask(slabs, steps)
+    runner.answer()
+    steps.look()
+    [(_, [head, *pieces])] = taken
+    assert (len(head), [len(piece) for piece in pieces]) == (16, [1 << 19] * 3 + [8])
+    assert b"".join(pieces) == runner.observations[:]
+    steps.forget(slabs)
+    assert bytes(pieces[0]) == runner.observations[: 1 << 19], "they are sent after the end, too"
+
+
+@pytest.mark.parametrize("size", [0, HALF - 1, HALF + 64 + words.INFO_BYTES + 1])
+def test_what_is_no_half_of_a_request_slab_is_none(slabs: ServedSlabs, size: int) -> None:
+    """Nothing is written beyond the slab, nor half of the words."""
+    assert not slabs.fits(bytes(size))
+    assert slabs.fits(bytes(HALF))
+    assert slabs.fits(bytes(HALF + 64 + words.INFO_BYTES))
+
+
+def test_nothing_is_owed_by_what_is_forgotten(
+    slabs: ServedSlabs, steps: ServedSteps, runner: Runner
+) -> None:
+    """And a jail that goes on ringing is not heard."""
+    taken = ask(slabs, steps)
+    steps.forget(slabs)
+    runner.answer()
+    assert steps.look() is None
+    assert taken == []
+    assert not select.select([steps.fileno()], [], [], 0)[0]
+
+
+def test_an_answer_may_be_the_end_of_others(steps: ServedSteps) -> None:
+    """As where what one runner said ends its jail: the answers of the others are not taken."""
+    made = [ServedSlabs(LEAVES, words.HEADER_BYTES + 64 + words.INFO_BYTES, 8) for _ in range(2)]
+    ended: list[ServedSlabs] = []
+
+    def end() -> None:
+        for slabs in made:
+            ended.append(slabs)
+            steps.forget(slabs)
+
+    for slabs in made:
+        steps.add(slabs)
+        slabs.ask(frame(), "owner")
+        steps.owe(slabs, end)
+    for slabs in made:
+        Runner(slabs, 8).answer()
+    assert steps.look() is None
+    assert ended == made
+
+
+def test_a_server_without_descriptors_loses_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A client that asks again and again would otherwise take the last ones for good."""
+    dup, made = os.dup, list[int]()
+
+    def scarce(fd: int) -> int:
+        if len(made) == 3:
+            raise OSError(errno.EMFILE, "Too many open files")
+        made.append(dup(fd))
+        return made[-1]
+
+    monkeypatch.setattr(os, "dup", scarce)
+    with pytest.raises(OSError, match="Too many"):
+        ServedSlabs(LEAVES, words.HEADER_BYTES + 64 + words.INFO_BYTES, 8)
+    assert len(made) == 3
+    for fd in made:
+        with pytest.raises(OSError, match="Bad file descriptor"):
+            os.fstat(fd)

@@ -1,0 +1,47 @@
+"""The server's loop looks before each wait, and sleeps for as long as that permits."""
+
+from __future__ import annotations
+
+import os
+
+from envhub_worker.loop import Loop
+
+
+def test_it_looks_before_each_wait() -> None:
+    """And waits no longer than it is told; None is as long as it likes."""
+    failures: list[Exception] = []
+    loop = Loop(failures.append)
+    looked: list[int] = []
+    waits = [0, 0, None, 0]
+    heard, rings = os.pipe()
+    loop.watch(heard, lambda: os.read(heard, 1))
+
+    def look() -> int | None:
+        looked.append(1)
+        wait_ms = waits[len(looked) - 1]
+        if wait_ms is None:
+            os.write(rings, b"x")  # else it would sleep now
+        if len(looked) == len(waits):
+            loop.stop()
+        return wait_ms
+
+    loop.look_by(look)
+    loop.run()
+    assert len(looked) == len(waits)
+    assert not failures
+    os.close(heard)
+    os.close(rings)
+
+
+def test_a_look_that_fails_ends_nothing() -> None:
+    """The operator hears of it."""
+    failures: list[Exception] = []
+    loop = Loop(failures.append)
+
+    def fail() -> int | None:
+        loop.stop()
+        raise RuntimeError("ours")
+
+    loop.look_by(fail)
+    loop.run()
+    assert [str(one) for one in failures] == ["ours"]
