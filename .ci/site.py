@@ -14,6 +14,7 @@ import shutil
 import subprocess
 import sys
 import tarfile
+from collections import Counter
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -23,8 +24,12 @@ from mkdocs.structure.files import File, Files
 from mkdocs.utils import get_relative_url
 
 ROOT = Path(__file__).resolve().parents[1]
-BESIDE = ("SECURITY.md", "CONTRIBUTING.md", "CHANGELOG.md", "LICENSE", "benchmarks/README.md")
-PLACES = {"README.md": "index.md", **{name: name for name in BESIDE}}
+BESIDE = ("SECURITY.md", "CONTRIBUTING.md", "CHANGELOG.md", "LICENSE")
+PLACES = {
+    "README.md": "index.md",
+    "benchmarks/README.md": "internals/benchmarks-how.md",
+    **{name: name for name in BESIDE},
+}
 CSS = "assets/site.css"
 MERMAID = "assets/mermaid.min.js"
 VERSION = "11.17.2"
@@ -50,6 +55,9 @@ def on_files(files: Files, config: Any) -> Files:
     css = Path(__file__).with_suffix(".css")
     files.append(File.generated(config, CSS, abs_src_path=str(css)))
     files.append(File.generated(config, MERMAID, abs_src_path=str(mermaid())))
+    pages = Counter(page.url for page in files.documentation_pages())
+    if twice := [url for url, count in pages.items() if count > 1]:
+        raise PluginError(f"two pages have the same address: {', '.join(twice)}")
     return files
 
 

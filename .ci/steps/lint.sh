@@ -1,5 +1,5 @@
-# Style, and types of both packages. Proves that
-# nothing is called that is not there, on any path.
+# Style, spelling, and types of both packages. Proves that
+# nothing is called that is not there, on any path: of a client not even on macOS and Windows.
 set -euo pipefail
 . "$(dirname "${BASH_SOURCE[0]}")/../lib.sh"
 make_venv "$(find_python 3.11 || command -v python3)" "$CI_WORK/lint"
@@ -9,6 +9,12 @@ bin=$CI_WORK/lint/bin
 
 "$bin/ruff" check .
 "$bin/ruff" format --check .
+"$bin/codespell" . .ci  # a copy of the checkout, which is no repository
 
 "$bin/mypy" --strict --config-file pyproject.toml \
   --cache-dir "$CI_WORK/mypy" -p envhub_sandbox -p envhub_worker
+# a client needs nothing of Linux
+for platform in darwin win32; do
+  "$bin/mypy" --config-file .ci/elsewhere.ini --platform "$platform" \
+    --cache-dir "$CI_WORK/mypy" -p envhub_sandbox
+done

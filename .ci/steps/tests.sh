@@ -11,6 +11,7 @@ export PYTHON PATH=$PATH:$CI_WORK/unpacked/usr/bin  # a Prometheus, where the st
 permit_what_this_machine_lacks
 command -v prometheus >/dev/null || export ENVHUB_CI_WITHOUT_PROMETHEUS=1
 # The step "container" has those that need an engine.
-export PYTEST_ADDOPTS="--ignore=tests/containers --durations=40"  # the next minutes to save are there
+# Ray is in the step "ray".
+export PYTEST_ADDOPTS="--ignore=tests/containers --ignore=tests/remote/ray --durations=40"  # the next minutes to save are there
 export ENVHUB_TEST_RUNNER="bash $CI_AGAIN"
 with_summary tests ./test --full -n "$(processes)"
