@@ -13,8 +13,19 @@ import numpy as np
 
 from envhub_sandbox.check.checks import CHECKS
 from envhub_sandbox.check.findings import Finding, Report
-from envhub_sandbox.check.page.markup import data, facts, folded, markup_page, table, text
-from envhub_sandbox.check.page.plots import bar_plot, finite, histogram_plot, line_plot, number
+from envhub_sandbox.check.page.markup import (
+    bar_plot,
+    data,
+    facts,
+    finite,
+    folded,
+    histogram_plot,
+    line_plot,
+    markup_page,
+    number,
+    table,
+    text,
+)
 from envhub_sandbox.check.play.plays import Film, Play
 from envhub_worker.protocol.text import counted, duration_text, size_text
 

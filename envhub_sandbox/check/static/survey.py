@@ -14,7 +14,6 @@ from pathlib import Path, PurePosixPath
 
 from envhub_sandbox.check.findings import Finding
 from envhub_sandbox.check.static import contents
-from envhub_sandbox.check.static.constructs import constructs, long_lines
 from envhub_sandbox.errors import SnapshotError
 from envhub_sandbox.hub.git.checkout import Checkout
 from envhub_sandbox.hub.listing import FileRecord, Snapshot
@@ -97,7 +96,7 @@ def _in_text(record: FileRecord, path: Path, *, is_code: bool) -> Iterator[Findi
     text = _bytes(path, record.size).decode("utf-8-sig", "replace")
     yield from contents.hidden(record.path, text, is_code=is_code)
     if is_code:
-        yield from long_lines(record.path, text)
+        yield from contents.long_lines(record.path, text)
 
 
 def _in_code(record: FileRecord, parsed: ParsedFile | None) -> Iterator[Finding]:
@@ -112,7 +111,7 @@ def _in_code(record: FileRecord, parsed: ParsedFile | None) -> Iterator[Finding]
     if parsed.encoding is not None:
         named = f"Python reads it as {parsed.encoding}" if parsed.encoding else "it is not UTF-8"
         yield Finding("source-encoding", f"{named}, and it has not been read", file=record.path)
-    found = constructs(record.path, parsed)
+    found = contents.constructs(record.path, parsed)
     yield from itertools.islice(found, _MOST_OF_A_FILE)
     if next(found, None) is not None:
         yield _unread(record, f"there is more in it than the first {_MOST_OF_A_FILE} findings")

@@ -10,7 +10,7 @@ import pytest
 from gymnasium import spaces
 from gymnasium.vector.utils import batch_space
 
-from envhub_sandbox.check.play.zero_action import zero_action
+from envhub_sandbox.check.play.episodes import zero_action
 
 FEATURES = spaces.Box(1, 2, (2,), np.float32)
 SPACES: list[gym.Space[Any]] = [

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from envhub_sandbox.check.play.frames import other_modes, wrong_frames
+from envhub_sandbox.check.play.probes import other_modes, wrong_frames
 
 FRAME = np.zeros((4, 6, 3), np.uint8)
 

@@ -6,17 +6,17 @@ import itertools
 
 import pytest
 
-from envhub_sandbox.check.play import leaks
+from envhub_sandbox.check.play import probes
 
 _MIB = 1 << 20
 
 
-def seen(*rows: tuple[int, int, int, int]) -> list[leaks.Usage]:
+def seen(*rows: tuple[int, int, int, int]) -> list[probes.Usage]:
     """One count after each round."""
     return [{"processes": p, "threads": t, "files": f, "memory_bytes": m} for p, t, f, m in rows]
 
 
-_GROWTH: dict[str, tuple[list[leaks.Usage], str | None]] = {
+_GROWTH: dict[str, tuple[list[probes.Usage], str | None]] = {
     "level": (seen(*[(1, 0, 9, 0)] * 4), None),
     "filled once": (seen((1, 0, 9, 0), *[(9, 8, 9, 90 * _MIB)] * 3), None),
     "jitter": (seen(*((1 + n, n, 9, 1000 * n) for n in range(4))), None),
@@ -30,14 +30,14 @@ _GROWTH: dict[str, tuple[list[leaks.Usage], str | None]] = {
 
 
 @pytest.mark.parametrize(("counts", "found"), _GROWTH.values(), ids=_GROWTH)
-def test_what_grows_in_every_round_is_told(counts: list[leaks.Usage], found: str | None) -> None:
+def test_what_grows_in_every_round_is_told(counts: list[probes.Usage], found: str | None) -> None:
     """And of what comes with it nothing: a process has threads and memory of its own."""
-    grew = leaks.leak(counts, 8)
+    grew = probes.leak(counts, 8)
     assert (grew[0] if grew else None) == found
 
 
 def test_nobody_who_counts_is_no_count() -> None:
     """A server on another host may be an older one: then nothing is said, not that all is well."""
     numbers = itertools.count()
-    assert leaks.usage_per_round(lambda: next(numbers), dict, 2, lambda what: None) == []
+    assert probes.usage_per_round(lambda: next(numbers), dict, 2, lambda what: None) == []
     assert next(numbers) == 8

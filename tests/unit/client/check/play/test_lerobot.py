@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from envhub_sandbox.check.play.lerobot import lerobot_lacks
+from envhub_sandbox.check.play.probes import lerobot_lacks
 
 PLAYABLE = spaces.Dict({"agent_pos": spaces.Box(-1, 1, (2,), np.float32)})
 VECTOR = spaces.Box(-1, 1, (2,), np.float32)

@@ -6,7 +6,7 @@ import pickle
 
 import pytest
 
-from envhub_sandbox.check.static import constructs, contents
+from envhub_sandbox.check.static import contents
 from envhub_sandbox.hub.sources.parsing import parsed
 
 
@@ -90,12 +90,12 @@ def test_constructs_are_found_where_they_are_written(code: str, check: str | Non
     """By whatever name a module is imported; a module of the repository's own is another."""
     read = parsed({"f.py": code.encode()})["f.py"]
     assert read is not None
-    found = list(constructs.constructs("f.py", read))
+    found = list(contents.constructs("f.py", read))
     assert {one.id for one in found} == ({check} if check else set())
     assert all(one.file == "f.py" and one.line == code.count("\n") + 1 for one in found)
 
 
 def test_lines_that_nobody_reads_to_their_end() -> None:
     """With their number and length."""
-    [found] = constructs.long_lines("f.py", "a\n" + "x" * 2_000 + "\n" + "y" * 1_999)
+    [found] = contents.long_lines("f.py", "a\n" + "x" * 2_000 + "\n" + "y" * 1_999)
     assert (found.line, found.message) == (2, "a line of 2000 characters")
