@@ -77,7 +77,7 @@ def _tasks(
 ) -> tuple[TaskFingerprint, ...]:
     from envhub_sandbox.dependencies.locks import making
     from envhub_sandbox.factory.make_env import make_env
-    from envhub_sandbox.session.recipe import pinned
+    from envhub_sandbox.session.repository import pinned
 
     with make_env(pinned(snapshot), env_kwargs=env_kwargs, **hub) as suites:
         return making.tasks_of(suites)

@@ -161,7 +161,7 @@ def _write(
 ) -> None:
     from envhub_sandbox.check import reports
     from envhub_sandbox.check.findings import Report
-    from envhub_sandbox.session.recipe import pinned
+    from envhub_sandbox.session.repository import pinned
 
     write_report(path, reports.sarif(Report(pinned(snapshot), list(findings)), failures))
 

@@ -21,7 +21,7 @@ import numpy as np
 from envhub_sandbox.errors import PolicyError
 from envhub_sandbox.sandboxes.fleet.place_list import is_list
 from envhub_sandbox.sandboxes.sandbox import Sandbox
-from envhub_sandbox.session.recipe import PlainConfig
+from envhub_sandbox.session.repository import PlainConfig
 from envhub_sandbox.settings.options import option_name
 from envhub_worker.protocol.messages import CONFIG_CLASS
 
@@ -32,10 +32,8 @@ _LEFT_OUT = object()
 
 def sandbox_of(sandbox: str | Sandbox | list[str | Sandbox], server_key: str | None) -> Sandbox:
     """The sandbox of a name, or the one that was given; of a list, a fleet of these.
-
-    Raises:
-        PolicyError: There is none of that name.
-        SandboxUnavailableError: This platform has none of that kind.
+    Raises ``PolicyError``: there is none of that name; ``SandboxUnavailableError``: this platform
+    has none of that kind.
     """
     fleet: Any = sandbox
     if isinstance(sandbox, (list, tuple)) or (isinstance(sandbox, str) and is_list(sandbox)):
@@ -92,11 +90,7 @@ def interpreter(python: str | Path | None) -> str:
 
 
 def check_executable(python: str) -> None:
-    """Refuse an interpreter of this machine that cannot be run.
-
-    Raises:
-        PolicyError: It is not there, or is no program.
-    """
+    """Refuse an interpreter of this machine that cannot be run. Raises ``PolicyError``."""
     if python and not (os.path.isfile(python) and os.access(python, os.X_OK)):
         raise PolicyError(
             f"{option_name('python')} is {python!r}, which is not a program; it takes the path of "
@@ -106,9 +100,7 @@ def check_executable(python: str) -> None:
 
 def check_readable(paths: Iterable[str]) -> None:
     """Refuse to grant what is not on this machine: it would silently not be there.
-
-    Raises:
-        PolicyError: A path leads to nothing.
+    Raises ``PolicyError``: a path leads to nothing.
     """
     for path in paths:
         if not os.path.exists(path):

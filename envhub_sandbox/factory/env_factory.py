@@ -22,13 +22,11 @@ from envhub_sandbox.hub.cache import cache_root
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.session.crash.history import History
 from envhub_sandbox.session.env_session import EnvSession
-from envhub_sandbox.session.jails.launcher import Launcher
+from envhub_sandbox.session.jails.builder import JailSource, SharedJail
+from envhub_sandbox.session.jails.launcher import Launcher, retry_while_busy
 from envhub_sandbox.session.jails.loaded import ExpectedManifest, LoadedJail
-from envhub_sandbox.session.jails.retry_while_busy import retry_while_busy
-from envhub_sandbox.session.jails.sources import JailSource, SharedJail
 from envhub_sandbox.session.parts.fleet_session import AnySession, FleetSession
 from envhub_sandbox.session.prewarm import SuitePrewarm, TaskPrewarm
-from envhub_sandbox.session.recipe import provenance_of
 from envhub_sandbox.settings.policy import Policy
 from envhub_sandbox.system import folders
 from envhub_sandbox.system.files import write_whole_file
@@ -161,8 +159,8 @@ class EnvFactory:
         self._repository = repository = launcher.repository
         self._num_workers = num_workers
         self._prewarm = prewarm
-        load = repository.arguments.message()
-        key = manifest_key(repository.snapshot, load, repository.policy, launcher.runs_on)
+        given = repository.snapshot, repository.arguments, repository.policy, launcher.runs_on
+        key = manifest_key(*given)
         self._cache = ManifestCache(cache_root() / "manifests", key)
 
     def make(self) -> EnvSuites:
@@ -207,14 +205,7 @@ class EnvFactory:
             SuitePrewarm(list(suites.values()), self._prewarm)
         return EnvSuites(
             envs,
-            lambda: provenance_of(
-                repository.snapshot,
-                manifest,
-                repository.latest_report,
-                repository.installed,
-                repository.latest_profile,
-                repository.places,
-            ),
+            lambda: repository.provenance(manifest),
             partial(_close_all, shared or ()),
             repository.recipe,
         )

@@ -21,14 +21,19 @@ from envhub_sandbox.hub.sources.assets import with_assets
 from envhub_sandbox.sandboxes import inprocess
 from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.session.jails.launcher import Launcher
-from envhub_sandbox.session.recipe import Recipe, pinned, provenance_of
-from envhub_sandbox.session.repository import LoadArguments, Repository
+from envhub_sandbox.session.repository import (
+    Recipe,
+    Repository,
+    pinned,
+    provenance_of,
+)
 from envhub_sandbox.settings.options import Options, option_name
 from envhub_sandbox.settings.policy import Limits, Policy, Timeouts, policy_from, timeouts_from
 from envhub_sandbox.system import processes
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_sandbox.vector.tracebacks import short_traceback
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
+from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.runtime import Runtime
 
@@ -150,7 +155,7 @@ def _make(cfg: Any, given: Options) -> EnvSuites:
     locked = wanted.lock.assets if wanted.lock is not None else ()
     snapshot = with_assets(snapshot, options.assets or locked, options.hub)
     packages = _packages(snapshot, wanted)
-    load = LoadArguments(
+    load = m.Load(
         n_envs=options.n_envs,
         use_async_envs=options.use_async_envs,
         cfg=None if config is None else plain_config(config),

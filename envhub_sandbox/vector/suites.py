@@ -11,7 +11,7 @@ from typing import Any, Generic, TypeVar
 
 from gymnasium.vector import VectorEnv
 
-from envhub_sandbox.session.recipe import Recipe
+from envhub_sandbox.session.repository import Recipe
 from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.system.log import WORKER
 from envhub_sandbox.system.progress import progress_shown

@@ -19,7 +19,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.hub.listing import FileRecord, Snapshot
-from envhub_sandbox.session.author_lines import add_author_line
+from envhub_sandbox.session.error_text import add_author_line
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import JailHandle, RunnersDiedError, open_jail
 from envhub_sandbox.transport.remote_warnings import MOST, RemoteWarnings

@@ -32,8 +32,7 @@ from envhub_sandbox.session.jails import launcher as launcher_module
 from envhub_sandbox.session.jails.launcher import Launcher
 from envhub_sandbox.session.jails.loaded import LoadedJail
 from envhub_sandbox.session.lease import Lease
-from envhub_sandbox.session.recipe import Recipe
-from envhub_sandbox.session.repository import Repository
+from envhub_sandbox.session.repository import Recipe, Repository
 from envhub_sandbox.system import folders
 from envhub_sandbox.transport import tcp
 from envhub_sandbox.transport.connection import WorkerConnection

@@ -105,7 +105,7 @@ _NO_FILES = (
     "envhub_sandbox/check/page/markup.py",
     "envhub_sandbox/check/page/page.py",
     "envhub_sandbox/check/checks.py",
-    "envhub_sandbox/check/static/survey.py",
+    "envhub_sandbox/check/static/static.py",
     "envhub_sandbox/cli/app.py",
     "envhub_sandbox/cli/init/starter.py",
     "envhub_sandbox/dependencies/locks/lockfile.py",

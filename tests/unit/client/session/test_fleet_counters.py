@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from envhub_sandbox.session.counters import Counters
-from envhub_sandbox.session.parts.fleet_counters import FleetCounters
+from envhub_sandbox.session.counters import Counters, FleetCounters
 from tests.support.in_process.fake_lane import FakeLane, session_over
 
 
@@ -30,7 +29,7 @@ def counters(parts: list[Counters]) -> FleetCounters:
     parts += [session.counters for session in sessions]
     for session in sessions:
         session.counters.connected(session.lease.lane)
-    return FleetCounters(sessions)
+    return FleetCounters(parts)
 
 
 def test_a_step_of_all_is_one_step(counters: FleetCounters, parts: list[Counters]) -> None:

@@ -1,4 +1,4 @@
-"""Errors name the author's own line, whatever text a worker sends."""
+"""What is added to an error: the author's own line, what a jail lacks, and what it was denied."""
 
 from __future__ import annotations
 
@@ -6,13 +6,15 @@ import copy
 import pickle
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from envhub_sandbox import errors
-from envhub_sandbox.errors import EnvHubError
+from envhub_sandbox.errors import EnvHubError, RemoteEnvError, WorkerDiedError
 from envhub_sandbox.hub.listing import FileRecord, Snapshot
-from envhub_sandbox.session.author_lines import add_author_line
+from envhub_sandbox.session.error_text import add_author_line, add_reach_advice, read_denials
+from envhub_sandbox.settings.policy import Policy
 from envhub_sandbox.transport.replies import raised
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.text import MARGIN
@@ -202,3 +204,77 @@ def test_our_own_frames_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyP
         'File "env.py", line 3, in <module>',
         'File "other.py", line 1, in <module>',
     ]
+
+
+def advised(kind: str, message: str, network: str = "none") -> str:
+    """What is added to a remote error."""
+    error = RemoteEnvError(kind, message)
+    before = str(error)
+    add_reach_advice(error, Policy(network=network))
+    add_reach_advice(error, Policy(network=network))  # once
+    return str(error).removeprefix(before)
+
+
+@pytest.mark.parametrize(
+    ("kind", "message", "named"),
+    [
+        ("huggingface_hub.errors.LocalEntryNotFoundError", "outgoing traffic ...", "assets="),
+        ("OSError", "We couldn't connect to 'https://huggingface.co' to load", "assets="),
+        ("subprocess.CalledProcessError", "Command '['uv', 'pip', 'install', 'x']' ...", "extra"),
+        ("subprocess.CalledProcessError", "Command 'pip install -q x' returned", "extra"),
+        ("OSError", "[Errno 97] Address family not supported by protocol", "'loopback'"),
+        ("requests.exceptions.ConnectionError", "Max retries exceeded", "assets="),
+        ("subprocess.CalledProcessError", "Command '['git', '-C', 'x', 'pull']' ...", "assets="),
+        ("socket.gaierror", "[Errno -3] Temporary failure in name resolution", "assets="),
+        ("pyglet.display.xlib.NoSuchDisplayException", 'Cannot connect to "None"', "window"),
+        ("_tkinter.TclError", "no display name and no $DISPLAY environment variable", "window"),
+        ("glfw.GLFWError", "(65550) b'X11: Failed to open display '", "window"),
+        ("pygame.error", "No available video device", "window"),
+    ],
+)
+def test_each_failure_names_what_brings_it(kind: str, message: str, named: str) -> None:
+    """One line, once."""
+    assert named in advised(kind, message)
+    assert advised(kind, message).count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("kind", "message", "network"),
+    [
+        ("ValueError", "pip and git are words, a display too", "none"),
+        ("KeyError", "'connect'", "none"),
+        ("socket.gaierror", "[Errno -3] Temporary failure in name resolution", "host"),
+        ("ConnectionRefusedError", "[Errno 111] Connection refused", "loopback"),
+    ],
+)
+def test_others_get_none(kind: str, message: str, network: str) -> None:
+    """Words alone say nothing, nor does a failure of a network that it has."""
+    assert advised(kind, message, network) == ""
+
+
+def test_its_own_loopback_is_not_named_twice() -> None:
+    """Where it has one, a family that is refused is another one."""
+    assert "loopback" not in advised("OSError", "[Errno 97] Address family", "loopback")
+
+
+def test_of_a_death_only_the_display_is_read() -> None:
+    """A process that exits by itself after such words, and one that is ended, are told apart."""
+    said = "qt.qpa.xcb: could not connect to display \nThis application failed to start"
+    for signal, added in (("SIGABRT", True), ("SIGKILL", False)):
+        error = WorkerDiedError("died", signal=signal, reason="signal", log_tail=said)
+        add_reach_advice(error, Policy())
+        assert ("a jail has no display" in str(error)) is added
+
+
+@pytest.mark.parametrize("said", [None, "ptrace", ["ptrace"], {"ptrace": 1}, 7])
+def test_denials_that_are_no_list_of_texts_are_none(said: Any) -> None:
+    """As where none are recorded."""
+    assert read_denials(said) is None
+
+
+def test_a_denial_that_is_no_attempt_is_left_out() -> None:
+    """Only forms that there are; nothing that a terminal would obey, nothing long, and not many."""
+    good = ("ptrace", "socket AF_INET", "write /home/other/x\\x1b")
+    bad = (b"ptrace", 7, None, ("ptrace",), "Ptrace", "read x", "read /\x1b[2J", "a" * 41)
+    assert read_denials((*bad, *good, "read /" + "x" * 401)) == good
+    assert len(read_denials(("ptrace",) * 100_000) or ()) == 64

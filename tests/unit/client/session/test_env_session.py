@@ -5,7 +5,6 @@ from __future__ import annotations
 import pytest
 
 from envhub_sandbox.errors import LocalProtocolError, RemoteEnvError, WorkerDiedError, remote_error
-from envhub_sandbox.session.parts.naming import name_part, rows_of
 from tests.attacks.client.lying_server import NUM_ENVS
 from tests.support.in_process.fake_lane import FakeLane, session_over
 
@@ -20,16 +19,16 @@ def test_the_first_line_names_the_rows_and_the_place(rows: tuple[int, int], name
     error = WorkerDiedError("it has ended\nits last words")
     error.args = (*error.args, "more")
     for _ in range(2):
-        name_part(error, part)
+        part.name_in(error)
         assert error.args == (f"it has ended ({named}, on here)\nits last words", "more")
-    assert rows_of(part) == rows
+    assert part.rows == rows
 
 
 def test_the_place_of_another_part_is_added_to_it() -> None:
     """Only the same part is not named twice."""
     error = WorkerDiedError("gone")
     for row in range(2):
-        name_part(error, session_over(FakeLane(1), (row, row + 1)))
+        session_over(FakeLane(1), (row, row + 1)).name_in(error)
     first, second = (f"(sub-environment {row} of 2, on here)" for row in range(2))
     assert str(error) == f"gone {first} {second}"
 
@@ -43,5 +42,5 @@ def test_errors_of_others_keep_their_text() -> None:
     bare.args = ()
     for error in (theirs, LocalProtocolError("a lambda cannot be sent"), bare):
         before = error.args
-        name_part(error, part)
+        part.name_in(error)
         assert error.args == before

@@ -9,8 +9,7 @@ import pytest
 from gymnasium import spaces
 
 from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
-from envhub_sandbox.session.survival.recovery import revived_step
-from envhub_sandbox.session.survival.seeds import SeedBook, derived_seed, resets
+from envhub_sandbox.session.recovery import SeedBook, derived_seed, resets, revived_step
 from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import JailHandle, RunnersDiedError
