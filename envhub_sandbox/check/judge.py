@@ -22,7 +22,7 @@ from envhub_sandbox.check.findings import Report
 from envhub_sandbox.check.play.confinement import Confinement, denial_findings
 from envhub_sandbox.check.play.task import TaskJudge
 from envhub_sandbox.check.settings import JudgeOptions
-from envhub_sandbox.check.static.static import survey, undeclared
+from envhub_sandbox.check.static import survey, undeclared
 from envhub_sandbox.dependencies.declared import declared
 from envhub_sandbox.dependencies.packages import packages_for
 from envhub_sandbox.dependencies.request import chosen

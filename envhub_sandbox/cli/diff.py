@@ -14,7 +14,7 @@ from envhub_sandbox.cli.shared.progress import ProgressBar
 from envhub_worker.protocol.text import counted
 
 if TYPE_CHECKING:
-    from envhub_sandbox.check.static.changes import Change
+    from envhub_sandbox.check.changes import Change
     from envhub_sandbox.dependencies.locks.fingerprint import TaskFingerprint
     from envhub_sandbox.hub.snapshot import Snapshot
 
@@ -46,8 +46,8 @@ def diff(
     [bold]envhub diff org/repo@<approved> org/repo@<new> --fail-on note[/bold]
     """
     least = None if fail_on is None else level(fail_on)
-    from envhub_sandbox.check.static import changes
-    from envhub_sandbox.check.static.static import static
+    from envhub_sandbox.check import changes
+    from envhub_sandbox.check.static import static
 
     with ProgressBar(quiet=json) as bar:
         read = []

@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from envhub_sandbox.check.checks import Severity
-from envhub_sandbox.check.static.static import survey
+from envhub_sandbox.check.static import survey
 from envhub_sandbox.hub.snapshot import local
 from envhub_sandbox.hub.sources import parsing
 

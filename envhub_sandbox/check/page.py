@@ -13,7 +13,7 @@ import numpy as np
 
 from envhub_sandbox.check.checks import CHECKS
 from envhub_sandbox.check.findings import Finding, Report
-from envhub_sandbox.check.page.markup import (
+from envhub_sandbox.check.markup import (
     bar_plot,
     data,
     facts,

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from envhub_sandbox.check.checks import Severity
-from envhub_sandbox.check.static.static import survey
+from envhub_sandbox.check.static import survey
 from envhub_sandbox.hub.snapshot import local
 from envhub_sandbox.hub.sources import parser, parsing
 from tests.support.repositories import write_repository

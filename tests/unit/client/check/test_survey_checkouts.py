@@ -9,7 +9,7 @@ import pytest
 
 from envhub_sandbox.check.checks import Severity
 from envhub_sandbox.check.findings import Finding
-from envhub_sandbox.check.static.static import survey
+from envhub_sandbox.check.static import survey
 from envhub_sandbox.errors import SnapshotError
 from envhub_sandbox.hub.git import checkout
 from envhub_sandbox.hub.snapshot import local

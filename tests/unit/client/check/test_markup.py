@@ -9,7 +9,7 @@ from html.parser import HTMLParser
 
 import pytest
 
-from envhub_sandbox.check.page import markup
+from envhub_sandbox.check import markup
 
 _HOSTILE = "<script>alert(1)</script>\"'&\x1b[2J\u202e"
 

@@ -9,7 +9,7 @@ import re
 import pytest
 
 from envhub_sandbox.check.findings import Report
-from envhub_sandbox.check.page.page import page
+from envhub_sandbox.check.page import page
 from envhub_sandbox.check.play.plays import Film, Play
 from envhub_sandbox.vector.pictures import png
 from envhub_worker.protocol.text import printable

@@ -15,7 +15,7 @@ from typing import Any
 
 from envhub_sandbox.check.checks import Severity
 from envhub_sandbox.check.findings import Finding
-from envhub_sandbox.check.static.static import Static
+from envhub_sandbox.check.static import Static
 from envhub_sandbox.dependencies.locks.drift import drift_of_tasks
 from envhub_sandbox.dependencies.locks.fingerprint import TaskFingerprint
 from envhub_sandbox.hub.hashing import differing

@@ -7,7 +7,7 @@ from xml.etree import ElementTree
 
 import pytest
 
-from envhub_sandbox.check.page.markup import bar_plot, histogram_plot, line_plot, number
+from envhub_sandbox.check.markup import bar_plot, histogram_plot, line_plot, number
 
 _NUMBERS: dict[str, list[float]] = {
     "one": [3.0],

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from envhub_sandbox.check.static.static import Survey, survey
+from envhub_sandbox.check.static import Survey, survey
 from envhub_sandbox.hub.listing import FileRecord, Snapshot
 from envhub_sandbox.hub.snapshot import local
 from envhub_sandbox.hub.sources import parsing

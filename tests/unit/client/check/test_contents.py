@@ -6,7 +6,7 @@ import pickle
 
 import pytest
 
-from envhub_sandbox.check.static import contents
+from envhub_sandbox.check import contents
 from envhub_sandbox.hub.sources.parsing import parsed
 
 

@@ -19,8 +19,8 @@ from typing import Any
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+from envhub_sandbox.check import contents
 from envhub_sandbox.check.findings import Finding
-from envhub_sandbox.check.static import contents
 from envhub_sandbox.dependencies import installed
 from envhub_sandbox.dependencies.declared import DeclaredPackages, declared
 from envhub_sandbox.dependencies.resolve import WORKERS
