@@ -29,8 +29,7 @@ import numpy as np
 import psutil
 
 from envhub_sandbox import errors, make_env
-from envhub_sandbox.session.survival.recovery import RESTARTED
-from envhub_sandbox.session.survival.seeds import derived_seed
+from envhub_sandbox.session.recovery import RESTARTED, derived_seed
 from tests.support import inside
 
 REPOSITORY = Path(__file__).parent / "repositories" / "walk"

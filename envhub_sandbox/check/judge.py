@@ -22,8 +22,7 @@ from envhub_sandbox.check.findings import Report
 from envhub_sandbox.check.play.confinement import Confinement, denial_findings
 from envhub_sandbox.check.play.task import TaskJudge
 from envhub_sandbox.check.settings import JudgeOptions
-from envhub_sandbox.check.static.static import undeclared
-from envhub_sandbox.check.static.survey import survey
+from envhub_sandbox.check.static import survey, undeclared
 from envhub_sandbox.dependencies.declared import declared
 from envhub_sandbox.dependencies.packages import packages_for
 from envhub_sandbox.dependencies.request import chosen
@@ -46,7 +45,7 @@ from envhub_sandbox.factory.make_env import make_env
 from envhub_sandbox.hub.reference import HubRef
 from envhub_sandbox.hub.snapshot import Snapshot, snapshot_named
 from envhub_sandbox.hub.sources import imports, parsing
-from envhub_sandbox.session.recipe import pinned
+from envhub_sandbox.session.repository import pinned
 from envhub_sandbox.settings.policy import policy_from
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_worker.protocol.text import size_text

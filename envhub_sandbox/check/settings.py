@@ -6,7 +6,6 @@ Nothing of the repository that is judged is read here: it has no say in how it i
 from __future__ import annotations
 
 import os
-import sys
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,12 +15,8 @@ from envhub_sandbox.errors import EnvHubError, PolicyError
 from envhub_sandbox.hub.local import split_local
 from envhub_sandbox.hub.reference import DEFAULT_PATH
 from envhub_sandbox.hub.snapshot import is_here
+from envhub_sandbox.hub.sources import toml
 from envhub_worker.protocol.text import size_text
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 if TYPE_CHECKING:
     from envhub_sandbox.vector.suites import EnvSuites
@@ -113,7 +108,6 @@ def read_file(path: Path) -> dict[str, Any]:
     if len(data) > _MOST_BYTES:
         raise PolicyError(f"{path} is larger than {size_text(_MOST_BYTES)}")
     try:
-        document: dict[str, Any] = tomllib.loads(data.decode("utf-8"))
-    except (ValueError, RecursionError) as error:
+        return toml.loads(data.decode("utf-8"), _MOST_BYTES)
+    except ValueError as error:
         raise PolicyError(f"{path} is not valid TOML: {error}") from error
-    return document

@@ -14,7 +14,7 @@ from envhub_sandbox.cli.shared.progress import ProgressBar
 from envhub_worker.protocol.text import counted
 
 if TYPE_CHECKING:
-    from envhub_sandbox.check.static.changes import Change
+    from envhub_sandbox.check.changes import Change
     from envhub_sandbox.dependencies.locks.fingerprint import TaskFingerprint
     from envhub_sandbox.hub.snapshot import Snapshot
 
@@ -46,8 +46,8 @@ def diff(
     [bold]envhub diff org/repo@<approved> org/repo@<new> --fail-on note[/bold]
     """
     least = None if fail_on is None else level(fail_on)
-    from envhub_sandbox.check.static import changes
-    from envhub_sandbox.check.static.static import static
+    from envhub_sandbox.check import changes
+    from envhub_sandbox.check.static import static
 
     with ProgressBar(quiet=json) as bar:
         read = []
@@ -77,7 +77,7 @@ def _tasks(
 ) -> tuple[TaskFingerprint, ...]:
     from envhub_sandbox.dependencies.locks import making
     from envhub_sandbox.factory.make_env import make_env
-    from envhub_sandbox.session.recipe import pinned
+    from envhub_sandbox.session.repository import pinned
 
     with make_env(pinned(snapshot), env_kwargs=env_kwargs, **hub) as suites:
         return making.tasks_of(suites)

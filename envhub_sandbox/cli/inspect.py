@@ -22,7 +22,7 @@ from envhub_worker.protocol.text import size_text
 
 if TYPE_CHECKING:
     from envhub_sandbox.check.findings import Finding
-    from envhub_sandbox.check.static.static import Static
+    from envhub_sandbox.check.static import Static
     from envhub_sandbox.hub.snapshot import Snapshot
 
 _SPACES = ("single_observation_space", "single_action_space", "observation_space", "action_space")
@@ -141,7 +141,7 @@ def inspect_static(
     least = None if fail_on is None else level(fail_on)
     with ProgressBar(quiet=as_json) as bar:
         bar.begin(f"reading {ref}")
-        from envhub_sandbox.check.static.static import document, static
+        from envhub_sandbox.check.static import document, static
 
         snapshot = make.snapshot(ref)
         read = static(snapshot)
@@ -161,7 +161,7 @@ def _write(
 ) -> None:
     from envhub_sandbox.check import reports
     from envhub_sandbox.check.findings import Report
-    from envhub_sandbox.session.recipe import pinned
+    from envhub_sandbox.session.repository import pinned
 
     write_report(path, reports.sarif(Report(pinned(snapshot), list(findings)), failures))
 
@@ -195,7 +195,7 @@ def _print_packages(read: Static) -> None:
 
 
 def _print_files(read: Static) -> None:
-    from envhub_sandbox.check.static.contents import LARGE
+    from envhub_sandbox.check.contents import LARGE
 
     kinds = Counter(one.kind for one in read.files)
     counts = ", ".join(f"{count} {kind}" for kind, count in sorted(kinds.items()))

@@ -185,7 +185,7 @@ def _with_spaces(
     """The lock with what its repository returns, in the sandbox and in its own environment."""
     from envhub_sandbox.dependencies.locks import lockfile, making
     from envhub_sandbox.factory.make_env import make_env
-    from envhub_sandbox.session.recipe import pinned
+    from envhub_sandbox.session.repository import pinned
 
     with tempfile.TemporaryDirectory(prefix="envhub-lock-") as folder:
         path = Path(folder, "pylock.toml")

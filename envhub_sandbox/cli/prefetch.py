@@ -61,7 +61,7 @@ def _of_lock(snapshot: Snapshot, lock: str, given: Any) -> Environment | None:
 
 
 def _document(snapshot: Snapshot, environment: Environment | None) -> dict[str, Any]:
-    from envhub_sandbox.session.recipe import pinned
+    from envhub_sandbox.session.repository import pinned
 
     made = environment and {
         "folder": str(environment.home),
@@ -74,7 +74,7 @@ def _document(snapshot: Snapshot, environment: Environment | None) -> dict[str, 
 
 
 def _print(snapshot: Snapshot, environment: Environment | None) -> None:
-    from envhub_sandbox.session.recipe import pinned
+    from envhub_sandbox.session.repository import pinned
 
     out(safe_line(pinned(snapshot), 300))
     if environment is None:

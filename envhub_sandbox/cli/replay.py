@@ -112,7 +112,7 @@ class _Replay:
         """The environment that the bundle is about; None if it is about ``make_env`` alone."""
         from envhub_sandbox.factory.make_env import make_env
         from envhub_sandbox.session.crash.replay import changed_files
-        from envhub_sandbox.session.recipe import Recipe
+        from envhub_sandbox.session.repository import Recipe
 
         recipe = Recipe(
             make_env=make_env,

@@ -28,7 +28,7 @@ from envhub_sandbox.settings.options import OPTIONS
 
 if TYPE_CHECKING:
     from envhub_sandbox.check.play.episodes import EpisodeCounter, Rollout
-    from envhub_sandbox.check.play.video import VideoWriter
+    from envhub_sandbox.check.play.plays import VideoWriter
 
 
 Verbose = Annotated[
@@ -122,7 +122,7 @@ class _Run:
         """Run, print what there is to print even if it fails midway, and raise what failed."""
         try:
             if self.video is not None:
-                from envhub_sandbox.check.play.video import check_target
+                from envhub_sandbox.check.play.plays import check_target
 
                 check_target(self.video)
             with ProgressBar(quiet=self.as_json) as bar, self.make.explained():
@@ -159,7 +159,7 @@ class _Run:
         if video is None:
             rollout = self._roll_out(env, bar, None)
         else:
-            from envhub_sandbox.check.play.video import VideoWriter, fps_of
+            from envhub_sandbox.check.play.plays import VideoWriter, fps_of
 
             with VideoWriter(video, fps_of(env.metadata)) as writer:
                 rollout = self._roll_out(env, bar, writer)
@@ -174,7 +174,7 @@ class _Run:
 
     def _roll_out(self, env: Any, bar: ProgressBar, writer: VideoWriter | None) -> Rollout:
         from envhub_sandbox.check.play.episodes import rollout
-        from envhub_sandbox.check.play.video import frame_of
+        from envhub_sandbox.check.play.plays import frame_of
 
         filming = writer is not None
 

@@ -24,11 +24,11 @@ from envhub_sandbox.hub.cache import CACHE_VARIABLE, cache_root
 from envhub_sandbox.hub.snapshot import local
 from envhub_sandbox.sandboxes.process import PROCESS
 from envhub_sandbox.session.jails.launcher import Launcher
-from envhub_sandbox.session.recipe import Recipe, pinned
-from envhub_sandbox.session.repository import LoadArguments, Repository
+from envhub_sandbox.session.repository import Recipe, Repository, pinned
 from envhub_sandbox.settings.policy import Limits, Policy, Timeouts
 from envhub_sandbox.system import processes
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
+from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.runtime import Runtime
 
 _PIECE = 16 * 2**20
@@ -97,7 +97,7 @@ def _repository(folder: Path, order: Mapping[str, Any]) -> Repository:
     runtime = Runtime(*order["runtime"])
     snapshot = local(str(entry))
     return Repository(
-        *(snapshot, LoadArguments(), policy, timeouts, runtime, "frames", True),
+        *(snapshot, m.Load(1, False, None, {}), policy, timeouts, runtime, "frames", True),
         recipe=Recipe(make_env=_built, reference=pinned(snapshot), config=None),
         installed=None,
         advice=lambda text: "",

@@ -8,6 +8,7 @@ waits for something to happen, and the environment answers.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 from envhub_sandbox.session.lease import Lease
@@ -79,3 +80,31 @@ class AttributeCache:
         )
         if not reads.watched:
             reads.patience = _NEVER
+
+
+class FleetAttributes:
+    """Those of an environment over several workers: see ``AttributeCache``."""
+
+    def __init__(self, parts: Sequence[AttributeCache], bounds: Sequence[tuple[int, int]]) -> None:
+        self._parts = parts
+        self._bounds = bounds
+
+    def get(self, name: str) -> tuple[Any, ...] | None:
+        """The values, if all parts know theirs."""
+        found: list[Any] = []
+        for one in self._parts:
+            values = one.get(name)
+            if values is None:
+                return None
+            found += values
+        return tuple(found)
+
+    def should_watch(self, name: str) -> bool:
+        """Whether every part is to be asked to watch it."""
+        wanted = [one.should_watch(name) for one in self._parts]  # each takes note of it
+        return all(wanted)
+
+    def put(self, name: str, values: tuple[Any, ...], *, watched: bool) -> None:
+        """Keep the answers of all parts."""
+        for one, (start, stop) in zip(self._parts, self._bounds, strict=True):
+            one.put(name, values[start:stop], watched=watched)

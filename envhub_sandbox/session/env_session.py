@@ -9,20 +9,27 @@ reset, closed, and abandoned in a fork. The rules for these are in docs/internal
 from __future__ import annotations
 
 import weakref
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, cast
 
-from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerError, WorkerTimeoutError
+from envhub_sandbox.errors import (
+    EnvHubError,
+    LocalProtocolError,
+    RemoteEnvError,
+    WorkerDiedError,
+    WorkerError,
+    WorkerTimeoutError,
+)
 from envhub_sandbox.session.counters import LEDGER, Counters, Labels
 from envhub_sandbox.session.crash.history import History, PartHistory
-from envhub_sandbox.session.jails.sources import JailSource
+from envhub_sandbox.session.failures import Failures, Restarts
+from envhub_sandbox.session.jails.builder import JailSource
 from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.session.prewarm import INTERRUPT_S, LOOK_S, Prewarm
+from envhub_sandbox.session.recovery import Recovery
 from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.session.requests import Requests
-from envhub_sandbox.session.survival.failures import Failures
-from envhub_sandbox.session.survival.recovery import Recovery
-from envhub_sandbox.session.survival.restart_policy import Restarts
 from envhub_sandbox.session.use_lock import UseLock
 from envhub_sandbox.system.log import WORKER
 from envhub_sandbox.system.platform import run_after_fork
@@ -88,9 +95,34 @@ class EnvSession:
     """That it lives in at a time."""
 
     @property
-    def closed(self) -> bool:
-        """Whether it is closed for good."""
-        return self.lifecycle.closed
+    def rows(self) -> tuple[int, int]:
+        """The first of its sub-environments, and the one after the last."""
+        return self.bounds[0][0], self.bounds[-1][1]
+
+    @contextmanager
+    def naming(self) -> Iterator[None]:
+        """Say in an error which sub-environments of a fleet it is of, and where these run."""
+        try:
+            yield
+        except EnvHubError as error:
+            self.name_in(error)
+            raise
+
+    def name_in(self, error: EnvHubError) -> None:
+        """Add that to its text, once.
+
+        An exception of the repository's own keeps its text, and what cannot be sent is the
+        caller's.
+        """
+        if isinstance(error, (RemoteEnvError, LocalProtocolError)) or not error.args:
+            return
+        start, stop = self.rows
+        alone = stop == start + 1
+        which = f"sub-environment {start}" if alone else f"sub-environments {start} to {stop - 1}"
+        where = f"({which} of {self.manifest.num_envs}, on {self.lease.place})"
+        if where not in str(error.args[0]):
+            first, *rest = str(error.args[0]).split("\n")
+            error.args = ("\n".join([f"{first} {where}", *rest]), *error.args[1:])
 
     def usage(self) -> dict[str, int]:
         """What its jail holds, as its server counts it; empty if it does not say."""
@@ -190,7 +222,7 @@ class EnvSession:
 
         Idempotent; where a Ctrl-C came into it, the next one goes on with what is left.
         """
-        if self.closed:
+        if self.lifecycle.closed:
             self._finish()
             return
         if self.lifecycle.state is State.FOREIGN:

@@ -14,18 +14,16 @@ from typing import Any
 
 import numpy as np
 
-from envhub_sandbox.errors import EnvHubError, ServerBusyError, WorkerError
+from envhub_sandbox.errors import EnvHubError, ServerBusyError, WorkerDiedError, WorkerError
 from envhub_sandbox.session.counters import Counters
-from envhub_sandbox.session.jails.builder import Builder
-from envhub_sandbox.session.jails.loaded import LoadedJail
-from envhub_sandbox.session.jails.retry_while_busy import (
+from envhub_sandbox.session.jails.builder import Builder, JailSource
+from envhub_sandbox.session.jails.launcher import (
     is_draining,
     is_unanswered,
     retry_while_busy,
 )
-from envhub_sandbox.session.jails.sources import JailSource
+from envhub_sandbox.session.jails.loaded import LoadedJail
 from envhub_sandbox.session.repository import Repository
-from envhub_sandbox.session.survival.refusals import closed_during
 from envhub_sandbox.system.processes import OwnerProcess
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
 from envhub_sandbox.transport.lane import Lane
@@ -70,7 +68,7 @@ class Lease:
         self.lifecycle = lifecycle
         self.loaded: LoadedJail | None = None
         self.lane: Lane | None = None
-        self.make_room: Callable[[], bool] = _no_room
+        self.make_room: Callable[[], bool] = lambda: False
         self._jails = jails
         self._launcher = jails.launcher
         self.results = results
@@ -83,7 +81,7 @@ class Lease:
         self._was_loaded = False
         self._startup: StartupDeadline | None = None
         self._release_server: Callable[[], None] = _nothing
-        self._departs = jails.launcher.stay()
+        self._departs = jails.launcher.server_hold.enter()
         weakref.finalize(self, self._departs).atexit = False  # interruption.md, rule 13
 
     @property
@@ -192,7 +190,7 @@ class Lease:
             if deadline.unasked or not (full or retry_s):
                 raise
             # both, whatever the first one finds: | and not "or"
-            room = full and self._launcher.settle() | self.make_room()
+            room = full and self._launcher.server_hold.settle() | self.make_room()
             if not room and not retry_s:
                 raise
             refused = error
@@ -326,10 +324,11 @@ class Lease:
         self._release_server = _nothing
 
 
+def closed_during(operation: str) -> WorkerDiedError:
+    """The error of a request during which the environment was closed."""
+    text = f"the environment was closed during {operation}"
+    return WorkerDiedError(text, reason="killed", request=operation)
+
+
 def _nothing() -> None:
     """There is nothing to give back."""
-
-
-def _no_room() -> bool:
-    """Nothing was started ahead that could be given up."""
-    return False

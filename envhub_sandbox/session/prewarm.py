@@ -14,16 +14,15 @@ import weakref
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import chain
-from typing import Protocol
 
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.session.crash.history import History
 from envhub_sandbox.session.jails.loaded import LoadedJail
-from envhub_sandbox.session.lease import Lease
-from envhub_sandbox.session.survival.recovery import Recovery
-from envhub_sandbox.session.survival.refusals import closed_during
+from envhub_sandbox.session.lease import Lease, closed_during
+from envhub_sandbox.session.recovery import Recovery
 from envhub_sandbox.session.use_lock import UseLock
 from envhub_sandbox.system.log import WORKER
+from envhub_sandbox.system.threads import Calls
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
 from envhub_worker.protocol.lifecycle import Event, State
 
@@ -34,23 +33,6 @@ INTERRUPT_S = 10.0
 than it waits for the environment's own ``close``."""
 _GOING_S = 30.0
 """How long a jail that is given up may take to go: its ``close``, and its processes' ends."""
-
-
-class TaskPrewarm(Protocol):
-    """What ``SuitePrewarm`` asks of a task: a ``Prewarm``, or that of several workers."""
-
-    @property
-    def closed(self) -> bool:
-        """Whether the environment is closed for good."""
-
-    def on_first_use(self, first_use: Callable[[], None], make_room: Callable[[], bool]) -> None:
-        """See ``Prewarm``."""
-
-    def start(self) -> None:
-        """See ``Prewarm``."""
-
-    def cancel(self) -> bool:
-        """See ``Prewarm``."""
 
 
 class Prewarm:
@@ -89,22 +71,19 @@ class Prewarm:
 
     def start_on_demand(self, deadline: StartupDeadline | None = None) -> None:
         """Take a jail, and build the environment in it; raises as ``Lease.acquire`` does."""
-        self._start(deadline or StartupDeadline(self._timeouts.startup_s))
+        try:
+            self._lease.acquire(deadline or StartupDeadline(self._timeouts.startup_s))
+        except EnvHubError:
+            if self.lifecycle.closed:
+                raise closed_during("make_env") from None
+            raise
+        self._started()
 
     def adopt(self, loaded: LoadedJail) -> None:
         """Use a jail that is already loaded, instead of opening one later."""
         with self._use.hold("make_env"):
             self._lease.adopt(loaded, Deadline(self._timeouts.startup_s))
             self._started()
-
-    def _start(self, deadline: StartupDeadline) -> None:
-        try:
-            self._lease.acquire(deadline)
-        except EnvHubError:
-            if self.lifecycle.closed:
-                raise closed_during("make_env") from None
-            raise
-        self._started()
 
     def _started(self) -> None:
         self._history.started()
@@ -127,7 +106,7 @@ class Prewarm:
             if self.lifecycle.state is State.IDLE:
                 self.starting = deadline
                 try:
-                    self._start(deadline)
+                    self.start_on_demand(deadline)
                     self.unused = True
                 finally:
                     self.starting = None
@@ -178,6 +157,57 @@ class Prewarm:
         if self.first_use is not None:
             first_use, self.first_use = self.first_use, None
             first_use()
+
+
+class FleetPrewarm:
+    """Starts the workers of one environment, side by side: see ``Prewarm``."""
+
+    def __init__(self, parts: Sequence[Prewarm]) -> None:
+        self._first_use: Callable[[], None] | None = None
+        self._parts = parts
+
+    @property
+    def closed(self) -> bool:
+        """Whether all parts are closed for good."""
+        return all(part.closed for part in self._parts)
+
+    @property
+    def starting(self) -> StartupDeadline | None:
+        """Of a part that is being started ahead."""
+        return next((part.starting for part in self._parts if part.starting is not None), None)
+
+    def adopt(self, loaded: LoadedJail) -> None:
+        """The first part uses a jail that is already loaded."""
+        self._parts[0].adopt(loaded)
+
+    def start_in_background(self) -> None:
+        """Each part in a thread of its own."""
+        for part in self._parts:
+            part.start_in_background()
+
+    def start(self) -> None:
+        """Likewise, and wait for them."""
+        Calls([part.start for part in self._parts]).wait()
+
+    def cancel(self) -> bool:
+        """Give up every part that was started ahead."""
+        cancelled = [part.cancel() for part in self._parts]
+        return any(cancelled)
+
+    def note_use(self) -> None:
+        """See ``Prewarm``."""
+        if self._first_use is not None:
+            first_use, self._first_use = self._first_use, None
+            first_use()
+
+    def on_first_use(self, first_use: Callable[[], None], make_room: Callable[[], bool]) -> None:
+        """See ``Prewarm``: whichever part is used first."""
+        self._first_use = first_use
+        for part in self._parts:
+            part.on_first_use(self.note_use, make_room)
+
+
+TaskPrewarm = Prewarm | FleetPrewarm
 
 
 class SuitePrewarm:

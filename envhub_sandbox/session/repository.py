@@ -1,12 +1,18 @@
-"""One repository under one policy: what all its environments share, and the errors of its start."""
+"""One repository under one policy: what all its environments share, and the errors of its start.
+
+What ran (``provenance_of``), and how to make it again in another process (``Recipe``): a process
+cannot be handed over, so a pickle of a proxy holds the arguments that made it. The other side gets
+a fresh environment in a worker of its own, of the very same commit. A token never travels, nor does
+a login in ``endpoint``: the other side uses its own.
+"""
 
 from __future__ import annotations
 
 import os
 import shlex
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import field
+from dataclasses import dataclass, field
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -18,13 +24,14 @@ from envhub_sandbox.errors import (
     WorkerTimeoutError,
     name_source,
 )
+from envhub_sandbox.hub import reference
 from envhub_sandbox.hub.cache import cache_root
+from envhub_sandbox.hub.client import default_endpoint
+from envhub_sandbox.hub.logins import without_login
 from envhub_sandbox.hub.snapshot import Snapshot
-from envhub_sandbox.session.author_lines import add_author_line
 from envhub_sandbox.session.crash.history import Recording
+from envhub_sandbox.session.error_text import add_author_line, add_reach_advice
 from envhub_sandbox.session.jails.loaded import LoadedJail
-from envhub_sandbox.session.jails.reach import add_reach_advice
-from envhub_sandbox.session.recipe import Recipe, provenance_of
 from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.settings.policy import Policy, Timeouts
 from envhub_sandbox.system.locks import SharedLock
@@ -35,35 +42,102 @@ from envhub_sandbox.transport.remote_warnings import RemoteWarnings
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import LACKS_PACKAGES
 from envhub_worker.protocol.limits import WireLimits, limits_for
-from envhub_worker.protocol.manifest.manifest import EnvManifest
-from envhub_worker.protocol.records import dataclass
+from envhub_worker.protocol.manifest.manifest import Manifest
+from envhub_worker.protocol.messages import VERSION
 from envhub_worker.protocol.runtime import RECORD, Runtime
 from envhub_worker.protocol.text import printable
 
 
+@dataclass(frozen=True)
+class PlainConfig:
+    """What ``make_env`` takes in place of a caller's config object: what of it has crossed."""
+
+    hub_path: str
+    values: dict[str, object]
+
+
 @dataclass(frozen=True, kw_only=True)
-class LoadArguments:
-    """What the repository's ``make_env`` is called with."""
+class Recipe:
+    """The arguments of ``make_env``, with the commit pinned.
 
-    n_envs: int = 1
-    use_async_envs: bool = False
-    cfg: dict[str, object] | None = None
-    env_kwargs: dict[str, object] = field(default_factory=dict)
+    Attributes:
+        make_env: The function that takes them; it travels by its name.
+        reference: The pinned hub reference, or a local folder and its entry file.
+        config: The caller's config object as plain values, or None.
+    """
 
-    def message(self) -> m.Load:
-        """As it travels."""
-        return m.Load(self.n_envs, self.use_async_envs, self.cfg, self.env_kwargs)
+    make_env: Callable[..., Any]
+    reference: str
+    config: dict[str, object] | None = field(repr=False)
+    options: dict[str, Any] = field(default_factory=dict, repr=False)
 
-    def message_for(self, task: EnvManifest) -> m.LoadTask:
-        """The same, where it is known what it returns."""
-        given = (self.n_envs, self.use_async_envs, self.cfg, self.env_kwargs)
-        return m.LoadTask(*given, task.suite, task.task)
+    def __post_init__(self) -> None:
+        endpoint = self.options.get("endpoint")
+        if isinstance(endpoint, str):
+            plain = {**self.options, "endpoint": without_login(endpoint)}
+            object.__setattr__(self, "options", plain)
+
+    def make(self) -> Any:
+        """Fresh environments: what ``make_env`` returns and raises."""
+        cfg: Any = self.reference
+        if self.config is not None:
+            cfg = PlainConfig(self.reference, {**self.config, "hub_path": self.reference})
+        options = dict(self.options)
+        if options.get("endpoint") == without_login(default_endpoint()):
+            options["endpoint"] = None  # it may come with a login here
+        return self.make_env(cfg, **options)
+
+    def make_one(self, suite: str, task: int | str) -> Any:
+        """One fresh environment of them."""
+        return self.make()[suite][task]
+
+
+def pinned(snapshot: Snapshot) -> str:
+    """A reference that means this snapshot, wherever it is read."""
+    kind, name = snapshot.repo_type, snapshot.repo_id
+    return reference.pinned(kind, name, snapshot.commit, snapshot.path)
+
+
+def provenance_of(
+    snapshot: Snapshot,
+    manifest: Manifest | None,
+    report: list[dict[str, Any]],
+    installed: dict[str, Any] | None = None,
+    profile: str | None = None,
+    places: Sequence[str] = (),
+) -> dict[str, Any]:
+    """What ran, as plain data: enough to run the same again, or to see that it cannot be the same.
+
+    Args:
+        snapshot: The files; every hash has been verified.
+        manifest: What the worker said. Trust: interpreter and packages are its own words.
+        report: The layers that confine it, once it runs.
+        installed: What was installed for it: our own record.
+        profile: Of its jails, once it runs.
+        places: Where each worker of an environment runs, or is to run; results do not depend on it.
+    """
+    return {
+        "repository": snapshot.repo_id,
+        "repo_type": snapshot.repo_type,
+        "commit": snapshot.commit,
+        "path": snapshot.path,
+        "files": {record.path: record.digest for record in snapshot.files},
+        "interpreter": dict(manifest.interpreter) if manifest else None,
+        "packages": dict(manifest.packages) if manifest else None,
+        "assets": [one.pinned for one in snapshot.assets],
+        "installed": installed,
+        "protocol": VERSION,
+        "profile": profile,
+        "places": list(places),
+        "layers": [dict(layer) for layer in report],
+    }
 
 
 class Repository:
     """What the environments of one ``make_env`` have in common. Opens nothing: see ``Launcher``.
 
     Args:
+        arguments: What the repository's ``make_env`` is called with.
         runtime: The interpreter of the jails, and their packages.
         lane: ``"auto"`` or ``"frames"``.
         copy: Whether observations are copied for the caller, or lent.
@@ -71,6 +145,8 @@ class Repository:
         advice: Says what to do where a module is missing, for the error's text.
 
     Attributes:
+        label: Repository, commit and entry file, for errors.
+        wire_limits: Bounds on what a jail may send.
         warnings: Those that it gave, in any jail.
         latest_report: The layers of the jail that was opened last, for the provenance of what was
             made. Which of them hold for an environment, only its own jail says.
@@ -82,7 +158,7 @@ class Repository:
     def __init__(
         self,
         snapshot: Snapshot,
-        arguments: LoadArguments,
+        arguments: m.Load,
         policy: Policy,
         timeouts: Timeouts,
         runtime: Runtime,
@@ -98,6 +174,8 @@ class Repository:
         self.snapshot = snapshot
         self.arguments = arguments
         self.policy = policy
+        self.label = snapshot.label
+        self.wire_limits: WireLimits = limits_for(policy.limits.message_bytes)
         self.timeouts = timeouts
         self.runtime = runtime
         self._in_use: list[SharedLock] = []
@@ -114,16 +192,6 @@ class Repository:
         self.recipe = recipe
         self.installed = installed
         self._advice = advice
-
-    @property
-    def label(self) -> str:
-        """Repository, commit and entry file, for errors."""
-        return self.snapshot.label
-
-    @property
-    def wire_limits(self) -> WireLimits:
-        """Bounds on what a jail may send."""
-        return limits_for(self.policy.limits.message_bytes)
 
     def hold(self, holder: object) -> None:
         """Keep its files and packages from being removed, until each holder has let go."""
@@ -160,6 +228,14 @@ class Repository:
             add_reach_advice(error, self.policy)
             add_author_line(error, self.snapshot)
             raise
+
+    def provenance(
+        self, manifest: Manifest | None, report: list[dict[str, Any]] | None = None
+    ) -> dict[str, Any]:
+        """What runs: see ``provenance_of``. ``report``: None for that of the latest jail."""
+        layers = self.latest_report if report is None else report
+        known = self.installed, self.latest_profile, self.places
+        return provenance_of(self.snapshot, manifest, layers, *known)
 
     def show_warnings(self) -> None:
         """Show the caller its new warnings."""
@@ -209,16 +285,14 @@ class Repository:
         if not ours or getattr(error, "reason", "") in ("killed", "idle", "gone", "connection"):
             return
         manifest = None if loaded is None else loaded.manifest
-        report = self.latest_report if loaded is None else loaded.jail.report
+        report = None if loaded is None else loaded.jail.report
         from envhub_sandbox.session.crash.bundle_writer import Crash, write_bundle
 
         crash = Crash(
             error=error,
             label=self.label,
-            provenance=provenance_of(
-                self.snapshot, manifest, report, self.installed, self.latest_profile, self.places
-            ),
-            load=self.arguments.message(),
+            provenance=self.provenance(manifest, report),
+            load=self.arguments,
             options=self.recipe.options,
             task=task,
             shared=shared,

@@ -13,7 +13,6 @@ from __future__ import annotations
 import contextlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from typing import Any, NamedTuple, NoReturn, TypeVar
 
 from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError
@@ -26,15 +25,14 @@ from envhub_sandbox.errors import (
     WorkerError,
     WorkerTimeoutError,
 )
-from envhub_sandbox.session.attribute_cache import AttributeCache
+from envhub_sandbox.session.attribute_cache import AttributeCache, FleetAttributes
 from envhub_sandbox.session.crash.history import History
+from envhub_sandbox.session.failures import Failures, refusal
 from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.session.prewarm import Prewarm
+from envhub_sandbox.session.recovery import Recovery
 from envhub_sandbox.session.repository import Repository
-from envhub_sandbox.session.survival.failures import Failures
-from envhub_sandbox.session.survival.recovery import Recovery
-from envhub_sandbox.session.survival.refusals import refusal
-from envhub_sandbox.session.use_lock import UseLock
+from envhub_sandbox.session.use_lock import FleetUse, UseLock
 from envhub_sandbox.transport.deadline import Deadline, StepDeadline, deadline_of
 from envhub_sandbox.transport.jail import RunnersDiedError
 from envhub_sandbox.transport.lane import Lane, Request
@@ -63,10 +61,21 @@ class RequestOrder(ABC):
         closed: Whether the caller has called ``close``.
         waiting: The request of an ``*_async`` whose ``*_wait`` has not come yet.
         face: What the environment is called in the error after ``close``.
+        attributes: Those that need no request.
+        use: A thread that asks something holds its lock until it has handled the answer;
+            between an ``*_async`` and its ``*_wait`` no thread does.
     """
 
-    def __init__(self, repository: Repository, results: Results) -> None:
+    def __init__(
+        self,
+        repository: Repository,
+        results: Results,
+        use: UseLock | FleetUse,
+        attributes: AttributeCache | FleetAttributes,
+    ) -> None:
         self.results = results
+        self.use = use
+        self.attributes = attributes
         self.closed = False
         self.waiting: str | None = None
         self.face = "VectorEnv"
@@ -135,7 +144,7 @@ class RequestOrder(ABC):
         kind: type[m.M] | tuple[type[m.M], ...],
         timeout_s: float | None,
     ) -> list[m.M]:
-        with self.locked():
+        with self.use.lock:
             self.refuse_if_busy(operation)
             self.submit(operation, message_for)
             return self.collect(timeout_s, kind)
@@ -143,10 +152,6 @@ class RequestOrder(ABC):
     @abstractmethod
     def note_sent(self, actions: Any | None) -> None:
         """Workers were sent a step; with these ``actions``, if all of them were."""
-
-    @abstractmethod
-    def locked(self) -> AbstractContextManager[Any]:
-        """Held by a thread from before it asks something until it has handled the answer."""
 
     @abstractmethod
     def submit(
@@ -190,13 +195,10 @@ class Packed(NamedTuple):
 
 
 class Requests(RequestOrder):
-    """The requests to one jail, which is opened by the first of them.
+    """The requests to one jail, which is opened by the first of them."""
 
-    Attributes:
-        attributes: Those that need no request.
-        use: A thread that asks something holds its lock until it has handled the answer;
-            between an ``*_async`` and its ``*_wait`` no thread does.
-    """
+    use: UseLock
+    attributes: AttributeCache
 
     def __init__(
         self,
@@ -207,11 +209,9 @@ class Requests(RequestOrder):
         failures: Failures,
         recovery: Recovery | None,
     ) -> None:
-        super().__init__(lease.repository, lease.results)
-        self.attributes = AttributeCache(lease)
+        super().__init__(lease.repository, lease.results, use, AttributeCache(lease))
         self.lifecycle = lease.lifecycle
         self._lease = lease
-        self.use = use
         self._prewarm = prewarm
         self._counters = lease.counters
         self._history = history
@@ -234,10 +234,6 @@ class Requests(RequestOrder):
         if actions is None:
             self._history.skip()
 
-    def locked(self) -> AbstractContextManager[Any]:
-        """See ``RequestOrder``."""
-        return self.use.lock
-
     # --- requests ------------------------------------------------------------------------------
 
     def submit(
@@ -258,7 +254,7 @@ class Requests(RequestOrder):
         ``start`` does so, or raises why it could not, where that was begun already.
         """
         if start is not None or self.lifecycle.state is not State.READY:
-            self._sending(operation, lambda: self._make_ready(operation, start))
+            self._sending(operation, start or (lambda: self._make_ready(operation)))
 
     def pack(
         self, operation: str, message_for: MessageFor, instead: MessageFor | None = None
@@ -273,7 +269,7 @@ class Requests(RequestOrder):
         """The second half, which leaves the history to the caller; raises as ``submit`` does."""
         self._sending(operation, lambda: self._submit_packed(operation, packed))
 
-    def _sending(self, operation: str, send: Callable[[], None]) -> None:
+    def _sending(self, operation: str, send: Callable[[], object]) -> None:
         try:
             try:
                 send()
@@ -492,10 +488,7 @@ class Requests(RequestOrder):
 
     # --- out and back --------------------------------------------------------------------------
 
-    def _make_ready(self, operation: str, start: Callable[[], object] | None = None) -> None:
-        if start is not None:
-            start()
-            return
+    def _make_ready(self, operation: str) -> None:
         state, restart = self.lifecycle.state, self._repository.policy.restart
         # a request that is still pending here was interrupted before its wait began
         pending = state is State.PENDING

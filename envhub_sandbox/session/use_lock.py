@@ -9,12 +9,11 @@ from __future__ import annotations
 import threading
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 
 from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
-from envhub_sandbox.session.lease import Lease
-from envhub_sandbox.session.survival.failures import Failures
-from envhub_sandbox.session.survival.refusals import closed_during
+from envhub_sandbox.session.failures import Failures
+from envhub_sandbox.session.lease import Lease, closed_during
 from envhub_sandbox.transport.remote_warnings import level_of_the_caller
 from envhub_worker.protocol.lifecycle import State
 from envhub_worker.protocol.untrusted import blamed, is_fault
@@ -119,3 +118,44 @@ class UseLock:
         """In a fork, which has not the thread that held the lock: interruption.md, rule 14."""
         self.lock = threading.RLock()
         self.stepping = None
+
+
+class FleetUse:
+    """The use of all parts at a time, by one thread: see ``UseLock``.
+    ``stepping``: likewise.
+    """
+
+    def __init__(self, parts: Sequence[UseLock]) -> None:
+        self.stepping: int | None = None
+        self._parts = parts
+        self._holder: int | None = None
+
+    @property
+    def lock(self) -> AbstractContextManager[None]:
+        """The locks of all parts, taken in their order: interruption.md, rule 16.
+
+        A fresh one for each ``with``: where a Ctrl-C comes into it, the locks are released with
+        that object at the latest.
+        """
+        return self._hold_all()
+
+    @property
+    def is_mine(self) -> bool:
+        """Whether this thread holds them."""
+        return self._holder == threading.get_ident()
+
+    @contextmanager
+    def _hold_all(self) -> Iterator[None]:
+        with all_held([part.lock for part in self._parts]):
+            before, self._holder = self._holder, threading.get_ident()
+            try:
+                yield
+            finally:
+                self._holder = before
+
+    def warn_of_two(self, thread: int) -> None:
+        """See ``UseLock``."""
+        first = self._parts[0]
+        first.stepping = self.stepping
+        first.warn_of_two(thread)
+        first.stepping = None

@@ -7,7 +7,7 @@ in this process would see. Followed: ``gymnasium.vector.utils.iterate``.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import singledispatch
 from typing import Any
 
@@ -17,8 +17,9 @@ from gymnasium import spaces
 from gymnasium.error import CustomSpaceError
 
 from envhub_sandbox.errors import ActionError, ActionTypeError
+from envhub_worker.protocol.manifest.manifest import EnvManifest
 from envhub_worker.protocol.shared_memory.slabs import DTYPE_CODES
-from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES
+from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES, OpaqueSpace
 
 _INTEGERS = frozenset("iub")
 _NUMBERS = frozenset("fiub")
@@ -111,6 +112,18 @@ def _batch_of_tuples(
         batch_of(sub, item, count, f"{where}[{index}]")
         for index, (sub, item) in enumerate(zip(space.spaces, value, strict=True))
     )
+
+
+def action_reader(manifest: EnvManifest, count: int) -> Callable[[Any], Any]:
+    """Checks a batch of so many actions and makes it what the worker takes. Trust: a manifest is
+    input from the worker.
+    """
+    single, own = manifest.single_action_space, manifest.own_batch("action_space")
+    if isinstance(single, OpaqueSpace):
+        return lambda actions: actions
+    if own is not None:
+        return ActionReader(own, None).read
+    return ActionReader(single, count).read
 
 
 class ActionReader:

@@ -10,9 +10,11 @@ import warnings
 import weakref
 from collections.abc import Callable, Sequence
 from copy import copy
+from functools import partial
 from threading import get_ident
 from typing import Any, NamedTuple, cast
 
+import gymnasium as gym
 import numpy as np
 from gymnasium.error import Error
 from gymnasium.vector import VectorEnv
@@ -27,12 +29,14 @@ from envhub_sandbox.transport.remote_warnings import level_of_the_caller
 from envhub_sandbox.transport.replies import typed_reply
 from envhub_sandbox.transport.results import StepResult
 from envhub_sandbox.transport.values import generators
-from envhub_sandbox.vector import from_manifest
+from envhub_sandbox.transport.values.descriptions import not_here, spec_of
+from envhub_sandbox.vector.actions import action_reader
 from envhub_sandbox.vector.sandbox_view import SandboxView
 from envhub_sandbox.vector.sub_environment import SubEnvironment
 from envhub_sandbox.vector.tracebacks import short_traceback, shortened
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.lifecycle import State
+from envhub_worker.protocol.manifest.manifest import EnvManifest
 from envhub_worker.protocol.manifest.names import absent, is_servable
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
@@ -73,7 +77,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         self._requests.face = type(self).__name__
         self._manifest = manifest
         self._timeouts = session.repository.timeouts
-        self._read_actions = from_manifest.action_reader(manifest, manifest.num_envs)
+        self._read_actions = action_reader(manifest, manifest.num_envs)
         self._readers: dict[int, Callable[[Any], Any]] = {}
         self._flight: InFlight | None = None
         self._still: Any = None
@@ -82,13 +86,15 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         self.single_action_space = manifest.single_action_space
         self.observation_space = manifest.observation_space
         self.action_space = manifest.action_space
-        self.metadata = from_manifest.metadata(manifest)
+        self.metadata = metadata_of(manifest)
         self.render_mode = manifest.render_mode
-        self.spec = from_manifest.spec(manifest, session.repository.label)
+        self.spec = spec_of(manifest.spec, session.repository.label)  # facts, which make nothing
         if manifest.shardable:  # a repository's own class has others, or none
             self.autoreset_mode = self.metadata.get("autoreset_mode")
             self.copy = session.repository.copy
-            self.env_fns = from_manifest.env_fns(manifest, session.repository.label)
+            # the functions are in the sandbox: what stands for them here says so when it is called
+            made_there = partial(not_here, reference=session.repository.label)
+            self.env_fns = [made_there] * manifest.num_envs
             self.observation_mode = "same"
         # processes end with the last reference to the proxy; interruption.md, rule 13
         weakref.finalize(self, session.finalize).atexit = False
@@ -188,7 +194,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         if options is not None and "reset_mask" in options:
             options = copy(options)  # the caller's own keep theirs
             mask = options.pop("reset_mask")
-            from_manifest.check_mask(mask, self.num_envs)
+            _check_mask(mask, self.num_envs)
         seeds = self._seeds(seed)
         self._recover()
         self._requests.submit("reset", self._reset_message(seeds, options, mask))
@@ -393,7 +399,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         """The batch of actions for these, checked as those of all are."""
         count = len(rows.named)
         if count not in self._readers:
-            self._readers[count] = from_manifest.action_reader(self._manifest, count)
+            self._readers[count] = action_reader(self._manifest, count)
         return self._readers[count](actions)
 
     # --- everything else -----------------------------------------------------------------------
@@ -619,6 +625,33 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
 def leave_suite(env: SandboxVectorEnv) -> None:
     """Have its first use start no other task of its suite: ``EnvSuites.map`` does that."""
     env._session.prewarm.on_first_use(lambda: None, lambda: False)
+
+
+def metadata_of(manifest: EnvManifest) -> dict[str, Any]:
+    """With the autoreset mode as Gymnasium's enum where it has one. Trust: the worker's words."""
+    mode: Any = manifest.autoreset_mode
+    if mode is None:
+        return dict(manifest.metadata)
+    if hasattr(gym.vector, "AutoresetMode"):
+        mode = gym.vector.AutoresetMode(mode)
+    return {**manifest.metadata, "autoreset_mode": mode}
+
+
+def _check_mask(mask: Any, num_envs: int) -> None:
+    """``SyncVectorEnv.reset``'s checks, in its words."""
+    if not isinstance(mask, np.ndarray):
+        raise TypeError(f"`options['reset_mask']` must be a numpy array, got {type(mask)}")
+    if mask.shape != (num_envs,):
+        raise ValueError(
+            f"`options['reset_mask']` must have shape `({num_envs},)`, got {mask.shape}"
+        )
+    if mask.dtype != np.bool_:
+        raise TypeError(f"`options['reset_mask']` must have `dtype=np.bool_`, got {mask.dtype}")
+    if not np.any(mask):
+        raise ValueError(
+            "`options['reset_mask']` must contain a boolean array with at least one True value, "
+            f"got reset_mask={mask}"
+        )
 
 
 def _check_name(name: object) -> None:

@@ -24,7 +24,7 @@ import numpy as np
 
 from envhub_sandbox.check.checks import Severity
 from envhub_sandbox.check.many import index
-from envhub_sandbox.check.page.page import page
+from envhub_sandbox.check.page import page
 from tests.browser import shots, site
 from tests.browser.attempts import Attempts, Kind
 from tests.browser.chromium import NAMES, Browser, program

@@ -15,7 +15,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from unittest import mock
 
-from envhub_sandbox.check.page import markup
+from envhub_sandbox.check import markup
 from tests.browser.chromium import Browser, Page
 from tests.browser.hostile import unescaped, without_policy
 from tests.browser.listener import Listener

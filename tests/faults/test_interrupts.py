@@ -13,7 +13,7 @@ import pytest
 from gymnasium.error import ClosedEnvironmentError
 
 from envhub_sandbox import errors, make_env
-from envhub_sandbox.session.survival import restart_policy
+from envhub_sandbox.session import failures
 from envhub_worker.protocol.lifecycle import Event, Lifecycle, State
 from tests.support import inside
 from tests.support.processes import descendants, eventually
@@ -208,7 +208,7 @@ def test_close_ends_the_wait_before_a_restart(
         if restart == "on_reset":
             with pytest.raises(errors.WorkerDiedError):
                 env.step([0, 1])
-        monkeypatch.setattr(restart_policy, "backoff_s", waiting)
+        monkeypatch.setattr(failures, "backoff_s", waiting)
         loaded = inside.loaded(env)
         assert loaded is not None
         thread, raised = threaded(env.reset if restart == "on_reset" else lambda: env.step([0, 1]))

@@ -19,16 +19,17 @@ from gymnasium.envs.registration import EnvSpec
 
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.hub.listing import FileRecord, Snapshot
-from envhub_sandbox.session.author_lines import add_author_line
+from envhub_sandbox.session.error_text import add_author_line
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import JailHandle, RunnersDiedError, open_jail
 from envhub_sandbox.transport.remote_warnings import MOST, RemoteWarnings
 from envhub_sandbox.transport.replies import check_reply, death, expect_reply, raised
 from envhub_sandbox.transport.results import Results
 from envhub_sandbox.transport.values import descriptions
-from envhub_sandbox.transport.values.descriptions import DescriptionReader
+from envhub_sandbox.transport.values.descriptions import DescriptionReader, spec_of
 from envhub_sandbox.transport.values.generators import generator
-from envhub_sandbox.vector import from_manifest
+from envhub_sandbox.vector.actions import action_reader
+from envhub_sandbox.vector.vector_env import metadata_of
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.codec import decode, encode
 from envhub_worker.protocol.codec.kinds import GENERATOR, SPACE, SPEC
@@ -273,14 +274,14 @@ def manifest(dice: Dice) -> None:
     usable((found.interpreter, found.packages))
     for env in found.envs:
         usable((env.metadata, env.attributes, env.render_mode, env.suite, env.task))
-        from_manifest.metadata(env)
-        spec = from_manifest.spec(env, "a/b@c")
+        metadata_of(env)
+        spec = spec_of(env.spec, "a/b@c")
         entry = f"{descriptions.__name__}:{descriptions.not_here.__name__}"
         demand(spec is None or spec.entry_point == entry, "an entry point of the worker's")
         for space in (env.single_observation_space, env.single_action_space):
             repr(space)
             demand(space == space, "a space that is not itself")
-        from_manifest.action_reader(env, min(env.num_envs, 64))
+        action_reader(env, min(env.num_envs, 64))
 
 
 def built(dice: Dice) -> None:

@@ -20,7 +20,7 @@ import zmq
 
 from envhub_sandbox.check.play import confinement
 from envhub_sandbox.dependencies import environments, interpreters, modules, resolutions
-from envhub_sandbox.factory import make
+from envhub_sandbox.factory import make_env
 from envhub_sandbox.sandboxes import remote
 from envhub_sandbox.sandboxes.docker import container
 from envhub_sandbox.sandboxes.fleet import place_list
@@ -32,8 +32,7 @@ from envhub_sandbox.session.jails import launcher as launcher_module
 from envhub_sandbox.session.jails.launcher import Launcher
 from envhub_sandbox.session.jails.loaded import LoadedJail
 from envhub_sandbox.session.lease import Lease
-from envhub_sandbox.session.recipe import Recipe
-from envhub_sandbox.session.repository import Repository
+from envhub_sandbox.session.repository import Recipe, Repository
 from envhub_sandbox.system import folders
 from envhub_sandbox.transport import tcp
 from envhub_sandbox.transport.connection import WorkerConnection
@@ -90,12 +89,12 @@ def freshness_of_dns() -> Spot:
 
 def choice_of_runtime() -> Spot:
     """Makes of an interpreter what a repository's jails run on."""
-    return make, "Runtime"
+    return make_env, "Runtime"
 
 
 def choice_of_packages() -> Spot:
     """Makes the packages that a repository declares."""
-    return make, "packages_for"
+    return make_env, "packages_for"
 
 
 def cut_s() -> Spot:
@@ -313,7 +312,7 @@ CLOSE_PATIENCE: Spot = (env_session, "INTERRUPT_S")
 """For how long ``close`` waits for another thread."""
 WAITS_FOR_A_SERVER: tuple[Spot, Spot] = ((launcher_module, "_CLOSE_S"), (remote, "_CLOSE_S"))
 """For how long a close waits for a server's word, also where it has gone."""
-MAKER: Spot = (make, "EnvFactory")
+MAKER: Spot = (make_env, "EnvFactory")
 """What ``make_env`` starts to work with when its arguments have been checked."""
 CONTAINER_MARKS: Spot = (listen_options, "_CONTAINER_MARKS")
 """The files by which a container is told."""

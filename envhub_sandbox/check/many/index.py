@@ -11,12 +11,11 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
 from xml.etree import ElementTree
 
-from envhub_sandbox.check import reports
+from envhub_sandbox.check import markup, reports
 from envhub_sandbox.check.checks import Severity
 from envhub_sandbox.check.findings import Finding, Report
 from envhub_sandbox.check.many.entries import ListEntry
 from envhub_sandbox.check.many.results import Result, Verdict, link
-from envhub_sandbox.check.page import markup
 from envhub_worker.protocol.text import counted, duration_text, printable
 
 _FORMAT = 1

@@ -14,8 +14,7 @@ from gymnasium import spaces
 from gymnasium.error import CustomSpaceError
 
 from envhub_sandbox.check.findings import Report
-from envhub_sandbox.check.play import frames, leaks, traces
-from envhub_sandbox.check.play.lerobot import lerobot_lacks
+from envhub_sandbox.check.play import probes, traces
 from envhub_sandbox.check.play.plays import Play, facts_of, film
 from envhub_sandbox.check.play.traces import Env, Trace
 from envhub_sandbox.check.settings import JudgeOptions
@@ -99,7 +98,7 @@ class TaskJudge:
             self._say("autoreset", first.notes["autoreset"])
         self._tell("rendering")
         self._render()
-        self._say("lerobot", lerobot_lacks(self._env))
+        self._say("lerobot", probes.lerobot_lacks(self._env))
         self._tell("one sub-environment by itself")
         self._alone()
         self._compare(first, mode)
@@ -243,12 +242,12 @@ class TaskJudge:
         resets, counting = self._asked.resets, self._play.counting(self._sandbox.usage)
         steps = min(_BEGUN, self._asked.steps)
         begin = partial(self._ends, self._env, steps)
-        seen = leaks.usage_per_round(begin, counting, resets, self._tell)
+        seen = probes.usage_per_round(begin, counting, resets, self._tell)
         if not seen:
             return  # a server on another host that does not count
         self._report.figures[self._name] |= {name: float(n) for name, n in seen[-1].items()}
-        grown, words = leaks.leak(seen, resets) or ("", "")
-        for check in leaks.LEAK_CHECKS:
+        grown, words = probes.leak(seen, resets) or ("", "")
+        for check in probes.LEAK_CHECKS:
             self._holds(check, check != grown, words)
 
     def _render(self) -> None:
@@ -263,21 +262,21 @@ class TaskJudge:
         # LeRobot's evaluation reads the number, and so does Gymnasium's RecordVideo
         fps = self._env.metadata.get("render_fps")
         is_rate = isinstance(fps, (int, float)) and not isinstance(fps, bool) and fps > 0
-        holds = is_rate or self._env.render_mode not in frames.FILMED
+        holds = is_rate or self._env.render_mode not in probes.FILMED
         self._holds("render-fps", holds, f"metadata['render_fps'] is {printable(repr(fps), 100)}")
 
     def _renders(self) -> Iterator[str]:
         """In its own mode; in the others that it declares, where its make_env takes one."""
-        yield from frames.wrong_frames(self._env)
+        yield from probes.wrong_frames(self._env)
         given = self._asked.arguments.get("env_kwargs") or {}
-        for mode in frames.other_modes(self._env) if self._takes_render_mode else ():
+        for mode in probes.other_modes(self._env) if self._takes_render_mode else ():
             asked = {**given, "render_mode": mode}
             with self._make(env_kwargs=asked, num_workers=1) as suites:
                 env = suites[self._suite][self._task]
                 env.reset(seed=self._asked.seed)
                 if env.render_mode != mode:
                     yield f"{mode}: it is declared and asked for, and is {env.render_mode!r}"
-                yield from frames.wrong_frames(env)
+                yield from probes.wrong_frames(env)
 
     def _alone(self) -> None:
         """What one sub-environment gives before Gymnasium writes it into a batch."""
@@ -304,7 +303,7 @@ class TaskJudge:
         space = self._env.single_observation_space
         with contextlib.suppress(CustomSpaceError):  # whose code is not here to be asked
             if _would_be_cast(observation, space) or not space.contains(observation):
-                given = frames.kind(observation)
+                given = probes.kind(observation)
                 yield f"sub-environment 0 gave {given}, which is not in {space}"
 
 
@@ -321,12 +320,12 @@ def _untyped(reward: Any, terminated: Any, truncated: Any, info: Any) -> Iterato
     """What Gymnasium's ``check_env`` refuses of a step. Trust: input from the worker."""
     is_vector = isinstance(reward, np.ndarray) and reward.size > 1  # as mo-gymnasium's
     if not is_vector and not isinstance(reward, (int, float, np.integer, np.floating)):
-        yield f"the reward is {frames.kind(reward)}, not a number"
+        yield f"the reward is {probes.kind(reward)}, not a number"
     for name, value in (("terminated", terminated), ("truncated", truncated)):
         if not isinstance(value, (bool, np.bool_)):
-            yield f"{name} is {frames.kind(value)}, not a bool"
+            yield f"{name} is {probes.kind(value)}, not a bool"
     if not isinstance(info, Mapping):
-        yield f"the info is {frames.kind(info)}, not a dict"
+        yield f"the info is {probes.kind(info)}, not a dict"
 
 
 def _can_be_guessed(space: spaces.Space[Any]) -> bool:

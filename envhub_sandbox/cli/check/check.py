@@ -266,8 +266,7 @@ def _judge(
 
 def _write(report: Report, failures: list[Finding], *files: Path | None) -> None:
     """The files of ``--junit``, ``--sarif`` and ``--html``."""
-    from envhub_sandbox.check import reports
-    from envhub_sandbox.check.page import page
+    from envhub_sandbox.check import page, reports
 
     for path, form in zip(files, (reports.junit, reports.sarif, page.page), strict=True):
         if path is not None:

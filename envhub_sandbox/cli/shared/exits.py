@@ -79,7 +79,7 @@ def code_for(error: BaseException) -> Exit:
         return Exit.INTERRUPTED
     if not isinstance(error, EnvHubError):
         return Exit.USAGE if _is_full(error) else Exit.BUG
-    from envhub_sandbox.check.play.video import VideoError  # numpy, which only a failure may cost
+    from envhub_sandbox.check.play.plays import VideoError  # numpy, which only a failure may cost
 
     if isinstance(error, (UsageError, VideoError)):
         return Exit.USAGE

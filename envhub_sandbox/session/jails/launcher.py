@@ -1,33 +1,38 @@
-"""Opens jails for one repository, in the place where its workers run."""
+"""Opens jails for one repository, in the place where its workers run; waits where it is full."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from time import monotonic
-from typing import Any
+from time import monotonic, sleep
+from typing import Any, TypeVar
 
-from envhub_sandbox.errors import EnvHubError, LoadError, WorkerDiedError, WorkerTimeoutError
+from envhub_sandbox.errors import (
+    EnvHubError,
+    LoadError,
+    ServerBusyError,
+    WorkerDiedError,
+    WorkerTimeoutError,
+)
 from envhub_sandbox.sandboxes.fleet.refusals import may_go_elsewhere, worst_of
 from envhub_sandbox.sandboxes.pool import ServerUse, WorkerServer
 from envhub_sandbox.sandboxes.sandbox import Sandbox
-from envhub_sandbox.session.jails.loaded import ExpectedManifest, LoadedJail
-from envhub_sandbox.session.jails.server_hold import ServerHold
+from envhub_sandbox.session.error_text import name_denied, read_denials
+from envhub_sandbox.session.jails.loaded import ExpectedManifest, LoadedJail, ServerHold
 from envhub_sandbox.session.repository import Repository
-from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.system.log import WORKER
 from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import JailHandle, open_jail
 from envhub_sandbox.transport.output import OutputFollower, OutputSinks
 from envhub_sandbox.transport.replies import expect_reply, typed_reply
+from envhub_sandbox.transport.tcp import UnreachableError
 from envhub_sandbox.transport.values.generators import generator
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec.inert import one_line
 from envhub_worker.protocol.manifest.manifest import EnvManifest, decode_manifest
+from envhub_worker.protocol.messages.busy import DRAINING
 from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _CLOSE_S = 5.0
@@ -39,12 +44,12 @@ _SILENT_S = 30.0
 _STATUS_S = 1.0
 _DENIED_S = 10.0
 """A caller who has denials recorded wants to know them, also of a host that is busy."""
-_DENIAL = re.compile(r"[a-z0-9_]{1,40}( [A-Z0-9_]{1,40}| /.{0,400})?")
-_MOST_DENIALS = 64
+_SOON_S = 0.1
+_SLICE_S = 0.1
+_AGAIN_S = 1.0
 _UNKNOWN = ("server", "connection", "gone")
 """How a jail died of which its server can say nothing."""
-_NAMED, _SHOWN = 8, 200
-"""Denials in the text of an error, and characters of each."""
+T = TypeVar("T")
 
 
 class Launcher:
@@ -56,6 +61,7 @@ class Launcher:
     Attributes:
         runs_on: What runs it where it runs; a remembered manifest holds for this only.
         retry_s: For how long to ask again, where a server has no room.
+        server_hold: Keeps the server while an environment may need it again.
     """
 
     def __init__(self, repository: Repository, sandbox: Sandbox, store: Path) -> None:
@@ -72,7 +78,7 @@ class Launcher:
         repository.places.append(place.address)
         ours = object()
         hold, let_go = partial(repository.hold, ours), partial(repository.let_go, ours)
-        self._hold = ServerHold(self._acquire, hold, let_go)
+        self.server_hold = ServerHold(self._acquire, hold, let_go)
 
     def another(self) -> Launcher:
         """For a further worker in the same place."""
@@ -85,10 +91,6 @@ class Launcher:
     def hold(self) -> Callable[[], None]:
         """Keep the server between two jails; returns what gives it back."""
         return self._acquire().release
-
-    def stay(self) -> Callable[[], None]:
-        """An environment may need the server again; returns what says that it is closed."""
-        return self._hold.enter()
 
     def _acquire(self) -> ServerUse[WorkerServer]:
         idle_s = self.repository.timeouts.server_idle_s
@@ -127,7 +129,7 @@ class Launcher:
         try:  # interruption.md, rule 4
             # one on another host runs anyway
             if self.repository.timeouts.server_idle_s != 0 and use.server.is_ours:
-                self._hold.keep(use.server)
+                self.server_hold.keep(use.server)
             with self.repository.starting(deadline):
                 loaded = self._open(use, place, deadline, known)
                 self.repository.places[self._worker] = loaded.address = place.address
@@ -204,9 +206,7 @@ class Launcher:
         self, jail: JailHandle, use: ServerUse[WorkerServer], deadline: Deadline
     ) -> LoadedJail:
         runner = jail.runners[0]
-        [reply] = jail.exchange(
-            "make_env", [(runner, self.repository.arguments.message())], deadline
-        )
+        [reply] = jail.exchange("make_env", [(runner, self.repository.arguments)], deadline)
         if not isinstance(reply, m.LoadDone):
             raise LoadError(f"the worker answered Load with {type(reply).__name__}")
         elements = self.repository.policy.limits.elements
@@ -245,7 +245,9 @@ class Launcher:
     ) -> None:
         """Have runners of a jail call ``make_env``, for a task that is known."""
         jail = loaded.jail
-        again = self.repository.arguments.message_for(task)
+        load = self.repository.arguments
+        given = load.n_envs, load.use_async_envs, load.cfg, load.env_kwargs
+        again = m.LoadTask(*given, task.suite, task.task)
         replies = jail.exchange("make_env", [(runner, again) for runner in runners], deadline)
         found = [typed_reply(reply, m.Value).value for reply in replies]
         loaded.changed |= not all(_is_what(value, task) for value in found)
@@ -295,16 +297,12 @@ class Launcher:
             loaded.ending = True
             WORKER.debug("%s: jail %x closes", self.repository.label, loaded.jail.number)
             wait_for_end = partial(loaded.jail.ask_to_close(), Deadline(_CLOSE_S))
-            if wait or not self._hold.close_later(loaded.server, wait_for_end):
+            if wait or not self.server_hold.close_later(loaded.server, wait_for_end):
                 wait_for_end()
         else:  # interruption.md, rule 7: what was sent is not known: over another connection
             self.interrupt(loaded)
             loaded.jail.drop()
         loaded.ended = True
-
-    def settle(self) -> bool:
-        """Wait for the jails that are on their way out; whether there was one."""
-        return self._hold.settle()
 
     def states(self, loaded: LoadedJail) -> tuple[str, ...]:
         """What a jail's runners are doing, one word each."""
@@ -333,7 +331,7 @@ class Launcher:
         if getattr(error, "reason", "") not in _UNKNOWN:
             error.denied = self.denials(server, jail)
             if isinstance(error, WorkerDiedError) and error.reason in ("exit", "signal"):
-                _name_denied(error)
+                name_denied(error)
 
     def _status(self, server: WorkerServer, jail: int, deadline: Deadline) -> dict[str, Any]:
         try:
@@ -379,26 +377,56 @@ def _refuse_late(deadline: Deadline) -> None:
         raise WorkerTimeoutError("the worker's manifest could not be read in time")
 
 
-def read_denials(said: object) -> tuple[str, ...] | None:
-    """What a jail was denied, as its server remembers it; None where it is not recorded.
+def retry_while_busy(
+    ask: Callable[[], T],
+    retry_s: float,
+    deadline: Deadline,
+    label: str,
+    refusal: EnvHubError | None = None,
+) -> T:
+    """Ask, and ask again while the answer is that there is no room.
 
-    Trust: a server on another host may say anything, and paths are a stranger's words.
+    The server keeps the order of those who go on asking: so the second time is soon, and takes the
+    place in the line. The time in the line does not count against the deadline.
+
+    Args:
+        deadline: For all else; once it is given up, the waiting ends.
+        refusal: The answer to an earlier try.
+
+    Raises:
+        ServerBusyError: There was no room in all that time.
     """
-    if not isinstance(said, tuple):
-        return None
-    texts = (one for one in said[:_MOST_DENIALS] if isinstance(one, str) and one.isprintable())
-    return tuple(one for one in texts if _DENIAL.fullmatch(one))
+    until, pause_s = monotonic() + retry_s, _SOON_S
+    ends = refusal is not None and (is_draining(refusal) or is_unanswered(refusal))
+    while True:
+        try:
+            return ask()
+        except (ServerBusyError, WorkerDiedError, UnreachableError) as error:
+            left_s = until - monotonic()
+            ends = ends or is_draining(error)
+            worth_it = isinstance(error, ServerBusyError) or (ends and is_unanswered(error))
+            if left_s <= 0 or deadline.unasked or not worth_it:
+                raise
+            if pause_s == _SOON_S:
+                WORKER.warning("%s: %s; waiting for up to %.0f s", label, error, left_s)
+            _pause(min(pause_s, left_s), deadline)
+            pause_s = max(getattr(error, "retry_s", _AGAIN_S), _SLICE_S * 2)
 
 
-def _name_denied(error: WorkerDiedError) -> None:
-    """Say what a process was denied before it ended by itself: many a program dies of that."""
-    text = ""
-    if error.denied:
-        more = len(error.denied) - _NAMED
-        named = [one_line(one, _SHOWN) for one in error.denied[:_NAMED]]
-        text = f"Before that it was denied: {', '.join(named)}{f' and {more} more' * (more > 0)}"
-    elif error.denied is None and error.signal not in (None, "SIGKILL"):
-        recording = option_name("policy", {"record_denials": True})
-        text = f"If something that it was denied is the reason, {recording} names it"
-    if text and text not in str(error):  # called again where nothing is recorded
-        error.args = (f"{error.args[0]}\n{text}", *error.args[1:])
+def is_draining(error: EnvHubError) -> bool:
+    """Whether another in its place is worth waiting for."""
+    return isinstance(error, ServerBusyError) and error.quota == DRAINING
+
+
+def is_unanswered(error: EnvHubError) -> bool:
+    """Whether there was no answer, so that it may have been between two servers."""
+    if isinstance(error, WorkerDiedError):
+        return error.reason == "connection"
+    return isinstance(error, UnreachableError)
+
+
+def _pause(pause_s: float, deadline: Deadline) -> None:
+    until = monotonic() + pause_s
+    while not deadline.unasked and (left_s := until - monotonic()) > 0:
+        sleep(min(left_s, _SLICE_S))
+    deadline.postpone(pause_s)

@@ -10,19 +10,18 @@ some of them ``READY`` and some ``PENDING``: the next request is refused, and ``
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import chain
-from threading import get_ident
 from time import perf_counter_ns
 from typing import Any, TypeVar
 
-from envhub_sandbox.errors import EnvHubError, LocalProtocolError, WorkerError, WorkerTimeoutError
+from envhub_sandbox.errors import LocalProtocolError, WorkerError, WorkerTimeoutError
+from envhub_sandbox.session.attribute_cache import FleetAttributes
+from envhub_sandbox.session.counters import FleetCounters
 from envhub_sandbox.session.crash.history import History
 from envhub_sandbox.session.env_session import EnvSession
-from envhub_sandbox.session.parts.fleet_counters import FleetCounters
-from envhub_sandbox.session.parts.naming import name_part
+from envhub_sandbox.session.recovery import mark_revived
 from envhub_sandbox.session.requests import (
     MessageFor,
     OneMessageFor,
@@ -30,8 +29,7 @@ from envhub_sandbox.session.requests import (
     RequestOrder,
     Requests,
 )
-from envhub_sandbox.session.survival.recovery import mark_revived
-from envhub_sandbox.session.use_lock import all_held
+from envhub_sandbox.session.use_lock import FleetUse
 from envhub_sandbox.system.log import WORKER
 from envhub_sandbox.system.threads import Calls
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline, deadline_of
@@ -54,11 +52,9 @@ class FleetRequests(RequestOrder):
         results: Joins what the parts give; its bounds are theirs.
         history: That of the whole environment.
         counters: Likewise.
-
-    Attributes:
-        attributes: Those that need no request.
-        use: The locks of all parts, as one.
     """
+
+    use: FleetUse
 
     def __init__(
         self,
@@ -69,9 +65,9 @@ class FleetRequests(RequestOrder):
     ) -> None:
         self._parts = parts
         self._each: list[Requests] = [part.requests for part in parts]
-        super().__init__(parts[0].repository, results)
-        self.use = FleetUse(parts)
-        self.attributes = FleetAttributes(self._each, results)
+        use = FleetUse([part.use for part in parts])
+        attributes = FleetAttributes([one.attributes for one in self._each], results.bounds)
+        super().__init__(parts[0].repository, results, use, attributes)
         self._history = history
         self._counters = counters
         self._space = results.manifest.single_action_space
@@ -98,16 +94,12 @@ class FleetRequests(RequestOrder):
         else:
             self._history.step(actions)
 
-    def locked(self) -> AbstractContextManager[Any]:
-        """See ``RequestOrder``."""
-        return self.use.lock
-
     def ask_one(self, name: str, index: int, message: OneMessageFor) -> m.Message:
         """Ask the part that has the sub-environment; the others are not asked."""
         with self.use.lock:
             self.refuse_if_busy(f"envs[{index}].{name}")
             at = next(i for i, (start, stop) in enumerate(self.results.bounds) if index < stop)
-            with self._naming(at):
+            with self._parts[at].naming():
                 return self._each[at].ask_one(name, index, message)
 
     # --- requests ------------------------------------------------------------------------------
@@ -203,12 +195,12 @@ class FleetRequests(RequestOrder):
         idle = [at for at, state in enumerate(states) if state is State.IDLE]
         for at, one in enumerate(self._each):
             if at not in idle:
-                with self._naming(at):
+                with self._parts[at].naming():
                     one.make_ready(operation)
         if idle:
             started = self._start([self._parts[at] for at in idle])
             for at, start in zip(idle, started, strict=True):
-                with self._naming(at):
+                with self._parts[at].naming():
                     self._each[at].make_ready(operation, start)
 
     def _start(self, parts: Sequence[EnvSession]) -> list[Callable[[], None]]:
@@ -245,7 +237,7 @@ class FleetRequests(RequestOrder):
                 send(at)
             except Exception as error:
                 if at == 0:
-                    with self._naming(at):
+                    with self._parts[at].naming():
                         raise
                 self._unsent[at] = error
                 self._each[at].fall_behind()
@@ -276,88 +268,10 @@ class FleetRequests(RequestOrder):
                 WORKER.info("%s: also: %s", self._repository.label, error)
         error = failures[first]
         try:
-            with self._naming(first):
+            with self._parts[first].naming():
                 raise error
         finally:
             self.explain(error)
-
-    @contextmanager
-    def _naming(self, at: int) -> Iterator[None]:
-        """Say in an error which sub-environments it is of, and where they are."""
-        try:
-            yield
-        except EnvHubError as error:
-            name_part(error, self._parts[at])
-            raise
-
-
-class FleetUse:
-    """The use of all parts at a time, by one thread: see ``UseLock``.
-    ``stepping``: likewise.
-    """
-
-    def __init__(self, parts: Sequence[EnvSession]) -> None:
-        self.stepping: int | None = None
-        self._parts = parts
-        self._holder: int | None = None
-
-    @property
-    def lock(self) -> AbstractContextManager[None]:
-        """The locks of all parts, taken in their order: interruption.md, rule 16.
-
-        A fresh one for each ``with``: where a Ctrl-C comes into it, the locks are released with
-        that object at the latest.
-        """
-        return self._hold_all()
-
-    @property
-    def is_mine(self) -> bool:
-        """Whether this thread holds them."""
-        return self._holder == get_ident()
-
-    @contextmanager
-    def _hold_all(self) -> Iterator[None]:
-        with all_held([part.use.lock for part in self._parts]):
-            before, self._holder = self._holder, get_ident()
-            try:
-                yield
-            finally:
-                self._holder = before
-
-    def warn_of_two(self, thread: int) -> None:
-        """See ``UseLock``."""
-        first = self._parts[0].use
-        first.stepping = self.stepping
-        first.warn_of_two(thread)
-        first.stepping = None
-
-
-class FleetAttributes:
-    """The attributes that need no request: see ``AttributeCache``."""
-
-    def __init__(self, each: Sequence[Requests], results: Results) -> None:
-        self._each = each
-        self._bounds = results.bounds
-
-    def get(self, name: str) -> tuple[Any, ...] | None:
-        """The values, if all parts know theirs."""
-        found: list[Any] = []
-        for one in self._each:
-            values = one.attributes.get(name)
-            if values is None:
-                return None
-            found += values
-        return tuple(found)
-
-    def should_watch(self, name: str) -> bool:
-        """Whether every part is to be asked to watch it."""
-        wanted = [one.attributes.should_watch(name) for one in self._each]  # each takes note of it
-        return all(wanted)
-
-    def put(self, name: str, values: tuple[Any, ...], *, watched: bool) -> None:
-        """Keep the answers of all parts."""
-        for one, (start, stop) in zip(self._each, self._bounds, strict=True):
-            one.attributes.put(name, values[start:stop], watched=watched)
 
 
 def _joined(packed: Sequence[Packed], bounds: Sequence[tuple[int, int]]) -> Request:

@@ -8,19 +8,16 @@ of an ``EnvSession`` is asked of all of them here.
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-from envhub_sandbox.errors import EnvHubError
-from envhub_sandbox.session.counters import LEDGER, Labels
+from envhub_sandbox.session.counters import LEDGER, FleetCounters, Labels
 from envhub_sandbox.session.crash.history import History
 from envhub_sandbox.session.env_session import GRACE_S, EnvSession
-from envhub_sandbox.session.jails.loaded import LoadedJail
-from envhub_sandbox.session.parts.fleet_counters import FleetCounters
 from envhub_sandbox.session.parts.fleet_requests import FleetRequests
-from envhub_sandbox.session.parts.naming import name_part, rows_of
+from envhub_sandbox.session.prewarm import FleetPrewarm
 from envhub_sandbox.system.threads import Calls
-from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
+from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.results import Results
 from envhub_worker.protocol.lifecycle import State
 
@@ -43,10 +40,10 @@ class FleetSession:
         self.parts = list(parts)
         self.repository = parts[0].repository
         self.manifest = manifest = parts[0].manifest
-        self.bounds = [rows_of(part) for part in parts]
-        self.counters = FleetCounters(parts)
+        self.bounds = [part.rows for part in parts]
+        self.counters = FleetCounters([part.counters for part in parts])
         self.lifecycle = FleetLifecycle(parts)
-        self.prewarm = FleetPrewarm(parts)
+        self.prewarm = FleetPrewarm([part.prewarm for part in parts])
         results = Results(manifest, self.bounds)
         self.requests = FleetRequests(self.parts, results, history, self.counters)
         labels = Labels(self.repository.label, manifest.suite, str(manifest.task))
@@ -56,11 +53,6 @@ class FleetSession:
     def jails(self) -> int:
         """That it lives in at a time."""
         return len(self.parts)
-
-    @property
-    def closed(self) -> bool:
-        """Whether all parts are closed for good."""
-        return self.lifecycle.closed
 
     def report(self) -> list[dict[str, Any]]:
         """The layers of every jail, each with the number of its worker."""
@@ -104,15 +96,12 @@ class FleetSession:
             for part in self.parts:
                 part.notice_death()
         for part in self.parts:
-            try:
+            with part.naming():
                 part.recover(grace)
-            except EnvHubError as error:
-                name_part(error, part)
-                raise
 
     def close(self) -> None:
         """Close every part, side by side: see ``EnvSession``."""
-        if not (self.requests.use.is_mine or self.closed):
+        if not (self.requests.use.is_mine or self.lifecycle.closed):
             with contextlib.suppress(RuntimeError):  # this system has no thread left
                 Calls([part.close for part in self.parts]).wait()
         self.finalize()
@@ -143,51 +132,3 @@ class FleetLifecycle:
     def closed(self) -> bool:
         """Whether all are closed."""
         return all(part.closed for part in self._parts)
-
-
-class FleetPrewarm:
-    """Starts all parts, side by side: see ``Prewarm``."""
-
-    def __init__(self, parts: Sequence[EnvSession]) -> None:
-        self._first_use: Callable[[], None] | None = None
-        self._parts = [part.prewarm for part in parts]
-
-    @property
-    def closed(self) -> bool:
-        """Whether all parts are closed for good."""
-        return all(part.closed for part in self._parts)
-
-    @property
-    def starting(self) -> StartupDeadline | None:
-        """Of a part that is being started ahead."""
-        return next((part.starting for part in self._parts if part.starting is not None), None)
-
-    def adopt(self, loaded: LoadedJail) -> None:
-        """The first part uses a jail that is already loaded."""
-        self._parts[0].adopt(loaded)
-
-    def start_in_background(self) -> None:
-        """Each part in a thread of its own."""
-        for part in self._parts:
-            part.start_in_background()
-
-    def start(self) -> None:
-        """Likewise, and wait for them."""
-        Calls([part.start for part in self._parts]).wait()
-
-    def cancel(self) -> bool:
-        """Give up every part that was started ahead."""
-        cancelled = [part.cancel() for part in self._parts]
-        return any(cancelled)
-
-    def note_use(self) -> None:
-        """See ``Prewarm``."""
-        if self._first_use is not None:
-            first_use, self._first_use = self._first_use, None
-            first_use()
-
-    def on_first_use(self, first_use: Callable[[], None], make_room: Callable[[], bool]) -> None:
-        """See ``Prewarm``: whichever part is used first."""
-        self._first_use = first_use
-        for part in self._parts:
-            part.on_first_use(self.note_use, make_room)

@@ -22,9 +22,9 @@ from gymnasium.error import NoAsyncCallError
 
 from envhub_sandbox.errors import ActionError, WorkerTimeoutError
 from envhub_sandbox.session.env_session import EnvSession
+from envhub_sandbox.session.failures import refusal
 from envhub_sandbox.session.parts.worker_queue import WorkerQueue
 from envhub_sandbox.session.requests import MessageFor, RequestOrder
-from envhub_sandbox.session.survival.refusals import refusal
 from envhub_sandbox.session.use_lock import all_held
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.readiness import answered_first

@@ -23,7 +23,6 @@ from envhub_sandbox.errors import (
     remote_error,
 )
 from envhub_sandbox.session.env_session import EnvSession
-from envhub_sandbox.session.parts.naming import name_part, rows_of
 from envhub_sandbox.session.requests import MessageFor
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.lane import Lane
@@ -54,7 +53,7 @@ class WorkerQueue:
 
     def __init__(self, part: EnvSession, *, sliced: bool) -> None:
         self.part = part
-        self.rows = rows_of(part)
+        self.rows = part.rows
         self.failure: EnvHubError | None = None
         self.count = self.rows[1] - self.rows[0]
         self._requests = part.requests
@@ -190,7 +189,7 @@ class WorkerQueue:
 
     def _name(self, error: EnvHubError) -> None:
         """Have it say whose it is."""
-        name_part(error, self.part)
+        self.part.name_in(error)
         error.env_ids = tuple(range(*self.rows))
 
     def _take(self) -> StepResult:
@@ -237,7 +236,7 @@ class WorkerQueue:
         self._waiting.clear()
         while self._owed and not self.interrupted:
             with suppress(EnvHubError):  # a reset that follows meets what is wrong
-                self.take(_ignore)
+                self.take(lambda result: None)
         self.forget()
 
     def forget(self) -> None:
@@ -245,7 +244,3 @@ class WorkerQueue:
         self._owed.clear()
         self._waiting.clear()
         self.failure, self.taking = None, False
-
-
-def _ignore(result: StepResult) -> None:
-    """They are not wanted any more."""

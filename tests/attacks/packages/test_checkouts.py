@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from envhub_sandbox.check.static.static import static
+from envhub_sandbox.check.static import static
 from envhub_sandbox.hub.git.checkout import read_checkout
 from envhub_sandbox.hub.snapshot import snapshot_named
 from tests.hub.olah_server import GitRepository

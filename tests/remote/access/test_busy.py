@@ -14,7 +14,7 @@ import pytest
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import PolicyError, ServerBusyError, WorkerError
 from envhub_sandbox.sandboxes.remote import RemoteSandbox
-from envhub_sandbox.session.jails.retry_while_busy import retry_while_busy
+from envhub_sandbox.session.jails.launcher import retry_while_busy
 from envhub_sandbox.transport.deadline import StartupDeadline
 from envhub_worker.access import keys
 from envhub_worker.access.places import Line

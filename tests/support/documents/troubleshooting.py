@@ -102,10 +102,10 @@ _NO_MESSAGES = {
     *("Option", "_option", "Argument", "Typer", "add_argument", "add_parser", "Check", "Template")
 }
 _NO_FILES = (
-    "envhub_sandbox/check/page/markup.py",
-    "envhub_sandbox/check/page/page.py",
+    "envhub_sandbox/check/markup.py",
+    "envhub_sandbox/check/page.py",
     "envhub_sandbox/check/checks.py",
-    "envhub_sandbox/check/static/survey.py",
+    "envhub_sandbox/check/static.py",
     "envhub_sandbox/cli/app.py",
     "envhub_sandbox/cli/init/starter.py",
     "envhub_sandbox/dependencies/locks/lockfile.py",

@@ -22,6 +22,7 @@ from envhub_sandbox.transport.remote_warnings import RemoteWarnings
 from envhub_sandbox.transport.results import StepResult
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.lifecycle import State
+from envhub_worker.protocol.limits import DEFAULT_LIMITS
 from tests.attacks.client.lying_server import NUM_ENVS, OBSERVATION, env_manifest
 
 
@@ -146,6 +147,7 @@ class FakeRepository(Repository):
         self.policy, self.timeouts = Policy(crash_history=8), Timeouts()
         self.warnings, self.recipe, self.copy = RemoteWarnings(), None, True
         self.min_ready = None
+        self.label, self.wire_limits = "a/b", DEFAULT_LIMITS
 
     def keep_crash(self, *_: object, **__: object) -> None:
         """There is none."""
@@ -173,7 +175,8 @@ def session_over(
 ) -> EnvSession:
     """A session that is READY, with its environment behind this lane."""
     repository = repository or FakeRepository()
-    here = {"stay": lambda: lambda: None, "where": lambda _: "here"}
+    hold = SimpleNamespace(enter=lambda: lambda: None)
+    here = {"server_hold": hold, "where": lambda _: "here"}
     launcher = SimpleNamespace(repository=repository, **here)
     jails = SimpleNamespace(launcher=launcher, shared=False)
     trials = SimpleNamespace(note=lambda *_: None)

@@ -11,8 +11,8 @@ from typing import Any
 import pytest
 from typer.testing import CliRunner, Result
 
-from envhub_sandbox.check.static.changes import changes
-from envhub_sandbox.check.static.static import static
+from envhub_sandbox.check.changes import changes
+from envhub_sandbox.check.static import static
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.hub.hashing import GIT_SHA1, digest_of
 from envhub_sandbox.hub.listing import FileRecord, Snapshot

@@ -12,8 +12,8 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import HubReferenceError, PolicyError, RepositoryUnavailableError
-from envhub_sandbox.factory import sandbox_spec
-from envhub_sandbox.factory.config import plain_config
+from envhub_sandbox.factory import arguments
+from envhub_sandbox.factory.arguments import plain_config
 from envhub_sandbox.hub import snapshot
 from envhub_sandbox.settings.options import Options
 from envhub_worker.protocol.messages import CONFIG_CLASS
@@ -88,9 +88,9 @@ def test_without_a_sandbox_nothing_pretends_to_protect(given: dict[str, Any]) ->
 def test_a_name_is_looked_up_as_a_shell_does(monkeypatch: pytest.MonkeyPatch) -> None:
     """And a path is a path."""
     monkeypatch.setattr("shutil.which", lambda name: f"/somewhere/{name}")
-    assert sandbox_spec.interpreter("python3.12") == "/somewhere/python3.12"
-    assert sandbox_spec.interpreter("/a/../python3.12") == "/python3.12"
-    assert sandbox_spec.interpreter(None) == ""
+    assert arguments.interpreter("python3.12") == "/somewhere/python3.12"
+    assert arguments.interpreter("/a/../python3.12") == "/python3.12"
+    assert arguments.interpreter(None) == ""
 
 
 @dataclass

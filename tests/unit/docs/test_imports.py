@@ -38,7 +38,7 @@ OPTIONAL = {
     "envhub_sandbox.sandboxes.ray.actor": {"ray"},
     "envhub_sandbox.sandboxes.ray.cluster": {"ray"},
     "envhub_sandbox.transport.values.tensors": {"torch"},
-    "envhub_sandbox.check.play.video": {"imageio_ffmpeg"},
+    "envhub_sandbox.check.play.plays": {"imageio_ffmpeg"},
     "envhub_sandbox.integrations.pytest_plugin": {"pytest"},
 }
 DESERIALISERS = {"_pickle", "copyreg", "dill", "joblib", "marshal", "pickle", "shelve"}

@@ -17,7 +17,7 @@ import typer
 
 from envhub_sandbox import errors
 from envhub_sandbox.check.play.episodes import Episode, Rollout, RolloutError
-from envhub_sandbox.check.play.video import VideoError
+from envhub_sandbox.check.play.plays import VideoError
 from envhub_sandbox.cli.shared.console import plain, print_json, safe_line, say
 from envhub_sandbox.cli.shared.exits import (
     Exit,

@@ -11,7 +11,7 @@ import pytest
 from envhub_sandbox.check import reports
 from envhub_sandbox.check.checks import CHECKS, Severity
 from envhub_sandbox.check.findings import Finding, Report
-from envhub_sandbox.check.page.page import page
+from envhub_sandbox.check.page import page
 from envhub_sandbox.check.play.confinement import Confinement
 from envhub_worker.protocol.text import printable
 from tests.support.output.pages import HOSTILE

@@ -11,10 +11,9 @@ import pytest
 from envhub_sandbox.errors import LoadError
 from envhub_sandbox.factory.env_factory import EnvFactory
 from envhub_sandbox.hub.snapshot import local
-from envhub_sandbox.session.jails.builder import Builder
+from envhub_sandbox.session.jails.builder import Builder, JailSource
 from envhub_sandbox.session.jails.launcher import Launcher
-from envhub_sandbox.session.jails.sources import JailSource
-from envhub_sandbox.session.repository import LoadArguments, Repository
+from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.settings.policy import Policy, Timeouts
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.results import Results
@@ -44,7 +43,8 @@ def launcher(server: LyingServer, tmp_path: Path, snapshot_store: Path) -> Launc
     """Opens jails of a repository there."""
     (tmp_path / "repo").mkdir()
     (tmp_path / "repo" / "env.py").write_text("")
-    given: Any = (local(tmp_path / "repo"), LoadArguments(n_envs=NUM_ENVS), Policy(), Timeouts())
+    load = m.Load(NUM_ENVS, False, None, {})
+    given: Any = (local(tmp_path / "repo"), load, Policy(), Timeouts())
     more: Any = {"recipe": None, "installed": None, "advice": str}
     repository = Repository(*given, OWN, "frames", True, **more)
     return Launcher(repository, LyingSandbox(server), snapshot_store)

@@ -14,7 +14,7 @@ from envhub_sandbox.errors import HubReferenceError, PolicyError
 from envhub_sandbox.hub.client import HubClient, checked_endpoint
 from envhub_sandbox.hub.logins import authorization, login_of, without_login
 from envhub_sandbox.sandboxes.remote import RemoteSandbox
-from envhub_sandbox.session.recipe import Recipe
+from envhub_sandbox.session.repository import Recipe
 
 SECRET = "s3cret"
 HUB = f"https://me@there:{SECRET}@hub.example/x"

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from envhub_sandbox.check.play.video import (
+from envhub_sandbox.check.play.plays import (
     MAX_SIDE,
     VideoError,
     VideoWriter,

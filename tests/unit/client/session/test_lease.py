@@ -24,7 +24,6 @@ class _Jails:
         self.done: list[str] = []
         self.fails: dict[str, list[BaseException]] = {}
         self.launcher = launcher
-        launcher.settle = lambda: False
         launcher.note_denied = lambda *_: None
         launcher.hold = lambda: lambda: self.done.append("server released")
         self.launcher.retry_s = 0.0
@@ -55,7 +54,8 @@ def taken(monkeypatch: pytest.MonkeyPatch) -> tuple[Lease, _Jails]:
     """The lease of an environment that has no jail yet, and where it gets one."""
     lane = FakeLane()
     session = session_over(lane)
-    jails = _Jails(SimpleNamespace(repository=session.repository, stay=lambda: lambda: None))
+    hold = SimpleNamespace(enter=lambda: lambda: None, settle=lambda: False)
+    jails = _Jails(SimpleNamespace(repository=session.repository, server_hold=hold))
     building = SimpleNamespace(build=lambda *_: jails.do("build") or lane)
     monkeypatch.setattr(lease_module, "Builder", lambda *_: building)
     session.lifecycle.state = State.IDLE

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from packaging.requirements import Requirement
 
-from envhub_sandbox.check.static.static import undeclared
+from envhub_sandbox.check.static import undeclared
 from envhub_sandbox.hub.snapshot import Snapshot, local
 from envhub_sandbox.hub.sources import imports as source
 from envhub_sandbox.hub.sources import parser, parsing

@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 
 from envhub_sandbox.errors import SnapshotError
+from envhub_sandbox.factory.env_factory import ManifestCache
 from envhub_sandbox.hub import store as store
 from envhub_sandbox.hub.listing import FileRecord
-from envhub_sandbox.session.manifest_cache import ManifestCache
 from envhub_sandbox.system import folders
 from tests.hub.stub_hub import git_blob_id
 from tests.support import inside

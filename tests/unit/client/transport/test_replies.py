@@ -12,7 +12,7 @@ import gymnasium as gym
 import pytest
 
 from envhub_sandbox import errors
-from envhub_sandbox.session.author_lines import add_author_line
+from envhub_sandbox.session.error_text import add_author_line
 from envhub_sandbox.transport.replies import check_reply, death, expect_reply, raised, refusal
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import REASONS

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from envhub_sandbox.vector.task_map import TaskMap, live_tasks
+from envhub_sandbox.vector.suites import TaskMap, live_tasks
 
 DEADLINE_S = 60.0
 GIB = 1 << 30

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from envhub_sandbox.errors import RemoteEnvError, RemoteProtocolError, remote_error
 from envhub_sandbox.transport.values import generators
-from envhub_sandbox.vector import from_manifest
+from envhub_sandbox.transport.values.descriptions import spec_of
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol.codec.codec import decode, encode
 from envhub_worker.protocol.codec.inert import RemoteEnum, RemoteObject
@@ -197,14 +197,14 @@ def test_specs_of_wrong_types_are_refused(lie: object) -> None:
 
 def test_specs_name_the_repository_that_makes_them() -> None:
     """As text, JSON, a pickle and a copy; whoever makes one is told."""
-    made = from_manifest.spec(an_env(), "org/repo@0123")
+    made = spec_of(an_env().spec, "org/repo@0123")
     assert made is not None
     for spec in (made, copy.deepcopy(made), pickle.loads(pickle.dumps(made))):
         assert EnvSpec.from_json(spec.to_json()) == made
         with pytest.raises(gym.error.Error, match="org/repo@0123"):
             gym.make(spec)
-    assert from_manifest.spec(an_env(spec=None), "x") is None
-    assert from_manifest.spec(an_env(spec={"id": "not an id!"}), "x") is None
+    assert spec_of(an_env(spec=None).spec, "x") is None
+    assert spec_of(an_env(spec={"id": "not an id!"}).spec, "x") is None
 
 
 # --- generators, stand-ins, errors ----------------------------------------------------------

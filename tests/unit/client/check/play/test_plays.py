@@ -9,7 +9,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from envhub_sandbox.check.play import traces, video
+from envhub_sandbox.check.play import plays, traces
 from envhub_sandbox.check.play.plays import Play, facts_of, film
 from envhub_sandbox.errors import RemoteEnvError
 
@@ -66,7 +66,7 @@ def test_a_film_is_of_so_many_frames(mode: Modes) -> None:
 
 def test_there_are_pictures_where_nothing_makes_a_film(monkeypatch: pytest.MonkeyPatch) -> None:
     """And it says what to install."""
-    monkeypatch.setattr(video, "can_encode", lambda: False)
+    monkeypatch.setattr(plays, "can_encode", lambda: False)
     made = film(walks(), seed=0, seconds=600)
     assert (len(made.stills), made.video) == (4, b"")
     assert "envhub-sandbox[video]" in made.lacks

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from envhub_sandbox.errors import PolicyError
-from envhub_sandbox.factory.sandbox_spec import sandbox_of
+from envhub_sandbox.factory.arguments import sandbox_of
 from envhub_sandbox.sandboxes.fleet.fleet import Fleet
 from envhub_worker.access import keys
 from envhub_worker.protocol.keys import key_text

@@ -11,7 +11,7 @@ import pytest
 
 from envhub_sandbox import RaySandbox
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerStartupError
-from envhub_sandbox.factory.sandbox_spec import sandbox_of
+from envhub_sandbox.factory.arguments import sandbox_of
 from envhub_sandbox.sandboxes.ray import cluster, sandbox
 from envhub_sandbox.settings.policy import Policy
 from envhub_worker.protocol.runtime import OWN, Runtime

@@ -12,7 +12,7 @@ import pytest
 from envhub_sandbox.errors import WorkerDiedError, WorkerStartupError
 from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.session.jails import launcher as launcher_module
-from envhub_sandbox.session.jails.launcher import Launcher, read_denials
+from envhub_sandbox.session.jails.launcher import Launcher
 from envhub_sandbox.session.jails.loaded import LoadedJail
 from envhub_worker.protocol import messages as m
 from tests.support.in_process.fake_lane import FakeLane, session_over
@@ -196,17 +196,3 @@ def test_no_server_no_use(launcher: Launcher, place: _Place) -> None:
     with pytest.raises(WorkerStartupError):
         launcher.hold()
     assert place.released == 0
-
-
-@pytest.mark.parametrize("said", [None, "ptrace", ["ptrace"], {"ptrace": 1}, 7])
-def test_denials_that_are_no_list_of_texts_are_none(said: Any) -> None:
-    """As where none are recorded."""
-    assert read_denials(said) is None
-
-
-def test_a_denial_that_is_no_attempt_is_left_out() -> None:
-    """Only forms that there are; nothing that a terminal would obey, nothing long, and not many."""
-    good = ("ptrace", "socket AF_INET", "write /home/other/x\\x1b")
-    bad = (b"ptrace", 7, None, ("ptrace",), "Ptrace", "read x", "read /\x1b[2J", "a" * 41)
-    assert read_denials((*bad, *good, "read /" + "x" * 401)) == good
-    assert len(read_denials(("ptrace",) * 100_000) or ()) == 64

@@ -7,8 +7,8 @@ from typing import Any
 import pytest
 
 from envhub_sandbox.errors import EnvHubError, ServerBusyError, WorkerDiedError
-from envhub_sandbox.session.jails import retry_while_busy as module
-from envhub_sandbox.session.jails.retry_while_busy import retry_while_busy
+from envhub_sandbox.session.jails import launcher as module
+from envhub_sandbox.session.jails.launcher import retry_while_busy
 from envhub_sandbox.transport.deadline import StartupDeadline
 from envhub_worker.protocol.messages.busy import DRAINING
 

@@ -8,7 +8,7 @@ from functools import partial
 import pytest
 
 from envhub_sandbox.sandboxes.pool import ServerPool, ServerUse
-from envhub_sandbox.session.jails.server_hold import ServerHold
+from envhub_sandbox.session.jails.loaded import ServerHold
 from tests.unit.client.sandboxes.test_pool import Server
 
 

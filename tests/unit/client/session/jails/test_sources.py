@@ -8,7 +8,7 @@ from unittest.mock import MagicMock
 
 import pytest
 
-from envhub_sandbox.session.jails.sources import JailSource, SharedJail
+from envhub_sandbox.session.jails.builder import JailSource, SharedJail
 from envhub_sandbox.transport.deadline import Deadline
 
 

@@ -1,0 +1,181 @@
+"""What is different between two commits, in terms of what a repository would do.
+
+A finding is the same where it stands in the same file, in a line that reads the same: lines that
+move are no change, and what stands in a changed line is a new finding.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from envhub_sandbox.check.checks import Severity
+from envhub_sandbox.check.findings import Finding
+from envhub_sandbox.check.static import Static
+from envhub_sandbox.dependencies.locks.drift import drift_of_tasks
+from envhub_sandbox.dependencies.locks.fingerprint import TaskFingerprint
+from envhub_sandbox.hub.hashing import differing
+from envhub_sandbox.hub.listing import FileRecord
+from envhub_worker.protocol.text import printable, size_text
+
+_MOST_BYTES = 1 << 20
+_LONGEST = 500
+
+
+@dataclass(frozen=True)
+class Change:
+    """One thing that differs.
+
+    Attributes:
+        what: ``"file"``, ``"entry"``, ``"python"``, ``"package"``, ``"import"``, ``"finding"`` or
+            ``"environment"``.
+        how: ``"new"``, ``"gone"``, ``"changed"`` or ``"renamed"``.
+    """
+
+    what: str
+    how: str
+    text: str
+    finding: Finding | None = None
+
+    def weighs(self, least: Severity) -> bool:
+        """Whether it is a new finding of at least this severity."""
+        return (
+            self.finding is not None
+            and self.how == "new"
+            and self.finding.check.severity.reaches(least)
+        )
+
+
+def changes(then: Static, now: Static) -> list[Change]:
+    """What differs, in the order of ``Change.what``."""
+    return [
+        *_files(then, now),
+        *_value("entry", _entry(then), _entry(now)),
+        *_value("python", _python(then), _python(now)),
+        *_named("package", _packages(then), _packages(now)),
+        *_named("import", _imports(then), _imports(now)),
+        *sorted(_findings(then, now), key=_rank),
+    ]
+
+
+def _rank(change: Change) -> int:
+    return 0 if change.finding is None else change.finding.check.severity.rank
+
+
+def _files(then: Static, now: Static) -> Iterator[Change]:
+    before, after = ({one.record.path: one.record for one in read.files} for read in (then, now))
+    other = set(differing(now.snapshot.root, after.values(), before.values())) & set(before)
+    gone = {path: one.digest for path, one in before.items() if path not in after}
+    was = {digest: path for path, digest in gone.items()}
+    moved = {was.get(one.digest) for path, one in after.items() if path not in before}
+    for path in sorted({*before, *after}):
+        if path in other:
+            sizes = f"{size_text(before[path].size)}, now {size_text(after[path].size)}"
+            yield Change("file", "changed", _shown(f"{path}: {sizes}"))
+        elif path in gone and path not in moved:
+            yield Change("file", "gone", _shown(path))
+        elif path not in before:
+            yield _new(after[path], was)
+
+
+def _new(record: FileRecord, was: Mapping[str, str]) -> Change:
+    if record.digest in was:
+        return Change("file", "renamed", _shown(f"{record.path}: was {was[record.digest]}"))
+    return Change("file", "new", _shown(f"{record.path}: {size_text(record.size)}"))
+
+
+def _shown(text: str) -> str:
+    return printable(text, _LONGEST)
+
+
+def _entry(read: Static) -> str:
+    arguments = " or ".join(f"make_env({text})" for text, _ in read.entries)
+    return f"{read.snapshot.path}: {arguments or 'no make_env at its top'}"
+
+
+def _python(read: Static) -> str:
+    return (read.declared.python if read.declared else "") or "any"
+
+
+def _value(what: str, then: str, now: str) -> Iterator[Change]:
+    if then != now:
+        yield Change(what, "changed", _shown(f"{then}, now {now}"))
+
+
+def _packages(read: Static) -> dict[str, str]:
+    found: dict[str, list[str]] = {}
+    for one in read.declared.wanted if read.declared else ():
+        found.setdefault(one.requirement.name.lower(), []).append(str(one))
+    return {name: ", ".join(sorted(texts)) for name, texts in found.items()}
+
+
+def _imports(read: Static) -> dict[str, str]:
+    return {name: name for name in read.modules}
+
+
+def _named(what: str, then: Mapping[str, str], now: Mapping[str, str]) -> Iterator[Change]:
+    for name in sorted({*then, *now}):
+        if name not in then:
+            yield Change(what, "new", _shown(now[name]))
+        elif name not in now:
+            yield Change(what, "gone", _shown(then[name]))
+        else:
+            yield from _value(what, then[name], now[name])
+
+
+def _findings(then: Static, now: Static) -> Iterator[Change]:
+    before, after = _by_line(then), _by_line(now)
+    for how, mine, others in (("new", after, before), ("gone", before, after)):
+        known = Counter({key: len(found) for key, found in others.items()})
+        for key, found in mine.items():
+            for one in found[known[key] :]:
+                yield Change("finding", how, one.text, one)
+
+
+def _by_line(read: Static) -> dict[tuple[str, ...], list[Finding]]:
+    """Findings by what they say and by the line that they stand in, whatever its number."""
+    lines: dict[str, list[str]] = {}
+    found: dict[tuple[str, ...], list[Finding]] = {}
+    for one in read.findings:
+        if one.line and one.file not in lines:
+            lines[one.file] = _lines(read.snapshot.root / one.file)
+        text = lines[one.file][one.line - 1 : one.line] if one.line else []
+        found.setdefault((one.id, one.file, one.message, *text), []).append(one)
+    return found
+
+
+def _lines(path: Path) -> list[str]:
+    try:
+        with path.open("rb") as file:
+            text = file.read(_MOST_BYTES).decode("utf-8", "replace")
+    except OSError:
+        return []
+    return [line.strip() for line in re.split("\r\n|\r|\n", text)]
+
+
+def environments(then: Sequence[TaskFingerprint], now: Sequence[TaskFingerprint]) -> list[Change]:
+    """What differs in what two of them return. Trust: input from the worker, already checked."""
+    lines = (line.removeprefix("environment ") for line in drift_of_tasks(then, now))
+    return [Change("environment", "changed", _shown(line)) for line in lines]
+
+
+def document(then: Static, now: Static, found: list[Change]) -> dict[str, Any]:
+    """All of it, as plain data."""
+    return {
+        "then": then.reference,
+        "now": now.reference,
+        "same": not found,
+        "changes": [
+            {
+                "what": one.what,
+                "change": one.how,
+                "text": one.text,
+                "finding": one.finding and one.finding.document(),
+            }
+            for one in found
+        ],
+    }

@@ -1,1 +1,0 @@
-"""The page for people: its parts, and how text gets into it."""

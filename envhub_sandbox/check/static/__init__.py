@@ -1,1 +1,0 @@
-"""What is read of a repository without running any of it."""

@@ -1,0 +1,182 @@
+"""What is added to the text of an error: the author's own line, advice, and what was denied.
+
+A worker names the files of its repository relative to it. Here they get the name that their author
+knows: the path in the local folder, or the name in the repository at that commit; never the copy
+in the store. The verified snapshot decides which names these are, and not the worker.
+
+A sentence is added to the errors of downloads, sockets and windows: a jail has no network and no
+display, and what libraries say then ("check your Internet connection") is of no help. Which
+sentence, is read off the text. Trust: text from the worker, which chooses among ours and no more.
+"""
+
+from __future__ import annotations
+
+import re
+
+from envhub_sandbox.errors import EnvHubError, RemoteEnvError, WorkerDiedError
+from envhub_sandbox.hub.snapshot import Snapshot
+from envhub_sandbox.settings.options import option_name
+from envhub_sandbox.settings.policy import Policy
+from envhub_worker.protocol.codec.inert import one_line
+from envhub_worker.protocol.text import printable, quoted
+
+_FRAME = re.compile(
+    r'^(?P<margin>[ |+-]*)File "(?P<file>[^"\n]{1,4096})", line (?P<line>[0-9]{1,9})'
+    r"(?:, in (?P<function>[^\n]*))?(?:\n(?P<source>[ |]{4}[^\n]*)(?:\n(?P<caret>[ |\t]*\^+))?)?",
+    re.MULTILINE,
+)
+_TRACEBACK_CHARS = 32_768
+_FUNCTION_CHARS, _SOURCE_CHARS = 100, 200
+
+
+def add_author_line(error: EnvHubError, snapshot: Snapshot) -> None:
+    """Add the repository's own line to what it raised, once. Trust: text from the worker."""
+    remote = error if isinstance(error, RemoteEnvError) else error.__cause__
+    if not isinstance(remote, RemoteEnvError) or "__notes__" in vars(error):
+        return
+    frames = [found for found in _FRAME.finditer(remote.traceback) if _place(found, snapshot)]
+    where = _line(frames[-1], snapshot) if frames else ""
+    named = _FRAME.sub(lambda found: _named(found, snapshot), remote.traceback)
+    remote.traceback = printable(named, _TRACEBACK_CHARS)
+    remote.where = where
+    if where:
+        error.args = (f"{error.args[0]}\n{where}", *error.args[1:])
+    if remote.traceback:
+        note = f"In the environment:\n{quoted(remote.traceback.rstrip())}"
+        # before Python 3.11 only some shells and test runners show it
+        vars(error)["__notes__"] = [note]
+
+
+def _place(found: re.Match[str], snapshot: Snapshot) -> str | None:
+    name = found["file"].removeprefix(f"{snapshot.root}/")  # older workers give the whole path
+    return snapshot.known_as(name)
+
+
+def _named(found: re.Match[str], snapshot: Snapshot) -> str:
+    place, rest = _place(found, snapshot), found[0].partition('"')[2].partition('"')[2]
+    return found[0] if place is None else f"{found['margin']}File {place}{rest}"
+
+
+def _line(found: re.Match[str], snapshot: Snapshot) -> str:
+    place = printable(str(_place(found, snapshot)))
+    function = found["function"]
+    inside = f", in {one_line(function, _FUNCTION_CHARS)}" if function else ""
+    lines = [f"  File {place}, line {found['line']}{inside}", *_source(found)]
+    return "\n    ".join(lines)
+
+
+def _source(found: re.Match[str]) -> list[str]:
+    """The line, and below it the caret of a syntax error, whose line alone says little.
+
+    Python indents both alike, by blanks and by the tabs of the line itself.
+    """
+    source = (found["source"] or "").replace("\t", " ")
+    text = source.lstrip(" |")
+    shown = one_line(text.rstrip(" |"), _SOURCE_CHARS)
+    caret = (found["caret"] or "")[len(source) - len(text) :].replace("\t", " ")
+    aligned = text.startswith(shown) and len(caret) <= _SOURCE_CHARS
+    return [line for line in (shown, caret if aligned and not found["function"] else "") if line]
+
+
+# --- what it wanted to reach, and which option brings that ---------------------------------------
+
+_HUB = re.compile(
+    r"LocalEntryNotFoundError|OfflineModeIsEnabled|HF_HUB_OFFLINE|huggingface\.co|"
+    r"[Oo]utgoing traffic has been disabled"
+)
+_INSTALL = re.compile(r"\b(pip|pip3|uv|conda)\b[^\n]{0,80}\b(install|add|sync)\b")
+_NO_FAMILY = re.compile(r"\[Errno 97\]|[Aa]ddress family not supported")
+_DOWNLOAD = re.compile(
+    r"\bgit\b[^\n]{0,80}\b(clone|fetch|pull|submodule|lfs)\b|\b(wget|curl|aria2c)\b|"
+    r"URLError|gaierror|ConnectionError|ConnectError|NewConnectionError|Max retries exceeded|"
+    r"[Nn]ame resolution|Name or service not known|Could not resolve host|Network is unreachable"
+)
+_DISPLAY = re.compile(
+    r"NoSuchDisplayException|no display name and no \$DISPLAY|DISPLAY environment variable|"
+    r"(connect|open|find)[^\n]{0,20} (X server|[Xx]?[ -]?display)|Qt platform plugin|"
+    r"No available video device|Failed to (initialize GLFW|create window)",
+)
+_TEXT_CHARS = 65_536
+
+
+def add_reach_advice(error: EnvHubError, policy: Policy) -> None:
+    """Add what to do to an error of a download, a socket or a window, once."""
+    remote = error if isinstance(error, RemoteEnvError) else error.__cause__
+    if "__notes__" in vars(error):
+        return
+    advice = ""
+    if isinstance(remote, RemoteEnvError):
+        advice = _advice(f"{remote.type_name}: {remote.message}"[:_TEXT_CHARS], policy)
+    elif isinstance(error, WorkerDiedError) and error.signal in ("SIGABRT", "SIGSEGV", None):
+        advice = _of_display(error.log_tail[-_TEXT_CHARS:], policy)
+    if advice and not str(error).endswith(advice):
+        error.args = (f"{error.args[0]}\n{advice}", *error.args[1:])
+
+
+def _advice(text: str, policy: Policy) -> str:
+    if policy.network != "host":
+        if _HUB.search(text):
+            return (
+                "A jail has no network, and of the Hub it has its own repository and its assets "
+                f"only: name this one with {option_name('assets', ['org/repo@COMMIT'])}"
+            )
+        if _INSTALL.search(text):
+            return (
+                "A jail has no network and cannot install packages: name the packages in the "
+                "repository's requirements.txt, or with "
+                f"{option_name('dependencies', {'extra': ['PACKAGE']})}"
+            )
+        if _NO_FAMILY.search(text) and policy.network == "none":
+            return (
+                "A jail has no network: for connections between its own processes give it a "
+                f"loopback device of its own, with {option_name('network', 'loopback')}"
+            )
+        if _DOWNLOAD.search(text) or _NO_FAMILY.search(text):
+            return (
+                "A jail has no network: put what it downloads into the repository, or into one on "
+                f"the Hub that {option_name('assets', ['org/repo@COMMIT'])} names"
+            )
+    return _of_display(text, policy)
+
+
+def _of_display(text: str, policy: Policy) -> str:
+    if not _DISPLAY.search(text) or policy.display != "none":
+        return ""
+    return (
+        "It tried to open a window, and a jail has no display: have it render to arrays "
+        "(render_mode='rgb_array'), or give the jail a display of its own, with "
+        f"{option_name('display', 'virtual')}"
+    )
+
+
+# --- what it was denied --------------------------------------------------------------------------
+
+_DENIAL = re.compile(r"[a-z0-9_]{1,40}( [A-Z0-9_]{1,40}| /.{0,400})?")
+_MOST_DENIALS = 64
+_NAMED_DENIALS, _SHOWN = 8, 200
+"""Denials in the text of an error, and characters of each."""
+
+
+def read_denials(said: object) -> tuple[str, ...] | None:
+    """What a jail was denied, as its server remembers it; None where it is not recorded.
+
+    Trust: a server on another host may say anything, and paths are a stranger's words.
+    """
+    if not isinstance(said, tuple):
+        return None
+    texts = (one for one in said[:_MOST_DENIALS] if isinstance(one, str) and one.isprintable())
+    return tuple(one for one in texts if _DENIAL.fullmatch(one))
+
+
+def name_denied(error: WorkerDiedError) -> None:
+    """Say what a process was denied before it ended by itself: many a program dies of that."""
+    text = ""
+    if error.denied:
+        more = len(error.denied) - _NAMED_DENIALS
+        named = [one_line(one, _SHOWN) for one in error.denied[:_NAMED_DENIALS]]
+        text = f"Before that it was denied: {', '.join(named)}{f' and {more} more' * (more > 0)}"
+    elif error.denied is None and error.signal not in (None, "SIGKILL"):
+        recording = option_name("policy", {"record_denials": True})
+        text = f"If something that it was denied is the reason, {recording} names it"
+    if text and text not in str(error):  # called again where nothing is recorded
+        error.args = (f"{error.args[0]}\n{text}", *error.args[1:])

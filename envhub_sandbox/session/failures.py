@@ -1,0 +1,221 @@
+"""Failures of requests: the error for the caller, the crash bundle, the lifecycle's move.
+
+``refusal`` says why an environment takes no request now, and ``Restarts`` how often, and how soon,
+one whose worker died gets a fresh one.
+"""
+
+from __future__ import annotations
+
+import time
+
+from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerError, WorkerTimeoutError
+from envhub_sandbox.session.counters import Counters
+from envhub_sandbox.session.crash.history import History
+from envhub_sandbox.session.lease import Lease, closed_during
+from envhub_sandbox.settings.options import option_name
+from envhub_sandbox.settings.policy import Policy
+from envhub_sandbox.system.log import WORKER
+from envhub_sandbox.system.processes import fork_error_text
+from envhub_sandbox.transport.deadline import Deadline
+from envhub_worker.protocol.lifecycle import Event, State
+
+_CALM_S = 60.0
+_LONGEST_S = 30.0
+_LOOK_AGAIN_S = 0.1
+
+
+def expiry(operation: str, why: str) -> WorkerDiedError:
+    """The error of an environment that was idle for too long."""
+    text = f"cannot {operation}: {why}, so its processes were ended; call reset() first"
+    return WorkerDiedError(text, reason="idle", request=operation, detail=why)
+
+
+def refusal(
+    state: State, operation: str, restart: str, interrupted: str | None = None
+) -> EnvHubError | None:
+    """Why an environment takes no request now; None if it takes one.
+
+    ``restart`` is the policy's; ``interrupted`` the request whose wait was interrupted.
+    """
+    if state in (State.IDLE, State.READY):
+        return None
+    if state in (State.LATE, State.PENDING) and interrupted is not None:
+        text = (
+            f"cannot {operation}: the last {interrupted} was interrupted, by Ctrl-C or a stopped "
+            "cell, so the state of the environment is unknown; call reset() first"
+        )
+        return WorkerTimeoutError(text, request=operation)
+    if state in (State.LATE, State.PENDING):
+        text = f"cannot {operation}: the reply to the last request is late; call reset() first"
+        return WorkerTimeoutError(text, request=operation)
+    if state is State.DEAD:
+        text = f"cannot {operation}: the worker process has died; {_advice(restart)}"
+        return WorkerDiedError(text, request=operation)
+    if state is State.EXPIRED:
+        return expiry(operation, "it was idle for too long")
+    if state is State.FOREIGN:
+        return WorkerError(f"cannot {operation}: {fork_error_text()}")
+    if state is State.CLOSED:
+        return closed_during(operation)
+    return WorkerError(f"cannot {operation}: the environment is {state.value}")
+
+
+def _advice(restart: str) -> str:
+    if restart != "never":
+        return "call reset() first"
+    return (
+        f"make the environment again, or use {option_name('restart', 'on_reset')} and call reset()"
+    )
+
+
+class Restarts:
+    """The restarts of one environment, which its counters count."""
+
+    def __init__(self, policy: Policy, counters: Counters) -> None:
+        self._policy = policy
+        self._counters = counters
+        self._last = -_CALM_S
+        self._in_a_row = 0
+        self._given_up = False
+
+    @property
+    def permitted(self) -> bool:
+        """Whether the policy permits any."""
+        return self._policy.restart != "never"
+
+    def give_up(self) -> None:
+        """No more restarts are needed: a wait in another thread ends soon."""
+        # interruption.md, rule 12: no Event
+        self._given_up = True
+
+    def spend(self, operation: str) -> None:
+        """Count one more for an operation, and wait if the last one was a moment ago.
+        Raises ``WorkerDiedError``: there are none left, or the environment was closed.
+        """
+        budget = self._policy.restart_budget
+        if self._counters.restarts >= budget:
+            raise WorkerDiedError(
+                f"the worker process has died again, and all {budget} restarts are used up "
+                "(restart_budget of the policy); make the environment again",
+                request=operation,
+            )
+        calm = time.monotonic() - self._last >= _CALM_S
+        self._in_a_row = 0 if calm else self._in_a_row + 1
+        self._wait(backoff_s(self._policy.restart_backoff_s, self._in_a_row), operation)
+        self._last = time.monotonic()
+        self._counters.restarts += 1
+
+    def _wait(self, wait_s: float, operation: str) -> None:
+        until = time.monotonic() + wait_s
+        while not self._given_up and (left := until - time.monotonic()) > 0:
+            time.sleep(min(left, _LOOK_AGAIN_S))
+        if self._given_up:
+            raise closed_during(operation)
+
+
+def backoff_s(first_s: float, in_a_row: int) -> float:
+    """Seconds to wait before a restart that has so many right before it."""
+    if in_a_row == 0:
+        return 0.0
+    return min(first_s * 2.0 ** min(in_a_row - 1, 64), _LONGEST_S)
+
+
+class Failures:
+    """The failures of one environment's requests.
+    ``interruption``: the request whose wait was interrupted, so that its reply is late; None where
+    the last late reply has another reason.
+    """
+
+    def __init__(self, lease: Lease, history: History) -> None:
+        self._lease = lease
+        self._counters = lease.counters
+        self._label = lease.repository.label
+        self._history = history
+        self.interruption: str | None = None
+
+    def timed_out(self, operation: str, deadline: Deadline) -> WorkerTimeoutError:
+        """The deadline of a request came first: the environment is LATE."""
+        self._counters.timeouts += 1
+        self.interruption = None
+        self._lease.lifecycle.moved(Event.TIMEOUT)
+        return self.late(operation, deadline)
+
+    def interrupted(self, error: BaseException) -> None:
+        """Ctrl-C, or another exception of a signal handler, ended a wait.
+
+        The reply may still come, so the environment is LATE, and not READY.
+        Raises ``WorkerDiedError``: a ``close`` within the wait took away what was waited for.
+        """
+        if self._lease.lifecycle.closed and isinstance(error, Exception):
+            raise self.dead(WorkerDiedError("")) from error
+        self.note_interruption()
+
+    def note_interruption(self) -> None:
+        """The reply to the pending request is late, for that reason."""
+        self.interruption = self._lease.lifecycle.request or "request"
+        self._lease.lifecycle.moved(Event.INTERRUPT)
+
+    def late(self, operation: str, deadline: Deadline) -> WorkerTimeoutError:
+        """The error for a reply that did not come in time."""
+        timeout_s, states = deadline.timeout_s, self._lease.states()
+        WORKER.info("%s: no answer to %s after %s s", self._label, operation, timeout_s)
+        busy = f" (its processes: {', '.join(states)})" if states else ""
+        error = WorkerTimeoutError(
+            f"{operation} has not finished after {timeout_s} s{busy}; reset() brings the "
+            "environment back, in a fresh process if it still does not answer",
+            request=operation,
+            timeout_s=timeout_s,
+        )
+        error.worker = states
+        return error
+
+    def expired(self, operation: str, why: str) -> WorkerDiedError:
+        """The server has ended the jail because it was idle."""
+        lifecycle = self._lease.lifecycle
+        lifecycle.moved(Event.EXPIRY)
+        lifecycle.request = None
+        return expiry(operation, why)
+
+    def dead(self, error: EnvHubError) -> EnvHubError:
+        """The jail has died, or broke a rule of the protocol: the environment is DEAD.
+
+        A jail that still lives is ended: after a broken rule, and where it goes on without the
+        runner that has died.
+
+        Returns:
+            The error for the caller; after a ``close`` it says that the environment was closed.
+        """
+        lifecycle, lease = self._lease.lifecycle, self._lease
+        operation = lifecycle.request or "a request"
+        if lifecycle.closed:
+            return closed_during(operation)
+        self._counters.deaths += 1
+        lifecycle.moved(Event.DEATH)
+        WORKER.info("%s: %s", self._label, str(error).partition("\n")[0])
+        died = isinstance(error, WorkerDiedError)
+        try:
+            lease.note_denied(error)
+        finally:
+            if lease.loaded is not None and (lease.loaded.jail.kept or not died):
+                lease.end()
+        if isinstance(error, WorkerDiedError):
+            self._write_crash(error)  # denials are asked for once: a silent server costs 10 s
+        return error
+
+    def keep_crash(self, error: WorkerDiedError | WorkerTimeoutError) -> None:
+        """Write a crash bundle, and name it in the error."""
+        self._lease.note_denied(error)
+        self._write_crash(error)
+
+    def _write_crash(self, error: WorkerDiedError | WorkerTimeoutError) -> None:
+        lease, results = self._lease, self._lease.results
+        manifest = results.manifest
+        task = {
+            "suite": manifest.suite,
+            "task": manifest.task,
+            "num_envs": manifest.num_envs,
+            "shards": len(results.bounds),
+            "lane": None if lease.lane is None else lease.lane.name,
+        }
+        recording, loaded = self._history.recording(), lease.loaded
+        lease.repository.keep_crash(error, recording, task, loaded, shared=lease.shared)

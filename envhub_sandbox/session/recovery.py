@@ -1,0 +1,358 @@
+"""``restart="transparent"``: a request goes on although runners have died.
+
+The dead shards come back in fresh runners, seeded anew, with the attributes that were set; the
+others go on. Without it there is no ``Recovery``, and a death is an error.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerError, WorkerTimeoutError
+from envhub_sandbox.session.crash.history import History
+from envhub_sandbox.session.failures import Failures, Restarts
+from envhub_sandbox.session.lease import Lease
+from envhub_sandbox.system.log import WORKER
+from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
+from envhub_sandbox.transport.jail import RunnersDiedError
+from envhub_sandbox.transport.lane import Lane, Request
+from envhub_sandbox.transport.replies import check_reply, typed_reply
+from envhub_sandbox.transport.results import is_batch
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.codec.codec import Buffer
+from envhub_worker.protocol.lifecycle import Event
+from envhub_worker.protocol.untrusted import UNTRUSTED
+
+RESTARTED = "worker_restarted"
+"""The key in the infos: whether a sub-environment was lost and came back reset."""
+_SETTINGS = 256
+"""Attributes that are remembered, the last ones."""
+MessagesFor = Callable[[Lane, int], list[m.Message]]
+"""Makes what a shard's fresh runner is asked, one after the other."""
+RowsOf = Callable[[m.Message, int], m.Message]
+"""Makes the reply for a dead shard of a fresh runner's last answer and the number of rows."""
+
+
+class Recovery:
+    """Brings back the dead shards of one environment.
+    ``fresh``: those that came back in the last request.
+    """
+
+    def __init__(
+        self,
+        lease: Lease,
+        restarts: Restarts,
+        failures: Failures,
+        history: History,
+    ) -> None:
+        manifest = lease.results.manifest
+        self._lease = lease
+        self._lifecycle = lease.lifecycle
+        self._bounds = lease.results.bounds
+        self._restarts = restarts
+        self._failures = failures
+        self._counters = lease.counters
+        self._history = history
+        self._seeds = SeedBook(manifest.num_envs, manifest.shardable)
+        self._settings = Settings()
+        self._setting: tuple[str, list[list[bytes]]] | None = None  # what is being set
+        self._asked: Sequence[m.Message] = ()
+        self.fresh: tuple[int, ...] = ()
+
+    # --- what is asked -------------------------------------------------------------------------
+
+    def started(self) -> None:
+        """There is a fresh jail, in which no attribute was set."""
+        self._settings.clear()
+
+    def sent(self, request: Request) -> None:
+        """Remember the seeds and attributes of a request that has gone out."""
+        self._asked = messages = request.messages
+        self._setting, self.fresh = None, ()
+        for message, (start, _) in zip(messages, self._bounds, strict=True):
+            if isinstance(message, m.Reset):
+                self._seeds.remember(message, start)
+        if isinstance(messages[0], m.SetAttr):
+            self._setting = messages[0].name, request.kept()
+
+    def answered(self) -> None:
+        """Every shard has answered it, and none has raised."""
+        if self._setting is not None:
+            self._settings.remember(*self._setting)
+            self._setting = None
+
+    # --- deaths --------------------------------------------------------------------------------
+
+    def deaths_of_all(self, error: WorkerError) -> RunnersDiedError:
+        """The end of the jail, as the death of all shards."""
+        if not isinstance(error, WorkerDiedError):  # another environment there has given it up
+            error = WorkerDiedError(str(error), reason="killed")
+        shards = range(len(self._bounds))
+        replies: list[m.Message | None] = [None for _ in shards]
+        return RunnersDiedError(replies, dict.fromkeys(shards, error), jail_gone=True)
+
+    def survive_request(self, deaths: RunnersDiedError) -> list[m.Message]:
+        """The replies to a reset, which fresh runners repeat; another request is not repeated.
+        Raises ``WorkerDiedError``: it was another one; the next step or reset brings the dead back.
+        """
+        replies = self._of_survivors(deaths)
+        if self._lifecycle.request != "reset":
+            self._lifecycle.answered()
+            raise deaths.first
+        fresh = self._revive(deaths, "reset", self._resets, _reset_rows)
+        merged = [fresh.get(index, reply) for index, reply in enumerate(replies)]
+        return [reply for reply in merged if reply is not None]
+
+    def survive_step(self, deaths: RunnersDiedError) -> list[m.StepDone]:
+        """The replies to a step, with truncated rows in the place of the dead."""
+        replies = self._of_survivors(deaths)
+        fresh = self._revive(deaths, "step", self._revivals, _step_rows)
+        merged = [fresh.get(index, reply) for index, reply in enumerate(replies)]
+        return [typed_reply(reply, m.StepDone) for reply in merged if reply is not None]
+
+    def mark(self, infos: dict[Any, Any]) -> dict[Any, Any]:
+        """All infos of the last request, of which those of the fresh shards say that they are."""
+        if not self.fresh:
+            return infos
+        results = self._lease.results
+        return mark_revived(infos, results.count, [results.slices[index] for index in self.fresh])
+
+    def _of_survivors(self, deaths: RunnersDiedError) -> list[m.Message | None]:
+        """What the others answered; None in the place of the dead.
+        Raises ``RemoteEnvError``: one of them raised. The next request meets the deaths.
+        """
+        try:
+            for reply in deaths.replies:
+                if reply is not None:
+                    check_reply(reply)
+        except EnvHubError:
+            self._lifecycle.answered()
+            raise
+        return deaths.replies
+
+    def _revive(
+        self, deaths: RunnersDiedError, operation: str, messages_for: MessagesFor, rows_of: RowsOf
+    ) -> dict[int, m.Message]:
+        """Have the dead shards brought back, and move on to the state that it leads to."""
+        lifecycle, failures = self._lifecycle, self._failures
+        lifecycle.moved(Event.LOSS)
+        failures.keep_crash(deaths.first)
+        try:
+            replies = self._bring_back(deaths, operation, messages_for)
+            with UNTRUSTED:
+                fresh = {index: rows_of(one, self._size(index)) for index, one in replies.items()}
+        except WorkerTimeoutError as error:
+            if lifecycle.closed:
+                raise failures.dead(error) from error
+            lifecycle.request = None  # how far it came is not known: a reset starts afresh
+            failures.interruption = None
+            lifecycle.moved(Event.TIMEOUT)
+            raise
+        except EnvHubError as error:
+            cause = error.__cause__ or deaths.first
+            raise failures.dead(error) from (None if cause is error else cause)
+        except BaseException as error:  # interruption.md, rule 2
+            failures.interrupted(error)
+            lifecycle.request = None
+            raise
+        lifecycle.request = None
+        self.fresh = tuple(fresh)
+        self._counters.deaths += len(fresh)
+        self._history.revived()
+        lifecycle.moved(Event.REVIVAL)
+        return fresh
+
+    def _bring_back(
+        self, deaths: RunnersDiedError, operation: str, messages_for: MessagesFor
+    ) -> dict[int, m.Message]:
+        """What the fresh runners answer to the last of their requests."""
+        if any(death.reason == "protocol" for death in deaths.deaths.values()):
+            raise deaths.first  # after a broken rule there is no second chance
+        try:
+            self._restarts.spend(operation)
+        except WorkerDiedError as spent:
+            raise deaths.first from spent
+        self._log(deaths)
+        dead = sorted(deaths.deaths)
+        timeouts = self._lease.repository.timeouts
+        deadline = StartupDeadline(timeouts.startup_s)
+        if deaths.jail_gone:
+            self._lease.replace(deadline)
+        else:
+            self._lease.rebuild(dead, deadline)
+        lane, deadline_of_reset = self._lease.lane, Deadline(timeouts.reset_s)
+        assert lane is not None
+        try:
+            self._set_again(lane, dead, deadline_of_reset)
+            return _ask_anew(lane, dead, messages_for, deadline_of_reset)
+        except WorkerTimeoutError as error:
+            raise self._failures.late("reset", deadline_of_reset) from error
+
+    def _log(self, deaths: RunnersDiedError) -> None:
+        """Log a death that the caller sees in the infos only."""
+        rows = [row for index in sorted(deaths.deaths) for row in range(*self._bounds[index])]
+        why, label = str(deaths.first).partition("\n")[0], self._lease.repository.label
+        WORKER.info("%s: %s; sub-environments %s start again in new processes", label, why, rows)
+
+    def _set_again(self, lane: Lane, dead: Sequence[int], deadline: Deadline) -> None:
+        """Set attributes in fresh runners; what one's setter raises is only logged."""
+        for name, frames in self._settings.messages():
+            asked: list[tuple[int, list[Buffer]]] = [
+                (lane.runners[index], [*frames[index]]) for index in dead
+            ]
+            replies = lane.jail.ask("set_attr", asked, deadline)
+            if any(isinstance(reply, m.RaisedException) for reply in replies):
+                label = self._lease.repository.label
+                WORKER.warning("%s: %r could not be set again", label, name)
+            for reply in replies:
+                if not isinstance(reply, m.RaisedException):
+                    typed_reply(reply, m.Value)
+
+    def _revivals(self, lane: Lane, index: int) -> list[m.Message]:
+        return [m.Revive(lane.number, self._derived(index))]
+
+    def _resets(self, lane: Lane, index: int) -> list[m.Message]:
+        reset = self._asked[index]
+        assert isinstance(reset, m.Reset)
+        return resets(reset, self._derived(index))
+
+    def _derived(self, index: int) -> Any:
+        return self._seeds.derived(self._bounds[index], self._counters.restarts)
+
+    def _size(self, index: int) -> int:
+        start, stop = self._bounds[index]
+        return stop - start
+
+
+def _step_rows(reply: m.Message, size: int) -> m.Message:
+    """Trust: input from the worker."""
+    return revived_step(typed_reply(reply, m.StepDone), size)
+
+
+def _reset_rows(reply: m.Message, size: int) -> m.Message:
+    """Trust: input from the worker."""
+    done = typed_reply(reply, m.ResetDone)
+    return m.replace(done, info=mark_revived(done.info, size))
+
+
+def _ask_anew(
+    lane: Lane, dead: Sequence[int], messages_for: MessagesFor, deadline: Deadline
+) -> dict[int, m.Message]:
+    replies: list[m.Message] = []
+    for messages in zip(*(messages_for(lane, index) for index in dead), strict=True):
+        asked = [(lane.runners[i], message) for i, message in zip(dead, messages, strict=True)]
+        replies = lane.jail.exchange("reset", asked, deadline)
+    return dict(zip(dead, replies, strict=True))
+
+
+def revived_step(reply: m.StepDone, count: int) -> m.StepDone:
+    """A fresh runner's rows of the step in which another died. Trust: its flags are not used.
+
+    Of the rewards the shape is used where they are an array: then it was paid for in bytes. A
+    described space also has a ``shape``, of any size, for a few.
+    """
+    rewards: Any = reply.rewards
+    return m.StepDone(
+        reply.observation,
+        np.zeros(rewards.shape if is_batch(rewards) else (count,)),
+        np.zeros(count, np.bool_),
+        np.ones(count, np.bool_),
+        mark_revived(reply.info, count),
+    )
+
+
+def mark_revived(
+    info: dict[Any, Any], count: int, bounds: Iterable[tuple[int, int]] | None = None
+) -> dict[Any, Any]:
+    """Infos that say of each sub-environment, or of those within, that it came back."""
+    yes = np.zeros(count, np.bool_)
+    for start, stop in [(0, count)] if bounds is None else bounds:
+        yes[start:stop] = True
+    return {**info, RESTARTED: yes, f"_{RESTARTED}": yes.copy()}
+
+
+# --- seeds and attributes for the fresh runner of a dead shard -----------------------------------
+
+
+class SeedBook:
+    """What sub-environments were last seeded with, and what those that come back get.
+
+    Where the caller gave a seed, what follows a death is derived of it, so that the same run can be
+    had again; where he gave none, the fresh one is drawn by the environment.
+    ``each``: whether they are seeded one by one; otherwise the environment does that by itself.
+    """
+
+    def __init__(self, num_envs: int, each: bool) -> None:
+        self._each = each
+        self._last: list[int | None] = [None] * num_envs
+        self._own: Any = None
+
+    def remember(self, reset: m.Reset, start: int = 0) -> None:
+        """Take note of a reset of sub-environments from ``start`` on, or of those in its mask."""
+        seeds: Any = reset.seeds
+        if seeds is None:
+            return
+        if not self._each:
+            self._own = seeds
+            return
+        chosen_of: Any = [True] * len(seeds) if reset.mask is None else reset.mask
+        for index, (chosen, seed) in enumerate(zip(chosen_of, seeds, strict=True), start):
+            if chosen and seed is not None:
+                self._last[index] = seed
+
+    def derived(self, bounds: tuple[int, int], restart: int) -> Any:
+        """Seeds for the sub-environments of a shard that comes back."""
+        if self._each:
+            return [derived_seed(seed, restart) for seed in self._last[slice(*bounds)]]
+        if isinstance(self._own, list):
+            return [derived_seed(seed, restart) for seed in self._own]
+        return derived_seed(self._own, restart)
+
+
+class Settings:
+    """Attributes that the caller has set: the last message of each, as the shards were sent it."""
+
+    def __init__(self) -> None:
+        self._sent: dict[str, Sequence[list[bytes]]] = {}
+
+    def remember(self, name: str, sent: Sequence[list[bytes]]) -> None:
+        """Take note of what was set, given the frames for each shard."""
+        self._sent.pop(name, None)  # the last one counts, in its place
+        self._sent[name] = sent
+        if len(self._sent) > _SETTINGS:
+            del self._sent[next(iter(self._sent))]
+
+    def clear(self) -> None:
+        """There is a fresh jail, in which nothing has been set."""
+        self._sent.clear()
+
+    def messages(self) -> list[tuple[str, Sequence[list[bytes]]]]:
+        """Names, and the frames for each shard."""
+        return list(self._sent.items())
+
+
+def derived_seed(seed: int | None, restart: int) -> int | None:
+    """The seed after the ``restart``-th restart of what was last seeded with ``seed``."""
+    if seed is None:
+        return None
+    return int(np.random.SeedSequence((abs(seed), restart)).generate_state(1)[0])
+
+
+def resets(message: m.Reset, derived: Any) -> list[m.Message]:
+    """What a fresh runner is asked in the place of one that died in a reset.
+
+    The reset itself, with derived seeds where the caller gave none; where it is one of some
+    sub-environments only, all are reset before.
+    """
+    if message.mask is not None:
+        return [m.Reset(message.env, derived, None, None), message]
+    return [m.replace(message, seeds=_filled(message.seeds, derived))]
+
+
+def _filled(seeds: Any, derived: Any) -> Any:
+    if not isinstance(seeds, list) or not isinstance(derived, list):
+        return derived if seeds is None else seeds
+    return [new if seed is None else seed for seed, new in zip(seeds, derived, strict=True)]

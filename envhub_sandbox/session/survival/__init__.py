@@ -1,1 +1,0 @@
-"""What becomes of an environment when its processes die: it fails, or they are brought back."""

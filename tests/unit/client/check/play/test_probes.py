@@ -1,0 +1,121 @@
+"""Single probes: what episodes leave behind, what render gives, and what LeRobot needs."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from envhub_sandbox.check.play import probes
+from envhub_sandbox.check.play.probes import lerobot_lacks, other_modes, wrong_frames
+
+_MIB = 1 << 20
+
+
+def seen(*rows: tuple[int, int, int, int]) -> list[probes.Usage]:
+    """One count after each round."""
+    return [{"processes": p, "threads": t, "files": f, "memory_bytes": m} for p, t, f, m in rows]
+
+
+_GROWTH: dict[str, tuple[list[probes.Usage], str | None]] = {
+    "level": (seen(*[(1, 0, 9, 0)] * 4), None),
+    "filled once": (seen((1, 0, 9, 0), *[(9, 8, 9, 90 * _MIB)] * 3), None),
+    "jitter": (seen(*((1 + n, n, 9, 1000 * n) for n in range(4))), None),
+    "processes": (seen(*((1 + 8 * n, 0, 9, 0) for n in range(4))), "leaks-processes"),
+    "threads": (seen(*((1, 8 * n, 9, 0) for n in range(4))), "leaks-threads"),
+    "files": (seen(*((1, 0, 3 + 6 * n, 0) for n in range(4))), "leaks-files"),
+    "memory": (seen(*((1, 0, 9, 2 * n * _MIB) for n in range(4))), "leaks-memory"),
+    "all": (seen(*((1 + 8 * n, 8 * n, 9, 100 * n * _MIB) for n in range(4))), "leaks-processes"),
+    "uncounted": ([], None),
+}
+
+
+@pytest.mark.parametrize(("counts", "found"), _GROWTH.values(), ids=_GROWTH)
+def test_what_grows_in_every_round_is_told(counts: list[probes.Usage], found: str | None) -> None:
+    """And of what comes with it nothing: a process has threads and memory of its own."""
+    grew = probes.leak(counts, 8)
+    assert (grew[0] if grew else None) == found
+
+
+def test_nobody_who_counts_is_no_count() -> None:
+    """A server on another host may be an older one: then nothing is said, not that all is well."""
+    numbers = itertools.count()
+    assert probes.usage_per_round(lambda: next(numbers), dict, 2, lambda what: None) == []
+    assert next(numbers) == 8
+
+
+FRAME = np.zeros((4, 6, 3), np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("mode", "rendered", "said"),
+    [
+        ("rgb_array", (FRAME, FRAME), ""),
+        ("rgb_array_list", [[FRAME], ()], ""),
+        ("ansi", ("a", ""), ""),
+        ("human", None, ""),
+        ("rgb_array", FRAME, r"uint8 \(4, 6, 3\), not one result for each"),
+        ("rgb_array", (FRAME, FRAME.astype(float)), "sub-environment 1 gave float64"),
+        ("rgb_array", (FRAME[:0], FRAME), "sub-environment 0"),
+        ("rgb_array_list", [[FRAME], FRAME], "sub-environment 1"),
+        ("ansi", ("a", b"b"), "sub-environment 1 gave bytes"),
+    ],
+)
+def test_frames_fit_their_mode(mode: str, rendered: Any, said: str) -> None:
+    """Modes of which nobody knows what they give are not judged."""
+    env: Any = SimpleNamespace(render_mode=mode, num_envs=2, render=lambda: rendered)
+    found = list(wrong_frames(env))
+    assert len(found) == bool(said)
+    assert all(re.search(said, text) for text in found), found
+
+
+@pytest.mark.parametrize("declared", [["ansi", "human", 3, "rgb_array"], ("rgb_array", "ansi")])
+def test_modes_that_need_no_window_are_tried(declared: Any) -> None:
+    """Of those that it declares; a lie about them names none."""
+    env: Any = SimpleNamespace(metadata={"render_modes": declared}, render_mode="rgb_array")
+    assert other_modes(env) == ["ansi"]
+    assert other_modes(SimpleNamespace(metadata={"render_modes": 3}, render_mode=None)) == []  # type: ignore[arg-type]
+
+
+PLAYABLE = spaces.Dict({"agent_pos": spaces.Box(-1, 1, (2,), np.float32)})
+VECTOR = spaces.Box(-1, 1, (2,), np.float32)
+
+
+def vector(observations: Any = PLAYABLE, actions: Any = VECTOR, *, limited: bool = True) -> Any:
+    """What is asked of an environment."""
+
+    def get_attr(name: str) -> tuple[int, ...]:
+        if not limited:
+            raise AttributeError(name)
+        return (100,)
+
+    return SimpleNamespace(
+        single_observation_space=observations, single_action_space=actions, get_attr=get_attr
+    )
+
+
+def test_nothing_is_said_of_what_it_can_play() -> None:
+    """State or pixels in a mapping, a vector as action, and an end."""
+    assert list(lerobot_lacks(vector())) == []
+
+
+@pytest.mark.parametrize(
+    ("env", "lacking"),
+    [
+        (vector(VECTOR), "observations with agent_pos, environment_state or pixels, not a"),
+        (vector(spaces.Dict({"image": VECTOR})), "not a Dict of image"),
+        (vector(actions=spaces.Discrete(3)), r"a vector \(Box\) as action, not Discrete\(3\)"),
+        (vector(actions=spaces.Box(0, 1, (2, 2))), r"not a Box of shape \(2, 2\)"),
+        (vector(limited=False), "_max_episode_steps"),
+    ],
+)
+def test_what_it_lacks_is_one_text(env: Any, lacking: str) -> None:
+    """It names all that is missing."""
+    [text] = lerobot_lacks(env)
+    assert text.startswith("LeRobot cannot evaluate it, which needs ")
+    assert re.search(lacking, text)

@@ -1,0 +1,237 @@
+"""What a repository's files show: nothing is run, and what cannot be read is said."""
+
+from __future__ import annotations
+
+import io
+import pickle
+import zipfile
+from pathlib import Path
+
+import pytest
+
+from envhub_sandbox.check.static import Survey, survey
+from envhub_sandbox.hub.listing import FileRecord, Snapshot
+from envhub_sandbox.hub.snapshot import local
+from envhub_sandbox.hub.sources import parsing
+from tests.support.repositories import write_repository
+
+_ENTRY = "def make_env(n_envs=1, use_async_envs=False): pass"
+
+
+def zipped(*names: str) -> bytes:
+    """An archive of empty files."""
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w") as archive:
+        for name in names:
+            archive.writestr(name, b"")
+    return file.getvalue()
+
+
+def repository(folder: Path, name: str, data: bytes | str) -> Path:
+    """One with its papers and a further file."""
+    write_repository(folder, _ENTRY, README__md="# x", LICENSE="MIT")
+    (folder / name).parent.mkdir(parents=True, exist_ok=True)
+    (folder / name).write_bytes(data.encode() if isinstance(data, str) else data)
+    return folder
+
+
+def from_the_hub(folder: Path) -> Snapshot:
+    """A folder as a snapshot of the Hub would have it, where nothing is left out."""
+    files = [path for path in sorted(folder.rglob("*")) if path.is_file()]
+    records = [
+        FileRecord(str(path.relative_to(folder)), path.stat().st_size, "sha256:" + "0" * 64)
+        for path in files
+    ]
+    return Snapshot("org/repo", "model", "0" * 40, "env.py", folder, tuple(records))
+
+
+def surveyed(snapshot: Snapshot) -> Survey:
+    """All that is read of one."""
+    return survey(snapshot, parsing.read(snapshot))
+
+
+def found(folder: Path, data: bytes | str, name: str = "odd.py") -> list[tuple[str, int]]:
+    """The checks, with lines, of what is found in one further file."""
+    repository(folder, name, data)
+    return [(one.id, one.line) for one in surveyed(local(folder)).findings if one.file == name]
+
+
+@pytest.mark.parametrize(
+    ("text", "check"),
+    [
+        ("from urllib import request", "source-network"),
+        ("import asyncio as a; a.open_connection('x', 1)", "source-network"),
+        ("import subprocess", "source-process"),
+        ("import os as harmless; harmless.system('x')", "source-process"),
+        ("from os import system as s; s('x')", "source-process"),
+        ("import os; run = os.popen", "source-process"),
+        ("import os; getattr(os, 'system')('x')", "source-process"),
+        ("import os; getattr(os, 'sys' + 'tem')('x')", "source-dynamic"),
+        ("\uff45\uff56\uff41\uff4c('1')", "source-dynamic"),
+        ("import importlib; importlib.import_module(x)", "source-dynamic"),
+        ("import builtins", "source-dynamic"),
+        ("import zipimport", "source-dynamic"),
+        ("import importlib.machinery as m; m.SourceFileLoader('x', 'x.txt')", "source-dynamic"),
+        ("import codecs; codecs.register(x)", "source-dynamic"),
+        ("import torch; torch.load('x')", "source-pickle"),
+        ("import numpy as np; np.load('x', allow_pickle=True)", "source-pickle"),
+        ("import ctypes", "source-native"),
+        ("open('/etc/passwd')", "source-outside"),
+        ("open('~/.ssh/id_rsa')", "source-outside"),
+        ("x['HF_TOKEN']", "source-outside"),
+        ("from pathlib import Path; Path.home()", "source-outside"),
+        ("x = '" + "QUJD" * 300 + "'", "source-obscure"),
+        ("x = 1" + " " * 3_000 + "; y = 2", "source-obscure"),
+        ("x = 'a\u202eb'", "source-hidden"),
+        ("# \u200b", "source-hidden"),
+        ("\u3164 = 1", "source-hidden"),
+        ("s\u0443stem = 1", "source-hidden"),
+        ("x = 1\ry = 2", "source-hidden"),
+        ("# \x1b[8m", "source-hidden"),
+    ],
+)
+def test_what_is_worth_a_look_is_found(text: str, check: str, tmp_path: Path) -> None:
+    """Each by its check alone, in its line; the line before is the control."""
+    assert set(found(tmp_path / "r", f"x = None\n{text}")) == {(check, 2)}
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "import os, re, math; re.compile('x'); model.compile(); os.path.join('a', 'b')",
+        "def f(eval=False, exec=None): return eval if exec else None",
+        "import numpy as np; np.load('x'); np.load('y', allow_pickle=False)",
+        "import torch; getattr(torch, name); getattr(self, 'system')",
+        "from . import subprocess",
+        '"""Reads /etc, and ~/.ssh, and so on."""',
+        "x = 'na\u00efve \u0441\u043b\u043e\u0432\u043e \u5f3a\u5316'\r\ny = 1\r\n",
+        "import os; getattr(os, 0x" + "f" * 900 + ")",  # which Python refuses to write out
+    ],
+)
+def test_honest_code_is_not_named(text: str, tmp_path: Path) -> None:
+    """Names that look alike, and letters of other languages."""
+    assert found(tmp_path / "r", text) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "kind", "check"),
+    [
+        ("fast.so", b"", "machine code", "source-native"),
+        ("weights.npz", b"\x7fELF\x02", "machine code", "source-native"),
+        ("env.cpython-311.pyc", b"\xa7\r\r\n\0\0", "compiled Python", "source-compiled"),
+        ("__pycache__/env.pyc", b"MZ", "compiled Python", "source-compiled"),
+        ("policy.pt", b"PK\x03\x04", "pickle", "source-pickle"),
+        ("data.bin", pickle.dumps({"a": [1]}), "pickle", "source-pickle"),
+        ("more.zip", b"PK\x03\x04", "archive", "source-unread"),
+        ("more.dat", b"\x1f\x8b\x08", "archive", "source-unread"),
+        ("icon.png", b"\x89PNG\r\n\x1a\n\0" + zipped("a.py"), "archive", "source-unread"),
+        ("notes.txt", b"a\n" * 9_000 + zipped("a.txt"), "archive", "source-unread"),
+        ("arrays.npz", zipped("a.npy", "b.npy"), "binary", ""),
+        ("arrays.npz", zipped("a.npy", "b.pyc", "c.npy"), "archive", "source-unread"),
+        ("arrays.npz", zipped(*map(str, range(2_000))), "archive", "source-unread"),
+        (
+            "mesh.stl",
+            b"version https://git-lfs.github.com/spec/v1\n",
+            "LFS pointer",
+            "source-unread",
+        ),
+        ("weights.npz", b"PK\x03\x04\0", "binary", ""),
+        ("frame.png", b"\x89PNG\r\n\x1a\n\0", "binary", ""),
+        ("notes.txt", "\u5f3a\u5316 \u5b66\u4e60".encode(), "text", ""),
+        ("long.txt", ("\u5f3a" * 5_000).encode(), "text", ""),
+        ("turned.md", "a\u2066b".encode(), "text", "source-hidden"),
+    ],
+)
+def test_files_are_told_by_their_beginnings_and_ends(
+    name: str, data: bytes, kind: str, check: str, tmp_path: Path
+) -> None:
+    """Whatever they are called, but what Python runs by its name; nothing opens them further."""
+    told = surveyed(from_the_hub(repository(tmp_path / "r", name, data)))
+    assert {one.record.path: one.kind for one in told.files}[name] == kind
+    assert [one.id for one in told.findings if one.file == name] == ([check] if check else [])
+
+
+@pytest.mark.parametrize(
+    ("text", "check"),
+    [
+        ("def (", "source-unread"),
+        ("\0", "source-unread"),
+        ("(" * 5_000, "source-unread"),
+        ("x = " + "-" * 100_000 + "1", "source-unparsed"),
+        ("\xff\xfe", "source-encoding"),
+        ("#" * (3 << 20), "source-unparsed"),
+    ],
+    ids=["syntax", "null", "nesting", "deep", "bytes", "large"],
+)
+def test_what_cannot_be_read_is_said(text: str, check: str, tmp_path: Path) -> None:
+    """No crash, no recursion without end, no time for what no person wrote, and no silence."""
+    checks = {check for check, _ in found(tmp_path / "r", text.encode("latin-1"))}
+    assert check in checks
+    assert checks <= {check, "source-hidden", "source-obscure"}
+
+
+def test_a_long_chain_ends_nothing(tmp_path: Path) -> None:
+    """Some versions of Python's parser take it, and others do not."""
+    chain = "if x: pass\n" + "elif x: pass\n" * 5_000
+    assert {check for check, _ in found(tmp_path / "r", chain)} <= {"source-unparsed"}
+
+
+def test_what_is_found_in_a_file_is_bounded(tmp_path: Path) -> None:
+    """And that there is more is found, too."""
+    checks = [check for check, _ in found(tmp_path / "r", "eval()\n" * 20_000)]
+    assert checks == ["source-dynamic"] * 100 + ["source-unread"]
+
+
+def test_what_is_read_of_a_repository_is_bounded(tmp_path: Path) -> None:
+    """What is left over is named, file by file."""
+    folder = repository(tmp_path / "r", "odd.py", "")
+    for number in range(70):
+        (folder / f"part{number:02}.py").write_bytes((b"#" * 98 + b"\n") * 2_600)
+    left_over = [one.file for one in surveyed(from_the_hub(folder)).findings]
+    assert left_over == sorted(left_over)
+    assert left_over[-1] == "part69.py"
+    assert 0 < len(left_over) < 10
+
+
+@pytest.mark.parametrize("start", ["MZ = 1", "BZh = 1", "#" + " " * 256 + "ustar"])
+def test_no_beginning_makes_python_anything_else(start: str, tmp_path: Path) -> None:
+    """It runs by its name, and is read by it."""
+    assert ("source-process", 2) in found(tmp_path / "r", f"{start}\nimport subprocess")
+
+
+def test_machine_code_in_place_of_a_source_fails(tmp_path: Path) -> None:
+    """Python takes it first; beside no source of its name it is what it is."""
+    folder = repository(tmp_path / "r", "lib/fast.cpython-311-x86_64-linux-gnu.so", b"\x7fELF")
+    (folder / "lib/fast.py").write_text("x = 1")
+    (folder / "env.abi3.so").write_bytes(b"\x7fELF")
+    (folder / "other.so").write_bytes(b"\x7fELF")
+    told = surveyed(from_the_hub(folder)).findings
+    compiled = {"env.abi3.so", "lib/fast.cpython-311-x86_64-linux-gnu.so"}
+    assert {one.file for one in told if one.id == "source-compiled"} == compiled
+
+
+def test_no_flood_hides_what_weighs_more(tmp_path: Path) -> None:
+    """Neither of findings nor of texts to be read."""
+    folder = repository(tmp_path / "r", "z/odd.py", b"# coding: utf-7\n")
+    (folder / "z/turned.py").write_text("x = 'a\u202eb'")
+    for number in range(220):
+        (folder / f"a{number:03}.py").write_text("eval()\n" * 101)
+    for number in range(33):
+        (folder / f"b{number}.txt").write_text("a b\n" * (1 << 18))
+    told = surveyed(from_the_hub(folder)).findings
+    assert len(told) > 20_000
+    weighs_more = {one.id for one in told if one.file.startswith("z/")}
+    assert weighs_more == {"source-encoding", "source-hidden"}
+
+
+def test_links_are_named(tmp_path: Path) -> None:
+    """Those of a folder, and those that git made, which the Hub hands out as texts."""
+    folder = repository(tmp_path / "r", "data.txt", "# something else\n")
+    (folder / "alias.txt").symlink_to("data.txt")
+    told = [one for one in surveyed(local(folder)).findings if one.id == "source-link"]
+    assert [(one.file, one.message) for one in told] == [("alias.txt", "a link to data.txt")]
+    for name, target in (("alias.txt", "data.txt"), ("out.txt", "../../etc/x")):
+        (folder / name).unlink(missing_ok=True)
+        (folder / name).write_text(target)
+    told = [one for one in surveyed(from_the_hub(folder)).findings if one.id == "source-link"]
+    assert [one.file for one in told] == ["alias.txt", "out.txt"]

@@ -1,0 +1,280 @@
+"""What is added to an error: the author's own line, what a jail lacks, and what it was denied."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from envhub_sandbox import errors
+from envhub_sandbox.errors import EnvHubError, RemoteEnvError, WorkerDiedError
+from envhub_sandbox.hub.listing import FileRecord, Snapshot
+from envhub_sandbox.session.error_text import add_author_line, add_reach_advice, read_denials
+from envhub_sandbox.settings.policy import Policy
+from envhub_sandbox.transport.replies import raised
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.text import MARGIN
+from envhub_worker.runner.raised import raised as described
+
+ROOT = "/store/tree"
+FILES = tuple(FileRecord(path, 1, "sha256:0") for path in ("env.py", "lib/a.py", "lib/b.py"))
+LOCAL = Snapshot("/home/me/my-env", "local", "local-1", "env.py", Path(ROOT), FILES)
+HUB = Snapshot(
+    "org/repo", "space", "0123456789abcdef" * 2 + "00000000", "env.py", Path(ROOT), FILES
+)
+TRACE = """Traceback (most recent call last):
+  File "env.py", line 12, in step
+    helper(0)
+  File "lib/a.py", line 2, in helper
+    return np.linalg.inv(x)
+           ~~~~~~~~~~~~~^~~
+  File "/usr/lib/python3/numpy/linalg.py", line 561, in inv
+    raise LinAlgError("no")
+ValueError: no
+"""
+
+
+def failed(traceback: str, snapshot: Snapshot = LOCAL, stage: str = "step") -> EnvHubError:
+    """The error that is raised for this traceback."""
+    error = raised(m.RaisedException("ValueError", "ValueError", "no", traceback, stage))
+    add_author_line(error, snapshot)
+    return error
+
+
+def notes(error: EnvHubError) -> str:
+    """What Python prints below the error."""
+    return "\n".join(vars(error).get("__notes__", ())).replace(f"\n{MARGIN}", "\n")
+
+
+@pytest.mark.parametrize(
+    ("snapshot", "place"),
+    [(LOCAL, '"/home/me/my-env/{}"'), (HUB, '"{}" of spaces/org/repo@0123456789ab')],
+)
+@pytest.mark.parametrize("stage", ["step", "make_env"])
+def test_the_authors_last_line_is_in_the_text(snapshot: Snapshot, place: str, stage: str) -> None:
+    """By the name that he knows, and the whole traceback is in the notes, by these names too."""
+    error = failed(TRACE, snapshot, stage)
+    last = f"  File {place.format('lib/a.py')}, line 2, in helper\n    return np.linalg.inv(x)"
+    assert str(error).endswith(f"ValueError: no\n{last}")
+    assert f"File {place.format('env.py')}, line 12, in step\n    helper(0)\n" in notes(error)
+    assert 'File "/usr/lib/python3/numpy/linalg.py", line 561' in notes(error)
+    remote = error if stage == "step" else error.__cause__
+    assert isinstance(remote, errors.RemoteEnvError)
+    assert remote.where == last
+    assert remote.traceback.rstrip() in notes(error)
+
+
+def test_a_path_in_the_store_is_taken_for_the_authors_too() -> None:
+    """As older workers name files."""
+    error = failed(TRACE.replace('"env.py"', f'"{ROOT}/env.py"').replace('"lib/a.py"', '"x.py"'))
+    assert str(error).endswith('  File "/home/me/my-env/env.py", line 12, in step\n    helper(0)')
+    assert ROOT not in notes(error)
+
+
+@pytest.mark.parametrize(
+    "name", ["train.py", "../env.py", "lib", "lib/", "", "env.pyc", "/home/me/my-env/env.py", "env"]
+)
+def test_only_files_of_the_snapshot_are_pointed_at(name: str) -> None:
+    """A worker fills in which of them; it cannot send the reader anywhere else."""
+    error = failed(f'Traceback:\n  File "{name}", line 3, in x\n    y\nValueError: no\n')
+    assert str(error) == "ValueError: no"
+
+
+def test_it_is_told_once() -> None:
+    """However many layers of ours the error goes through."""
+    error = failed(TRACE)
+    before = str(error), notes(error)
+    add_author_line(error, LOCAL)
+    assert (str(error), notes(error)) == before
+
+
+@pytest.mark.parametrize(
+    ("margin", "source", "caret", "shown"),
+    [
+        ("    ", "x = (1 +", "    ^^^^", "    x = (1 +\n        ^^^^"),
+        ("    ", "\tx =\t(", "\t   \t^", "    x = (\n        ^"),
+        ("  |     ", "x = (", "    ^", "    x = (\n        ^"),
+        ("    ", "x" * 300, " " * 290 + "^", "    " + "x" * 200 + "..."),
+        ("    ", "x = (", " " * 9000 + "^", "    x = ("),
+    ],
+    ids=["plain", "tabs", "of a group", "long line", "far"],
+)
+def test_a_syntax_error_has_its_caret(margin: str, source: str, caret: str, shown: str) -> None:
+    """Below the very character, or not at all."""
+    lines = ("Traceback:", '  File "env.py", line 1', margin + source, margin + caret, "no")
+    error = failed("\n".join(lines), stage="import")
+    assert str(error).endswith(f'  File "/home/me/my-env/env.py", line 1\n{shown}')
+
+
+def test_copies_and_pickles_keep_the_line() -> None:
+    """As those of a pool's worker do."""
+    for stage in ("step", "make_env"):
+        error = failed(TRACE, stage=stage)
+        for made in (copy.copy(error), pickle.loads(pickle.dumps(error))):
+            assert (str(made), notes(made)) == (str(error), notes(error))
+
+
+HOSTILE = "\x1b]0;owned\x07\x1b[2J\r\u202e"
+
+
+@pytest.mark.parametrize(
+    "trace",
+    [
+        f'  File "env.py", line 1, in {HOSTILE}\n    {HOSTILE}\n',
+        f'  File "{HOSTILE}env.py", line 1, in x\n    y\n',
+        '  File "env.py", line 1, in ' + "x" * 100_000,
+        '  File "env.py", line 1, in x\n    ' + "y" * 100_000,
+        '  File "env.py", line 1, in x\n    y\n' * 20_000,
+        '  File "' + "e" * 100_000 + '", line 1\n',
+        '  File "env.py", line ' + "9" * 10_000 + "\n",
+        "  " * 50_000 + 'File "env.py", line 1\n',
+        "| + - " * 20_000,
+    ],
+    ids=range(9),
+)
+@pytest.mark.parametrize("stage", ["step", "import"])
+def test_hostile_tracebacks_stay_bounded_and_printable(trace: str, stage: str) -> None:
+    """Nothing that a terminal obeys, and no more than a screen in the text itself."""
+    error = failed(trace, stage=stage)
+    for text in (str(error), notes(error)):
+        assert all(char in "\n\t" or char.isprintable() for char in text)
+        assert len(text) < 40_000
+    assert len(str(error)) < 2_000
+
+
+def test_names_of_the_machine_that_a_terminal_would_obey_are_escaped() -> None:
+    """A folder may have any name."""
+    folder = Snapshot(f"/home/{HOSTILE}", "local", "local-1", "env.py", Path(ROOT), FILES)
+    error = failed(TRACE, folder)
+    assert "\\x1b" in str(error)
+    for text in (str(error), notes(error)):
+        assert all(char in "\n\t" or char.isprintable() for char in text)
+
+
+# --- in the worker --------------------------------------------------------------------------
+
+
+def a_failure(folder: Path, source: str) -> m.RaisedException:
+    """What a runner says of a file that raises when it is run."""
+    path = folder / "env.py"
+    path.write_text(source)
+    try:
+        exec(compile(source, str(path), "exec"), {"__name__": "hub_env.env"})
+    except Exception as error:
+        return described(error, "step", str(folder))
+    raise AssertionError("nothing was raised")
+
+
+def test_files_of_the_repository_have_their_names_in_it(tmp_path: Path) -> None:
+    """Causes included; the line of the source is found all the same."""
+    source = "try:\n    1 / 0\nexcept ArithmeticError as error:\n    raise KeyError from error\n"
+    failure = a_failure(tmp_path, source)
+    assert failure.traceback.count('File "env.py", line') == 2
+    assert "    1 / 0\n" in failure.traceback
+    assert str(tmp_path) not in failure.traceback
+
+
+def test_a_syntax_error_has_its_line(tmp_path: Path) -> None:
+    """It has no frame in the repository."""
+    failure = a_failure(tmp_path, "def make_env(:\n")
+    assert '  File "env.py", line 1\n    def make_env(:\n                 ^\n' in failure.traceback
+
+
+def test_our_own_frames_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wherever they stand; so are those of the import of the entry file."""
+    source = (
+        "import importlib, sys\n"
+        "from envhub_worker.runner.loader import import_entry\n"
+        f"import_entry({str(tmp_path)!r}, 'other.py', {str(tmp_path)!r})\n"
+    )
+    (tmp_path / "other.py").write_text("1 / 0\n")
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    try:
+        failure = a_failure(tmp_path, source).traceback
+    finally:
+        for name in [name for name in sys.modules if name.split(".")[0] == "hub_env"]:
+            del sys.modules[name]
+    _, *lines = [line.strip() for line in failure.splitlines() if "File" in line]
+    assert lines == [
+        'File "env.py", line 3, in <module>',
+        'File "other.py", line 1, in <module>',
+    ]
+
+
+def advised(kind: str, message: str, network: str = "none") -> str:
+    """What is added to a remote error."""
+    error = RemoteEnvError(kind, message)
+    before = str(error)
+    add_reach_advice(error, Policy(network=network))
+    add_reach_advice(error, Policy(network=network))  # once
+    return str(error).removeprefix(before)
+
+
+@pytest.mark.parametrize(
+    ("kind", "message", "named"),
+    [
+        ("huggingface_hub.errors.LocalEntryNotFoundError", "outgoing traffic ...", "assets="),
+        ("OSError", "We couldn't connect to 'https://huggingface.co' to load", "assets="),
+        ("subprocess.CalledProcessError", "Command '['uv', 'pip', 'install', 'x']' ...", "extra"),
+        ("subprocess.CalledProcessError", "Command 'pip install -q x' returned", "extra"),
+        ("OSError", "[Errno 97] Address family not supported by protocol", "'loopback'"),
+        ("requests.exceptions.ConnectionError", "Max retries exceeded", "assets="),
+        ("subprocess.CalledProcessError", "Command '['git', '-C', 'x', 'pull']' ...", "assets="),
+        ("socket.gaierror", "[Errno -3] Temporary failure in name resolution", "assets="),
+        ("pyglet.display.xlib.NoSuchDisplayException", 'Cannot connect to "None"', "window"),
+        ("_tkinter.TclError", "no display name and no $DISPLAY environment variable", "window"),
+        ("glfw.GLFWError", "(65550) b'X11: Failed to open display '", "window"),
+        ("pygame.error", "No available video device", "window"),
+    ],
+)
+def test_each_failure_names_what_brings_it(kind: str, message: str, named: str) -> None:
+    """One line, once."""
+    assert named in advised(kind, message)
+    assert advised(kind, message).count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("kind", "message", "network"),
+    [
+        ("ValueError", "pip and git are words, a display too", "none"),
+        ("KeyError", "'connect'", "none"),
+        ("socket.gaierror", "[Errno -3] Temporary failure in name resolution", "host"),
+        ("ConnectionRefusedError", "[Errno 111] Connection refused", "loopback"),
+    ],
+)
+def test_others_get_none(kind: str, message: str, network: str) -> None:
+    """Words alone say nothing, nor does a failure of a network that it has."""
+    assert advised(kind, message, network) == ""
+
+
+def test_its_own_loopback_is_not_named_twice() -> None:
+    """Where it has one, a family that is refused is another one."""
+    assert "loopback" not in advised("OSError", "[Errno 97] Address family", "loopback")
+
+
+def test_of_a_death_only_the_display_is_read() -> None:
+    """A process that exits by itself after such words, and one that is ended, are told apart."""
+    said = "qt.qpa.xcb: could not connect to display \nThis application failed to start"
+    for signal, added in (("SIGABRT", True), ("SIGKILL", False)):
+        error = WorkerDiedError("died", signal=signal, reason="signal", log_tail=said)
+        add_reach_advice(error, Policy())
+        assert ("a jail has no display" in str(error)) is added
+
+
+@pytest.mark.parametrize("said", [None, "ptrace", ["ptrace"], {"ptrace": 1}, 7])
+def test_denials_that_are_no_list_of_texts_are_none(said: Any) -> None:
+    """As where none are recorded."""
+    assert read_denials(said) is None
+
+
+def test_a_denial_that_is_no_attempt_is_left_out() -> None:
+    """Only forms that there are; nothing that a terminal would obey, nothing long, and not many."""
+    good = ("ptrace", "socket AF_INET", "write /home/other/x\\x1b")
+    bad = (b"ptrace", 7, None, ("ptrace",), "Ptrace", "read x", "read /\x1b[2J", "a" * 41)
+    assert read_denials((*bad, *good, "read /" + "x" * 401)) == good
+    assert len(read_denials(("ptrace",) * 100_000) or ()) == 64
