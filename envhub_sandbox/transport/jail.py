@@ -19,13 +19,12 @@ from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.remote_warnings import RemoteWarnings
 from envhub_sandbox.transport.replies import check_reply, death, expect_reply, typed_reply
-from envhub_sandbox.transport.values import pickles
-from envhub_sandbox.transport.values.descriptions import unpacked
+from envhub_sandbox.transport.values import framed, unpacked
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec.codec import Buffer
+from envhub_worker.protocol.codec.wire import Buffer
+from envhub_worker.protocol.errors import UNTRUSTED
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 from envhub_worker.protocol.messages.prefix import CHANGES, WATCHED_TYPES, Attribute
-from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _CAUSE_S = 10.0
 _CAUSE_POLL_S = 0.01
@@ -129,7 +128,7 @@ class JailHandle:
     def pack(self, message: m.Message) -> list[Buffer]:
         """The frames of a message to a runner."""
         # the only way in for the caller's own objects; nothing is ever unpickled here
-        return m.pack(message, pickler=pickles.framed, limits=self.limits)
+        return m.pack(message, pickler=framed, limits=self.limits)
 
     def send(self, operation: str, requests: Sequence[tuple[int, m.Message]]) -> int:
         """Send one message to each of some runners, in one request; returns its id."""

@@ -11,10 +11,10 @@ from envhub_sandbox.errors import EnvHubError, RemoteProtocolError, remote_error
 from envhub_sandbox.transport.replies import check_reply, typed_reply
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.inert import one_line
+from envhub_worker.protocol.errors import FAULTS, UNTRUSTED
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
 from envhub_worker.protocol.manifest.manifest import EnvManifest
 from envhub_worker.protocol.spaces import batches
-from envhub_worker.protocol.untrusted import FAULTS, UNTRUSTED
 
 _SHOWN = 500
 StepResult = tuple[Any, Any, Any, Any, dict[Any, Any]]

@@ -13,7 +13,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
-from envhub_sandbox.transport.values.descriptions import not_here, spec_of
+from envhub_sandbox.transport.values import not_here, spec_of
 from envhub_sandbox.vector.actions import ActionReader
 from envhub_worker.protocol.manifest.manifest import EnvManifest
 from envhub_worker.protocol.spaces.spaces import OpaqueSpace

@@ -19,16 +19,14 @@ from envhub_sandbox.transport.lane import Frames, RelayLane, Request
 from envhub_sandbox.transport.replies import typed_reply
 from envhub_sandbox.transport.results import Results, StepResult
 from envhub_sandbox.transport.shared_memory.attachment import Attachment
-from envhub_sandbox.transport.shared_memory.cores import CPUS, Cores
 from envhub_sandbox.transport.shared_memory.observations import RING, ObservationSlab
-from envhub_sandbox.transport.shared_memory.shard import LaneShard
-from envhub_sandbox.transport.shared_memory.shard_slabs import Outcome, ShardSlabs
-from envhub_sandbox.transport.shared_memory.spin import SpinChooser
+from envhub_sandbox.transport.shared_memory.shard import LaneShard, Outcome, ShardSlabs
+from envhub_sandbox.transport.shared_memory.spin import CPUS, Cores, SpinChooser
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.errors import UNTRUSTED
 from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.stream import pack_packet
-from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _CAUSE_S = 10.0
 # elsewhere a core may see the sequence word before the data it announces: sleep, do not poll

@@ -23,10 +23,10 @@ from envhub_sandbox.transport.lane import Frames, RelayLane
 from envhub_sandbox.transport.replies import expect_reply, typed_reply
 from envhub_sandbox.transport.results import Results, StepResult
 from envhub_sandbox.transport.shared_memory.observations import ObservationSlab
-from envhub_sandbox.transport.shared_memory.shard_slabs import Outcome, ShardSlabs
+from envhub_sandbox.transport.shared_memory.shard import Outcome, ShardSlabs
 from envhub_sandbox.transport.shared_memory.spin import SpinChooser
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec.kinds import Buffer
+from envhub_worker.protocol.codec.wire import Buffer
 from envhub_worker.protocol.limits import LARGE_BYTES
 from envhub_worker.protocol.shared_memory import slabs
 
