@@ -14,8 +14,8 @@ import gymnasium as gym
 
 from envhub_sandbox.errors import RemoteProtocolError
 from envhub_sandbox.session.requests import OneMessageFor
-from envhub_sandbox.transport import values
 from envhub_sandbox.transport.replies import typed_reply
+from envhub_sandbox.transport.values import seeds
 from envhub_sandbox.vector.tracebacks import short_traceback
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.inert import RemoteObject
@@ -160,7 +160,7 @@ class SubEnvironment(gym.Env[Any, Any]):
         """Its seed."""
         seed = self._get("np_random_seed")
         with UNTRUSTED:
-            return values.seeds(seed)
+            return seeds(seed)
 
     @property
     def _is_shown(self) -> bool:

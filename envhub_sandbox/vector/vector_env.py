@@ -22,11 +22,11 @@ from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.parts.fleet_session import AnySession, FleetSession
 from envhub_sandbox.session.parts.in_flight import SENT, InFlight, Received, Rows
 from envhub_sandbox.session.requests import Bounds, MessageFor, OneMessageFor
-from envhub_sandbox.transport import values
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.remote_warnings import level_of_the_caller
 from envhub_sandbox.transport.replies import typed_reply
 from envhub_sandbox.transport.results import StepResult
+from envhub_sandbox.transport.values import generator, seeds
 from envhub_sandbox.vector import from_manifest
 from envhub_sandbox.vector.sandbox_view import SandboxView
 from envhub_sandbox.vector.sub_environment import SubEnvironment
@@ -496,9 +496,9 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         replies = self._requests.ask("np_random", lambda number, _: m.GetRandom(number))
         with UNTRUSTED:  # a generator that numpy does not know breaks no rule of the wire
             if type(replies[0].value) is dict:
-                return values.generator(replies[0].value)
+                return generator(replies[0].value)
             states = self._requests.one_each("np_random", replies)
-            return tuple(values.generator(state) for state in states)
+            return tuple(generator(state) for state in states)
 
     @property
     @short_traceback
@@ -507,8 +507,8 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         name = "np_random_seed"
         replies = self._requests.ask(name, lambda number, _: m.GetOwn(number, name))
         if type(replies[0].value) is not tuple:
-            return values.seeds(replies[0].value)
-        return values.seeds(self._requests.one_each(name, replies))
+            return seeds(replies[0].value)
+        return seeds(self._requests.one_each(name, replies))
 
     @property
     def envs(self) -> tuple[SubEnvironment, ...]:

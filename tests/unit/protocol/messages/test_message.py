@@ -31,24 +31,24 @@ from tests.support import inside
 
 
 @pytest.mark.parametrize("message", [server.GetStatus(), runner.Value([1, {"a": b"x"}])])
-def test_a_message_arrives_as_it_was(message: message.Message) -> None:
+def test_a_message_arrives_as_it_was(message: m.Message) -> None:
     """By itself, and with a number of one or more."""
-    assert message.unpack(message.pack(message)) == message
+    assert m.unpack(m.pack(message)) == message
     for number in (1, 7, 1 << 40):
-        [frame] = message.pack_header(message, number)
-        assert message.unpack_header(frame) == (number, message)
-        assert message.number_of(frame) == message.id_of(frame) == number
-        assert bytes(message.without_id(frame)) == bytes(message.pack(message)[0])
+        [frame] = m.pack_header(message, number)
+        assert m.unpack_header(frame) == (number, message)
+        assert m.number_of(frame) == m.id_of(frame) == number
+        assert bytes(m.without_id(frame)) == bytes(m.pack(message)[0])
 
 
 @pytest.mark.parametrize("frame", [b"", b"\0\0\0"])
 def test_a_header_without_a_number_has_none(frame: bytes) -> None:
     """No error of another kind than the protocol's."""
-    assert message.number_of(frame) is None
-    assert message.id_of(frame) is None
-    assert message.id_of(b"\0" * 20) is None
+    assert m.number_of(frame) is None
+    assert m.id_of(frame) is None
+    assert m.id_of(b"\0" * 20) is None
     with pytest.raises(ProtocolError):
-        message.unpack_header(frame)
+        m.unpack_header(frame)
 
 
 _DTYPES = ("bool", "int8", "uint16", "int64", "float16", "float32", ">f8", "complex64")
