@@ -19,11 +19,11 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, NamedTuple, TypeVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, NamedTuple, TypeVar
 
 from envhub_worker.protocol.codec.decoder import Decoder, TensorMaker, ThingReader, Unpickler
 from envhub_worker.protocol.codec.encoder import Describer, encode
-from envhub_worker.protocol.codec.wire import DOCUMENT_BYTES, Buffer, Pickler, split_frames
+from envhub_worker.protocol.codec.wire import Buffer, Pickler, split_frames
 from envhub_worker.protocol.errors import UNTRUSTED, LocalProtocolError, RemoteProtocolError
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 from envhub_worker.protocol.records import About, FrozenRecord
@@ -119,7 +119,7 @@ def check_fields(cls: type[Message], values: list[object]) -> None:
             )
 
 
-MAX_DOCUMENT_BYTES = 1024
+_MAX_HEADER_BYTES = 1024
 _MAX_FORMS = 256
 _MAX_ITEMS = 32
 _MAX_TEXT = 256
@@ -129,7 +129,6 @@ _TEXTS = frozenset({str, bytes})
 
 K = TypeVar("K")
 F = TypeVar("F")
-T = TypeVar("T")
 
 
 class Forms(Generic[K, F]):
@@ -174,12 +173,12 @@ class Outgoing(NamedTuple):
     limits: WireLimits
 
 
-class Incoming(Generic[T]):
+class Incoming:
     """What to make of a document that was decoded before.
 
     Args:
         document: All of it.
-        make: Makes the message of its fields.
+        make: The class of the message.
         limits: For which it was decoded, and holds.
 
     Raises:
@@ -188,19 +187,17 @@ class Incoming(Generic[T]):
 
     __slots__ = ("_fields", "_make", "_message", "limits")
 
-    def __init__(self, document: bytes, make: Callable[..., T], limits: WireLimits) -> None:
+    def __init__(self, document: bytes, make: type[Message], limits: WireLimits) -> None:
         self.limits = limits
         self._make = make
         value: Any = Decoder(b"", (), limits, None, None).value(document)
         fields = value[1:]
         self._fields = _maker(tuple(fields))
-        self._message: T | None = make(*fields) if self._fields is None else None
+        self._message = make(*fields)
 
-    def message(self) -> T:
+    def message(self) -> Message:
         """The message; what of it can be changed is fresh."""
-        if self._fields is None:
-            return cast("T", self._message)
-        return self._make(*self._fields())
+        return self._message if self._fields is None else self._make(*self._fields())
 
 
 class _IrregularError(Exception):
@@ -257,9 +254,8 @@ _NUMBER = struct.Struct(">Q")
 """The id in front of a header between client and server; 0 for ``CompressionHeader`` alone."""
 _MOST = (1 << 63) - 1
 _OUTGOING: Forms[Any, Outgoing] = Forms()
-_INCOMING: Forms[bytes, Incoming[Message]] = Forms()
-_HEADERS: Forms[bytes, Incoming[Message]] = Forms()
-"""The same by the whole header, where that is nothing but the document."""
+_INCOMING: Forms[bytes, Incoming] = Forms()
+"""By the whole header, where that is nothing but the document."""
 
 
 def pack(
@@ -333,9 +329,9 @@ def _encoded(
 
 def _asked(message: Message) -> str:
     """What the caller asked for, to stand before an error about it."""
-    name = getattr(message, "name", None) if message.ASKS else None
     if not message.ASKS:
         return ""
+    name = getattr(message, "name", None)
     return f"{message.ASKS}: " if name is None else f"{message.ASKS}({name!r}): "
 
 
@@ -349,16 +345,24 @@ def unpack(
 ) -> Message:
     """The message of some frames. Raises ``RemoteProtocolError``: the peer broke the rules."""
     with UNTRUSTED:
-        document, tail, buffers = split_frames(frames, limits)
-        bare = not (tail or buffers)
-        form = _INCOMING.get(document) if bare else None
+        header = _alone(frames)
+        form = _INCOMING.get(header)
         if form is not None and form.limits is limits:
             return form.message()
+        document, tail, buffers = split_frames(frames, limits)
         decoder = Decoder(tail, buffers, limits, unpickler, tensors, things)
         message = _checked(decoder.value(document))
-        if bare and len(document) <= MAX_DOCUMENT_BYTES:
-            _INCOMING.met(document, lambda: Incoming(document, type(message), limits))
+        if header and not tail:
+            _INCOMING.met(header, lambda: Incoming(document, type(message), limits))
         return message
+
+
+def _alone(frames: Sequence[Buffer]) -> bytes:
+    """The header, where that is all there is and small: what recurs; else nothing."""
+    if len(frames) != 1:
+        return b""
+    header = frames[0] if type(frames[0]) is bytes else memoryview(frames[0]).cast("B")
+    return bytes(header) if len(header) <= _MAX_HEADER_BYTES else b""
 
 
 def pack_header(message: Message, number: int) -> list[Buffer]:
@@ -379,17 +383,7 @@ def unpack_header(frame: Buffer, *, limits: WireLimits = DEFAULT_LIMITS) -> tupl
     number = id_of(frame)
     if number is None:
         raise RemoteProtocolError("a header starts with the id of its request")
-    header = without_id(frame)
-    if type(header) is not bytes:
-        return number, unpack([header], limits=limits)
-    known = _HEADERS.get(header)
-    if known is not None and known.limits is limits:
-        return number, known.message()
-    message = unpack([header], limits=limits)
-    form = _INCOMING.get(header[DOCUMENT_BYTES.size :])
-    if form is not None:
-        _HEADERS.met(header, lambda: form)
-    return number, message
+    return number, unpack([without_id(frame)], limits=limits)
 
 
 def without_id(frame: Buffer) -> Buffer:
