@@ -173,11 +173,10 @@ class JailHandle:
             parts = _cut(payload, reply.parts)
             if len(parts) != asked:
                 raise RemoteProtocolError(f"{asked} runners were asked, {len(parts)} answered")
+            unpack = unpack or self._unpack
             if isinstance(reply, m.RelayDonePartly):
-                raise self._died(reply.dead, parts, unpack or self._unpack_one)
-            if unpack is not None:
-                return [unpack(index, part) for index, part in enumerate(parts)]
-            return [self._unpack(part) for part in parts]
+                raise self._died(reply.dead, parts, unpack)
+            return [unpack(index, part) for index, part in enumerate(parts)]
 
     def arrived(self, request_id: int) -> list[list[Buffer]]:
         """What has arrived of each runner, and is not taken yet; nothing where that is an error."""
@@ -202,14 +201,12 @@ class JailHandle:
         """The server says which runners have died; a runner cannot."""
         if not dead or not set(dead) <= set(range(len(parts))):
             raise RemoteProtocolError("the worker names dead runners that were not asked")
-        deaths = {index: death(typed_reply(self._unpack(parts[index]), m.Death)) for index in dead}
+        said = {index: self._unpack(index, parts[index]) for index in dead}
+        deaths = {index: death(typed_reply(one, m.Death)) for index, one in said.items()}
         living = [None if i in deaths else unpack(i, part) for i, part in enumerate(parts)]
         return RunnersDiedError(living, deaths)
 
-    def _unpack_one(self, index: int, frames: list[Buffer]) -> m.Message:
-        return self._unpack(frames)
-
-    def _unpack(self, frames: Sequence[Buffer]) -> m.Message:
+    def _unpack(self, _: int, frames: Sequence[Buffer]) -> m.Message:
         if len(frames) > 1:  # with one frame there is nothing in front
             frames = self.warnings.take(self.watched.take(frames))
         return unpacked(frames, self.limits)

@@ -117,21 +117,16 @@ class SharedMemoryLane:
         Raises:
             WorkerError: A runner died, or took too long.
         """
-        manifest = results.manifest
         slots = 1 if copy else 1 + RING
-        space = manifest.single_observation_space
-        observed = slabs.observation_layout(space, results.count, slots)
-        sizes = [stop - start for start, stop in results.slices]
-        layouts = [slabs.layout_of(manifest.single_action_space, size) for size in sizes]
-        known = [layout for layout in layouts if layout is not None]
-        own = [manifest.own_batch(name) for name in ("action_space", "observation_space")]
-        if observed is None or len(known) < len(layouts) or own != [None, None]:
+        space = results.manifest.single_observation_space
+        observed, layouts = slabs.observation_layout(space, results.count, slots), results.layouts()
+        if observed is None or layouts is None:
             attachment.close()
             return None
-        lane = cls(relay, results, observed, known, attachment)
+        lane = cls(relay, results, observed, layouts, attachment)
         agreed = False
         try:
-            agreed = lane._attach(range(len(known)), deadline)
+            agreed = lane._attach(range(len(layouts)), deadline)
         finally:
             if not agreed:
                 lane.close()

@@ -7,7 +7,7 @@ import copy
 import gymnasium as gym
 import numpy as np
 
-from envhub_worker.protocol.spaces import spaces
+from envhub_worker.protocol.spaces.spaces import seeded_nodes, seeded_states
 
 
 def nested() -> gym.spaces.Dict:
@@ -18,7 +18,7 @@ def nested() -> gym.spaces.Dict:
 
 def test_nodes_come_in_a_fixed_order() -> None:
     """A space before what it is made of."""
-    kinds = [type(node).__name__ for node in spaces.seeded_nodes(nested())]
+    kinds = [type(node).__name__ for node in seeded_nodes(nested())]
     assert kinds == ["Dict", "MultiBinary", "Tuple", "Discrete", "Box"]
 
 
@@ -26,7 +26,7 @@ def test_what_nobody_seeded_does_not_travel() -> None:
     """Even where it has drawn; a remembered description would make each run the same."""
     space = nested()
     space.sample()
-    assert spaces.seeded_states(space) is None
+    assert seeded_states(space) is None
 
 
 def test_the_same_seed_is_the_same_states() -> None:
@@ -34,16 +34,16 @@ def test_the_same_seed_is_the_same_states() -> None:
     spaces = [nested() for _ in range(3)]
     for space, seed in zip(spaces, (1, 1, 2), strict=True):
         space.seed(seed)
-    first, same, other = (repr(spaces.seeded_states(space)) for space in spaces)
+    first, same, other = (repr(seeded_states(space)) for space in spaces)
     assert first == same != other
     spaces[0].sample()
-    assert repr(spaces.seeded_states(spaces[0])) != same
+    assert repr(seeded_states(spaces[0])) != same
 
 
 def test_a_shared_generator_is_told_once() -> None:
     """The later node has the place of the first."""
     one = gym.spaces.Discrete(2, seed=3)
-    states = spaces.seeded_states(gym.spaces.Tuple([one, copy.copy(one)]))
+    states = seeded_states(gym.spaces.Tuple([one, copy.copy(one)]))
     assert states is not None
     assert states[2] == 1
     assert not isinstance(states[1], int)
