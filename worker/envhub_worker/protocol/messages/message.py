@@ -383,7 +383,11 @@ def unpack_header(frame: Buffer, *, limits: WireLimits = DEFAULT_LIMITS) -> tupl
     number = id_of(frame)
     if number is None:
         raise RemoteProtocolError("a header starts with the id of its request")
-    return number, unpack([without_id(frame)], limits=limits)
+    header = without_id(frame)
+    form = _INCOMING.get(header) if type(header) is bytes else None
+    if form is not None and form.limits is limits:  # as unpack, which a step need not call
+        return number, form.message()
+    return number, unpack([header], limits=limits)
 
 
 def without_id(frame: Buffer) -> Buffer:

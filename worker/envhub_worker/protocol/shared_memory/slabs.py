@@ -240,9 +240,12 @@ def _nested(space: gym.Space[Any]) -> Callable[[Iterator[Any]], Any]:
 
 def flatten(space: gym.Space[Any], batch: Any) -> list[Any]:
     """The leaves of a batch in the order of ``Layout``: the inverse of ``assembler``."""
-    leaves: list[Any] = []
-    batches.mapped(space, lambda _, leaf: leaves.append(leaf), batch)
-    return leaves
+    if isinstance(space, spaces.Dict):
+        return [leaf for key, sub in space.spaces.items() for leaf in flatten(sub, batch[key])]
+    if isinstance(space, spaces.Tuple):
+        pairs = zip(space.spaces, batch, strict=True)
+        return [leaf for sub, item in pairs for leaf in flatten(sub, item)]
+    return [batch]
 
 
 MAX_COLUMNS = 256

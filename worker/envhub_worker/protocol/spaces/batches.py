@@ -55,47 +55,39 @@ def is_batch(batched: gym.Space[Any], single: gym.Space[Any], count: int) -> boo
     return True
 
 
-def mapped(space: gym.Space[Any], leaf: Callable[..., Any], *values: Any) -> Any:
-    """A value of the structure of the space: ``leaf`` of each part that is no mapping or tuple.
-
-    Args:
-        leaf: Is given the part of the space, and those of the values.
-        values: Members of the space, or batches of them.
-    """
-    if isinstance(space, spaces.Dict):
-        parts = space.spaces.items()
-        return {key: mapped(sub, leaf, *[one[key] for one in values]) for key, sub in parts}
-    if isinstance(space, spaces.Tuple):
-        each = zip(space.spaces, *values, strict=True)
-        return tuple([mapped(sub, leaf, *parts) for sub, *parts in each])
-    return leaf(space, *values)
-
-
 def split(space: gym.Space[Any], batch: Any, bounds: Bounds) -> list[Any]:
     """The slices of a batch. Arrays are views."""
-    rows = itertools.starmap(slice, bounds)
-    return [mapped(space, lambda _, part, own=own: part[own], batch) for own in rows]
+    if isinstance(space, spaces.Dict):
+        named = {key: split(sub, batch[key], bounds) for key, sub in space.spaces.items()}
+        return [{key: part[index] for key, part in named.items()} for index in range(len(bounds))]
+    if isinstance(space, spaces.Tuple):
+        parts = [split(sub, item, bounds) for sub, item in zip(space.spaces, batch, strict=True)]
+        return [tuple(part[index] for part in parts) for index in range(len(bounds))]
+    return [batch[start:stop] for start, stop in bounds]
 
 
 def reordered(space: gym.Space[Any], batch: Any, order: Sequence[int]) -> Any:
     """The same members of a batch in another order; lists and tuples stay what they are."""
-
-    def leaf(_: Any, part: Any) -> Any:
-        if isinstance(part, np.ndarray):
-            return part[np.asarray(order)]
-        return type(part)(part[index] for index in order)
-
-    return mapped(space, leaf, batch)
+    if isinstance(space, spaces.Dict):
+        return {key: reordered(sub, batch[key], order) for key, sub in space.spaces.items()}
+    if isinstance(space, spaces.Tuple):
+        pairs = zip(space.spaces, batch, strict=True)
+        return tuple(reordered(sub, item, order) for sub, item in pairs)
+    if isinstance(batch, np.ndarray):
+        return batch[np.asarray(order)]
+    return type(batch)(batch[index] for index in order)
 
 
 def join(space: gym.Space[Any], parts: Sequence[Any]) -> Any:
     """One batch out of the shards' slices, in order."""
-
-    def leaf(sub: gym.Space[Any], *slices: Any) -> Any:
-        whole = isinstance(sub, ARRAY_SPACES)
-        return np.concatenate(slices) if whole else tuple(itertools.chain.from_iterable(slices))
-
-    return mapped(space, leaf, *parts)
+    if isinstance(space, ARRAY_SPACES):
+        return np.concatenate(parts)
+    if isinstance(space, spaces.Dict):
+        return {key: join(sub, [part[key] for part in parts]) for key, sub in space.spaces.items()}
+    if isinstance(space, spaces.Tuple):
+        members = enumerate(space.spaces)
+        return tuple(join(sub, [part[index] for part in parts]) for index, sub in members)
+    return tuple(member for part in parts for member in part)
 
 
 def conforms(space: gym.Space[Any], batch: Any, count: int) -> bool:
@@ -151,11 +143,15 @@ def integers(space: gym.Space[Any], member: Any) -> list[bool]:
 
 def with_integers(space: gym.Space[Any], member: Any, which: Iterator[bool]) -> Any:
     """The member with those for which the next of ``which`` is true; the other way round."""
-
-    def leaf(sub: gym.Space[Any], part: Any) -> Any:
-        return int(part) if isinstance(sub, spaces.Discrete) and next(which, False) else part
-
-    return mapped(space, leaf, member)
+    if isinstance(space, spaces.Discrete):
+        return int(member) if next(which, False) else member
+    if isinstance(space, spaces.Dict):
+        known = space.spaces
+        return {key: with_integers(sub, member[key], which) for key, sub in known.items()}
+    if isinstance(space, spaces.Tuple):
+        each = zip(space.spaces, member, strict=True)
+        return tuple(with_integers(sub, one, which) for sub, one in each)
+    return member
 
 
 def join_infos(parts: Sequence[dict[Any, Any]], sizes: Sequence[int]) -> dict[Any, Any]:
@@ -377,11 +373,12 @@ def restores(space: gym.Space[Any]) -> bool:
 
 def restore_batch(space: gym.Space[Any], batch: Any) -> Any:
     """A batch that ``conforms``, with the classes that Gymnasium gives its members."""
-
-    def leaf(sub: gym.Space[Any], part: Any) -> Any:
-        return tuple(restore(sub, one) for one in part) if isinstance(part, tuple) else part
-
-    return mapped(space, leaf, batch)
+    if isinstance(space, spaces.Dict):
+        return {key: restore_batch(sub, batch[key]) for key, sub in space.spaces.items()}
+    if isinstance(space, spaces.Tuple):
+        pairs = zip(space.spaces, batch, strict=True)
+        return tuple(restore_batch(sub, item) for sub, item in pairs)
+    return tuple(restore(space, member) for member in batch) if isinstance(batch, tuple) else batch
 
 
 def restore(space: Any, member: Any) -> Any:
