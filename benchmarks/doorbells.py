@@ -19,7 +19,7 @@ from time import perf_counter_ns
 from typing import Any
 
 from benchmarks.load import stolen
-from envhub_worker.protocol.shared_memory.doorbell import OwnBell, RunnerBell, Watch
+from envhub_worker.protocol.shared_memory.descriptors import OwnBell, RunnerBell, Watch
 
 _RING = (1).to_bytes(8, "little")
 _FLAGS = socket.MSG_DONTWAIT | socket.MSG_NOSIGNAL

@@ -32,13 +32,12 @@ from envhub_sandbox.system import folders
 from envhub_sandbox.system.files import write_whole_file
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.shard_trials import ShardTrials
-from envhub_sandbox.transport.values import pickles
-from envhub_sandbox.transport.values.generators import generator
+from envhub_sandbox.transport.values import generator, lasting
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker import protocol
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec.codec import encode
+from envhub_worker.protocol.codec.encoder import encode
 from envhub_worker.protocol.manifest.manifest import EnvManifest, Manifest, decode_manifest
 from envhub_worker.protocol.runtime import Runtime
 from envhub_worker.protocol.stream import StreamReader, pack_packet
@@ -99,7 +98,7 @@ def manifest_key(snapshot: Snapshot, load: m.Load, policy: Policy, runtime: Runt
     a miss, and no harm.
     """
     try:
-        arguments = b"".join(map(bytes, m.pack(load, pickler=pickles.lasting)))
+        arguments = b"".join(map(bytes, m.pack(load, pickler=lasting)))
     except (EnvHubError, TypeError):
         return None
     facts = (

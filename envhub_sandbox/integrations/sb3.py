@@ -20,7 +20,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 from envhub_sandbox.factory.make_env import make_env
 from envhub_sandbox.vector.single_env import info_of
 from envhub_sandbox.vector.suites import choose
-from envhub_worker.protocol.untrusted import UNTRUSTED
+from envhub_worker.protocol.errors import UNTRUSTED
 
 _Indices = int | Iterable[int] | None
 

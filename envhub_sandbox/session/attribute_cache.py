@@ -2,7 +2,7 @@
 
 LeRobot's evaluation reads the task of every sub-environment after each step. Each read was a
 request, which costs as much as the step, and on another host a round trip. A watched attribute
-(``envhub_worker.runner.watches``) is answered from here, once a step: a caller that reads it twice
+(``envhub_worker.runner.prefixes``) is answered from here, once a step: a caller that reads it twice
 waits for something to happen, and the environment answers.
 """
 

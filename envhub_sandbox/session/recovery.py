@@ -22,9 +22,9 @@ from envhub_sandbox.transport.lane import Lane, Request
 from envhub_sandbox.transport.replies import check_reply, typed_reply
 from envhub_sandbox.transport.results import is_batch
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec.codec import Buffer
+from envhub_worker.protocol.codec.wire import Buffer
+from envhub_worker.protocol.errors import UNTRUSTED
 from envhub_worker.protocol.lifecycle import Event
-from envhub_worker.protocol.untrusted import UNTRUSTED
 
 RESTARTED = "worker_restarted"
 """The key in the infos: whether a sub-environment was lost and came back reset."""

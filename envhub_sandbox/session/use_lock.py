@@ -15,8 +15,8 @@ from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
 from envhub_sandbox.session.failures import Failures
 from envhub_sandbox.session.lease import Lease, closed_during
 from envhub_sandbox.transport.remote_warnings import level_of_the_caller
+from envhub_worker.protocol.errors import blamed, is_fault
 from envhub_worker.protocol.lifecycle import State
-from envhub_worker.protocol.untrusted import blamed, is_fault
 
 _AT_ONCE = 8
 """Locks that one ``with`` takes."""

@@ -27,10 +27,10 @@ from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.replies import expect_reply
 from envhub_sandbox.transport.tcp import TcpLink, TcpServer
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec.codec import Buffer
+from envhub_worker.protocol.codec.wire import Buffer
+from envhub_worker.protocol.errors import UNTRUSTED
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, LARGE_BYTES, WireLimits
 from envhub_worker.protocol.messages import compression
-from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _NOW = int(zmq.NOBLOCK)
 _MORE_NOW = int(zmq.SNDMORE) | _NOW

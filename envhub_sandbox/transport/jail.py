@@ -19,13 +19,12 @@ from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.remote_warnings import RemoteWarnings
 from envhub_sandbox.transport.replies import check_reply, death, expect_reply, typed_reply
-from envhub_sandbox.transport.values import pickles
-from envhub_sandbox.transport.values.descriptions import unpacked
+from envhub_sandbox.transport.values import framed, unpacked
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec.codec import Buffer
+from envhub_worker.protocol.codec.wire import Buffer
+from envhub_worker.protocol.errors import UNTRUSTED
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 from envhub_worker.protocol.messages.prefix import CHANGES, WATCHED_TYPES, Attribute
-from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _CAUSE_S = 10.0
 _CAUSE_POLL_S = 0.01
@@ -129,7 +128,7 @@ class JailHandle:
     def pack(self, message: m.Message) -> list[Buffer]:
         """The frames of a message to a runner."""
         # the only way in for the caller's own objects; nothing is ever unpickled here
-        return m.pack(message, pickler=pickles.framed, limits=self.limits)
+        return m.pack(message, pickler=framed, limits=self.limits)
 
     def send(self, operation: str, requests: Sequence[tuple[int, m.Message]]) -> int:
         """Send one message to each of some runners, in one request; returns its id."""
@@ -174,11 +173,10 @@ class JailHandle:
             parts = _cut(payload, reply.parts)
             if len(parts) != asked:
                 raise RemoteProtocolError(f"{asked} runners were asked, {len(parts)} answered")
+            unpack = unpack or self._unpack
             if isinstance(reply, m.RelayDonePartly):
-                raise self._died(reply.dead, parts, unpack or self._unpack_one)
-            if unpack is not None:
-                return [unpack(index, part) for index, part in enumerate(parts)]
-            return [self._unpack(part) for part in parts]
+                raise self._died(reply.dead, parts, unpack)
+            return [unpack(index, part) for index, part in enumerate(parts)]
 
     def arrived(self, request_id: int) -> list[list[Buffer]]:
         """What has arrived of each runner, and is not taken yet; nothing where that is an error."""
@@ -203,14 +201,12 @@ class JailHandle:
         """The server says which runners have died; a runner cannot."""
         if not dead or not set(dead) <= set(range(len(parts))):
             raise RemoteProtocolError("the worker names dead runners that were not asked")
-        deaths = {index: death(typed_reply(self._unpack(parts[index]), m.Death)) for index in dead}
+        said = {index: self._unpack(index, parts[index]) for index in dead}
+        deaths = {index: death(typed_reply(one, m.Death)) for index, one in said.items()}
         living = [None if i in deaths else unpack(i, part) for i, part in enumerate(parts)]
         return RunnersDiedError(living, deaths)
 
-    def _unpack_one(self, index: int, frames: list[Buffer]) -> m.Message:
-        return self._unpack(frames)
-
-    def _unpack(self, frames: Sequence[Buffer]) -> m.Message:
+    def _unpack(self, _: int, frames: Sequence[Buffer]) -> m.Message:
         if len(frames) > 1:  # with one frame there is nothing in front
             frames = self.warnings.take(self.watched.take(frames))
         return unpacked(frames, self.limits)

@@ -18,9 +18,9 @@ from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import JailHandle, RunnersDiedError, Unpack
 from envhub_sandbox.transport.replies import all_replies
 from envhub_sandbox.transport.results import Results, StepResult
-from envhub_sandbox.transport.values import pickles
+from envhub_sandbox.transport.values import framed
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec.codec import Buffer
+from envhub_worker.protocol.codec.wire import Buffer
 from envhub_worker.protocol.spaces import batches
 
 Frames = list[Buffer]
@@ -333,4 +333,4 @@ class _NotingPickler:
 
     def __call__(self, value: object) -> bytes | memoryview:
         self.plain = False
-        return pickles.framed(value)
+        return framed(value)

@@ -12,8 +12,8 @@ from collections import deque
 from collections.abc import Sequence
 
 from envhub_sandbox.errors import RemoteEnvWarning
-from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.codec.inert import one_line
+from envhub_worker.protocol.codec.wire import Buffer
 from envhub_worker.protocol.messages.prefix import (
     MAX_CATEGORY,
     MAX_TEXT,

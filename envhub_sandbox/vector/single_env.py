@@ -22,9 +22,9 @@ from envhub_sandbox.errors import ActionError
 from envhub_sandbox.vector.sandbox_view import SandboxView
 from envhub_sandbox.vector.tracebacks import short_traceback, shortened
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
+from envhub_worker.protocol.errors import UNTRUSTED
 from envhub_worker.protocol.manifest.names import absent, is_servable
 from envhub_worker.protocol.spaces import batches
-from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _DECLARED = frozenset({"action_space", "observation_space", "metadata", "render_mode"})
 """What is known of the environment without a request; set here and there."""

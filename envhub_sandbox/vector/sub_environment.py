@@ -15,14 +15,14 @@ import gymnasium as gym
 from envhub_sandbox.errors import RemoteProtocolError
 from envhub_sandbox.session.requests import OneMessageFor
 from envhub_sandbox.transport.replies import typed_reply
-from envhub_sandbox.transport.values import generators
+from envhub_sandbox.transport.values import seeds
 from envhub_sandbox.vector.tracebacks import short_traceback
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.inert import RemoteObject
+from envhub_worker.protocol.errors import UNTRUSTED
 from envhub_worker.protocol.manifest.manifest import EnvManifest
 from envhub_worker.protocol.manifest.names import is_servable
 from envhub_worker.protocol.spaces import batches
-from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _OUTERMOST = 0
 _SEARCHED = -1
@@ -160,7 +160,7 @@ class SubEnvironment(gym.Env[Any, Any]):
         """Its seed."""
         seed = self._get("np_random_seed")
         with UNTRUSTED:
-            return generators.seeds(seed)
+            return seeds(seed)
 
     @property
     def _is_shown(self) -> bool:

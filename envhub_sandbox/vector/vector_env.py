@@ -28,17 +28,16 @@ from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.remote_warnings import level_of_the_caller
 from envhub_sandbox.transport.replies import typed_reply
 from envhub_sandbox.transport.results import StepResult
-from envhub_sandbox.transport.values import generators
-from envhub_sandbox.transport.values.descriptions import not_here, spec_of
+from envhub_sandbox.transport.values import generator, not_here, seeds, spec_of
 from envhub_sandbox.vector.actions import action_reader
 from envhub_sandbox.vector.sandbox_view import SandboxView
 from envhub_sandbox.vector.sub_environment import SubEnvironment
 from envhub_sandbox.vector.tracebacks import short_traceback, shortened
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.errors import UNTRUSTED
 from envhub_worker.protocol.lifecycle import State
 from envhub_worker.protocol.manifest.manifest import EnvManifest
 from envhub_worker.protocol.manifest.names import absent, is_servable
-from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _NOT_CALLED = frozenset({"reset", "step", "close"})
 """What ``AsyncVectorEnv.call`` refuses: it would take one sub-environment from under the others."""
@@ -502,9 +501,9 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         replies = self._requests.ask("np_random", lambda number, _: m.GetRandom(number))
         with UNTRUSTED:  # a generator that numpy does not know breaks no rule of the wire
             if type(replies[0].value) is dict:
-                return generators.generator(replies[0].value)
+                return generator(replies[0].value)
             states = self._requests.one_each("np_random", replies)
-            return tuple(generators.generator(state) for state in states)
+            return tuple(generator(state) for state in states)
 
     @property
     @short_traceback
@@ -513,8 +512,8 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         name = "np_random_seed"
         replies = self._requests.ask(name, lambda number, _: m.GetOwn(number, name))
         if type(replies[0].value) is not tuple:
-            return generators.seeds(replies[0].value)
-        return generators.seeds(self._requests.one_each(name, replies))
+            return seeds(replies[0].value)
+        return seeds(self._requests.one_each(name, replies))
 
     @property
     def envs(self) -> tuple[SubEnvironment, ...]:

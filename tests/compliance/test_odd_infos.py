@@ -10,7 +10,7 @@ import pytest
 
 from envhub_sandbox import SandboxEnv, make_env
 from envhub_sandbox.errors import RemoteEnvError
-from envhub_worker.protocol.codec.codec import RemoteObject
+from envhub_worker.protocol.codec.inert import RemoteObject
 from tests.support.repositories import write_repository
 
 _ENV = """

@@ -16,7 +16,7 @@ from envhub_sandbox import errors
 from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec.codec import Buffer
+from envhub_worker.protocol.codec.wire import Buffer
 
 pytestmark = pytest.mark.short
 

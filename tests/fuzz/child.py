@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from envhub_sandbox.errors import EnvHubError
-from envhub_sandbox.transport.values.descriptions import DescriptionReader
+from envhub_sandbox.transport.values import DescriptionReader
 from envhub_worker.protocol import messages as m
 from tests.fuzz import bundle
 from tests.fuzz.controls import CONTROLS

@@ -12,9 +12,9 @@ from envhub_sandbox.transport.shared_memory.lane import infos_of
 from envhub_sandbox.transport.shared_memory.observations import ObservationSlab
 from envhub_sandbox.transport.shared_memory.shard import LaneShard
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.errors import UNTRUSTED
 from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.stream import pack_packet
-from envhub_worker.protocol.untrusted import UNTRUSTED
 from tests.attacks.client.lying_server import env_manifest
 from tests.fuzz.oracle import demand, fits, per_env, usable
 from tests.fuzz.targets import Dice, NotSentError, attempt, is_error, parts, spoiled_message

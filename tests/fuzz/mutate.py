@@ -9,7 +9,8 @@ from typing import Any
 import msgpack
 import numpy as np
 
-from envhub_worker.protocol.codec.codec import decode, encode
+from envhub_worker.protocol.codec.decoder import decode
+from envhub_worker.protocol.codec.encoder import encode
 from envhub_worker.protocol.codec.inert import RemoteEnum, RemoteObject
 from envhub_worker.protocol.errors import ProtocolError
 from envhub_worker.protocol.limits import WireLimits

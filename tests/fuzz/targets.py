@@ -20,28 +20,28 @@ from gymnasium.envs.registration import EnvSpec
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.hub.listing import FileRecord, Snapshot
 from envhub_sandbox.session.error_text import add_author_line
+from envhub_sandbox.transport import values
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import JailHandle, RunnersDiedError, open_jail
 from envhub_sandbox.transport.remote_warnings import MOST, RemoteWarnings
 from envhub_sandbox.transport.replies import check_reply, death, expect_reply, raised
 from envhub_sandbox.transport.results import Results
-from envhub_sandbox.transport.values import descriptions
-from envhub_sandbox.transport.values.descriptions import DescriptionReader, spec_of
-from envhub_sandbox.transport.values.generators import generator
+from envhub_sandbox.transport.values import DescriptionReader, generator, spec_of
 from envhub_sandbox.vector.actions import action_reader
 from envhub_sandbox.vector.vector_env import metadata_of
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec.codec import decode, encode
-from envhub_worker.protocol.codec.kinds import GENERATOR, SPACE, SPEC
+from envhub_worker.protocol.codec.decoder import decode
+from envhub_worker.protocol.codec.encoder import encode
+from envhub_worker.protocol.codec.wire import GENERATOR, SPACE, SPEC
+from envhub_worker.protocol.errors import UNTRUSTED
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 from envhub_worker.protocol.manifest.manifest import decode_env, decode_manifest
 from envhub_worker.protocol.messages.compression import pack_frames, unpack_frames
 from envhub_worker.protocol.messages.prefix import MAX_TEXT
-from envhub_worker.protocol.shared_memory import columns
+from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.spaces.spaces import OpaqueSpace, encode_space
 from envhub_worker.protocol.stream import StreamReader, pack_packet
-from envhub_worker.protocol.untrusted import UNTRUSTED
 from tests.attacks.client.lying_server import env_manifest
 from tests.fuzz.mutate import Spoiler, crossing
 from tests.fuzz.oracle import WrongError, alike, demand, fits, per_env, usable
@@ -276,7 +276,7 @@ def manifest(dice: Dice) -> None:
         usable((env.metadata, env.attributes, env.render_mode, env.suite, env.task))
         metadata_of(env)
         spec = spec_of(env.spec, "a/b@c")
-        entry = f"{descriptions.__name__}:{descriptions.not_here.__name__}"
+        entry = f"{values.__name__}:{values.not_here.__name__}"
         demand(spec is None or spec.entry_point == entry, "an entry point of the worker's")
         for space in (env.single_observation_space, env.single_action_space):
             repr(space)
@@ -528,9 +528,9 @@ def column_schemas(dice: Dice) -> None:
     if type(lie) is not dict:
         raise NotSentError
     with UNTRUSTED:
-        for column in columns.columns_of(lie) or ():
+        for column in slabs.columns_of(lie) or ():
             end = column.offset + int(np.prod(column.shape, dtype=object)) * column.dtype.itemsize
-            demand(0 <= column.offset <= end <= columns.INFO_BYTES, "a column outside")
+            demand(0 <= column.offset <= end <= slabs.INFO_BYTES, "a column outside")
 
 
 TARGETS: dict[str, Callable[[Dice], None]] = {

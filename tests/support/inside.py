@@ -47,10 +47,10 @@ from envhub_worker.cli import listen, listen_options
 from envhub_worker.cli.identity import Identity
 from envhub_worker.lockdown.limits import cgroups
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec.codec import Buffer
+from envhub_worker.protocol.codec.wire import Buffer
 from envhub_worker.protocol.lifecycle import Lifecycle, State
 from envhub_worker.protocol.manifest.manifest import EnvManifest
-from envhub_worker.protocol.messages import packing, prefix
+from envhub_worker.protocol.messages import message, prefix
 from envhub_worker.spawn.spawner import Spawner
 from envhub_worker.supervisor import served_slabs
 
@@ -318,11 +318,11 @@ CONTAINER_MARKS: Spot = (listen_options, "_CONTAINER_MARKS")
 """The files by which a container is told."""
 CGROUP_WRITE: Spot = (cgroups, "_write")
 """What writes a file of a control group."""
-DECODING: Spot = (packing, "_checked")
+DECODING: Spot = (message, "_checked")
 """What makes a message of a decoded document that has no form yet."""
 MAY_SPIN: Spot = (served_slabs, "_MAY_SPIN")
 """Whether a server and a runner wait awake for one another on this machine."""
-FORMS: tuple[Spot, Spot] = ((packing, "_OUTGOING"), (packing, "_INCOMING"))
+FORMS: tuple[Spot, Spot] = ((message, "_OUTGOING"), (message, "_INCOMING"))
 """What is remembered of the shape of messages, each way."""
 CHECK_OF_WARNINGS: Spot = (prefix.WARNINGS, "_check")
 """What looks at each warning of a worker's."""

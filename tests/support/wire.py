@@ -12,7 +12,7 @@ from gymnasium.vector.utils import batch_space
 from envhub_sandbox.transport.jail import JailHandle
 from envhub_sandbox.transport.lane import RelayLane, Request
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec.codec import Buffer
+from envhub_worker.protocol.codec.wire import Buffer
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
 from envhub_worker.protocol.manifest.manifest import EnvManifest
 from envhub_worker.protocol.spaces.reader import Space, SpaceReader

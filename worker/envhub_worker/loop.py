@@ -13,7 +13,7 @@ from typing import Any
 
 import zmq
 
-from envhub_worker.protocol.codec.kinds import Buffer
+from envhub_worker.protocol.codec.wire import Buffer
 
 # plain numbers: as members of an enumeration they cost more than the calls that take them
 _MORE = int(zmq.SNDMORE)

@@ -21,7 +21,7 @@ from envhub_worker.access.sessions import Sessions
 from envhub_worker.lockdown.mechanisms.scratch import remove_tree
 from envhub_worker.loop import Loop, has_message, send
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec.kinds import Buffer
+from envhub_worker.protocol.codec.wire import Buffer
 from envhub_worker.protocol.errors import ProtocolError
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, LARGE_BYTES
 from envhub_worker.protocol.messages import compression

@@ -17,8 +17,8 @@ from envhub_sandbox.errors import (
 )
 from envhub_sandbox.sandboxes.docker.run_arguments import Container
 from envhub_sandbox.settings.options import option_name
-from envhub_worker.protocol.messages.surroundings import Surroundings
-from envhub_worker.protocol.untrusted import UNTRUSTED
+from envhub_worker.protocol.confinement import Surroundings
+from envhub_worker.protocol.errors import UNTRUSTED
 
 _MIB = 1024 * 1024
 _NATIVE_RUNTIMES = (None, "runc", "crun", "io.containerd.runc.v2")

@@ -22,13 +22,13 @@ from envhub_sandbox.hub.grammar import is_commit
 from envhub_sandbox.hub.reference import pinned
 from envhub_sandbox.session.crash.bundle_writer import FORMAT
 from envhub_sandbox.settings.policy import Limits, Policy
-from envhub_sandbox.transport.values.tensors import to_tensor
+from envhub_sandbox.transport.values import to_tensor
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.inert import one_line
+from envhub_worker.protocol.errors import FAULTS
 from envhub_worker.protocol.shared_memory.slabs import DTYPE_CODES
 from envhub_worker.protocol.stream import StreamReader
 from envhub_worker.protocol.text import printable
-from envhub_worker.protocol.untrusted import FAULTS
 
 MAX_FILE_BYTES = 64 << 20
 MAX_DOCUMENT_BYTES = 16 << 20

@@ -38,8 +38,8 @@ from envhub_sandbox.session.crash.history import RecordedRequest, Recording, Ste
 from envhub_sandbox.settings.policy import Policy, Timeouts
 from envhub_sandbox.system import folders
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec.codec import Buffer
 from envhub_worker.protocol.codec.inert import inert_copy, one_line
+from envhub_worker.protocol.codec.wire import Buffer
 from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.stream import pack_packet
 from envhub_worker.protocol.text import printable

@@ -17,7 +17,7 @@ import numpy as np
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.transport.lane import Request
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec.codec import Buffer
+from envhub_worker.protocol.codec.wire import Buffer
 from envhub_worker.protocol.manifest.manifest import EnvManifest
 from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES
 

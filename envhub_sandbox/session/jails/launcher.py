@@ -29,11 +29,11 @@ from envhub_sandbox.transport.jail import JailHandle, open_jail
 from envhub_sandbox.transport.output import OutputFollower, OutputSinks
 from envhub_sandbox.transport.replies import expect_reply, typed_reply
 from envhub_sandbox.transport.tcp import UnreachableError
-from envhub_sandbox.transport.values.generators import generator
+from envhub_sandbox.transport.values import generator
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.errors import UNTRUSTED
 from envhub_worker.protocol.manifest.manifest import EnvManifest, decode_manifest
 from envhub_worker.protocol.messages.busy import DRAINING
-from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _CLOSE_S = 5.0
 _LOST_S = 1.0

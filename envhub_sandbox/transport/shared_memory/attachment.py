@@ -12,7 +12,7 @@ from envhub_sandbox.transport.connection import SESSION
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.shared_memory.shard import LaneShard
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.shared_memory.doorbell import Watch
+from envhub_worker.protocol.shared_memory.descriptors import Watch
 
 _ANSWER_S = 20.0
 _LEAST_S = 0.1

@@ -19,16 +19,14 @@ from envhub_sandbox.transport.lane import Frames, RelayLane, Request
 from envhub_sandbox.transport.replies import typed_reply
 from envhub_sandbox.transport.results import Results, StepResult
 from envhub_sandbox.transport.shared_memory.attachment import Attachment
-from envhub_sandbox.transport.shared_memory.cores import CPUS, Cores
 from envhub_sandbox.transport.shared_memory.observations import RING, ObservationSlab
-from envhub_sandbox.transport.shared_memory.shard import LaneShard
-from envhub_sandbox.transport.shared_memory.shard_slabs import Outcome, ShardSlabs
-from envhub_sandbox.transport.shared_memory.spin import SpinChooser
+from envhub_sandbox.transport.shared_memory.shard import LaneShard, Outcome, ShardSlabs
+from envhub_sandbox.transport.shared_memory.spin import CPUS, Cores, SpinChooser
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.errors import UNTRUSTED
 from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.stream import pack_packet
-from envhub_worker.protocol.untrusted import UNTRUSTED
 
 _CAUSE_S = 10.0
 # elsewhere a core may see the sequence word before the data it announces: sleep, do not poll
@@ -119,21 +117,16 @@ class SharedMemoryLane:
         Raises:
             WorkerError: A runner died, or took too long.
         """
-        manifest = results.manifest
         slots = 1 if copy else 1 + RING
-        space = manifest.single_observation_space
-        observed = slabs.observation_layout(space, results.count, slots)
-        sizes = [stop - start for start, stop in results.slices]
-        layouts = [slabs.layout_of(manifest.single_action_space, size) for size in sizes]
-        known = [layout for layout in layouts if layout is not None]
-        own = [manifest.own_batch(name) for name in ("action_space", "observation_space")]
-        if observed is None or len(known) < len(layouts) or own != [None, None]:
+        space = results.manifest.single_observation_space
+        observed, layouts = slabs.observation_layout(space, results.count, slots), results.layouts()
+        if observed is None or layouts is None:
             attachment.close()
             return None
-        lane = cls(relay, results, observed, known, attachment)
+        lane = cls(relay, results, observed, layouts, attachment)
         agreed = False
         try:
-            agreed = lane._attach(range(len(known)), deadline)
+            agreed = lane._attach(range(len(layouts)), deadline)
         finally:
             if not agreed:
                 lane.close()

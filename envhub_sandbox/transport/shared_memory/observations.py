@@ -52,7 +52,7 @@ class ObservationSlab:
         self.fd = -1
         if received is None:
             # late, for Linux alone has what it imports
-            from envhub_worker.protocol.shared_memory.memfd import sealed_memfd
+            from envhub_worker.protocol.shared_memory.descriptors import sealed_memfd
 
             self._memory, self._file = sealed_memfd("observations", layout.total_bytes)
             self.fd = self._file.fileno()

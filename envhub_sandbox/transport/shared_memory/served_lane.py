@@ -23,10 +23,10 @@ from envhub_sandbox.transport.lane import Frames, RelayLane
 from envhub_sandbox.transport.replies import expect_reply, typed_reply
 from envhub_sandbox.transport.results import Results, StepResult
 from envhub_sandbox.transport.shared_memory.observations import ObservationSlab
-from envhub_sandbox.transport.shared_memory.shard_slabs import Outcome, ShardSlabs
+from envhub_sandbox.transport.shared_memory.shard import Outcome, ShardSlabs
 from envhub_sandbox.transport.shared_memory.spin import SpinChooser
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec.kinds import Buffer
+from envhub_worker.protocol.codec.wire import Buffer
 from envhub_worker.protocol.limits import LARGE_BYTES
 from envhub_worker.protocol.shared_memory import slabs
 
@@ -61,14 +61,16 @@ class ServedLane(RelayLane):
         Raises:
             WorkerError: A runner died, or took too long.
         """
-        manifest = results.manifest
-        own = [manifest.own_batch(name) for name in ("action_space", "observation_space")]
-        shards = [ServedShard.of(results, stop - start) for start, stop in results.slices]
-        known = [shard for shard in shards if shard is not None]
-        if len(known) < len(shards) or own != [None, None]:
+        space = results.manifest.single_observation_space
+        shards = [
+            ServedShard(space, layout, observed)
+            for layout in results.layouts() or ()
+            if (observed := slabs.observation_layout(space, layout.count, 1)) is not None
+        ]
+        if len(shards) < len(results.slices):
             return relay
-        lane = cls(relay, results, known)
-        return lane if lane._attach(range(len(known)), deadline) else relay
+        lane = cls(relay, results, shards)
+        return lane if lane._attach(range(len(shards)), deadline) else relay
 
     def renew(self, dead: Sequence[int], fresh: Sequence[int], deadline: Deadline) -> None:
         """See ``Lane``; they get slabs that the dead never saw."""
@@ -262,16 +264,6 @@ class ServedShard:
         self.observations = ObservationSlab(space, observed, self._received)
         self._assemble = slabs.assembler(space)
         self._pieces: list[Buffer] = []
-
-    @classmethod
-    def of(cls, results: Results, count: int) -> ServedShard | None:
-        """For so many sub-environments; None where the spaces have no fixed layout."""
-        manifest = results.manifest
-        layout = slabs.layout_of(manifest.single_action_space, count)
-        observed = slabs.observation_layout(manifest.single_observation_space, count, 1)
-        if layout is None or observed is None:
-            return None
-        return cls(manifest.single_observation_space, layout, observed)
 
     def again(self) -> ServedShard:
         """The same with nothing in it."""

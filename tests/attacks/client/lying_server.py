@@ -25,7 +25,7 @@ from gymnasium import spaces
 from envhub_sandbox.sandboxes.pool import WorkerServer
 from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec.codec import Buffer
+from envhub_worker.protocol.codec.wire import Buffer
 from envhub_worker.protocol.manifest.manifest import (
     EnvManifest,
     Manifest,

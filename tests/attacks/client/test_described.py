@@ -19,8 +19,8 @@ from gymnasium.envs.registration import EnvSpec
 
 from envhub_sandbox.errors import RemoteProtocolError
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec.codec import encode
-from envhub_worker.protocol.codec.kinds import GENERATOR, SPACE, SPEC
+from envhub_worker.protocol.codec.encoder import encode
+from envhub_worker.protocol.codec.wire import GENERATOR, SPACE, SPEC
 from envhub_worker.protocol.limits import WireLimits
 from tests.attacks.client.lies import (
     STATES,

@@ -25,8 +25,8 @@ from envhub_sandbox.errors import (
     WorkerDiedError,
 )
 from envhub_sandbox.transport import results
+from envhub_worker.protocol import errors
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol import untrusted
 from envhub_worker.protocol.manifest.manifest import Manifest, encode_env, encode_manifest
 from envhub_worker.protocol.spaces import batches
 from tests.attacks.client.lies import ACTIONS, opened, relayed, started
@@ -145,7 +145,7 @@ def test_without_the_mechanism_it_comes_out(
     liar: LyingServer, folder: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The control: what stands around the handling is what turns it."""
-    monkeypatch.setattr(untrusted, "FAULTS", ())
+    monkeypatch.setattr(errors, "FAULTS", ())
     with started(liar, folder) as env, monkeypatch.context() as patched:
         patched.setattr(results.batches, "conforms", raising(TypeError("unhashable")))
         with pytest.raises(TypeError, match="unhashable"):

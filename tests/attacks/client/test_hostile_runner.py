@@ -24,7 +24,7 @@ from envhub_sandbox.errors import (
     WorkerTimeoutError,
 )
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec.codec import Buffer
+from envhub_worker.protocol.codec.wire import Buffer
 from tests.attacks.client.lies import Canary, peak_growth
 from tests.attacks.client.lying_server import step_done
 from tests.attacks.harness import TIMEOUTS, Arena

@@ -24,8 +24,7 @@ from envhub_sandbox import make_env
 from envhub_sandbox.errors import EnvHubError, RemoteProtocolError, WorkerError, WorkerTimeoutError
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest.manifest import encode_env
-from envhub_worker.protocol.spaces.opaque import MAX_SPACE_DEPTH
-from envhub_worker.protocol.spaces.spaces import encode_space
+from envhub_worker.protocol.spaces.spaces import MAX_SPACE_DEPTH, encode_space
 from tests.attacks.client.lies import (
     ACTIONS,
     MIB,

@@ -12,7 +12,7 @@ import pytest
 from gymnasium import spaces
 
 from envhub_sandbox.errors import RemoteProtocolError
-from envhub_sandbox.transport.values.generators import generator
+from envhub_sandbox.transport.values import generator
 from envhub_worker.protocol.manifest.manifest import (
     EnvManifest,
     Manifest,

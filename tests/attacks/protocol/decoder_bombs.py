@@ -17,7 +17,8 @@ from pathlib import Path
 
 import msgpack
 
-from envhub_worker.protocol.codec.codec import Buffer, decode
+from envhub_worker.protocol.codec.decoder import decode
+from envhub_worker.protocol.codec.wire import Buffer
 from envhub_worker.protocol.errors import RemoteProtocolError
 from tests.support.wire import ext, message, packed
 

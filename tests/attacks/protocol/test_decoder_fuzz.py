@@ -21,7 +21,10 @@ from gymnasium import spaces
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from envhub_worker.protocol.codec.codec import Buffer, RemoteObject, decode, encode
+from envhub_worker.protocol.codec.decoder import decode
+from envhub_worker.protocol.codec.encoder import encode
+from envhub_worker.protocol.codec.inert import RemoteObject
+from envhub_worker.protocol.codec.wire import Buffer
 from envhub_worker.protocol.errors import RemoteProtocolError
 from envhub_worker.protocol.spaces.spaces import encode_space
 from tests.attacks.protocol import decoder_bombs

@@ -18,11 +18,10 @@ from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
 from envhub_sandbox.hub.listing import Snapshot
-from envhub_sandbox.transport import results
-from envhub_sandbox.transport.values import descriptions
+from envhub_sandbox.transport import results, values
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec import forms
 from envhub_worker.protocol.limits import WireLimits
+from envhub_worker.protocol.messages import message
 from tests.fuzz import child, traffic
 from tests.fuzz.oracle import WrongError, fits
 from tests.support import inside
@@ -134,8 +133,8 @@ def test_a_memory_that_fails_is_noticed(
     """What is read as another message the second time is noticed."""
     assert first_wrong(recorded, "unpack") == ""
     for spot in inside.FORMS:
-        monkeypatch.setattr(*spot, forms.Forms())
-    monkeypatch.setattr(forms, "Incoming", Forgetful)
+        monkeypatch.setattr(*spot, message.Forms())
+    monkeypatch.setattr(message, "Incoming", Forgetful)
     assert first_wrong(recorded, "unpack") == "another message"
 
 
@@ -145,7 +144,7 @@ def test_specs_that_are_not_read_as_facts_are_noticed(
     """Without what makes a spec of facts alone, the fuzzer says so; with it, nothing."""
     assert first_wrong(recorded, "things") == ""
     naive = {"id": "A-v0", "entry_point": "os:system"}
-    monkeypatch.setattr(descriptions, "spec_of", lambda facts: EnvSpec(**naive))
+    monkeypatch.setattr(values, "spec_of", lambda facts: EnvSpec(**naive))
     assert "an entry point" in first_wrong(recorded, "things")
 
 

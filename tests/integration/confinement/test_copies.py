@@ -196,7 +196,7 @@ def test_report_says_how_files_are_seen(cell: Cell) -> None:
 
 
 ADVICE = """
-from envhub_worker.runner.raised import raised
+from envhub_worker.runner.described import raised
 def advice(path, mode):
     try:
         open(path, mode)

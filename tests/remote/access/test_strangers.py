@@ -34,8 +34,7 @@ from envhub_worker.cli import listen
 from envhub_worker.loop import Loop
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.keys import key_text
-from envhub_worker.supervisor.records import Asker, RefusedError
-from envhub_worker.supervisor.witness import Witness
+from envhub_worker.supervisor.records import Asker, RefusedError, Witness
 from tests.remote.listening import Listening, listening
 from tests.remote.relay import relay
 from tests.remote.strangers import ends, greeting, knock, say

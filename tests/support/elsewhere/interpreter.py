@@ -33,13 +33,13 @@ import sysconfig
 import types
 from typing import Any
 
-_SHARED = ("attachment", "cores", "lane", "shard")
+_SHARED = ("attachment", "lane")
 LINUX_ALONE = (
     "envhub_sandbox.dependencies.for_a_server",
     "envhub_sandbox.sandboxes.docker.monitor",
     "envhub_sandbox.sandboxes.ray.actor",
     *(f"envhub_sandbox.transport.shared_memory.{name}" for name in _SHARED),
-    *(f"envhub_worker.protocol.shared_memory.{name}" for name in ("doorbell", "memfd")),
+    "envhub_worker.protocol.shared_memory.descriptors",
 )
 """Of the client, what a client elsewhere never imports; tests may."""
 

@@ -17,8 +17,7 @@ from envhub_worker.access.sessions import Sessions
 from envhub_worker.loop import Loop, receive
 from envhub_worker.protocol import messages as m
 from envhub_worker.supervisor.jails import Jails
-from envhub_worker.supervisor.records import Asker
-from envhub_worker.supervisor.witness import Witness
+from envhub_worker.supervisor.records import Asker, Witness
 
 
 class ClientRequest(NamedTuple):

@@ -44,7 +44,7 @@ from envhub_worker.cli.state_folder import Note, ServerNote, state_folder
 from envhub_worker.lockdown import probe, surroundings
 from envhub_worker.lockdown.mechanisms import landlock, locked_folder
 from envhub_worker.lockdown.mechanisms.locked_folder import LockedFolder
-from envhub_worker.protocol.messages.surroundings import Surroundings
+from envhub_worker.protocol.confinement import Surroundings
 from envhub_worker.server import Server
 
 _MAX_OPEN_FILES = 65_536

@@ -15,8 +15,7 @@ from typing import Any
 from envhub_worker import __version__
 from envhub_worker.lockdown import probe
 from envhub_worker.lockdown.mechanisms import landlock
-from envhub_worker.protocol.confinement import LEAST_LANDLOCK
-from envhub_worker.protocol.messages.surroundings import Surroundings
+from envhub_worker.protocol.confinement import LEAST_LANDLOCK, Surroundings
 from envhub_worker.protocol.runtime import OWN, Runtime
 
 ENVIRONMENT = Path("/opt/environment/bin/python")

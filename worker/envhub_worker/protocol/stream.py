@@ -10,7 +10,7 @@ import struct
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
-from envhub_worker.protocol.codec.kinds import Buffer
+from envhub_worker.protocol.codec.wire import Buffer
 from envhub_worker.protocol.errors import MessageTooLargeError, RemoteProtocolError
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 

@@ -1,20 +1,29 @@
-"""Describes what has no form of its own on the wire, and yet can be made again on the other side.
+"""Describes what has no form of its own on the wire: spaces, specs and generators by plain values,
+of which the client makes them again; exceptions of the repository by text.
 
 Runs in the jail; the client checks what it says.
 """
 
 from __future__ import annotations
 
+import builtins
+import contextlib
+import os
+import sys
+import traceback
+from collections.abc import Iterator
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
-from envhub_worker.protocol.codec.kinds import GENERATOR, SPACE, SPEC
+from envhub_worker.file_access import why_file_hidden, why_file_unwritable
+from envhub_worker.protocol.codec.wire import GENERATOR, SPACE, SPEC
 from envhub_worker.protocol.errors import EnvHubError
-from envhub_worker.protocol.spaces.seeded import BIT_GENERATORS
-from envhub_worker.protocol.spaces.spaces import encode_space
+from envhub_worker.protocol.messages import RaisedException
+from envhub_worker.protocol.spaces.spaces import BIT_GENERATORS, encode_space
+from envhub_worker.protocol.text import printable
 
 SPEC_FIELDS = ("id", "max_episode_steps", "reward_threshold", "nondeterministic")
 
@@ -36,3 +45,106 @@ def described(value: object) -> tuple[int, object] | None:
 def facts_of(spec: Any) -> dict[str, Any]:
     """What a spec says about the environment, and nothing of how it is made."""
     return {name: getattr(spec, name, None) for name in SPEC_FIELDS}
+
+
+_MAX_MESSAGE = 8_192
+_MAX_TRACEBACK = 32_768
+_GYMNASIUM = "gymnasium.error"
+_OURS = os.path.dirname(os.path.dirname(os.path.abspath(__file__))) + os.sep
+_IMPORTING = ("<frozen importlib.", f"{os.path.dirname(os.__file__)}{os.sep}importlib{os.sep}")
+
+
+def raised(error: BaseException, stage: str, root: str = "") -> RaisedException:
+    """The message for an exception: its nearest builtin ancestor, its text, its traceback.
+
+    Args:
+        root: The repository's folder: its files are named relative to it.
+    """
+    # a package that may not be read is imported all the same, as one without a file of its own
+    why = ""
+    nowhere = isinstance(error, ImportError) and error.path is None
+    hidden = why_file_hidden(str(getattr(error, "name", ""))) if nowhere else ""
+    if hidden:
+        denied = PermissionError(f"{_text(error)}, but {hidden}")
+        error = denied.with_traceback(error.__traceback__)
+    with contextlib.suppress(Exception):  # the error may be of a class of the repository's
+        why = _usage(error) or why_file_unwritable(error, root)
+    kind = type(error)
+    name = kind.__qualname__
+    if kind.__module__ not in ("builtins", "__main__"):
+        name = f"{kind.__module__}.{name}"
+    return RaisedException(
+        builtin=_builtin(kind),
+        type_name=printable(name, 512),
+        message=printable(". ".join(filter(None, (_text(error), why))), _MAX_MESSAGE),
+        traceback=printable(_traceback(error, root), _MAX_TRACEBACK),
+        stage=stage,
+    )
+
+
+def _builtin(kind: type[BaseException]) -> str:
+    """Its nearest builtin ancestor that says anything, or else its nearest one of Gymnasium's."""
+    own = [base for base in kind.__mro__ if getattr(builtins, base.__name__, None) is base]
+    theirs = [base for base in kind.__mro__ if base.__module__ == _GYMNASIUM]
+    if theirs and own and own[0] is Exception:
+        return f"{_GYMNASIUM}.{theirs[0].__name__}"
+    return str(own[0].__name__) if own else "Exception"
+
+
+def _text(error: BaseException) -> str:
+    try:
+        return str(error)
+    except Exception:
+        return "(its text could not be read)"
+
+
+def _usage(error: BaseException) -> str:
+    """What argparse printed before it left, where it did."""
+    parsing = getattr(sys.modules.get("argparse"), "__file__", None)
+    if not isinstance(error, SystemExit) or parsing is None:
+        return ""
+    for frame, _ in traceback.walk_tb(error.__traceback__):
+        if frame.f_code.co_name == "exit" and frame.f_code.co_filename == parsing:
+            usage, why = frame.f_locals["self"].format_usage(), frame.f_locals.get("message")
+            return f"argparse said: {usage}{why or ''}".rstrip()
+    return ""
+
+
+def _traceback(error: BaseException, root: str) -> str:
+    """The traceback, without the frames of this package that called into the repository."""
+    try:
+        whole = traceback.TracebackException.from_exception(error, compact=True)
+        for one in _chain(whole):
+            _tell(one, root)
+        return "".join(whole.format())
+    except Exception:
+        return ""
+
+
+def _chain(whole: traceback.TracebackException) -> Iterator[traceback.TracebackException]:
+    """An exception, and all that its traceback shows."""
+    waiting, seen = [whole], set()
+    while waiting:
+        one = waiting.pop()
+        if id(one) in seen:
+            continue
+        seen.add(id(one))
+        yield one
+        group = getattr(one, "exceptions", None) or ()
+        waiting += [two for two in (one.__cause__, one.__context__, *group) if two is not None]
+
+
+def _tell(one: traceback.TracebackException, root: str) -> None:
+    """Leave out frames that are not the repository's, and name its files relative to it."""
+    theirs = [frame for frame in one.stack if not frame.filename.startswith((_OURS, *_IMPORTING))]
+    syntax = getattr(one, "filename", None) is not None  # which tells its line without a frame
+    if theirs or syntax:
+        one.stack[:] = theirs
+    for frame in one.stack:
+        frame.filename = _in_repository(frame.filename, root)
+    if syntax:
+        one.filename = _in_repository(str(one.filename), root)
+
+
+def _in_repository(name: str, root: str) -> str:
+    return name.removeprefix(f"{root.rstrip(os.sep)}{os.sep}") if root else name

@@ -7,7 +7,7 @@ from typing import Any
 
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.shared_memory import slabs
-from envhub_worker.protocol.shared_memory.columns import Column, columns_of
+from envhub_worker.protocol.shared_memory.slabs import Column, columns_of
 from envhub_worker.protocol.spaces import batches
 
 Pack = Callable[[m.Message], list[Any]]

@@ -21,8 +21,8 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.stream import Packet, pack_packet, read_packet
 from envhub_worker.runner.infos import InfoWriter, Pairs
+from envhub_worker.runner.prefixes import Watches
 from envhub_worker.runner.sync_envs import SubEnvs
-from envhub_worker.runner.watches import Watches
 
 _RING = (1).to_bytes(8, "little")
 

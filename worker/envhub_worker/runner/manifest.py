@@ -13,9 +13,8 @@ from gymnasium.vector.utils import batch_space
 from envhub_worker.protocol.manifest.manifest import EnvManifest, Manifest
 from envhub_worker.protocol.manifest.names import MAX_NAMES
 from envhub_worker.runner import gymnasium_compat as compat
-from envhub_worker.runner.derived_spaces import derived_space
 from envhub_worker.runner.described import facts_of
-from envhub_worker.runner.tasks import Task
+from envhub_worker.runner.tasks import Task, derived_space
 
 _GYMNASIUMS = frozenset(dir(VectorEnv)) | compat.OWN_NAMES | {"num_envs", "env", "envs"}
 _HEAD_BYTES = 2048

@@ -34,8 +34,8 @@ from gymnasium.vector.utils import batch_space, iterate
 
 from envhub_worker.runner import gymnasium_compat as compat
 from envhub_worker.runner.described import facts_of
+from envhub_worker.runner.gymnasium_compat import names, parameters_of, takes
 from envhub_worker.runner.infos import join
-from envhub_worker.runner.parameters import names, parameters_of, takes
 
 _OPTIONAL = ("seed", "options", "return_info")
 _MODES = ("rgb_array", "ansi")

@@ -25,15 +25,13 @@ from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.stream import Packet, StreamReader, pack_packet
 from envhub_worker.runner import gymnasium_compat as compat
 from envhub_worker.runner import loader, manifest
-from envhub_worker.runner.described import described
+from envhub_worker.runner.described import described, raised
 from envhub_worker.runner.infos import Pairs
 from envhub_worker.runner.lane import Lane
-from envhub_worker.runner.raised import raised
+from envhub_worker.runner.prefixes import WarningLog, Watches
 from envhub_worker.runner.recording import standing_in
 from envhub_worker.runner.sync_envs import SubEnvs
 from envhub_worker.runner.tasks import ResultError, Task, tasks_of
-from envhub_worker.runner.warning_log import WarningLog
-from envhub_worker.runner.watches import Watches
 
 _ANCILLARY_BYTES = socket.CMSG_SPACE(8 * array("i").itemsize)
 _RECHECK_MS = 2

@@ -33,9 +33,12 @@ from envhub_worker.lockdown.stages import runner
 from envhub_worker.protocol.records import dataclass
 from envhub_worker.spawn import blas
 from envhub_worker.spawn.channel import Channel
-from envhub_worker.spawn.display import check_display, start_display
-from envhub_worker.spawn.hub_cache import make_hub_cache
-from envhub_worker.spawn.lerobot_stub import install_lerobot_stub
+from envhub_worker.spawn.preparations import (
+    check_display,
+    install_lerobot_stub,
+    make_hub_cache,
+    start_display,
+)
 
 _SELF_TEST = Layer("self-test", True, "the denials above were tried and held")
 

@@ -24,13 +24,13 @@ from envhub_worker.supervisor.records import (
     Pending,
     RefusedError,
     Reply,
+    Witness,
     signal_name,
     waiting,
     whole_jail,
 )
 from envhub_worker.supervisor.runner_stream import RunnerLink
 from envhub_worker.supervisor.served_slabs import ServedSlabs, ServedSteps
-from envhub_worker.supervisor.witness import Witness
 
 MAX_DEAD = 256
 """Jails that have ended and are not closed, whose deaths are remembered."""

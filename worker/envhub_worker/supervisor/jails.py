@@ -21,17 +21,18 @@ from envhub_worker.protocol.shared_memory import words
 from envhub_worker.spawn.channel import close_fds
 from envhub_worker.spawn.zygote_process import ZygoteProcess
 from envhub_worker.supervisor.fd_store import FdStore
-from envhub_worker.supervisor.idle_timer import IdleTimer
 from envhub_worker.supervisor.jail_events import JailEvents
-from envhub_worker.supervisor.output_tail import OutputTail
 from envhub_worker.supervisor.records import (
     AnsweredError,
     Asker,
+    IdleTimer,
     JailRecord,
     Opening,
+    OutputTail,
     Pending,
     RefusedError,
     Reply,
+    Witness,
     owes,
     status_of,
     whole_jail,
@@ -39,7 +40,6 @@ from envhub_worker.supervisor.records import (
 from envhub_worker.supervisor.runner_stream import RunnerLink
 from envhub_worker.supervisor.served_slabs import ServedSlabs
 from envhub_worker.supervisor.usage import CountLimit, reached, usage_of
-from envhub_worker.supervisor.witness import Witness
 from envhub_worker.supervisor.zygotes import Zygotes
 
 MAX_RUNNERS = 64

@@ -1,21 +1,124 @@
-"""Records of a worker server: each of its jails, and the requests that wait for it."""
+"""Records of a worker server: each of its jails, what it prints, how long it has been idle, the
+requests that wait for it, and ``Witness``, which is called about its events.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import os
 import signal
-from collections.abc import Callable
+import traceback
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from time import monotonic
 from typing import Any, NamedTuple
 
 from envhub_worker.lockdown.mechanisms import procfs
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec.kinds import Buffer
+from envhub_worker.protocol.codec.wire import Buffer
 from envhub_worker.protocol.confinement import Reason
+from envhub_worker.protocol.shared_memory.words import SEQUENCE
+from envhub_worker.protocol.text import printable
+from envhub_worker.spawn.channel import close_fds
 from envhub_worker.spawn.jail import Jail
-from envhub_worker.supervisor.idle_timer import IdleTimer
-from envhub_worker.supervisor.output_tail import OutputTail
 from envhub_worker.supervisor.runner_stream import RunnerLink
+
+_CHUNK = 1 << 16
+MAX_BYTES = 1 << 20
+"""What one reply tells at most."""
+
+
+class OutputTail:
+    """The last ``limit`` bytes of a pipe that a jail writes to. Owns the descriptor.
+    ``ended``: nothing more will come.
+    """
+
+    def __init__(self, fd: int, limit: int) -> None:
+        self.ended = False
+        self._fd = fd
+        self._limit = limit
+        self._kept = bytearray()
+        self._total = 0
+
+    def fileno(self) -> int:
+        """The descriptor, or -1 once it is closed."""
+        return self._fd
+
+    def read(self) -> None:
+        """Take what is there. One read a call, so that a flood cannot hold up the server."""
+        if self._fd < 0 or self.ended:
+            return
+        try:
+            data = os.read(self._fd, _CHUNK)
+        except BlockingIOError:
+            return
+        self.ended = not data  # its watcher closes it: its number is soon another's
+        self._kept += data
+        self._total += len(data)
+        if len(self._kept) > 2 * self._limit:
+            del self._kept[: -self._limit]
+
+    def since(self, offset: int) -> tuple[int, bytes]:
+        """What came from this byte on, and where that begins: later, if it is not kept any more."""
+        first = self._total - len(self._kept)
+        start = min(max(offset, first), self._total)
+        return start, bytes(self._kept[start - first : start - first + MAX_BYTES])
+
+    def text(self, lines: int = 40) -> str:
+        """The last lines, fit for a terminal."""
+        kept = bytes(self._kept[-self._limit :]).decode("utf-8", "backslashreplace")
+        return printable("\n".join(kept.splitlines()[-lines:]))
+
+    def close(self) -> None:
+        """Close the pipe. Idempotent."""
+        if self._fd >= 0:
+            os.close(self._fd)
+            self._fd = -1
+
+
+_WORD = 8
+
+
+class IdleTimer:
+    """The clock of one jail."""
+
+    def __init__(self, limit_s: float) -> None:
+        self.limit_s = limit_s
+        self._slabs: dict[int, list[int]] = {}
+        self._seen: list[int] = []
+        self.begin()
+
+    def begin(self) -> None:
+        """Something was asked, or answered."""
+        self._since = monotonic()
+
+    def watch(self, runner: int, fds: Sequence[int]) -> None:
+        """Count a runner's steps, too. Takes the descriptors over: request slab and reply slab."""
+        self.forget(runner)
+        self._slabs[runner] = list(fds)
+
+    def forget(self, runner: int) -> None:
+        """A runner has gone, or there was none."""
+        close_fds(self._slabs.pop(runner, []))
+
+    def close(self) -> None:
+        """Give all descriptors back."""
+        for runner in list(self._slabs):
+            self.forget(runner)
+
+    def passed(self, busy: bool) -> bool:
+        """Whether it was too long; ``busy``: some runner owes an answer to a message."""
+        asked = [_sequence(request) for request, _ in self._slabs.values()]
+        answered = [_sequence(reply) for _, reply in self._slabs.values()]
+        if busy or asked != answered or asked + answered != self._seen:
+            self._seen = asked + answered
+            self.begin()
+        return monotonic() - self._since >= self.limit_s
+
+
+def _sequence(slab: int) -> int:
+    return int.from_bytes(os.pread(slab, _WORD, SEQUENCE * _WORD), "little")
+
 
 _MAX_SAID = 4096
 """Characters of a refusal."""
@@ -186,3 +289,27 @@ def status_of(entry: JailRecord) -> dict[str, object]:
         "busy_s": 0.0 if oldest is None else monotonic() - oldest.since,
         "operation": "" if oldest is None else oldest.operation,
     }
+
+
+class Witness:
+    """Called about every jail. It must not raise, and must not keep what it is shown.
+
+    This one writes nothing down: the server's client is on this machine, and logs by itself.
+    """
+
+    def opened(self, entry: JailRecord, runners: int, seconds: float) -> None:
+        """A jail has come up, or further runners in it, so long after it was asked for."""
+
+    def lost(self, entry: JailRecord, death: m.Death) -> None:
+        """A runner has died in a jail that goes on."""
+
+    def died(self, entry: JailRecord) -> None:
+        """A jail is dead: ``entry.death`` says how."""
+
+    def closed(self, entry: JailRecord) -> None:
+        """Nothing is left of a jail that its client has closed, or that the server ends with."""
+
+    def failed(self, error: Exception) -> None:
+        """The server itself has met an error, of which it does not die: on stderr."""
+        with contextlib.suppress(OSError, ValueError):  # stderr may have no reader any more
+            traceback.print_exception(error)

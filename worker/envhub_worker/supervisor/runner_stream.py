@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from envhub_worker.protocol.codec.kinds import Buffer
+from envhub_worker.protocol.codec.wire import Buffer
 from envhub_worker.protocol.errors import RemoteProtocolError
 from envhub_worker.protocol.limits import LARGE_BYTES, WireLimits
 from envhub_worker.protocol.stream import Packet, StreamReader, pack_packet

@@ -6,7 +6,7 @@ understands none of the rest.
 
 Trust: a jail holds all of this, and the server is many clients'. Each word is read once; only its
 client's own bytes and bounded numbers decide what is sent. Nothing here waits: rings are sent and
-heard as ``doorbell`` says, and a hole that is punched costs a fault for each page, of slabs whose
+heard as ``descriptors`` says; a hole that is punched costs a fault for each page, of slabs whose
 size is bounded. A large observation is sent from where it lies. An honest runner writes it again
 only for the next step, which its client asks for when it has all of this one; another one decides
 what its client reads anyway.
@@ -21,11 +21,15 @@ from collections.abc import Callable
 from time import perf_counter_ns
 from typing import Any
 
-from envhub_worker.protocol.codec.kinds import Buffer
+from envhub_worker.protocol.codec.wire import Buffer
 from envhub_worker.protocol.limits import LARGE_BYTES
 from envhub_worker.protocol.shared_memory import words
-from envhub_worker.protocol.shared_memory.doorbell import OwnBell, RunnerBell
-from envhub_worker.protocol.shared_memory.memfd import SEAL_FUTURE_WRITE, sealed_memfd
+from envhub_worker.protocol.shared_memory.descriptors import (
+    SEAL_FUTURE_WRITE,
+    OwnBell,
+    RunnerBell,
+    sealed_memfd,
+)
 from envhub_worker.spawn.channel import close_fds
 
 _HEAD = struct.Struct("<QQ")

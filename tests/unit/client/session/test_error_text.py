@@ -18,7 +18,7 @@ from envhub_sandbox.settings.policy import Policy
 from envhub_sandbox.transport.replies import raised
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.text import MARGIN
-from envhub_worker.runner.raised import raised as described
+from envhub_worker.runner.described import raised as described
 
 ROOT = "/store/tree"
 FILES = tuple(FileRecord(path, 1, "sha256:0") for path in ("env.py", "lib/a.py", "lib/b.py"))

@@ -14,11 +14,11 @@ from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import JailHandle, RunnersDiedError
 from envhub_sandbox.transport.results import Results
-from envhub_sandbox.transport.values.descriptions import DescriptionReader
+from envhub_sandbox.transport.values import DescriptionReader
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec.codec import Buffer
+from envhub_worker.protocol.codec.wire import Buffer
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
-from envhub_worker.protocol.spaces.opaque import OpaqueSpace
+from envhub_worker.protocol.spaces.spaces import OpaqueSpace
 from envhub_worker.runner.described import described
 from tests.attacks.client.lying_server import env_manifest
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from envhub_sandbox.transport import output
 from envhub_sandbox.transport.output import Lines, OutputSinks
-from envhub_worker.supervisor.output_tail import OutputTail
+from envhub_worker.supervisor.records import OutputTail
 
 
 def lines_of(*chunks: bytes) -> list[str]:

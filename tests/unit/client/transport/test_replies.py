@@ -16,7 +16,7 @@ from envhub_sandbox.session.error_text import add_author_line
 from envhub_sandbox.transport.replies import check_reply, death, expect_reply, raised, refusal
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import REASONS
-from envhub_worker.runner.raised import raised as described
+from envhub_worker.runner.described import raised as described
 
 ESCAPE = "\x1b]0;owned\x07\x1b[2J\r"
 

@@ -11,7 +11,7 @@ import pytest
 from gymnasium import spaces
 
 from envhub_sandbox.session import requests
-from envhub_sandbox.transport.shared_memory import shard, shard_slabs
+from envhub_sandbox.transport.shared_memory import shard
 from envhub_sandbox.transport.shared_memory.shard import LaneShard
 from envhub_sandbox.vector import vector_env
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
@@ -72,10 +72,7 @@ class _Runner:
 
 @pytest.mark.parametrize("afterwards", [("int64", 0), ("int32", 1)])
 @pytest.mark.parametrize("what", ["step", "message"])
-@pytest.mark.parametrize("module", [shard, shard_slabs])
-def test_a_runner_is_told_all_after_an_interrupt(
-    module: ModuleType, what: str, afterwards: tuple[str, int]
-) -> None:
+def test_a_runner_is_told_all_after_an_interrupt(what: str, afterwards: tuple[str, int]) -> None:
     """Whether the next step is like the interrupted one, or like the one before it."""
     dtype, slot = afterwards
     expected = (0, slabs.DTYPE_CODES[np.dtype(dtype)], slot)
@@ -91,7 +88,7 @@ def test_a_runner_is_told_all_after_an_interrupt(
             else:
                 lane.tell(b"packet", 1)
 
-        came = before_line(module.__file__, line, act)
+        came = before_line(shard.__file__, line, act)
         assert runner.asked(dtype, slot) == expected
         lane.close()
         if not came:

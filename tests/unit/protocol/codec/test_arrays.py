@@ -13,7 +13,8 @@ from hypothesis.extra import numpy as hnp
 
 from envhub_worker.protocol.codec import arrays
 from envhub_worker.protocol.codec.arrays import ArrayReader, ArrayWriter
-from envhub_worker.protocol.codec.codec import decode, encode
+from envhub_worker.protocol.codec.decoder import decode
+from envhub_worker.protocol.codec.encoder import encode
 from envhub_worker.protocol.codec.numpy_forms import read_numpy_scalar
 from envhub_worker.protocol.errors import (
     LocalProtocolError,

@@ -18,7 +18,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from envhub_worker.protocol.codec.arrays import INLINE_BYTES
-from envhub_worker.protocol.codec.codec import Buffer, RemoteEnum, RemoteObject, decode, encode
+from envhub_worker.protocol.codec.decoder import decode
+from envhub_worker.protocol.codec.encoder import encode
+from envhub_worker.protocol.codec.inert import RemoteEnum, RemoteObject
+from envhub_worker.protocol.codec.wire import Buffer
 from envhub_worker.protocol.errors import LocalProtocolError, RemoteProtocolError
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
 from tests.support.compare import assert_same
@@ -365,7 +368,7 @@ def test_decoded_arrays_do_not_alias_the_transport() -> None:
 def test_the_value_layer_imports_little() -> None:
     """Importing the codec loads no Gymnasium, no ZeroMQ, no Hub client and no torch."""
     code = (
-        "import sys, envhub_worker.protocol.codec.codec;"
+        "import sys, envhub_worker.protocol.codec.encoder;"
         "print({'gymnasium', 'zmq', 'huggingface_hub', 'torch', 'pickle5'} & set(sys.modules))"
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -9,7 +9,10 @@ import msgpack
 import numpy as np
 import pytest
 
-from envhub_worker.protocol.codec.codec import Buffer, RemoteObject, decode, encode
+from envhub_worker.protocol.codec.decoder import decode
+from envhub_worker.protocol.codec.encoder import encode
+from envhub_worker.protocol.codec.inert import RemoteObject
+from envhub_worker.protocol.codec.wire import Buffer
 from envhub_worker.protocol.errors import (
     LocalProtocolError,
     MessageTooLargeError,

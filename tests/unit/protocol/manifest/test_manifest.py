@@ -10,7 +10,8 @@ from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 
-from envhub_worker.protocol.codec.codec import decode, encode
+from envhub_worker.protocol.codec.decoder import decode
+from envhub_worker.protocol.codec.encoder import encode
 from envhub_worker.protocol.errors import RemoteProtocolError
 from envhub_worker.protocol.limits import MAX_NUM_ENVS
 from envhub_worker.protocol.manifest.manifest import (

@@ -16,12 +16,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from envhub_sandbox.errors import RemoteEnvError, RemoteProtocolError, remote_error
-from envhub_sandbox.transport.values import generators
-from envhub_sandbox.transport.values.descriptions import spec_of
+from envhub_sandbox.transport import values
+from envhub_sandbox.transport.values import spec_of
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
-from envhub_worker.protocol.codec.codec import decode, encode
+from envhub_worker.protocol.codec.decoder import decode
+from envhub_worker.protocol.codec.encoder import encode
 from envhub_worker.protocol.codec.inert import RemoteEnum, RemoteObject
-from envhub_worker.protocol.manifest.facts import MAX_METADATA, read_metadata_facts, read_spec_facts
+from envhub_worker.protocol.manifest.manifest import (
+    MAX_METADATA,
+    read_metadata_facts,
+    read_spec_facts,
+)
 from envhub_worker.protocol.manifest.names import GYMNASIUMS, PROBED, is_servable
 from tests.support.objects.curious import names_asked_for
 from tests.support.objects.protocol_names import names_that_libraries_call
@@ -219,7 +224,7 @@ def test_every_state_that_a_generator_has_is_taken(kind: str, draws: int) -> Non
     original = np.random.Generator(getattr(np.random, kind)(3))
     original.integers(0, 9, draws, np.int32)  # leaves half a word behind
     state: Any = decode(encode(original.bit_generator.state))
-    assert generators.generator(state).random() == original.random()
+    assert values.generator(state).random() == original.random()
 
 
 @given(st.sampled_from(KINDS), st.data())
@@ -233,7 +238,7 @@ def test_states_with_another_field_are_refused_or_harmless(kind: str, data: st.D
         st.integers(-(2**130), 2**130) | st.none() | st.floats() | st.text() | st.booleans()
     )
     try:
-        made = generators.generator(state)
+        made = values.generator(state)
     except RemoteProtocolError:
         return
     made.integers(0, 3, 10_000)

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 import envhub_worker
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec.codec import encode
+from envhub_worker.protocol.codec.encoder import encode
 from envhub_worker.protocol.errors import LocalProtocolError, RemoteProtocolError
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
 from envhub_worker.protocol.messages import compression

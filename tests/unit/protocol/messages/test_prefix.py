@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec.codec import Buffer
+from envhub_worker.protocol.codec.wire import Buffer
 from envhub_worker.protocol.errors import MessageTooLargeError, RemoteProtocolError
 from envhub_worker.protocol.messages.prefix import (
     CHANGES,

@@ -16,11 +16,11 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from envhub_sandbox.errors import WorkerTimeoutError
-from envhub_worker.protocol.codec.codec import decode, encode
+from envhub_worker.protocol.codec.decoder import decode
+from envhub_worker.protocol.codec.encoder import encode
 from envhub_worker.protocol.errors import LocalProtocolError, RemoteProtocolError
-from envhub_worker.protocol.spaces.opaque import MAX_SPACE_DEPTH
 from envhub_worker.protocol.spaces.reader import ELEMENT_BYTES, SPACE_BYTES, SpaceReader
-from envhub_worker.protocol.spaces.spaces import OpaqueSpace, encode_space
+from envhub_worker.protocol.spaces.spaces import MAX_SPACE_DEPTH, OpaqueSpace, encode_space
 from tests.support.compare import assert_same
 from tests.support.wire import decode_space
 

@@ -11,7 +11,7 @@ import pytest
 
 from envhub_worker.cli import health
 from envhub_worker.lockdown import surroundings
-from envhub_worker.protocol.messages.surroundings import Surroundings
+from envhub_worker.protocol.confinement import Surroundings
 from envhub_worker.protocol.runtime import OWN, Runtime
 
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.shared_memory import slabs
-from envhub_worker.protocol.shared_memory.columns import columns_of
+from envhub_worker.protocol.shared_memory.slabs import columns_of
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.runner.infos import InfoWriter, join
 from tests.support.compare import assert_same

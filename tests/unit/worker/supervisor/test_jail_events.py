@@ -13,10 +13,9 @@ from envhub_worker.protocol.shared_memory import words
 from envhub_worker.spawn.jail import CallDenied, RunnerExited
 from envhub_worker.spawn.spawner import JailExited
 from envhub_worker.supervisor.jail_events import JailEvents
-from envhub_worker.supervisor.records import JailRecord, Pending, whole_jail
+from envhub_worker.supervisor.records import JailRecord, Pending, Witness, whole_jail
 from envhub_worker.supervisor.runner_stream import RunnerLink
 from envhub_worker.supervisor.served_slabs import ServedSlabs
-from envhub_worker.supervisor.witness import Witness
 
 
 class _Jail:

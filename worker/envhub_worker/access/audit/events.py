@@ -14,8 +14,7 @@ from envhub_worker.protocol.keys import KEY_BYTES, key_text
 from envhub_worker.protocol.messages import busy
 from envhub_worker.protocol.messages.busy import Busy
 from envhub_worker.protocol.text import shortage
-from envhub_worker.supervisor.records import Asker, JailRecord
-from envhub_worker.supervisor.witness import Witness
+from envhub_worker.supervisor.records import Asker, JailRecord, Witness
 
 
 class Events(Witness):

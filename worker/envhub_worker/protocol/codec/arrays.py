@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from envhub_worker.protocol.codec.kinds import Buffer
+from envhub_worker.protocol.codec.wire import Buffer
 from envhub_worker.protocol.errors import (
     LocalProtocolError,
     MessageTooLargeError,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgpack  # type: ignore[import-untyped]
 
-from envhub_worker.protocol.codec import kinds, structure
+from envhub_worker.protocol.codec import wire
 from envhub_worker.protocol.codec.inert import (
     MAX_NAME_CHARS,
     MAX_REPR_CHARS,
@@ -18,9 +18,9 @@ from envhub_worker.protocol.codec.inert import (
     inert_copy,
     one_line,
 )
-from envhub_worker.protocol.codec.kinds import Buffer
+from envhub_worker.protocol.codec.wire import Buffer
 from envhub_worker.protocol.errors import MessageTooLargeError, ProtocolError, RemoteProtocolError
-from envhub_worker.protocol.limits import WireLimits
+from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 
 if TYPE_CHECKING:
     from envhub_worker.protocol.codec.arrays import Array, ArrayReader
@@ -81,7 +81,7 @@ class Decoder:
             MessageTooLargeError: Over a limit.
             RemoteProtocolError: Malformed in any way.
         """
-        structure.check(document, self.limits)
+        wire.check_document(document, self.limits)
         try:
             value = msgpack.unpackb(
                 document,
@@ -111,7 +111,7 @@ class Decoder:
             return read(self, payload)
         if code not in _BUILDERS:
             raise RemoteProtocolError(f"Unknown extension {code}.")
-        if payload and code not in (kinds.OBJECTS, kinds.TENSOR):
+        if payload and code not in (wire.OBJECTS, wire.TENSOR):
             raise RemoteProtocolError(f"Extension {code} has a payload.")
         self._heads += 1
         return _Head(code, payload)
@@ -211,9 +211,9 @@ def _read_integer(decoder: Decoder, payload: bytes) -> object:
 
 
 def _read_complex(decoder: Decoder, payload: bytes) -> object:
-    if len(payload) != kinds.COMPLEX_BYTES.size:
+    if len(payload) != wire.COMPLEX_BYTES.size:
         raise RemoteProtocolError("A complex number does not have 16 bytes.")
-    return complex(*kinds.COMPLEX_BYTES.unpack(payload))
+    return complex(*wire.COMPLEX_BYTES.unpack(payload))
 
 
 def _read_pickle_frame(decoder: Decoder, payload: bytes) -> object:
@@ -289,21 +289,53 @@ def _inert_texts(items: list[Any]) -> tuple[str, str]:
 
 
 _READERS: dict[int, Callable[[Decoder, bytes], object]] = {
-    kinds.ARRAY: Decoder.take,
-    kinds.SCALAR: _read_scalar,
-    kinds.INTEGER: _read_integer,
-    kinds.COMPLEX: _read_complex,
-    kinds.PICKLE: _read_pickle,
-    kinds.PICKLE_FRAME: _read_pickle_frame,
+    wire.ARRAY: Decoder.take,
+    wire.SCALAR: _read_scalar,
+    wire.INTEGER: _read_integer,
+    wire.COMPLEX: _read_complex,
+    wire.PICKLE: _read_pickle,
+    wire.PICKLE_FRAME: _read_pickle_frame,
 }
 _BUILDERS: dict[int, Callable[[Decoder, _Head, list[Any]], object]] = {
-    kinds.TUPLE: lambda decoder, head, items: tuple(items),
-    kinds.SET: _build_set,
-    kinds.FROZENSET: lambda decoder, head, items: frozenset(_build_set(decoder, head, items)),
-    kinds.RANGE: _build_range,
-    kinds.SLICE: _build_slice,
-    **dict.fromkeys((kinds.OBJECTS, kinds.TEXT_SCALAR, kinds.TENSOR), _build_of_numpy),
-    kinds.ENUM: _build_enum,
-    kinds.REMOTE: _build_remote,
-    **dict.fromkeys((kinds.SPACE, kinds.SPEC, kinds.GENERATOR), Decoder.make),
+    wire.TUPLE: lambda decoder, head, items: tuple(items),
+    wire.SET: _build_set,
+    wire.FROZENSET: lambda decoder, head, items: frozenset(_build_set(decoder, head, items)),
+    wire.RANGE: _build_range,
+    wire.SLICE: _build_slice,
+    **dict.fromkeys((wire.OBJECTS, wire.TEXT_SCALAR, wire.TENSOR), _build_of_numpy),
+    wire.ENUM: _build_enum,
+    wire.REMOTE: _build_remote,
+    **dict.fromkeys((wire.SPACE, wire.SPEC, wire.GENERATOR), Decoder.make),
 }
+
+
+def decode(
+    frames: Sequence[Buffer],
+    *,
+    limits: WireLimits = DEFAULT_LIMITS,
+    unpickler: Unpickler | None = None,
+    tensors: TensorMaker | None = None,
+    copy: bool = True,
+    things: ThingReader | None = None,
+) -> object:
+    """Decodes frames into the value that was encoded.
+
+    Trust: input from the worker. Sizes are checked before anything is allocated, every byte
+    must be accounted for, and nothing is executed.
+
+    Args:
+        frames: As ``encode`` returned them.
+        limits: What is accepted.
+        unpickler: Decodes pickled objects; only a worker, which trusts its client, has one.
+        tensors: Makes a tensor of an array and a dtype name (``"bfloat16"`` comes as uint16
+            bits). Without it tensors come as arrays, bfloat16 as float32.
+        copy: Arrays own their memory and can be written. Otherwise they are read-only and the
+            large ones are views of ``frames``.
+        things: Begins to make what is described. Decoders without it refuse descriptions.
+
+    Raises:
+        MessageTooLargeError: Over one of ``limits``.
+        RemoteProtocolError: Malformed in any other way.
+    """
+    document, tail, buffers = wire.split_frames(frames, limits)
+    return Decoder(tail, buffers, limits, unpickler, tensors, things, copy).value(document)

@@ -7,33 +7,24 @@ without. ``numpy_forms`` has the forms of arrays, and is loaded with the first v
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from enum import Enum
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
 import msgpack  # type: ignore[import-untyped]
 
-from envhub_worker.protocol.codec import kinds, structure
+from envhub_worker.protocol.codec import wire
 from envhub_worker.protocol.codec.inert import RemoteEnum, RemoteObject, inert_copy, inert_enum
-from envhub_worker.protocol.codec.kinds import Buffer
+from envhub_worker.protocol.codec.wire import Buffer, PickledValue, Pickler
 from envhub_worker.protocol.errors import LocalProtocolError
-from envhub_worker.protocol.limits import WireLimits
-from envhub_worker.protocol.records import dataclass
+from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 
 if TYPE_CHECKING:
     from envhub_worker.protocol.codec.arrays import Array, ArrayWriter
 
 Describer = Callable[[object], "tuple[int, object] | None"]
 """The code and the plain value of what the peer can make again; None of all else."""
-Pickler = Callable[[object], Buffer]
-
-
-@dataclass(frozen=True)
-class PickledValue:
-    """A value that travels pickled. A ``memoryview`` becomes a frame of its own."""
-
-    data: Buffer
 
 
 class Encoder:
@@ -50,8 +41,8 @@ class Encoder:
     def frames(self, value: object) -> list[Buffer]:
         """Returns the header frame and the arrays' frames."""
         document = self._pack(value)
-        structure.check(document, self.limits)
-        prefix = kinds.DOCUMENT_BYTES.pack(len(document))
+        wire.check_document(document, self.limits)
+        prefix = wire.DOCUMENT_BYTES.pack(len(document))
         if self._writer is None:
             return [prefix + document]
         return [b"".join((prefix, document, *self._writer.tail)), *self._writer.frames]
@@ -97,26 +88,26 @@ def _write_integer(encoder: Encoder, value: int) -> object:
     size = value.bit_length() // 8 + 1
     if size > encoder.limits.int_bytes:
         raise LocalProtocolError(f"an integer of {size} bytes")
-    return msgpack.ExtType(kinds.INTEGER, value.to_bytes(size, "little", signed=True))
+    return msgpack.ExtType(wire.INTEGER, value.to_bytes(size, "little", signed=True))
 
 
 def _write_complex(encoder: Encoder, value: complex) -> object:
-    return msgpack.ExtType(kinds.COMPLEX, kinds.COMPLEX_BYTES.pack(value.real, value.imag))
+    return msgpack.ExtType(wire.COMPLEX, wire.COMPLEX_BYTES.pack(value.real, value.imag))
 
 
 def _write_pickled(encoder: Encoder, pickled: PickledValue) -> object:
     data = pickled.data
     if type(data) is bytes:
-        return msgpack.ExtType(kinds.PICKLE, data)
+        return msgpack.ExtType(wire.PICKLE, data)
     import numpy as np
 
-    return msgpack.ExtType(kinds.PICKLE_FRAME, encoder.array(np.frombuffer(data, np.uint8)))
+    return msgpack.ExtType(wire.PICKLE_FRAME, encoder.array(np.frombuffer(data, np.uint8)))
 
 
 def _write_other(encoder: Encoder, value: Any) -> object:
     """Handles subclasses, arrays and tensors of other libraries, and the unknown."""
     if isinstance(value, Enum):
-        return [_HEADS[kinds.ENUM], *inert_enum(value), value.value]
+        return [_HEADS[wire.ENUM], *inert_enum(value), value.value]
     if "numpy" in sys.modules:
         form = _numpy_writer()(encoder, value)
         if form is not NotImplemented:
@@ -150,23 +141,23 @@ def _bounds(code: int) -> Callable[[Encoder, Any], object]:
 
 
 def _write_remote(encoder: Encoder, value: RemoteObject) -> object:
-    return [_HEADS[kinds.REMOTE], value.type_name, value.text]
+    return [_HEADS[wire.REMOTE], value.type_name, value.text]
 
 
 def _write_remote_enum(encoder: Encoder, value: RemoteEnum) -> object:
-    return [_HEADS[kinds.ENUM], value.type_name, value.text, value.value]
+    return [_HEADS[wire.ENUM], value.type_name, value.text, value.value]
 
 
-_HEADS = {code: msgpack.ExtType(code, b"") for code in range(kinds.TUPLE, kinds.GENERATOR + 1)}
+_HEADS = {code: msgpack.ExtType(code, b"") for code in range(wire.TUPLE, wire.GENERATOR + 1)}
 
 _WRITERS: dict[type, Callable[[Encoder, Any], object]] = {
     int: _write_integer,
-    tuple: _headed(kinds.TUPLE),
-    set: _headed(kinds.SET),
-    frozenset: _headed(kinds.FROZENSET),
+    tuple: _headed(wire.TUPLE),
+    set: _headed(wire.SET),
+    frozenset: _headed(wire.FROZENSET),
     complex: _write_complex,
-    range: _bounds(kinds.RANGE),
-    slice: _bounds(kinds.SLICE),
+    range: _bounds(wire.RANGE),
+    slice: _bounds(wire.SLICE),
     PickledValue: _write_pickled,
     RemoteObject: _write_remote,
     RemoteEnum: _write_remote_enum,
@@ -179,3 +170,73 @@ _PLAIN: dict[type, Callable[[Any], object]] = {
     bytes: bytes,
 }
 _BASES = (int, tuple, complex, set, frozenset)
+
+
+def encode(
+    value: object,
+    *,
+    pickler: Pickler | None = None,
+    limits: WireLimits = DEFAULT_LIMITS,
+    names: Sequence[str] = (),
+    describer: Describer | None = None,
+    reduces: bool = False,
+) -> list[Buffer]:
+    """Encodes a value as frames: the header, then one per large array.
+
+    Args:
+        value: Plain Python values, numpy arrays and scalars, torch tensors, nested in any way.
+            Anything else crosses as ``RemoteObject``.
+        pickler: Encodes objects that have no form of their own instead. Client to worker only.
+        limits: What the receiver accepts.
+        names: What to call the elements of the value in an error.
+        describer: Describes what the receiver can make again. Worker to client only.
+        reduces: Whether a ``RemoteObject`` may stand in the place of a part that cannot be sent.
+
+    Returns:
+        Frames to be sent in this order. Large contiguous arrays are not copied, and must
+        not be written until the frames are sent.
+
+    Raises:
+        LocalProtocolError: The value is cyclic, too deep, too large, or holds a dtype that
+            cannot cross. The text names the path to the offender. Nothing was sent.
+    """
+    encoder = Encoder(pickler, limits, describer)
+    try:
+        frames = encoder.frames(value)
+        if reduces:
+            wire.check_outgoing_frames(frames, limits)
+    except Exception as error:
+        if reduces and type(value) is list:
+            smaller = _reduced_frames(value, limits, describer)
+            if smaller is not None:
+                return smaller
+        # Objects' own code runs here (__array__, iteration): anything can come out of it.
+        from envhub_worker.protocol.codec.unsendable import explain
+
+        def send(leaf: object) -> list[Buffer]:
+            return Encoder(pickler, limits).frames(leaf)
+
+        raise LocalProtocolError(explain(value, error, limits, send, names)) from error
+    wire.check_outgoing_frames(frames, limits)
+    return frames
+
+
+def _reduced_frames(
+    message: list[Any], limits: WireLimits, describer: Describer | None
+) -> list[Buffer] | None:
+    """Those of the message without what cannot be sent; None where that does not help."""
+    from envhub_worker.protocol.codec.unsendable import reduced
+
+    def sendable(value: object) -> bool:
+        try:
+            wire.check_outgoing_frames(Encoder(None, limits, describer).frames(value), limits)
+        except Exception:
+            return False
+        return True
+
+    try:
+        frames = Encoder(None, limits, describer).frames(reduced(message, sendable, limits))
+        wire.check_outgoing_frames(frames, limits)
+    except Exception:
+        return None
+    return frames

@@ -10,7 +10,7 @@ from typing import Any
 import msgpack  # type: ignore[import-untyped]
 import numpy as np
 
-from envhub_worker.protocol.codec import kinds
+from envhub_worker.protocol.codec import wire
 from envhub_worker.protocol.codec.arrays import (
     Array,
     check_content,
@@ -36,8 +36,8 @@ def _write_array(encoder: Encoder, array: Array) -> object:
     if array.dtype.char in _WIDEST and encoder.pickler is None:
         array = array.astype(_WIDEST[array.dtype.char])
     if array.dtype.kind not in ("O" if encoder.pickler else "OV"):
-        return msgpack.ExtType(kinds.ARRAY, encoder.array(array))
-    return [msgpack.ExtType(kinds.OBJECTS, pack_shape(array.shape)), *array.ravel().tolist()]
+        return msgpack.ExtType(wire.ARRAY, encoder.array(array))
+    return [msgpack.ExtType(wire.OBJECTS, pack_shape(array.shape)), *array.ravel().tolist()]
 
 
 def _write_scalar(encoder: Encoder, scalar: np.generic) -> object:
@@ -48,23 +48,23 @@ def _write_scalar(encoder: Encoder, scalar: np.generic) -> object:
     if scalar.dtype.char in _WIDEST and encoder.pickler is None:
         scalar = _WIDEST[scalar.dtype.char](scalar)
     array = native(np.asarray(scalar))
-    return msgpack.ExtType(kinds.SCALAR, describe_dtype(array.dtype) + array.tobytes())
+    return msgpack.ExtType(wire.SCALAR, describe_dtype(array.dtype) + array.tobytes())
 
 
 def _write_text_scalar(encoder: Encoder, value: np.str_ | np.bytes_) -> object:
     plain = str(value) if isinstance(value, np.str_) else bytes(value)
-    return [msgpack.ExtType(kinds.TEXT_SCALAR, b""), plain]
+    return [msgpack.ExtType(wire.TEXT_SCALAR, b""), plain]
 
 
 def _write_tensor(encoder: Encoder, tensor: Any) -> object:
     name = str(tensor.dtype).rpartition(".")[2]
-    if name not in kinds.TENSOR_DTYPES or str(tensor.layout) != "torch.strided":
+    if name not in wire.TENSOR_DTYPES or str(tensor.layout) != "torch.strided":
         return encoder.unknown(tensor)
     plain = tensor.detach().cpu().resolve_conj().resolve_neg()
     if name == "bfloat16":
         plain = plain.view(sys.modules["torch"].int16)
-    array = plain.numpy().view(kinds.TENSOR_DTYPES[name])
-    return [msgpack.ExtType(kinds.TENSOR, name.encode()), array]
+    array = plain.numpy().view(wire.TENSOR_DTYPES[name])
+    return [msgpack.ExtType(wire.TENSOR, name.encode()), array]
 
 
 def write_numpy(encoder: Encoder, value: Any) -> object:
@@ -136,7 +136,7 @@ def _build_text_scalar(payload: bytes, items: list[Any], tensors: Tensors) -> ob
 def _build_tensor(payload: bytes, items: list[Any], tensors: Tensors) -> object:
     name = payload.decode("ascii", "replace")
     array = items[0] if len(items) == 1 else None
-    if not isinstance(array, np.ndarray) or array.dtype.name != kinds.TENSOR_DTYPES.get(name):
+    if not isinstance(array, np.ndarray) or array.dtype.name != wire.TENSOR_DTYPES.get(name):
         raise RemoteProtocolError("A tensor is not made of a fitting array.")
     if tensors is not None:
         return tensors(array, name)
@@ -150,7 +150,7 @@ def widened_numpy(bits: Array) -> Array:
 
 
 BUILDERS: dict[int, Callable[[bytes, list[Any], Tensors], object]] = {
-    kinds.OBJECTS: _build_objects,
-    kinds.TEXT_SCALAR: _build_text_scalar,
-    kinds.TENSOR: _build_tensor,
+    wire.OBJECTS: _build_objects,
+    wire.TEXT_SCALAR: _build_text_scalar,
+    wire.TENSOR: _build_tensor,
 }

@@ -5,7 +5,6 @@ and close jails and to relay; ``runner.py`` is between client and runner, about 
 """
 
 # ruff: noqa: F403 - the names are sixty, and stand in these modules
-from envhub_worker.protocol.messages.base import *
-from envhub_worker.protocol.messages.packing import *
+from envhub_worker.protocol.messages.message import *
 from envhub_worker.protocol.messages.runner import *
 from envhub_worker.protocol.messages.server import *

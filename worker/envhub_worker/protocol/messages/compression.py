@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec.kinds import Buffer
+from envhub_worker.protocol.codec.wire import Buffer
 from envhub_worker.protocol.errors import MessageTooLargeError, RemoteProtocolError
 from envhub_worker.protocol.limits import WireLimits
 

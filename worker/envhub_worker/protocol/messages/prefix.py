@@ -10,12 +10,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Generic, TypeVar
 
-from envhub_worker.protocol.codec.kinds import Buffer
-from envhub_worker.protocol.errors import MessageTooLargeError, RemoteProtocolError
-from envhub_worker.protocol.messages.base import Message, values_of
-from envhub_worker.protocol.messages.packing import pack, unpack
+from envhub_worker.protocol.codec.wire import Buffer
+from envhub_worker.protocol.errors import UNTRUSTED, MessageTooLargeError, RemoteProtocolError
+from envhub_worker.protocol.messages.message import Message, pack, unpack, values_of
 from envhub_worker.protocol.messages.runner import Changes, Warnings
-from envhub_worker.protocol.untrusted import UNTRUSTED
 
 MAX_CATEGORY = 256
 MAX_TEXT = 2048

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from envhub_worker.protocol.messages.base import Message
+from envhub_worker.protocol.messages.message import Message
 
 CONFIG_CLASS = "<class>"
 """The key, among an object's attributes in ``Load.cfg``, of what its class is: ``(names, fields,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from envhub_worker.protocol.confinement import Reason
-from envhub_worker.protocol.messages.base import Message
+from envhub_worker.protocol.messages.message import Message
 from envhub_worker.protocol.runtime import HubCopy, Runtime, read_hub_copies
 
 

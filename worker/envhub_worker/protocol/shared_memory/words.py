@@ -43,7 +43,7 @@ HEADER_BYTES = HEADER_WORDS * 8
 
 DONE, RAISED, FETCH, COLUMNS = 1, 2, 3, 4
 """Results and encoded infos are in the slab; an encoded ``RaisedException`` is; the infos must be
-fetched; the infos are columns (see ``columns``)."""
+fetched; the infos are columns (see ``slabs``)."""
 
 OWN_BYTES = SPIN * 8
 """Where the client's own words begin in the request slab. Before them stand those of who announces

@@ -15,10 +15,8 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.spaces.graph import GraphInstance
 
-from envhub_worker.protocol.errors import MessageTooLargeError, RemoteProtocolError
-from envhub_worker.protocol.spaces.opaque import OneOf
-from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES
-from envhub_worker.protocol.untrusted import FAULTS
+from envhub_worker.protocol.errors import FAULTS, MessageTooLargeError, RemoteProtocolError
+from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES, OneOf
 
 Bounds = Sequence[tuple[int, int]]
 

@@ -15,17 +15,18 @@ from numpy.typing import NDArray
 
 from envhub_worker.protocol.codec.inert import MAX_NAME_CHARS, one_line
 from envhub_worker.protocol.errors import EnvHubError, RemoteProtocolError
-from envhub_worker.protocol.spaces.opaque import (
+from envhub_worker.protocol.spaces.spaces import (
     BOX_DTYPES,
     FIELDS,
+    GENERATORS,
     INTEGER_DTYPES,
     MAX_SPACE_DEPTH,
     OneOf,
     OpaqueSpace,
     is_charset,
     is_shape,
+    seeded_nodes,
 )
-from envhub_worker.protocol.spaces.seeded import seeded_nodes
 
 # Children of one Dict, Tuple or OneOf; a batch of custom spaces is a Tuple of as many.
 MAX_CHILDREN = 65_536
@@ -42,8 +43,6 @@ CHARACTER_BYTES = 256
 """One character of a Text's set, which stands in a set, a list and a dict."""
 GENERATOR_BYTES = 4 * SPACE_BYTES
 """The largest state of a generator, and the objects around it."""
-GENERATORS = "generators"
-"""The key of what the generators of a space and its parts are to begin with."""
 _SHARED_BYTES = 256
 
 _DISCRETE_HAS_DTYPE = "dtype" in signature(spaces.Discrete.__init__).parameters

@@ -1,37 +1,199 @@
 """Gymnasium spaces to plain values; ``reader.py`` reads them back.
 
 Works with Gymnasium 0.26 to 1.4, which may differ between the two ends.
+
+A space that its author has seeded draws the same samples in each run, and so must its copy in the
+client: the states of its generators travel along. One that was not seeded starts anywhere: its
+state does not travel, for a remembered description would make every run start at the same place.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from functools import singledispatch
-from typing import Any
+from typing import Any, NoReturn, TypeGuard
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from envhub_worker.protocol.codec.arrays import MAX_DIMENSIONS
 from envhub_worker.protocol.codec.inert import MAX_NAME_CHARS, inert_copy, one_line
 from envhub_worker.protocol.errors import LocalProtocolError
-from envhub_worker.protocol.spaces.opaque import (
-    ARRAY_SPACES,
-    BOX_DTYPES,
-    FIELDS,
-    MAX_SPACE_DEPTH,
-    OneOf,
-    OpaqueSpace,
-    is_charset,
-    is_shape,
-)
-from envhub_worker.protocol.spaces.reader import GENERATORS
-from envhub_worker.protocol.spaces.seeded import seeded_states
 
-__all__ = ["ARRAY_SPACES", "OpaqueSpace", "encode_space"]
+# A nested space takes two containers of the wire's depth of 32; messages need some around it.
+MAX_SPACE_DEPTH = 12
+
+_DTYPE_CODES = ("?", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4", "f8")
+BOX_DTYPES = {np.dtype(code).name: np.dtype(code) for code in _DTYPE_CODES}
+INTEGER_DTYPES = {name: dtype for name, dtype in BOX_DTYPES.items() if dtype.kind in "iu"}
+
+ARRAY_SPACES = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
+"""Whose members are arrays or numbers, and whose batches are one array."""
+FIELDS = {
+    "opaque": ("type", "text", "shape", "dtype"),
+    "box": ("dtype", "shape", "low", "high", "bounded_below", "bounded_above"),
+    "discrete": ("n", "start", "dtype"),
+    "multi_discrete": ("dtype", "shape", "nvec", "start"),
+    "multi_binary": ("n",),
+    "text": ("min_length", "max_length", "characters"),
+    "dict": ("keys", "spaces", "sort_keys"),
+    "tuple": ("spaces",),
+    "one_of": ("spaces",),
+    "sequence": ("space", "stack"),
+    "graph": ("node", "edge"),
+}
+"""By the kind of a space: what describes it, beside the kind."""
+
+GENERATORS = "generators"
+"""The key of what the generators of a space and its parts are to begin with."""
+
+# Gymnasium 0.29 has none.
+OneOf: Any = getattr(spaces, "OneOf", None)
+
+
+class OpaqueSpace(gym.Space[Any]):
+    """Stands for a space of the peer that Gymnasium does not know.
+
+    It can say what it is, be compared and batched, and nothing else.
+
+    Attributes:
+        type_name: Qualified class name of the peer's space.
+        text: Its ``repr``; bounded and printable.
+        dtype_text: Its dtype as text, empty if it has none.
+    """
+
+    def __init__(
+        self, type_name: str, text: str, shape: tuple[int, ...] | None = None, dtype_text: str = ""
+    ) -> None:
+        super().__init__(shape=shape)
+        self.type_name, self.text, self.dtype_text = type_name, text, dtype_text
+
+    @property
+    def is_np_flattenable(self) -> bool:
+        """False: nothing is known about its elements."""
+        return False
+
+    def sample(self, *args: Any, **kwargs: Any) -> NoReturn:
+        """Raises ``gymnasium.error.CustomSpaceError``."""
+        self._refuse("sample from")
+
+    def contains(self, x: object) -> NoReturn:
+        """Raises ``gymnasium.error.CustomSpaceError``."""
+        self._refuse("check membership of")
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, OpaqueSpace) and self._identity() == other._identity()
+
+    def __hash__(self) -> int:
+        return hash(self._identity())
+
+    def __repr__(self) -> str:
+        return f"OpaqueSpace({self.type_name}: {self.text})"
+
+    def _identity(self) -> tuple[object, ...]:
+        return self.type_name, self.text, self.shape, self.dtype_text
+
+    def _refuse(self, what: str) -> NoReturn:
+        raise gym.error.CustomSpaceError(
+            f"Cannot {what} {self.type_name}: its code exists only inside the sandbox. "
+            "Build values for it yourself, or call the environment's own method for it."
+        )
+
+
+def is_shape(value: object) -> TypeGuard[tuple[int, ...]]:
+    """Says whether this is a tuple of sizes that numpy can take."""
+    return (
+        type(value) is tuple
+        and len(value) <= MAX_DIMENSIONS
+        and all(type(size) is int and 0 <= size < 2**31 for size in value)
+    )
+
+
+def is_charset(characters: str) -> bool:
+    """Says whether these are distinct characters that UTF-8 can carry."""
+    lone_surrogate = any("\ud800" <= char <= "\udfff" for char in characters)
+    return len(set(characters)) == len(characters) and not lone_surrogate
+
 
 Space = gym.Space[Any]
+States = list[Any]
+_CHANCE_BITS = 64
+"""The entropy of a seed; what the operating system gives has twice as many bits."""
+BIT_GENERATORS = (
+    np.random.PCG64,
+    np.random.PCG64DXSM,
+    np.random.MT19937,
+    np.random.Philox,
+    np.random.SFC64,
+)
+
+
+def seeded_nodes(space: Space) -> Iterator[Space]:
+    """A space and all that it is made of, in a fixed order."""
+    yield space
+    for child in _parts_of(space):
+        yield from seeded_nodes(child)
+
+
+def seeded_states(space: Space, single: Space | None = None) -> States | None:
+    """What each node's generator is to begin with, None for those that were not seeded.
+
+    A number says that it is the very generator of an earlier node.
+
+    Args:
+        space: The space.
+        single: The one that it is a batch of, if it is. Gymnasium seeds copies of some spaces in a
+            batch, by chance where they were not seeded.
+
+    Returns:
+        None if there is nothing to tell.
+    """
+    if single is not None and not all(map(_may_be_batched, seeded_nodes(single))):
+        return None
+    found: States = []
+    first: dict[int, int] = {}
+    for index, node in enumerate(seeded_nodes(space)):
+        state = _state(node)
+        # one that several share: the place of the first
+        place = first.setdefault(id(getattr(node, "_np_random", None)), index)
+        found.append(state if state is None or place == index else place)
+    return found if any(state is not None for state in found) else None
+
+
+def _parts_of(space: Space) -> tuple[Space, ...]:
+    if isinstance(space, spaces.Dict):
+        return tuple(space.spaces.values())
+    if isinstance(space, spaces.Tuple) or (OneOf is not None and isinstance(space, OneOf)):
+        return tuple(space.spaces)
+    if isinstance(space, spaces.Sequence):
+        return (space.feature_space,)
+    if isinstance(space, spaces.Graph):
+        return (space.node_space, *(() if space.edge_space is None else (space.edge_space,)))
+    return ()
+
+
+def _may_be_batched(space: Space) -> bool:
+    """Whether the generators of its batch are seeded only if it is."""
+    return (
+        isinstance(space, (*ARRAY_SPACES, spaces.Dict, spaces.Tuple)) or _state(space) is not None
+    )
+
+
+def _state(space: Space) -> Any:
+    """The state of its generator; None if there is none, or it starts anywhere."""
+    generator = getattr(space, "_np_random", None)
+    if type(generator) is not np.random.Generator:
+        return None
+    bits = generator.bit_generator
+    if type(bits) not in BIT_GENERATORS:
+        return None
+    sequence = getattr(bits, "seed_seq", None) or getattr(bits, "_seed_seq", None)
+    entropy = getattr(sequence, "entropy", None)
+    if entropy is None or (isinstance(entropy, int) and entropy.bit_length() > _CHANCE_BITS):
+        return None
+    return bits.state
 
 
 def encode_space(

@@ -20,7 +20,7 @@ from envhub_sandbox.sandboxes.docker.run_arguments import Container
 from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
 from envhub_sandbox.settings.policy import Limits, Policy
 from envhub_worker.lockdown.seccomp import policy as seccomp_policy
-from envhub_worker.protocol.messages.surroundings import Surroundings
+from envhub_worker.protocol.confinement import Surroundings
 from envhub_worker.protocol.runtime import Runtime
 from tests.unit.docs.test_imports import folder, modules
 

@@ -44,17 +44,12 @@ class Both:
     """The client's shard, the server's slabs, and what a runner does with these."""
 
     def __init__(self, space: Any) -> None:
-        manifest = env_manifest(
-            single_observation_space=space, single_action_space=ACTIONS, num_envs=COUNT
-        )
-        shard = ServedShard.of(Results(manifest, [(0, COUNT)]), COUNT)
-        assert shard is not None
-        self.shard = shard
-        self.server = ServedSlabs(*shard.sizes)
         self.layout = slabs.layout_of(ACTIONS, COUNT)
         self.observed = slabs.observation_layout(space, COUNT, 1)
         assert self.layout is not None
         assert self.observed is not None
+        self.shard = ServedShard(space, self.layout, self.observed)
+        self.server = ServedSlabs(*self.shard.sizes)
         self.memory = [
             memoryview(memory(fd, size))
             for fd, size in zip(

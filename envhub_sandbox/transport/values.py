@@ -1,0 +1,295 @@
+"""What crosses the wire and is not plain: spaces, specs, generators and tensors that a worker
+describes, made here of plain values; and the caller's own values, pickled on their way in.
+
+Trust: every description is input from the worker. Nothing of the worker's is executed or unpickled:
+what comes is fields of a fixed form, each held against what such a thing can have. numpy checks
+next to nothing of a generator's state: an index behind a key makes the next draw a crash, one
+before a buffer makes the process's own memory the numbers, and a generator that stands still makes
+``integers`` loop for ever. So every field is held against what that generator can hold.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import io
+import sys
+from collections.abc import Callable, Mapping, Sequence
+from functools import cache
+from types import FunctionType
+from typing import Any, NoReturn, Union
+
+import cloudpickle  # type: ignore[import-untyped]
+import gymnasium as gym
+import numpy as np
+import numpy.typing as npt
+from gymnasium.envs.registration import EnvSpec
+
+from envhub_sandbox.errors import RemoteProtocolError
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.codec.arrays import INLINE_BYTES
+from envhub_worker.protocol.codec.inert import RemoteObject, one_line
+from envhub_worker.protocol.codec.numpy_forms import widened_numpy
+from envhub_worker.protocol.codec.wire import GENERATOR, SPACE, SPEC, Buffer
+from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
+from envhub_worker.protocol.manifest.manifest import read_spec_facts
+from envhub_worker.protocol.spaces.reader import (
+    ELEMENT_BYTES,
+    GENERATOR_BYTES,
+    SPACE_BYTES,
+    SpaceReader,
+)
+
+_Check = Callable[[Any], bool]
+_Form = Mapping[str, Union[_Check, "_Form"]]
+_KEY_WORDS = 624
+"""Of the Mersenne twister."""
+
+
+def generator(state: object) -> np.random.Generator:
+    """A generator in a given state. Trust: the state is input from the worker.
+
+    Raises:
+        RemoteProtocolError: It is no state that a generator can have.
+    """
+    name = state.get("bit_generator") if type(state) is dict else None
+    form = _FORMS.get(name) if type(name) is str else None
+    if form is None or name is None:
+        raise RemoteProtocolError("the worker sent the state of an unknown random generator")
+    wrong = _misfit(form, state, name)
+    if wrong is not None:
+        raise RemoteProtocolError(f"the worker sent a broken generator state: {wrong}")
+    bits = getattr(np.random, name)()
+    try:
+        bits.state = state
+    except (TypeError, ValueError, OverflowError) as error:  # newer releases check more themselves
+        raise RemoteProtocolError(f"numpy refuses the worker's generator state: {error}") from error
+    return np.random.Generator(bits)
+
+
+def seeds(value: object) -> Any:
+    """A seed, or one each. Trust: input from the worker.
+
+    Raises:
+        RemoteProtocolError: It is neither a number nor None.
+    """
+    for one in value if type(value) is tuple else (value,):
+        if one is not None and (isinstance(one, bool) or not isinstance(one, (int, np.integer))):
+            raise RemoteProtocolError(f"the worker sent a {type(one).__name__} for a seed")
+    return value
+
+
+def _misfit(form: _Form, value: Any, where: str) -> str | None:
+    """Which field has no such value; fields are exactly those of the form."""
+    if type(value) is not dict or value.keys() != form.keys():
+        return f"{where} has the fields {', '.join(form)}"
+    for name, check in form.items():
+        if isinstance(check, Mapping):
+            wrong = _misfit(check, value[name], name)
+            if wrong is not None:
+                return wrong
+        elif not check(value[name]):
+            return f"{name} has a value that it never has"
+    return None
+
+
+def _below(limit: int) -> _Check:
+    return lambda value: type(value) is int and 0 <= value < limit
+
+
+def _is_position(value: Any) -> bool:
+    return type(value) is int and 1 <= value <= 4  # of the next draw: 4 fills the buffer first
+
+
+def _words(count: int) -> _Check:
+    return lambda value: (
+        type(value) is np.ndarray and value.dtype == np.uint64 and value.shape == (count,)
+    )
+
+
+def _is_odd(value: Any) -> bool:
+    """An increment without which the generator's period is shorter, down to standing still."""
+    return _below(1 << 128)(value) and value % 2 == 1
+
+
+def _is_key(value: Any) -> bool:
+    if type(value) is not np.ndarray or value.dtype != np.uint32 or value.shape != (_KEY_WORDS,):
+        return False
+    return bool(value[0] >> 31 or value[1:].any())  # else it yields zeros for ever
+
+
+def _is_name(value: Any) -> bool:
+    return True  # its form was found by it
+
+
+_HALF: _Form = {"has_uint32": _below(2), "uinteger": _below(1 << 32)}
+_NAMED: _Form = {"bit_generator": _is_name}
+_PCG: _Form = {**_NAMED, "state": {"state": _below(1 << 128), "inc": _is_odd}, **_HALF}
+_FORMS: dict[str, _Form] = {
+    "PCG64": _PCG,
+    "PCG64DXSM": _PCG,
+    "MT19937": {**_NAMED, "state": {"key": _is_key, "pos": _below(_KEY_WORDS + 1)}},
+    "Philox": {
+        **_NAMED,
+        "state": {"counter": _words(4), "key": _words(2)},
+        "buffer": _words(4),
+        "buffer_pos": _is_position,
+        **_HALF,
+    },
+    "SFC64": {**_NAMED, "state": {"state": _words(4)}, **_HALF},
+}
+
+
+@cache
+def _torch() -> Any:
+    # a fixed name of ours: nothing is imported because a worker said so
+    if importlib.util.find_spec("torch") is None:
+        return None
+    import torch
+
+    return torch
+
+
+def to_tensor(array: npt.NDArray[Any], dtype: str) -> Any:
+    """A tensor that owns its memory, or the array if there is no torch.
+
+    Args:
+        array: The bits, owned and writable; ``uint16`` for ``bfloat16``.
+        dtype: Torch's name of the dtype, out of the codec's table.
+    """
+    torch = _torch()
+    if torch is None:
+        return widened_numpy(array) if dtype == "bfloat16" else array
+    tensor = torch.from_numpy(array)
+    return tensor.view(torch.bfloat16) if dtype == "bfloat16" else tensor
+
+
+def unpacked(frames: Sequence[Buffer], limits: WireLimits = DEFAULT_LIMITS) -> m.Message:
+    """A runner's message, with what it describes. Trust: input from the worker.
+
+    Raises:
+        RemoteProtocolError: It is none.
+    """
+    return m.unpack(frames, limits=limits, tensors=to_tensor, things=DescriptionReader)
+
+
+_REFUSAL = f"{__name__}:not_here"
+_SPEC_TYPE = "gymnasium.envs.registration.EnvSpec"
+_SHOWN = 200
+
+
+class DescriptionReader:
+    """What one message describes, out of one budget: all of it costs no more than its bytes may.
+
+    Args:
+        limits: What the message may hold.
+    """
+
+    def __init__(self, limits: WireLimits) -> None:
+        self._reader = SpaceReader(limits.message_bytes // ELEMENT_BYTES, generator=generator)
+
+    def __call__(self, code: int, value: object) -> object:
+        """The thing that is described. Trust: input from the worker.
+
+        Raises:
+            RemoteProtocolError: There can be none like it, or it costs too much.
+        """
+        if code == SPACE:
+            return self._reader.space(value)
+        if code == SPEC:
+            self._reader.spend(SPACE_BYTES)
+            return _spec(value)
+        if code == GENERATOR:
+            self._reader.spend(GENERATOR_BYTES)
+            return generator(value)
+        raise RemoteProtocolError(f"nothing is described by {code}")
+
+
+def _spec(value: object) -> Any:
+    """A spec; a description of one whose id this Gymnasium cannot read."""
+    facts = read_spec_facts(value)
+    made = spec_of(facts)
+    return RemoteObject(_SPEC_TYPE, one_line(str(facts), _SHOWN)) if made is None else made
+
+
+def spec_of(given: dict[str, Any] | None, reference: str = "") -> EnvSpec | None:
+    """A spec with these facts, as ``read_spec`` lets them through.
+
+    A string names what refuses, so that it can be written as JSON like any other.
+
+    Args:
+        given: ``id``, ``max_episode_steps``, ``reward_threshold``, ``nondeterministic``.
+        reference: The repository, for the text of the refusal.
+    """
+    # gym.make imports what stands before a colon
+    if given is None or given.get("id") is None or ":" in given["id"]:
+        return None
+    facts = {name: value for name, value in given.items() if value is not None}
+    try:
+        return EnvSpec(
+            **facts,
+            entry_point=_REFUSAL,
+            vector_entry_point=_REFUSAL,
+            kwargs={"reference": reference} if reference else {},
+        )
+    except Exception:  # an id that this Gymnasium cannot read: not worth failing for
+        return None
+
+
+def not_here(*args: Any, reference: str = "", **kwargs: Any) -> NoReturn:
+    """What ``gym.make(env.spec)`` calls.
+
+    Raises:
+        gymnasium.error.Error: Always.
+    """
+    where = f", {reference}" if reference else ""
+    raise gym.error.Error(
+        f"this describes an environment in a sandbox{where}, whose code never enters this process. "
+        "Use envhub_sandbox.make_env with that repository, or copy.deepcopy(env) for a copy"
+    )
+
+
+def pickled(value: object) -> bytes:
+    """What the jail makes the same value of; a class of ``__main__`` travels along."""
+    buffer = io.BytesIO()
+    _Pickler(buffer).dump(value)
+    return buffer.getvalue()
+
+
+def lasting(value: object) -> bytes:
+    """The same, if it says all there is to the value: no code of the caller's own is named in it.
+
+    Raises:
+        TypeError: It is; who knows what that code is by the next time.
+    """
+    buffer = io.BytesIO()
+    _LastingPickler(buffer).dump(value)
+    return buffer.getvalue()
+
+
+def framed(value: object) -> bytes | memoryview:
+    """The same, in a frame of its own where that is worth it."""
+    data = pickled(value)
+    return data if len(data) <= INLINE_BYTES else memoryview(data)
+
+
+class _Pickler(cloudpickle.Pickler):  # type: ignore[misc]
+    def reducer_override(self, value: Any) -> Any:
+        """A view of memory, which pickle knows nothing of, is one of a copy."""
+        if type(value) is memoryview:
+            plain = value.readonly and value.format == "B" and value.ndim == 1
+            return memoryview, (bytes(value) if plain else np.array(value),)
+        return super().reducer_override(value)
+
+
+class _LastingPickler(_Pickler):
+    def reducer_override(self, value: Any) -> Any:
+        """Judges classes and functions; their names are all that a pickle has of them."""
+        if isinstance(value, (type, FunctionType)):
+            package = str(value.__module__).partition(".")[0]
+            if package not in _INSTALLED and package not in sys.stdlib_module_names:
+                raise TypeError(f"{value.__qualname__} may be another one by the next time")
+        return super().reducer_override(value)
+
+
+_INSTALLED = frozenset({"gymnasium", "numpy"})
+"""Packages that come with the interpreter, as far as we know."""

@@ -1,0 +1,120 @@
+"""Spaces, specs and generators in answers: the same on the other side, out of one budget."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
+
+from envhub_sandbox.errors import RemoteProtocolError
+from envhub_sandbox.transport.values import DescriptionReader
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.codec.inert import RemoteObject
+from envhub_worker.protocol.limits import WireLimits
+from envhub_worker.protocol.spaces.spaces import OpaqueSpace
+from envhub_worker.runner.described import described
+from tests.support.compare import assert_same, assert_same_space
+
+SPACES: list[gym.Space[Any]] = [
+    spaces.Box(-1, np.inf, (2, 3), np.float16),
+    spaces.Discrete(3, start=-5),
+    spaces.MultiDiscrete([[2, 3], [4, 5]]),
+    spaces.MultiBinary((2, 2)),
+    spaces.Text(5, min_length=2, charset="ab"),
+    spaces.Dict({"b": spaces.Discrete(2), "a": spaces.Tuple([spaces.Box(0, 1, ())])}),
+    spaces.Sequence(spaces.Box(0, 1, (2,)), stack=True),
+    spaces.Graph(spaces.Box(0, 1, (2,)), spaces.Discrete(3)),
+    spaces.OneOf([spaces.Discrete(2), spaces.MultiBinary(3)]),
+]
+BITS = ("PCG64", "PCG64DXSM", "MT19937", "Philox", "SFC64")
+
+
+def arrived(value: object) -> Any:
+    """What a client makes of a worker's answer."""
+    frames = m.pack(m.Value(value), describer=described)
+    message = m.unpack(frames, things=DescriptionReader)
+    assert isinstance(message, m.Value)
+    return message.value
+
+
+@pytest.mark.parametrize("space", SPACES, ids=repr)
+@pytest.mark.parametrize("place", [lambda it: it, lambda it: ({"k": [it]},)], ids=["bare", "deep"])
+def test_spaces_arrive(space: gym.Space[Any], place: Callable[[Any], Any]) -> None:
+    """Wherever they stand in a value."""
+    found = arrived(place(space))
+    assert_same_space(space, found if found == space else found[0]["k"][0], "it")
+
+
+def test_spaces_in_object_arrays_arrive() -> None:
+    """As infos hold them."""
+    array = np.full(3, None, dtype=object)
+    array[0], array[2] = spaces.Tuple([spaces.Discrete(2)]), spaces.Dict({})
+    assert arrived(array).tolist() == array.tolist()
+
+
+class Custom(gym.Space[Any]):
+    """A space that Gymnasium does not know."""
+
+
+class Own(np.random.Generator):
+    """A generator that only its owner knows."""
+
+
+def test_what_only_its_owner_knows_is_told() -> None:
+    """A space as an opaque one, any other thing as a text."""
+    assert isinstance(arrived(Custom((2,), np.float32)), OpaqueSpace)
+    deep: Any = spaces.Discrete(2)
+    for _ in range(20):
+        deep = spaces.Tuple([deep])
+    for value in (deep, Own(np.random.PCG64()), np.random.RandomState(1), spaces.Discrete):
+        assert isinstance(arrived(value), RemoteObject)
+
+
+@pytest.mark.parametrize("bits", BITS)
+def test_generators_arrive(bits: str) -> None:
+    """They go on where the worker's stand, and are the caller's own."""
+    original = np.random.Generator(getattr(np.random, bits)(3))
+    original.integers(0, 9, 5, np.int32)
+    found = arrived((original, None))[0]
+    assert_same(original, found, "it")
+    assert found.random() == copy.deepcopy(original).random()
+
+
+def test_specs_arrive_as_facts() -> None:
+    """What would make something stays behind; they copy and pickle."""
+    given = EnvSpec("a/B-v1", entry_point="os:system", kwargs={"a": 1}, max_episode_steps=7)
+    found = arrived(given)
+    assert (found.id, found.max_episode_steps, found.name) == ("a/B-v1", 7, "B")
+    for spec in (found, copy.deepcopy(found), pickle.loads(pickle.dumps(found))):
+        assert "system" not in repr(spec)
+        with pytest.raises(gym.error.Error, match="in a sandbox"):
+            gym.make(spec)
+
+
+def test_a_message_has_one_budget() -> None:
+    """Each space would do; together they cost more than the message may hold."""
+    limits = WireLimits(message_bytes=48 << 10)
+    space = spaces.Box(0, 1, (3000,))
+    for values, fits in (((space,), True), ((space, spaces.Box(0, 2, (3000,)), space), False)):
+        frames = m.pack(m.Value(values), describer=described)
+        if fits:
+            assert m.unpack(frames, limits=limits, things=DescriptionReader) == m.Value(values)
+            continue
+        with pytest.raises(RemoteProtocolError, match="cost more"):
+            m.unpack(frames, limits=limits, things=DescriptionReader)
+
+
+def test_nobody_else_makes_anything_of_descriptions() -> None:
+    """Whoever was not given what makes them refuses them: a server, a runner, an older client."""
+    with pytest.raises(RemoteProtocolError, match="not made here"):
+        m.unpack(m.pack(m.Value(spaces.Discrete(2)), describer=described))
+    plain = m.unpack(m.pack(m.Value(spaces.Discrete(2))), things=DescriptionReader)
+    assert isinstance(plain, m.Value)
+    assert isinstance(plain.value, RemoteObject)

@@ -1,0 +1,312 @@
+"""Frames of a message, and the number in front of a header.
+
+Messages that recur are packed and unpacked by their form: nobody may notice.
+"""
+
+from __future__ import annotations
+
+import struct
+from typing import Any
+
+import cloudpickle
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.codec.arrays import ArrayReader
+from envhub_worker.protocol.codec.decoder import decode
+from envhub_worker.protocol.codec.encoder import encode
+from envhub_worker.protocol.codec.inert import RemoteEnum, RemoteObject
+from envhub_worker.protocol.errors import (
+    LocalProtocolError,
+    MessageTooLargeError,
+    ProtocolError,
+    RemoteProtocolError,
+)
+from envhub_worker.protocol.limits import WireLimits
+from envhub_worker.protocol.messages import message, runner, server
+from tests.support import inside
+
+
+@pytest.mark.parametrize("message", [server.GetStatus(), runner.Value([1, {"a": b"x"}])])
+def test_a_message_arrives_as_it_was(message: m.Message) -> None:
+    """By itself, and with a number of one or more."""
+    assert m.unpack(m.pack(message)) == message
+    for number in (1, 7, 1 << 40):
+        [frame] = m.pack_header(message, number)
+        assert m.unpack_header(frame) == (number, message)
+        assert m.number_of(frame) == m.id_of(frame) == number
+        assert bytes(m.without_id(frame)) == bytes(m.pack(message)[0])
+
+
+@pytest.mark.parametrize("frame", [b"", b"\0\0\0"])
+def test_a_header_without_a_number_has_none(frame: bytes) -> None:
+    """No error of another kind than the protocol's."""
+    assert m.number_of(frame) is None
+    assert m.id_of(frame) is None
+    assert m.id_of(b"\0" * 20) is None
+    with pytest.raises(ProtocolError):
+        m.unpack_header(frame)
+
+
+_DTYPES = ("bool", "int8", "uint16", "int64", "float16", "float32", ">f8", "complex64")
+_LEAVES = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers(-(2**70), 2**70),
+    st.text(max_size=5),
+    st.binary(max_size=5),
+    st.floats(),
+    st.builds(
+        lambda shape, dtype: np.arange(np.prod(shape, dtype=int)).reshape(shape).astype(dtype),
+        st.lists(st.integers(0, 3), max_size=3).map(tuple),
+        st.sampled_from(_DTYPES),
+    ),
+)
+_PLAIN_KEYS = st.one_of(
+    *(st.none(), st.integers(), st.text(max_size=3), st.binary(max_size=3)),
+    *(st.floats(allow_nan=False), st.complex_numbers(allow_nan=False), st.builds(np.int8)),
+    st.builds(RemoteObject, st.just("a.B"), st.text("xy", max_size=2)),
+)
+_KEYS = st.recursive(
+    _PLAIN_KEYS,
+    lambda inner: st.one_of(
+        st.tuples(inner, inner),
+        st.frozensets(inner, max_size=3),
+        st.builds(range, st.integers(-5, 5)),
+        st.builds(RemoteEnum, st.just("a.E"), st.text("xy"), st.lists(inner, max_size=2)),
+        st.builds(
+            *(RemoteEnum, st.just("a.F"), st.text("xy")),
+            st.dictionaries(st.text(max_size=3), inner, max_size=2),
+        ),
+    ),
+    max_leaves=4,
+)
+_VALUES = st.recursive(
+    _LEAVES,
+    lambda inner: st.one_of(
+        st.lists(inner, max_size=3),
+        st.lists(inner, max_size=3).map(tuple),
+        st.dictionaries(st.text(max_size=3), inner, max_size=3),
+        st.dictionaries(_KEYS, inner, max_size=3),
+    ),
+    max_leaves=8,
+)
+
+
+OUTGOING, INCOMING = inside.FORMS
+
+
+@pytest.fixture(autouse=True)
+def no_forms(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever other tests have sent."""
+    for spot in (OUTGOING, INCOMING):
+        monkeypatch.setattr(*spot, message.Forms())
+
+
+def alike(one: Any, other: Any) -> bool:
+    """Equal, and of the same types all the way down."""
+    if type(one) is not type(other):
+        return False
+    if isinstance(one, np.ndarray):
+        same = one.dtype == other.dtype and one.shape == other.shape
+        return same and one.tobytes() == other.tobytes() and one.flags.writeable
+    if isinstance(one, (list, tuple)):
+        return len(one) == len(other) and all(map(alike, one, other))
+    if isinstance(one, dict):
+        return list(one) == list(other) and all(alike(one[key], other[key]) for key in one)
+    return repr(one) == repr(other)
+
+
+def changed(value: Any) -> Any:
+    """The same with other numbers in its arrays."""
+    if isinstance(value, np.ndarray):
+        return np.logical_not(value) if value.dtype == bool else value + 1
+    if isinstance(value, (list, tuple)):
+        return type(value)(map(changed, value))
+    if isinstance(value, dict):
+        return {key: changed(item) for key, item in value.items()}
+    return value
+
+
+@given(_VALUES)
+def test_what_comes_again_is_packed_and_unpacked_as_the_first_time(value: Any) -> None:
+    """The codec itself decides what is right, for anything that it takes."""
+    for one in (value, value, value, changed(value)):
+        frames = m.pack(m.Value(one))
+        assert [bytes(f) for f in frames] == [bytes(f) for f in encode([m.Value.kind, one])]
+        message = m.unpack(frames)
+        assert isinstance(message, m.Value)
+        assert alike(message.value, decode(encode(one)))
+
+
+@pytest.mark.parametrize(("one", "other"), [(1, True), (0, False), (0.0, -0.0), ("a", b"a")])
+def test_what_is_equal_and_not_the_same_is_kept_apart(one: Any, other: Any) -> None:
+    """True is 1, and is not."""
+    for value in (one, one, one, other, other, other):
+        message = m.unpack(m.pack(m.Value((value, np.zeros(2)))))
+        assert isinstance(message, m.Value)
+        assert alike(message.value, (value, np.zeros(2)))
+
+
+MAPPED = RemoteEnum("a.E", "MAPPED", {"x": [1]})
+"""A member of an enumeration whose value is a mapping: the document has that inside of a key."""
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        *((1, 2), frozenset({1, 2}), range(3), ((), (range(2), "a")), 1.5, 2j, b"b", None),
+        *(MAPPED, (MAPPED, 1), frozenset({MAPPED}), RemoteEnum("a.E", "ARRAY", np.zeros(2))),
+        *(RemoteObject("a.B", "<b>"), np.int8(3), np.str_("a"), np.datetime64("2024-05-06"), 2**80),
+    ],
+    ids=repr,
+)
+def test_keys_that_are_no_text_recur(key: object) -> None:
+    """Repositories count visits by ``(x, y)``: the second such message is read as the first was."""
+    for number in range(4):
+        message = m.unpack(m.pack(m.Value({"visits": {key: number % 2}})))
+        assert message == m.Value({"visits": {key: number % 2}})
+
+
+def test_a_form_that_cannot_be_made_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For whatever reason: what was packed and unpacked without one is so again."""
+
+    def failing(*_: object) -> None:
+        raise RuntimeError
+
+    for name in ("Outgoing", "Incoming"):
+        monkeypatch.setattr(message, name, failing)
+    for _ in range(5):
+        assert m.unpack(m.pack(m.Value({"a": 1}))) == m.Value({"a": 1})
+
+
+def test_what_can_be_changed_of_a_recurring_message_is_the_receivers_own() -> None:
+    """What one receiver writes, no other sees."""
+    frames = m.pack(m.Value({"a": [1]}))
+    values = [m.unpack(frames).value for _ in range(4)]  # type: ignore[attr-defined]
+    for number, value in enumerate(values):
+        value["a"][:] = [number]
+        value["more"] = number
+    assert [value["a"] for value in values] == [[number] for number in range(4)]
+
+
+def _known(value: object) -> bytes:
+    """The header of a message whose form both sides know."""
+    for _ in range(3):
+        frames = m.pack(m.Value(value))
+        m.unpack(frames)
+    assert inside.forms(INCOMING)
+    [header] = frames
+    return bytes(header)
+
+
+@pytest.mark.parametrize("change", [lambda raw: raw[:-1], lambda raw: raw + b"x"])
+def test_the_bytes_of_a_known_message_are_counted(change: Any) -> None:
+    """Too few, too many, or a frame that nothing describes."""
+    header = _known("known")
+    with pytest.raises(RemoteProtocolError):
+        m.unpack([change(header)])
+    with pytest.raises(RemoteProtocolError):
+        m.unpack([header, b"more"])
+
+
+def test_the_limits_of_a_known_message_hold() -> None:
+    """A form is for the limits under which it was made, and no others."""
+    value = ["a" * 20, 1]
+    header = _known(value)
+    with pytest.raises(MessageTooLargeError):
+        m.unpack([header], limits=WireLimits(header_bytes=20))
+    with pytest.raises(MessageTooLargeError):
+        m.unpack([header], limits=WireLimits(depth=0))
+    with pytest.raises(LocalProtocolError):
+        m.pack(m.Value(value), limits=WireLimits(header_bytes=20))
+
+
+def test_a_known_header_is_read_with_any_id() -> None:
+    """The whole of it is known then; one byte more, and it is another."""
+    message = m.Relay(3, "step", ((1, 1),), stepped=True)
+    for number in range(1, 5):
+        [header] = m.pack_header(message, number)
+        assert m.unpack_header(bytes(header)) == (number, message)
+        assert m.unpack_header(memoryview(header)) == (number, message)
+    with pytest.raises(RemoteProtocolError):
+        m.unpack_header(bytes(header) + b"x")
+    with pytest.raises(MessageTooLargeError):
+        m.unpack_header(bytes(header), limits=WireLimits(header_bytes=20))
+
+
+def test_pickled_objects_and_tensors_never_have_a_form() -> None:
+    """What they become depends on who reads them."""
+    frames = m.pack(m.Value(_Own()), pickler=cloudpickle.dumps)
+    for _ in range(3):
+        message = m.unpack(frames, unpickler=cloudpickle.loads)
+        assert type(message.value).__name__ == "_Own"  # type: ignore[attr-defined]
+    for _ in range(3):
+        with pytest.raises(ProtocolError):
+            m.unpack(frames)
+    torch = pytest.importorskip("torch")
+    frames = m.pack(m.Value(torch.zeros(2)))
+    for _ in range(3):
+        assert type(m.unpack(frames).value) is np.ndarray  # type: ignore[attr-defined]
+    made = m.unpack(frames, tensors=lambda array, name: (name, array))
+    assert made.value[0] == "float32"  # type: ignore[attr-defined]
+
+
+class _Own:
+    """Something that only a pickler can send."""
+
+
+def test_a_peer_that_never_repeats_itself_fills_nothing() -> None:
+    """Of what comes once no more is kept than a number."""
+    for number in range(2000):
+        m.unpack(m.pack(m.Value(f"{number}")))
+    assert not inside.forms(INCOMING)
+    assert not inside.forms(OUTGOING)
+
+
+@pytest.mark.parametrize("message", [m.Value(None), m.Done()], ids=["a field", "no field"])
+def test_a_document_that_is_cut_off_is_refused(message: m.Message) -> None:
+    """No form is taken for it."""
+    for _ in range(3):
+        [known] = m.pack(message)
+        m.unpack([known])
+    document = bytes(known)[4:-1]
+    for rest in (b"\xcd\x01", b"\xcd", b""):
+        with pytest.raises(RemoteProtocolError):
+            m.unpack([struct.pack("<I", len(document + rest)) + document + rest])
+
+
+def test_memory_that_is_not_there_is_the_peers_fault(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As without a form."""
+    header, large = _framed()
+    monkeypatch.setattr(ArrayReader, "take", _without_memory)
+    with pytest.raises(MessageTooLargeError):
+        m.unpack([header, large])
+
+
+def _framed() -> tuple[bytes, bytes]:
+    """A known message with a frame of its own."""
+    for _ in range(3):
+        frames = m.pack(m.Value(np.zeros(50_000, np.uint8)))
+        m.unpack(frames)
+    return bytes(frames[0]), bytes(frames[1])
+
+
+def _without_memory(*_: object) -> None:
+    raise MemoryError
+
+
+def test_what_has_no_end_is_refused_as_without_a_form() -> None:
+    """It is the codec that says where it is."""
+    cyclic: list[object] = []
+    cyclic.append(cyclic)
+    deep: object = 1
+    for _ in range(5000):
+        deep = (deep,)
+    with pytest.raises(LocalProtocolError, match="contains itself"):
+        m.pack(m.Value({"a": cyclic}))
+    with pytest.raises(LocalProtocolError, match="nested deeper"):
+        m.pack(m.Value({"a": deep}))

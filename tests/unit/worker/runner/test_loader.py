@@ -1,0 +1,79 @@
+"""A caller's config object, made again of the plain values that have crossed."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import pytest
+
+from envhub_worker.protocol.messages import CONFIG_CLASS
+from envhub_worker.runner.loader import ConfigMapping, config_of
+
+
+@dataclasses.dataclass
+class Camera:
+    """A class that both sides have."""
+
+    width: int
+    name: str = "top"
+
+
+def here(module: str, name: str) -> type[Any] | None:
+    """Only the class above can be imported."""
+    return Camera if (module, name) == (__name__, "Camera") else None
+
+
+def described(*names: tuple[str, str], fields: Any, computed: Any = None, **values: Any) -> Any:
+    """As it crosses: the values, and what is said of their class."""
+    return {**values, CONFIG_CLASS: (names, fields, computed or {})}
+
+
+def test_the_class_itself_is_used_where_it_is_here() -> None:
+    """No code of it decides: a missing field has its default, and no argument is required."""
+    made = config_of(described((__name__, "Camera"), fields=("width", "name"), width=3), here)
+    assert made == Camera(3)
+    assert type(made) is Camera
+
+
+def test_elsewhere_a_dataclass_of_the_same_name_stands_in() -> None:
+    """With the caller's fields and what was computed there; its base is the nearest known one."""
+    said = described(
+        ("arena.configs", "Outer.ArmCamera"),
+        (__name__, "Camera"),
+        fields=("width", "name", "focus"),
+        computed={"pixels": 12},
+        width=3,
+        name="wrist",
+        focus=0.5,
+    )
+    made = config_of(said, here)
+    assert (type(made).__name__, type(made).__module__) == ("ArmCamera", "arena.configs")
+    assert isinstance(made, Camera)
+    assert dataclasses.asdict(made) == {"width": 3, "name": "wrist", "focus": 0.5}
+    assert dataclasses.replace(made, width=4).width == 4
+    assert made.pixels == 12
+
+
+@pytest.mark.parametrize("value", [5, "text", None, [1, {"a": 2}], (1, 2), {"a": {"b": [3]}}])
+def test_plain_values_stay_what_they_are(value: Any) -> None:
+    """Also their types."""
+    assert config_of(value, here) == value
+    assert type(config_of(value, here)) is type(value)
+
+
+def test_nested_objects_are_made_too() -> None:
+    """In fields, lists and mappings that were no dict."""
+    camera = described((__name__, "Camera"), fields=("width", "name"), width=3, name="top")
+    said = {"cameras": [camera], "more": described(fields=None, left=camera)}
+    made = config_of(said, here)
+    assert made["cameras"] == [Camera(3)]
+    assert type(made["more"]) is ConfigMapping
+    assert made["more"]["left"] == made["more"].left == Camera(3)
+
+
+def test_what_cannot_be_made_is_named() -> None:
+    """By its class, with what was to be its fields."""
+    said = described(("arena", "Bad"), fields=("not a name",), **{"not a name": 1})
+    with pytest.raises(TypeError, match=r"no Bad can be made of not a name"):
+        config_of(said, here)

@@ -1,0 +1,110 @@
+"""The layout of a jail's cache of the Hub, as huggingface_hub reads it.
+
+The stub of LeRobot: the names of its contract, and only where it is not installed.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import sys
+import warnings
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from huggingface_hub import snapshot_download
+
+from envhub_worker.lockdown.spec import JailSpec
+from envhub_worker.protocol.confinement import Confinement
+from envhub_worker.protocol.runtime import HubCopy
+from envhub_worker.spawn.preparations import install_lerobot_stub, make_hub_cache
+
+COMMIT = "ab" * 20
+
+
+def spec_of(snapshot: Path, *copies: HubCopy, **environment: str) -> JailSpec:
+    """A jail for these files."""
+    confinement = Confinement(environment=environment)
+    given = {"entry": "env.py", "confinement": confinement, "name": "x"}
+    return JailSpec(snapshot=str(snapshot), hub_copies=copies, **given)
+
+
+def test_the_snapshot_is_a_link_to_the_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every runner of a jail makes the same, and huggingface_hub finds it without a network."""
+    monkeypatch.setenv("HF_HOME", str(tmp_path / "hf"))
+    other = tmp_path / "other"
+    own = HubCopy("models--org--repo", COMMIT, ("main", "refs/pr/3"), "")
+    spec = spec_of(tmp_path, own, HubCopy("datasets--org--data", COMMIT, ("main",), str(other)))
+    for _ in range(2):
+        make_hub_cache(spec)
+    hub = tmp_path / "hf/hub"
+    assert (hub / "models--org--repo/refs/refs/pr/3").read_text() == COMMIT
+    assert (hub / "models--org--repo/snapshots" / COMMIT).readlink() == tmp_path
+    assert (hub / "datasets--org--data/snapshots" / COMMIT).readlink() == other
+    found = snapshot_download("org/repo", cache_dir=hub, local_files_only=True)
+    assert Path(found).resolve() == tmp_path.resolve()
+
+
+def test_a_cache_that_the_caller_gives_stays_as_it_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """``policy={"environment": ["HF_HOME"]}`` names another one."""
+    monkeypatch.setenv("HF_HOME", str(tmp_path / "theirs"))
+    copy = HubCopy("models--org--repo", COMMIT, ("main",), "")
+    make_hub_cache(spec_of(tmp_path, copy, HF_HOME=str(tmp_path / "theirs")))
+    assert not (tmp_path / "theirs").exists()
+
+
+@pytest.fixture(autouse=True)
+def stub(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """The stub, and no module of it afterwards."""
+    before = list(sys.meta_path)
+    for name in [one for one in sys.modules if one.partition(".")[0] == "lerobot"]:
+        monkeypatch.delitem(sys.modules, name)
+    install_lerobot_stub()
+    yield
+    sys.meta_path[:] = before
+    for name in [one for one in sys.modules if one.partition(".")[0] == "lerobot"]:
+        del sys.modules[name]
+
+
+def test_the_contract_is_there_and_it_warns_once() -> None:
+    """Configurations to annotate with and to inherit from, types of features, and constants."""
+    with pytest.warns(UserWarning, match="lerobot is not installed in the jail"):
+        importlib.import_module("lerobot")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        configs = importlib.import_module("lerobot.envs.configs")
+    types = importlib.import_module("lerobot.configs.types")
+    constants = importlib.import_module("lerobot.utils.constants")
+    assert importlib.import_module("lerobot.constants").ACTION == constants.ACTION
+    assert issubclass(configs.HubEnvConfig, configs.EnvConfig)
+    made = configs.HubEnvConfig(hub_path="org/repo", fps=10)
+    assert dataclasses.asdict(made)["hub_path"] == "org/repo"
+    own = configs.EnvConfig.register_subclass("own")(type("Own", (configs.EnvConfig,), {}))
+    assert own().gym_kwargs == {}
+    feature = types.PolicyFeature(type=types.FeatureType.ACTION, shape=(2,))
+    assert feature.type == "ACTION"
+    assert constants.OBS_IMAGES == "observation.images"
+
+
+@pytest.mark.filterwarnings("ignore:lerobot is not installed")
+def test_the_rest_is_missing_as_before() -> None:
+    """A module or a name that the stub does not have."""
+    with pytest.raises(ModuleNotFoundError, match=r"lerobot\.policies"):
+        importlib.import_module("lerobot.policies")
+    with pytest.raises(ImportError, match="AlohaEnv"):
+        exec("from lerobot.envs.configs import AlohaEnv")
+
+
+def test_lerobot_itself_goes_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also a release that has no such module: half a stub would be neither."""
+    (tmp_path / "lerobot").mkdir()
+    (tmp_path / "lerobot" / "__init__.py").write_text("REAL = True\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    assert importlib.import_module("lerobot").REAL
+    with pytest.raises(ModuleNotFoundError):
+        importlib.import_module("lerobot.envs")

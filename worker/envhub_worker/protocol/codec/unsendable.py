@@ -1,0 +1,340 @@
+"""What the wire does not carry as it is: pickled, named in an error, or described in its place.
+
+What the caller hands over arrives exactly as it is, or is pickled as one piece: where a value holds
+anything that the wire's forms would change (the class of a mapping, the order of an array in
+memory, a lone surrogate), or anything beyond their limits, all of it is pickled. Only from client
+to worker: nothing that comes back is ever unpickled.
+
+The rest runs only after a failure. The caller learns which part of a value cannot be sent. In what
+a runner sends, an inert description stands in the place of each such part, so that one part of a
+step's infos does not lose the rest of the step.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from enum import Enum
+from typing import Any
+
+import numpy as np
+
+from envhub_worker.protocol.codec.arrays import MAX_DIMENSIONS, MAX_UNIT_COUNT
+from envhub_worker.protocol.codec.inert import (
+    RemoteEnum,
+    RemoteObject,
+    inert_copy,
+    one_line,
+    type_name,
+)
+from envhub_worker.protocol.codec.wire import PickledValue, Pickler
+from envhub_worker.protocol.limits import WireLimits
+
+_DEPTH = 16
+"""Containers in containers; a message's own count towards the wire's limit, too."""
+_FEW = 64
+"""Keys that are no text, and elements of a set: the receiver counts those of larger ones."""
+_MOST_ARRAYS = 1024
+"""Each may become a frame."""
+_ATOMS = frozenset({type(None), bool, float, complex})
+_SCALARS = frozenset(np.dtype(char).type for char in "?bBhHiIlLqQefdFDmM")
+_ARRAYS = frozenset("?bBhHiIlLqQefdFDmMS")
+"""Characters of dtypes whose bytes are all there is to them."""
+
+
+def handed_over(value: object, pickler: Pickler, limits: WireLimits) -> object:
+    """The value itself, if the wire carries exactly that, or else its pickle."""
+    return value if _Judge(limits).holds(value, 0) else PickledValue(pickler(value))
+
+
+class _Judge:
+    """Says whether the wire's forms carry a value exactly, by the exact types of all that it holds.
+
+    Whatever it does not know is not exact: it is pickled, and that is exact.
+    """
+
+    __slots__ = ("_arrays_left", "_bytes_left", "_left", "_limits")
+
+    def __init__(self, limits: WireLimits) -> None:
+        self._limits = limits
+        self._left = limits.items // 2
+        self._bytes_left = limits.header_bytes // 4
+        self._arrays_left = _MOST_ARRAYS
+
+    def holds(self, value: Any, depth: int) -> bool:
+        kind = type(value)
+        self._left -= 1
+        if kind in _ATOMS:
+            return True
+        check = _CHECKS.get(kind)
+        return (
+            check is not None and depth < _DEPTH and self._left >= 0 and check(self, value, depth)
+        )
+
+    def all(self, values: Any, depth: int) -> bool:
+        return all(self.holds(value, depth + 1) for value in values)
+
+    def number(self, value: int, depth: int) -> bool:
+        return value.bit_length() // 8 < self._limits.int_bytes
+
+    def text(self, value: str, depth: int) -> bool:
+        """A text: none that UTF-8 cannot carry."""
+        if value.isascii():
+            return self.bytes(value, depth)
+        try:
+            return self.bytes(value.encode(), depth)
+        except UnicodeEncodeError:
+            return False
+
+    def bytes(self, value: Any, depth: int) -> bool:
+        self._bytes_left -= len(value)
+        return self._bytes_left >= 0 and len(value) <= self._limits.text_bytes
+
+    def mapping(self, value: dict[Any, Any], depth: int) -> bool:
+        plain = len(value) <= _FEW or set(map(type, value)) == {str}
+        return plain and self.all(value, depth) and self.all(value.values(), depth)
+
+    def elements(self, value: Any, depth: int) -> bool:
+        """A set of a few."""
+        return len(value) <= _FEW and self.all(value, depth)
+
+    def bounds(self, value: Any, depth: int) -> bool:
+        return self.all((value.start, value.stop, value.step), depth)
+
+    def array(self, value: Any, depth: int) -> bool:
+        """An array, as it lies in memory; strided ones are copied by pickle, too."""
+        dtype = value.dtype
+        self._arrays_left -= 1
+        if self._arrays_left < 0 or value.ndim > MAX_DIMENSIONS:
+            return False
+        if value.flags.fnc or not dtype.isnative or not dtype.itemsize or dtype.metadata:
+            return False
+        if dtype.kind == "O":
+            return self.all(value.ravel().tolist(), depth)
+        return dtype.char in _ARRAYS and _is_unit(dtype)
+
+    def scalar(self, value: Any, depth: int) -> bool:
+        return _is_unit(value.dtype)
+
+
+def _is_unit(dtype: np.dtype[Any]) -> bool:
+    return dtype.kind not in "mM" or np.datetime_data(dtype)[1] <= MAX_UNIT_COUNT
+
+
+def _always(judge: _Judge, value: Any, depth: int) -> bool:
+    return True
+
+
+_CHECKS: dict[type, Callable[[_Judge, Any, int], bool]] = {
+    int: _Judge.number,
+    bytes: _Judge.bytes,
+    np.bytes_: _Judge.bytes,
+    str: _Judge.text,
+    np.str_: _Judge.text,
+    list: _Judge.all,
+    tuple: _Judge.all,
+    dict: _Judge.mapping,
+    set: _Judge.elements,
+    frozenset: _Judge.elements,
+    range: _Judge.bounds,
+    slice: _Judge.bounds,
+    np.ndarray: _Judge.array,
+    RemoteObject: _always,
+    RemoteEnum: _always,
+    **dict.fromkeys(_SCALARS, _Judge.scalar),
+}
+
+Path = tuple[object, ...]
+_ATTEMPTS = 2000
+"""Values that are pickled to find the one that cannot be."""
+
+
+def explain(
+    value: object,
+    error: Exception,
+    limits: WireLimits,
+    send: Callable[[object], object],
+    names: Sequence[str] = (),
+) -> str:
+    """Says what cannot be sent, and where in the value it is; ``send`` raises for such a leaf."""
+    found = _Search(limits, send).first(value, (), ())
+    if found is None:
+        return f"The value cannot be sent: {error}"
+    path, reason = found
+    if path and names:
+        path = (names[path[0]], *path[1:])  # type: ignore[call-overload]
+    return f"{_path_text(path)} cannot be sent: {reason}."
+
+
+def unpicklable(name: str, value: object, error: Exception, pickler: Pickler) -> str:
+    """Says which part of an argument cannot be pickled, and what to do."""
+    text, culprit, error = _culprit(name, value, error, pickler, {id(value)})
+    reason = one_line(f"{type(error).__name__}: {error}", 500)
+    return (
+        f"{one_line(text)} cannot be sent: a {type_name(type(culprit))} cannot be pickled "
+        f"({reason}). Pass plain data, or a function that makes the object there."
+    )
+
+
+def _culprit(
+    text: str, value: object, error: Exception, pickler: Pickler, seen: set[int]
+) -> tuple[str, object, Exception]:
+    """The innermost value that fails, how to call it, and how it does."""
+    for step, child in _members(value):
+        if id(child) in seen or len(seen) > _ATTEMPTS:
+            continue
+        seen.add(id(child))
+        try:
+            pickler(child)
+        except Exception as inner:
+            return _culprit(text + step, child, inner, pickler, seen)
+    return text, value, error
+
+
+def _members(value: object) -> Iterator[tuple[str, object]]:
+    """What a value consists of, and how one gets at it."""
+    for step, child in _children(value) or ():
+        yield f"[{_step_text(step)}]", child
+    attributes = getattr(value, "__dict__", None)
+    if type(attributes) is dict:
+        for name, child in attributes.items():
+            yield f".{name}", child
+
+
+class _Search:
+    """Walks a value until it meets the offender, or has met as many values as may be sent."""
+
+    def __init__(self, limits: WireLimits, send: Callable[[object], object]) -> None:
+        self.limits, self._send = limits, send
+        self._left = limits.items
+
+    def first(self, value: object, path: Path, above: tuple[int, ...]) -> tuple[Path, str] | None:
+        """Returns path and reason of the first value that is cyclic, too deep, or refused."""
+        children = _children(value)
+        if children is None:
+            reason = self._refusal(value)
+            return None if reason is None else (path, reason)
+        if id(value) in above:
+            return path, "it contains itself"
+        if len(above) == self.limits.depth:
+            return path, f"it is nested deeper than {self.limits.depth} containers"
+        for step, child in children:
+            self._left -= 1
+            if self._left < 0:
+                return None
+            found = self.first(child, (*path, step), (*above, id(value)))
+            if found is not None:
+                return found
+        return None
+
+    def _refusal(self, value: object) -> str | None:
+        try:
+            self._send(value)
+        except Exception as error:
+            return str(error).rstrip(".") or type(error).__name__
+        return None
+
+
+def _children(value: object) -> list[tuple[object, object]] | None:
+    """Returns steps and elements of a container, None for a leaf."""
+    if isinstance(value, dict):
+        keys = [(key, key) for key in value if isinstance(key, tuple | frozenset | Enum)]
+        return [*keys, *value.items()]
+    if isinstance(value, list | tuple | set | frozenset):
+        return list(enumerate(value))
+    if isinstance(value, np.ndarray) and value.dtype.kind == "O":
+        return list(enumerate(value.ravel().tolist()))
+    return None
+
+
+def _path_text(path: tuple[object, ...]) -> str:
+    """Writes ``("info", "a", 3)`` as ``info["a"][3]``."""
+    if not path:
+        return "The value"
+    first, *rest = path
+    named = isinstance(first, str) and first.isidentifier()
+    steps = [str(first)] if named else [f"value[{_step_text(first)}]"]
+    return one_line("".join([*steps, *(f"[{_step_text(step)}]" for step in rest)]))
+
+
+def _step_text(step: object) -> str:
+    return inert_copy(step).text
+
+
+_PLAIN = frozenset({bool, float, type(None)})
+_SHORT = 64
+"""Characters of a text, bits of an integer, that need no trial."""
+_AROUND = 2
+"""Containers: the message, and a description, which is one itself."""
+_SPARE = 64
+"""Items for what stands around the value in a message."""
+Sendable = Callable[[object], bool]
+
+
+def reduced(message: list[Any], sendable: Sendable, limits: WireLimits) -> list[Any]:
+    """The fields of a message with descriptions in the place of what cannot be sent.
+
+    A field that is a mapping or a tuple stays one.
+
+    Args:
+        sendable: Whether a value that is no container can be sent by itself.
+    """
+    walk = _Walk(sendable, limits)
+    return [walk.members(field, 1) if walk.is_container(field) else field for field in message]
+
+
+class _Walk:
+    """Copies a value, in order, until as many items as may be sent are spent."""
+
+    def __init__(self, sendable: Sendable, limits: WireLimits) -> None:
+        self._sendable = sendable
+        self._depth = limits.depth - _AROUND
+        self._left = limits.items - _SPARE
+        self._text_left = limits.header_bytes // 2
+
+    def is_container(self, value: Any) -> bool:
+        objects = isinstance(value, np.ndarray) and value.dtype.kind == "O"
+        return objects or isinstance(value, (dict, list, tuple, set, frozenset))
+
+    def value(self, value: Any, depth: int) -> Any:
+        """What is sent of it."""
+        kind = type(value)
+        self._left -= 1
+        if kind in _PLAIN or (kind is int and value.bit_length() < _SHORT):
+            return value
+        if kind is str or kind is bytes:
+            short = len(value) <= _SHORT and value.isascii()
+            if len(value) > self._text_left or not (short or self._sendable(value)):
+                return inert_copy(value)
+            self._text_left -= len(value)
+            return value
+        if not self.is_container(value):
+            return value if self._sendable(value) else inert_copy(value)
+        count = value.size if isinstance(value, np.ndarray) else len(value)
+        if depth >= self._depth or count * (1 + isinstance(value, dict)) > self._left:
+            return RemoteObject(type_name(kind), _counted(value, count))
+        return self.members(value, depth)
+
+    def members(self, value: Any, depth: int) -> Any:
+        """A container of what is sent of its members."""
+        if isinstance(value, dict):
+            pairs = [(self.value(k, depth + 1), self.value(v, depth + 1)) for k, v in value.items()]
+            return dict(pairs)
+        if isinstance(value, np.ndarray):
+            array = np.empty(value.size, object)
+            for index, one in enumerate(value.ravel().tolist()):
+                array[index] = self.value(one, depth + 1)
+            return array.reshape(value.shape)
+        if isinstance(value, (set, frozenset)):
+            return value if self._sendable(value) else inert_copy(value)
+        members = [self.value(one, depth + 1) for one in value]
+        return tuple(members) if isinstance(value, tuple) else members
+
+
+def _counted(value: Any, count: int) -> str:
+    """Of a small one its text; of a large one, how large it is."""
+    if count > _SHORT:
+        return f"<{count} items>"
+    try:
+        return one_line(repr(value))
+    except Exception as error:
+        return f"<repr failed with {type(error).__name__}>"

@@ -1,0 +1,417 @@
+"""What a message is, and its frames.
+
+A message is a record with a kind, and fields of fixed names and types. It travels as the value
+``[kind, field, ...]`` in the codec's encoding: one msgpack header and raw buffers. ``unpack``
+checks the kind, the number of fields and each field's type, so that a decoded message is what its
+class says. Trust: what comes from a jail is hostile.
+
+Between client and server an id ties a reply to its request. It stands in front of the header, so
+that a message that recurs is the same bytes again. Packets to a runner have ids of their own.
+
+What recurs, such as calls and what a server is asked, is encoded and decoded once: what the codec
+has made of a document without arrays is kept, when it is met again, as a *form*. The key is the
+whole document, or all that it depends on, so a form says exactly what the codec would say. Forms
+are few and small: a peer that sends nothing twice gains nothing and costs nothing.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, NamedTuple, TypeVar
+
+from envhub_worker.protocol.codec.decoder import Decoder, TensorMaker, ThingReader, Unpickler
+from envhub_worker.protocol.codec.encoder import Describer, encode
+from envhub_worker.protocol.codec.wire import Buffer, Pickler, split_frames
+from envhub_worker.protocol.errors import UNTRUSTED, LocalProtocolError, RemoteProtocolError
+from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
+from envhub_worker.protocol.records import About, FrozenRecord
+
+if TYPE_CHECKING:
+    from typing_extensions import dataclass_transform
+else:
+
+    def dataclass_transform(**_: object) -> Callable[[type], type]:
+        """Tells type checkers of a constructor; here it has nothing to do."""
+        return lambda cls: cls
+
+
+VERSION = 1
+"""The version of the protocol. Both sides must speak the same one (``Hello``)."""
+FIRST_RUNNER_KIND = 64
+"""Kinds from here on are between client and runner; a runner may send no other."""
+
+
+# a field's annotation, and the types that a decoded value of it may have
+_ACCEPTED: dict[str, frozenset[type] | None] = {
+    "int": frozenset({int}),
+    "bool": frozenset({bool}),
+    "str": frozenset({str}),
+    "Reason": frozenset({str}),
+    "bytes": frozenset({bytes}),
+    "int | None": frozenset({int, type(None)}),
+    "str | None": frozenset({str, type(None)}),
+    "tuple[int, ...]": frozenset({tuple}),
+    "tuple[object, ...]": frozenset({tuple}),
+    "dict[str, object]": frozenset({dict}),
+    "dict[object, object]": frozenset({dict}),
+    "dict[str, object] | None": frozenset({dict, type(None)}),
+    "object": None,
+}
+KINDS: dict[int, type[Message]] = {}
+
+
+@dataclass_transform(frozen_default=True)
+class Message(FrozenRecord):
+    """Base of all messages; ``kind`` is its number on the wire and never changes.
+
+    ``FIELDS`` are what a class annotates, in the order in which they travel. ``HANDED`` are those
+    that are the caller's own: they arrive exactly as they are, pickled if need be. ``ASKS`` is what
+    the caller calls it, for errors; with the name of what is called, if the message has one.
+    """
+
+    kind: ClassVar[int]
+    HANDED: ClassVar[tuple[str, ...]] = ()
+    ASKS: ClassVar[str] = ""
+    FIELDS: ClassVar[tuple[str, ...]] = ()
+    _accepted: ClassVar[tuple[frozenset[type] | None, ...]] = ()
+
+    def __init_subclass__(cls, *, kind: int, asks: str = "", handed: tuple[str, ...] = ()) -> None:
+        cls.kind = kind
+        cls.ASKS, cls.HANDED = asks, handed
+        KINDS[kind] = cls
+        cls.FIELDS = names = tuple(cls.__annotations__)
+        cls._accepted = tuple(_ACCEPTED[text] for text in cls.__annotations__.values())
+        defaults: dict[str, Any] = {
+            name: partial(getattr, cls, name) for name in names if hasattr(cls, name)
+        }
+        cls.__order__ = names
+        cls.__record__ = About(names, names, defaults, names, names)
+
+
+M = TypeVar("M", bound=Message)
+
+
+def replace(message: M, **changes: Any) -> M:
+    """The same message with some fields changed."""
+    return type(message)(**{**message.__dict__, **changes})
+
+
+def values_of(message: Message) -> list[Any]:
+    """The fields, in the order in which they travel."""
+    return [*message.__dict__.values()]
+
+
+def check_fields(cls: type[Message], values: list[object]) -> None:
+    """Whether decoded values are fields of this message. Trust: input from the other side.
+    Raises ``RemoteProtocolError``: they are too many, too few, or of another type.
+    """
+    names = cls.FIELDS
+    if len(values) != len(names):
+        raise RemoteProtocolError(
+            f"{cls.__name__} has {len(names)} fields, the peer sent {len(values)}"
+        )
+    for name, accepted, value in zip(names, cls._accepted, values, strict=True):
+        if accepted is not None and type(value) not in accepted:
+            raise RemoteProtocolError(
+                f"{cls.__name__}.{name} cannot be of type {type(value).__name__}"
+            )
+
+
+_MAX_HEADER_BYTES = 1024
+_MAX_FORMS = 256
+_MAX_ITEMS = 32
+_MAX_TEXT = 256
+_CONSTANTS = frozenset({int, bool, str, bytes, type(None)})
+_BITS = struct.Struct("<d")
+_TEXTS = frozenset({str, bytes})
+
+K = TypeVar("K")
+F = TypeVar("F")
+
+
+class Forms(Generic[K, F]):
+    """Forms by key; one is made when its key is met for the second time.
+
+    Until then there is no more of a key than its hash: most keys of a server come once, with the
+    number of a jail or a time in them, and some are large. Two keys of one hash only get forms
+    earlier, for a form is kept under the whole key.
+    """
+
+    def __init__(self) -> None:
+        self._forms: dict[K, F] = {}
+        self._once: set[int] = set()
+        self.get = self._forms.get
+
+    def met(self, key: K, make: Callable[[], F]) -> None:
+        """Take note of a key that has no form, or none that holds.
+
+        The codec has already made the message. So if ``make`` fails, for whatever reason, there is
+        no form, and the codec makes the next message of this key too.
+        """
+        hashed = hash(key)
+        if hashed not in self._once and key not in self._forms:
+            if len(self._once) >= _MAX_FORMS:
+                self._once.clear()
+            self._once.add(hashed)
+            return
+        self._once.discard(hashed)
+        try:
+            form = make()
+        except Exception:
+            return
+        if len(self._forms) >= _MAX_FORMS:
+            self._forms.clear()
+        self._forms[key] = form
+
+
+class Outgoing(NamedTuple):
+    """The frames of messages of one outline, and the limits that they were encoded for."""
+
+    frames: list[Buffer]
+    limits: WireLimits
+
+
+class Incoming:
+    """What to make of a document that was decoded before.
+
+    Args:
+        document: All of it.
+        make: The class of the message.
+        limits: For which it was decoded, and holds.
+
+    Raises:
+        Exception: There is no form for it: it holds more than constants, tuples, lists and dicts.
+    """
+
+    __slots__ = ("_fields", "_make", "_message", "limits")
+
+    def __init__(self, document: bytes, make: type[Message], limits: WireLimits) -> None:
+        self.limits = limits
+        self._make = make
+        value: Any = Decoder(b"", (), limits, None, None).value(document)
+        fields = value[1:]
+        self._fields = _maker(tuple(fields))
+        self._message = make(*fields)
+
+    def message(self) -> Message:
+        """The message; what of it can be changed is fresh."""
+        return self._message if self._fields is None else self._make(*self._fields())
+
+
+class _IrregularError(Exception):
+    """There is no form for this."""
+
+
+def _maker(value: Any) -> Callable[[], Any] | None:
+    """Makes a fresh value like this one; None where it cannot be changed."""
+    kind = type(value)
+    if kind in _CONSTANTS or kind is float:
+        return None
+    if kind is dict and not set(map(type, value)) - {str}:
+        named = [(key, item, _maker(item)) for key, item in value.items()]
+        return lambda: {key: make() if make else item for key, item, make in named}
+    if kind is not tuple and kind is not list:
+        raise _IrregularError
+    parts = [(item, _maker(item)) for item in value]
+    if kind is list:
+        return lambda: [make() if make else item for item, make in parts]
+    if all(make is None for _, make in parts):
+        return None
+    return lambda: tuple([make() if make else item for item, make in parts])
+
+
+def outline(values: list[Any]) -> tuple[Any, ...] | None:
+    """All that the document of these values depends on.
+
+    None if they hold anything but constants, and small tuples, lists and dicts.
+    """
+    try:
+        return tuple([_outlined(value) for value in values])
+    except (_IrregularError, RecursionError):  # deep or cyclic: the codec says what is wrong
+        return None
+
+
+def _outlined(value: Any) -> Any:
+    kind = type(value)
+    if kind is float:
+        return kind, _BITS.pack(value)  # 0.0 is -0.0, and nan is not nan
+    if kind in _CONSTANTS:
+        if kind in _TEXTS and len(value) > _MAX_TEXT:
+            raise _IrregularError
+        return kind, value
+    if kind is dict and len(value) <= _MAX_ITEMS:
+        if set(map(type, value)) - {str}:
+            raise _IrregularError
+        return kind, tuple([(key, _outlined(item)) for key, item in value.items()])
+    if (kind is tuple or kind is list) and len(value) <= _MAX_ITEMS:
+        return kind, tuple([_outlined(item) for item in value])
+    raise _IrregularError
+
+
+_NUMBER = struct.Struct(">Q")
+"""The id in front of a header between client and server; 0 for ``CompressionHeader`` alone."""
+_MOST = (1 << 63) - 1
+_OUTGOING: Forms[Any, Outgoing] = Forms()
+_INCOMING: Forms[bytes, Incoming] = Forms()
+"""By the whole header, where that is nothing but the document."""
+
+
+def pack(
+    message: Message,
+    *,
+    pickler: Pickler | None = None,
+    limits: WireLimits = DEFAULT_LIMITS,
+    describer: Describer | None = None,
+    reduces: bool = False,
+) -> list[Buffer]:
+    """The frames of a message.
+
+    With a pickler, what the caller hands over (``Message.HANDED``) arrives exactly as it is.
+    ``reduces``: as ``encode`` has it.
+    Raises ``LocalProtocolError``: a field holds what the wire cannot carry; nothing was sent.
+    """
+    cls = type(message)
+    values = values_of(message)
+    if pickler is not None and cls.HANDED:
+        values = _handed(message, values, pickler, limits)
+    key = cls, outline(values)
+    if key[1] is None:
+        return _encoded(message, values, pickler, limits, describer, reduces=reduces)
+    form = _OUTGOING.get(key)
+    if form is not None and form.limits is limits:
+        return list(form.frames)
+    try:
+        frames = _encoded(message, values, pickler, limits)
+    except LocalProtocolError:
+        if not reduces:
+            raise
+        return _encoded(message, values, pickler, limits, describer, reduces=True)
+    _OUTGOING.met(key, lambda: Outgoing(list(frames), limits))
+    return frames
+
+
+def _handed(
+    message: Message, values: list[Any], pickler: Pickler, limits: WireLimits
+) -> list[object]:
+    """The fields as they are sent."""
+    from envhub_worker.protocol.codec.unsendable import handed_over, unpicklable
+
+    sent = list(values)
+    for index, name in enumerate(message.FIELDS):
+        if name not in message.HANDED:
+            continue
+        try:
+            sent[index] = handed_over(values[index], pickler, limits)
+        except Exception as error:  # whatever the caller's own classes raise
+            text = unpicklable(name, values[index], error, pickler)
+            raise LocalProtocolError(f"{_asked(message)}{text}") from error
+    return sent
+
+
+def _encoded(
+    message: Message,
+    values: list[Any],
+    pickler: Pickler | None,
+    limits: WireLimits,
+    describer: Describer | None = None,
+    *,
+    reduces: bool = False,
+) -> list[Buffer]:
+    value, names = [message.kind, *values], ("kind", *message.FIELDS)
+    options: dict[str, Any] = {"describer": describer, "reduces": reduces}
+    try:
+        return encode(value, pickler=pickler, limits=limits, names=names, **options)
+    except LocalProtocolError as error:
+        raise LocalProtocolError(f"{_asked(message)}{error}") from error.__cause__
+
+
+def _asked(message: Message) -> str:
+    """What the caller asked for, to stand before an error about it."""
+    if not message.ASKS:
+        return ""
+    name = getattr(message, "name", None)
+    return f"{message.ASKS}: " if name is None else f"{message.ASKS}({name!r}): "
+
+
+def unpack(
+    frames: Sequence[Buffer],
+    *,
+    limits: WireLimits = DEFAULT_LIMITS,
+    unpickler: Unpickler | None = None,
+    tensors: TensorMaker | None = None,
+    things: ThingReader | None = None,
+) -> Message:
+    """The message of some frames. Raises ``RemoteProtocolError``: the peer broke the rules."""
+    with UNTRUSTED:
+        header = _alone(frames)
+        form = _INCOMING.get(header)
+        if form is not None and form.limits is limits:
+            return form.message()
+        document, tail, buffers = split_frames(frames, limits)
+        decoder = Decoder(tail, buffers, limits, unpickler, tensors, things)
+        message = _checked(decoder.value(document))
+        if header and not tail:
+            _INCOMING.met(header, lambda: Incoming(document, type(message), limits))
+        return message
+
+
+def _alone(frames: Sequence[Buffer]) -> bytes:
+    """The header, where that is all there is and small: what recurs; else nothing."""
+    if len(frames) != 1:
+        return b""
+    header = frames[0] if type(frames[0]) is bytes else memoryview(frames[0]).cast("B")
+    return bytes(header) if len(header) <= _MAX_HEADER_BYTES else b""
+
+
+def pack_header(message: Message, number: int) -> list[Buffer]:
+    """The frames of a message between client and server, with its id in front."""
+    header, *buffers = pack(message)
+    return [with_id(header, number), *buffers]
+
+
+def with_id(header: Buffer, number: int) -> Buffer:
+    """A header with the id of its request in front."""
+    return _NUMBER.pack(number) + header
+
+
+def unpack_header(frame: Buffer, *, limits: WireLimits = DEFAULT_LIMITS) -> tuple[int, Message]:
+    """The id and the message of a header. Trust: input from the other side.
+    Raises ``RemoteProtocolError``: the peer broke the rules.
+    """
+    number = id_of(frame)
+    if number is None:
+        raise RemoteProtocolError("a header starts with the id of its request")
+    header = without_id(frame)
+    form = _INCOMING.get(header) if type(header) is bytes else None
+    if form is not None and form.limits is limits:  # as unpack, which a step need not call
+        return number, form.message()
+    return number, unpack([header], limits=limits)
+
+
+def without_id(frame: Buffer) -> Buffer:
+    """What comes after the id of a header."""
+    return frame[_NUMBER.size :] if type(frame) is bytes else memoryview(frame)[_NUMBER.size :]
+
+
+def id_of(frame: Buffer) -> int | None:
+    """The id in front of a header; None if there is none. Trust: input from the other side."""
+    number = number_of(frame)
+    return number if number is not None and 0 < number <= _MOST else None
+
+
+def number_of(frame: Buffer) -> int | None:
+    """The first bytes of a header as a number, 0 included; None if there are too few."""
+    return _NUMBER.unpack_from(frame)[0] if len(frame) >= _NUMBER.size else None
+
+
+def _checked(value: object) -> Message:
+    if type(value) is not list or not value:
+        raise RemoteProtocolError("a message is a list that starts with its kind")
+    kind, *fields = value
+    cls = KINDS.get(kind) if type(kind) is int else None
+    if cls is None:
+        raise RemoteProtocolError(f"unknown message kind {str(kind)[:40]!r}")
+    check_fields(cls, fields)
+    return cls(*fields)

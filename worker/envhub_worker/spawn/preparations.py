@@ -1,0 +1,238 @@
+"""What a repository finds in its jail: a cache of the Hub, a display, LeRobot's names.
+
+The cache has huggingface_hub's layout: for each repository a folder with ``refs/main``, which names
+the commit, and ``snapshots/COMMIT``, which is a link to the files. ``HF_HUB_OFFLINE`` (see
+``lockdown.mechanisms.environment``) makes ``snapshot_download`` and ``hf_hub_download`` look there
+and nowhere else.
+
+The display is Xvfb, as confined as what draws on it. It listens on a socket file in the jail's own
+``/tmp`` and nowhere else: neither TCP nor an abstract socket, so that no other jail and no program
+of the host finds it, and no display of the host is there in the jail.
+
+LeRobot is stood in for where a repository imports it for names alone, and it is not installed. An
+``env.py`` often imports ``EnvConfig`` for an annotation, or constants that name observations.
+LeRobot itself is gigabytes. So where nothing else brings these modules they have the names of
+LeRobot's contract with environments; whatever else is imported of it is missing, as before.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import select
+import shutil
+import subprocess
+import sys
+import types
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec
+from typing import Any
+
+from envhub_worker.lockdown.layers import LayerUnavailableError
+from envhub_worker.lockdown.spec import JailSpec
+
+_GRANTED = ("HF_HOME", "HF_HUB_CACHE", "HUGGINGFACE_HUB_CACHE")
+"""Variables by which a caller gives another cache to the jail."""
+
+
+def make_hub_cache(spec: JailSpec) -> None:
+    """Lay out the cache in the jail's home. All runners of a jail make the same there."""
+    if any(name in spec.confinement.environment for name in _GRANTED):
+        return
+    for copy in spec.hub_copies:
+        folder = f"{os.environ['HF_HOME']}/hub/{copy.folder}"
+        for revision in copy.revisions:
+            _write(f"{folder}/refs/{revision}", copy.commit)
+        os.makedirs(f"{folder}/snapshots", exist_ok=True)
+        with contextlib.suppress(FileExistsError):
+            os.symlink(copy.tree or spec.snapshot, f"{folder}/snapshots/{copy.commit}")
+
+
+def _write(path: str, text: str) -> None:
+    os.makedirs(os.path.dirname(path), exist_ok=True)
+    draft = f"{path}.{os.getpid()}.draft"
+    with open(draft, "w") as file:
+        file.write(text)
+    os.replace(draft, path)
+
+
+_PROGRAM = "Xvfb"
+_SCREEN = "1280x1024x24"
+_START_S = 60.0
+_HEADLESS = ("PYOPENGL_PLATFORM", "SDL_VIDEODRIVER")
+"""Variables of ``jail_environment`` that keep libraries from looking for a display."""
+_running: list[subprocess.Popen[bytes]] = []
+
+
+def check_display(spec: JailSpec, environment: Mapping[str, str]) -> None:
+    """Look for the program that a display needs, before anything is given up.
+
+    Raises:
+        LayerUnavailableError: The policy asks for a display, and it is not there.
+    """
+    wanted = spec.confinement.display == "virtual"
+    if wanted and shutil.which(_PROGRAM, path=environment.get("PATH")) is None:
+        raise LayerUnavailableError(
+            "display",
+            f"a virtual display needs {_PROGRAM}, which is not installed where the jail runs",
+            "Install it there (on Debian and Ubuntu: apt-get install xvfb), or leave the display "
+            "out and render to arrays.",
+        )
+
+
+def start_display(spec: JailSpec) -> None:
+    """Start the display of this process, where it is to have one, and name it in its environment.
+
+    Call it once confined: what is started then is as confined. It ends with this process's session.
+
+    Raises:
+        SystemExit: It did not come up; the text says so.
+    """
+    if spec.confinement.display != "virtual":
+        return
+    ready, theirs = os.pipe()
+    words = [_PROGRAM, "-displayfd", str(theirs), "-screen", "0", _SCREEN]
+    words += ["-nolisten", "tcp", "-nolisten", "local", "-noreset"]
+    none = subprocess.DEVNULL
+    _running.append(
+        subprocess.Popen(words, pass_fds=[theirs], stdin=none, stdout=none, stderr=none)
+    )
+    os.close(theirs)
+    number = _line(ready)
+    os.close(ready)
+    if not number.isdigit():
+        raise SystemExit(f"the virtual display ({_PROGRAM}) did not come up in the jail")
+    os.environ["DISPLAY"] = f":{number.decode()}"
+    for name in _HEADLESS:
+        if name not in spec.confinement.environment:
+            os.environ.pop(name, None)
+
+
+def _line(ready: int) -> bytes:
+    """What Xvfb says in time: the number of its display, and the end of the line apart."""
+    said = b""
+    while b"\n" not in said and select.select([ready], [], [], _START_S)[0]:
+        piece = os.read(ready, 16)
+        if not piece:
+            return b""
+        said += piece
+    return said.strip()
+
+
+_CONSTANTS = {
+    "OBS_STR": "observation",
+    "OBS_PREFIX": "observation.",
+    "OBS_ENV_STATE": "observation.environment_state",
+    "OBS_STATE": "observation.state",
+    "OBS_IMAGE": "observation.image",
+    "OBS_IMAGES": "observation.images",
+    "OBS_LANGUAGE": "observation.language",
+    "ACTION": "action",
+    "REWARD": "next.reward",
+    "TRUNCATED": "next.truncated",
+    "DONE": "next.done",
+    "SUCCESS": "next.success",
+    "INFO": "info",
+}
+_FEATURES = ("STATE", "VISUAL", "ENV", "ACTION", "REWARD", "LANGUAGE")
+
+
+def install_lerobot_stub() -> None:
+    """Have it found last, behind everything that the interpreter and its packages bring."""
+    sys.meta_path.append(_Finder())
+
+
+class _Finder(MetaPathFinder, Loader):
+    """Finds and loads the modules of ``_MODULES``."""
+
+    def __init__(self) -> None:
+        self._said = False
+
+    def find_spec(
+        self, name: str, path: Sequence[str] | None, target: object = None
+    ) -> ModuleSpec | None:
+        """The spec of a module of the stub; None for others, and below a LeRobot that is real."""
+        root = sys.modules.get("lerobot")
+        real = root is not None and not isinstance(getattr(root, "__loader__", None), _Finder)
+        if name not in _MODULES or real:
+            return None
+        return ModuleSpec(name, self, origin="stub of envhub-sandbox", is_package=True)
+
+    def create_module(self, spec: ModuleSpec) -> None:
+        """An ordinary one."""
+
+    def exec_module(self, module: types.ModuleType) -> None:
+        """Fill it, and warn of it once."""
+        vars(module).update(_MODULES[module.__name__]())
+        if not self._said:
+            self._said = True
+            warnings.warn(
+                "lerobot is not installed in the jail: a stub replaces it, with EnvConfig, "
+                "HubEnvConfig, PolicyFeature, FeatureType and the constants of observations",
+                stacklevel=2,
+            )
+
+
+def _nothing() -> dict[str, Any]:
+    return {}
+
+
+def _constants() -> dict[str, Any]:
+    return dict(_CONSTANTS)
+
+
+def _types() -> dict[str, Any]:
+    from dataclasses import make_dataclass
+    from enum import Enum
+
+    made: Any = Enum  # made of a tuple, whose members mypy cannot see
+    kind = made("FeatureType", [(name, name) for name in _FEATURES], type=str)
+    feature = make_dataclass("PolicyFeature", [("type", kind), ("shape", tuple)])
+    return {"FeatureType": kind, "PolicyFeature": feature}
+
+
+def _configs() -> dict[str, Any]:
+    from dataclasses import dataclass, field
+
+    @dataclass
+    class EnvConfig:
+        """The fields that every configuration of an environment has."""
+
+        task: str | None = None
+        fps: int = 30
+        features: dict[str, Any] = field(default_factory=dict)
+        features_map: dict[str, str] = field(default_factory=dict)
+        max_parallel_tasks: int = 1
+        disable_env_checker: bool = True
+
+        @classmethod
+        def register_subclass(cls, name: str) -> Callable[[type[Any]], type[Any]]:
+            """Nothing looks a configuration up by its name here."""
+            return lambda kind: kind
+
+        @property
+        def gym_kwargs(self) -> dict[str, Any]:
+            """A repository's ``make_env`` gets its arguments by itself."""
+            return {}
+
+    @dataclass
+    class HubEnvConfig(EnvConfig):
+        """A repository of the Hub."""
+
+        hub_path: str | None = None
+
+    for kind in (EnvConfig, HubEnvConfig):
+        kind.__module__, kind.__qualname__ = "lerobot.envs.configs", kind.__name__
+    return {"EnvConfig": EnvConfig, "HubEnvConfig": HubEnvConfig}
+
+
+_MODULES: dict[str, Callable[[], dict[str, Any]]] = {
+    **dict.fromkeys(("lerobot", "lerobot.envs", "lerobot.utils", "lerobot.configs"), _nothing),
+    "lerobot.envs.configs": _configs,
+    "lerobot.configs.types": _types,
+    "lerobot.utils.constants": _constants,
+    "lerobot.constants": _constants,
+}
+"""What each module of the stub has."""
