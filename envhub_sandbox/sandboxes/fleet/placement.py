@@ -85,17 +85,21 @@ class Placement:
         return [Seat(self, number) for number in range(count)]
 
     def open_for(self, repository: ForRepository) -> None:
-        """Make the places of a repository; of one that joins the list later, when it is used."""
+        """Make the places of a repository.
+
+        One that is absent, or joins the list later, is made when a worker is to go there.
+        """
         with self._lock:
             if self._repository is None:
-                for member in self.members():
+                members = self.members()
+                for member in [one for one in members if not one.absent] or members:
                     member.open_for(repository)
                 self._rooms = Rooms(repository.policy.limits.memory_bytes)
                 self._repository = repository
 
     def runs_on(self, runtime: Runtime) -> Runtime:
         """What runs it, on all places together."""
-        each = dict.fromkeys(member.runs_on(runtime) for member in self._opened())
+        each = dict.fromkeys(member.runs_on(runtime) for member in self._open_ones())
         if len(each) == 1:
             return next(iter(each))
         return Runtime(" ".join(sorted(f"{one.python} {one.packages}" for one in each)))
@@ -104,21 +108,23 @@ class Placement:
         """Where a worker is, or will be as far as is known."""
         with self._lock:
             if number not in self._at:
-                members = self._opened()
+                members = self._open_ones()
                 return members[number % len(members)]
             return self._at[number]
 
     def candidates(self, number: int) -> Iterator[Member]:
         """Where a worker may go: the best place first, each of the others if that has refused."""
         tried: list[Member] = []
-        while True:
-            members = self._opened()
-            left = [member for member in members if member not in tried]
-            if not left:
+        took = False
+        for places in (self.members, self._open_ones):
+            while left := [member for member in places() if member not in tried]:
+                best = self._best(number, left)
+                tried.append(best)
+                if self._opens(number, best):
+                    took = True
+                    yield best
+            if took:
                 return
-            best = self._best(number, left)
-            tried.append(best)
-            yield best
 
     def _best(self, number: int, members: list[Member]) -> Member:
         """The best of these, and note that the worker goes there."""
@@ -137,19 +143,23 @@ class Placement:
                     return best
         raise AssertionError("there are no places")
 
-    def _opened(self) -> list[Member]:
-        members, repository = self.members(), self._repository
-        if repository is None:
-            return members
-        opened: list[Member] = []
-        for member in members:
-            try:
-                member.open_for(repository)
-            except EnvHubError as error:
-                WORKER.warning("%s joins the fleet in vain: %s", member.address, error)
-            else:
-                opened.append(member)
-        return opened or [one for one in self._known.values() if one.is_open]
+    def _open_ones(self) -> list[Member]:
+        """Those of the list that are made, else those that were; before that all."""
+        members = self.members()
+        opened = [one for one in members if one.is_open]
+        return opened or [one for one in list(self._known.values()) if one.is_open] or members
+
+    def _opens(self, number: int, member: Member) -> bool:
+        """Whether a worker can go there; a place that has joined is made for the repository."""
+        try:
+            if self._repository is not None:
+                member.open_for(self._repository)
+        except EnvHubError as error:
+            WORKER.warning("%s joins the fleet in vain: %s", member.address, error)
+            with self._lock:
+                self._at.pop(number, None)
+            return False
+        return True
 
     def _ranks(
         self, number: int, order: dict[Member, int], rooms: dict[Member, Room]

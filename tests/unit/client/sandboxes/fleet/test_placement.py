@@ -21,6 +21,13 @@ from envhub_worker.protocol.runtime import Runtime
 class _Place(Sandbox):
     def __init__(self, name: str) -> None:
         self.name = name
+        self.refuses = False
+
+    def for_repository(self, *given: Any) -> Sandbox:
+        """As the test says."""
+        if self.refuses:
+            raise PolicyError(f"{self.name} cannot permit that")
+        return self
 
 
 class _Rooms:
@@ -119,6 +126,30 @@ def test_where_a_worker_is(rooms: dict[str, Room]) -> None:
     tries = placement.candidates(0)
     assert [next(tries).name, next(tries).name] == ["a", "b"]
     assert placement.at(0).name == "b"
+
+
+def test_a_place_that_was_absent_is_made_when_it_is_used(rooms: dict[str, Room]) -> None:
+    """Packages could not be made there: the others are used without it, and it comes last."""
+    placement = _placement(["a", "b", "c"])
+    [a, b, c] = placement.members()
+    a.absent = c.absent = True
+    rooms |= {one: Room(answers=False, workers=0) for one in "ac"}
+    placement.seats(None)[0].for_repository(Path(), Policy(), Runtime(""))
+    assert [one.is_open for one in (a, b, c)] == [False, True, False]
+    assert [placement.at(number).name for number in range(2)] == ["b", "b"]
+    vars(c.sandbox)["refuses"] = True
+    assert [one.name for one in placement.candidates(0)] == ["b", "a"]
+    assert [one.is_open for one in (a, b, c)] == [True, True, False]
+    assert placement.at(0).is_open, "where a worker is held there is a place"
+
+
+def test_all_are_made_where_none_was_there(rooms: dict[str, Room]) -> None:
+    """The first error says why."""
+    placement = _placement(["a", "b"])
+    for one in placement.members():
+        one.absent = vars(one.sandbox)["refuses"] = True
+    with pytest.raises(PolicyError, match="a cannot"):
+        placement.seats(None)[0].for_repository(Path(), Policy(), Runtime(""))
 
 
 def test_what_it_runs_on_is_that_of_all_places(rooms: dict[str, Room]) -> None:
