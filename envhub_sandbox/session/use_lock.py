@@ -47,11 +47,14 @@ class UseLock:
     Attributes:
         lock: Held for as long as a use lasts; reentrant, for a signal handler may close what its
             own thread waits for.
+        flight: Held in ``send``, ``recv`` and ``reset``, taken before ``lock``: a ``recv`` holds
+            only the locks of workers that owe something.
         stepping: The thread that is in a step, as far as it was not interrupted there.
     """
 
     def __init__(self, lease: Lease, failures: Failures) -> None:
         self.lock = threading.RLock()  # interruption.md, rule 12
+        self.flight = threading.RLock()
         self.stepping: int | None = None
         self._warned = False
         self._lease = lease
@@ -118,4 +121,5 @@ class UseLock:
     def abandon(self) -> None:
         """In a fork, which has not the thread that held the lock: interruption.md, rule 14."""
         self.lock = threading.RLock()
+        self.flight = threading.RLock()
         self.stepping = None

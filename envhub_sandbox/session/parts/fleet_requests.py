@@ -10,6 +10,7 @@ some of them ``READY`` and some ``PENDING``: the next request is refused, and ``
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from functools import partial
@@ -309,6 +310,11 @@ class FleetUse:
         that object at the latest.
         """
         return self._hold_all()
+
+    @property
+    def flight(self) -> threading.RLock:
+        """See ``UseLock``: that of the first part, which a fork replaces."""
+        return self._parts[0].use.flight
 
     @property
     def is_mine(self) -> bool:
