@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import ipaddress
 import os
+import re
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -16,6 +17,8 @@ from envhub_worker.protocol.keys import parse_key
 SERVER_KEY_VARIABLE = "ENVHUB_SERVER_KEY"
 CLIENT_KEY_VARIABLE = "ENVHUB_CLIENT_KEY"
 CONFIG_VARIABLE = "ENVHUB_CONFIG"
+_HOST = re.compile(r"[a-z0-9_.:%;-]+")
+"""What ZeroMQ connects to; of others it says nothing that names the endpoint."""
 
 
 def address_of(endpoint: str) -> str:
@@ -27,10 +30,11 @@ def address_of(endpoint: str) -> str:
         )
     try:
         parts = urlsplit(endpoint)
-        host, port, is_whole = parts.hostname, parts.port, parts.scheme == "tcp" and not parts.path
+        host, port = parts.hostname or "", parts.port
+        is_whole = endpoint == f"tcp://{parts.netloc}"
     except ValueError:
-        host = None
-    if not host or port is None or not is_whole:
+        host, port, is_whole = "", None, False
+    if not (port and is_whole and _HOST.fullmatch(host)):
         raise PolicyError(f"sandbox is {endpoint!r}; a remote server is tcp://HOST:PORT")
     return f"{host}:{port}"
 

@@ -46,11 +46,14 @@ class UseLock:
     Attributes:
         lock: Held for as long as a use lasts; reentrant, for a signal handler may close what its
             own thread waits for.
+        flight: Held in ``send``, ``recv`` and ``reset``, taken before ``lock``: a ``recv`` holds
+            only the locks of workers that owe something.
         stepping: The thread that is in a step, as far as it was not interrupted there.
     """
 
     def __init__(self, lease: Lease, failures: Failures) -> None:
         self.lock = threading.RLock()  # interruption.md, rule 12
+        self.flight = threading.RLock()
         self.stepping: int | None = None
         self._warned = False
         self._lease = lease
@@ -117,6 +120,7 @@ class UseLock:
     def abandon(self) -> None:
         """In a fork, which has not the thread that held the lock: interruption.md, rule 14."""
         self.lock = threading.RLock()
+        self.flight = threading.RLock()
         self.stepping = None
 
 
@@ -138,6 +142,11 @@ class FleetUse:
         that object at the latest.
         """
         return self._hold_all()
+
+    @property
+    def flight(self) -> threading.RLock:
+        """See ``UseLock``: that of the first part, which a fork replaces."""
+        return self._parts[0].flight
 
     @property
     def is_mine(self) -> bool:

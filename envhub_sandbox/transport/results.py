@@ -34,12 +34,14 @@ class Results:
         slices: The same as ``bounds``, counted from the first of these.
         apart: Whether infos are to come as the only sub-environment gave them, which is what the
             environment is then built for; set before that.
+        max_bytes: How much larger than what the workers sent their infos may be when joined.
     """
 
     def __init__(self, manifest: EnvManifest, bounds: Sequence[tuple[int, int]]) -> None:
         self.manifest = manifest
         self.bounds = list(bounds)
         self.apart = False
+        self.max_bytes = DEFAULT_LIMITS.message_bytes
         self._space = manifest.single_observation_space
         self._declared = manifest.shardable
         self._sizes = [stop - start for start, stop in bounds]
@@ -82,7 +84,7 @@ class Results:
             np.concatenate(rewards),
             np.concatenate(terminations),
             np.concatenate(truncations),
-            batches.join_infos(own, self._sizes) if infos is None else infos,
+            self._joined_infos(own) if infos is None else infos,
         )
 
     def joined_resets(
@@ -92,8 +94,11 @@ class Results:
     ) -> tuple[Any, dict[Any, Any]]:
         """Likewise of a reset."""
         observations, own = zip(*parts, strict=True)
-        joined = batches.join_infos(own, self._sizes) if infos is None else infos
+        joined = self._joined_infos(own) if infos is None else infos
         return batches.join(self._space, observations), joined
+
+    def _joined_infos(self, own: Sequence[dict[Any, Any]]) -> dict[Any, Any]:
+        return batches.join_infos(own, self._sizes, self.max_bytes)
 
     def reset(
         self, replies: list[m.ResetDone], infos: dict[Any, Any] | None = None

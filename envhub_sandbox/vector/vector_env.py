@@ -158,7 +158,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         # Not by reset_async and reset_wait: an interrupt between them would leave `waiting` set,
         # and the next request refused, although no reset_wait can follow.
         self._note_first_use()
-        with self._requests.use.lock:
+        with self._requests.use.flight, self._requests.use.lock:
             self._refuse_if_busy_for_reset(options)
             self._send_reset(seed, options)
             return self._end_reset(self._timeouts.reset_s)
@@ -171,7 +171,7 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
     ) -> None:
         """Send the reset; ``reset_wait`` returns its results."""
         self._note_first_use()
-        with self._requests.use.lock:
+        with self._requests.use.flight, self._requests.use.lock:
             self._refuse_if_busy_for_reset(options)
             self._send_reset(seed, options)
             self._requests.waiting = "reset"
@@ -309,9 +309,10 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             WorkerError: A worker has died or is late; nothing was sent. ``env_ids`` of the error
                 are its sub-environments: send to others, or restart it by ``send_reset``.
         """
-        flight = self._in_flight()
-        rows = flight.rows(env_ids)
-        flight.send(rows, self._read_rows(rows, actions))
+        with self._requests.use.flight:
+            flight = self._in_flight()
+            rows = flight.rows(env_ids)
+            flight.send(rows, self._read_rows(rows, actions))
 
     @short_traceback
     def send_reset(
@@ -337,9 +338,10 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             raise ValueError(
                 "`send_reset` takes no `reset_mask`: name sub-environments by `env_ids`"
             )
-        flight = self._in_flight()
-        rows = flight.rows(env_ids)
-        flight.send_reset(rows, self._reset_message(self._seeds_of(rows, seed), options, None))
+        with self._requests.use.flight:
+            flight = self._in_flight()
+            rows = flight.rows(env_ids)
+            flight.send_reset(rows, self._reset_message(self._seeds_of(rows, seed), options, None))
 
     def _seeds_of(self, rows: Rows, seed: Any) -> Any:
         """A seed or None for each sub-environment of all, of which those of ``rows`` count."""
@@ -385,7 +387,8 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         wanted = self._session.repository.min_ready if min_ready is None else min_ready
         if wanted is not None and wanted < 1:
             raise ValueError(f"`min_ready` is {wanted}, and must be at least 1")
-        return self._in_flight().recv(self.num_envs if wanted is None else wanted, timeout)
+        with self._requests.use.flight:
+            return self._in_flight().recv(self.num_envs if wanted is None else wanted, timeout)
 
     def _in_flight(self) -> InFlight:
         if self._flight is None:

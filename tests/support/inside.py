@@ -177,6 +177,22 @@ def part_pids(part: EnvSession) -> list[int]:
     return list(part.lease.status()["pids"])
 
 
+def written_later(lane: Any, word: int, value: int) -> Callable[[], bool]:
+    """``lane.answered`` of a lane in shared memory whose jail writes one word into each reply as
+    soon as that has said yes.
+    """
+    answered = lane.answered
+
+    def and_changed() -> bool:
+        said: bool = answered()
+        if said:
+            for shard in lane.shards:
+                shard._tells[word] = value
+        return said
+
+    return and_changed
+
+
 def use_lock_of(part: EnvSession) -> Any:
     """What a thread holds while it asks one worker something."""
     return part.use.lock

@@ -9,7 +9,7 @@ from typing import Any
 
 from envhub_sandbox.errors import PolicyError
 from envhub_sandbox.sandboxes.fleet.packages import FleetPackages
-from envhub_sandbox.sandboxes.fleet.place_list import PlaceList
+from envhub_sandbox.sandboxes.fleet.place_list import PlaceList, is_list
 from envhub_sandbox.sandboxes.fleet.placement import Placement, Resolve, Seat
 from envhub_sandbox.sandboxes.remote import RemoteSandbox
 from envhub_sandbox.sandboxes.sandbox import Sandbox
@@ -57,16 +57,20 @@ class Fleet(Sandbox):
         """
 
         def sandbox_of(place: str | Sandbox) -> Sandbox:
+            if is_fleet(place):  # before it is read: a file may name itself
+                raise PolicyError("a fleet's places are named one by one: no fleet is one")
             address, _, key = place.partition(" ") if isinstance(place, str) else ("", "", "")
             if not address.startswith("tcp://"):
-                found = resolve(place)
-                if isinstance(found, OpenFleet):
-                    raise PolicyError("a fleet's places are named one by one: no fleet is one")
-                return found
+                return resolve(place)
             known = {"server_key": server_key, **self.remote}
             return RemoteSandbox(address, **(known | {"server_key": key} if key else known))
 
         return OpenFleet(PlaceList(self.places), sandbox_of)
+
+
+def is_fleet(place: object) -> bool:
+    """Whether this names several places. Reads none of them."""
+    return isinstance(place, (list, tuple, Fleet)) or (isinstance(place, str) and is_list(place))
 
 
 class OpenFleet(Sandbox):

@@ -37,12 +37,14 @@ class Member(Sandbox):
     Attributes:
         sandbox: Likewise.
         weight: How often it is in the list.
+        absent: Whether it did not answer when packages were to be made there, or had no room.
     """
 
     def __init__(self, sandbox: Sandbox, runtime: Callable[[Member], Runtime]) -> None:
         self.sandbox = sandbox
         self.name, self.retry_s = sandbox.name, sandbox.retry_s
         self.weight = 1
+        self.absent = False
         self._opening = threading.RLock()  # interruption.md, rule 12
         self._make_runtime = runtime
         self._runtime: Runtime | None = None

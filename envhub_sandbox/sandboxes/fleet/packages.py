@@ -54,6 +54,7 @@ class FleetPackages:
             if made.error is not None:
                 if not isinstance(made.error, EnvHubError) or not may_go_elsewhere(made.error):
                     raise made.error
+                member.absent = True
                 WORKER.warning("%s makes no packages now: %s", member.address, made.error)
         return self._summary()
 

@@ -58,7 +58,7 @@ class PlaceList:
                     f"a fleet is {self._source!r}, which names {len(places)} places; it takes 1 to "
                     f"{MOST_PLACES}, such as ['tcp://a:5555', 'tcp://b:5555']"
                 )
-        except (OSError, PolicyError) as error:
+        except (OSError, ValueError) as error:  # of a path that is none, too
             if not self._last:
                 if isinstance(error, PolicyError):
                     raise

@@ -8,8 +8,9 @@ all are tried before a worker has none. Results never depend on it.
 
 from __future__ import annotations
 
+import hashlib
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from time import monotonic
 
@@ -25,6 +26,8 @@ from envhub_worker.protocol.runtime import OWN, Runtime
 
 _ASKED = 32
 """Servers that are asked for their room at the same time."""
+ASK_S = 10.0
+"""For how long further servers are asked for the place of one worker, where none has room."""
 Resolve = Callable[["str | Sandbox"], Sandbox]
 
 
@@ -50,6 +53,7 @@ class Placement:
         self._placed_s: dict[int, float] = {}
         self._repository: ForRepository | None = None
         self._rooms: Rooms | None = None
+        self._run_by: tuple[list[Member], Runtime] | None = None
 
     def members(self) -> list[Member]:
         """The places that there are now, each once, with its weight.
@@ -85,71 +89,89 @@ class Placement:
         return [Seat(self, number) for number in range(count)]
 
     def open_for(self, repository: ForRepository) -> None:
-        """Make the places of a repository; of one that joins the list later, when it is used."""
+        """Make the places of a repository.
+
+        One that is absent, or joins the list later, is made when a worker is to go there.
+        """
         with self._lock:
             if self._repository is None:
-                for member in self.members():
+                members = self.members()
+                for member in [one for one in members if not one.absent] or members:
                     member.open_for(repository)
                 self._rooms = Rooms(repository.policy.limits.memory_bytes)
                 self._repository = repository
 
     def runs_on(self, runtime: Runtime) -> Runtime:
         """What runs it, on all places together."""
-        each = dict.fromkeys(member.runs_on(runtime) for member in self._opened())
-        if len(each) == 1:
-            return next(iter(each))
-        return Runtime(" ".join(sorted(f"{one.python} {one.packages}" for one in each)))
+        with self._lock:  # each of a thousand workers asks, and there may be a thousand places
+            members = self._open_ones()
+            if self._run_by is None or self._run_by[0] != members:
+                self._run_by = members, _all_together(one.runs_on(runtime) for one in members)
+            return self._run_by[1]
+
+    def retry_s(self) -> float:
+        """For how long a worker waits for room: the longest of all places."""
+        return max(member.retry_s for member in self._last or self.members())
 
     def at(self, number: int) -> Member:
         """Where a worker is, or will be as far as is known."""
         with self._lock:
             if number not in self._at:
-                members = self._opened()
+                members = self._open_ones()
                 return members[number % len(members)]
             return self._at[number]
 
     def candidates(self, number: int) -> Iterator[Member]:
         """Where a worker may go: the best place first, each of the others if that has refused."""
         tried: list[Member] = []
-        while True:
-            members = self._opened()
-            left = [member for member in members if member not in tried]
-            if not left:
+        took = False
+        for places in (self.members, self._open_ones):
+            while left := [member for member in places() if member not in tried]:
+                best = self._best(number, left)
+                tried.append(best)
+                if self._opens(number, best):
+                    took = True
+                    yield best
+            if took:
                 return
-            best = self._best(number, left)
-            tried.append(best)
-            yield best
 
     def _best(self, number: int, members: list[Member]) -> Member:
         """The best of these, and note that the worker goes there."""
         order = {member: place for place, member in enumerate(members)}
         with self._lock:
             members = sorted(members, key=self._ranks(number, order, {}))
-        # some are asked, and more only if none of these has room: there may be a thousand
+        # some are asked, and more only if none of these has room: there may be a thousand, which
+        # do not even answer
+        until = monotonic() + ASK_S
         for some in (members[start : start + _ASKED] for start in range(0, len(members), _ASKED)):
             rooms = self._rooms.ask(some) if self._rooms and len(members) > 1 else {}
             with self._lock:
                 rank = self._ranks(number, order, rooms)
                 best = min(some, key=rank)
                 full = rank(best)[:2] != (False, False)
-                if not full or some[-1] is members[-1]:
+                if not full or some[-1] is members[-1] or monotonic() >= until:
                     self._at[number], self._placed_s[number] = best, monotonic()
                     return best
         raise AssertionError("there are no places")
 
-    def _opened(self) -> list[Member]:
-        members, repository = self.members(), self._repository
-        if repository is None:
-            return members
-        opened: list[Member] = []
-        for member in members:
-            try:
-                member.open_for(repository)
-            except EnvHubError as error:
-                WORKER.warning("%s joins the fleet in vain: %s", member.address, error)
-            else:
-                opened.append(member)
-        return opened or [one for one in self._known.values() if one.is_open]
+    def _open_ones(self) -> list[Member]:
+        """Those of the list, as it was last read, that are made, else those that were; before that
+        all."""
+        members = self._last or self.members()
+        opened = [one for one in members if one.is_open]
+        return opened or [one for one in list(self._known.values()) if one.is_open] or members
+
+    def _opens(self, number: int, member: Member) -> bool:
+        """Whether a worker can go there; a place that has joined is made for the repository."""
+        try:
+            if self._repository is not None:
+                member.open_for(self._repository)
+        except EnvHubError as error:
+            WORKER.warning("%s joins the fleet in vain: %s", member.address, error)
+            with self._lock:
+                self._at.pop(number, None)
+            return False
+        return True
 
     def _ranks(
         self, number: int, order: dict[Member, int], rooms: dict[Member, Room]
@@ -169,6 +191,16 @@ class Placement:
         return rank
 
 
+def _all_together(each: Iterable[Runtime]) -> Runtime:
+    """One that stands for all: that of places that are alike, or else a name of them together."""
+    runtimes = sorted(set(each), key=lambda one: (one.python, one.packages))
+    if len(runtimes) == 1:
+        return runtimes[0]
+    # it is looked up as a path, which thousands of addresses are too long for
+    digest = hashlib.sha256(repr([tuple(one) for one in runtimes]).encode())
+    return Runtime(f"fleet/of/{digest.hexdigest()}")
+
+
 class Seat(Sandbox):
     """The place of one worker of a fleet, wherever that is at present."""
 
@@ -181,7 +213,7 @@ class Seat(Sandbox):
     @property
     def retry_s(self) -> float:  # type: ignore[override]
         """The longest of all places."""
-        return max(member.retry_s for member in self._placement.members())
+        return self._placement.retry_s()
 
     @property
     def address(self) -> str:

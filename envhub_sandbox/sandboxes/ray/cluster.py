@@ -210,8 +210,12 @@ class PlacedActor:
         error = answer.exception()
         if error is not None:
             return f"Ray says: {_one_line(str(error).partition(_GUESSES)[0])}"
-        said = read_answer(answer.result())
-        return f"it ended with {said.get('code')}: {_one_line(str(said.get('log')))}"
+        try:
+            said = read_answer(answer.result())
+        except WorkerStartupError as error:  # whoever asks has an error of their own
+            return str(error)
+        code, log = _one_line(str(said.get("code"))), _one_line(str(said.get("log")))
+        return f"it ended with {code}: {log}"
 
     def kill(self) -> None:
         """End it, and with it its server. Idempotent; nothing after ``ray.shutdown``."""

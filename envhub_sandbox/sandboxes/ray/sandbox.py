@@ -34,6 +34,7 @@ from envhub_worker.protocol.keys import parse_key
 from envhub_worker.protocol.runtime import OWN, Runtime
 
 _NODE_CHARS = 12
+_MOST_GPUS = 1 << 16
 _KEPT_S = 60.0
 """A server that has made packages waits for so long for the jail that needs them."""
 _FATE_S = 30.0
@@ -236,6 +237,10 @@ RAY = RaySandbox()
 """What ``sandbox="ray"`` means."""
 
 
+def _is_gpu(number: object) -> bool:
+    return type(number) is int and 0 <= number < _MOST_GPUS
+
+
 def read_started(said: Mapping[str, Any]) -> tuple[str, bytes, str, tuple[int, ...]]:
     """What an actor says of its server: endpoint, public key, node, GPUs.
 
@@ -246,8 +251,9 @@ def read_started(said: Mapping[str, Any]) -> tuple[str, bytes, str, tuple[int, .
         parts = urlsplit(endpoint)
         ipaddress.ip_address(parts.hostname or "")
         good = parts.scheme == "tcp" and endpoint == f"tcp://{parts.netloc}" and parts.port
-        good = good and "@" not in endpoint and type(node) is str and 0 < len(node) <= 64
-        if good and node.isalnum() and all(type(one) is int and one >= 0 for one in gpus):
+        good = good and "@" not in endpoint and endpoint.isascii() and endpoint.isprintable()
+        good = good and type(node) is str and 0 < len(node) <= 64 and node.isascii()
+        if good and node.isalnum() and type(gpus) is list and all(map(_is_gpu, gpus)):
             return endpoint, parse_key(key), node, tuple(gpus[:64])
     except (AttributeError, LookupError, TypeError, ValueError):
         pass

@@ -37,6 +37,7 @@ from envhub_sandbox.transport.lane import Request
 from envhub_sandbox.transport.results import Results, StepResult
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.lifecycle import State
+from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.spaces import batches
 
 T = TypeVar("T")
@@ -71,6 +72,7 @@ class FleetRequests(RequestOrder):
         self._history = history
         self._counters = counters
         self._space = results.manifest.single_action_space
+        self._may_not_fit = slabs.layout_of(self._space, 1) is None
         self._unsent: dict[int, Exception] = {}
         self._starting: Calls[None] = Calls([])
         self._sent_ns = 0
@@ -152,10 +154,24 @@ class FleetRequests(RequestOrder):
                 self._make_ready("step")
                 break
         rows = batches.split(self._space, actions, self.results.bounds)
+        if self._may_not_fit:
+            self._refuse_unsendable(actions, rows)
         self._sent_ns = perf_counter_ns()
         self._send(lambda at: self._each[at].submit_step(rows[at]))
         self._counters.requests += 1
         self._history.step(actions)
+
+    def _refuse_unsendable(self, actions: Any, rows: Sequence[Any]) -> None:
+        """Refuse what one worker cannot be sent before others are sent theirs.
+        Raises ``LocalProtocolError``, which names it by its place in ``actions``.
+        """
+        try:
+            for one, row in zip(self._each, rows, strict=True):
+                one.pack("step", partial(_step, row))
+        except LocalProtocolError:
+            count = self.results.manifest.num_envs
+            self._each[0].refuse_whole("step", partial(_step, actions), count)
+            raise
 
     def collect_step(self, timeout: float | Deadline | None) -> StepResult:
         """See ``Requests.collect_step``."""
@@ -272,6 +288,10 @@ class FleetRequests(RequestOrder):
                 raise error
         finally:
             self.explain(error)
+
+
+def _step(actions: Any, number: int, bounds: tuple[int, int]) -> m.Message:
+    return m.Step(number, actions)
 
 
 def _joined(packed: Sequence[Packed], bounds: Sequence[tuple[int, int]]) -> Request:

@@ -45,6 +45,7 @@ class FleetSession:
         self.lifecycle = FleetLifecycle(parts)
         self.prewarm = FleetPrewarm([part.prewarm for part in parts])
         results = Results(manifest, self.bounds)
+        results.max_bytes = self.repository.wire_limits.message_bytes
         self.requests = FleetRequests(self.parts, results, history, self.counters)
         labels = Labels(self.repository.label, manifest.suite, str(manifest.task))
         LEDGER.add(self, labels, self.counters, self.lifecycle)

@@ -92,6 +92,7 @@ class SharedMemoryLane:
         self._talk_spin = SpinChooser(may_spin)  # messages take another time than steps
         self._asked_ns = 0
         self._fetching: tuple[int, Sequence[int]] = 0, ()  # for which request, of which shards
+        self._settled_ns = 0  # the request of which ``answered`` has found all answers
         self._listens = False
         # One core is the client's. Shards that find no other sleep until they are asked, then run
         # on the client's while it sleeps: so it waits for those first, and for the others awake.
@@ -225,6 +226,7 @@ class SharedMemoryLane:
         if slabs.FETCH not in kinds or (slabs.RAISED in kinds and not asked):
             return outcomes
         missing = [index for index, kind in enumerate(kinds) if kind == slabs.FETCH]
+        self._refuse_further(missing)
         try:
             replies = self._fetch(missing, deadline)
         except RunnersDiedError as error:
@@ -289,6 +291,7 @@ class SharedMemoryLane:
         answers = [shard.answer() for shard in self.shards]
         missing = [index for index, answer in enumerate(answers) if answer is None]
         if missing:
+            self._refuse_further(missing)
             for index, reply in zip(missing, self._fetch(missing, deadline), strict=True):
                 answers[index] = reply
         replies = [answer for answer in answers if answer is not None]
@@ -313,6 +316,8 @@ class SharedMemoryLane:
         """See ``Lane``. What has to be fetched is asked for here: a runner may never give it."""
         if self._owed == _BY_SERVER:
             return self._relay.answered()
+        if self._settled_ns == self._asked_ns:
+            return True
         for shard in self.shards:
             if not shard.answered():
                 return self._listens and self._watch.wait(0)
@@ -325,7 +330,10 @@ class SharedMemoryLane:
             except EnvHubError:  # whoever waits asks again, and meets the same
                 return True
             self._fetching = self._asked_ns, shards
-        return not self._fetching[1] or self._relay.answered()
+        if self._fetching[1] and not self._relay.answered():
+            return False
+        self._settled_ns = self._asked_ns
+        return True
 
     def sources(self) -> list[Source]:
         """See ``Lane``."""
@@ -366,6 +374,14 @@ class SharedMemoryLane:
         # after one has raised: an answer that is left in its slab would be taken for the answer to
         # the next request (interruption.md, rule 1). An interrupt anywhere here leaves ``_owed`` as
         # it was, and ``catch_up`` waits for the same answers again: to wait takes nothing away.
+        # What ``answered`` has found is not waited for: a jail may take it back, and others would
+        # wait for it as well.
+        if self._settled_ns != self._asked_ns:
+            self._wait_for_each(deadline)
+        self.elapsed_ns = perf_counter_ns() - self._asked_ns
+        self._spin.measured(self.elapsed_ns)
+
+    def _wait_for_each(self, deadline: Deadline) -> None:
         for shard in self._sleepers:
             if not shard.answered_before_death(self._watch, deadline):
                 raise _RunnerGoneError
@@ -377,8 +393,14 @@ class SharedMemoryLane:
                     self._spin.missed()
                 if not shard.answered_before_death(self._watch, deadline):
                     raise _RunnerGoneError
-        self.elapsed_ns = perf_counter_ns() - self._asked_ns
-        self._spin.measured(self.elapsed_ns)
+
+    def _refuse_further(self, missing: Sequence[int]) -> None:
+        """Refuse an answer that says after ``answered`` that more has to be fetched.
+
+        Trust: input from the worker, which may never give that; others wait meanwhile.
+        """
+        if self._settled_ns == self._asked_ns and self._fetching != (self._asked_ns, missing):
+            raise RemoteProtocolError("the worker has changed an answer that was there already")
 
     # --- deaths --------------------------------------------------------------------------------
 

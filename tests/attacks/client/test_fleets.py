@@ -19,6 +19,7 @@ from envhub_sandbox.errors import EnvHubError, LoadError, RemoteProtocolError
 from envhub_sandbox.transport.results import Results
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest.manifest import Manifest, encode_env, encode_manifest
+from envhub_worker.protocol.spaces import batches
 from tests.attacks.client.lies import refuses, relayed
 from tests.attacks.client.lying_server import (
     ACTION,
@@ -154,6 +155,29 @@ def test_infos_of_others_are_refused(
         error = refuses(lambda: env.step(ACTIONS))
         assert isinstance(error, RemoteProtocolError)
         assert states(env) == ["DEAD", "READY"]
+
+
+def test_infos_that_would_take_too_much_are_joined_one_by_one() -> None:
+    """A column has room for every row of the fleet: one of the liar's makes it as large."""
+    described = wire.env_manifest(OBSERVATION, ACTION, 64, sync=True)
+    joins = Results(described, [(0, 1), (1, 64)])
+    large = {"a": np.ones((1, 1 << 20), np.uint8), "_a": np.ones(1, bool)}
+    parts: list[Any] = [
+        (
+            np.zeros((rows, 3), np.float32),
+            np.zeros(rows),
+            np.zeros(rows, bool),
+            np.zeros(rows),
+            info,
+        )
+        for rows, info in ((1, large), (63, {}))
+    ]
+    assert joins.joined_steps(parts)[4]["a"].shape == (64, 1 << 20)  # the control
+    joins.max_bytes = 32 << 20
+    with pytest.raises(batches.Misfit):
+        joins.joined_steps(parts)
+    with pytest.raises(batches.Misfit):
+        joins.joined_resets([(part[0], part[4]) for part in parts])
 
 
 def test_another_space_is_refused_before_the_first_step(

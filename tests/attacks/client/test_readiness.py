@@ -16,11 +16,19 @@ import numpy as np
 import pytest
 
 from envhub_sandbox import make_env
-from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerError, WorkerTimeoutError
+from envhub_sandbox.errors import (
+    EnvHubError,
+    RemoteProtocolError,
+    WorkerDiedError,
+    WorkerError,
+    WorkerTimeoutError,
+)
+from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.spaces import batches
 from tests.attacks.harness import TIMEOUTS, Arena
 from tests.attacks.repositories import write_environment
 from tests.remote.listening import listening
+from tests.support import inside
 from tests.support.compare import assert_same
 
 FAMILY = "The client, from inside a jail"
@@ -96,7 +104,7 @@ def become_hostile():
 
     def answer(self, packet):
         request = m.unpack(packet.frames)
-        if isinstance(request, m.FetchInfos) and MODE == "elsewhere":
+        if isinstance(request, m.FetchInfos) and MODE in ("elsewhere", "silent elsewhere"):
             time.sleep(600)
         if isinstance(request, m.FetchInfos) and MODE == "whole":
             nothing = np.zeros(1, bool)
@@ -252,6 +260,31 @@ def test_who_breaks_a_rule_is_given_up_alone(
         with pytest.raises(WorkerError) as refused:
             found.env.send(np.zeros(1, np.int64), [HOSTILE])
         assert isinstance(refused.value, WorkerDiedError)
+
+
+@pytest.mark.short("strict")
+@pytest.mark.parametrize("word", ["SEQUENCE", "OUTCOME"])
+def test_an_answer_that_is_taken_back_holds_nobody_up(
+    arena: Arena, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, word: str
+) -> None:
+    """It was there, and a jail writes its slab whenever it likes: as if there were none yet, or as
+    if there were more elsewhere, which never comes.
+    """
+    value = {"SEQUENCE": 0, "OUTCOME": slabs.FETCH}[word]
+    with among(arena, liar(tmp_path, "silent elsewhere"), "auto") as suites:
+        found = Among(suites.env)
+        lane: Any = inside.parts(suites.env)[HOSTILE].lease.lane
+        changed = inside.written_later(lane, getattr(slabs, word), value)
+        monkeypatch.setattr(lane, "answered", changed)
+        of_it = found.others_go_on()
+        while not of_it:
+            try:
+                received = found.env.recv(1)
+                of_it += [received.infos] if HOSTILE in received.env_ids else []
+            except EnvHubError as error:
+                of_it.append(_of_the_hostile(error))
+        wanted = dict if word == "SEQUENCE" else RemoteProtocolError
+        assert isinstance(of_it[0], wanted), "it was waited for"
 
 
 def test_the_lie_about_infos_would_break_a_batch() -> None:

@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from envhub_sandbox.errors import WorkerDiedError, WorkerTimeoutError
+from envhub_sandbox.errors import LocalProtocolError, WorkerDiedError, WorkerTimeoutError
 from tests.integration.fleet.conftest import DIES, places
 from tests.remote.hosts import OtherHost, other_host
 from tests.remote.listening import Listening
 from tests.support import inside
 from tests.support.ports import lasting_port
 from tests.support.processes import eventually
+from tests.support.repositories import write_repository
 from tests.support.started import started
 
 STILL = np.zeros(6, np.int64)
@@ -139,6 +140,35 @@ def test_every_worker_is_waited_for_where_one_fails(rows: Path, servers: list[Li
         expected = env.reset(seed=9)[0]
         assert np.array_equal(env.reset(seed=9)[0], expected)
         assert env.sandbox.stats()["stale_replies"] == 0
+
+
+_TEXTS = """
+import gymnasium as gym
+
+class Texts(gym.Env):
+    observation_space = gym.spaces.Discrete(100)
+    action_space = gym.spaces.Sequence(gym.spaces.Text(8))
+
+    def reset(self, *, seed=None, options=None):
+        self.count = 0
+        return 0, {}
+
+    def step(self, action):
+        self.count += 1
+        return self.count, 0.0, False, False, {}
+
+def make_env(n_envs=1, use_async_envs=False):
+    return gym.vector.SyncVectorEnv([Texts] * n_envs)
+"""
+
+
+def test_an_action_that_cannot_be_sent_is_sent_to_nobody(tmp_path: Path) -> None:
+    """It is named by the row that it is for, and all go on where they were."""
+    folder = write_repository(tmp_path / "texts", _TEXTS)
+    with started(folder, n_envs=2, sandbox=["process", "process"]) as env:
+        with pytest.raises(LocalProtocolError, match=r"actions\[1\]\[0\] cannot be sent"):
+            env.step((("a",), ("x" * (5 << 20),)))
+        assert env.step((("a",), ("b",)))[0].tolist() == [1, 1]
 
 
 def test_all_workers_share_one_timeout(rows: Path, servers: list[Listening]) -> None:

@@ -10,7 +10,9 @@ import pytest
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import MissingModuleError
 from tests.integration.fleet.conftest import places, serving
+from tests.remote.listening import Listening
 from tests.support.packages.wheels import Index, make_wheel
+from tests.support.ports import lasting_port
 from tests.support.repositories import write_repository
 
 ENV = """
@@ -47,6 +49,17 @@ def test_here_and_on_a_server(packages: Index, client_key: Path, tmp_path: Path)
         where = suites.env.call("where")
         assert len(set(where)) == 2
         assert "listed==1.0" in suites.provenance["installed"]["packages"]
+
+
+def test_a_server_that_is_not_there_keeps_no_other_from_making_them(
+    packages: Index, servers: list[Listening], tmp_path: Path
+) -> None:
+    """All workers go where there are some; the absent server gets none."""
+    folder = write_repository(tmp_path / "repository", ENV, requirements__txt="listed\n")
+    absent = servers[0].sandbox(endpoint=f"tcp://127.0.0.1:{lasting_port()}")
+    with make_env(folder, n_envs=2, sandbox=[absent, "process"]) as suites:
+        suites.env.reset()
+        assert places(suites.env) == ["process", "process"]
 
 
 def test_a_place_that_lacks_one(packages: Index, client_key: Path, tmp_path: Path) -> None:

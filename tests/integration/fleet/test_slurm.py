@@ -18,6 +18,7 @@ trap 'kill $tasks' TERM
 wait $tasks
 wait $tasks
 """
+_THEIRS = "tcp://127.0.0.1:9"
 _TRAIN = """
 import json, os, sys
 import numpy as np
@@ -41,6 +42,10 @@ def test_a_job_trains_against_all_nodes(rows: Path, checkout: Path, tmp_path: Pa
         (commands / name).write_text(text)
         (commands / name).chmod(0o755)
     (tmp_path / "train.py").write_text(_TRAIN)
+    for number in range(3):  # another user of the nodes knows the job's number
+        theirs = tmp_path / f"envhub-7-{number}"
+        theirs.mkdir()
+        (theirs / "endpoint").write_text(f"{_THEIRS} {'ab' * 32} 1\n")
     variables = {
         **os.environ,
         "PATH": f"{commands}{os.pathsep}{os.environ['PATH']}",
@@ -64,6 +69,7 @@ def test_a_job_trains_against_all_nodes(rows: Path, checkout: Path, tmp_path: Pa
     observed, places = json.loads(done.stdout.splitlines()[-1])
     assert observed == list(range(6))
     assert len(set(places)) == 3
+    assert _THEIRS not in done.stdout + done.stderr
     assert not (tmp_path / "envhub-7").exists(), "the key was for this job alone"
 
     def alive() -> bool:

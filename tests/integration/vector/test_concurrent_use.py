@@ -114,6 +114,42 @@ def test_the_second_thread_is_refused_after_an_async_call(env: Any) -> None:
     assert env.step_wait()[0].shape == (2, 4)
 
 
+@pytest.mark.parametrize("asks", ["recv", "send", "reset"])
+def test_a_second_thread_waits_for_a_send(
+    env: Any, monkeypatch: pytest.MonkeyPatch, asks: str
+) -> None:
+    """It finds no half of it, which would look like one that a Ctrl-C has left."""
+    requests, stopped, go_on = inside.session(env).requests, threading.Event(), threading.Event()
+    submit, found = requests.submit_step, list[Any]()
+
+    def slow(actions: Any) -> None:
+        submit(actions)
+        stopped.set()
+        assert go_on.wait(DEADLINE_S)
+
+    def ask() -> None:
+        try:
+            found.append(getattr(env, asks)(*[ACTIONS] * (asks == "send")))
+        except Exception as error:
+            found.append(error)
+
+    monkeypatch.setattr(requests, "submit_step", slow)
+    first, second = threading.Thread(target=lambda: env.send(ACTIONS)), threading.Thread(target=ask)
+    first.start()
+    assert stopped.wait(DEADLINE_S)
+    second.start()
+    second.join(0.2)  # as far as it comes
+    monkeypatch.undo()
+    go_on.set()
+    first.join(DEADLINE_S)
+    second.join(DEADLINE_S)
+    assert len(found) == 1
+    assert not isinstance(found[0], Exception), found
+    if asks != "reset":
+        received = env.recv() if asks == "send" else found[0]
+        assert received.env_ids.tolist() == [0, 1]
+
+
 def test_a_close_in_another_thread_does_not_wait(env: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also between the halves of a step, which ends with an error then."""
     errors: list[Exception] = []

@@ -25,7 +25,12 @@ def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.parametrize(
-    "wrong", ["host:1", "tcp://host", "tcp://host:x", "ipc://host:1", "tcp://[::1"]
+    "wrong",
+    [
+        *("host:1", "tcp://host", "tcp://host:x", "ipc://host:1", "tcp://[::1"),
+        *("tcp://*:1", "tcp://host:0", "tcp://a b:1", "tcp://h\u00e9:1", "tcp://host:1?x"),
+        *("tcp://ho\nst:1", "tcp://ho\0st:1", "tcp://\x1b[2J:1", "TCP://host:1"),
+    ],
 )
 def test_only_host_and_port_are_an_address(wrong: str) -> None:
     """A login is refused, and is not repeated."""

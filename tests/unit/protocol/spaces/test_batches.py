@@ -269,6 +269,16 @@ class TestJoinedInfos:
             with pytest.raises(batches.Misfit):
                 batches.join_infos(parts, [1, 1])
 
+    def test_one_row_makes_no_endless_column(self) -> None:
+        """What all shards have sent is joined, whatever it takes; what one has sent is bounded."""
+        row = {"a": np.zeros((1, 1000), np.uint8), "_a": np.ones(1, bool)}
+        nested = {"x": row, "_x": np.ones(1, bool)}
+        for part in (row, nested):
+            assert batches.join_infos([part] * 64, [1] * 64, 100).keys() == part.keys()
+            assert batches.join_infos([part, {}], [1, 63], 70_000).keys() == part.keys()
+            with pytest.raises(batches.Misfit, match="more than 60000 bytes"):
+                batches.join_infos([part, {}], [1, 63], 60_000)
+
     def test_few_bytes_make_no_large_column(self) -> None:
         """One value of each sub-environment is as long as the first one's, and is counted so."""
         pairs = [(0, {"a": np.zeros(1000, np.uint8)}), (1, {"a": np.uint8(1)})]

@@ -154,11 +154,16 @@ def with_integers(space: gym.Space[Any], member: Any, which: Iterator[bool]) -> 
     return member
 
 
-def join_infos(parts: Sequence[dict[Any, Any]], sizes: Sequence[int]) -> dict[Any, Any]:
+def join_infos(
+    parts: Sequence[dict[Any, Any]], sizes: Sequence[int], max_bytes: int | None = None
+) -> dict[Any, Any]:
     """The infos of all shards as ``VectorEnv._add_info`` would have built them in one go.
 
     The first sub-environment that has a key decides about its dtype, and each shard has a first
     one of its own. Where these agree the shards' arrays are parts of the whole.
+
+    Args:
+        max_bytes: How much larger than the parts the whole may be: one row makes a long column.
 
     Raises:
         Misfit: They do not agree, or are not what infos look like; ask for each one's own.
@@ -167,25 +172,52 @@ def join_infos(parts: Sequence[dict[Any, Any]], sizes: Sequence[int]) -> dict[An
     if not any(parts):
         return joined
     starts = np.cumsum([0, *sizes]).tolist()
+    room = _Room(parts, max_bytes)
     for part, start, size in zip(parts, starts, sizes, strict=False):
         try:
-            _join_part(joined, part, slice(start, start + size), starts[-1])
+            _join_part(joined, part, slice(start, start + size), starts[-1], room)
         except FAULTS as error:
             raise Misfit(f"the shards' infos do not fit together: {error}") from error
     return joined
 
 
-def _join_part(joined: dict[Any, Any], part: dict[Any, Any], window: slice, count: int) -> None:
+class _Room:
+    """What the columns of joined infos may take: see ``join_infos``."""
+
+    def __init__(self, parts: Sequence[dict[Any, Any]], max_bytes: int | None) -> None:
+        self._parts, self._max_bytes, self._taken = parts, max_bytes, 0
+
+    def take(self, value: Any, count: int) -> None:
+        """Before a column of such values is made."""
+        self._taken += value.nbytes * count // len(value)
+        most = self._max_bytes
+        if most is not None and self._taken > most and self._taken > most + _bytes(*self._parts):
+            raise ValueError(f"they take more than {most} bytes beyond their own")
+
+
+def _bytes(*parts: dict[Any, Any]) -> int:
+    """Of the arrays in infos."""
+    values = [value for part in parts for value in part.values()]
+    nested = _bytes(*(one for one in values if isinstance(one, dict))) if values else 0
+    return nested + sum(one.nbytes for one in values if isinstance(one, np.ndarray))
+
+
+def _join_part(
+    joined: dict[Any, Any], part: dict[Any, Any], window: slice, count: int, room: _Room
+) -> None:
     for key, value in part.items():
         if type(key) is int and f"_{key}" not in part:
             raise ValueError("an entry has no mask")
         if isinstance(value, dict):
-            _join_part(joined.setdefault(key, {}), value, window, count)
+            _join_part(joined.setdefault(key, {}), value, window, count, room)
             continue
         size = window.stop - window.start
         if len(value) != size:  # or its other dimensions cost nothing
             raise ValueError("an entry does not have one value per sub-environment")
-        array = joined.setdefault(key, _blank(value, count))
+        array = joined.get(key)
+        if array is None:
+            room.take(value, count)
+            array = joined[key] = _blank(value, count)
         if (array.dtype, array.shape[1:]) != (value.dtype, value.shape[1:]):
             raise ValueError("an entry is of another dtype or shape in another shard")
         array[window] = value

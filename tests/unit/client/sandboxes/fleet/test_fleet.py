@@ -30,6 +30,19 @@ def test_a_fleet_is_no_place_of_another(tmp_path: Path) -> None:
     assert [seat.address for seat in opened.workers(None)] == ["tcp://a:1", "tcp://b:1"]
 
 
+def test_a_list_that_names_itself_is_no_place(tmp_path: Path) -> None:
+    """Neither at first nor later: what is no place is not read."""
+    path = tmp_path / "places"
+    resolve = partial(sandbox_of, server_key=None)
+    path.write_text(f"file:{path}\n")
+    with pytest.raises(PolicyError, match="no fleet"):
+        Fleet(path).opened(resolve, None)
+    path.write_text("tcp://a:1\n")
+    opened = Fleet(path).opened(resolve, None)
+    path.write_text(f"file:{path}\ntcp://a:1\ntcp://b:1,file:{path}\ntcp://b:1\n")
+    assert [seat.address for seat in opened.workers(None)] == ["tcp://a:1", "tcp://b:1"]
+
+
 def test_a_secret_key_is_in_copies_and_in_no_pickle() -> None:
     """A copy is of this process, as that of a RemoteSandbox is."""
     pair = keys.generate()

@@ -48,7 +48,7 @@ def test_a_file_is_read_again(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "source",
     [
-        *([], "", ",", "file:/there/is/none", "dns://nohost", "dns://h:x"),
+        *([], "", ",", "file:/there/is/none", "file:/a\0b", "dns://nohost", "dns://h:x"),
         *("dns://[", f"dns://{'a' * 70}:5", "dns://a..b:5", "dns://\u2100:5"),
     ],
 )

@@ -21,6 +21,18 @@ from envhub_worker.protocol.runtime import Runtime
 class _Place(Sandbox):
     def __init__(self, name: str) -> None:
         self.name = name
+        self.refuses, self.asked = False, 0
+
+    def runs_on(self, runtime: Runtime) -> Runtime:
+        """Something of its own, and a long one."""
+        self.asked += 1
+        return Runtime(f"tcp://{self.name} {'k' * 64}" if self.name.startswith("far") else "")
+
+    def for_repository(self, *given: Any) -> Sandbox:
+        """As the test says."""
+        if self.refuses:
+            raise PolicyError(f"{self.name} cannot permit that")
+        return self
 
 
 class _Rooms:
@@ -121,10 +133,62 @@ def test_where_a_worker_is(rooms: dict[str, Room]) -> None:
     assert placement.at(0).name == "b"
 
 
+def test_a_place_that_was_absent_is_made_when_it_is_used(rooms: dict[str, Room]) -> None:
+    """Packages could not be made there: the others are used without it, and it comes last."""
+    placement = _placement(["a", "b", "c"])
+    [a, b, c] = placement.members()
+    a.absent = c.absent = True
+    rooms |= {one: Room(answers=False, workers=0) for one in "ac"}
+    placement.seats(None)[0].for_repository(Path(), Policy(), Runtime(""))
+    assert [one.is_open for one in (a, b, c)] == [False, True, False]
+    assert [placement.at(number).name for number in range(2)] == ["b", "b"]
+    vars(c.sandbox)["refuses"] = True
+    assert [one.name for one in placement.candidates(0)] == ["b", "a"]
+    assert [one.is_open for one in (a, b, c)] == [True, True, False]
+    assert placement.at(0).is_open, "where a worker is held there is a place"
+
+
+def test_all_are_made_where_none_was_there(rooms: dict[str, Room]) -> None:
+    """The first error says why."""
+    placement = _placement(["a", "b"])
+    for one in placement.members():
+        one.absent = vars(one.sandbox)["refuses"] = True
+    with pytest.raises(PolicyError, match="a cannot"):
+        placement.seats(None)[0].for_repository(Path(), Policy(), Runtime(""))
+
+
 def test_what_it_runs_on_is_that_of_all_places(rooms: dict[str, Room]) -> None:
     """Of places that are alike that of one: a remembered manifest then holds for both."""
     placement = _opened(["a", "b"])
     assert placement.runs_on(Runtime("")) == Runtime("")
+
+
+def test_what_many_places_run_on_has_a_name_of_a_file(rooms: dict[str, Room]) -> None:
+    """It is looked up as one; the same places have the same, in any order."""
+    names = [f"far{number}" for number in range(300)]
+    found = [_opened(some).runs_on(Runtime("")) for some in (names, names[::-1], names[1:])]
+    assert found[0] == found[1] != found[2]
+    assert not Path(found[0].python).exists()
+    assert list(Path(found[0].python).parent.glob("none")) == []
+
+
+def test_a_place_is_asked_once_for_all_workers(rooms: dict[str, Room]) -> None:
+    """There may be a thousand of each."""
+    placement = _placement([f"far{number}" for number in range(50)])
+    for seat in placement.seats(None):
+        seat.for_repository(Path(), Policy(), Runtime("")).runs_on(Runtime(""))
+    assert {vars(member.sandbox)["asked"] for member in placement.members()} == {1}
+
+
+def test_servers_that_do_not_answer_are_not_all_asked(
+    rooms: dict[str, Room], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A name of DNS may have thousands of addresses; each group of them costs a wait."""
+    names = [f"far{number:03}" for number in range(100)]
+    rooms |= dict.fromkeys(names, Room(answers=False, workers=0)) | {"far099": Room(workers=1)}
+    assert _first(_opened(names), 0) == "far099"  # the control
+    monkeypatch.setattr(module, "ASK_S", 0)
+    assert _first(_opened(names), 0) == "far000"
 
 
 def test_a_place_that_is_wrong_later_is_left_out(tmp_path: Path, rooms: dict[str, Room]) -> None:

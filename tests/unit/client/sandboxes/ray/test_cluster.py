@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import concurrent.futures
 import json
 import pickle
 import sys
@@ -35,12 +36,45 @@ def test_bytes_of_json_are_an_answer() -> None:
         cluster.read_answer(type("Bytes", (bytes,), {})(b"{}"))
 
 
+@pytest.mark.parametrize(
+    ("answer", "says"),
+    [
+        (b'{"code": 3, "log": "no\\nroom"}', "it ended with 3: no room"),
+        (b'{"code": "\\u001b[2J", "log": "\\u001b[2J"}', r"it ended with \x1b[2J: \x1b[2J"),
+        (b'{"code": "%s", "log": ""}' % (b"x" * 60_000), "it ended with xxx"),
+        (b"nonsense", "none of ours"),
+        (7, "none of ours"),
+    ],
+)
+def test_how_a_server_ended_is_a_text(
+    answer: Any, says: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whatever the node says: it is short, does nothing to a terminal, and hides no other error."""
+    ray = use(Ray(connected="a:1"), monkeypatch)
+    placed = cluster.PlacedActor({})
+    placed.watch(lambda: None)
+    ray.waits.set_result(answer)
+    text = placed.end_text(0)
+    assert says in text
+    assert len(text) < 5_000
+    assert "\x1b" not in text
+
+
 class Ray:
     """Stands for Ray: whether this process is connected, and what becomes of ``init``."""
 
     def __init__(self, *, running: bool = False, connected: str = "") -> None:
         self.running, self.connected = running, connected
         self.asked: list[str] = []
+        self.waits: concurrent.futures.Future[Any] = concurrent.futures.Future()
+        self.exceptions = SimpleNamespace(ActorUnavailableError=type("Busy", (Exception,), {}))
+
+    def remote(self, **_: Any) -> Any:
+        """An actor, which has been placed; ``waits`` is what its ``wait`` will have answered."""
+        called = SimpleNamespace(future=lambda: self.waits)
+        handle = SimpleNamespace(wait=SimpleNamespace(remote=lambda: called))
+        placed = SimpleNamespace(remote=lambda: handle)
+        return lambda actor: SimpleNamespace(options=lambda **_: placed)
 
     def is_initialized(self) -> bool:
         """As Ray says it."""

@@ -42,8 +42,9 @@ def test_a_server_is_what_a_node_says() -> None:
             for one in ("tcp://10.0.0.3:99999", "tcp://10.0.0.3:1;tcp://1.1.1.1:1")
         ),
         *({"key": one} for one in ("", "ab" * 31, None, ["ab" * 32])),
-        *({"node": one} for one in ("", "x" * 65, "\x1b[2J", 3)),
-        *({"gpus": one} for one in ([-1], ["0"], [True], None, 1)),
+        *({"endpoint": f"tcp://[fe80::1%{one}]:1"} for one in ("\x1b[2J", "\u202e", "a\nb")),
+        *({"node": one} for one in ("", "x" * 65, "\x1b[2J", 3, "\u0663")),
+        *({"gpus": one} for one in ([-1], ["0"], [True], None, 1, "", {}, [10**400])),
     ],
 )
 def test_a_lie_of_a_node_is_refused(lie: dict[str, Any]) -> None:
