@@ -82,17 +82,24 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
 
 def _home(readme: str, meta: Any) -> str:
     """The README below what ``.ci/theme/home.html`` shows of it: all up to its first command."""
-    title, introduction, picture, *_ = readme.split("\n\n")
+    title, introduction, picture, needed, *_ = readme.split("\n\n")
     _, command, after = _COMMAND.split(readme, maxsplit=1)
     meta |= {
         "template": "home.html",
         "hide": ["navigation", "toc"],
         "title": title.removeprefix("# "),
         "description": " ".join(introduction.split()).replace("`", ""),
+        "introduction": _with_code(introduction),
         "picture": picture.partition("[")[2].partition("]")[0],
+        "needed": _with_code(needed),
         "command": f"<pre><code>{escape(command)}</code></pre>",
     }
     return after
+
+
+def _with_code(text: str) -> str:
+    """A paragraph as HTML, in which nothing but code is marked."""
+    return re.sub("`([^`]+)`", r"<code>\1</code>", escape(text))
 
 
 def _with_bars(code: re.Match[str]) -> str:
@@ -105,17 +112,11 @@ def _shown(found: re.Match[str]) -> str:
 
 def on_post_page(output: str, page: Any, config: Any) -> str:
     """Forbid the browser to load anything from elsewhere; and diagrams need mermaid."""
-    output, diagrams = _DIAGRAM.subn(_framed, output)
+    output, diagrams = _DIAGRAM.subn(r'<div class="diagram">\g<0></div>', output)
     if diagrams:
         script = f'<script src="{get_relative_url(MERMAID, page.url)}"></script>'
         output = output.replace("</head>", f"{script}</head>", 1)
     return _confined(output)
-
-
-def _framed(drawing: re.Match[str]) -> str:
-    """A chart fits any screen; a diagram scrolls where its words would be too small."""
-    kind = "diagram chart" if "xychart" in drawing[0] else "diagram"
-    return f'<div class="{kind}">{drawing[0]}</div>'
 
 
 def on_post_template(output_content: str, template_name: str, config: Any) -> str:
