@@ -40,6 +40,7 @@ POLICY = (
     "style-src 'self' 'unsafe-inline'; form-action 'none'\">"
 )
 _LINK = re.compile(r"\]\((?!https?:|mailto:|#)([^)\s#]+)")
+_BY_FILE = re.compile(r"\[([\w/-]+\.md)\]\(([\w./-]+\.md)(#[\w-]+)?\)")
 _EXAMPLE = re.compile(r"^\[(examples/[\w/]+\.py)\]\([^)]*\)$", re.M)
 _COMMAND = re.compile(r"^```sh\n(.*?)\n```$", re.M | re.S)
 _ROW = re.compile(r"^\|.*\|$", re.M)
@@ -77,7 +78,12 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
         there = PLACES.get(meant, meant.removeprefix("docs/"))
         return f"]({os.path.relpath(there, os.path.dirname(place) or '.')}"
 
-    return _LINK.sub(led, markdown)
+    def titled(found: re.Match[str]) -> str:
+        page = ROOT / os.path.normpath(os.path.join(folder, found[2]))
+        title = _title(page.read_text(), found[3]) if page.is_file() else None
+        return f"[{title or found[1]}]({found[2]}{found[3] or ''})"
+
+    return _LINK.sub(led, _BY_FILE.sub(titled, markdown))
 
 
 def _home(readme: str, meta: Any) -> str:
@@ -95,6 +101,17 @@ def _home(readme: str, meta: Any) -> str:
         "command": f"<pre><code>{escape(command)}</code></pre>",
     }
     return after
+
+
+def _title(text: str, anchor: str | None) -> str | None:
+    """Of a page, or of the part of it that an anchor names: a site has no names of files."""
+    titles = re.findall(r"^#+ (.+)$", re.sub(r"^```.*?^```$", "", text, flags=re.M | re.S), re.M)
+    wanted = (title for title in titles if anchor in (None, f"#{_slug(title)}"))
+    return next(wanted, None)
+
+
+def _slug(title: str) -> str:
+    return re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-")
 
 
 def _with_code(text: str) -> str:
