@@ -40,7 +40,7 @@ def inspect(
     context: typer.Context,
     ref: opt.Ref,
     static: Annotated[
-        bool, typer.Option("--static", help="Read the repository instead, and run nothing of it.")
+        bool, typer.Option("--static", help="Read the repository as data, and run nothing.")
     ] = False,
     sarif: Annotated[
         Path | None,
@@ -54,8 +54,8 @@ def inspect(
 ) -> None:
     """Print suites, tasks, spaces, metadata and provenance, without stepping anything.
 
-    The repository's make_env runs (in the sandbox) unless its answer is remembered. With --static
-    nothing runs: files, entry, packages, imports, and what is worth a look are read.
+    The repository's make_env runs in the sandbox, unless its answer is cached. With --static
+    nothing runs: files, entry, packages and imports are read as data, and findings are printed.
     """
     _check_options(context, static=static)
     if static:

@@ -68,7 +68,7 @@ Again = Annotated[
     bool,
     typer.Option(
         "--again",
-        help="With --all: judge repositories again that have results.",
+        help="With --all: judge also repositories that have results.",
         rich_help_panel=_PANEL,
     ),
 ]
