@@ -177,7 +177,7 @@ def _print_static(read: Static) -> None:
     for one in read.findings:
         show_finding(one)
     if not read.findings:
-        show("findings", "nothing that is worth a look")
+        show("findings", "none")
 
 
 def _print_packages(read: Static) -> None:

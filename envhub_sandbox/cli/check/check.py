@@ -216,12 +216,14 @@ def check(
 
 def _refuse_beside_a_list(*, ref: str | None, **files: Path | None) -> None:
     if ref is not None:
-        raise UsageError(f"a list, by --all, or one repository, {ref}: not both")
+        raise UsageError(
+            f"--all judges a list, and {ref} is one repository: give one of them, not both"
+        )
     for name, path in files.items():
         if path is not None:
             raise UsageError(
-                f"--{name} is about one repository; with --all each has its page and its JSON in "
-                "--output DIR, and --junit FILE is about all"
+                f"--{name} is about one repository; with --all, --output DIR has a page and a "
+                "JSON document for each, and --junit FILE has all"
             )
 
 

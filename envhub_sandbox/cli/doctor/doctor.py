@@ -115,12 +115,15 @@ def doctor(
         from envhub_sandbox.sandboxes.remote import RemoteSandbox
 
         if insecure_loopback and server_key is not None:
-            raise UsageError("--server-key is of a server with keys: not --insecure-loopback")
+            raise UsageError(
+                "--server-key is for a server with keys, and --insecure-loopback for one without: "
+                "leave one out"
+            )
         place = RemoteSandbox(server, server_key=server_key, insecure_loopback=insecure_loopback)
         raise typer.Exit(remote.examine(place, profile, json=json))
     if server_key is not None or insecure_loopback:
         raise UsageError(
-            "--server-key and --insecure-loopback are of a server: envhub doctor tcp://HOST:PORT"
+            "--server-key and --insecure-loopback need a server: envhub doctor tcp://HOST:PORT"
         )
     with ProgressBar(quiet=json) as bar, _scratch_folder() as folder:
         (folder / "idle").mkdir()
