@@ -200,7 +200,8 @@ def test_a_terminal_wraps_below_the_beginning(
     capsys: pytest.CaptureFixture[str], monkeypatch: Any
 ) -> None:
     """A long line is wrapped under its text, and a path in it stays in one piece."""
-    monkeypatch.setattr("envhub_sandbox.cli.shared.console._columns", lambda **_: 34)
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", "34")
     show("note", "the card is missing, and so is /a/long/path/of/more/than/a/line")
     shown = capsys.readouterr().out.splitlines()
     margin = " " * 13
