@@ -40,6 +40,7 @@ POLICY = (
     "style-src 'self' 'unsafe-inline'; form-action 'none'\">"
 )
 _LINK = re.compile(r"\]\((?!https?:|mailto:|#)([^)\s#]+)")
+_BY_FILE = re.compile(r"\[([\w/-]+\.md)\]\(([\w./-]+\.md)(#[\w-]+)?\)")
 _EXAMPLE = re.compile(r"^\[(examples/[\w/]+\.py)\]\([^)]*\)$", re.M)
 _COMMAND = re.compile(r"^```sh\n(.*?)\n```$", re.M | re.S)
 _ROW = re.compile(r"^\|.*\|$", re.M)
@@ -77,22 +78,45 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
         there = PLACES.get(meant, meant.removeprefix("docs/"))
         return f"]({os.path.relpath(there, os.path.dirname(place) or '.')}"
 
-    return _LINK.sub(led, markdown)
+    def titled(found: re.Match[str]) -> str:
+        page = ROOT / os.path.normpath(os.path.join(folder, found[2]))
+        title = _title(page.read_text(), found[3]) if page.is_file() else None
+        return f"[{title or found[1]}]({found[2]}{found[3] or ''})"
+
+    return _LINK.sub(led, _BY_FILE.sub(titled, markdown))
 
 
 def _home(readme: str, meta: Any) -> str:
     """The README below what ``.ci/theme/home.html`` shows of it: all up to its first command."""
-    title, introduction, picture, *_ = readme.split("\n\n")
+    title, introduction, picture, needed, *_ = readme.split("\n\n")
     _, command, after = _COMMAND.split(readme, maxsplit=1)
     meta |= {
         "template": "home.html",
         "hide": ["navigation", "toc"],
         "title": title.removeprefix("# "),
         "description": " ".join(introduction.split()).replace("`", ""),
+        "introduction": _with_code(introduction),
         "picture": picture.partition("[")[2].partition("]")[0],
+        "needed": _with_code(needed),
         "command": f"<pre><code>{escape(command)}</code></pre>",
     }
     return after
+
+
+def _title(text: str, anchor: str | None) -> str | None:
+    """Of a page, or of the part of it that an anchor names: a site has no names of files."""
+    titles = re.findall(r"^#+ (.+)$", re.sub(r"^```.*?^```$", "", text, flags=re.M | re.S), re.M)
+    wanted = (title for title in titles if anchor in (None, f"#{_slug(title)}"))
+    return next(wanted, None)
+
+
+def _slug(title: str) -> str:
+    return re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-")
+
+
+def _with_code(text: str) -> str:
+    """A paragraph as HTML, in which nothing but code is marked."""
+    return re.sub("`([^`]+)`", r"<code>\1</code>", escape(text))
 
 
 def _with_bars(code: re.Match[str]) -> str:
@@ -105,17 +129,11 @@ def _shown(found: re.Match[str]) -> str:
 
 def on_post_page(output: str, page: Any, config: Any) -> str:
     """Forbid the browser to load anything from elsewhere; and diagrams need mermaid."""
-    output, diagrams = _DIAGRAM.subn(_framed, output)
+    output, diagrams = _DIAGRAM.subn(r'<div class="diagram">\g<0></div>', output)
     if diagrams:
         script = f'<script src="{get_relative_url(MERMAID, page.url)}"></script>'
         output = output.replace("</head>", f"{script}</head>", 1)
     return _confined(output)
-
-
-def _framed(drawing: re.Match[str]) -> str:
-    """A chart fits any screen; a diagram scrolls where its words would be too small."""
-    kind = "diagram chart" if "xychart" in drawing[0] else "diagram"
-    return f'<div class="{kind}">{drawing[0]}</div>'
 
 
 def on_post_template(output_content: str, template_name: str, config: Any) -> str:

@@ -6,16 +6,17 @@ guarded output, help that is text, errors that name options.
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import inspect as python
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from envhub_sandbox.cli.shared.console import guarded, out
-from envhub_sandbox.cli.shared.exits import EXIT_CODES, reported
+from envhub_sandbox.cli.shared.console import guarded, out, say
+from envhub_sandbox.cli.shared.exits import EXIT_CODES, Exit, reported
 from envhub_sandbox.settings.options import on_command_line, use_option_names
 
 Where = Mapping[str, str]
@@ -32,24 +33,24 @@ _COMMANDS: dict[str, tuple[str, str | Where]] = {
         "inspect:inspect",
     ),
     "check": (
-        "Run a repository in a sandbox and say what is wrong with it.",
+        "Run a repository in a sandbox and report what is wrong with it.",
         "check.check:check",
     ),
     "diff": (
-        "Say what changed from one commit to another, in terms of what a repository would do.",
+        "Compare two commits: files, packages, imports and findings; with --run, tasks and spaces.",
         "diff:diff",
     ),
     "prefetch": (
-        "Download a repository and make the environment that it runs in, and run nothing of it.",
+        "Download a repository and install its packages, without running the repository.",
         "prefetch:prefetch",
     ),
     "lock": (
-        "Write down commit, file hashes, packages, Python and spaces, for make_env(lock=FILE).",
+        "Record commit, file hashes, packages, Python and spaces in a file for "
+        "make_env(lock=FILE).",
         "lock:lock",
     ),
     "verify": (
-        "Say whether a repository is still as it was locked, and if not, what differs (exit code "
-        "7).",
+        "Compare a repository with its lock file; exit code 7 if something differs.",
         "lock:verify",
     ),
     "init": (
@@ -62,18 +63,18 @@ _COMMANDS: dict[str, tuple[str, str | Where]] = {
         "push:push",
     ),
     "replay": (
-        "Make the environment of a crash bundle again, ask the same of it, and say how that ends.",
+        "Repeat the requests of a crash bundle, and report whether it dies in the same way.",
         "replay:replay",
     ),
     "doctor": (
-        "Try what this host can enforce, say what is missing and how to get it.",
+        "Test what this host can enforce, and print what is missing and how to get it.",
         "doctor.doctor:doctor",
     ),
     "cache": (
-        "List and remove what was downloaded and made of it, and what killed clients have left.",
+        "List and remove snapshots, installed packages, and what killed clients left behind.",
         {"list": "cache:list_", "remove": "cache:remove", "gc": "cache:gc"},
     ),
-    "image": ("Container images for repositories.", {"build": "image:build"}),
+    "image": ("Build container images for repositories.", {"build": "image:build"}),
 }
 
 
@@ -100,6 +101,32 @@ class Program(TyperGroup):
         """Run a command."""
         with guarded():
             return super().main(*args, **options)
+
+    def make_context(self, *args: Any, **options: Any) -> Any:
+        """Parse what stands before a command."""
+        with _wrong_usage():
+            return super().make_context(*args, **options)
+
+    def invoke(self, ctx: Any) -> Any:
+        """Parse a command's options, and call it."""
+        with _wrong_usage():
+            return super().invoke(ctx)
+
+
+@contextlib.contextmanager
+def _wrong_usage() -> Iterator[None]:
+    """Report what the parser refuses as every other error: one message, without a box."""
+    try:
+        yield
+    except Exception as error:
+        # the parser's errors have this method; the place of their class depends on typer's version
+        text = error.format_message() if hasattr(error, "format_message") else ""
+        if not text:  # another error; or a command without arguments, which prints its help
+            raise
+        end = "" if text[-1] in ".?!)" else "."
+        path = getattr(getattr(error, "ctx", None), "command_path", "envhub")
+        say(f"Error: {text}{end} Try '{path} --help'.", style="red")
+        raise typer.Exit(Exit.USAGE) from None
 
 
 class Command(TyperCommand):
@@ -180,7 +207,7 @@ def envhub(
             "--version",
             callback=_print_versions,
             is_eager=True,
-            help="Print versions: ours, the protocol's, Python's and of the packages that matter.",
+            help="Print the versions of envhub, the protocol, Python and the packages that matter.",
         ),
     ] = False,
 ) -> None:

@@ -85,7 +85,7 @@ def _repository(document: dict[str, Any]) -> str:
 def list_(
     json: opt.Json = False,
 ) -> None:
-    """List snapshots, and the environments of their packages, the latest used first."""
+    """List snapshots and environments of packages, last used first."""
     from envhub_sandbox.dependencies import environments
     from envhub_sandbox.hub.cache import cache_root
 
@@ -160,14 +160,14 @@ def remove(
         ),
     ] = None,
     everything: Annotated[
-        bool, typer.Option("--all", help="Everything, remembered descriptions included.")
+        bool, typer.Option("--all", help="Everything, cached descriptions and versions included.")
     ] = False,
     unused_for: Annotated[
         float | None,
-        typer.Option(metavar="DAYS", min=0, help="Those that were not used for so many days."),
+        typer.Option(metavar="DAYS", min=0, help="What was not used for this many days."),
     ] = None,
 ) -> None:
-    """Remove snapshots, environments and unfinished remains; what is in use stays."""
+    """Remove snapshots and environments of packages that are not in use."""
     from envhub_sandbox.dependencies import environments
     from envhub_sandbox.hub.cache import cache_root
 
@@ -222,16 +222,16 @@ def _chosen(
 @opt.with_options()
 def gc(
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", "-n", help="Say what would be removed.")
+        bool,
+        typer.Option("--dry-run", "-n", help="List what would be removed, and remove nothing."),
     ] = False,
     json: opt.Json = False,
 ) -> None:
     """Remove containers, runtime folders and control groups whose client is gone.
 
-    Usually there are none: they end with the client. Never touched are those of a client that
-    still runs, of another machine's clients while they run, or of anything but envhub; nor those
-    of another user, but root removes every user's containers and control groups. Exit code 9 says
-    that an engine is installed and could not be asked.
+    Usually there are none, because they end with the client. What belongs to a running client, to
+    another user, or to clients on another machine that share the engine stays; root removes the
+    containers and control groups of all users. Exit code 9: an installed engine did not answer.
     """
     from envhub_sandbox.sandboxes.docker import leftovers
 

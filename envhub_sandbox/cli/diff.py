@@ -24,9 +24,7 @@ def diff(
     *,
     then: Annotated[
         str,
-        typer.Argument(
-            metavar="REF_A", help="The commit that is known: org/repo@commit, or a folder."
-        ),
+        typer.Argument(metavar="REF_A", help="The approved commit, org/repo@commit, or a folder."),
     ],
     now: Annotated[str, typer.Argument(metavar="REF_B", help="The commit to compare with it.")],
     run: Annotated[
@@ -37,11 +35,10 @@ def diff(
     json: opt.Json = False,
     make: opt.MakeOptions,
 ) -> None:
-    """Say what changed from one commit to another, in terms of what a repository would do.
+    """Compare two commits: files, packages, imports and findings; with --run, tasks and spaces.
 
-    Files, entry, declared packages, imports, and what is worth a look and was not there before.
-    Both are read, and nothing runs without --run. Exit code 7 if something differs; with --fail-on
-    only a new finding counts, and the exit code is 1.
+    Both commits are read as data; nothing runs without --run. Exit code 7 if something differs;
+    with --fail-on only new findings count, and the exit code is 1.
 
     [bold]envhub diff org/repo@<approved> org/repo@<new> --fail-on note[/bold]
     """

@@ -21,18 +21,18 @@ def build(
     *,
     ref: opt.Ref,
     base: Annotated[
-        str, typer.Option(metavar="IMAGE", help="The worker's image that it derives from.")
+        str, typer.Option(metavar="IMAGE", help="The image to derive from.")
     ] = "envhub-worker",
     engine: Annotated[
-        str | None, typer.Option(metavar="docker|podman", help="Docker, if it answers.")
+        str | None, typer.Option(metavar="docker|podman", help="Docker by default, if it answers.")
     ] = None,
     apt: Annotated[
         list[str] | None,
-        typer.Option(metavar="PACKAGE", help="A Debian package that it needs too (repeatable)."),
+        typer.Option(metavar="PACKAGE", help="A Debian package to install (repeatable)."),
     ] = None,
     exclude_newer: Annotated[
         str | None,
-        typer.Option(metavar="DATE", help="See no package that was uploaded after this date."),
+        typer.Option(metavar="DATE", help="Ignore packages that were published after this date."),
     ] = None,
     build_network: Annotated[
         str | None,
@@ -43,8 +43,8 @@ def build(
 ) -> None:
     """Derive an image from envhub-worker with the packages that a repository declares.
 
-    Its packages are pinned with hashes, wheels only: nothing of the repository runs. The image is
-    tagged by the hash of all that it is made of, so the same again costs nothing.
+    Packages are wheels, pinned by hash, and nothing of the repository runs. The image's tag is the
+    hash of all inputs, so the same image is built once.
     """
     with ProgressBar(quiet=json) as bar:
         bar.begin(f"reading {ref}")

@@ -40,7 +40,7 @@ def inspect(
     context: typer.Context,
     ref: opt.Ref,
     static: Annotated[
-        bool, typer.Option("--static", help="Read the repository instead, and run nothing of it.")
+        bool, typer.Option("--static", help="Read the repository as data, and run nothing.")
     ] = False,
     sarif: Annotated[
         Path | None,
@@ -54,8 +54,8 @@ def inspect(
 ) -> None:
     """Print suites, tasks, spaces, metadata and provenance, without stepping anything.
 
-    The repository's make_env runs (in the sandbox) unless its answer is remembered. With --static
-    nothing runs: files, entry, packages, imports, and what is worth a look are read.
+    The repository's make_env runs in the sandbox, unless its answer is cached. With --static
+    nothing runs: files, entry, packages and imports are read as data, and findings are printed.
     """
     _check_options(context, static=static)
     if static:
@@ -177,7 +177,7 @@ def _print_static(read: Static) -> None:
     for one in read.findings:
         show_finding(one)
     if not read.findings:
-        show("findings", "nothing that is worth a look")
+        show("findings", "none")
 
 
 def _print_packages(read: Static) -> None:

@@ -29,7 +29,7 @@ Output = Annotated[
         "--output",
         "-o",
         metavar="FILE",
-        help="The file; by default pylock.NAME.toml here, after the repository's name.",
+        help="The file; by default pylock.NAME.toml in this folder.",
     ),
 ]
 NoSpaces = Annotated[
@@ -56,10 +56,10 @@ def lock(
     json: opt.Json = False,
     make: opt.MakeOptions,
 ) -> None:
-    """Write down commit, file hashes, packages, Python and spaces, for make_env(lock=FILE).
+    """Record commit, file hashes, packages, Python and spaces in a file for make_env(lock=FILE).
 
-    The packages are those of an environment of its own. To see its spaces the repository is loaded,
-    in the sandbox.
+    It installs the packages in a separate environment, and loads the repository in the sandbox to
+    record its spaces.
     """
     _check_platform()
     with ProgressBar(quiet=json) as bar:
@@ -83,25 +83,25 @@ def lock(
 @opt.with_options(*opt.HUB)
 def verify(
     *,
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="What 'envhub lock' wrote.")],
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="A lock file of 'envhub lock'.")],
     ref: Annotated[
         str | None,
         typer.Argument(
             metavar="[REF]",
-            help="What to compare with it; by default the commit that was locked. A branch says "
-            "whether it has moved on. A folder has to be named.",
+            help="The reference to compare; by default the locked commit. With a branch, shows "
+            "whether it has changed. For a locked folder it is required.",
         ),
     ] = None,
     no_spaces: NoSpaces = False,
     no_index: Annotated[
-        bool, typer.Option("--no-index", help="Do not ask whether the index still has the files.")
+        bool, typer.Option("--no-index", help="Do not ask the package index for the files.")
     ] = False,
     json: opt.Json = False,
     make: opt.MakeOptions,
 ) -> None:
-    """Say whether a repository is still as it was locked, and if not, what differs (exit code 7).
+    """Compare a repository with its lock file; exit code 7 if something differs.
 
-    Files, the packages on the index, Python, and, except with --no-spaces, its spaces.
+    It compares files, the index's files of each package, Python and spaces.
     """
     _check_platform()
     with ProgressBar(quiet=json) as bar:

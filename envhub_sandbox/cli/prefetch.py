@@ -26,9 +26,9 @@ def prefetch(
     json: opt.Json = False,
     make: opt.MakeOptions,
 ) -> None:
-    """Download a repository and make the environment that it runs in, and run nothing of it.
+    """Download a repository and install its packages, without running the repository.
 
-    Afterwards the printed reference works without network.
+    It prints the pinned reference, which then works without network.
     """
     with ProgressBar(quiet=json) as bar:
         bar.begin(f"reading {ref}")

@@ -37,7 +37,7 @@ def push(
         str,
         typer.Argument(
             metavar="REPO",
-            help="Where to: 'owner/name', 'spaces/owner/name', 'owner/name@branch'.",
+            help="The target: 'owner/name', 'spaces/owner/name' or 'owner/name@branch'.",
         ),
     ],
     message: Annotated[
@@ -47,16 +47,17 @@ def push(
         bool, typer.Option("--private", help="If the repository is new, make it private.")
     ] = False,
     dry_run: Annotated[
-        bool, typer.Option("--dry-run", help="Check, say what would be uploaded, and stop.")
+        bool,
+        typer.Option("--dry-run", help="Check the folder, list its files, and upload nothing."),
     ] = False,
     json: opt.Json = False,
     make: opt.MakeOptions,
 ) -> None:
     """Publish a folder on the Hub as one commit, and print the pinned reference.
 
-    First it is loaded, reset and stepped in a sandbox, every value held against its space. What
-    fails there is not uploaded; what is uploaded is the very copy that was checked. Files of the
-    repository that the folder lacks stay as they are.
+    First the folder is loaded, reset and stepped in a sandbox, and every value is compared with
+    its space. If that fails, nothing is uploaded; otherwise exactly the checked copy is. Files of
+    the repository that the folder lacks stay there.
     """
     from envhub_sandbox.hub.reference import HubRef
     from envhub_sandbox.hub.snapshot import local

@@ -30,7 +30,7 @@ BundleFolder = Annotated[
     Path,
     typer.Argument(
         metavar="BUNDLE",
-        help="The folder of a crash bundle, as the message of the death names it.",
+        help="The folder of a crash bundle, which the error of the death names.",
         show_default=False,
     ),
 ]
@@ -38,7 +38,7 @@ Grant = Annotated[
     bool,
     typer.Option(
         "--grant",
-        help="Permit what the bundle asks for beyond an ordinary run: its network, readable paths, "
+        help="Grant what the bundle needs beyond an ordinary run: its network, readable paths, "
         "variables, limits, interpreter, packages, Hub. Only for bundles that you trust.",
     ),
 ]
@@ -52,11 +52,11 @@ def replay(
     json: opt.Json = False,
     make: opt.MakeOptions,
 ) -> None:
-    """Make the environment of a crash bundle again, ask the same of it, and say how that ends.
+    """Repeat the requests of a crash bundle, and report whether it dies in the same way.
 
-    The same commit, the same seeds, the same actions: an environment whose only chance is its
-    seed dies again at the same step. The exit code is 0 if it does, 7 if it ends in another way
-    or at another request, 8 if it does not end.
+    It uses the same commit, seeds and actions, so an environment that depends on nothing else dies
+    at the same step. Exit code 0: it died in the same way; 7: it died in another way or at another
+    request; 8: it did not die.
 
     [bold]envhub replay ~/.cache/envhub-sandbox/crashes/20261121T081500-5f3a9c01[/bold]
     """

@@ -82,7 +82,7 @@ def run(
 ) -> None:
     """Play episodes of an environment and print returns, lengths, speed and provenance.
 
-    The repository's code runs in a confined process of its own; see 'envhub doctor'.
+    The repository's code runs in a separate, confined process; see 'envhub doctor'.
 
     [bold]envhub run ./examples/cartpole --episodes 20 --n-envs 4 --video cartpole.mp4[/bold]
     """

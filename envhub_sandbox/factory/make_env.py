@@ -74,30 +74,32 @@ def make_env(
         cfg: A hub reference (``"org/repo@commit:path"``), one of git
             (``"github:org/repo@commit:path"``), an id that a package registers
             (``"pypi:minigrid@3.0.0#MiniGrid-Empty-5x5-v0"``), a local folder (``"./my-env"``), a
-            ``.py`` file that is here (``"env.py"``), or a ``HubEnvConfig``-like object with
+            ``.py`` file (``"env.py"``), or a ``HubEnvConfig``-like object with
             ``hub_path``, whose ``vars()`` and public properties the repository's ``make_env``
             gets as ``cfg``.
         n_envs: Number of sub-environments, passed to the repository's ``make_env``.
-        use_async_envs: Passed likewise; sub-environments may then run in several processes.
+        use_async_envs: Also passed to it; if True, sub-environments may run in several processes.
         hub_cache_dir: huggingface_hub's ``cache_dir``.
         trust_remote_code: Only for ``sandbox=None``.
-        sandbox: ``"process"``; ``"docker"``, ``"docker:IMAGE"`` or a ``DockerSandbox``;
-            ``"ray"`` or a ``RaySandbox``; ``"tcp://HOST:PORT"`` or a ``RemoteSandbox``; a list of
-            these, ``"file:PATH"``, ``"dns://HOST:PORT"`` or a ``Fleet``, over which the
-            sub-environments of each environment are spread (``docs/scaling.md``); or None to run
-            the code in this process without protection, as LeRobot does.
+        sandbox: Where the code runs: ``"process"``; ``"docker"``, ``"docker:IMAGE"`` or a
+            ``DockerSandbox``; ``"ray"`` or a ``RaySandbox``; ``"tcp://HOST:PORT"`` or a
+            ``RemoteSandbox``. A list of these, ``"file:PATH"``, ``"dns://HOST:PORT"`` or a
+            ``Fleet`` spreads the sub-environments of each environment over several places
+            (``docs/scaling.md``). None runs the code in this process without protection, as
+            LeRobot does.
         env_kwargs: Further keyword arguments for the repository's ``make_env``.
         policy: What the code may reach; see ``Policy``.
         timeouts: How long operations may take; see ``Timeouts``.
-        limits: Hard caps; a mapping changes those of ``policy.limits`` that it names.
+        limits: Hard caps; a mapping overrides those of ``policy.limits`` that it names.
         token: As in huggingface_hub.
         endpoint: As in huggingface_hub.
         python: The interpreter that runs the repository; this one by default. It needs cloudpickle,
             gymnasium, msgpack and numpy beside the repository's own packages.
         dependencies: Where its packages come from. ``"auto"`` installs what it declares and imports
-            into an environment of its own, if this interpreter lacks some of it; ``"declared"``
-            only what it declares; ``"host"`` uses this interpreter's packages; a path those of that
-            interpreter or virtual environment. A mapping always makes an environment:
+            into a separate environment, if this interpreter lacks some of it; ``"declared"``
+            installs only what it declares; ``"host"`` uses this interpreter's packages; a path
+            uses those of that interpreter or virtual environment. A mapping always makes a
+            separate environment:
             ``{"extra": ["scipy"], "python": "3.12", "exclude_newer": "2026-01-31"}``, also with
             ``only``, ``without``, ``override`` and ``fetch_python``. See ``docs/dependencies.md``.
         lock: A file of ``envhub lock``: its packages are used, and any difference from it (commit,
@@ -106,9 +108,9 @@ def make_env(
             ``["datasets/org/data@<commit>"]``; without a prefix a model, a dataset or a Space. They
             are verified like its own files, and ``snapshot_download`` and ``hf_hub_download`` find
             them without a network. See ``docs/authors.md``.
-        num_workers: Processes for the sub-environments; by default one, or with
-            ``use_async_envs`` the number that was fastest in the first uses, and with several
-            places in ``sandbox`` one in each.
+        num_workers: Number of processes for the sub-environments. The default is one; with
+            ``use_async_envs`` it is the number that was fastest in the first uses, and with several
+            places in ``sandbox`` it is one for each place.
         prewarm: How many of a suite's next tasks start in the background when a task is first
             reset; this is also the maximum of unused jails. By default one, if tasks are closed
             before the next is reset, on this machine and without a GPU; otherwise none.

@@ -167,8 +167,8 @@ class Options:
     dependencies: str | os.PathLike[str] | Mapping[str, Any] = _option(
         "auto",
         "--dependencies",
-        "Where its packages come from. auto: an environment of its own, if this interpreter lacks "
-        "something that it declares or imports; declared: likewise, without mere imports; host: "
+        "Where its packages come from. auto: a separate environment, if this interpreter lacks "
+        "something that it declares or imports; declared: the same, without mere imports; host: "
         "this interpreter; PATH: another one or a virtual environment; JSON: its own, adjusted: "
         '\'{"extra": ["scipy"], "without": ["torch"], "python": "3.12"}\'.',
         metavar="auto|declared|host|PATH|JSON",
@@ -290,38 +290,50 @@ class Options:
 
 _TIMEOUT = Option(
     "--timeout",
-    "How long loading, one reset, one step or one render may take; 300 by default.",
+    "Longest time for loading, one reset, one step or one render; 300 by default.",
     "SECONDS",
     float,
 )
 _KEYS: dict[str, dict[str, Option]] = {
     "policy": {
         "profile": Option(
-            "--profile", "Which layers must hold; strict by default.", "|".join(PROFILES)
+            "--profile",
+            "Which layers must confine the jail; strict by default.",
+            "|".join(PROFILES),
         ),
-        "network": Option("--network", "None by default.", "|".join(NETWORKS)),
+        "network": Option(
+            "--network", "Which network the jail has; none by default.", "|".join(NETWORKS)
+        ),
         "display": Option(
-            "--display", "An X display of its own, by Xvfb; none by default.", "|".join(DISPLAYS)
+            "--display",
+            "A separate X display in the jail, by Xvfb; none by default.",
+            "|".join(DISPLAYS),
         ),
-        "gpu": Option("--gpu", "Grant all GPUs, or these, as nvidia-smi counts.", "all|N[,N]"),
+        "gpu": Option("--gpu", "Grant all GPUs, or these, numbered as by nvidia-smi.", "all|N[,N]"),
         "readable": Option(
-            "--readable", "An absolute path that it may read (repeatable).", "PATH", list
+            "--readable", "An absolute path that the jail may read (repeatable).", "PATH", list
         ),
         "environment": Option(
-            "--environment", "A variable that it may see (repeatable).", "NAME", list
+            "--environment",
+            "An environment variable that the jail may see (repeatable).",
+            "NAME",
+            list,
         ),
         "output": Option(
             "--worker-output",
-            "Write the worker's output to this file, further jails' to further files; - is stderr.",
+            "Write the worker's output to this file, that of further jails to further files; - is "
+            "stderr.",
             "FILE|-",
             panel="What it logs",
         ),
     },
     "limits": {
-        "memory_bytes": Option("--memory", "Memory, as in 512M or 4G.", "SIZE"),
-        "disk_bytes": Option("--disk", "Scratch space on disk.", "SIZE"),
-        "processes": Option("--processes", "Processes and threads alive at once.", kind=int),
-        "cpu_time_s": Option("--cpu-time", "CPU seconds of one process.", "SECONDS", int),
+        "memory_bytes": Option("--memory", "Memory of a jail, as in 512M or 4G.", "SIZE"),
+        "disk_bytes": Option("--disk", "Scratch space of a jail, as in 512M or 4G.", "SIZE"),
+        "processes": Option(
+            "--processes", "Processes and threads of a jail at the same time.", kind=int
+        ),
+        "cpu_time_s": Option("--cpu-time", "CPU seconds that one process may use.", "SECONDS", int),
     },
     "timeouts": dict.fromkeys(("startup_s", "reset_s", "step_s", "call_s"), _TIMEOUT),
 }

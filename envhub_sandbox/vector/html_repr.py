@@ -14,6 +14,7 @@ from typing import Any
 
 from envhub_sandbox.vector.pictures import is_frame, png, small_picture
 from envhub_worker.protocol.codec.inert import one_line
+from envhub_worker.protocol.text import counted
 
 _CHARS = 300
 _ROWS = 50
@@ -36,12 +37,16 @@ def environment_html(env: Any, layers: Iterable[Mapping[str, Any]], rendered: An
         ("observations", env.single_observation_space),
         ("actions", env.single_action_space),
         ("state", "closed" if env.closed else "open"),
-        ("confined by", ", ".join(names) or "(it does not run now)"),
+        ("confined by", _counted(names) if names else "(it does not run now)"),
     ]
     body = "".join(
         f"<tr><th>{_text(name)}</th><td>{_text(value)}</td></tr>" for name, value in rows
     )
     return f"<code>{_text(repr(env))}</code><table>{body}</table>{_picture(rendered)}"
+
+
+def _counted(layers: list[str]) -> str:
+    return f"{counted(len(layers), 'layer')}: {', '.join(layers)}"
 
 
 def _picture(rendered: Any) -> str:
@@ -69,4 +74,5 @@ def _row(line: tuple[Any, Any, Any]) -> str:
 
 
 def _text(value: object) -> str:
-    return html.escape(one_line(str(value), _CHARS))
+    # numpy aligns the numbers of a Box with spaces, of which HTML shows one
+    return html.escape(" ".join(one_line(str(value), _CHARS).split()))

@@ -77,7 +77,8 @@ def replace_missing_streams() -> None:
 def _parser(*, all_commands: bool) -> tuple[argparse.ArgumentParser, list[str]]:
     """The parser, and its commands; ``all_commands``: with those that take long to import."""
     parser = argparse.ArgumentParser(
-        prog="envhub-worker", description="Executes environments from the Hub under confinement."
+        prog="envhub-worker",
+        description="Runs environments from the Hugging Face Hub in confined processes.",
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     serving = commands.add_parser("serve", help="serve one client on an ipc:// endpoint")
@@ -104,10 +105,10 @@ def _add_others(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -
 
     for name, command, what in (
         ("listen", listen, "serve clients on other hosts, with keys"),
-        ("status", status, "who uses a listening server"),
-        ("drain", drain, "end the server that listens here, gently"),
+        ("status", status, "print sessions, connections and jails of a server"),
+        ("drain", drain, "end a server after its open jails are closed"),
         ("keygen", keygen, "make a CURVE key pair"),
-        ("health", health, "whether a server of this container answers"),
+        ("health", health, "test whether the server on this machine answers"),
     ):
         parser = commands.add_parser(name, help=what)
         command.add_arguments(parser)

@@ -86,7 +86,7 @@ def check(
         str,
         typer.Option(
             metavar="|".join(STYLES),
-            help="Findings of this severity or a worse one make it fail.",
+            help="Exit with 1 for findings of this severity or a worse one.",
             autocompletion=lambda: list(STYLES),
         ),
     ] = "error",
@@ -116,7 +116,11 @@ def check(
     ] = None,
     html: Annotated[
         Path | None,
-        typer.Option(metavar=_FILE, help="A page for people, in one file.", rich_help_panel=_PANEL),
+        typer.Option(
+            metavar=_FILE,
+            help="One HTML page with pictures, plots and all findings.",
+            rich_help_panel=_PANEL,
+        ),
     ] = None,
     github: Annotated[
         bool,
@@ -145,11 +149,11 @@ def check(
     make: opt.MakeOptions,
     debug: opt.Debug = False,
 ) -> None:
-    """Run a repository in a sandbox and say what is wrong with it.
+    """Run a repository in a sandbox and report what is wrong with it.
 
-    Its files are read, its packages installed, and each task is played again and again, in one
-    process and in others. docs/checks.md has every check. Exit code 0: nothing fails; 1:
-    something does; others: it could not be judged.
+    It reads the files, installs the packages, and plays each task several times, in one process
+    and in others. docs/checks.md has every check. Exit code 0: nothing fails; 1: something
+    fails; others: the repository could not be judged.
 
     [bold]envhub check org/repo@<commit> --junit report.xml[/bold]
 
@@ -212,12 +216,14 @@ def check(
 
 def _refuse_beside_a_list(*, ref: str | None, **files: Path | None) -> None:
     if ref is not None:
-        raise UsageError(f"a list, by --all, or one repository, {ref}: not both")
+        raise UsageError(
+            f"--all judges a list, and {ref} is one repository: give one of them, not both"
+        )
     for name, path in files.items():
         if path is not None:
             raise UsageError(
-                f"--{name} is about one repository; with --all each has its page and its JSON in "
-                "--output DIR, and --junit FILE is about all"
+                f"--{name} is about one repository; with --all, --output DIR has a page and a "
+                "JSON document for each, and --junit FILE has all"
             )
 
 

@@ -68,7 +68,7 @@ Again = Annotated[
     bool,
     typer.Option(
         "--again",
-        help="With --all: judge repositories again that have results.",
+        help="With --all: judge also repositories that have results.",
         rich_help_panel=_PANEL,
     ),
 ]
@@ -86,5 +86,5 @@ def refuse_options_of_the_judged(
         if path is not None and is_judged(path, reference):
             raise UsageError(
                 f"{option} {path} is inside the repository that is checked, {reference}{where}, "
-                "and no repository has a say in that: take a place outside"
+                "and a repository must not influence its own check: take a place outside"
             )

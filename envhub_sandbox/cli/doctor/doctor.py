@@ -33,6 +33,7 @@ from envhub_sandbox.cli.shared.console import (
     print_json,
     safe_line,
     safe_text,
+    show_below,
     show_rows,
 )
 from envhub_sandbox.cli.shared.exits import Exit, UsageError, describe
@@ -75,7 +76,8 @@ def doctor(
     server: Annotated[
         str | None,
         typer.Argument(
-            metavar="[tcp://HOST:PORT]", help="A server on another host, to be asked instead."
+            metavar="[tcp://HOST:PORT]",
+            help="A server on another host, to test instead of this one.",
         ),
     ] = None,
     profile: Annotated[
@@ -91,20 +93,19 @@ def doctor(
         str | None,
         typer.Option(
             metavar="KEY",
-            help="That server's public key; else $ENVHUB_SERVER_KEY, or what known_hosts says.",
+            help="That server's public key; otherwise $ENVHUB_SERVER_KEY or known_hosts.",
         ),
     ] = None,
     insecure_loopback: Annotated[
         bool,
-        typer.Option("--insecure-loopback", help="Ask a server of this machine that has no keys."),
+        typer.Option("--insecure-loopback", help="Test a server on this machine that has no keys."),
     ] = False,
 ) -> None:
-    """Try what this host can enforce, say what is missing and how to get it.
+    """Test what this host can enforce, and print what is missing and how to get it.
 
-    Exits with 0 if the profile (strict by default) can be enforced, with 6 if it cannot, with 5 if
-    the jail died or took too long, and with 3 if only the cache cannot be used. With a server, asks
-    it over our key: 6 also if it is not reached or does not know us, 5 if it is about to end or
-    refuses.
+    Exit code 0: this host can enforce the profile (strict by default); 6: it cannot; 5: the jail
+    died or timed out; 3: only the cache cannot be used. For a server, 6 also if it does not answer
+    or does not accept the key, and 5 if it drains or refuses.
     """
     from envhub_sandbox.settings.policy import Policy
 
@@ -114,12 +115,15 @@ def doctor(
         from envhub_sandbox.sandboxes.remote import RemoteSandbox
 
         if insecure_loopback and server_key is not None:
-            raise UsageError("--server-key is of a server with keys: not --insecure-loopback")
+            raise UsageError(
+                "--server-key is for a server with keys, and --insecure-loopback for one without: "
+                "leave one out"
+            )
         place = RemoteSandbox(server, server_key=server_key, insecure_loopback=insecure_loopback)
         raise typer.Exit(remote.examine(place, profile, json=json))
     if server_key is not None or insecure_loopback:
         raise UsageError(
-            "--server-key and --insecure-loopback are of a server: envhub doctor tcp://HOST:PORT"
+            "--server-key and --insecure-loopback need a server: envhub doctor tcp://HOST:PORT"
         )
     with ProgressBar(quiet=json) as bar, _scratch_folder() as folder:
         (folder / "idle").mkdir()
@@ -279,14 +283,18 @@ def _print(trials: list[Trial], asked: str) -> None:
     bad = {number: "red" for number, one in enumerate(trials, 1) if not one.available}
     show_rows([_PROFILES, *map(_profile, trials)], right=(2,), styles=bad)
     for trial in trials:
-        if trial.problem is not None:
-            out()
-            out(f"{trial.profile}: not available here", BAD)
-            _indented(trial.problem, "  ")
-        elif trial.profile == asked:
+        if trial.problem is None and trial.profile == asked:
             out()
             out(f"{trial.profile}: available", GOOD)
             show_rows([_LAYERS, *map(_layer, trial.layers)])
+    problems: dict[str, list[str]] = {}
+    for trial in trials:
+        if trial.problem is not None:
+            problems.setdefault(trial.problem, []).append(trial.profile)
+    for problem, names in problems.items():
+        out()
+        out(f"{', '.join(names)}: not available here", BAD)
+        show_below(problem)
 
 
 def _profile(trial: Trial) -> list[str]:
@@ -303,11 +311,6 @@ def _layer(layer: dict[str, Any]) -> list[str]:
     return [str(layer.get("layer")), mark, str(layer.get("detail"))]
 
 
-def _indented(text: str, margin: str) -> None:
-    for line in safe_text(text).splitlines():
-        out(f"{margin}{line}")
-
-
 def _print_missing(probed: dict[str, Any]) -> None:
     if probed["gpu"] is not None:
         nodes = ", ".join(map(safe_line, probed["gpu"]))
@@ -318,8 +321,8 @@ def _print_missing(probed: dict[str, Any]) -> None:
         out()
         out("Layers that are missing here, each tried on its own:", "bold")
     for layer in missing:
-        out(f"  {safe_line(layer['layer'])}: {safe_line(layer['detail'])}")
-        _indented(layer["fix"], "    ")
+        show_below(f"{safe_line(layer['layer'])}: {safe_line(layer['detail'])}")
+        show_below(layer["fix"], "    ")
     if probed["apparmor_profile"]:
         out()
         out("An AppArmor profile that permits user namespaces to this interpreter:")

@@ -28,14 +28,14 @@ def init(
         bool,
         typer.Option(
             "--lerobot",
-            help="Observe what LeRobot's policies are given: its evaluation"
-            " and its training play it.",
+            help="Write an environment that LeRobot can evaluate and train on, with agent_pos and "
+            "pixels as observations.",
         ),
     ] = False,
 ) -> None:
     """Write a new environment's repository: env.py, requirements, card, licence, test, CI workflow.
 
-    In no git checkout, and where there is git, the folder becomes one.
+    If git is installed and the folder is in no checkout, 'git init' runs in it.
 
     [bold]envhub init my-env && envhub run ./my-env --validate[/bold]
     """

@@ -1,7 +1,7 @@
 """The only place that writes to stdout and stderr: what a stranger chose is text and no more.
 
-Control characters are escaped, rich's markup is not read, and no line is folded: a terminal wraps
-what is long by itself, and what is folded begins lines. CI systems obey what they find in a log:
+Control characters are escaped, and rich's markup is not read. Only in a terminal are long lines
+wrapped, below their beginning: a log has each as one line. CI systems obey what they find in a log:
 GitHub ``::name::`` at the beginning of a line, GitHub and Azure ``##[name]`` and ``##vso[name]``
 anywhere, GitLab ``section_start:``. ``guarded`` breaks all of these, also in warnings
 and in errors of the option parser. ``command`` is the only way around it.
@@ -146,8 +146,24 @@ def say(text: str, style: str | None = None) -> None:
 
 def show(word: str, text: object = "", style: str | None = None, *, stderr: bool = False) -> None:
     """Print a line: a word of ours, and what may be a stranger's."""
-    line = f"{word:{_WORD}} {safe_line(text, _LONGEST)}".rstrip()
+    line = _hanging(f"{word:{_WORD}} ", safe_line(text, _LONGEST), stderr=stderr)
     say(line, style) if stderr else out(line, style)
+
+
+def show_below(text: str, margin: str = "  ") -> None:
+    """Print a text below a line that is its title, each line of it behind a margin."""
+    for line in safe_text(text).splitlines():
+        out(_hanging(margin, line))
+
+
+def _hanging(begin: str, text: str, *, stderr: bool = False) -> str:
+    """A line; in a terminal it is wrapped below the end of its beginning."""
+    room = _columns(stderr=stderr) - len(begin)
+    if len(text) > room >= _NARROWEST:
+        # a path or a command stays in one piece, to be copied
+        lines = textwrap.wrap(text, room, break_on_hyphens=False, break_long_words=False)
+        text = f"\n{' ' * len(begin)}".join(lines)
+    return f"{begin}{text}".rstrip()
 
 
 def show_rows(
@@ -180,9 +196,10 @@ def show_rows(
         out(text, (styles or {}).get(number, None if number else "bold"))
 
 
-def _columns() -> int:
-    """Of the terminal on stdout; more than any table has where it is none."""
-    return shutil.get_terminal_size().columns if sys.stdout.isatty() else _MOST
+def _columns(*, stderr: bool = False) -> int:
+    """Of the terminal on this stream; more than any line has where it is none."""
+    stream = sys.stderr if stderr else sys.stdout
+    return shutil.get_terminal_size().columns if stream.isatty() else _MOST
 
 
 def command(line: str) -> None:

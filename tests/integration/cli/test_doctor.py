@@ -94,6 +94,15 @@ def test_what_is_missing_comes_with_its_fix(monkeypatch: pytest.MonkeyPatch) -> 
     assert "  this host cannot enforce user-namespace: \\x1b[2J\n  sysctl -w x=1\n" in done.stdout
 
 
+def test_profiles_with_the_same_reason_share_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It is printed once, below the names of all of them."""
+    fail_with(monkeypatch, {"strict": SandboxUnavailableError("no namespaces")})
+    printed = RUNNER.invoke(app, ["doctor"]).stdout
+    assert "strict: not available here\n  no namespaces\n" in printed
+    assert "no-userns, container: not available here\n  not this either\n" in printed
+    assert printed.count("not this either") == 1
+
+
 def test_the_chosen_profile_decides(monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever the others came to."""
     fail_with(monkeypatch, {"container": WorkerStartupError("it did not come up")})

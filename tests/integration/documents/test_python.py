@@ -49,7 +49,11 @@ def python_of(document: str) -> list[str]:
 
 
 @pytest.mark.parametrize(
-    "document", ["docs/async.md", "docs/observing.md", "docs/authors.md", "docs/quickstart.md"]
+    "document",
+    [
+        *("docs/async.md", "docs/authors.md", "docs/concepts.md"),
+        *("docs/observing.md", "docs/quickstart.md"),
+    ],
 )
 def test_the_python_of_a_document_runs(document: str, tmp_path: Path) -> None:
     """All of its blocks, one after the other."""

@@ -71,9 +71,9 @@ TABLE = {
     **{
         (document, "python"): RUN
         for document in (
-            *("README.md", "docs/async.md", "docs/authors.md", "docs/deployment.md"),
-            *("docs/integrations.md", "docs/observing.md", "docs/quickstart.md"),
-            "docs/scaling.md",
+            *("README.md", "docs/async.md", "docs/authors.md", "docs/concepts.md"),
+            *("docs/deployment.md", "docs/integrations.md", "docs/observing.md"),
+            *("docs/quickstart.md", "docs/scaling.md"),
         )
     },
 }

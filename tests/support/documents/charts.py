@@ -1,71 +1,121 @@
 """The plots of ``docs/benchmarks.md``, drawn from tables of ``docs/internals/benchmarks.md``.
 
-Draw them again with ``python -m tests.support.documents.charts``.
+Each is a picture of ``docs/assets`` that loads nothing, on the ground of the pictures of terminals,
+so that it can be read on light and dark pages and on a telephone. Draw them again with
+``python -m tests.support.documents.charts``.
 """
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from pathlib import Path
 
 from tests.support.documents.written import DOCS, filled
 
 DOCUMENT = DOCS / "benchmarks.md"
 MEASURED = DOCS / "internals" / "benchmarks.md"
-_STEPS = {
-    "CartPole": "CartPole, quiet",
-    "Cheetah": "HalfCheetah, quiet",
-    "cam": "2 cameras, quiet",
-}
-_SIZES = (("CartPole", 1), ("CartPole", 16), ("CartPole", 64), ("Cheetah", 16), ("Cheetah", 64))
-_EVALUATIONS = {
-    "LeRobot sync": "LeRobot, sync",
-    "LeRobot async": "LeRobot, async",
-    "envhub sync": "envhub, sync",
-    "envhub async": "envhub, async",
-}
-_MEMORY = (("sync", "SyncVectorEnv"), ("async", "AsyncVectorEnv"), ("envhub", "envhub"))
-_BAR, _GREY = "#26a69a", "#808890"
-_GREYS = (
-    "xAxisLabel",
-    "xAxisLine",
-    "xAxisTick",
-    "yAxisLabel",
-    "yAxisTitle",
-    "yAxisLine",
-    "yAxisTick",
+ASSETS = DOCS / "assets"
+OURS = "envhub"
+_STEPS = (
+    ("1 CartPole", "CartPole, quiet", "1"),
+    ("16 CartPoles", "CartPole, quiet", "16"),
+    ("64 CartPoles", "CartPole, quiet", "64"),
+    ("16 HalfCheetahs (MuJoCo)", "HalfCheetah, quiet", "16"),
+    ("8 environments with two cameras", "2 cameras, quiet", "8"),
 )
+_BESIDE = re.compile(
+    r"CartPole, n = 16, in the same runs: [\d.]+ and ([\d.]+) times PufferLib's speed "
+    r"\(target [\d.]+\), [\d.]+ and ([\d.]+) times OpenEnv's"
+)
+"""Of the second machine, as in the column B."""
+_EVALUATIONS = ("LeRobot, sync", "LeRobot, async", "envhub, sync", "envhub, async")
+_WIDTH, _LEFT, _RIGHT, _TOP = 480, 142, 56, 16
+_BAR, _ROW, _HEAD = 15, 22, 30
+_FONT = 'text{font-size:14px;font-family:system-ui,-apple-system,"Segoe UI",Roboto,sans-serif}'
+_GROUND, _TEXT, _DIM, _OWN, _OTHER = "#171a23", "#d6dae4", "#aab1c3", "#26a69a", "#5b647c"
+
+
+@dataclass(frozen=True)
+class Plot:
+    """Horizontal bars in groups.
+
+    Attributes:
+        title: What their lengths are.
+        groups: The bars of each, by name.
+        form: Of a number, as ``format`` takes it.
+    """
+
+    title: str
+    groups: Mapping[str, Mapping[str, float]]
+    form: str
 
 
 def document() -> str:
     """What the page has to hold."""
-    return filled(DOCUMENT, steps=_steps(), evaluation=_evaluation(), memory=_memory())
+    shown = {name: f"![{_told(plot)}](assets/{name}.svg)" for name, plot in plots().items()}
+    return filled(DOCUMENT, **shown)
 
 
-def _steps() -> str:
+def pictures() -> dict[Path, str]:
+    """What each picture has to hold."""
+    return {ASSETS / f"{name}.svg": drawn(plot) for name, plot in plots().items()}
+
+
+def plots() -> dict[str, Plot]:
+    """The three of the page, by the names of their places in it."""
+    return {"steps": _steps(), "evaluation": _evaluation(), "memory": _memory()}
+
+
+def _steps() -> Plot:
     rows = {
         (row["workload, condition"], row["n"]): row["B"] for row in _table("workload, condition")
     }
-    shown = (*_SIZES, ("cam", 8))
-    bars = {f"{name} {n}": _first(rows[_STEPS[name], str(n)]) for name, n in shown}
-    return _chart(bars, "times SyncVectorEnv", 2.5)
-
-
-def _evaluation() -> str:
-    rows = {row[""]: row["6 simulators"] for row in _table("6 simulators")}
-    bars = {name: _first(rows[label]) for name, label in _EVALUATIONS.items()}
-    return _chart(bars, "seconds, less is better", 14)
-
-
-def _memory() -> str:
-    rows = _table("sub-environments, memory in MB")
-    bars = {
-        f"{name} {row['sub-environments, memory in MB']}": _first(row[column])
-        for row in rows
-        for name, column in _MEMORY
+    groups = {title: _speeds(rows[workload, n]) for title, workload, n in _STEPS}
+    beside = _BESIDE.search(" ".join(MEASURED.read_text().split()))
+    assert beside is not None
+    ours = groups["16 CartPoles"].pop(OURS)
+    groups["16 CartPoles"] |= {
+        "OpenEnv": ours / float(beside[2]),
+        "PufferLib": ours / float(beside[1]),
+        OURS: ours,
     }
-    return _chart(bars, "MB, less is better", 300)
+    return Plot("Speed of steps, times that of SyncVectorEnv", groups, ".2f")
+
+
+def _speeds(cell: str) -> dict[str, float]:
+    """Of ``ours / SyncVectorEnv's`` and ``ours / AsyncVectorEnv's``, in times SyncVectorEnv's."""
+    by_sync, by_async = map(_first, cell.split(" / "))
+    return {"AsyncVectorEnv": by_sync / by_async, "SyncVectorEnv": 1.0, OURS: by_sync}
+
+
+def _evaluation() -> Plot:
+    rows = {row[""]: row for row in _table("6 simulators")}
+    suites = {
+        "6 simulators, each built in one second": "6 simulators",
+        "10 light tasks": "10 light",
+    }
+    groups = {
+        title: {name: _first(rows[name][_column(rows[name], column)]) for name in _EVALUATIONS}
+        for title, column in suites.items()
+    }
+    return Plot("Seconds for a suite: less is better", groups, ".2f")
+
+
+def _column(row: Mapping[str, str], begins: str) -> str:
+    return next(name for name in row if name.startswith(begins))
+
+
+def _memory() -> Plot:
+    groups = {
+        f"{row['sub-environments, memory in MB']} CartPoles": {
+            name: _first(row[name]) for name in ("AsyncVectorEnv", "SyncVectorEnv", OURS)
+        }
+        for row in _table("sub-environments, memory in MB")
+    }
+    return Plot("MB of memory: less is better", groups, ".0f")
 
 
 def _table(column: str) -> Sequence[Mapping[str, str]]:
@@ -87,22 +137,63 @@ def _first(cell: str) -> float:
     return float(found[1])
 
 
-def _chart(bars: Mapping[str, float], title: str, top: float) -> str:
-    greys = {f"{name}Color": _GREY for name in _GREYS}
-    colours = {"plotColorPalette": _BAR, "backgroundColor": "transparent", **greys}
-    size = {"xyChart": {"width": 640, "height": 250}, "themeVariables": {"xyChart": colours}}
+def _told(plot: Plot) -> str:
+    """All of its numbers as a sentence, for people who do not see it."""
+    groups = (
+        f"{title}: {', '.join(f'{name} {size:{plot.form}}' for name, size in bars.items())}"
+        for title, bars in plot.groups.items()
+    )
+    return f"{plot.title}. {'; '.join(groups)}."
+
+
+def drawn(plot: Plot) -> str:
+    """The picture: the longest bar takes the whole width."""
+    scale = (_WIDTH - _LEFT - _RIGHT) / max(
+        size for bars in plot.groups.values() for size in bars.values()
+    )
+    lines, y = [_label(_TOP, _TOP + 14, plot.title, _DIM)], _TOP + 18
+    for title, bars in plot.groups.items():
+        y += _HEAD
+        lines.append(_label(_TOP, y - 8, title, _TEXT, weight="bold"))
+        for name, size in bars.items():
+            own = name.startswith(OURS)
+            length = max(size * scale, 1.5)
+            lines += [
+                _label(_LEFT - 8, y + 12, name, _TEXT if own else _DIM, anchor="end"),
+                f'<rect x="{_LEFT}" y="{y}" width="{length:.1f}" height="{_BAR}" rx="2" '
+                f'fill="{_OWN if own else _OTHER}"/>',
+                _label(_LEFT + length + 6, y + 12, f"{size:{plot.form}}", _TEXT if own else _DIM),
+            ]
+            y += _ROW
+    height = y + _TOP
     return "\n".join(
         [
-            "```mermaid",
-            f"%%{{init: {json.dumps(size)}}}%%",
-            "xychart-beta",
-            f"  x-axis {json.dumps(list(bars))}",
-            f'  y-axis "{title}" 0 --> {top:g}',
-            f"  bar {json.dumps(list(bars.values()))}",
-            "```",
+            '<svg xmlns="http://www.w3.org/2000/svg" role="img" '
+            f'viewBox="0 0 {_WIDTH} {height}" width="{_WIDTH}" height="{height}">',
+            f"<title>{escape(plot.title)}</title>",
+            f"<style>{_FONT}</style>",
+            f'<rect width="100%" height="100%" rx="10" fill="{_GROUND}"/>',
+            *lines,
+            "</svg>\n",
         ]
     )
 
 
-if __name__ == "__main__":
+def _label(
+    x: float, y: float, text: str, fill: str, *, anchor: str = "start", weight: str = "normal"
+) -> str:
+    return (
+        f'<text x="{x:.1f}" y="{y}" text-anchor="{anchor}" font-weight="{weight}" fill="{fill}">'
+        f"{escape(text)}</text>"
+    )
+
+
+def main() -> None:
+    """Draw them, and name them on the page."""
+    for path, text in pictures().items():
+        path.write_text(text)
     DOCUMENT.write_text(document())
+
+
+if __name__ == "__main__":
+    main()

@@ -97,6 +97,10 @@ _CURE = re.compile(
     r"|whoever runs it starts )"
     r"|needs a server that was started |must (?:return|expose) "
 )
+NO_MORE = "what the error says"
+"""What stands on the right where the left names the cure."""
+_GOES_ON = re.compile(r" *;|(?:and|or|which|takes|needs|free|it (?:has|needs|does|cannot)) ")
+"""How a text begins that stands behind one that varies."""
 # What a function or a class of this name is told is no message: help, and checks (docs/checks.md).
 _NO_MESSAGES = {
     *("Option", "_option", "Argument", "Typer", "add_argument", "add_parser", "Check", "Template")
@@ -112,7 +116,7 @@ _NO_FILES = (
 )
 # Nor is this: parts of other formats, what is said after success, and answers to our own client.
 _NO_ERRORS = re.compile(
-    r"^(?:RUN |FROM |Connection: |make a CURVE key pair$|end the server that listens here, gently$)"
+    r"^(?:RUN |FROM |Connection: |make a CURVE key pair$|end a server after its open jails )"
     r"|^(?:say Hello first|check membership of)$|^\[\[|; (?:offer it|ask for them) first$"
     r"|\b(?:Use|Try) it: "
 )
@@ -300,8 +304,13 @@ def _literal(node: ast.expr) -> Any:
 def _row(message: Message) -> tuple[str, str]:
     """What is searched for stands on the left, also where it is nothing but a cure."""
     if message.says:
-        return _cell(message.says), _cell(message.cure)
-    return _cell(message.cure), "as it says"
+        return _cell(_begun(message.says)), _cell(message.cure)
+    return _cell(_begun(message.cure)), NO_MORE
+
+
+def _begun(text: str) -> str:
+    """With an ellipsis in front, where a text goes on from one that varies."""
+    return f"… {text.lstrip()}" if _GOES_ON.match(text) else text
 
 
 def _cell(text: str) -> str:

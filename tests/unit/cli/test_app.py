@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 
 import envhub_sandbox.cli
 from envhub_sandbox.cli.app import app, functions, whole_command
-from envhub_sandbox.cli.shared.console import neutralised, out, say, show_rows
+from envhub_sandbox.cli.shared.console import neutralised, out, say, show, show_rows
 from tests.support.output.ci import obeyed
 
 _WIDTH = 80
@@ -194,6 +194,36 @@ def test_nothing_is_folded(capsys: pytest.CaptureFixture[str], monkeypatch: Any)
     assert head.split() == ["name", "n"]
     assert long == f"{words[:150]}   1"
     assert short == f"{'short':150}  10"
+
+
+def test_a_terminal_wraps_below_the_beginning(
+    capsys: pytest.CaptureFixture[str], monkeypatch: Any
+) -> None:
+    """A long line is wrapped under its text, and a path in it stays in one piece."""
+    monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+    monkeypatch.setenv("COLUMNS", "34")
+    show("note", "the card is missing, and so is /a/long/path/of/more/than/a/line")
+    shown = capsys.readouterr().out.splitlines()
+    margin = " " * 13
+    assert shown == [
+        "note         the card is missing,",
+        f"{margin}and so is",
+        f"{margin}/a/long/path/of/more/than/a/line",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        ([], "Missing argument 'REF'. Try 'envhub run --help'."),
+        (["--bad", "."], "No such option: --bad. Try 'envhub run --help'."),
+    ],
+)
+def test_wrong_usage_is_one_message(words: list[str], says: str) -> None:
+    """As every other error is: without a box."""
+    done = CliRunner().invoke(app, ["run", *words])
+    assert (done.exit_code, done.stdout) == (2, "")
+    assert done.stderr == f"Error: {says}\n"
 
 
 def test_one_place_writes() -> None:

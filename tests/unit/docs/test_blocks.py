@@ -30,6 +30,7 @@ _RUN_BY = {
     "docs/integrations.md": "tests/unit/docs/test_docs.py",
     "docs/async.md": "tests/integration/documents/test_python.py",
     "docs/authors.md": "tests/integration/documents/test_python.py",
+    "docs/concepts.md": "tests/integration/documents/test_python.py",
     "docs/deployment.md": _SHELL,
     "docs/observing.md": "tests/integration/documents/test_python.py",
     "docs/quickstart.md": "tests/integration/documents/test_python.py",

@@ -329,6 +329,11 @@ def test_what_is_written_from_the_source_is_up_to_date(written: Any) -> None:
     assert written.DOCUMENT.read_text() == written.document()
 
 
+def test_the_plots_are_drawn_from_what_was_measured() -> None:
+    """``python -m tests.support.documents.charts`` draws them."""
+    assert {path: path.read_text() for path in charts.pictures()} == charts.pictures()
+
+
 def test_the_rules_of_interruption_are_those_that_the_source_names() -> None:
     """Each rule is named where a line depends on it, and no rule that there is not."""
     page = (CHECKOUT / "docs" / "internals" / "interruption.md").read_text()

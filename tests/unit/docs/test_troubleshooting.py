@@ -92,5 +92,11 @@ def test_what_is_really_raised_is_found(
 
 def pattern(row: str) -> str:
     """What a row says, with anything for its ellipses."""
-    says = as_shown(row).strip("|").replace(" | ", " ").removesuffix(" as it says ").strip()
+    says = (
+        as_shown(row)
+        .strip("|")
+        .replace(" | ", " ")
+        .removesuffix(f" {troubleshooting.NO_MORE} ")
+        .strip()
+    )
     return ".*".join(re.escape(part.strip()) for part in says.split("…"))

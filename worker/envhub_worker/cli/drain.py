@@ -19,12 +19,12 @@ from envhub_worker.protocol.errors import ProtocolError
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``drain``."""
-    parser.add_argument("--state-dir", type=Path, help="as for listen")
-    parser.add_argument("--no-wait", action="store_true", help="do not wait until it has ended")
+    parser.add_argument("--state-dir", type=Path, help="the server's state folder")
+    parser.add_argument("--no-wait", action="store_true", help="return before the server has ended")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Send the signal; 0 once the server has ended, or the signal is sent."""
+    """End the server of a state folder: it accepts no new jails and waits for open ones."""
     try:
         pidfd, drains = _server(arguments.state_dir)
     except (OSError, ValueError, ProtocolError, status.UnreachableError) as error:

@@ -15,12 +15,14 @@ _WAIT_S = 5.0
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``health``."""
-    parser.add_argument("--port", type=int, default=5555, help="it listens on (default: 5555)")
-    parser.add_argument("--state-dir", type=Path, help="as for listen")
+    parser.add_argument(
+        "--port", type=int, default=5555, help="the server's port on 127.0.0.1 (default: 5555)"
+    )
+    parser.add_argument("--state-dir", type=Path, help="the server's state folder")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Say whether a server answers: one that listens by its key, any other by its greeting."""
+    """Exit with 0 if the server on this machine answers, and with 1 if it does not."""
     healthy = status_is_healthy(arguments.state_dir)
     return 0 if healthy or (healthy is None and answers("127.0.0.1", arguments.port)) else 1
 

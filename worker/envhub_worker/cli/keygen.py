@@ -13,10 +13,14 @@ from envhub_worker.protocol.keys import key_text
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``keygen``."""
     parser.add_argument(
-        "--out", type=Path, default=Path(), metavar="DIR", help="where both lie (default: here)"
+        "--out",
+        type=Path,
+        default=Path(),
+        metavar="DIR",
+        help="folder for both files (default: here)",
     )
     parser.add_argument(
-        "--name", default="client", help="of NAME.key (secret) and NAME.pub (default: client)"
+        "--name", default="client", help="writes NAME.key (secret) and NAME.pub (default: client)"
     )
 
 

@@ -27,10 +27,10 @@ _QUOTAS: dict[str, tuple[tuple[str, ...], str, str]] = {
     "runners": (("--max-runners", "--max-hosts"), "processes of environments", ""),
     "sessions": (("--max-sessions",), "client processes", ""),
     "upload_files": (("--max-upload-files",), "files of a snapshot", ""),
-    "memory_bytes": (("--max-memory",), "memory limits of jails", "GiB"),
-    "upload_bytes": (("--max-upload",), "snapshots", "MiB"),
-    "packages_bytes": (("--max-packages",), "installed packages", "MiB"),
-    "inflight_bytes": (("--max-inflight",), "unanswered requests", "MiB"),
+    "memory_bytes": (("--max-memory",), "sum of the memory limits of its jails", "GiB"),
+    "upload_bytes": (("--max-upload",), "size of its snapshots", "MiB"),
+    "packages_bytes": (("--max-packages",), "size of its installed packages", "MiB"),
+    "inflight_bytes": (("--max-inflight",), "size of its unanswered requests", "MiB"),
 }
 
 
@@ -40,7 +40,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--max-connections",
         type=_count,
         default=MAX_CONNECTIONS,
-        help=f"connections of all clients and unknown hosts (default: {MAX_CONNECTIONS})",
+        help=f"most connections, those of unknown hosts included (default: {MAX_CONNECTIONS})",
     )
     parser.add_argument(
         "--bind",
@@ -53,73 +53,80 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--authorized-clients",
         type=Path,
         metavar="FILE",
-        help="clients' public keys, one a line; without it one is made and printed",
+        help="list of clients: a public key and a name on each line; without this option, a key "
+        "for one client is made and printed",
     )
     parser.add_argument(
         "--only-client",
         type=_key,
         metavar="KEY",
-        help="the public key of the one client, instead of a file",
+        help="public key of the only client, instead of a list",
     )
-    parser.add_argument("--insecure-loopback", action="store_true", help="no keys; loopback only")
-    parser.add_argument("--state-dir", type=Path, help="keys and snapshots; private, writable")
+    parser.add_argument(
+        "--insecure-loopback", action="store_true", help="serve without keys, on loopback only"
+    )
+    parser.add_argument("--state-dir", type=Path, help="private folder for keys and snapshots")
     parser.add_argument(
         "--idle-s",
         type=_seconds,
         default=_IDLE_S,
-        help=f"end jails of clients that are silent for so long; 0: never (default: {_IDLE_S})",
+        help="end the jails of a client that was silent for so many seconds; 0: never "
+        f"(default: {_IDLE_S})",
     )
     parser.add_argument(
         "--metrics",
         metavar="[ADDRESS:]PORT",
-        help="answer GET /metrics, /healthz and /readyz there, over plain HTTP and without keys; "
-        "on 127.0.0.1, unless another address is given",
+        help="serve /metrics, /healthz and /readyz there, over plain HTTP and without keys; on "
+        "127.0.0.1 unless an address is given",
     )
     parser.add_argument(
         "--drain-s",
         type=_seconds,
         default=0,
-        help="after SIGTERM let nothing new in, and give open jails so long; a second SIGTERM ends "
-        "at once (default: 0, the first one does)",
+        help="after SIGTERM, accept no new jails and wait so many seconds until open ones are "
+        "closed; a second SIGTERM ends the server at once (default: 0)",
     )
     parser.add_argument(
         "--weakest-profile",
         choices=PROFILES,
         default=_weakest_profile(),
-        help="that a policy may ask for (default here: %(default)s)",
+        help="the weakest profile that a client's policy may name (default here: %(default)s)",
     )
-    parser.add_argument("--allow-network", action="store_true", help="permit network='host'")
-    parser.add_argument("--allow-gpu", action="store_true", help="permit gpu=True")
+    parser.add_argument(
+        "--allow-network", action="store_true", help="permit policies with network='host'"
+    )
+    parser.add_argument("--allow-gpu", action="store_true", help="permit policies with gpu=True")
     parser.add_argument(
         "--dependencies",
         action="store_true",
-        help="install the packages that repositories declare; needs envhub-sandbox beside this",
+        help="install the packages that repositories declare; needs envhub-sandbox in this "
+        "interpreter",
     )
     parser.add_argument(
         "--packages-s",
         type=_count,
         default=int(MAKE_S),
         metavar="SECONDS",
-        help=f"how long one order of packages may take (default: {MAKE_S:.0f})",
+        help=f"longest time for one installation (default: {MAKE_S:.0f})",
     )
     parser.add_argument(
         "--log-format",
         choices=tuple(FORMS),
         default="text",
-        help="the form of the log on stderr, a line an event (default: text)",
+        help="format of the log on stderr, which has a line for each event (default: text)",
     )
     parser.add_argument(
         "--log-level",
         choices=LEVELS,
         default="info",
-        help="the least important events in the log (default: info)",
+        help="lowest level of events in the log (default: info)",
     )
     parser.add_argument("--until-eof", action="store_true", help="end when stdin ends")
     parser.add_argument(
         "--announce",
         action="store_true",
-        help="print one line of JSON for the program that started this, instead of the line for "
-        "the client: the public key, and what confines the server",
+        help="print the public key and what confines the server as one line of JSON, for the "
+        "program that started this, instead of the line for the client",
     )
     # of a program that starts a server for itself: see the head of __main__.py
     for name in ("--client-pidfd", "--ready-fd"):
@@ -135,7 +142,7 @@ def _add_quotas(parser: argparse.ArgumentParser) -> None:
         if unit:
             shown, more = size_text(default), f", as in 16G; in {unit} without a unit"
             how = {"type": partial(_size, unit), "metavar": "SIZE"}
-        text = f"of one key: {what}{more} (default: {shown})"
+        text = f"for each key: {what}{more} (default: {shown})"
         parser.add_argument(*names, default=default, help=text, **how)
 
 

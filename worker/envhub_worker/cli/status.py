@@ -29,15 +29,15 @@ class UnreachableError(Exception):
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The options of ``status``."""
-    parser.add_argument("--state-dir", type=Path, help="as for listen")
-    parser.add_argument("--endpoint", help="of a server elsewhere: tcp://HOST:PORT")
-    parser.add_argument("--server-key", help="its public key")
-    parser.add_argument("--key", type=Path, help="a secret key that it knows")
-    parser.add_argument("--json", action="store_true", help="for programs")
+    parser.add_argument("--state-dir", type=Path, help="the server's state folder")
+    parser.add_argument("--endpoint", help="of a server on another host: tcp://HOST:PORT")
+    parser.add_argument("--server-key", help="that server's public key")
+    parser.add_argument("--key", type=Path, help="file with the secret key of a client on its list")
+    parser.add_argument("--json", action="store_true", help="print one JSON document")
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Print who uses the server, what their jails do, and how the server is."""
+    """Print sessions, connections and jails of a server, and its state."""
     try:
         sessions, server = _ask(*_address(arguments))
     except (OSError, ValueError, ProtocolError, UnreachableError) as error:

@@ -45,12 +45,22 @@ def an_env(name: str = "arm", **fields: Any) -> Any:
     return SimpleNamespace(**{**kept, "single_action_space": gym.spaces.Discrete(4), **fields})
 
 
+def test_a_box_is_shown_without_the_spaces_that_align_it() -> None:
+    """Numpy writes bounds of several lengths in columns."""
+    high = np.array([4.8, np.inf, 0.418])
+    box = gym.spaces.Box(-high, high, dtype=np.float64)
+    assert "  " in str(box)
+    text = Tags(environment_html(an_env(single_observation_space=box), [])).text
+    assert "Box([-4.8 -inf -0.418], [4.8 inf 0.418], (3,), float64)" in text
+
+
 def test_spaces_and_layers_are_shown() -> None:
     """Of the layers those that hold."""
     layers = [{"layer": "seccomp", "enforced": True}, {"layer": "cgroup", "enforced": False}]
     text = Tags(environment_html(an_env(), layers)).text
     for word in ("3", "'arm': Box", "Discrete(4)", "seccomp", "open"):
         assert word in text
+    assert "1 layer: seccomp" in text
     assert "cgroup" not in text
     assert "does not run" in Tags(environment_html(an_env(), [])).text
 
