@@ -7,7 +7,6 @@ from contextlib import ExitStack
 from functools import partial
 from typing import Any
 
-from envhub_sandbox.hub.cache import cache_root
 from envhub_sandbox.session.crash.history import History
 from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.jails.launcher import Launcher
@@ -18,6 +17,7 @@ from envhub_sandbox.session.manifest_cache import ManifestCache, manifest_key
 from envhub_sandbox.session.parts.fleet_session import AnySession, FleetSession
 from envhub_sandbox.session.prewarm import SuitePrewarm, TaskPrewarm
 from envhub_sandbox.session.recipe import provenance_of
+from envhub_sandbox.system.folders import cache_root
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.shard_trials import ShardTrials
 from envhub_sandbox.vector.suites import EnvSuites

@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from envhub_sandbox.errors import PolicyError
-from envhub_sandbox.sandboxes.fleet.place_list import is_list
-from envhub_sandbox.sandboxes.sandbox import Sandbox
+from envhub_sandbox.sandboxes.sandbox import Sandbox, is_list
 from envhub_sandbox.settings.options import option_name
 
 

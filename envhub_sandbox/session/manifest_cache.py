@@ -16,7 +16,7 @@ from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.settings.policy import Policy
 from envhub_sandbox.system import folders
-from envhub_sandbox.system.files import write_whole_file
+from envhub_sandbox.system.folders import write_whole_file
 from envhub_sandbox.transport.shard_trials import ShardTrials
 from envhub_sandbox.transport.values import pickles
 from envhub_sandbox.transport.values.generators import generator

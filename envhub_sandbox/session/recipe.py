@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from envhub_sandbox.hub import reference
 from envhub_sandbox.hub.client import default_endpoint
 from envhub_sandbox.hub.logins import without_login
 from envhub_sandbox.hub.snapshot import Snapshot
@@ -61,12 +60,6 @@ class Recipe:
     def make_one(self, suite: str, task: int | str) -> Any:
         """One fresh environment of them."""
         return self.make()[suite][task]
-
-
-def pinned(snapshot: Snapshot) -> str:
-    """A reference that means this snapshot, wherever it is read."""
-    kind, name = snapshot.repo_type, snapshot.repo_id
-    return reference.pinned(kind, name, snapshot.commit, snapshot.path)
 
 
 def provenance_of(

@@ -18,7 +18,6 @@ from envhub_sandbox.errors import (
     WorkerTimeoutError,
     name_source,
 )
-from envhub_sandbox.hub.cache import cache_root
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.session.author_lines import add_author_line
 from envhub_sandbox.session.crash.history import Recording
@@ -27,6 +26,7 @@ from envhub_sandbox.session.jails.reach import add_reach_advice
 from envhub_sandbox.session.recipe import Recipe, provenance_of
 from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.settings.policy import Policy, Timeouts
+from envhub_sandbox.system.folders import cache_root
 from envhub_sandbox.system.locks import SharedLock
 from envhub_sandbox.system.log import CRASHES
 from envhub_sandbox.transport import trace

@@ -9,8 +9,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Generic, TypeVar
 
 from envhub_sandbox.settings.options import option_name
-from envhub_sandbox.system.log import WORKER
-from envhub_sandbox.system.progress import progress_shown
+from envhub_sandbox.system.log import WORKER, progress_shown
 from envhub_sandbox.system.threads import Calls
 from envhub_worker.protocol.text import parse_size, size_text
 

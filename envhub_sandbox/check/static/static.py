@@ -17,14 +17,13 @@ from packaging.utils import canonicalize_name
 
 from envhub_sandbox.check.findings import Finding
 from envhub_sandbox.check.static.survey import File, survey
-from envhub_sandbox.dependencies import installed
+from envhub_sandbox.dependencies import interpreters
 from envhub_sandbox.dependencies.declared import DeclaredPackages, declared
 from envhub_sandbox.dependencies.resolve import WORKERS
 from envhub_sandbox.errors import RequirementError
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.hub.sources import parsing
-from envhub_sandbox.hub.sources.imports import Import, imports
-from envhub_sandbox.session.recipe import pinned
+from envhub_sandbox.hub.sources.parsing import Import, imports
 from envhub_worker.protocol.text import printable
 
 _LONGEST = 500
@@ -51,7 +50,7 @@ class Static:
     @property
     def reference(self) -> str:
         """What was read, pinned."""
-        return pinned(self.snapshot)
+        return self.snapshot.reference
 
     @property
     def modules(self) -> dict[str, Import]:
@@ -154,7 +153,7 @@ def undeclared(
 
 def _of_this_interpreter(declared: Mapping[str, Requirement]) -> set[str]:
     wanted = [*map(Requirement, WORKERS), *declared.values()]
-    return {module for one in installed.brought(wanted) for module in _modules(one)}
+    return {module for one in interpreters.brought(wanted) for module in _modules(one)}
 
 
 def _modules(found: metadata.Distribution) -> set[str]:

@@ -11,9 +11,8 @@ from time import monotonic
 from typing import Any
 
 from envhub_sandbox.errors import EnvHubError, LoadError, WorkerDiedError, WorkerTimeoutError
-from envhub_sandbox.sandboxes.fleet.refusals import may_go_elsewhere, worst_of
 from envhub_sandbox.sandboxes.pool import ServerUse, WorkerServer
-from envhub_sandbox.sandboxes.sandbox import Sandbox
+from envhub_sandbox.sandboxes.sandbox import Sandbox, may_go_elsewhere, worst_of
 from envhub_sandbox.session.jails.loaded import ExpectedManifest, LoadedJail
 from envhub_sandbox.session.jails.server_hold import ServerHold
 from envhub_sandbox.session.repository import Repository

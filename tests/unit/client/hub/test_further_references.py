@@ -7,10 +7,10 @@ import ast
 import pytest
 
 from envhub_sandbox.errors import HubReferenceError
+from envhub_sandbox.hub import registered
 from envhub_sandbox.hub.git import address
 from envhub_sandbox.hub.reference import HubRef, pinned
-from envhub_sandbox.hub.registered import reference
-from envhub_sandbox.hub.registered.entry import entry
+from envhub_sandbox.hub.registered import entry
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 SITE = "https://github.com/org/repo"
@@ -129,4 +129,4 @@ def test_the_entry_says_what_the_reference_says() -> None:
         if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name)
     }
     assert (constants["DISTRIBUTION"], constants["ENV_ID"]) == ("gymnasium", "a.b:Ant-v5")
-    assert reference.requirement(HubRef.parse("pypi:x#Y-v0").parts) == "x"
+    assert registered.requirement(HubRef.parse("pypi:x#Y-v0").parts) == "x"
