@@ -163,7 +163,7 @@ def _publish(
 @contextlib.contextmanager
 def _explained(what: str, also: str = "") -> Iterator[None]:
     from envhub_sandbox.errors import RepositoryUnavailableError
-    from envhub_sandbox.hub.failures import HubFailure
+    from envhub_sandbox.hub.answers import HubFailure
 
     try:
         yield

@@ -22,8 +22,15 @@ from typing import Any
 from urllib.parse import parse_qsl, quote, urlsplit
 
 from envhub_sandbox.errors import HubReferenceError, SnapshotError, SnapshotIntegrityError
-from envhub_sandbox.hub.answers import HostileAnswerError, bounded_body, guarded, streamed
-from envhub_sandbox.hub.failures import chain, conceal, explain
+from envhub_sandbox.hub.answers import (
+    HostileAnswerError,
+    bounded_body,
+    chain,
+    conceal,
+    explain,
+    guarded,
+    streamed,
+)
 from envhub_sandbox.hub.grammar import is_commit
 from envhub_sandbox.hub.listing import (
     GIT_SHA1,

@@ -23,8 +23,8 @@ from envhub_sandbox.errors import (
 )
 from envhub_sandbox.hub import registered
 from envhub_sandbox.hub import store as store
+from envhub_sandbox.hub.answers import ABSENT, UNREACHABLE, HubFailure, Kind
 from envhub_sandbox.hub.client import HubClient, checked_endpoint, checked_token
-from envhub_sandbox.hub.failures import ABSENT, UNREACHABLE, HubFailure, Kind
 from envhub_sandbox.hub.git import address
 from envhub_sandbox.hub.listing import (
     DEFAULT_LIMITS,

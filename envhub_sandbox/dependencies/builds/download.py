@@ -33,7 +33,7 @@ from envhub_sandbox.errors import (
     SnapshotError,
     SnapshotTooLargeError,
 )
-from envhub_sandbox.hub.failures import HubFailure
+from envhub_sandbox.hub.answers import HubFailure
 from envhub_sandbox.hub.git import commits
 from envhub_sandbox.hub.logins import authorization, login_of, without_login
 from envhub_worker.protocol.text import printable, size_text

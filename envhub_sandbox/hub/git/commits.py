@@ -26,7 +26,7 @@ from envhub_sandbox.errors import (
     SnapshotIntegrityError,
     SnapshotTooLargeError,
 )
-from envhub_sandbox.hub.failures import HubFailure, Kind
+from envhub_sandbox.hub.answers import HubFailure, Kind
 from envhub_sandbox.hub.git import address
 from envhub_sandbox.hub.grammar import is_commit
 from envhub_sandbox.hub.listing import (
