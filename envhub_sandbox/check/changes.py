@@ -16,10 +16,9 @@ from typing import Any
 from envhub_sandbox.check.checks import Severity
 from envhub_sandbox.check.findings import Finding
 from envhub_sandbox.check.static import Static
-from envhub_sandbox.dependencies.locks.drift import drift_of_tasks
 from envhub_sandbox.dependencies.locks.fingerprint import TaskFingerprint
-from envhub_sandbox.hub.hashing import differing
-from envhub_sandbox.hub.listing import FileRecord
+from envhub_sandbox.dependencies.locks.making import drift_of_tasks
+from envhub_sandbox.hub.listing import FileRecord, differing
 from envhub_worker.protocol.text import printable, size_text
 
 _MOST_BYTES = 1 << 20

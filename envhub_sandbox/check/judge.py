@@ -44,8 +44,7 @@ from envhub_sandbox.errors import (
 from envhub_sandbox.factory.make_env import make_env
 from envhub_sandbox.hub.reference import HubRef
 from envhub_sandbox.hub.snapshot import Snapshot, snapshot_named
-from envhub_sandbox.hub.sources import imports, parsing
-from envhub_sandbox.session.repository import pinned
+from envhub_sandbox.hub.sources import parsing
 from envhub_sandbox.settings.policy import policy_from
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_worker.protocol.text import size_text
@@ -76,7 +75,7 @@ def judge(asked: JudgeOptions, report: Report | None = None) -> Report:
     where = {name: asked.arguments.get(name) for name in ("hub_cache_dir", "token", "endpoint")}
     snapshot = snapshot_named(asked.reference, **where)
     report = Report(asked.reference) if report is None else report
-    report.reference, report.commit = pinned(snapshot), snapshot.commit
+    report.reference, report.commit = snapshot.reference, snapshot.commit
     judging = _Judge(asked, snapshot, report)
     report.asked = judging.how()
     with contextlib.suppress(_StoppedError):
@@ -168,7 +167,7 @@ class _Judge:
             self._report.judged("requirements", [str(error)])
             raise _StoppedError from error
         self._report.judged("requirements", [])
-        read = imports.imports(self._snapshot, self._files)
+        read = parsing.imports(self._snapshot, self._files)
         found = undeclared(read, wanted, packages, taken)
         for finding in found:
             self._report.add(finding)

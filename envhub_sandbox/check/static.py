@@ -21,7 +21,7 @@ from packaging.utils import canonicalize_name
 
 from envhub_sandbox.check import contents
 from envhub_sandbox.check.findings import Finding
-from envhub_sandbox.dependencies import installed
+from envhub_sandbox.dependencies import interpreters
 from envhub_sandbox.dependencies.declared import DeclaredPackages, declared
 from envhub_sandbox.dependencies.resolve import WORKERS
 from envhub_sandbox.errors import RequirementError, SnapshotError
@@ -30,9 +30,7 @@ from envhub_sandbox.hub.listing import FileRecord
 from envhub_sandbox.hub.local import LocalFolder
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.hub.sources import parsing
-from envhub_sandbox.hub.sources.imports import Import, imports
-from envhub_sandbox.hub.sources.parsing import MOST_BYTES, ParsedFile
-from envhub_sandbox.session.repository import pinned
+from envhub_sandbox.hub.sources.parsing import MOST_BYTES, Import, ParsedFile, imports
 from envhub_worker.protocol.text import printable
 
 _LONGEST = 500
@@ -259,7 +257,7 @@ class Static:
     @property
     def reference(self) -> str:
         """What was read, pinned."""
-        return pinned(self.snapshot)
+        return self.snapshot.reference
 
     @property
     def modules(self) -> dict[str, Import]:
@@ -362,7 +360,7 @@ def undeclared(
 
 def _of_this_interpreter(declared: Mapping[str, Requirement]) -> set[str]:
     wanted = [*map(Requirement, WORKERS), *declared.values()]
-    return {module for one in installed.brought(wanted) for module in _modules(one)}
+    return {module for one in interpreters.brought(wanted) for module in _modules(one)}
 
 
 def _modules(found: metadata.Distribution) -> set[str]:

@@ -56,7 +56,7 @@ _COMMANDS: dict[str, tuple[str, str | Where]] = {
     "init": (
         "Write a new environment's repository: env.py, requirements, card, licence, test, CI "
         "workflow.",
-        "init.init:init",
+        "init:init",
     ),
     "push": (
         "Publish a folder on the Hub as one commit, and print the pinned reference.",
@@ -191,7 +191,7 @@ app = _typer(
 
 def _print_versions(wanted: bool) -> None:
     if wanted:
-        from envhub_sandbox.cli.shared.versions import versions
+        from envhub_sandbox.cli.shared.host import versions
 
         with reported(debug=False):
             for name, text in versions().items():

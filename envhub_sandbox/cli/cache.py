@@ -54,7 +54,7 @@ class StoredSnapshot:
 
 def stored_snapshots() -> list[StoredSnapshot]:
     """Everything in the store, the latest used first. Nothing is verified."""
-    from envhub_sandbox.hub.cache import cache_root
+    from envhub_sandbox.system.folders import cache_root
 
     folder = cache_root() / "snapshots"
     records = [*folder.glob("*/*/record.json"), *folder.glob("*/*/*/record.json")]
@@ -87,7 +87,7 @@ def list_(
 ) -> None:
     """List snapshots and environments of packages, last used first."""
     from envhub_sandbox.dependencies import environments
-    from envhub_sandbox.hub.cache import cache_root
+    from envhub_sandbox.system.folders import cache_root
 
     found, made = stored_snapshots(), environments.every()
     if json:
@@ -169,7 +169,7 @@ def remove(
 ) -> None:
     """Remove snapshots and environments of packages that are not in use."""
     from envhub_sandbox.dependencies import environments
-    from envhub_sandbox.hub.cache import cache_root
+    from envhub_sandbox.system.folders import cache_root
 
     found, made = stored_snapshots(), environments.every()
     if everything:

@@ -7,10 +7,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from envhub_sandbox.cli.shared import options as opt
-from envhub_sandbox.cli.shared.console import DOUBTFUL, GOOD, out, print_json, say, show, show_rows
+from envhub_sandbox.cli.shared.console import (
+    DOUBTFUL,
+    GOOD,
+    ProgressBar,
+    out,
+    print_json,
+    say,
+    show,
+    show_rows,
+)
 from envhub_sandbox.cli.shared.exits import Exit
 from envhub_sandbox.cli.shared.findings import STYLES, FailOn, level
-from envhub_sandbox.cli.shared.progress import ProgressBar
 from envhub_worker.protocol.text import counted
 
 if TYPE_CHECKING:
@@ -74,9 +82,8 @@ def _tasks(
 ) -> tuple[TaskFingerprint, ...]:
     from envhub_sandbox.dependencies.locks import making
     from envhub_sandbox.factory.make_env import make_env
-    from envhub_sandbox.session.repository import pinned
 
-    with make_env(pinned(snapshot), env_kwargs=env_kwargs, **hub) as suites:
+    with make_env(snapshot.reference, env_kwargs=env_kwargs, **hub) as suites:
         return making.tasks_of(suites)
 
 

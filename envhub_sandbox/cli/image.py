@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from envhub_sandbox.cli.shared import options as opt
-from envhub_sandbox.cli.shared.console import out, print_json, safe_line, say
-from envhub_sandbox.cli.shared.progress import ProgressBar
+from envhub_sandbox.cli.shared.console import ProgressBar, out, print_json, safe_line, say
 from envhub_worker.protocol.text import counted
 
 if TYPE_CHECKING:
@@ -69,7 +68,7 @@ def _build(
 ) -> dict[str, Any]:
     from envhub_sandbox.dependencies.request import Choice, request_of
     from envhub_sandbox.errors import DependencyError
-    from envhub_sandbox.sandboxes.docker import image
+    from envhub_sandbox.sandboxes.docker import packages
     from envhub_sandbox.sandboxes.docker.engines import find_engine
 
     request = request_of(snapshot, Choice("own", exclude_newer=exclude_newer))
@@ -82,6 +81,6 @@ def _build(
     is_local = snapshot.repo_type == "local"
     name = Path(snapshot.repo_id).name if is_local else snapshot.repo_id
     engine = find_engine(engine_name)
-    made = image.derived(engine, base, request, name=name, system=system, network=network)
+    made = packages.derived(engine, base, request, name=name, system=system, network=network)
     lock = made.lock
     return {"image": made.tag, "built": made.is_new, "lock": lock.digest, "packages": lock.packages}

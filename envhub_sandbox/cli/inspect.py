@@ -13,10 +13,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from envhub_sandbox.cli.shared import options as opt
-from envhub_sandbox.cli.shared.console import out, print_json, safe_line, show
+from envhub_sandbox.cli.shared.console import ProgressBar, out, print_json, safe_line, show
 from envhub_sandbox.cli.shared.exits import Exit, UsageError
 from envhub_sandbox.cli.shared.findings import FailOn, level, show_finding, write_report
-from envhub_sandbox.cli.shared.progress import ProgressBar
 from envhub_sandbox.cli.shared.results import print_provenance
 from envhub_worker.protocol.text import size_text
 
@@ -161,9 +160,8 @@ def _write(
 ) -> None:
     from envhub_sandbox.check import reports
     from envhub_sandbox.check.findings import Report
-    from envhub_sandbox.session.repository import pinned
 
-    write_report(path, reports.sarif(Report(pinned(snapshot), list(findings)), failures))
+    write_report(path, reports.sarif(Report(snapshot.reference, list(findings)), failures))
 
 
 def _print_static(read: Static) -> None:

@@ -12,9 +12,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from envhub_sandbox.cli.shared import options as opt
-from envhub_sandbox.cli.shared.console import GOOD, out, print_json, safe_line, say, show
+from envhub_sandbox.cli.shared.console import (
+    GOOD,
+    ProgressBar,
+    out,
+    print_json,
+    safe_line,
+    say,
+    show,
+)
 from envhub_sandbox.cli.shared.exits import UsageError
-from envhub_sandbox.cli.shared.progress import ProgressBar
 from envhub_sandbox.errors import SandboxUnavailableError
 from envhub_sandbox.system.platform import IS_LINUX, NAME
 
@@ -64,7 +71,7 @@ def lock(
     _check_platform()
     with ProgressBar(quiet=json) as bar:
         bar.begin(f"locking {ref}")
-        from envhub_sandbox.dependencies.locks import drift, lockfile, making
+        from envhub_sandbox.dependencies.locks import lockfile, making
 
         snapshot = make.snapshot(ref)
         path = _path(output, snapshot)
@@ -75,7 +82,7 @@ def lock(
         if not no_spaces:
             kwargs = _kwargs(make["env_kwargs"], old)
             made = _with_spaces(made, snapshot, kwargs, make.hub)
-        changes = [] if old is None else drift.differences(old, made)
+        changes = [] if old is None else making.differences(old, made)
         lockfile.write(made, path)
     _print(path, made, changes, old is not None, as_json=json)
 
@@ -106,17 +113,17 @@ def verify(
     _check_platform()
     with ProgressBar(quiet=json) as bar:
         bar.begin(f"verifying {file}")
-        from envhub_sandbox.dependencies.locks import drift, lockfile
+        from envhub_sandbox.dependencies.locks import lockfile, making
 
         locked = lockfile.read(file)
         snapshot = make.snapshot_with_assets(_reference(ref, locked, file), locked.assets)
         now = _now(locked, snapshot, no_index=no_index)
-        if not no_spaces and not drift.differences(locked, now):
+        if not no_spaces and not making.differences(locked, now):
             now = _spaces_again(now, locked, snapshot, make.hub)
-        found = drift.differences(locked, now)
+        found = making.differences(locked, now)
     if json:
         print_json({"lock": str(file), "reference": snapshot.label, "drift": found})
-    drift.refuse(found, snapshot.label)
+    making.refuse(found, snapshot.label)
     if not json:
         say(f"{snapshot.label} is as it was locked in {file}.", GOOD)
 
@@ -185,12 +192,11 @@ def _with_spaces(
     """The lock with what its repository returns, in the sandbox and in its own environment."""
     from envhub_sandbox.dependencies.locks import lockfile, making
     from envhub_sandbox.factory.make_env import make_env
-    from envhub_sandbox.session.repository import pinned
 
     with tempfile.TemporaryDirectory(prefix="envhub-lock-") as folder:
         path = Path(folder, "pylock.toml")
         lockfile.write(replace(made, spaces=None), path)
-        with make_env(pinned(snapshot), env_kwargs=env_kwargs, lock=path, **hub) as suites:
+        with make_env(snapshot.reference, env_kwargs=env_kwargs, lock=path, **hub) as suites:
             return making.with_spaces(made, env_kwargs, suites)
 
 
@@ -206,7 +212,7 @@ def _reference(ref: str | None, locked: LockFile, file: Path) -> str:
 def _now(locked: LockFile, snapshot: Snapshot, *, no_index: bool) -> LockFile:
     from envhub_sandbox.dependencies import interpreters
     from envhub_sandbox.dependencies.locks import lockfile, making
-    from envhub_sandbox.dependencies.locks.drift import with_files
+    from envhub_sandbox.dependencies.locks.making import with_files
 
     here = lockfile.Runner.of(interpreters.find(locked.runner.python))
     now = replace(with_files(locked, snapshot), runner=here)

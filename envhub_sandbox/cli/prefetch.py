@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from envhub_sandbox.cli.shared import options as opt
-from envhub_sandbox.cli.shared.console import out, print_json, safe_line, show
-from envhub_sandbox.cli.shared.progress import ProgressBar
+from envhub_sandbox.cli.shared.console import ProgressBar, out, print_json, safe_line, show
 from envhub_worker.protocol.text import size_text
 
 if TYPE_CHECKING:
@@ -55,14 +54,12 @@ def _environment(snapshot: Snapshot, given: Any, upgrade: bool) -> Environment |
 
 
 def _of_lock(snapshot: Snapshot, lock: str, given: Any) -> Environment | None:
-    from envhub_sandbox.dependencies.locks import use
+    from envhub_sandbox.dependencies.packages import locked_packages, opened_lock
 
-    return use.provided(snapshot, use.opened(lock, "process", None, given)).environment
+    return locked_packages(snapshot, opened_lock(lock, "process", None, given)).environment
 
 
 def _document(snapshot: Snapshot, environment: Environment | None) -> dict[str, Any]:
-    from envhub_sandbox.session.repository import pinned
-
     made = environment and {
         "folder": str(environment.home),
         "python": environment.python,
@@ -70,13 +67,11 @@ def _document(snapshot: Snapshot, environment: Environment | None) -> dict[str, 
         "bytes": environment.size,
         **environment.facts,
     }
-    return {"reference": pinned(snapshot), "commit": snapshot.commit, "environment": made}
+    return {"reference": snapshot.reference, "commit": snapshot.commit, "environment": made}
 
 
 def _print(snapshot: Snapshot, environment: Environment | None) -> None:
-    from envhub_sandbox.session.repository import pinned
-
-    out(safe_line(pinned(snapshot), 300))
+    out(safe_line(snapshot.reference, 300))
     if environment is None:
         show("packages", "this interpreter's, which are enough", stderr=True)
         return

@@ -9,9 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from envhub_sandbox.cli.shared import options as opt
-from envhub_sandbox.cli.shared.console import out, print_json, safe_line, say
+from envhub_sandbox.cli.shared.console import ProgressBar, out, print_json, safe_line, say
 from envhub_sandbox.cli.shared.exits import UsageError
-from envhub_sandbox.cli.shared.progress import ProgressBar
 from envhub_worker.protocol.text import counted
 
 if TYPE_CHECKING:
@@ -135,8 +134,12 @@ def _publish(
 
     from envhub_sandbox.errors import SnapshotIntegrityError
     from envhub_sandbox.hub.client import HubClient, checked_endpoint, checked_token
-    from envhub_sandbox.hub.hashing import differing
-    from envhub_sandbox.hub.listing import DEFAULT_LIMITS, Repository, listing_within_limits
+    from envhub_sandbox.hub.listing import (
+        DEFAULT_LIMITS,
+        Repository,
+        differing,
+        listing_within_limits,
+    )
 
     hub = HubClient(checked_endpoint(make["endpoint"]), checked_token(make["token"]))
     repo = Repository(target.repo_type or "model", target.repo_id)
@@ -161,7 +164,7 @@ def _publish(
 @contextlib.contextmanager
 def _explained(what: str, also: str = "") -> Iterator[None]:
     from envhub_sandbox.errors import RepositoryUnavailableError
-    from envhub_sandbox.hub.failures import HubFailure
+    from envhub_sandbox.hub.answers import HubFailure
 
     try:
         yield

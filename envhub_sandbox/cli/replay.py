@@ -13,6 +13,7 @@ from envhub_sandbox.cli.shared.console import (
     BAD,
     DOUBTFUL,
     GOOD,
+    ProgressBar,
     out,
     print_json,
     safe_line,
@@ -20,7 +21,6 @@ from envhub_sandbox.cli.shared.console import (
     show_rows,
 )
 from envhub_sandbox.cli.shared.exits import Exit, UsageError
-from envhub_sandbox.cli.shared.progress import ProgressBar
 
 if TYPE_CHECKING:
     from envhub_sandbox.session.crash.bundle_reader import Bundle

@@ -14,9 +14,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from envhub_sandbox.cli.shared import options as opt
-from envhub_sandbox.cli.shared.console import out, print_json, safe_line, safe_text, say
+from envhub_sandbox.cli.shared.console import (
+    ProgressBar,
+    out,
+    print_json,
+    safe_line,
+    safe_text,
+    say,
+)
 from envhub_sandbox.cli.shared.exits import code_for, describe
-from envhub_sandbox.cli.shared.progress import ProgressBar
 from envhub_sandbox.cli.shared.results import (
     TaskResult,
     print_provenance,

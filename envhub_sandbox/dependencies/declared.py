@@ -4,7 +4,7 @@ The files are a stranger's. pip and uv obey options, URLs and paths in them, som
 run code at once, so only plain requirements get through, each parsed and printed anew. The first of
 these that there is counts, as the most particular one: the metadata of a script (PEP 723) in the
 entry file, ``requirements.txt`` beside it or else at the root, and ``[project]`` of
-``pyproject.toml``.
+``pyproject.toml``. A requirement may name a repository of git, which is a ``Source``.
 """
 
 from __future__ import annotations
@@ -20,11 +20,62 @@ from typing import Any
 from packaging.requirements import InvalidRequirement, Requirement
 from packaging.specifiers import InvalidSpecifier, SpecifierSet
 from packaging.utils import canonicalize_name
+from packaging.version import InvalidVersion, Version
 
-from envhub_sandbox.dependencies.builds.sources import of_git
 from envhub_sandbox.errors import RequirementError
 from envhub_sandbox.hub.sources import toml
 from envhub_sandbox.settings.options import option_name
+
+_GIT = re.compile(
+    r"git\+(?P<url>https://[A-Za-z0-9.-]+(:\d{1,5})?/[A-Za-z0-9._~/-]+?)"
+    r"(?:@(?P<revision>[A-Za-z0-9._/-]{1,200}))?(#subdirectory=(?P<folder>[A-Za-z0-9._/-]{1,200}))?"
+)
+
+
+@dataclass(frozen=True)
+class Source:
+    """What was chosen and has no wheel.
+
+    Attributes:
+        name: Its canonical name.
+        version: Empty for a repository of git.
+        url: Of the source distribution, or of the repository.
+        sha256: Of the source distribution; empty for git.
+        commit: What a requirement names in a repository: a commit, a tag or a branch; or ``HEAD``.
+        subdirectory: Where the project lies in there.
+        where: The line that asks for it, for errors.
+    """
+
+    name: str
+    version: str = ""
+    url: str = ""
+    sha256: str = ""
+    commit: str = ""
+    subdirectory: str = ""
+    where: str = ""
+
+    @property
+    def identity(self) -> str:
+        """What names its content: the hash of a file, or a full commit."""
+        if not self.commit:
+            return f"sha256:{self.sha256}"
+        below = f"#subdirectory={self.subdirectory}" if self.subdirectory else ""
+        return f"git+{self.url}@{self.commit}{below}"
+
+
+def of_git(requirement: Requirement, where: str) -> Source | None:
+    """The repository that a requirement names; None for what is no ``git+https`` at a revision."""
+    found = _GIT.fullmatch(requirement.url or "")
+    if found is None or ".." in found[0]:
+        return None
+    return Source(
+        canonicalize_name(requirement.name),
+        url=found["url"],
+        commit=found["revision"] or "HEAD",
+        subdirectory=found["folder"] or "",
+        where=where,
+    )
+
 
 PROJECT = "pyproject.toml"
 MAX_BYTES = 256 * 1024
@@ -310,6 +361,20 @@ def _specifier(found: object, where: str) -> str:
             f"requires-python in {where} is {str(found)[:80]!r}, which is not a range of versions "
             f"such as '>=3.11'. {_advice()}"
         ) from error
+
+
+def check_versions(asked: str) -> None:
+    """Refuse what is neither a version, nor versions, nor a path. Raises ``ValueError``."""
+    if os.sep not in asked:
+        versions(asked)
+
+
+def versions(asked: str) -> SpecifierSet:
+    """What a caller asks for: one version, or several; otherwise ``ValueError``."""
+    try:
+        return SpecifierSet(f"=={Version(asked)}.*" if asked.count(".") < 2 else f"=={asked}")
+    except (InvalidVersion, InvalidSpecifier):
+        return SpecifierSet(asked)
 
 
 def _bounded(count: int, where: str) -> None:

@@ -34,8 +34,8 @@ from envhub_sandbox.dependencies.bounds import Bounds, Watch, checked, walk
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.dependencies.resolve import Lock
 from envhub_sandbox.errors import DependencyError
-from envhub_sandbox.hub.cache import BUILDING, CACHE_VARIABLE, cache_root, draft, remove_tree
 from envhub_sandbox.system import folders, locks
+from envhub_sandbox.system.folders import BUILDING, CACHE_VARIABLE, cache_root, draft, remove_tree
 from envhub_sandbox.system.locks import sharers
 from envhub_sandbox.system.platform import own_variables
 from envhub_worker.protocol.runtime import RECORD

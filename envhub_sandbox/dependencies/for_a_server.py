@@ -31,17 +31,16 @@ from packaging.utils import canonicalize_name
 from envhub_sandbox.dependencies import (
     bounds,
     environments,
-    interpreters,
     packages,
     resolutions,
     uv,
 )
-from envhub_sandbox.dependencies.declared import WantedPackage, parse_requirement
+from envhub_sandbox.dependencies.declared import WantedPackage, check_versions, parse_requirement
 from envhub_sandbox.dependencies.modules import Guess
 from envhub_sandbox.dependencies.request import DATE, PackageRequest
 from envhub_sandbox.errors import DependencyError, PackagesTooLargeError, RequirementError
-from envhub_sandbox.hub.cache import CACHE_VARIABLE, remove_tree
 from envhub_sandbox.system import locks, processes
+from envhub_sandbox.system.folders import CACHE_VARIABLE, remove_tree
 from envhub_worker.protocol.text import printable
 
 BLOCK_BYTES = 4096
@@ -118,8 +117,8 @@ def _request(order: Mapping[str, Any]) -> PackageRequest:
     """What is asked for. Trust: input from a client."""
     python, until = order["python"], order["exclude_newer"]
     try:
-        interpreters.check_versions(python or ">=3")
-        interpreters.check_versions(order["supports"] or ">=3")
+        check_versions(python or ">=3")
+        check_versions(order["supports"] or ">=3")
         if os.sep in python + order["supports"] or (until and not DATE.fullmatch(until)):
             raise ValueError("a path, or no date")
     except ValueError as error:

@@ -19,9 +19,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from envhub_sandbox.errors import RequirementError
-from envhub_sandbox.hub.cache import cache_root, keep, recall
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.settings.options import option_name
+from envhub_sandbox.system.folders import cache_root, keep, recall
 from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.text import printable
 
@@ -111,7 +111,7 @@ def _of_id(text: str) -> tuple[str, str, list[str]] | None:
 def _of_module(name: str, extras: Mapping[str, WantedPackage]) -> tuple[str, str, list[str]] | None:
     from packaging.utils import canonicalize_name
 
-    from envhub_sandbox.hub.sources.imports import of_module
+    from envhub_sandbox.hub.sources.parsing import of_module
 
     distributions = of_module(name)
     names = list(map(str, map(canonicalize_name, distributions or [name.partition(".")[0]])))
@@ -147,12 +147,12 @@ def _recalled(snapshot: Snapshot) -> tuple[tuple[str, str, int], ...]:
     with contextlib.suppress(ValueError, TypeError):
         rows = json.loads(recall(folder, key) or "")
         return tuple((str(name), str(file), int(line)) for name, file, line in rows)
-    from envhub_sandbox.hub.sources import imports, parsing
+    from envhub_sandbox.hub.sources import parsing
 
     files = parsing.read(snapshot)
-    found = [(one.module, one.file, one.line) for one in imports.imports(snapshot, files)]
+    found = [(one.module, one.file, one.line) for one in parsing.imports(snapshot, files)]
     found = [row for row in found if row[0] not in _WORKERS]
-    rows = [*found, *(row for row in imports.ids(snapshot, files) if _of_id(row[0]))]
+    rows = [*found, *(row for row in parsing.ids(snapshot, files) if _of_id(row[0]))]
     keep(folder, key, json.dumps(rows))
     return tuple(rows)
 
@@ -194,7 +194,7 @@ class MissingModule:
         return ""
 
     def _cure(self, module: str, says: DeclaredPackages | None) -> str:
-        from envhub_sandbox.hub.sources.imports import of_module
+        from envhub_sandbox.hub.sources.parsing import of_module
 
         name = next(iter(of_module(module)), "NAME-OF-THE-PACKAGE")
         extra = option_name("dependencies", {"extra": [name]})

@@ -2,12 +2,14 @@
 
 read what it is to have (``request_of``), take the place's own packages if they meet it, choose
 versions (``resolution_for``), make an environment. What differs between this machine, a container
-and a server on another host is a ``PackageTarget``.
+and a server on another host is a ``PackageTarget``. With a lock file its packages are used and no
+others, and nothing that has drifted.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import os
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -15,17 +17,25 @@ from envhub_sandbox.dependencies.request import Choice, PackageRequest, request_
 from envhub_sandbox.errors import (
     DependencyError,
     IndexUnavailableError,
+    LockError,
+    PolicyError,
     ResolutionError,
     name_source,
 )
-from envhub_sandbox.hub.registered import reference as registered
+from envhub_sandbox.hub import registered
 from envhub_sandbox.hub.snapshot import Snapshot
-from envhub_sandbox.system import progress
+from envhub_sandbox.settings.options import option_name
+from envhub_sandbox.system import log
 from envhub_sandbox.system.log import DEPENDENCIES
 from envhub_worker.protocol.records import dataclass
 
 if TYPE_CHECKING:
+    from envhub_sandbox.dependencies.builds.wheels import WheelOrigin
     from envhub_sandbox.dependencies.environments import Environment
+    from envhub_sandbox.dependencies.interpreters import Interpreter
+    from envhub_sandbox.dependencies.locks.lockfile import LockFile
+    from envhub_sandbox.dependencies.resolve import Lock
+    from envhub_worker.protocol.manifest.manifest import Manifest
 
 _CHECK_REFERENCE = (
     "The reference names the package: is it spelt so, and has the index that version?"
@@ -73,9 +83,9 @@ class ThisMachine:
 
     def meets(self, request: PackageRequest) -> bool:
         """Whether this process's interpreter has all of it."""
-        from envhub_sandbox.dependencies import installed, modules
+        from envhub_sandbox.dependencies import interpreters, modules
 
-        met = installed.first_unmet(request) is None
+        met = interpreters.first_unmet(request) is None
         return met and all(map(modules.is_here, request.guesses))
 
     def make(self, request: PackageRequest, tell: Tell) -> PackageSet:
@@ -102,7 +112,7 @@ def packages_for(
         request = request_of(snapshot, choice, gpu=gpu)
         if request is None or (not request.always and target.meets(request)):
             return None
-        with progress.progress_shown("packages") as tell:
+        with log.progress_shown("packages") as tell:
             try:
                 return target.make(request, tell)
             except (ResolutionError, IndexUnavailableError) as error:
@@ -116,3 +126,104 @@ def packages_for(
             error.args = (f"{error}\n{_CHECK_REFERENCE}", *error.args[1:])
         name_source(error, snapshot.label)
         raise
+
+
+def opened_lock(
+    path: str | os.PathLike[str], sandbox: object, python: object, dependencies: object
+) -> LockFile:
+    """The lock of these arguments of ``make_env``; ``PolicyError`` if the others say something
+    else.
+    """
+    if python is not None or dependencies != "auto":
+        raise PolicyError(
+            f"{option_name('lock')} has the packages already; leave out {option_name('python')} "
+            f"and {option_name('dependencies')}"
+        )
+    if sandbox != "process":
+        raise PolicyError(
+            f"{option_name('lock')} is for {option_name('sandbox', 'process')}; an image is locked "
+            "by its digest, and on another host the operator of the server chooses its packages"
+        )
+    from envhub_sandbox.dependencies.locks import lockfile
+
+    return lockfile.read(path)
+
+
+def locked_packages(snapshot: Snapshot, lock: LockFile) -> PackageSet:
+    """The environment of its packages; made if there is none.
+
+    Raises ``LockDriftError`` where the files or the interpreter are others.
+    """
+    from envhub_sandbox.dependencies import environments, interpreters
+    from envhub_sandbox.dependencies.locks import lockfile, making, pylock
+
+    here = making.with_files(lock, snapshot)
+    making.refuse(making.differences(lock, here), snapshot.label)
+    try:
+        interpreter = interpreters.find(lock.runner.python)
+        here = replace(here, runner=lockfile.Runner.of(interpreter))
+        making.refuse(making.differences(lock, here), snapshot.label)
+        with log.progress_shown("packages") as tell:
+            locked = [one.origin for one in lock.packages if one.origin is not None]
+            pins = _with_wheels(pylock.pins(lock.packages), locked, interpreter, tell)
+            made = environments.provide(pins, interpreter, tell)
+            return PackageSet.of(made)
+    except (DependencyError, LockError) as error:
+        name_source(error, snapshot.label)
+        raise
+
+
+def _with_wheels(
+    lock: Lock,
+    locked: Sequence[WheelOrigin],
+    interpreter: Interpreter,
+    tell: Callable[[str], None],
+) -> Lock:
+    """The lock with wheels of what has none: kept, or built again of the locked sources.
+    Raises ``DependencyError`` where one cannot be built, or its source is another.
+    """
+    from envhub_sandbox.dependencies import environments
+    from envhub_sandbox.dependencies.builds.wheels import describe
+    from envhub_sandbox.dependencies.resolutions import build
+    from envhub_sandbox.dependencies.resolve import Lock
+
+    if not locked or environments.ready(environments.key_of(lock, interpreter)) is not None:
+        return lock
+    wheels = build([one.source for one in locked], interpreter, tell)
+    text, options = lock.text, list(lock.options)
+    for origin, wheel in zip(locked, wheels, strict=True):
+        built = describe(wheel)
+        assert built is not None
+        if built.wheel != origin.wheel:
+            tell(f"{origin.source.name} was built again, and not to the same bytes")
+        text = text.replace(f"sha256:{origin.wheel}", f"sha256:{built.wheel}")
+        options += ["--find-links", str(wheel.parent)]
+    return Lock(text, tuple(options))
+
+
+def lock_checker(
+    lock: LockFile | None, label: str, env_kwargs: Mapping[str, Any], config: object
+) -> Callable[[Manifest], None]:
+    """What holds a manifest against the lock.
+
+    With other arguments than those that were locked a repository may well make other environments:
+    then there is nothing to hold it against.
+    """
+
+    def check(manifest: Manifest) -> None:
+        if lock is None or lock.spaces is None or config is not None:
+            return
+        from envhub_sandbox.dependencies.locks import lockfile, making
+        from envhub_sandbox.dependencies.locks.fingerprint import fingerprint_of_task
+
+        if lockfile.arguments_text(env_kwargs) == lock.spaces.arguments:
+            now = [
+                fingerprint_of_task(
+                    *(env.suite, env.task, env.autoreset_mode),
+                    *(env.single_observation_space, env.single_action_space),
+                )
+                for env in manifest.envs
+            ]
+            making.refuse(list(making.drift_of_tasks(lock.spaces.tasks, now)), label)
+
+    return check

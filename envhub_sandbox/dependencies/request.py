@@ -137,13 +137,13 @@ def _names(given: Mapping[str, Any]) -> tuple[str, ...]:
 
 
 def _python(given: object) -> str:
-    from envhub_sandbox.dependencies import interpreters
+    from envhub_sandbox.dependencies.declared import check_versions
 
     text = os.fspath(given) if isinstance(given, os.PathLike) else given or ""
     try:
         if not isinstance(text, str):
             raise ValueError("no text")
-        interpreters.check_versions(text)
+        check_versions(text)
     except ValueError as error:
         raise PolicyError(
             f"python in dependencies is {given!r}; it takes a version such as '3.12', versions "

@@ -19,20 +19,22 @@ from typing import TYPE_CHECKING
 from packaging.utils import parse_wheel_filename
 
 from envhub_sandbox.dependencies import index, interpreters, resolve
-from envhub_sandbox.dependencies.builds.sources import Builder, Source, of_git
-from envhub_sandbox.dependencies.declared import parse_requirement
+from envhub_sandbox.dependencies.declared import Source, of_git, parse_requirement
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.dependencies.request import PackageRequest
 from envhub_sandbox.dependencies.resolve import WORKERS, Lock, Target
 from envhub_sandbox.errors import ResolutionError
-from envhub_sandbox.hub import cache
 from envhub_sandbox.settings.options import option_name
+from envhub_sandbox.system import folders
 
 if TYPE_CHECKING:
     from envhub_sandbox.dependencies.modules import Guess
 
 _FORMAT = 2
 Tell = Callable[[str], None]
+Builder = Callable[[Sequence[Source], Interpreter, Callable[[str], None]], Sequence[Path]]
+"""Makes one wheel of each source, in the same order; each lies in a folder of wheels alone, and
+stays there. Raises ``DependencyError``."""
 
 
 @dataclass(frozen=True)
@@ -200,7 +202,7 @@ def versions_for(
 
 def root() -> Path:
     """Where they lie; ours alone, since what lies there is installed."""
-    return cache.cache_root() / "resolutions"
+    return folders.cache_root() / "resolutions"
 
 
 def key_of(request: PackageRequest, interpreter: Interpreter) -> str:
@@ -217,7 +219,7 @@ def key_of(request: PackageRequest, interpreter: Interpreter) -> str:
 def recall(key: str) -> Resolution | None:
     """What was chosen, if that is known, and its interpreter is still the same."""
     try:
-        facts = json.loads(cache.recall(root(), key) or "{}")
+        facts = json.loads(folders.recall(root(), key) or "{}")
         lock = Lock(str(facts["lock"]), tuple(map(str, facts["options"])))
         interpreter = Interpreter(**facts["interpreter"])
         # what the worker needs is in each: an empty one was lost
@@ -240,7 +242,7 @@ def remember(key: str, found: Resolution) -> None:
         "stamp": _stamp(found.interpreter),
         "taken": found.taken,
     }
-    cache.keep(root(), key, json.dumps(facts))
+    folders.keep(root(), key, json.dumps(facts))
 
 
 def _stamp(interpreter: Interpreter) -> list[int]:

@@ -12,8 +12,7 @@ from packaging.utils import canonicalize_name
 from packaging.version import Version
 
 from envhub_sandbox.dependencies import index, interpreters, uv
-from envhub_sandbox.dependencies.builds.sources import Source
-from envhub_sandbox.dependencies.declared import WantedPackage, parse_requirement
+from envhub_sandbox.dependencies.declared import Source, WantedPackage, parse_requirement
 from envhub_sandbox.dependencies.request import PackageRequest
 from envhub_sandbox.errors import (
     DependencyError,

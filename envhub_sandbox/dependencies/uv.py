@@ -28,9 +28,9 @@ from envhub_sandbox.errors import (
     PackagesTooLargeError,
     ResolutionError,
 )
-from envhub_sandbox.hub.cache import remove_tree
 from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.system import locks
+from envhub_sandbox.system.folders import remove_tree
 from envhub_sandbox.system.platform import IS_WINDOWS
 from envhub_worker.protocol.text import printable
 

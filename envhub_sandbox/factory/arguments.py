@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 
 from envhub_sandbox.errors import PolicyError
-from envhub_sandbox.sandboxes.fleet.place_list import is_list
-from envhub_sandbox.sandboxes.sandbox import Sandbox
+from envhub_sandbox.sandboxes.sandbox import Sandbox, is_list
 from envhub_sandbox.session.repository import PlainConfig
 from envhub_sandbox.settings.options import option_name
 from envhub_worker.protocol.messages import CONFIG_CLASS

@@ -20,13 +20,13 @@ from typing import Any
 from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerTimeoutError
 from envhub_sandbox.factory import build_env
 from envhub_sandbox.factory.env_factory import EnvFactory
-from envhub_sandbox.hub.cache import CACHE_VARIABLE, cache_root
 from envhub_sandbox.hub.snapshot import local
 from envhub_sandbox.sandboxes.process import PROCESS
 from envhub_sandbox.session.jails.launcher import Launcher
-from envhub_sandbox.session.repository import Recipe, Repository, pinned
+from envhub_sandbox.session.repository import Recipe, Repository
 from envhub_sandbox.settings.policy import Limits, Policy, Timeouts
 from envhub_sandbox.system import processes
+from envhub_sandbox.system.folders import CACHE_VARIABLE, cache_root
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.runtime import Runtime
@@ -98,7 +98,7 @@ def _repository(folder: Path, order: Mapping[str, Any]) -> Repository:
     snapshot = local(str(entry))
     return Repository(
         *(snapshot, m.Load(1, False, None, {}), policy, timeouts, runtime, "frames", True),
-        recipe=Recipe(make_env=_built, reference=pinned(snapshot), config=None),
+        recipe=Recipe(make_env=_built, reference=snapshot.reference, config=None),
         installed=None,
         advice=lambda text: "",
     )

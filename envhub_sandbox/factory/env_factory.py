@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 from envhub_sandbox.errors import EnvHubError
-from envhub_sandbox.hub.cache import cache_root
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.session.crash.history import History
 from envhub_sandbox.session.env_session import EnvSession
@@ -29,7 +28,7 @@ from envhub_sandbox.session.parts.fleet_session import AnySession, FleetSession
 from envhub_sandbox.session.prewarm import SuitePrewarm, TaskPrewarm
 from envhub_sandbox.settings.policy import Policy
 from envhub_sandbox.system import folders
-from envhub_sandbox.system.files import write_whole_file
+from envhub_sandbox.system.folders import cache_root, write_whole_file
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.shard_trials import ShardTrials
 from envhub_sandbox.transport.values import generator, lasting

@@ -7,15 +7,19 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from envhub_sandbox.dependencies.locks import use as locks
 from envhub_sandbox.dependencies.modules import MissingModule
-from envhub_sandbox.dependencies.packages import PackageSet, packages_for
+from envhub_sandbox.dependencies.packages import (
+    PackageSet,
+    lock_checker,
+    locked_packages,
+    opened_lock,
+    packages_for,
+)
 from envhub_sandbox.dependencies.request import Choice, chosen
 from envhub_sandbox.errors import PolicyError
 from envhub_sandbox.factory import arguments
 from envhub_sandbox.factory.arguments import plain_config, reference_of
 from envhub_sandbox.factory.env_factory import EnvFactory
-from envhub_sandbox.hub.cache import cache_root
 from envhub_sandbox.hub.snapshot import Snapshot, snapshot_named
 from envhub_sandbox.hub.sources.assets import with_assets
 from envhub_sandbox.sandboxes import inprocess
@@ -24,12 +28,12 @@ from envhub_sandbox.session.jails.launcher import Launcher
 from envhub_sandbox.session.repository import (
     Recipe,
     Repository,
-    pinned,
     provenance_of,
 )
 from envhub_sandbox.settings.options import Options, option_name
 from envhub_sandbox.settings.policy import Limits, Policy, Timeouts, policy_from, timeouts_from
 from envhub_sandbox.system import processes
+from envhub_sandbox.system.folders import cache_root
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_sandbox.vector.tracebacks import short_traceback
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
@@ -165,7 +169,7 @@ def _make(cfg: Any, given: Options) -> EnvSuites:
     )
     recipe = Recipe(
         make_env=make_env,  # a pickle makes the environments again by its name
-        reference=pinned(snapshot),
+        reference=snapshot.reference,
         config=load.cfg,
         options=options.for_a_recipe(
             env_kwargs=load.env_kwargs,
@@ -197,7 +201,7 @@ def _make(cfg: Any, given: Options) -> EnvSuites:
         options.num_workers,
         _ahead(wanted, options),
         _face(options.validate),
-        locks.checker(wanted.lock, snapshot.label, load.env_kwargs, config),
+        lock_checker(wanted.lock, snapshot.label, load.env_kwargs, config),
     ).make()
 
 
@@ -227,7 +231,7 @@ class _Plan:
 def _wanted(sandbox: str | Sandbox, options: Options) -> _Plan:
     lock = None
     if options.lock is not None:
-        lock = locks.opened(options.lock, sandbox, options.python, options.dependencies)
+        lock = opened_lock(options.lock, sandbox, options.python, options.dependencies)
     choice, python = chosen(options.dependencies, options.python)
     policy = policy_from(options.policy, options.limits)
     timeouts = timeouts_from(options.timeouts)
@@ -259,7 +263,7 @@ def _make_here(reference: str, config: Any, options: Options) -> EnvSuites:
 def _packages(snapshot: Snapshot, wanted: _Plan) -> PackageSet | None:
     """The packages that are made for it; None for those of the place."""
     if wanted.lock is not None:
-        return locks.provided(snapshot, wanted.lock)
+        return locked_packages(snapshot, wanted.lock)
     target = wanted.place.package_target()
     if target is None:
         return None

@@ -1,16 +1,25 @@
-"""What a Hub's answers may be before anything is done with them: bounded, and harmless as names.
+"""What a Hub's answers may be before anything is done with them, and what its failures mean.
 
-huggingface_hub makes paths of the headers ``ETag`` and ``X-Repo-Commit``: a Hub that lies in them
-would write files outside of the Hub cache. Sessions are those of requests (before 1.0) or httpx.
+Answers are bounded, and harmless as names: huggingface_hub makes paths of the headers ``ETag`` and
+``X-Repo-Commit``, and a Hub that lies in them would write files outside of the Hub cache. Sessions
+are those of requests (before 1.0) or httpx.
+
+Failures are told in words that say what to do next. huggingface_hub 0.34 raises requests'
+exceptions, 1.x httpx's and 2.x httpx2's, often wrapped in ``LocalEntryNotFoundError``. So the chain
+of causes is walked, and transports are recognised by the names of their classes.
 """
 
 from __future__ import annotations
 
+import errno
 import re
 import time
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from enum import Enum
 from typing import Any
+
+from envhub_sandbox.settings.options import option_name
 
 MAX_BODY_BYTES = 64 << 20
 """Of a page of a listing, unpacked: those of the Hub have some 300 kB."""
@@ -80,3 +89,212 @@ def _judge(response: Any, *_: object, **__: object) -> None:
         value = response.headers.get(name)
         if value is not None and not form.fullmatch(value):
             raise HostileAnswerError(f"the header {name} of an answer is {value[:200]!r}")
+
+
+_LONGEST_QUOTE = 200
+_LOG_IN = "log in with `hf auth login` (`huggingface-cli login` before 1.0) or pass a token"
+
+
+class Kind(Enum):
+    """Why the Hub did not give something: what happened, and what to do.
+
+    The fields in the texts are those of ``explain``.
+    """
+
+    NO_REPOSITORY = (
+        "there is no {repo_type} repository {repo_id} that you may see ({status})",
+        f"Check the spelling and the owner; if it is private, {_LOG_IN}",
+    )
+    NO_REVISION = (
+        "the {repo_type} repository {repo_id} has no revision {revision}",
+        "Check the branch, tag or commit at {url}/commits/main",
+    )
+    NO_ENTRY = (
+        "the {repo_type} repository {repo_id} lacks a file that its own listing names",
+        "Try again; if it persists, ask the repository's owner",
+    )
+    GATED = (
+        "the {repo_type} repository {repo_id} is gated and you have no access yet{said}",
+        f"Accept its terms at {{url}}, then {_LOG_IN}",
+    )
+    DISABLED = (
+        "the {repo_type} repository {repo_id} was disabled on the Hub{said}",
+        "Ask its owner, or use another repository",
+    )
+    UNAUTHORIZED = (
+        "the Hub refused your token (401){said}",
+        f"It may have expired, or be for another endpoint: {_LOG_IN}; {{no_token}} sends none",
+    )
+    FORBIDDEN = (
+        "your token may not read the {repo_type} repository {repo_id} (403){said}",
+        "Give the token read access to it at {endpoint}/settings/tokens, or ask its owner",
+    )
+    NO_TOKEN = (
+        "token=True needs a stored token, and none is stored on this machine",
+        f"To store one, {_LOG_IN}",
+    )
+    RATE_LIMITED = (
+        "the Hub's rate limit is reached (429){said}",
+        f"Wait {{wait}} and try again; you get a higher limit if you {_LOG_IN}",
+    )
+    SERVER_ERROR = (
+        "the Hub has a problem ({status}){said}",
+        "Try again later; see https://status.huggingface.co",
+    )
+    OFFLINE = (
+        "HF_HUB_OFFLINE is set, so the Hub was not asked",
+        "Unset HF_HUB_OFFLINE to go online",
+    )
+    TIMEOUT = (
+        "the Hub did not answer in time",
+        "Check the network and try again; HF_HUB_ETAG_TIMEOUT=30 waits longer",
+    )
+    UNREACHABLE = (
+        "the Hub cannot be reached ({reason})",
+        "Check the network, the proxy settings and the endpoint",
+    )
+    BROKEN_DOWNLOAD = (
+        "the download broke off or had the wrong length",
+        "Try again; if it persists, a proxy or a mirror changes the files",
+    )
+    DISK_FULL = ("the disk is full", "Free space, or put the Hub cache elsewhere (HF_HOME)")
+    OTHER = (
+        "the Hub client failed ({reason}){said}",
+        "Check the endpoint; if it is right, try again with HF_DEBUG=1",
+    )
+
+
+ABSENT = frozenset({Kind.NO_REPOSITORY, Kind.NO_REVISION, Kind.NO_ENTRY})
+"""The repository is not there or not like this: one of another type may be."""
+
+UNREACHABLE = frozenset(
+    {Kind.OFFLINE, Kind.TIMEOUT, Kind.UNREACHABLE, Kind.RATE_LIMITED, Kind.SERVER_ERROR}
+)
+"""Nothing was learned about the repository: what the store has may still be what is wanted."""
+
+
+class HubFailure(Exception):
+    """A request to the Hub failed. ``what`` and ``advice`` are sentences without a full stop."""
+
+    def __init__(self, kind: Kind, what: str, advice: str) -> None:
+        super().__init__(what, advice)
+        self.kind = kind
+        self.what = what
+        self.advice = advice
+
+
+_BAD_TOKEN = "Invalid credentials in Authorization header"
+_TIMEOUT_CLASSES = frozenset({"Timeout", "TimeoutException", "TimeoutError"})
+_TRANSPORT_CLASSES = frozenset(
+    {"ConnectionError", "NetworkError", "TransportError", "ProtocolError", "ProxyError", "SSLError"}
+)
+
+
+def explain(
+    error: BaseException,
+    secrets: tuple[str, ...] = (),
+    *,
+    repo_type: str,
+    repo_id: str,
+    revision: str | None,
+    endpoint: str,
+) -> HubFailure:
+    """The failure that an exception of the Hub client stands for."""
+    found = ((kind, link) for link in chain(error) if (kind := _kind_of(link)) is not None)
+    kind, source = next(found, (Kind.OTHER, error))
+    response = getattr(source, "response", None)
+    fields = {
+        "repo_type": repo_type,
+        "repo_id": repo_id,
+        "endpoint": endpoint,
+        "url": f"{endpoint}/{'' if repo_type == 'model' else f'{repo_type}s/'}{repo_id}",
+        "revision": repr(revision) if revision else "'main' (is it empty?)",
+        "status": getattr(response, "status_code", "not found"),
+        "said": _said(response),
+        "wait": _wait(response),
+        "reason": type(source).__name__,
+        "no_token": option_name("token", False),
+    }
+    what, advice = (text.format(**fields) for text in kind.value)
+    return HubFailure(kind, redact(what, secrets), redact(advice, secrets))
+
+
+def redact(text: str, secrets: tuple[str, ...]) -> str:
+    """The text without the secrets, which a careless server may have echoed."""
+    for secret in secrets:
+        text = text.replace(secret, "***")
+    return text
+
+
+def conceal(error: BaseException, secrets: tuple[str, ...]) -> None:
+    """Take the secrets out of the texts of an exception and its causes: tracebacks show them."""
+    for link in chain(error):
+        link.args = tuple(
+            redact(value, secrets) if isinstance(value, str) else value for value in link.args
+        )
+
+
+def chain(error: BaseException | None) -> Iterator[BaseException]:
+    """An exception, and what it came of."""
+    seen: set[int] = set()
+    while error is not None and id(error) not in seen:
+        seen.add(id(error))
+        yield error
+        error = error.__cause__ or error.__context__
+
+
+def _kind_of(error: BaseException) -> Kind | None:
+    names = {cls.__name__ for cls in type(error).__mro__}
+    if "LocalEntryNotFoundError" in names or "IncompleteSnapshotError" in names:
+        return None  # A wrapper: the reason is in its cause.
+    for name, kind in _KIND_OF_CLASS:
+        if name in names:
+            return kind
+    response = getattr(error, "response", None)
+    status = getattr(response, "status_code", None)
+    if status == 401 and _header(response, "X-Error-Message") != _BAD_TOKEN:
+        return Kind.NO_REPOSITORY  # What the Hub answers without a token for all it does not show.
+    if isinstance(status, int):
+        return _KIND_OF_STATUS.get(status, Kind.SERVER_ERROR if status >= 500 else Kind.OTHER)
+    if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return Kind.DISK_FULL
+    if "Consistency check failed" in str(error) or "IncompleteRead" in str(error):
+        return Kind.BROKEN_DOWNLOAD
+    if names & _TIMEOUT_CLASSES:
+        return Kind.TIMEOUT
+    return Kind.UNREACHABLE if names & _TRANSPORT_CLASSES else None
+
+
+# Gated is a subclass of not found: first come the narrower ones.
+_KIND_OF_CLASS = (
+    ("GatedRepoError", Kind.GATED),
+    ("DisabledRepoError", Kind.DISABLED),
+    ("RepositoryNotFoundError", Kind.NO_REPOSITORY),
+    ("RevisionNotFoundError", Kind.NO_REVISION),
+    ("EntryNotFoundError", Kind.NO_ENTRY),
+    ("OfflineModeIsEnabled", Kind.OFFLINE),
+    ("LocalTokenNotFoundError", Kind.NO_TOKEN),
+)
+_KIND_OF_STATUS = {
+    401: Kind.UNAUTHORIZED,
+    403: Kind.FORBIDDEN,
+    404: Kind.NO_REPOSITORY,
+    408: Kind.TIMEOUT,
+    429: Kind.RATE_LIMITED,
+}
+
+
+def _said(response: object) -> str:
+    message = _header(response, "X-Error-Message")
+    words = "".join(c if c.isprintable() else " " for c in message)[:_LONGEST_QUOTE]
+    return f'; it said: "{words}"' if words else ""
+
+
+def _wait(response: object) -> str:
+    seconds = _header(response, "Retry-After")
+    return f"{int(seconds)} s" if seconds.isdecimal() else "a few minutes"
+
+
+def _header(response: object, name: str) -> str:
+    headers = getattr(response, "headers", None)
+    return str(headers.get(name) or "") if headers is not None else ""

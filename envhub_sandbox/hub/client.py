@@ -22,11 +22,25 @@ from typing import Any
 from urllib.parse import parse_qsl, quote, urlsplit
 
 from envhub_sandbox.errors import HubReferenceError, SnapshotError, SnapshotIntegrityError
-from envhub_sandbox.hub.answers import HostileAnswerError, bounded_body, guarded, streamed
-from envhub_sandbox.hub.failures import chain, conceal, explain
+from envhub_sandbox.hub.answers import (
+    HostileAnswerError,
+    bounded_body,
+    chain,
+    conceal,
+    explain,
+    guarded,
+    streamed,
+)
 from envhub_sandbox.hub.grammar import is_commit
-from envhub_sandbox.hub.hashing import GIT_SHA1, SHA256, HashMismatch, copy_verified
-from envhub_sandbox.hub.listing import Copier, FileRecord, Repository
+from envhub_sandbox.hub.listing import (
+    GIT_SHA1,
+    SHA256,
+    Copier,
+    FileRecord,
+    HashMismatch,
+    Repository,
+    copy_verified,
+)
 from envhub_sandbox.hub.logins import authorization, login_of, without_login
 from envhub_worker.protocol.records import dataclass
 

@@ -1,21 +1,24 @@
-"""What a snapshot is made of, and what a listing may ask of this machine's disk.
+"""What a snapshot is made of: its files and their digests, and what a listing may ask of a disk.
 
 A listing is somebody else's text: its names become paths here and its sizes become bytes here,
-so both are judged before anything is downloaded.
+so both are judged before anything is downloaded. What comes then is hashed while it is written.
 """
 
 from __future__ import annotations
 
+import hashlib
+import os
+import stat
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, field, fields
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, TypeVar
+from typing import IO, Any, NamedTuple, Protocol, TypeVar
 
 from envhub_sandbox.errors import PolicyError, SnapshotError, SnapshotTooLargeError
 from envhub_sandbox.hub.grammar import REPO_TYPES, Parts, has_control_characters, join
-from envhub_sandbox.system.file_names import wrong_here
+from envhub_sandbox.system.platform import wrong_here
 from envhub_worker.protocol.runtime import is_cached_revision
 from envhub_worker.protocol.text import size_text
 
@@ -106,6 +109,18 @@ class Snapshot:
     def pinned(self) -> str:
         """The repository at its commit, without an entry file: ``"datasets/org/data@COMMIT"``."""
         return f"{self.name}@{self.commit}"
+
+    @property
+    def reference(self) -> str:
+        """A reference that means this snapshot, wherever it is read.
+
+        What a package is then depends on the version in it, and on a lock.
+        """
+        if self.repo_type == "local":
+            return f"{self.repo_id}:{self.path}"
+        if self.repo_type == "pypi":
+            return self.name
+        return join(Parts(self.repo_id, self.commit, self.path, self.repo_type))
 
     @property
     def hub_copies(self) -> tuple[tuple[str, str, tuple[str, ...], str], ...]:
@@ -242,3 +257,92 @@ def _wrong_with_name(path: str) -> str | None:
     if any(len(step.encode()) > MAX_NAME_BYTES for step in steps):
         return f"has a step over {MAX_NAME_BYTES} bytes in its name"
     return wrong_here(path)
+
+
+_CHUNK_BYTES = 1 << 20
+GIT_SHA1 = "git-sha1"
+SHA256 = "sha256"
+
+
+class HashMismatch(Exception):
+    """Bytes are not the ones that were recorded; ``found`` says in words what they are."""
+
+    def __init__(self, found: str) -> None:
+        super().__init__(found)
+        self.found = found
+
+
+def _start(kind: str, size: int) -> Any:
+    if kind == SHA256:
+        return hashlib.sha256()
+    # A git blob id covers the length too; git chose SHA-1, we only follow.
+    sha1 = hashlib.sha1(usedforsecurity=False)
+    sha1.update(b"blob %d\x00" % size)
+    return sha1
+
+
+def digest_of(source: Path, kind: str, size: int) -> str:
+    """The digest of a file that should have ``size`` bytes, for example ``"sha256:..."``."""
+    running = _start(kind, size)
+    with _open_regular(source) as stream:
+        for chunk in _chunks(stream):
+            running.update(chunk)
+    return f"{kind}:{running.hexdigest()}"
+
+
+def copy_verified(source: Path, target: Path, record: FileRecord) -> None:
+    """Copy a file into a new one; as ``write_verified``."""
+    with _open_regular(source) as stream:
+        write_verified(stream, target, record)
+
+
+def write_verified(stream: IO[bytes], target: Path, record: FileRecord) -> None:
+    """Write a new file; what was written is exactly what the record says.
+
+    The hash is taken of the bytes on their way, so they cannot change in between.
+
+    Raises:
+        HashMismatch: Other bytes or another size. The new file may be there in part.
+    """
+    running = _start(record.digest.partition(":")[0], record.size)
+    written = 0
+    with target.open("xb") as out:
+        for chunk in _chunks(stream):
+            written += len(chunk)
+            if written > record.size:
+                raise HashMismatch(f"more than {record.size} bytes")
+            running.update(chunk)
+            out.write(chunk)
+    found = f"{record.digest.partition(':')[0]}:{running.hexdigest()}"
+    if written != record.size or found != record.digest:
+        raise HashMismatch(f"{written} bytes with {found}")
+
+
+def differing(root: Path, mine: Iterable[FileRecord], theirs: Iterable[FileRecord]) -> list[str]:
+    """The files below ``root`` that another listing has with other bytes, or not at all."""
+    listed = {record.path: record for record in theirs}
+    return [
+        file.path
+        for file in mine
+        if (there := listed.get(file.path)) is None
+        or there.size != file.size
+        or digest_of(root / file.path, there.digest.partition(":")[0], file.size) != there.digest
+    ]
+
+
+@contextmanager
+def _open_regular(path: Path) -> Iterator[IO[bytes]]:
+    try:
+        # A pipe or device under the name would block or never end.
+        if not stat.S_ISREG(os.stat(path).st_mode):
+            raise HashMismatch("not a regular file")
+        stream = path.open("rb")
+    except OSError as error:
+        raise HashMismatch(f"unreadable ({error})") from error
+    with stream:
+        yield stream
+
+
+def _chunks(stream: IO[bytes]) -> Iterator[bytes]:
+    while chunk := stream.read(_CHUNK_BYTES):
+        yield chunk

@@ -24,12 +24,15 @@ from envhub_sandbox.errors import (
     SnapshotTooLargeError,
 )
 from envhub_sandbox.hub.git.checkout import Checkout, read_checkout
-from envhub_sandbox.hub.hashing import SHA256, HashMismatch, copy_verified, digest_of
 from envhub_sandbox.hub.listing import (
     MAX_DEPTH,
+    SHA256,
     FileRecord,
+    HashMismatch,
     SnapshotLimits,
     check_listing_names,
+    copy_verified,
+    digest_of,
     listing_within_limits,
 )
 from envhub_worker.protocol.records import dataclass

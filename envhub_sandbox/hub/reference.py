@@ -1,7 +1,7 @@
 """Hub references: ``[models/|spaces/|datasets/]owner/name[@revision][:path]``, and Hub URLs.
 
 And of other places: a commit of git (``hub.git.address``), and an environment that a package of the
-index registers (``hub.registered.reference``). A reference is text that somebody pasted, so every
+index registers (``hub.registered``). A reference is text that somebody pasted, so every
 form that can mean only one thing works, and for every other form the error says what to write
 instead. Extends the grammar of ``lerobot.envs.utils._parse_hub_url``. Nothing is asked of the
 network.
@@ -13,10 +13,9 @@ import re
 from dataclasses import dataclass
 
 from envhub_sandbox.errors import HubReferenceError
-from envhub_sandbox.hub import grammar
+from envhub_sandbox.hub import grammar, registered
 from envhub_sandbox.hub.git import address
 from envhub_sandbox.hub.grammar import DEFAULT_PATH, REPO_TYPES, Parts, Wrong, is_commit, is_local
-from envhub_sandbox.hub.registered import reference as registered
 
 __all__ = ["DEFAULT_PATH", "REPO_TYPES", "HubRef", "is_local", "pinned"]
 
@@ -95,10 +94,7 @@ class HubRef:
 
 
 def pinned(repo_type: str, repo_id: str, commit: str, path: str) -> str:
-    """A reference that means a snapshot, wherever it is read, by what provenance says of it.
-
-    What a package is then depends on the version in it, and on a lock.
-    """
+    """``Snapshot.reference``, by what a provenance says of it, which may be a stranger's."""
     if repo_type == "local":
         return f"{repo_id}:{path}"
     if repo_type == registered.KIND:

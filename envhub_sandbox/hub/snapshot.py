@@ -21,13 +21,14 @@ from envhub_sandbox.errors import (
     SnapshotError,
     SnapshotIntegrityError,
 )
+from envhub_sandbox.hub import registered
 from envhub_sandbox.hub import store as store
+from envhub_sandbox.hub.answers import ABSENT, UNREACHABLE, HubFailure, Kind
 from envhub_sandbox.hub.client import HubClient, checked_endpoint, checked_token
-from envhub_sandbox.hub.failures import ABSENT, UNREACHABLE, HubFailure, Kind
 from envhub_sandbox.hub.git import address
-from envhub_sandbox.hub.hashing import SHA256
 from envhub_sandbox.hub.listing import (
     DEFAULT_LIMITS,
+    SHA256,
     FileRecord,
     Repository,
     RepositoryHost,
@@ -38,8 +39,6 @@ from envhub_sandbox.hub.listing import (
 )
 from envhub_sandbox.hub.local import LocalFolder, content_digest, copier, split_local
 from envhub_sandbox.hub.reference import DEFAULT_PATH, HubRef, is_local
-from envhub_sandbox.hub.registered import entry as registered_entry
-from envhub_sandbox.hub.registered import reference as registered
 from envhub_sandbox.system.log import SNAPSHOT
 from envhub_worker.protocol.records import dataclass
 
@@ -161,7 +160,7 @@ def _candidates(
 ) -> Sequence[_Candidate]:
     """As what it may be read; the last four are of the Hub alone."""
     if ref.repo_type == address.KIND:
-        from envhub_sandbox.hub.git.host import GitHost
+        from envhub_sandbox.hub.git.commits import GitHost
 
         scheme, _, rest = ref.repo_id.partition("://")
         place, _, name = rest.partition("/")
@@ -245,7 +244,7 @@ def local(
 
 def _registered(ref: HubRef) -> Snapshot:
     """The repository of one file that stands for an environment of a package."""
-    text = registered_entry.entry(ref.parts)
+    text = registered.entry(ref.parts)
     digest = f"{SHA256}:{hashlib.sha256(text).hexdigest()}"
     files = (FileRecord(DEFAULT_PATH, len(text), digest),)
     name = str(ref).partition(":")[2]

@@ -27,11 +27,9 @@ from typing import NamedTuple
 from urllib.parse import urlsplit
 
 from envhub_sandbox.errors import SnapshotError, SnapshotIntegrityError
-from envhub_sandbox.hub.cache import BUILDING, cache_root, draft, remove_tree
-from envhub_sandbox.hub.hashing import HashMismatch, digest_of
-from envhub_sandbox.hub.listing import FileRecord
-from envhub_sandbox.system import file_names, folders, locks
-from envhub_sandbox.system.files import write_whole_file
+from envhub_sandbox.hub.listing import FileRecord, HashMismatch, digest_of
+from envhub_sandbox.system import folders, locks, platform
+from envhub_sandbox.system.folders import BUILDING, cache_root, draft, remove_tree, write_whole_file
 from envhub_sandbox.system.log import SNAPSHOT
 from envhub_sandbox.system.platform import IS_WINDOWS, open_flags
 from envhub_worker.protocol.records import dataclass
@@ -250,12 +248,12 @@ def refuse_clashes(slot: Slot, files: Iterable[FileRecord]) -> None:
     """Refuse files that the store's file system would keep as one, which differ in case alone.
     Raises ``SnapshotError``: with their names and what to do.
     """
-    clash = file_names.taken_as_one(file.path for file in files)
+    clash = platform.taken_as_one(file.path for file in files)
     if clash is None:
         return
     try:
         folders.make(slot.folder)
-        is_one = file_names.ignores_case(slot.folder)
+        is_one = platform.ignores_case(slot.folder)
     except OSError as error:
         raise _unwritable(slot, error) from error
     if is_one:

@@ -46,6 +46,7 @@ class WorkerServer(ABC):
             ``layer``, ``enforced``, ``detail``.
         silent_s: When it last did not answer to the end of a jail, by the monotonic clock.
         far: Its key and ours, where it is on another host and sees no file of this one.
+        uploading: Held while something is brought to such a one.
         is_ours: Whether we have started it, and end it.
     """
 
@@ -55,6 +56,7 @@ class WorkerServer(ABC):
     layers: Sequence[Mapping[str, Any]] = ()
     silent_s: float = float("-inf")
     far: TcpServer | None = None
+    uploading: threading.Lock
     is_ours = True
 
     @property

@@ -14,11 +14,12 @@ import threading
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
-from envhub_sandbox.errors import DependencyError, EnvHubError, PolicyError
-from envhub_sandbox.sandboxes import remote_keys, remote_packages, upload
+from envhub_sandbox.errors import EnvHubError, PolicyError
+from envhub_sandbox.sandboxes import remote_keys
 from envhub_sandbox.sandboxes.pool import ServerPool, ServerUse, WorkerServer
+from envhub_sandbox.sandboxes.remote_repository import ServerPackages, UploadedRepository
 from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.settings.policy import Policy
@@ -106,11 +107,9 @@ class RemoteSandbox(Sandbox):
         given = snapshot, order, runtime.packages, self.endpoint, self.far()
         return RemoteRepository(*given, self.retry_s)
 
-    def package_target(self) -> remote_packages.ServerPackages:
+    def package_target(self) -> ServerPackages:
         """The server makes packages itself."""
-        return remote_packages.ServerPackages(
-            lambda: _use_of(self.endpoint, self.far()), self._orders
-        )
+        return ServerPackages(lambda: _use_of(self.endpoint, self.far()), self._orders)
 
     def far(self) -> TcpServer:
         """The server's key and ours.
@@ -151,51 +150,6 @@ def check_policy(policy: Policy, runtime: Runtime) -> None:
 
 
 @dataclass(eq=False)
-class UploadedRepository(Sandbox):
-    """The sandbox of one repository, whose files are brought to its server.
-
-    Attributes:
-        order: What the packages were made of that the server has made for it; None without any.
-        packages: What the server called them.
-    """
-
-    snapshot: Path
-    order: m.NeedPackages | None
-    packages: str
-    _files: dict[Path, tuple[upload.Sent, ...]] = field(default_factory=dict, init=False)
-
-    def prepare(
-        self, order: m.OpenJail, server: WorkerServer, client: WorkerConnection, deadline: Deadline
-    ) -> m.OpenJail:
-        """Bring the files there, and see that the packages are. One of our threads at a time."""
-        with cast("RemoteServer", server).uploading:
-            if self.order is not None:
-                self._check_packages(self.order, client, deadline)
-            here = {copy.tree for copy in order.repositories if copy.tree}
-            trees = {tree: self._bring(Path(tree), client, deadline) for tree in sorted(here)}
-            snapshot = self._bring(self.snapshot, client, deadline)
-        order = m.replace(order, hub_copies=order.with_trees(trees))
-        return m.replace(order, snapshot=snapshot, python="", packages=self.packages)
-
-    def _bring(self, root: Path, client: WorkerConnection, deadline: Deadline) -> str:
-        """What the server calls a folder of files, once it has them."""
-        if root not in self._files:
-            self._files[root] = upload.listing(root)
-        return upload.upload(client, root, self._files[root], deadline)[0]
-
-    def _check_packages(
-        self, order: m.NeedPackages, client: WorkerConnection, deadline: Deadline
-    ) -> None:
-        """The server may have been replaced, or have needed the room; it may make them again."""
-        made = remote_packages.request_packages(order, client, deadline)
-        if made is None or made.packages != self.packages:
-            raise DependencyError(
-                "the server no longer has these packages, and would choose other versions now: "
-                "make the environment again"
-            )
-
-
-@dataclass(eq=False)
 class RemoteRepository(UploadedRepository):
     """The sandbox of one repository: its files on the other host."""
 
@@ -226,7 +180,6 @@ class RemoteServer(WorkerServer):
 
     Attributes:
         process_fd: Readable once we have given it up.
-        uploading: Held while something is brought there.
     """
 
     far: TcpServer

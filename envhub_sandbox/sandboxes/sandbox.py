@@ -6,8 +6,16 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from envhub_sandbox.errors import SandboxUnavailableError
+from envhub_sandbox.errors import (
+    EnvHubError,
+    SandboxUnavailableError,
+    ServerBusyError,
+    WorkerDiedError,
+    WorkerStartupError,
+    WorkerTimeoutError,
+)
 from envhub_sandbox.sandboxes.pool import ServerUse, WorkerServer
+from envhub_sandbox.transport.tcp import UnreachableError
 from envhub_worker.protocol.runtime import OWN, Runtime
 
 if TYPE_CHECKING:
@@ -16,6 +24,14 @@ if TYPE_CHECKING:
     from envhub_sandbox.transport.connection import WorkerConnection
     from envhub_sandbox.transport.deadline import Deadline
     from envhub_worker.protocol.messages import OpenJail
+
+FILE, DNS = "file:", "dns://"
+"""What a fleet's place begins with that names a list of places."""
+
+
+def is_list(text: str) -> bool:
+    """Whether a text names several places, or where they are listed."""
+    return "," in text or text.startswith((FILE, DNS))
 
 
 class Sandbox:
@@ -104,3 +120,30 @@ class Sandbox:
             WorkerError: The server does not take it.
         """
         return order
+
+
+def may_go_elsewhere(error: EnvHubError) -> bool:
+    """Whether another place is worth a try: this one has no room, or is not there.
+
+    What the repository does would be the same elsewhere, and a key that is refused is a mistake
+    that has to be known.
+    """
+    if isinstance(error, WorkerDiedError):
+        return error.reason in ("connection", "server")
+    if isinstance(error, WorkerTimeoutError):
+        return error.request is None
+    return isinstance(error, (ServerBusyError, UnreachableError, WorkerStartupError))
+
+
+def worst_of(failures: Sequence[EnvHubError]) -> EnvHubError:
+    """The error for a worker that no place takes: one that may pass first; the text has all.
+
+    ``failures``: at least one, in the order of the tries.
+    """
+    busy = (one for one in failures if isinstance(one, ServerBusyError))
+    error = next(busy, failures[0])
+    others = [str(one).partition("\n")[0] for one in failures if one is not error]
+    if others and error.args:
+        more = "\n".join(["The other places of the fleet:", *others])
+        error.args = (f"{error.args[0]}\n{more}", *error.args[1:])
+    return error

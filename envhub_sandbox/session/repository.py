@@ -24,8 +24,6 @@ from envhub_sandbox.errors import (
     WorkerTimeoutError,
     name_source,
 )
-from envhub_sandbox.hub import reference
-from envhub_sandbox.hub.cache import cache_root
 from envhub_sandbox.hub.client import default_endpoint
 from envhub_sandbox.hub.logins import without_login
 from envhub_sandbox.hub.snapshot import Snapshot
@@ -34,6 +32,7 @@ from envhub_sandbox.session.error_text import add_author_line, add_reach_advice
 from envhub_sandbox.session.jails.loaded import LoadedJail
 from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.settings.policy import Policy, Timeouts
+from envhub_sandbox.system.folders import cache_root
 from envhub_sandbox.system.locks import SharedLock
 from envhub_sandbox.system.log import CRASHES
 from envhub_sandbox.transport import trace
@@ -90,12 +89,6 @@ class Recipe:
     def make_one(self, suite: str, task: int | str) -> Any:
         """One fresh environment of them."""
         return self.make()[suite][task]
-
-
-def pinned(snapshot: Snapshot) -> str:
-    """A reference that means this snapshot, wherever it is read."""
-    kind, name = snapshot.repo_type, snapshot.repo_id
-    return reference.pinned(kind, name, snapshot.commit, snapshot.path)
 
 
 def provenance_of(

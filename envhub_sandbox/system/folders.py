@@ -1,10 +1,10 @@
-"""Our folders on disk: made with the modes that are meant, and believed where only we can write.
+"""Our folders and files on disk, and the user's cache folder that most of them lie in.
 
-The umask says nothing about them: under 0 it would let others in, under 077 it would keep a worker
-of another user out. It belongs to the whole process, so it is never changed here.
-
-On Windows a mode says only whether a file can be written; whose it is, and who else may write it,
-its access list says, which it inherits: what lies in a user's own folders is that user's.
+Folders are made with the modes that are meant, and believed where only we can write. The umask says
+nothing about them: under 0 it would let others in, under 077 it would keep a worker of another user
+out. It belongs to the whole process, so it is never changed here. On Windows a mode says only
+whether a file can be written; whose it is, and who else may write it, its access list says, which
+it inherits: what lies in a user's own folders is that user's.
 """
 
 from __future__ import annotations
@@ -12,17 +12,21 @@ from __future__ import annotations
 import contextlib
 import errno
 import os
+import secrets
 import shlex
 import stat
 import sys
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from envhub_sandbox.system.platform import IS_WINDOWS, user_id
+from envhub_sandbox.errors import SnapshotError
+from envhub_sandbox.system.platform import IS_WINDOWS, open_flags, user_id
 
 if sys.platform != "win32":
     import grp
     import pwd
+
 
 SHARED_MODE = 0o755
 PRIVATE_MODE = 0o700
@@ -200,3 +204,106 @@ def _group(gid: int) -> str:
         with contextlib.suppress(KeyError):
             return f"{grp.getgrgid(gid).gr_name} (gid {gid})"
     return str(gid)
+
+
+_NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | open_flags("O_CLOEXEC")
+
+
+def write_whole_file(path: Path, data: bytes, *, mode: int = 0o600, durable: bool = False) -> None:
+    """Write a file under another name, and rename it: meanwhile others read the old one.
+
+    Args:
+        mode: Its mode; the umask takes from it.
+        durable: Whether it is also whole after a loss of power.
+
+    Raises:
+        OSError: It cannot be written. Nothing is left of it.
+    """
+    part = path.with_name(f".{path.name}-{secrets.token_hex(4)}")
+    descriptor = os.open(part, _NEW, mode)
+    try:
+        with open(descriptor, "wb") as file:
+            file.write(data)
+            file.flush()
+            if durable:
+                os.fsync(descriptor)
+        os.replace(part, path)
+    except BaseException:
+        with contextlib.suppress(OSError):
+            os.unlink(part)
+        raise
+
+
+CACHE_VARIABLE = "ENVHUB_CACHE"
+BUILDING = ".building-"
+_MAX_TEXT_BYTES = 16 * 1024 * 1024
+
+
+def cache_root() -> Path:
+    """``$ENVHUB_CACHE``, or the user's cache folder for ``envhub-sandbox``.
+
+    Raises:
+        SnapshotError: The user has none.
+    """
+    chosen = os.environ.get(CACHE_VARIABLE)
+    if chosen:
+        return Path(os.path.abspath(os.path.expanduser(chosen)))
+    import platformdirs
+
+    try:
+        return Path(platformdirs.user_cache_dir("envhub-sandbox", appauthor=False))
+    except RuntimeError:
+        raise SnapshotError(
+            f"this user has no home folder for the cache; set {CACHE_VARIABLE} to a folder"
+        ) from None
+
+
+@contextlib.contextmanager
+def draft(folder: Path, prefix: str = BUILDING) -> Iterator[Path]:
+    """A new folder (0700) to be filled and then renamed into place; otherwise it is removed."""
+    made = Path(tempfile.mkdtemp(prefix=prefix, dir=folder))
+    try:
+        made.chmod(PRIVATE_MODE)
+        yield made
+    finally:
+        remove_tree(made)
+
+
+def remove_tree(path: Path) -> None:
+    """Remove a folder of the cache, whose own folders are read-only; nothing if it is gone.
+
+    Without recursion, as ``shutil.rmtree`` has it: of a package, a stranger chose how deep it is.
+    """
+    found = [] if path.is_symlink() else [str(path)]
+    for folder in found:  # which grows
+        with contextlib.suppress(OSError):
+            os.chmod(folder, 0o700)
+            with os.scandir(folder) as items:
+                found += [item.path for item in items if item.is_dir(follow_symlinks=False)]
+    for folder in reversed(found):
+        with contextlib.suppress(OSError):
+            for name in os.listdir(folder):
+                with contextlib.suppress(OSError):
+                    file = os.path.join(folder, name)
+                    if IS_WINDOWS:  # which removes no file that cannot be written
+                        os.chmod(file, PRIVATE_MODE)
+                    os.unlink(file)
+            os.rmdir(folder)
+
+
+def recall(folder: Path, key: str) -> str | None:
+    """A text that ``keep`` wrote; None if it is not there, or others could have written it."""
+    path = folder / key
+    try:
+        if not is_ours_alone(folder) or path.stat().st_size > _MAX_TEXT_BYTES:
+            return None
+        return path.read_text("utf-8")
+    except (OSError, ValueError):
+        return None
+
+
+def keep(folder: Path, key: str, text: str) -> None:
+    """Remember a text. A cache that cannot be written is no error."""
+    with contextlib.suppress(OSError):
+        make_private(folder)
+        write_whole_file(folder / key, text.encode())

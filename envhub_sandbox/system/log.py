@@ -1,14 +1,26 @@
-"""Our part of the ``logging`` tree. Silent until the application that uses us sets it up.
+"""What is said of work while it goes on: our part of the ``logging`` tree, and progress lines.
 
-``envhub_sandbox.worker`` logs jails: opened, closed (DEBUG), died, timed out, restarted (INFO).
+The loggers are silent until the application that uses us sets them up. ``envhub_sandbox.worker``
+logs jails: opened, closed (DEBUG), died, timed out, restarted (INFO).
 ``envhub_sandbox.worker.output`` has every line that they print (DEBUG). ``envhub_sandbox.snapshot``
 logs downloads, ``envhub_sandbox.dependencies`` packages, ``envhub_sandbox.crashes``
 crash bundles. ``envhub_sandbox.errors`` has our own frames of what is raised (DEBUG).
+
+Progress is shown on a terminal or in a notebook, for what takes a moment, such as packages.
+Elsewhere (in CI, under a program) there is the log.
 """
 
 from __future__ import annotations
 
+import contextlib
 import logging
+import os
+import sys
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 ROOT = logging.getLogger("envhub_sandbox")
 ROOT.addHandler(logging.NullHandler())
@@ -18,3 +30,51 @@ SNAPSHOT = ROOT.getChild("snapshot")
 DEPENDENCIES = ROOT.getChild("dependencies")
 CRASHES = ROOT.getChild("crashes")
 ERRORS = ROOT.getChild("errors")
+
+
+_WIDTH = 100
+_shown_by: list[Callable[[str], None]] = []
+
+
+@contextlib.contextmanager
+def progress_shown_by(show: Callable[[str], None]) -> Iterator[None]:
+    """While it lasts, progress goes to ``show``, which has the terminal already."""
+    _shown_by.append(show)
+    try:
+        yield
+    finally:
+        _shown_by.remove(show)
+
+
+@contextlib.contextmanager
+def progress_shown(
+    title: str, log: logging.Logger = DEPENDENCIES
+) -> Iterator[Callable[[str], None]]:
+    """Gives what takes a line for each thing that happens."""
+    with contextlib.ExitStack() as stack:
+        shows = list(_shown_by[-1:])
+        console = None if shows else _console()
+        if console is not None:
+            from rich.text import Text
+
+            status = stack.enter_context(console.status(""))
+            shows = [lambda text: status.update(Text(text))]
+
+        def tell(line: str) -> None:
+            log.info("%s: %s", title, line)
+            for show in shows:
+                show(f"{title}: {line}"[:_WIDTH])
+
+        yield tell
+
+
+def _console() -> Console | None:
+    """A console that somebody looks at."""
+    shell = getattr(sys.modules.get("IPython"), "get_ipython", lambda: None)()
+    is_notebook = type(shell).__name__ == "ZMQInteractiveShell"
+    looked_at = sys.stderr is not None and sys.stderr.isatty()
+    if os.environ.get("CI") or not (looked_at or is_notebook):
+        return None
+    from rich.console import Console
+
+    return Console(stderr=True, markup=False, highlight=False, emoji=False)

@@ -15,7 +15,7 @@ import os
 from collections.abc import Sequence
 from pathlib import Path
 
-from envhub_sandbox.system.files import write_whole_file
+from envhub_sandbox.system.folders import write_whole_file
 from envhub_worker.protocol.manifest.manifest import EnvManifest
 from envhub_worker.protocol.spaces.batches import even_bounds
 

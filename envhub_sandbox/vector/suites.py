@@ -13,8 +13,7 @@ from gymnasium.vector import VectorEnv
 
 from envhub_sandbox.session.repository import Recipe
 from envhub_sandbox.settings.options import option_name
-from envhub_sandbox.system.log import WORKER
-from envhub_sandbox.system.progress import progress_shown
+from envhub_sandbox.system.log import WORKER, progress_shown
 from envhub_sandbox.system.threads import Calls
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv, leave_suite
 from envhub_worker.protocol.text import parse_size, size_text

@@ -14,8 +14,8 @@ from pathlib import Path
 
 import pytest
 
-from envhub_sandbox.hub.cache import cache_root
 from envhub_sandbox.sandboxes.process import PROCESS
+from envhub_sandbox.system.folders import cache_root
 from tests.attacks import table
 from tests.attacks.harness import Arena
 from tests.support.interpreter import profiles

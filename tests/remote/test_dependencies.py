@@ -16,7 +16,7 @@ import psutil
 import pytest
 
 from envhub_sandbox import make_env
-from envhub_sandbox.dependencies.builds import git
+from envhub_sandbox.dependencies.builds import download
 from envhub_sandbox.errors import (
     IndexUnavailableError,
     MissingModuleError,
@@ -140,7 +140,7 @@ def test_nothing_is_built_there(
         asked = threading.Thread(target=lambda: host.accept()[0].close())
         asked.start()
         with pytest.raises(IndexUnavailableError):
-            git.check_out(url, "0" * 40, tmp_path, print)
+            download.check_out(url, "0" * 40, tmp_path, print)
         asked.join()
 
 

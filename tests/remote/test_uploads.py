@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from envhub_sandbox.sandboxes import upload
+from envhub_sandbox.sandboxes import remote_repository
 from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_worker.access.quotas import Quotas
@@ -291,7 +291,7 @@ def test_a_restart_keeps_snapshots_and_drops_halves(uploads: Uploads) -> None:
 
 def test_only_the_edited_file_travels_to_a_real_server(server: Listening, tmp_path: Path) -> None:
     """A large file goes once; after an edit of another one it stays where it is."""
-    data = os.urandom(3 * upload.PIECE_BYTES + 17)
+    data = os.urandom(3 * remote_repository.PIECE_BYTES + 17)
     repository = counting(tmp_path / "large", files={"weights.bin": data, "empty": b""})
     with started(repository, sandbox=server.sandbox()) as env:
         env.step(np.array([0]))
@@ -299,7 +299,9 @@ def test_only_the_edited_file_travels_to_a_real_server(server: Listening, tmp_pa
         client = WorkerConnection(remote.endpoint, remote.process_fd, far=remote.far)
         client.hello(Deadline(30))
         (repository / "empty").write_bytes(b"no more")
-        files = upload.listing(repository)
-        assert upload.upload(client, repository, files, Deadline(30))[1] == len(b"no more")
-        assert upload.upload(client, repository, files, Deadline(30))[1] == 0
+        files = remote_repository.listing(repository)
+        assert remote_repository.upload(client, repository, files, Deadline(30))[1] == len(
+            b"no more"
+        )
+        assert remote_repository.upload(client, repository, files, Deadline(30))[1] == 0
         client.close()

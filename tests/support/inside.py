@@ -23,7 +23,7 @@ from envhub_sandbox.dependencies import environments, interpreters, modules, res
 from envhub_sandbox.factory import make_env
 from envhub_sandbox.sandboxes import remote
 from envhub_sandbox.sandboxes.docker import container
-from envhub_sandbox.sandboxes.fleet import place_list
+from envhub_sandbox.sandboxes.fleet import fleet
 from envhub_sandbox.session import env_session
 from envhub_sandbox.session.counters import Ledger
 from envhub_sandbox.session.crash import bundle_writer
@@ -84,7 +84,7 @@ def state(env: Any) -> State:
 
 def freshness_of_dns() -> Spot:
     """For how long an answer about a fleet's places holds."""
-    return place_list, "_FRESH_S"
+    return fleet, "_FRESH_S"
 
 
 def choice_of_runtime() -> Spot:

@@ -24,7 +24,7 @@ from envhub_sandbox.check import reports
 from envhub_sandbox.check.findings import Finding, Report
 from envhub_sandbox.check.many.entries import ListEntry
 from envhub_sandbox.hub.sources.parsing import content
-from envhub_sandbox.system.files import write_whole_file
+from envhub_sandbox.system.folders import write_whole_file
 from envhub_sandbox.system.locks import held
 from envhub_worker.protocol.text import printable
 

@@ -16,6 +16,7 @@ from envhub_sandbox.cli.shared.console import (
     BAD,
     DOUBTFUL,
     GOOD,
+    ProgressBar,
     out,
     print_json,
     safe_line,
@@ -25,7 +26,6 @@ from envhub_sandbox.cli.shared.console import (
 )
 from envhub_sandbox.cli.shared.exits import Exit, UsageError, reported
 from envhub_sandbox.cli.shared.findings import STYLES, annotate, level, show_finding, write_report
-from envhub_sandbox.cli.shared.progress import ProgressBar
 
 if TYPE_CHECKING:
     from envhub_sandbox.check.findings import Finding, Report

@@ -38,8 +38,7 @@ from envhub_sandbox.cli.shared.console import (
 )
 from envhub_sandbox.cli.shared.exits import Exit, UsageError
 from envhub_sandbox.cli.shared.findings import annotate, write_report
-from envhub_sandbox.cli.shared.memory import free_memory_bytes
-from envhub_sandbox.cli.shared.versions import versions
+from envhub_sandbox.cli.shared.host import free_memory_bytes, versions
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.hub.snapshot import commit_of
 from envhub_sandbox.sandboxes.ray import cluster

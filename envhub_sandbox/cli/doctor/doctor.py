@@ -24,11 +24,11 @@ from typing import Annotated, Any
 
 import typer
 
-from envhub_sandbox.cli.init.starter import starter
 from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import (
     BAD,
     GOOD,
+    ProgressBar,
     out,
     print_json,
     safe_line,
@@ -37,9 +37,8 @@ from envhub_sandbox.cli.shared.console import (
     show_rows,
 )
 from envhub_sandbox.cli.shared.exits import Exit, UsageError, describe
-from envhub_sandbox.cli.shared.memory import free_memory_bytes
-from envhub_sandbox.cli.shared.progress import ProgressBar
-from envhub_sandbox.cli.shared.versions import versions
+from envhub_sandbox.cli.shared.host import free_memory_bytes, versions
+from envhub_sandbox.cli.starter import starter
 from envhub_sandbox.errors import EnvHubError, SandboxUnavailableError, SnapshotError
 from envhub_sandbox.system.platform import IS_LINUX, NAME, user_id
 from envhub_worker.protocol.confinement import PROFILES
@@ -153,7 +152,7 @@ def _scratch_folder() -> Iterator[Path]:
     """A folder for a repository and a cache: what is wrong with the caller's hides no layer.
     Raises ``SandboxUnavailableError``: there is no place for one.
     """
-    from envhub_sandbox.hub.cache import CACHE_VARIABLE
+    from envhub_sandbox.system.folders import CACHE_VARIABLE
 
     try:
         made = tempfile.TemporaryDirectory(prefix="envhub-doctor-")
@@ -178,7 +177,7 @@ def _cache_problem(*, by_others: bool) -> str | None:
     """Why the caller's cache is of no use, and what to do; None if it is.
     ``by_others``: whether root's jails read it as another user: all but those with a private root.
     """
-    from envhub_sandbox.hub.cache import cache_root
+    from envhub_sandbox.system.folders import cache_root
 
     try:
         root = cache_root()
@@ -221,7 +220,7 @@ def engine() -> dict[str, Any]:
 
 def resources(problem: str | None) -> dict[str, Any]:
     """Bytes that are free: of memory, None where the kernel does not say, and for the cache."""
-    from envhub_sandbox.hub.cache import cache_root
+    from envhub_sandbox.system.folders import cache_root
 
     disk: dict[str, Any] = {"folder": None, "free_bytes": None, "problem": problem}
     with contextlib.suppress(SnapshotError):  # it is the problem

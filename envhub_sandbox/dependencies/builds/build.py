@@ -1,35 +1,105 @@
-"""From sources to wheels: fetched, unpacked, built in a jail, checked, kept."""
+"""From sources to wheels: fetched, unpacked, built in a jail, checked, kept.
+
+The jail is started by a program of ours (``factory/builder.py``), since packages know nothing of
+sandboxes.
+"""
 
 from __future__ import annotations
 
 import itertools
+import json
+import os
+import subprocess
+import sys
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from urllib.parse import unquote, urlsplit
 
+from envhub_sandbox import errors
 from envhub_sandbox.dependencies import environments, interpreters
-from envhub_sandbox.dependencies.builds import (
-    download,
-    git,
-    jail,
-    missing,
-    project,
-    trees,
-    wheel_store,
-    wheels,
-)
-from envhub_sandbox.dependencies.builds.sources import Source
-from envhub_sandbox.dependencies.declared import parse_requirement
+from envhub_sandbox.dependencies.builds import download, project, trees, wheels
+from envhub_sandbox.dependencies.builds.wheels import MAX_BYTES
+from envhub_sandbox.dependencies.declared import Source, parse_requirement
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.dependencies.request import PackageRequest
 from envhub_sandbox.dependencies.resolve import Lock
 from envhub_sandbox.errors import DependencyError, RequirementError, ResolutionError
 from envhub_sandbox.hub.logins import without_login
+from envhub_sandbox.system import processes
 from envhub_worker.protocol.runtime import OWN
+from envhub_worker.protocol.text import printable
+
+PROFILE_VARIABLE = "ENVHUB_BUILD_PROFILE"
+WALL_S = 1800.0
+LIMITS = {"memory_bytes": "8G", "disk_bytes": "6G", "disk_files": 400_000, "cpu_time_s": 7200}
+_PROGRAM = "envhub_sandbox.factory.builder"
+_SHOWN = 6000
+_AROUND_S = 900.0
+_MOST_REQUIRED = 200
+
+
+class BuildFailedError(DependencyError):
+    """The build backend failed, or was ended; the text is what it printed last."""
+
+
+def _in_jail(order: Mapping[str, Any], folder: Path) -> Path | tuple[str, ...]:
+    """A wheel below an empty folder, or what the build backend needs besides.
+
+    Nothing of either has been looked at: they are a stranger's. The order is read by
+    ``factory/builder.py``; limits, profile and what the jail may read are added here. Raises
+    ``BuildFailedError``, or ``DependencyError`` where there is no jail on this host.
+    """
+    said = _run(order, folder)
+    further, name = said.get("requires"), said.get("wheel")
+    if isinstance(further, list) and 0 < len(further) <= _MOST_REQUIRED:
+        return tuple(text for text in further if isinstance(text, str))
+    if not isinstance(name, str):
+        raise BuildFailedError("its build backend produced no wheel")
+    return folder / "wheel" / os.path.basename(name)
+
+
+def _run(order: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    whole = {
+        **order,
+        "readable": [order["source"], order["packages"], str(folder / "tools")],
+        "limits": LIMITS,
+        "wall_s": WALL_S,
+        "max_bytes": MAX_BYTES,
+        "profile": os.environ.get(PROFILE_VARIABLE) or "strict",
+    }
+    (folder / "order.json").write_text(json.dumps(whole))
+    with processes.pidfd() as ourselves:
+        done = subprocess.run(
+            [sys.executable, "-I", "-m", _PROGRAM, str(folder), str(ourselves)],
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            pass_fds=(ourselves,),
+            start_new_session=True,
+            timeout=WALL_S + _AROUND_S,
+        )
+    try:
+        said: dict[str, Any] = json.loads(done.stdout)
+    except ValueError as error:
+        shown = printable(done.stderr.decode("utf-8", "replace")[-_SHOWN:])
+        raise DependencyError(f"the program that builds failed:\n{shown}") from error
+    if "error" in said:
+        kind = getattr(errors, str(said["error"]), DependencyError)
+        text = str(said["said"])
+        if issubclass(kind, errors.SandboxUnavailableError):
+            raise DependencyError(
+                f"sources are built in a jail, and there is none here: {text}. A weaker profile "
+                f"for builds is chosen by {PROFILE_VARIABLE}, as in {PROFILE_VARIABLE}=no-userns"
+            )
+        raise DependencyError(text)
+    if "failed" in said:
+        raise BuildFailedError(printable(str(said["failed"])[-_SHOWN:], _SHOWN))
+    return said
+
 
 Tell = Callable[[str], None]
 Choose = Callable[[PackageRequest, Interpreter, Tell], Lock]
@@ -57,8 +127,8 @@ def build_wheels(
 
 def _wheel(source: Source, interpreter: Interpreter, tell: Tell, choose: Choose) -> Path:
     if source.commit:
-        source = replace(source, commit=git.resolve(source.url, source.commit))
-    known = wheel_store.recall(source, interpreter)
+        source = replace(source, commit=download.resolve(source.url, source.commit))
+    known = wheels.recall(source, interpreter)
     if known is not None:
         wheels.named(known.name, source.name, source.version)  # one commit, asked for as another
         return known
@@ -93,7 +163,7 @@ def _fetched(source: Source, place: Path, tell: Tell) -> Path:
     tree.mkdir()
     tell(f"fetching the source of {_title(source)}")
     if source.commit:
-        git.check_out(source.url, source.commit, tree, tell)
+        download.check_out(source.url, source.commit, tree, tell)
         return _below(tree, source)
     archive = place / Path(unquote(urlsplit(source.url).path)).name
     download.download(source.url, source.sha256, archive)
@@ -145,7 +215,7 @@ class _Build:
         while True:
             try:
                 return self._tried(further)
-            except jail.BuildFailedError as failed:
+            except BuildFailedError as failed:
                 more = self._remedy(str(failed), further)
                 if not more:
                     raise self._failed(failed) from failed
@@ -157,11 +227,11 @@ class _Build:
         A program that it lacks may come as a wheel. And sources of years ago may not be read by
         the setuptools of today: then one of theirs is tried.
         """
-        program = missing.wheel_for(log)
+        program = project.wheel_for(log)
         if program and program not in tried:
             return (program,)
         old = _old_tools(self._interpreter)
-        if not self._project.uses_setuptools or missing.advice(log) or old[0] in tried:
+        if not self._project.uses_setuptools or project.advice(log) or old[0] in tried:
             return ()
         return old
 
@@ -172,12 +242,12 @@ class _Build:
             self._tell(f"building {_title(self._source)} in a jail")
             folder = Path(tempfile.mkdtemp(prefix=f"try-{number}-", dir=self._place))
             folder.chmod(0o755)
-            found = jail.build(self._order(packages, known), folder)
+            found = _in_jail(self._order(packages, known), folder)
             if isinstance(found, Path):
                 wheels.check(found, self._source.name, self._source.version, self._interpreter)
-                return wheel_store.keep(found, self._source, lock, self._interpreter)
+                return wheels.keep(found, self._source, lock, self._interpreter)
             known = (*known, *found)
-        raise jail.BuildFailedError("its backend never has all that it needs")
+        raise BuildFailedError("its backend never has all that it needs")
 
     def _environment(self, further: Iterable[str]) -> tuple[Path, str]:
         """The folder of what it is built with, and the hash of that one's lock."""
@@ -216,7 +286,7 @@ class _Build:
 
     def _failed(self, failed: DependencyError) -> ResolutionError:
         source, log = self._source, str(failed)
-        said = missing.advice(log)
+        said = project.advice(log)
         needed_by = f" ({source.where})" if source.where else ""
         return ResolutionError(
             f"{_title(source)}{needed_by} has no wheel for Python {self._interpreter.version}, and "

@@ -1,18 +1,27 @@
-"""Looks at a wheel that came out of a jail: as at any stranger's bytes, before it is kept.
+"""Wheels that came out of a jail: looked at as at any stranger's bytes, and then kept.
 
-It is the package that was asked for, fits the interpreter, and holds what its RECORD says: files
+Each is the package that was asked for, fits the interpreter, and holds what its RECORD says: files
 with these hashes, no links, nothing that leads out of a folder. What it does once it is installed
-is a jail's matter, as with every wheel of an index.
+is a jail's matter, as with every wheel of an index. They are kept by what they were built of::
+
+    <cache>/wheels/<source and interpreter>/<build environment>/
+        NAME-VERSION-TAGS.whl
+        built.json      what it was built of, and its hash
 """
 
 from __future__ import annotations
 
 import base64
+import contextlib
 import csv
 import hashlib
 import io
+import json
+import os
+import shutil
 import zipfile
 import zlib
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from packaging import tags
@@ -20,9 +29,19 @@ from packaging.utils import InvalidWheelFilename, canonicalize_name, parse_wheel
 from packaging.version import InvalidVersion, Version
 
 from envhub_sandbox.dependencies.builds.trees import MAX_TABLE, BoundedStream, check_zip_member
+from envhub_sandbox.dependencies.declared import Source
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.errors import DependencyError, PackageIntegrityError, SnapshotError
-from envhub_sandbox.hub.listing import FileRecord, check_listing_names
+from envhub_sandbox.hub.listing import (
+    SHA256,
+    FileRecord,
+    HashMismatch,
+    check_listing_names,
+    digest_of,
+)
+from envhub_sandbox.hub.logins import without_login
+from envhub_sandbox.system import folders
+from envhub_sandbox.system.folders import cache_root, draft, remove_tree
 from envhub_worker.protocol.text import printable, size_text
 
 MAX_BYTES = 512 * 2**20
@@ -33,6 +52,17 @@ _UNREADABLE = (
     *(OSError, EOFError, ValueError, RuntimeError, NotImplementedError, KeyError),
     *(zipfile.BadZipFile, zlib.error, csv.Error),
 )
+
+
+@dataclass(frozen=True)
+class WheelOrigin:
+    """What a wheel was built of: its source, the digest of the lock of the packages that it was
+    built with, and its own SHA-256.
+    """
+
+    source: Source
+    environment: str
+    wheel: str
 
 
 def check(wheel: Path, name: str, version: str, interpreter: Interpreter) -> None:
@@ -157,3 +187,70 @@ def _digest(archive: zipfile.ZipFile, name: str) -> str:
                 raise PackageIntegrityError(f"{name[:200]!r} is longer than it says")
             digest.update(block)
     return "sha256=" + base64.urlsafe_b64encode(digest.digest()).rstrip(b"=").decode()
+
+
+FORMAT = 2
+"""Of what is kept, and of how it is built: another one is built again."""
+
+
+def root() -> Path:
+    """Where they lie; ours alone, since what lies there is installed."""
+    return cache_root() / "wheels"
+
+
+def recall(source: Source, interpreter: Interpreter) -> Path | None:
+    """The wheel of a source that was built last for an interpreter; None where there is none."""
+    place = root() / _key(source, interpreter)
+    if not place.is_dir() or not folders.is_ours_alone(root()):
+        return None
+    records = sorted(place.glob("[!.]*/built.json"), key=lambda one: -one.stat().st_mtime)
+    return next(filter(None, map(_whole, records)), None)
+
+
+def _whole(record: Path) -> Path | None:
+    """The wheel beside a record, if it is what that one says."""
+    with contextlib.suppress(OSError, ValueError, HashMismatch):
+        [wheel] = record.parent.glob("*.whl")
+        built = describe(wheel)
+        return wheel if built is not None and _hash(wheel) == f"sha256:{built.wheel}" else None
+    return None
+
+
+def describe(wheel: Path) -> WheelOrigin | None:
+    """What a wheel was built of; None for one that was not built here."""
+    with contextlib.suppress(OSError, ValueError, TypeError, LookupError):
+        facts = json.loads((wheel.parent / "built.json").read_bytes())
+        return WheelOrigin(Source(**facts["source"]), facts["environment"], facts["wheel"])
+    return None
+
+
+def keep(wheel: Path, source: Source, environment: str, interpreter: Interpreter) -> Path:
+    """Keep a wheel that was checked, and return where it lies. Raises ``DependencyError``."""
+    place = root() / _key(source, interpreter)
+    public = replace(source, url=without_login(source.url), where="")
+    built = WheelOrigin(public, environment, _hash(wheel).removeprefix("sha256:"))
+    try:
+        folders.make_private(root())
+        folders.make(place)
+        with draft(place) as building:
+            shutil.copyfile(wheel, building / wheel.name)
+            (building / "built.json").write_text(json.dumps(asdict(built)))
+            home = place / environment[:40]
+            if home.exists() and _whole(home / "built.json") is None:
+                remove_tree(home)
+            with contextlib.suppress(OSError):  # one that another has put there is as good
+                os.rename(building, home)
+    except OSError as error:
+        raise DependencyError(f"{root()} cannot be written: {error}") from error
+    kept = recall(source, interpreter)
+    assert kept is not None
+    return kept
+
+
+def _key(source: Source, interpreter: Interpreter) -> str:
+    facts = json.dumps([FORMAT, source.identity, asdict(interpreter)])
+    return hashlib.sha256(facts.encode()).hexdigest()[:40]
+
+
+def _hash(wheel: Path) -> str:
+    return digest_of(wheel, SHA256, wheel.stat().st_size)

@@ -22,7 +22,7 @@ from envhub_sandbox.dependencies.locks.pylock import PylockPackage, quoted, tabl
 from envhub_sandbox.dependencies.request import DATE
 from envhub_sandbox.errors import LockError, RequirementError
 from envhub_sandbox.hub.snapshot import Snapshot
-from envhub_sandbox.system.files import write_whole_file
+from envhub_sandbox.system.folders import write_whole_file
 
 FORMAT = 1
 MAX_FILES = 20_000

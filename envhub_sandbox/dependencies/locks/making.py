@@ -1,21 +1,145 @@
-"""Makes lock files: what is there now, as a lock file says it."""
+"""Makes lock files of what is there now, and says what differs from one: drift."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 from envhub_sandbox.dependencies import interpreters
 from envhub_sandbox.dependencies.declared import WantedPackage, parse_requirement
 from envhub_sandbox.dependencies.locks import lockfile, pylock
-from envhub_sandbox.dependencies.locks.drift import with_files
 from envhub_sandbox.dependencies.locks.fingerprint import TaskFingerprint, fingerprint_of_task
-from envhub_sandbox.dependencies.locks.lockfile import LockFile, Runner, Spaces
+from envhub_sandbox.dependencies.locks.lockfile import (
+    LOCAL,
+    LockFile,
+    Runner,
+    Spaces,
+    repository_of,
+)
+from envhub_sandbox.dependencies.locks.pylock import PylockPackage
 from envhub_sandbox.dependencies.request import Choice, request_of
 from envhub_sandbox.dependencies.resolutions import resolution_for
-from envhub_sandbox.errors import LockError
+from envhub_sandbox.errors import LockDriftError, LockError
 from envhub_sandbox.hub.snapshot import Snapshot
+from envhub_worker.protocol.text import printable
+
+_SHOWN = 30
+
+
+def differences(then: LockFile, now: LockFile) -> list[str]:
+    """Whatever differs, a line each."""
+    runner = f"Python: {then.runner} was locked, this is {now.runner}"
+    spaces: Iterator[str] = iter(())
+    if then.spaces and now.spaces and then.spaces.arguments == now.spaces.arguments:
+        spaces = drift_of_tasks(then.spaces.tasks, now.spaces.tasks)
+    return [
+        *_of_files(then, now),
+        *([runner] if then.runner != now.runner else []),
+        *_of_packages(then.packages, now.packages),
+        *spaces,
+    ]
+
+
+def refuse(found: Sequence[str], label: str) -> None:
+    """Raise ``LockDriftError`` if anything has drifted."""
+    if not found:
+        return
+    more = [f"and {len(found) - _SHOWN} more"] if len(found) > _SHOWN else []
+    lines = "\n".join(f"  {line}" for line in [*found[:_SHOWN], *more])
+    raise LockDriftError(
+        f"{label}: differs from its lock:\n{lines}\nUse what was locked, or lock the present "
+        "state: envhub lock --upgrade",
+        tuple(found),
+    )
+
+
+def with_files(lock: LockFile, snapshot: Snapshot) -> LockFile:
+    """The same with the files of a snapshot."""
+    return replace(
+        lock,
+        repository=repository_of(snapshot),
+        commit=snapshot.commit,
+        entry=snapshot.path,
+        files={record.path: record.digest for record in snapshot.files},
+        assets=tuple(one.pinned for one in snapshot.assets),
+    )
+
+
+def _of_files(then: LockFile, now: LockFile) -> Iterator[str]:
+    if then.repository != now.repository:
+        both = (then.repository, now.repository)
+        names = ["a local folder" if one == LOCAL else one for one in both]
+        yield f"repository: {names[0]} was locked, this is {names[1]}"
+    if then.commit != now.commit:
+        yield f"commit: {then.commit[:18]} was locked, this is {now.commit[:18]}"
+    if then.entry != now.entry:
+        yield f"entry file: {then.entry} was locked, this is {now.entry}"
+    if set(then.assets) != set(now.assets):
+        old, new = (", ".join(sorted(one.assets)) or "none" for one in (then, now))
+        yield f"assets: {printable(old, 2000)} were locked, these are {printable(new, 2000)}"
+    for name in sorted({*then.files, *now.files}):
+        shown = printable(name, 200)
+        if name not in now.files:
+            yield f"file {shown}: gone"
+        elif name not in then.files:
+            yield f"file {shown}: new"
+        elif then.files[name] != now.files[name]:
+            yield f"file {shown}: other content"
+
+
+def _of_packages(then: Sequence[PylockPackage], now: Sequence[PylockPackage]) -> Iterator[str]:
+    before, after = ({one.name: one for one in packages} for packages in (then, now))
+    for name in sorted({*before, *after}):
+        old, new = before.get(name), after.get(name)
+        if old is None and new is not None:
+            yield f"package {name}: new, {new.version}"
+        elif new is None and old is not None:
+            yield f"package {name}: gone, {old.version} was locked"
+        elif old is not None and new is not None:
+            yield from _of_package(old, new)
+
+
+def _of_package(then: PylockPackage, now: PylockPackage) -> Iterator[str]:
+    if then.version != now.version:
+        yield f"package {then.name}: {then.version} was locked, this is {now.version}"
+        return
+    before, after = (one.origin.source.identity if one.origin else "" for one in (then, now))
+    if before != after:
+        yield f"package {then.name}: built of {before or 'no source'}, this of {after or 'none'}"
+    there = {wheel.sha256 for wheel in now.wheels}
+    for wheel in then.wheels:
+        if wheel.sha256 not in there:
+            others = ", ".join(sorted(one[:12] for one in there)) or "none"
+            yield (
+                f"package {then.name}=={then.version}: the file with SHA-256 "
+                f"{wheel.sha256[:12]}... was locked, there is {others}"
+            )
+
+
+def drift_of_tasks(
+    then: Sequence[TaskFingerprint], now: Sequence[TaskFingerprint]
+) -> Iterator[str]:
+    """What differs in environments."""
+    before, after = ({task.name: task for task in tasks} for tasks in (then, now))
+    for name in sorted({*before, *after}):
+        old, new, shown = before.get(name), after.get(name), printable(name, 200)
+        if old is None or new is None:
+            yield f"environment {shown}: {'new' if old is None else 'gone'}"
+            continue
+        if old.mode != new.mode:
+            yield f"environment {shown}: autoreset mode {old.mode or 'none'}, now {new.mode}"
+        if old.spaces != new.spaces:
+            said = [
+                f"{what} were {before}, now {after}"
+                for what, before, after in (
+                    ("observations", old.observations, new.observations),
+                    ("actions", old.actions, new.actions),
+                )
+                if before != after
+            ]
+            text = "; ".join(said) or "other bounds or types in its spaces, which read the same"
+            yield f"environment {shown}: {text}"
 
 
 def locked(

@@ -21,8 +21,8 @@ from packaging.requirements import InvalidRequirement, Requirement
 from packaging.version import InvalidVersion, Version
 
 from envhub_sandbox.dependencies import index, uv
-from envhub_sandbox.dependencies.builds import wheel_store
-from envhub_sandbox.dependencies.builds.sources import Source, WheelOrigin, of_git
+from envhub_sandbox.dependencies.builds.wheels import WheelOrigin, describe
+from envhub_sandbox.dependencies.declared import Source, of_git
 from envhub_sandbox.dependencies.resolve import Lock, Target, torch_options
 from envhub_sandbox.errors import LockError, PackageIntegrityError
 from envhub_sandbox.hub.logins import without_login
@@ -224,7 +224,7 @@ def _origins(lock: Lock) -> dict[str, WheelOrigin]:
     """What was built here of the packages of a lock, by the hash of the wheel."""
     folders = [Path(option) for option in lock.options if option.startswith("/")]
     wheels = [wheel for folder in folders for wheel in folder.glob("*.whl")]
-    found = [built for built in map(wheel_store.describe, wheels) if built is not None]
+    found = [built for built in map(describe, wheels) if built is not None]
     return {one.wheel: one for one in found}
 
 

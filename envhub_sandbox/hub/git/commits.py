@@ -1,4 +1,4 @@
-"""Fetches the files of one commit of a git repository, as data.
+"""The files of one commit of a git repository, as data; ``GitHost`` has the Hub's interface.
 
 Git gets no settings but ours: no hooks, no filters, no submodules, no logins, and no protocol but
 https. Nothing is checked out: files are read out of the objects, whose names are hashes of their
@@ -14,21 +14,36 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
-from envhub_sandbox.errors import HubReferenceError, SnapshotError, SnapshotTooLargeError
-from envhub_sandbox.hub.failures import HubFailure, Kind
+from envhub_sandbox.errors import (
+    HubReferenceError,
+    SnapshotError,
+    SnapshotIntegrityError,
+    SnapshotTooLargeError,
+)
+from envhub_sandbox.hub.answers import HubFailure, Kind
 from envhub_sandbox.hub.git import address
 from envhub_sandbox.hub.grammar import is_commit
+from envhub_sandbox.hub.listing import (
+    GIT_SHA1,
+    Copier,
+    FileRecord,
+    HashMismatch,
+    Repository,
+    write_verified,
+)
+from envhub_sandbox.system.log import SNAPSHOT
 from envhub_sandbox.system.platform import IS_LINUX, kill_group, own_group, own_variables
 from envhub_worker.protocol.text import printable, size_text
 
 if sys.platform != "win32":
     import resource
+
 
 MAX_BYTES = 2 * 2**30
 """Of a file that git writes: what it fetches, and all files of a commit, unpacked."""
@@ -289,3 +304,68 @@ def _to_the_network(variables: Variables) -> dict[str, str]:
     if certificates := variables.get("SSL_CERT_FILE"):
         kept["GIT_SSL_CAINFO"] = os.path.abspath(os.path.expanduser(certificates))
     return kept
+
+
+_LOOKED_AT = 64 << 10
+_SHOWN = 10
+
+
+@dataclass(frozen=True)
+class GitHost:
+    """Scheme and host of an address, in front of the repository's name."""
+
+    public_endpoint: str
+
+    def resolve(self, repo: Repository, revision: str | None) -> str:
+        """The full commit that a branch or a tag is now; None is ``HEAD``."""
+        return resolve(f"{self.public_endpoint}/{repo.repo_id}", revision or "HEAD")
+
+    @contextmanager
+    def files(self, repo: Repository, commit: str) -> Iterator[_FetchedFiles]:
+        """The files of a commit. Links are files with their text; submodules are left out."""
+        with fetched(f"{self.public_endpoint}/{repo.repo_id}", commit) as found:
+            title = f"{repo.repo_id}@{commit[:12]}"
+            if found.submodules:
+                shown = ", ".join(map(repr, found.submodules[:_SHOWN]))
+                more = f" and {len(found.submodules) - _SHOWN} more"
+                more = more if len(found.submodules) > _SHOWN else ""
+                SNAPSHOT.warning("%s: submodules are left out: %s%s", title, shown, more)
+            if _has_lfs(found):
+                SNAPSHOT.warning("%s: of its files in LFS only the pointers are here", title)
+            yield _FetchedFiles(found)
+
+
+def _has_lfs(found: GitFiles) -> bool:
+    """Whether ``.gitattributes`` at its root says so."""
+    for blob in found.blobs:
+        if blob.path == ".gitattributes":
+            with found.open(blob) as stream:
+                return b"filter=lfs" in stream.read(_LOOKED_AT)
+    return False
+
+
+@dataclass(frozen=True)
+class _FetchedFiles:
+    """The files of a commit that was fetched."""
+
+    found: GitFiles
+
+    @property
+    def listing(self) -> Iterator[FileRecord]:
+        for blob in self.found.blobs:
+            yield FileRecord(blob.path, blob.size, f"{GIT_SHA1}:{blob.digest}")
+
+    def copier(self, files: Sequence[FileRecord], title: str) -> Copier:
+        blobs = {blob.path: blob for blob in self.found.blobs}
+
+        def copy(record: FileRecord, target: Path) -> None:
+            try:
+                with self.found.open(blobs[record.path]) as stream:
+                    write_verified(stream, target, record)
+            except HashMismatch as mismatch:
+                raise SnapshotIntegrityError(
+                    f"{title}: git returned {mismatch.found} as {record.path!r}, which is "
+                    f"{record.digest}. Nothing of it was used; try again, with another git"
+                ) from mismatch
+
+        return copy

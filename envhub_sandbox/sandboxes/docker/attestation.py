@@ -7,7 +7,7 @@ typed here all the same, and whatever does not hold ends the matter.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from envhub_sandbox.errors import (
@@ -71,9 +71,7 @@ def layers(wanted: Container, found: Surroundings, title: str) -> list[dict[str,
         ("container-capabilities", found.capabilities == 0, "none in any set"),
         ("container-privileges", found.no_new_privileges, "no new ones can be gained"),
         ("container-files", found.read_only, "a read-only root, the snapshot, and scratch"),
-        *_network(wanted, found),
-        *_seccomp(wanted, found),
-        *_limits(wanted, found),
+        *_chosen(wanted, found),
     )
     for layer, holds, _ in checks:
         if not holds:
@@ -83,20 +81,13 @@ def layers(wanted: Container, found: Surroundings, title: str) -> list[dict[str,
     return [*report, *_absent(wanted)]
 
 
-def _network(wanted: Container, found: Surroundings) -> list[tuple[str, bool, str]]:
-    if wanted.network != "none" or wanted.only_client:
-        return []
-    return [("container-network", set(found.devices) <= {"lo"}, "no device but its own loopback")]
-
-
-def _seccomp(wanted: Container, found: Surroundings) -> list[tuple[str, bool, str]]:
-    if wanted.runtime not in _NATIVE_RUNTIMES:
-        return []  # another kernel than the host's answers
-    return [("container-seccomp", found.seccomp, "an allow-list around the jail's own")]
-
-
-def _limits(wanted: Container, found: Surroundings) -> list[tuple[str, bool, str]]:
-    checks = []
+def _chosen(wanted: Container, found: Surroundings) -> Iterator[tuple[str, bool, str]]:
+    """What is asked for by some containers only."""
+    if wanted.network == "none" and not wanted.only_client:
+        own = set(found.devices) <= {"lo"}
+        yield "container-network", own, "no device but its own loopback"
+    if wanted.runtime in _NATIVE_RUNTIMES:  # else another kernel than the host's answers
+        yield "container-seccomp", found.seccomp, "an allow-list around the jail's own"
     for name, most, has in (
         ("memory", wanted.memory, found.memory),
         ("pids", wanted.pids, found.pids),
@@ -104,8 +95,7 @@ def _limits(wanted: Container, found: Surroundings) -> list[tuple[str, bool, str
     ):
         if most is not None:
             holds = has is not None and has <= most * 1.01
-            checks.append((f"container-{name}", holds, _amount(name, most)))
-    return checks
+            yield f"container-{name}", holds, _amount(name, most)
 
 
 def _amount(name: str, most: float) -> str:

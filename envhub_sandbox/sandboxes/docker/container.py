@@ -11,15 +11,15 @@ import sys
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 from envhub_sandbox.errors import SandboxUnavailableError, WorkerStartupError
 from envhub_sandbox.sandboxes import runtime_folder
-from envhub_sandbox.sandboxes.docker import attestation, run_arguments, seccomp_profile
+from envhub_sandbox.sandboxes.docker import attestation, run_arguments
 from envhub_sandbox.sandboxes.docker.engines import Engine, environment, explained, own_limits
 from envhub_sandbox.sandboxes.docker.run_arguments import Container
-from envhub_sandbox.sandboxes.local_server import LocalServer
 from envhub_sandbox.sandboxes.pool import ServerPool, ServerUse, WorkerServer
+from envhub_sandbox.sandboxes.process import LocalServer
 from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.settings.policy import Policy
 from envhub_sandbox.system import processes
@@ -40,16 +40,18 @@ _KILLED = 128 + 9
 _UNUSED_USERS = range(0x6E000000, 0x6EFFFFFF)
 
 
-class ContainerOptions(Protocol):
+@dataclass(kw_only=True)
+class ContainerOptions:
     """What a caller says of containers: see ``DockerSandbox``."""
 
-    image: str
-    runtime: str | None
-    gpus: str | None
-    memory: int | None
-    pids: int | None
-    cpus: float | None
-    cgroups: bool
+    image: str = "envhub-worker"
+    engine: str | None = None
+    runtime: str | None = None
+    gpus: str | None = None
+    memory: int | None = None
+    pids: int | None = None
+    cpus: float | None = None
+    cgroups: bool = True
 
 
 class ContainerServer(LocalServer):
@@ -161,7 +163,7 @@ class RepositoryContainer(Sandbox):
         sockets.mkdir(mode=0o700)
         user, group = _user(sockets)
         return replace(
-            self.wanted(folder, seccomp_profile.profile(), cores()),
+            self.wanted(folder, run_arguments.seccomp_profile(), cores()),
             sockets=str(sockets),
             snapshot=str(self.snapshot),
             packages=self.packages,

@@ -20,16 +20,22 @@ from typing import Any, cast
 
 from envhub_sandbox.errors import SandboxUnavailableError, WorkerStartupError
 from envhub_sandbox.sandboxes import runtime_folder
-from envhub_sandbox.sandboxes.docker import attestation, seccomp_profile
+from envhub_sandbox.sandboxes.docker import attestation
 from envhub_sandbox.sandboxes.docker.container import (
     STARTUP_S,
     RepositoryContainer,
     check_started,
 )
 from envhub_sandbox.sandboxes.docker.engines import Engine, EngineError, environment
-from envhub_sandbox.sandboxes.docker.run_arguments import PORT, Container, run_arguments
+from envhub_sandbox.sandboxes.docker.run_arguments import (
+    PORT,
+    Container,
+    run_arguments,
+    seccomp_profile,
+)
 from envhub_sandbox.sandboxes.pool import WorkerServer
-from envhub_sandbox.sandboxes.remote import RemoteRepository, RemoteServer
+from envhub_sandbox.sandboxes.remote import RemoteServer
+from envhub_sandbox.sandboxes.remote_repository import UploadedRepository
 from envhub_sandbox.sandboxes.runtime_folder import RuntimeFolder
 from envhub_sandbox.system.log import WORKER
 from envhub_sandbox.system.platform import cores, own_group, run_after_fork
@@ -51,11 +57,10 @@ _LINE_BYTES = 65536
 class PublishedContainer(RepositoryContainer):
     """The sandbox of one repository: one such container, which its environments share."""
 
-    _files: RemoteRepository = field(init=False, repr=False)
+    _files: UploadedRepository = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        nowhere = TcpServer(None, None)
-        self._files = RemoteRepository(self.snapshot, None, "", "", nowhere)
+        self._files = UploadedRepository(self.snapshot, None, "")
 
     def prepare(
         self, order: m.OpenJail, server: WorkerServer, client: WorkerConnection, deadline: Deadline
@@ -72,7 +77,7 @@ class PublishedContainer(RepositoryContainer):
         try:  # interruption.md, rule 4
             public, secret = new_keys()
             # the engine's processors, not ours, are those of the virtual machine
-            seccomp = seccomp_profile.profile(self.engine.machine or None)
+            seccomp = seccomp_profile(self.engine.machine or None)
             wanted = replace(
                 self.wanted(container.folder.path, seccomp, self.engine.cpus or cores()),
                 only_client=key_text(public),

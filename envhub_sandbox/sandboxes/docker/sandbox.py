@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError
-from envhub_sandbox.sandboxes.docker import image as images
 from envhub_sandbox.sandboxes.docker import packages, run_arguments
-from envhub_sandbox.sandboxes.docker.container import RepositoryContainer
+from envhub_sandbox.sandboxes.docker import packages as images
+from envhub_sandbox.sandboxes.docker.container import ContainerOptions, RepositoryContainer
 from envhub_sandbox.sandboxes.docker.engines import Engine, find_engine, find_image
 from envhub_sandbox.sandboxes.docker.published import PublishedContainer
 from envhub_sandbox.sandboxes.sandbox import Sandbox
@@ -26,7 +26,7 @@ from envhub_worker.protocol.runtime import Runtime
 
 
 @dataclass(kw_only=True)
-class DockerSandbox(Sandbox):
+class DockerSandbox(ContainerOptions, Sandbox):
     """Workers in containers. ``sandbox="docker"`` is this with its defaults.
 
     Attributes:
@@ -45,14 +45,6 @@ class DockerSandbox(Sandbox):
             a repository's packages.
     """
 
-    image: str = "envhub-worker"
-    engine: str | None = None
-    runtime: str | None = None
-    gpus: str | None = None
-    memory: int | None = None
-    pids: int | None = None
-    cpus: float | None = None
-    cgroups: bool = True
     published: bool = not IS_LINUX
     build_network: str | None = None
     name = "docker"

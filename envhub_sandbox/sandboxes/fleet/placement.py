@@ -1,9 +1,9 @@
 """Which worker of a fleet goes where.
 
 A worker goes where the fewest workers of its fleet are, among the places that answer and have room;
-of several such, where there is most room, and then by the order of the list. It comes back where it
-was, if that place answers. A place that refuses it, or does not answer, is followed by the next:
-all are tried before a worker has none. Results never depend on it.
+of several such, where there is most room by the word of its server, and then by the order of the
+list. It comes back where it was, if that place answers. A place that refuses it, or does not
+answer, is followed by the next: all are tried before a worker has none. Results never depend on it.
 """
 
 from __future__ import annotations
@@ -11,18 +11,87 @@ from __future__ import annotations
 import hashlib
 import threading
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from time import monotonic
 
 from envhub_sandbox.errors import EnvHubError
+from envhub_sandbox.sandboxes import server_facts
 from envhub_sandbox.sandboxes.fleet.member import ForRepository, Member
-from envhub_sandbox.sandboxes.fleet.place_list import PlaceList
-from envhub_sandbox.sandboxes.fleet.rooms import Room, Rooms
 from envhub_sandbox.sandboxes.pool import ServerUse, WorkerServer
+from envhub_sandbox.sandboxes.remote import RemoteSandbox
 from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.settings.policy import Policy
 from envhub_sandbox.system.log import WORKER
+from envhub_sandbox.system.threads import Call, Calls
+from envhub_sandbox.transport.tcp import UnreachableError
 from envhub_worker.protocol.runtime import OWN, Runtime
+
+_WAIT_S = 1.5
+"""How long servers may take to answer: one that takes longer comes after those that have."""
+_FRESH_S = 2.0
+"""For how long an answer holds, less what has been placed there since."""
+
+
+@dataclass(frozen=True)
+class Room:
+    """The room of one place.
+
+    Attributes:
+        answers: Whether it has answered; true of a place that is not asked.
+        known_s: When it was asked.
+        workers: For how many more workers there is room; infinity where nothing bounds them.
+    """
+
+    answers: bool = True
+    workers: float = float("inf")
+    known_s: float = 0.0
+
+
+class Rooms:
+    """The rooms of a fleet's places. Thread-safe.
+    ``memory_bytes``: what a worker takes of its key's quota.
+    """
+
+    def __init__(self, memory_bytes: int) -> None:
+        self._memory_bytes = memory_bytes
+        self._asking = threading.RLock()  # interruption.md, rule 12
+        self._pending: dict[Member, tuple[float, Call[server_facts.ServerFacts]]] = {}
+
+    def ask(self, members: Iterable[Member]) -> dict[Member, Room]:
+        """The room of each, asked of all at the same time; of one that is not a server its own."""
+        sandboxes = {one: one.sandbox for one in members}
+        servers = {m: one for m, one in sandboxes.items() if isinstance(one, RemoteSandbox)}
+        with self._asking:  # who comes next finds the answers
+            now = monotonic()
+            stale = [one for one in servers if self._is_stale(one, now)]
+            calls = [partial(server_facts.ask, servers[one]) for one in stale]
+            asked = Calls(calls)
+            asked.wait(_WAIT_S)
+            self._pending.update({one: (now, p) for one, p in zip(stale, asked.each, strict=True)})
+            return {one: self._room(one) for one in servers}
+
+    def _is_stale(self, member: Member, now: float) -> bool:
+        at, pending = self._pending.get(member, (0.0, None))
+        # one that has not answered yet is still being asked
+        return pending is None or (pending.done and now - at > _FRESH_S)
+
+    def _room(self, member: Member) -> Room:
+        known_s, pending = self._pending[member]
+        facts = pending.value
+        if pending.error is not None and not isinstance(pending.error, UnreachableError):
+            text = "%s gets no worker as long as others have room: %s"
+            WORKER.warning(text, member.address, pending.error)
+        if facts is None:
+            return Room(answers=False, workers=0)
+        if facts.draining:
+            return Room(workers=0)
+        taken = {"jails": 1, "runners": 1, "memory_bytes": self._memory_bytes}
+        quotas, used = facts.quotas, facts.used
+        free = [(quotas[n] - used.get(n, 0)) // each for n, each in taken.items() if n in quotas]
+        return Room(workers=max(0, min(free, default=1)), known_s=known_s)
+
 
 _ASKED = 32
 """Servers that are asked for their room at the same time."""
@@ -35,13 +104,16 @@ class Placement:
     """The places of the workers of one ``make_env``. Thread-safe.
 
     Args:
-        places: Which there are.
+        places: Gives those that there are now.
         resolve: Makes a sandbox of a place's name.
         runtime: Makes what the jails of a place run on.
     """
 
     def __init__(
-        self, places: PlaceList, resolve: Resolve, runtime: Callable[[Member], Runtime]
+        self,
+        places: Callable[[], list[str | Sandbox]],
+        resolve: Resolve,
+        runtime: Callable[[Member], Runtime],
     ) -> None:
         self._places = places
         self._resolve = resolve
@@ -62,7 +134,7 @@ class Placement:
         """
         with self._lock:
             found: dict[Member, int] = {}
-            for entry in self._places.read():
+            for entry in self._places():
                 try:
                     member = self._member(entry if isinstance(entry, str) else id(entry), entry)
                     while member in found and member.sandbox.is_placed_anew:
@@ -88,17 +160,18 @@ class Placement:
         count = num_workers or sum(member.weight for member in self.members())
         return [Seat(self, number) for number in range(count)]
 
-    def open_for(self, repository: ForRepository) -> None:
+    def open_for(self, repository: ForRepository, memory_bytes: int) -> None:
         """Make the places of a repository.
 
         One that is absent, or joins the list later, is made when a worker is to go there.
+        ``memory_bytes``: as of ``Rooms``.
         """
         with self._lock:
             if self._repository is None:
                 members = self.members()
                 for member in [one for one in members if not one.absent] or members:
                     member.open_for(repository)
-                self._rooms = Rooms(repository.policy.limits.memory_bytes)
+                self._rooms = Rooms(memory_bytes)
                 self._repository = repository
 
     def runs_on(self, runtime: Runtime) -> Runtime:
@@ -224,7 +297,11 @@ class Seat(Sandbox):
         self, snapshot: Path, policy: Policy, runtime: Runtime, assets: tuple[Path, ...] = ()
     ) -> Seat:
         """See ``Sandbox``; ``runtime`` is each place's own."""
-        self._placement.open_for(ForRepository(snapshot, policy, assets))
+
+        def at(place: Sandbox, runtime: Runtime) -> Sandbox:
+            return place.for_repository(snapshot, policy, runtime, assets)
+
+        self._placement.open_for(at, policy.limits.memory_bytes)
         return self
 
     def runs_on(self, runtime: Runtime) -> Runtime:

@@ -19,9 +19,9 @@ import tempfile
 from typing import Any
 
 from envhub_sandbox.dependencies import index
-from envhub_sandbox.hub.cache import cache_root
 from envhub_sandbox.sandboxes.process import BOOTSTRAP
 from envhub_sandbox.system import processes
+from envhub_sandbox.system.folders import cache_root
 
 STARTUP_S = 120.0
 _LINE_BYTES = 4096

@@ -13,7 +13,7 @@ import json
 import platform
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from envhub_sandbox.errors import (
@@ -148,7 +148,7 @@ class PlacedActor:
             raise PolicyError(f"RaySandbox: {error}") from error
         self._end: concurrent.futures.Future[Any] = concurrent.futures.Future()
         self._called: Any = None
-        self._ended: Callable[[], None] = _nothing
+        self._ended: Callable[[], object] = lambda: None
 
     def start(self, client_key: str, within_s: float) -> dict[str, Any]:
         """Have it started, once Ray has placed it.
@@ -175,7 +175,7 @@ class PlacedActor:
             raise WorkerStartupError(f"a worker server on a node of Ray: {text}")
         return said
 
-    def watch(self, ended: Callable[[], None]) -> None:
+    def watch(self, ended: Callable[[], object]) -> None:
         """Have ``ended`` called, in any thread, once the server or the actor has ended."""
         self._ended = ended
         self._ask()
@@ -237,10 +237,6 @@ def read_answer(answer: object) -> dict[str, Any]:
     raise WorkerStartupError("an actor on a node of Ray gave an answer that is none of ours")
 
 
-def _nothing() -> None:
-    """Nothing watches yet."""
-
-
 def _one_line(text: str) -> str:
     return printable(" ".join(text.split()), _SHOWN_CHARS)
 
@@ -267,13 +263,3 @@ def _not_started(error: Exception) -> WorkerStartupError:
             f"pass RaySandbox(runtime_env={{'pip': ['envhub-sandbox[ray]']}}). Ray says: {words}"
         )
     return WorkerStartupError(f"Ray could not start a worker server: {words}")
-
-
-@contextlib.contextmanager
-def killed_on_failure(actor: PlacedActor) -> Iterator[None]:
-    """End an actor that nothing knows of yet: interruption.md, rule 4."""
-    try:
-        yield
-    except BaseException:
-        actor.kill()
-        raise

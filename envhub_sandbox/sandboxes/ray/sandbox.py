@@ -23,7 +23,7 @@ from envhub_sandbox.sandboxes import remote
 from envhub_sandbox.sandboxes.pool import ServerPool, ServerUse, WorkerServer
 from envhub_sandbox.sandboxes.ray import cluster
 from envhub_sandbox.sandboxes.ray.cluster import PlacedActor
-from envhub_sandbox.sandboxes.remote_packages import ServerPackages
+from envhub_sandbox.sandboxes.remote_repository import ServerPackages, UploadedRepository
 from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.settings.policy import Policy
 from envhub_sandbox.transport.connection import WorkerConnection
@@ -145,7 +145,7 @@ def _made(given: dict[str, Any]) -> RaySandbox:
 
 
 @dataclass(eq=False)
-class RayRepository(remote.UploadedRepository):
+class RayRepository(UploadedRepository):
     """The sandbox of one repository: one server, which its environments share."""
 
     name = "ray"
@@ -197,12 +197,15 @@ class RayServer(remote.RemoteServer):
     def __init__(self, options: RaySandbox) -> None:
         cluster.connect(options.address)
         self._actor = PlacedActor(options.placement())
-        with cluster.killed_on_failure(self._actor):
+        try:  # interruption.md, rule 4
             ours = TcpServer(None, new_keys()[1], options.heartbeat_s, why_ended=self._why_ended)
             said = self._actor.start(ours.public_key(), options.placement_s)
             endpoint, key, self.node, self.gpus = read_started(said)
             super().__init__(endpoint, replace(ours, server_key=key))
             self._actor.watch(self._wake)
+        except BaseException:
+            self._actor.kill()
+            raise
 
     def _why_ended(self) -> str:
         node = self.node[:_NODE_CHARS]

@@ -16,9 +16,8 @@ from envhub_sandbox.errors import (
     WorkerDiedError,
     WorkerTimeoutError,
 )
-from envhub_sandbox.sandboxes.fleet.refusals import may_go_elsewhere, worst_of
 from envhub_sandbox.sandboxes.pool import ServerUse, WorkerServer
-from envhub_sandbox.sandboxes.sandbox import Sandbox
+from envhub_sandbox.sandboxes.sandbox import Sandbox, may_go_elsewhere, worst_of
 from envhub_sandbox.session.error_text import name_denied, read_denials
 from envhub_sandbox.session.jails.loaded import ExpectedManifest, LoadedJail, ServerHold
 from envhub_sandbox.session.repository import Repository

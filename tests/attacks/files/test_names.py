@@ -15,11 +15,10 @@ import pytest
 
 from envhub_sandbox.errors import SnapshotError
 from envhub_sandbox.hub import store
-from envhub_sandbox.hub.hashing import copy_verified
-from envhub_sandbox.hub.listing import FileRecord, check_listing_names
+from envhub_sandbox.hub.listing import FileRecord, check_listing_names, copy_verified
 from envhub_sandbox.hub.reference import HubRef
 from envhub_sandbox.hub.snapshot import fetch
-from envhub_sandbox.system import file_names
+from envhub_sandbox.system import platform
 from tests.hub.stub_hub import StubHub, StubRepository
 from tests.support.elsewhere.caseless import without_case
 from tests.support.elsewhere.kit import elsewhere
@@ -88,7 +87,7 @@ def test_a_name_that_windows_reads_as_another_is_refused(
 def test_ordinary_names_are_names_on_windows() -> None:
     """What only looks like one of those."""
     for name in ("console.py", "auxiliary/a.txt", "com/x", "a.b.c", ".gitignore", "com10", "nul_"):
-        assert file_names.wrong_on_windows(name) is None
+        assert platform.wrong_on_windows(name) is None
 
 
 @pytest.fixture
@@ -136,8 +135,8 @@ def test_files_that_differ_in_case_are_kept_apart_where_they_can_be(
 )
 def test_what_clashes_is_found_at_any_depth(pair: tuple[str, str]) -> None:
     """Folders and files, by case and by Unicode's form."""
-    assert file_names.taken_as_one(["other", *pair]) is not None
-    assert file_names.taken_as_one([pair[0], "other", f"{pair[0]}2"]) is None
+    assert platform.taken_as_one(["other", *pair]) is not None
+    assert platform.taken_as_one([pair[0], "other", f"{pair[0]}2"]) is None
 
 
 def test_what_was_written_is_never_written_over(caseless: Path) -> None:

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from envhub_sandbox.hub import snapshot
-from envhub_sandbox.hub.cache import cache_root
+from envhub_sandbox.system.folders import cache_root
 from tests.attacks.harness import HOSTILE, USER, Arena, Run, call, control_run, run_in, token
 
 FAMILY = "Changing files"

@@ -14,8 +14,8 @@ from typing import Any
 
 import pytest
 
-from envhub_sandbox.hub.cache import cache_root
 from envhub_sandbox.sandboxes.process import PROCESS
+from envhub_sandbox.system.folders import cache_root
 from tests.attacks.harness import USER, Arena, OpenJail, control_run, run_in, token
 from tests.attacks.network.listeners import (
     FRAMES,

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from envhub_sandbox.dependencies import interpreters
-from envhub_sandbox.dependencies.builds import jail
+from envhub_sandbox.dependencies.builds import build
 from envhub_sandbox.dependencies.builds.build import build_wheels
 from envhub_sandbox.dependencies.resolutions import lock_for
 from envhub_sandbox.errors import DependencyError
@@ -70,7 +70,7 @@ def further():
 @pytest.fixture(autouse=True)
 def _profile(arena: Arena, other_cache: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Builds are confined as the arena says, and keep nothing of another test's."""
-    monkeypatch.setenv(jail.PROFILE_VARIABLE, arena.profile)
+    monkeypatch.setenv(build.PROFILE_VARIABLE, arena.profile)
 
 
 def control(folder: Path, files: dict[str, str]) -> Path:
@@ -170,7 +170,7 @@ def test_a_build_that_never_ends(
         process.kill()
         process.wait()
         kill_named(alias)
-    monkeypatch.setattr(jail, "WALL_S", 8.0)
+    monkeypatch.setattr(build, "WALL_S", 8.0)
     wheel, why = built(tmp_path, files)
     assert wheel is None
     assert "it was not done after 8 s, and was ended" in why

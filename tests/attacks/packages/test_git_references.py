@@ -25,7 +25,7 @@ from envhub_sandbox.errors import (
     RepositoryUnavailableError,
     SnapshotTooLargeError,
 )
-from envhub_sandbox.hub.failures import HubFailure
+from envhub_sandbox.hub.answers import HubFailure
 from envhub_sandbox.hub.git import address, commits
 from envhub_sandbox.hub.reference import HubRef
 from envhub_sandbox.hub.snapshot import Snapshot, snapshot_named

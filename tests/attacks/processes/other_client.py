@@ -11,8 +11,8 @@ import json
 import os
 import sys
 
-from envhub_sandbox.hub.cache import cache_root
 from envhub_sandbox.sandboxes.process import PROCESS
+from envhub_sandbox.system.folders import cache_root
 from tests.attacks.harness import Arena, run_in
 
 

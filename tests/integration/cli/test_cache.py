@@ -15,7 +15,7 @@ from envhub_sandbox.cli.app import app
 from envhub_sandbox.cli.cache import stored_snapshots
 from envhub_sandbox.dependencies import environments
 from envhub_sandbox.hub import snapshot
-from envhub_sandbox.hub.cache import cache_root
+from envhub_sandbox.system.folders import cache_root
 from envhub_sandbox.system.locks import SharedLock
 from envhub_worker.protocol.runtime import RECORD
 from tests.support.packages.wheels import Index, make_wheel

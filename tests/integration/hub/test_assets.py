@@ -12,7 +12,7 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import HubReferenceError, RemoteEnvError, RepositoryUnavailableError
-from envhub_sandbox.hub.cache import remove_tree
+from envhub_sandbox.system.folders import remove_tree
 from tests.hub.stub_hub import StubHub, StubRepository
 from tests.support.interpreter import profiles
 from tests.support.repositories import STILL

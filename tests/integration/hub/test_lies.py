@@ -20,9 +20,9 @@ from envhub_sandbox.errors import (
     SnapshotIntegrityError,
     SnapshotTooLargeError,
 )
-from envhub_sandbox.hub.cache import remove_tree
 from envhub_sandbox.hub.reference import HubRef
 from envhub_sandbox.hub.snapshot import SnapshotLimits, fetch
+from envhub_sandbox.system.folders import remove_tree
 from tests.hub.stub_hub import StubHub, StubRepository
 from tests.integration.hub.conftest import Fetch
 

@@ -18,8 +18,8 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import RemoteEnvError
-from envhub_sandbox.hub.cache import cache_root
 from envhub_sandbox.sandboxes.pool import stop_idle
+from envhub_sandbox.system.folders import cache_root
 from tests.support import inside
 from tests.support.processes import descendants, eventually
 from tests.support.repositories import STILL, write_repository

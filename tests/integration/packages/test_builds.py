@@ -10,17 +10,17 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.dependencies import interpreters
-from envhub_sandbox.dependencies.builds import wheel_store
+from envhub_sandbox.dependencies.builds import wheels
 from envhub_sandbox.dependencies.builds.build import build_wheels
-from envhub_sandbox.dependencies.builds.sources import Source
+from envhub_sandbox.dependencies.declared import Source
 from envhub_sandbox.dependencies.locks import lockfile
 from envhub_sandbox.dependencies.locks.making import locked
 from envhub_sandbox.dependencies.request import Choice
 from envhub_sandbox.dependencies.resolutions import lock_for
 from envhub_sandbox.errors import DependencyError, PackageIntegrityError, ResolutionError
-from envhub_sandbox.hub.cache import cache_root, remove_tree
 from envhub_sandbox.hub.git import address
 from envhub_sandbox.hub.snapshot import local
+from envhub_sandbox.system.folders import cache_root, remove_tree
 from tests.support.packages.git_server import git_served, make_repository
 from tests.support.packages.sdists import backend, make_sdist
 from tests.support.packages.wheels import Index, make_wheel
@@ -72,7 +72,7 @@ def test_it_is_built_with_what_it_asks_for_and_once(packages: Index, tmp_path: P
     [wheel] = built([source], said.append)
     assert seen(wheel) == "('1.0', [])"
     assert "building x 1.0 in a jail" in said
-    known = wheel_store.describe(wheel)
+    known = wheels.describe(wheel)
     assert known is not None
     assert known.source.identity == f"sha256:{source.sha256}"
     (tmp_path / "x-1.0.tar.gz").unlink()
@@ -122,7 +122,7 @@ def test_a_commit_of_git(packages: Index, tmp_path: Path, monkeypatch: pytest.Mo
         source = Source("x", "", f"{where}/repo", commit="main", subdirectory="python")
         [wheel] = built([source])
     assert wheel.name == "x-3.0-py3-none-any.whl"
-    known = wheel_store.describe(wheel)
+    known = wheels.describe(wheel)
     assert known is not None
     assert known.source.identity == f"git+{where}/repo@{commit}#subdirectory=python"
 
@@ -173,4 +173,4 @@ def test_no_jail_no_build(packages: Index, tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setenv("ENVHUB_BUILD_PROFILE", "none-such")
     with pytest.raises(DependencyError, match="none-such"):
         built([make_sdist(tmp_path, "unbuilt")])
-    assert not list(wheel_store.root().glob("*/*/unbuilt*"))
+    assert not list(wheels.root().glob("*/*/unbuilt*"))

@@ -13,7 +13,7 @@ import pytest
 
 from envhub_sandbox import RaySandbox, make_env
 from envhub_sandbox.errors import PolicyError, ServerBusyError
-from envhub_sandbox.sandboxes import upload
+from envhub_sandbox.sandboxes import remote_repository
 from envhub_sandbox.sandboxes.pool import stop_idle
 from tests.compliance.conftest import pytest_generate_tests as pytest_generate_tests
 from tests.compliance.pair import Pair
@@ -89,8 +89,8 @@ def test_files_reach_a_node_once(
         sent.append(done[1])
         return done
 
-    original = upload.upload
-    monkeypatch.setattr(upload, "upload", upload_counted)
+    original = remote_repository.upload
+    monkeypatch.setattr(remote_repository, "upload", upload_counted)
     place = RaySandbox(resources={"one": 1})
     options = {"sandbox": place, "timeouts": AT_ONCE}
     with started(repository, **options) as env, started(repository, **options) as other:

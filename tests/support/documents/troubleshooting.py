@@ -22,7 +22,11 @@ from tests.support.documents.written import DOCS, filled
 DOCUMENT = DOCS / "troubleshooting.md"
 # title, where it is said, what more there is about it
 _PARTS = (
-    ("References, the Hub and local folders", ("envhub_sandbox/hub",), "snapshots.md"),
+    (
+        "References, the Hub and local folders",
+        ("envhub_sandbox/hub", "envhub_sandbox/system/folders.py"),
+        "snapshots.md",
+    ),
     ("A repository's packages", ("envhub_sandbox/dependencies",), "dependencies.md"),
     ("Locks", ("envhub_sandbox/dependencies/locks",), "dependencies.md#locks"),
     (
@@ -41,7 +45,7 @@ _PARTS = (
         (
             "envhub_sandbox/sandboxes/remote.py",
             "envhub_sandbox/sandboxes/remote_keys.py",
-            "envhub_sandbox/sandboxes/remote_packages.py",
+            "envhub_sandbox/sandboxes/remote_repository.py",
             "envhub_sandbox/transport/tcp.py",
             "envhub_sandbox/transport/connection.py",
             "envhub_worker/access",
@@ -111,7 +115,7 @@ _NO_FILES = (
     "envhub_sandbox/check/checks.py",
     "envhub_sandbox/check/static.py",
     "envhub_sandbox/cli/app.py",
-    "envhub_sandbox/cli/init/starter.py",
+    "envhub_sandbox/cli/starter.py",
     "envhub_sandbox/dependencies/locks/lockfile.py",
 )
 # Nor is this: parts of other formats, what is said after success, and answers to our own client.

@@ -16,11 +16,22 @@ import pytest
 from typer.testing import CliRunner
 
 from envhub_sandbox.check.checks import Severity
-from envhub_sandbox.cli import cache, diff, image, inspect, lock, prefetch, push, replay, run
+from envhub_sandbox.cli import (
+    cache,
+    diff,
+    image,
+    init,
+    inspect,
+    lock,
+    prefetch,
+    push,
+    replay,
+    run,
+    starter,
+)
 from envhub_sandbox.cli.app import app, whole_command
 from envhub_sandbox.cli.doctor import doctor
-from envhub_sandbox.cli.init import init, starter
-from envhub_sandbox.cli.shared import exits, findings, versions
+from envhub_sandbox.cli.shared import exits, findings, host
 from envhub_sandbox.cli.shared.console import guarded
 
 
@@ -201,7 +212,7 @@ def test_a_warning_is_a_line(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_versions_of_all_that_matters(monkeypatch: pytest.MonkeyPatch) -> None:
     """None for what is not installed; every value is plain."""
-    found = versions.versions()
+    found = host.versions()
     assert found == json.loads(json.dumps(found))
     assert found["python"]
     assert found["numpy"]
@@ -210,4 +221,4 @@ def test_versions_of_all_that_matters(monkeypatch: pytest.MonkeyPatch) -> None:
         raise metadata.PackageNotFoundError(name)
 
     monkeypatch.setattr(metadata, "version", gone)
-    assert versions.versions()["numpy"] is None
+    assert host.versions()["numpy"] is None

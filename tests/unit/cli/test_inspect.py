@@ -14,8 +14,7 @@ from typer.testing import CliRunner, Result
 from envhub_sandbox.check.changes import changes
 from envhub_sandbox.check.static import static
 from envhub_sandbox.cli.app import app
-from envhub_sandbox.hub.hashing import GIT_SHA1, digest_of
-from envhub_sandbox.hub.listing import FileRecord, Snapshot
+from envhub_sandbox.hub.listing import GIT_SHA1, FileRecord, Snapshot, digest_of
 from envhub_sandbox.hub.snapshot import local
 from tests.support.output.ci import obeyed
 from tests.support.repositories import write_repository

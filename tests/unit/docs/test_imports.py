@@ -60,7 +60,7 @@ MAY_IMPORT = {
         *("dependencies", "hub", "sandboxes", "session"),
         *("transport", "vector"),
     },
-    "envhub_sandbox.check": {"", "dependencies", "factory", "hub", "session", "vector"},
+    "envhub_sandbox.check": {"", "dependencies", "factory", "hub", "vector"},
     "envhub_sandbox.integrations": {"factory", "hub", "session", "vector"},
     "envhub_sandbox.vector": {"session", "transport"},
     "envhub_sandbox.session": {"hub", "sandboxes", "transport"},

@@ -1,4 +1,4 @@
-"""What commands print: facts, tables and their last column, in a terminal and in a pipe."""
+"""How a command prints: what is printed is text and no more, whoever chose it."""
 
 from __future__ import annotations
 
@@ -8,8 +8,10 @@ from collections.abc import Callable, Sequence
 
 import pytest
 
+from envhub_sandbox.cli.shared import console
 from envhub_sandbox.cli.shared.console import guarded, show, show_rows
 from tests.support.output.ci import obeyed
+from tests.support.processes import eventually
 
 _ROWS = [("layer", "what it does"), ("memory", "8192 MiB, counted by the kernel; not file-locks")]
 
@@ -74,3 +76,20 @@ def test_a_fact_is_on_the_stream_that_is_named(capsys: pytest.CaptureFixture[str
     shown = capsys.readouterr()
     assert shown.out == "packages     7 of them\n"
     assert shown.err == "in           /cache\n"
+
+
+def test_what_takes_long_has_lines_in_a_log(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    """It says what and for how long, and again; nothing of what was over before."""
+    written: list[str] = []
+
+    def lines() -> list[str]:
+        written.append(capfd.readouterr().err)
+        return "".join(written).splitlines()
+
+    with console.ProgressBar(quiet=True, long_s=0.05) as bar:
+        bar.begin("brief")
+        bar.begin("a / 0: ::error::8 resets, round 1 of 4")
+        assert eventually(lambda: len(lines()) >= 2)
+    assert all("a / 0: " in line and line.endswith(" so far") for line in lines())

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from envhub_sandbox.dependencies import installed, interpreters
+from envhub_sandbox.dependencies import interpreters
 from envhub_sandbox.dependencies.declared import parse_requirement
 from envhub_sandbox.dependencies.modules import MissingModule
 from envhub_sandbox.dependencies.packages import HERE
@@ -109,7 +109,7 @@ def test_no_link_and_no_second_interpreter(
 )
 def test_what_is_here_is_not_installed_again(lines: list[str]) -> None:
     """By name and version, without importing any of it."""
-    assert installed.first_unmet(declares(*lines)) is None
+    assert interpreters.first_unmet(declares(*lines)) is None
 
 
 @pytest.mark.parametrize(
@@ -121,7 +121,7 @@ def test_what_is_here_is_not_installed_again(lines: list[str]) -> None:
 )
 def test_what_is_not_here_is_named(line: str) -> None:
     """Another version is not here; nor is one whose files nobody can compare."""
-    assert installed.first_unmet(declares("gymnasium", line)) == str(
+    assert interpreters.first_unmet(declares("gymnasium", line)) == str(
         parse_requirement(line, "").requirement
     )
 
@@ -129,7 +129,7 @@ def test_what_is_not_here_is_named(line: str) -> None:
 @pytest.mark.parametrize("marker", ["os_name ~= 'posix'", "python_version ~= '3'", "'a' ~= 'b'"])
 def test_a_marker_that_says_nothing_is_left_to_uv(marker: str) -> None:
     """It compares what cannot be compared; that is no error of ours."""
-    assert str(installed.first_unmet(declares(f"numpy; {marker}"))).startswith("numpy; ")
+    assert str(interpreters.first_unmet(declares(f"numpy; {marker}"))).startswith("numpy; ")
 
 
 def test_a_python_that_was_built_from_a_checkout(
@@ -137,7 +137,7 @@ def test_a_python_that_was_built_from_a_checkout(
 ) -> None:
     """It says a plus behind its version."""
     monkeypatch.setattr(platform, "python_version", lambda: "3.12.1+")
-    assert installed.first_unmet(declares(python=">=3.12,<3.13")) is None
+    assert interpreters.first_unmet(declares(python=">=3.12,<3.13")) is None
     assert interpreters.own().version == "3.12.1"
     other = tmp_path / "python3"
     facts = ["cpython", "3.12.2+", "x86_64", "2.36", str(other)]
@@ -148,8 +148,8 @@ def test_a_python_that_was_built_from_a_checkout(
 
 def test_another_python_is_not_here() -> None:
     """Whatever is installed."""
-    assert installed.first_unmet(declares(python=f"=={platform.python_version()}")) is None
-    assert installed.first_unmet(declares("numpy", python="<3")) == "python<3"
+    assert interpreters.first_unmet(declares(python=f"=={platform.python_version()}")) is None
+    assert interpreters.first_unmet(declares("numpy", python="<3")) == "python<3"
 
 
 def test_what_is_here_needs_what_it_needs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -159,10 +159,10 @@ def test_what_is_here_needs_what_it_needs(tmp_path: Path, monkeypatch: pytest.Mo
         with zipfile.ZipFile(make_wheel(tmp_path, name, requires=requires)) as wheel:
             wheel.extractall(tmp_path / "site")
     monkeypatch.syspath_prepend(tmp_path / "site")
-    assert installed.first_unmet(declares("here5")) is None
-    assert installed.first_unmet(declares("here23")) is None
-    assert str(installed.first_unmet(declares("here23[more]"))).startswith("absent")
-    assert installed.first_unmet(declares("here6")) == "absent"
+    assert interpreters.first_unmet(declares("here5")) is None
+    assert interpreters.first_unmet(declares("here23")) is None
+    assert str(interpreters.first_unmet(declares("here23[more]"))).startswith("absent")
+    assert interpreters.first_unmet(declares("here6")) == "absent"
 
 
 def test_only_what_is_missing_makes_an_environment(tmp_path: Path) -> None:

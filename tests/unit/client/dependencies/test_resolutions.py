@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 
 from envhub_sandbox.dependencies import interpreters, packages, resolutions
-from envhub_sandbox.dependencies.builds.sources import Source, of_git
-from envhub_sandbox.dependencies.declared import parse_requirement
+from envhub_sandbox.dependencies.declared import Source, of_git, parse_requirement
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.dependencies.request import PackageRequest
 from envhub_sandbox.errors import RequirementError, ResolutionError

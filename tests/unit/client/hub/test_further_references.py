@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import ast
+from pathlib import Path
 
 import pytest
 
 from envhub_sandbox.errors import HubReferenceError
+from envhub_sandbox.hub import registered
 from envhub_sandbox.hub.git import address
+from envhub_sandbox.hub.listing import Snapshot
 from envhub_sandbox.hub.reference import HubRef, pinned
-from envhub_sandbox.hub.registered import reference
-from envhub_sandbox.hub.registered.entry import entry
+from envhub_sandbox.hub.registered import entry
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
 SITE = "https://github.com/org/repo"
@@ -113,10 +115,15 @@ def test_only_a_full_commit_is_pinned() -> None:
 
 def test_provenance_becomes_the_reference_again() -> None:
     """Of each kind of repository."""
-    assert pinned("git", SITE, COMMIT, "a.py") == f"git+{SITE}@{COMMIT}:a.py"
-    assert pinned("pypi", "x@1.0#X-v0", "pypi-00", "env.py") == "pypi:x@1.0#X-v0"
-    assert pinned("local", "/srv/env", "local-00", "a.py") == "/srv/env:a.py"
-    assert pinned("space", "org/repo", COMMIT, "env.py") == f"spaces/org/repo@{COMMIT}"
+    for text, kind, name, commit, path in (
+        (f"git+{SITE}@{COMMIT}:a.py", "git", SITE, COMMIT, "a.py"),
+        ("pypi:x@1.0#X-v0", "pypi", "x@1.0#X-v0", "pypi-00", "env.py"),
+        ("/srv/env:a.py", "local", "/srv/env", "local-00", "a.py"),
+        (f"spaces/org/repo@{COMMIT}", "space", "org/repo", COMMIT, "env.py"),
+        (f"models/org/repo@{COMMIT}", "model", "org/repo", COMMIT, "env.py"),
+    ):
+        assert pinned(kind, name, commit, path) == text
+        assert Snapshot(name, kind, commit, path, Path(), ()).reference == text
 
 
 def test_the_entry_says_what_the_reference_says() -> None:
@@ -129,4 +136,4 @@ def test_the_entry_says_what_the_reference_says() -> None:
         if isinstance(node, ast.Assign) and isinstance(node.targets[0], ast.Name)
     }
     assert (constants["DISTRIBUTION"], constants["ENV_ID"]) == ("gymnasium", "a.b:Ant-v5")
-    assert reference.requirement(HubRef.parse("pypi:x#Y-v0").parts) == "x"
+    assert registered.requirement(HubRef.parse("pypi:x#Y-v0").parts) == "x"

@@ -13,7 +13,7 @@ import pytest
 
 from envhub_sandbox.errors import SnapshotIntegrityError
 from envhub_sandbox.hub.git import commits
-from envhub_sandbox.hub.git.host import GitHost
+from envhub_sandbox.hub.git.commits import GitHost
 from envhub_sandbox.hub.listing import FileRecord, Repository
 
 HOST = GitHost("https://git.example")

@@ -7,8 +7,8 @@ from typing import Any
 
 import pytest
 
-from envhub_sandbox.hub import failures, grammar
-from envhub_sandbox.hub.failures import Kind
+from envhub_sandbox.hub import answers, grammar
+from envhub_sandbox.hub.answers import Kind
 from envhub_sandbox.hub.sources import toml
 
 
@@ -89,9 +89,9 @@ class Response:
         self.headers = {name.replace("_", "-"): value for name, value in headers.items()}
 
 
-def failed(error: BaseException, *secrets: str) -> failures.HubFailure:
+def failed(error: BaseException, *secrets: str) -> answers.HubFailure:
     """What an exception of the Hub's client means."""
-    return failures.explain(
+    return answers.explain(
         error,
         secrets,
         repo_type="space",
@@ -150,9 +150,9 @@ def test_a_secret_that_is_echoed_is_in_no_text() -> None:
     inner = ValueError("hf_secret", 3)
     outer = RuntimeError("with hf_secret")
     outer.__cause__, inner.__context__ = inner, outer  # a cycle ends, too
-    failures.conceal(outer, ("hf_secret",))
+    answers.conceal(outer, ("hf_secret",))
     assert (outer.args, inner.args) == (("with ***",), ("***", 3))
-    assert list(failures.chain(outer)) == [outer, inner]
+    assert list(answers.chain(outer)) == [outer, inner]
 
 
 def test_toml_is_read_within_bounds() -> None:

@@ -16,9 +16,8 @@ import pytest
 from envhub_sandbox.dependencies import bounds
 from envhub_sandbox.errors import SnapshotError, SnapshotIntegrityError
 from envhub_sandbox.hub import store as store
-from envhub_sandbox.hub.cache import cache_root, remove_tree
-from envhub_sandbox.hub.hashing import HashMismatch, copy_verified, digest_of
-from envhub_sandbox.hub.listing import FileRecord
+from envhub_sandbox.hub.listing import FileRecord, HashMismatch, copy_verified, digest_of
+from envhub_sandbox.system.folders import cache_root, remove_tree
 from tests.hub.stub_hub import git_blob_id
 
 CONTENT = {"env.py": b"print(1)\n", "pkg/deep/data.bin": b"\x00" * 3000, "empty": b""}

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from envhub_sandbox.dependencies import uv
-from envhub_sandbox.dependencies.locks import drift, lockfile, making, pylock
+from envhub_sandbox.dependencies.locks import lockfile, making, pylock
 from envhub_sandbox.dependencies.locks.fingerprint import fingerprint_of_spaces, fingerprint_of_task
 from envhub_sandbox.dependencies.locks.lockfile import LockFile, Runner, Spaces
 from envhub_sandbox.dependencies.locks.pylock import PylockPackage, Wheel
@@ -115,7 +115,7 @@ def test_a_lock_has_every_package_with_its_files(index: Index, tmp_path: Path) -
     assert pins == {**WORKERS, "wanted": "1.0"}
     assert lock.repository == lockfile.LOCAL
     assert set(lock.files) == {"env.py", "requirements.txt"}
-    assert drift.differences(lock, making.relisted(lock)) == []
+    assert making.differences(lock, making.relisted(lock)) == []
 
 
 def test_hashes_of_the_repository_hold_in_its_lock(index: Index, tmp_path: Path) -> None:
@@ -133,9 +133,9 @@ def test_a_file_that_was_replaced_on_the_index_is_told(index: Index, tmp_path: P
     make_wheel(index.folder, "wanted")
     lock = made(tmp_path / "repo", "wanted")
     make_wheel(index.folder, "wanted", tag="py2.py3-none-any")
-    assert drift.differences(lock, making.relisted(lock)) == []
+    assert making.differences(lock, making.relisted(lock)) == []
     make_wheel(index.folder, "wanted", files={"wanted/__init__.py": "evil = 1\n"})
-    [said] = drift.differences(lock, making.relisted(lock))
+    [said] = making.differences(lock, making.relisted(lock))
     assert said.startswith("package wanted==1.0: the file with SHA-256 ")
 
 
@@ -147,7 +147,7 @@ def test_upgrading_shows_what_differs(index: Index, tmp_path: Path) -> None:
     make_wheel(index.folder, "its-own")
     assert made(tmp_path / "repo", "wanted") == before
     after = made(tmp_path / "repo", "wanted", upgrade=True)
-    assert drift.differences(before, after) == [
+    assert making.differences(before, after) == [
         "package its-own: new, 1.0",
         "package wanted: 1.0 was locked, this is 2.0",
     ]
@@ -205,11 +205,11 @@ OTHER_BOX = gym.spaces.Box(-1, 2, (3,), np.float32)
 )
 def test_what_differs_is_said(now: LockFile, said: str) -> None:
     """Commit, file, package, Python, spaces; a line each, fit for a terminal."""
-    assert drift.differences(LOCK, LOCK) == []
-    found = drift.differences(LOCK, now)
+    assert making.differences(LOCK, LOCK) == []
+    found = making.differences(LOCK, now)
     assert said in found
     with pytest.raises(LockDriftError) as caught:
-        drift.refuse(found, "org/repo")
+        making.refuse(found, "org/repo")
     assert caught.value.drifts == tuple(found)
     assert isinstance(caught.value, EnvHubError)
     assert isinstance(caught.value, ValueError)
@@ -219,7 +219,7 @@ def test_what_differs_is_said(now: LockFile, said: str) -> None:
 def test_other_arguments_make_other_environments() -> None:
     """Spaces of other arguments are not held against those that were locked."""
     other = fingerprint_of_task("suite", 0, None, OTHER_BOX, gym.spaces.Discrete(2))
-    assert drift.differences(LOCK, changed(spaces=Spaces("{}", (other,)))) == []
+    assert making.differences(LOCK, changed(spaces=Spaces("{}", (other,)))) == []
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, SnapshotError
-from envhub_sandbox.sandboxes import remote_keys, upload
+from envhub_sandbox.sandboxes import remote_keys, remote_repository
 from envhub_worker.access import keys
 from envhub_worker.protocol.keys import key_text
 
@@ -79,13 +79,13 @@ def test_our_key_is_a_text_or_a_file(config: Path) -> None:
 
 def test_a_listing_names_each_file_once(tmp_path: Path) -> None:
     """By its path, sorted, with its size and hash, however many pieces it has."""
-    large = b"x" * (upload.PIECE_BYTES + 1)
+    large = b"x" * (remote_repository.PIECE_BYTES + 1)
     (tmp_path / "sub").mkdir()
     (tmp_path / "sub/b").write_bytes(large)
     (tmp_path / "a").write_bytes(b"")
-    found = upload.listing(tmp_path)
+    found = remote_repository.listing(tmp_path)
     assert [(one.path, one.size) for one in found] == [("a", 0), ("sub/b", len(large))]
     assert [one.sha256 for one in found] == [hashlib.sha256(x).digest() for x in (b"", large)]
     (tmp_path / "gone").symlink_to("nowhere")
     with pytest.raises(SnapshotError, match="cannot be read"):
-        upload.listing(tmp_path)
+        remote_repository.listing(tmp_path)

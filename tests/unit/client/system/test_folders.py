@@ -1,4 +1,4 @@
-"""Our folders have the modes that are meant, and are believed only where nobody else can write."""
+"""Our folders and files: their modes, that they are whole, and whom they are believed."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ from envhub_sandbox.factory.env_factory import ManifestCache
 from envhub_sandbox.hub import store as store
 from envhub_sandbox.hub.listing import FileRecord
 from envhub_sandbox.system import folders
+from envhub_sandbox.system.folders import write_whole_file
 from tests.hub.stub_hub import git_blob_id
 from tests.support import inside
 
@@ -239,3 +240,57 @@ def test_nobody_gets_at_a_snapshot_before_it_is_complete(snapshot_store: Path) -
     with umask(0):
         store.publish(made, (record,), copy, {})
     assert seen == [(0o666, 0o700)]
+
+
+def test_a_file_is_replaced_and_nothing_stays_beside_it(tmp_path: Path) -> None:
+    """With its mode, less what the umask takes."""
+    path = tmp_path / "file"
+    for data in (b"one", b"two"):
+        write_whole_file(path, data, durable=data == b"two")
+        assert path.read_bytes() == data
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+    assert os.listdir(tmp_path) == ["file"]
+
+
+def test_what_cannot_be_written_leaves_the_old_one(tmp_path: Path) -> None:
+    """And no half of the new one."""
+    path = tmp_path / "file"
+    path.mkdir()
+    with pytest.raises(OSError, match="director"):
+        write_whole_file(path, b"new")
+    assert os.listdir(tmp_path) == ["file"]
+
+
+def test_a_text_is_kept_and_recalled(tmp_path: Path) -> None:
+    """A folder that is open to others, a file that is no text and one that is absent are none."""
+    folder = tmp_path / "texts"
+    assert folders.recall(folder, "key") is None
+    folders.keep(folder, "key", "é")
+    assert folders.recall(folder, "key") == "é"
+    folder.chmod(0o777)
+    assert folders.recall(folder, "key") is None
+    folders.keep(folder, "key", "again")
+    assert folders.recall(folder, "key") == "again"
+    (folder / "key").write_bytes(b"\xff")
+    assert folders.recall(folder, "key") is None
+
+
+def test_what_cannot_be_kept_is_no_error(tmp_path: Path) -> None:
+    """A cache is a favour."""
+    (tmp_path / "file").write_text("")
+    folders.keep(tmp_path / "file", "key", "text")
+    assert (tmp_path / "file").read_text() == ""
+
+
+def test_a_draft_is_private_and_goes_unless_it_is_moved(tmp_path: Path) -> None:
+    """Also where an interrupt ends it."""
+    with pytest.raises(KeyboardInterrupt), folders.draft(tmp_path) as made:
+        interrupted(made)
+    assert list(tmp_path.iterdir()) == []
+
+
+def interrupted(made: Path) -> None:
+    """While it is filled."""
+    (made / "half").write_text("")
+    assert made.stat().st_mode & 0o777 == 0o700
+    raise KeyboardInterrupt

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from envhub_sandbox.hub.cache import remove_tree
+from envhub_sandbox.system.folders import remove_tree
 from envhub_sandbox.system.locks import held, sharers
 from envhub_worker.protocol.confinement import Confinement
 from envhub_worker.protocol.runtime import RECORD, Runtime

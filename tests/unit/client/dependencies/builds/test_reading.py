@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from envhub_sandbox.dependencies.builds import download, missing, project
+from envhub_sandbox.dependencies.builds import download, project
 from envhub_sandbox.errors import (
     IndexUnavailableError,
     PackageIntegrityError,
@@ -77,14 +77,14 @@ def test_what_is_not_taken(tmp_path: Path, text: str) -> None:
 )
 def test_what_was_missing_is_named(log: str, said: str) -> None:
     """With what to install."""
-    assert said in missing.advice(f"running build_ext\n{log}\n")
+    assert said in project.advice(f"running build_ext\n{log}\n")
 
 
 def test_nothing_is_guessed() -> None:
     """A file of its own that is missing is no program, and few programs come as wheels."""
-    assert missing.wheel_for("error: command 'swig' failed: No such file or directory") == "swig<5"
-    assert missing.wheel_for("error: command 'gcc' failed: No such file or directory") == ""
-    assert missing.advice("No such file or directory: 'README.md'\nSyntaxError") == ""
+    assert project.wheel_for("error: command 'swig' failed: No such file or directory") == "swig<5"
+    assert project.wheel_for("error: command 'gcc' failed: No such file or directory") == ""
+    assert project.advice("No such file or directory: 'README.md'\nSyntaxError") == ""
 
 
 def test_downloads_are_bounded_and_verified(

@@ -1,4 +1,4 @@
-"""Packages for a container: whether the image has them, and whether this machine's fit there."""
+"""Packages for a container: whether the image has them, or this machine's fit; and images."""
 
 from __future__ import annotations
 
@@ -6,12 +6,13 @@ from dataclasses import replace
 
 import pytest
 
-from envhub_sandbox.dependencies import installed, interpreters
+from envhub_sandbox.dependencies import interpreters
 from envhub_sandbox.dependencies.declared import parse_requirement
-from envhub_sandbox.dependencies.installed import InstalledPackage
+from envhub_sandbox.dependencies.interpreters import InstalledPackage
 from envhub_sandbox.dependencies.modules import Guess
 from envhub_sandbox.dependencies.request import PackageRequest
-from envhub_sandbox.errors import InterpreterUnavailableError
+from envhub_sandbox.dependencies.resolve import Lock
+from envhub_sandbox.errors import DependencyError, InterpreterUnavailableError
 from envhub_sandbox.sandboxes.docker import packages
 from envhub_sandbox.sandboxes.docker.packages import interpreter_fitting
 
@@ -45,7 +46,7 @@ def test_what_an_image_has_is_read_off_its_metadata(
     line: str, python: str, lacking: str | None
 ) -> None:
     """With the markers of the image's Python, and nothing of this one."""
-    assert installed.first_unmet(declares(line), THERE, python) == lacking
+    assert interpreters.first_unmet(declares(line), THERE, python) == lacking
 
 
 def test_what_it_imports_is_in_the_image_or_made(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -90,3 +91,51 @@ def test_the_images_python_is_the_one_that_there_is() -> None:
     ):
         with pytest.raises(InterpreterUnavailableError, match="the image has"):
             interpreter_fitting(NEWER, request)
+
+
+LOCK = Lock(
+    "minigrid==3.0.0 \\\n    --hash=sha256:aa \\\n    --hash=sha256:bb\nnumpy==2.1.0 \\\n"
+    "    --hash=sha256:cc\n"
+)
+
+
+def test_a_lock_names_its_packages() -> None:
+    """Without their hashes."""
+    assert LOCK.packages == ["minigrid==3.0.0", "numpy==2.1.0"]
+
+
+def test_the_tag_is_the_hash_of_all_that_an_image_is_made_of() -> None:
+    """Another base, another package or another library is another image."""
+    tags = {
+        packages.tag_for("org/repo", base, lock, system)
+        for base in ("sha256:1", "sha256:2")
+        for lock in (LOCK, Lock(LOCK.text + "x==1 \\\n"))
+        for system in ((), ("libgl1",))
+    }
+    assert len(tags) == 8
+    assert all(tag.startswith("envhub-worker-org-repo:") for tag in tags)
+
+
+@pytest.mark.parametrize("name", ["org/Repo.Name_1", "datasets/x/--y--", "../..", "Ünïcode/env"])
+def test_a_repositorys_name_makes_a_tag(name: str) -> None:
+    """Whatever it has in it."""
+    repository, _, tag = packages.tag_for(name, "sha256:1", LOCK, ()).partition(":")
+    assert set(repository) <= set("abcdefghijklmnopqrstuvwxyz0123456789-")
+    assert not repository.endswith("-")
+    assert len(tag) == 16
+
+
+def test_the_recipe_is_this_one() -> None:
+    """Wheels by their hashes, into an interpreter of their own; then nobody's again."""
+    recipe = packages.dockerfile("envhub-worker", LOCK, ["libgl1"])
+    assert recipe.startswith("FROM envhub-worker\nUSER root\nRUN apt-get update")
+    for words in ("--require-hashes", "--no-deps", "--only-binary :all:", "'*.pth'"):
+        assert words in recipe
+    assert recipe.endswith(f"LABEL dev.envhub.lock={LOCK.digest}\nUSER 65532:65532\n")
+
+
+@pytest.mark.parametrize("name", ["libgl1; reboot", "-o", "", "a b", "$(id)", "--allow-x"])
+def test_a_system_package_is_a_name(name: str) -> None:
+    """It stands in a shell's command line."""
+    with pytest.raises(DependencyError, match="Debian"):
+        packages.dockerfile("envhub-worker", LOCK, [name])

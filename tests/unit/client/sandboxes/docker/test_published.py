@@ -16,8 +16,7 @@ import pytest
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerStartupError
 from envhub_sandbox.sandboxes.docker import attestation, engines, published, run_arguments
 from envhub_sandbox.sandboxes.docker.engines import Engine
-from envhub_sandbox.sandboxes.docker.image import BuiltImageTarget
-from envhub_sandbox.sandboxes.docker.packages import ImageTarget
+from envhub_sandbox.sandboxes.docker.packages import BuiltImageTarget, ImageTarget
 from envhub_sandbox.sandboxes.docker.published import PublishedContainer
 from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
 from envhub_sandbox.settings.policy import Policy
@@ -197,7 +196,7 @@ def test_a_fork_does_not_keep_a_container(
 
 def test_an_engine_in_a_virtual_machine_says_what_that_has() -> None:
     """Other engines than this machine's have other processors; a pipe of Windows is here."""
-    assert published.seccomp_profile.profile("arm64")["architectures"] == ["SCMP_ARCH_AARCH64"]
+    assert published.seccomp_profile("arm64")["architectures"] == ["SCMP_ARCH_AARCH64"]
     with pytest.MonkeyPatch.context() as patch:
         for host, elsewhere in (("npipe:////./pipe/docker_engine", False), ("ssh://there", True)):
             patch.setenv("DOCKER_HOST", host)

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerStartupError
-from envhub_sandbox.sandboxes.docker import attestation, engines, run_arguments, seccomp_profile
+from envhub_sandbox.sandboxes.docker import attestation, engines, run_arguments
 from envhub_sandbox.sandboxes.docker.container import ContainerServer
 from envhub_sandbox.sandboxes.docker.engines import Engine
 from envhub_sandbox.sandboxes.docker.run_arguments import Container
@@ -244,7 +244,9 @@ def test_the_profile_permits_what_jails_may_call() -> None:
         if verdict not in (seccomp_policy.EPERM, seccomp_policy.ENOSYS)
     }
     outer = {
-        name for rule in seccomp_profile.profile("x86_64")["syscalls"] for name in rule["names"]
+        name
+        for rule in run_arguments.seccomp_profile("x86_64")["syscalls"]
+        for name in rule["names"]
     }
     assert len(inner) > 200
     assert inner <= outer
@@ -260,12 +262,12 @@ def test_the_profile_permits_what_lockdown_calls() -> None:
             words = path.read_text().split('number("') if path.exists() else []
             called |= {word.partition('"')[0] for word in words[1:]}
     assert {"landlock_create_ruleset", "open_tree", "seccomp"} <= called
-    assert called - tried <= seccomp_profile.ALLOWED
+    assert called - tried <= run_arguments.ALLOWED
 
 
 def test_the_profile_denies_what_reaches_the_kernels_innards() -> None:
     """And everything that it does not name."""
-    assert seccomp_profile.profile("aarch64")["defaultAction"] == "SCMP_ACT_ERRNO"
+    assert run_arguments.seccomp_profile("aarch64")["defaultAction"] == "SCMP_ACT_ERRNO"
     denied = """
         acct add_key bpf delete_module fanotify_init finit_module init_module io_uring_enter
         io_uring_setup ioperm iopl kcmp kexec_file_load kexec_load keyctl lookup_dcookie modify_ldt
@@ -273,22 +275,22 @@ def test_the_profile_denies_what_reaches_the_kernels_innards() -> None:
         process_vm_readv process_vm_writev ptrace quotactl reboot request_key setdomainname swapoff
         swapon syslog userfaultfd vhangup
     """
-    assert not set(denied.split()) & seccomp_profile.ALLOWED
+    assert not set(denied.split()) & run_arguments.ALLOWED
 
 
 def test_only_the_native_word_size_is_permitted() -> None:
     """The 32-bit calls have other numbers, which nothing here has looked at."""
-    assert seccomp_profile.profile("x86_64")["architectures"] == ["SCMP_ARCH_X86_64"]
+    assert run_arguments.seccomp_profile("x86_64")["architectures"] == ["SCMP_ARCH_X86_64"]
     with pytest.raises(SandboxUnavailableError, match="riscv64"):
-        seccomp_profile.profile("riscv64")
+        run_arguments.seccomp_profile("riscv64")
 
 
 def test_the_profile_for_ones_own_containers_is_the_same() -> None:
     """The file that the documents name, for either machine."""
     path = Path(__file__).resolve().parents[5] / "examples" / "deployment" / "seccomp.json"
-    architectures = sorted(seccomp_profile.ARCHITECTURES.values())
+    architectures = sorted(run_arguments.ARCHITECTURES.values())
     assert json.loads(path.read_text()) == {
-        **seccomp_profile.profile("x86_64"),
+        **run_arguments.seccomp_profile("x86_64"),
         "architectures": architectures,
     }
 

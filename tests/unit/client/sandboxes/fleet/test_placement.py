@@ -9,10 +9,9 @@ import pytest
 
 from envhub_sandbox.errors import PolicyError
 from envhub_sandbox.sandboxes.fleet import placement as module
+from envhub_sandbox.sandboxes.fleet.fleet import PlaceList
 from envhub_sandbox.sandboxes.fleet.member import Member
-from envhub_sandbox.sandboxes.fleet.place_list import PlaceList
-from envhub_sandbox.sandboxes.fleet.placement import Placement
-from envhub_sandbox.sandboxes.fleet.rooms import Room
+from envhub_sandbox.sandboxes.fleet.placement import Placement, Room
 from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.settings.policy import Policy
 from envhub_worker.protocol.runtime import Runtime
@@ -60,7 +59,7 @@ def _placement(names: list[str]) -> Placement:
     def resolve(place: Any) -> Sandbox:
         return known[place]
 
-    return Placement(PlaceList(names), resolve, lambda member: Runtime(""))
+    return Placement(PlaceList(names).read, resolve, lambda member: Runtime(""))
 
 
 def _opened(names: list[str]) -> Placement:
@@ -202,11 +201,11 @@ def test_a_place_that_is_wrong_later_is_left_out(tmp_path: Path, rooms: dict[str
 
     path = tmp_path / "places"
     path.write_text("b\n")
-    made = Placement(PlaceList(path), resolve, lambda member: Runtime(""))
+    made = Placement(PlaceList(path).read, resolve, lambda member: Runtime(""))
     made.members()
     path.write_text("a\ntcp://10.0.\nb\n")
     assert [member.name for member in made.members()] == ["a", "b"]
     path.write_text("tcp://10.0.\n")
     assert [member.name for member in made.members()] == ["a", "b"], "the last ones hold"
     with pytest.raises(PolicyError, match="10"):
-        Placement(PlaceList(path), resolve, lambda member: Runtime("")).members()
+        Placement(PlaceList(path).read, resolve, lambda member: Runtime("")).members()

@@ -9,8 +9,7 @@ import pytest
 from envhub_sandbox.dependencies.packages import PackageSet
 from envhub_sandbox.dependencies.request import PackageRequest
 from envhub_sandbox.errors import DependencyError, PolicyError
-from envhub_sandbox.sandboxes.fleet.member import Member
-from envhub_sandbox.sandboxes.fleet.packages import FleetPackages
+from envhub_sandbox.sandboxes.fleet.member import FleetPackages, Member
 from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.transport.tcp import UnreachableError
 from envhub_worker.protocol.runtime import Runtime

@@ -1,12 +1,15 @@
-"""References to registered environments: ``pypi:NAME[EXTRA][@VERSION]#ID``.
+"""Environments that a package registers with Gymnasium: ``pypi:NAME[EXTRA][@VERSION]#ID``.
 
 ``read`` and ``check`` are to these what those of ``hub.grammar`` are to references of the Hub. The
-name of the repository is ``NAME[EXTRA]#ID``, and its revision the version.
+name of the repository is ``NAME[EXTRA]#ID``, and its revision the version. Its entry file is
+generated and runs in a jail, as any repository's: what is in the package is looked at there.
+``registered_env.txt`` is its text but for what the reference says.
 """
 
 from __future__ import annotations
 
 import re
+from pathlib import Path
 
 from envhub_sandbox.hub.grammar import Parts, Wrong, join
 
@@ -52,3 +55,21 @@ def requirement(parts: Parts) -> str:
     """What its package is asked for as."""
     package = parts.repo_id.partition("#")[0]
     return package if parts.revision is None else f"{package}=={parts.revision}"
+
+
+_TEMPLATE = Path(__file__).with_name("registered_env.txt")
+
+
+def entry(parts: Parts) -> bytes:
+    """The bytes of the file; the same for the same reference."""
+    package, _, env_id = parts.repo_id.partition("#")
+    text = _TEMPLATE.read_text("utf-8")
+    filled = {
+        "REQUIREMENT": ascii(requirement(parts)).replace("'", '"'),
+        "DISTRIBUTION = None": f"DISTRIBUTION = {package.partition('[')[0]!r}",
+        "ENV_ID = None": f"ENV_ID = {env_id!r}",
+    }
+    for place, value in filled.items():
+        assert text.count(place) == 1
+        text = text.replace(place, value)
+    return text.encode()

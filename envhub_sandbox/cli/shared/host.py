@@ -1,11 +1,34 @@
-"""Memory that may still be taken here: of the machine, and of the control groups that we are in."""
+"""What there is on this machine: versions of everything that matters, and memory that is free."""
 
 from __future__ import annotations
 
 import contextlib
+import platform
 import re
 from collections.abc import Iterator
 from pathlib import Path, PurePosixPath
+
+_PACKAGES = ("gymnasium", "numpy", "huggingface_hub", "pyzmq", "msgpack", "imageio-ffmpeg")
+
+
+def versions() -> dict[str, str | int | None]:
+    """Ours, and of what we stand on; None for what is not installed."""
+    from envhub_sandbox import __version__
+    from envhub_worker.protocol.messages import VERSION
+
+    own: dict[str, str | int | None] = {"envhub-sandbox": __version__, "protocol": VERSION}
+    own |= {"python": platform.python_version(), "platform": platform.platform()}
+    return own | {name: _installed(name) for name in _PACKAGES}
+
+
+def _installed(name: str) -> str | None:
+    from importlib import metadata  # brings the standard library's e-mail
+
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return None
+
 
 _V1, _V2 = "memory", ""
 _FILES = (

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from envhub_sandbox.dependencies.builds import git
+from envhub_sandbox.dependencies.builds import download
 from envhub_sandbox.errors import (
     IndexUnavailableError,
     PackageIntegrityError,
@@ -53,32 +53,32 @@ def target(tmp_path: Path) -> Path:
 
 def test_the_files_of_a_commit(url: str, repository: Path, target: Path) -> None:
     """By a tag, which means its commit; not those of the newest."""
-    found = git.resolve(url, "v1")
+    found = download.resolve(url, "v1")
     assert found == run_git(repository, "rev-parse", "v1^{commit}")
-    git.check_out(url, found, target, print)
+    download.check_out(url, found, target, print)
     files = {str(f.relative_to(target)): f.read_text() for f in target.rglob("*") if f.is_file()}
     assert files == {"setup.py": "1", "a/b.py": "2"}
     newest = run_git(repository, "rev-parse", "main")
-    assert git.resolve(url, "main") == git.resolve(url, "HEAD") == newest
+    assert download.resolve(url, "main") == download.resolve(url, "HEAD") == newest
 
 
 def test_a_full_commit_is_not_asked_for() -> None:
     """It means itself."""
-    assert git.resolve("https://nowhere.invalid/x", "a" * 40) == "a" * 40
+    assert download.resolve("https://nowhere.invalid/x", "a" * 40) == "a" * 40
 
 
 @pytest.mark.parametrize("revision", ["v2", "1234567", "main~1"])
 def test_what_is_not_there(url: str, revision: str) -> None:
     """The error says what to write."""
     with pytest.raises((IndexUnavailableError, RequirementError), match=r"40 digits|not a commit"):
-        git.resolve(url, revision)
+        download.resolve(url, revision)
 
 
 @pytest.mark.parametrize("revision", ["--upload-pack=x", "a b", "", "a..b", "a@{0}", "-x"])
 def test_a_name_that_is_an_option(url: str, revision: str) -> None:
     """Git would take it for one, or for an expression."""
     with pytest.raises(RequirementError):
-        git.resolve(url, revision)
+        download.resolve(url, revision)
 
 
 @pytest.mark.parametrize(
@@ -98,7 +98,7 @@ def test_a_name_that_is_an_option(url: str, revision: str) -> None:
 def test_only_https_without_a_login(url: str, target: Path) -> None:
     """Nothing else reaches git."""
     with pytest.raises(RequirementError, match="not a supported address"):
-        git.check_out(url, "a" * 40, target, print)
+        download.check_out(url, "a" * 40, target, print)
 
 
 def test_links_and_submodules_are_left_out(url: str, repository: Path, target: Path) -> None:
@@ -109,7 +109,7 @@ def test_links_and_submodules_are_left_out(url: str, repository: Path, target: P
     run_git(repository, "add", "link")
     run_git(repository, "commit", "--quiet", "--message=x")
     said: list[str] = []
-    git.check_out(url, run_git(repository, "rev-parse", "HEAD"), target, said.append)
+    download.check_out(url, run_git(repository, "rev-parse", "HEAD"), target, said.append)
     assert sorted(path.name for path in target.iterdir()) == ["a", "setup.py"]
     assert len(said) == 2
     assert "link is a link or a submodule" in "".join(said)
@@ -119,7 +119,7 @@ def test_filters_and_attributes_do_nothing(url: str, repository: Path, target: P
     """The bytes are those of the commit, whatever its attributes ask for."""
     (repository / ".gitattributes").write_text("* export-ignore\n*.py filter=x text eol=crlf\n")
     (repository / "setup.py").write_bytes(b"$Format:%H$\n")
-    git.check_out(url, commit(repository), target, print)
+    download.check_out(url, commit(repository), target, print)
     assert (target / "setup.py").read_bytes() == b"$Format:%H$\n"
 
 
@@ -131,7 +131,7 @@ def test_settings_of_the_user_do_nothing(
     settings = tmp_path / "config"
     settings.write_text(f'[credential]\nhelper = "!touch {ran};"\n[url "file:///"]\ninsteadOf = h')
     monkeypatch.setenv("GIT_CONFIG_GLOBAL", str(settings))
-    git.check_out(url, run_git(repository, "rev-parse", "HEAD"), target, print)
+    download.check_out(url, run_git(repository, "rev-parse", "HEAD"), target, print)
     assert (target / "setup.py").read_text() == "3"
     assert not ran.exists()
 
@@ -144,7 +144,7 @@ def test_a_name_that_leads_out(url: str, repository: Path, target: Path) -> None
     bad = run_git(repository, "commit-tree", tree, "-m", "x")
     run_git(repository, "branch", "bad", bad)
     with pytest.raises(PackageIntegrityError, match="backslash"):
-        git.check_out(url, bad, target, print)
+        download.check_out(url, bad, target, print)
     assert not list(target.iterdir())
 
 
@@ -152,7 +152,7 @@ def test_bounds(url: str, repository: Path, target: Path, monkeypatch: pytest.Mo
     """Their number before they are read."""
     monkeypatch.setattr(commits, "MAX_FILES", 1)
     with pytest.raises(PackagesTooLargeError, match="more than 1 files"):
-        git.check_out(url, run_git(repository, "rev-parse", "HEAD"), target, print)
+        download.check_out(url, run_git(repository, "rev-parse", "HEAD"), target, print)
 
 
 def test_trees_that_hold_each_other(
@@ -169,7 +169,7 @@ def test_trees_that_hold_each_other(
     tracemalloc.start()
     try:
         with pytest.raises(PackagesTooLargeError, match="files"):
-            git.check_out(url, bomb, target, print)
+            download.check_out(url, bomb, target, print)
         assert tracemalloc.get_traced_memory()[1] < 6 << 20
         listed = run_git(repository, "ls-tree", "-r", "-l", bomb)
         assert tracemalloc.get_traced_memory()[1] > 12 << 20, "the control failed: it is no bomb"

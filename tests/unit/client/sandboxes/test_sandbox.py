@@ -14,7 +14,7 @@ from envhub_sandbox.errors import (
     WorkerStartupError,
     WorkerTimeoutError,
 )
-from envhub_sandbox.sandboxes.fleet.refusals import may_go_elsewhere, worst_of
+from envhub_sandbox.sandboxes.sandbox import may_go_elsewhere, worst_of
 from envhub_sandbox.transport.tcp import UnreachableError
 
 BUSY = ServerBusyError("a: no room")

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from envhub_sandbox.cli.shared.memory import free_memory_bytes
+from envhub_sandbox.cli.shared.host import free_memory_bytes
 
 _MIB = 1 << 20
 _NO_LIMIT = str((1 << 63) - 4096)

@@ -8,7 +8,7 @@ import sys
 
 import pytest
 
-from envhub_sandbox.system import log, progress
+from envhub_sandbox.system import log
 
 
 def test_loggers_are_ours_and_silent() -> None:
@@ -23,16 +23,16 @@ def test_each_line_is_logged_and_shown(caplog: pytest.LogCaptureFixture) -> None
     """By whoever has the terminal, the latest first, in a line that fits."""
     outer, inner = list[str](), list[str]()
     with caplog.at_level(logging.INFO, log.DEPENDENCIES.name):
-        with progress.progress_shown_by(outer.append):
+        with log.progress_shown_by(outer.append):
             with (
-                progress.progress_shown_by(inner.append),
-                progress.progress_shown("org/repo") as tell,
+                log.progress_shown_by(inner.append),
+                log.progress_shown("org/repo") as tell,
             ):
                 tell("resolving")
                 tell("x" * 300)
-            with progress.progress_shown("org/repo") as tell:
+            with log.progress_shown("org/repo") as tell:
                 tell("installing")
-        with progress.progress_shown("org/repo") as tell:
+        with log.progress_shown("org/repo") as tell:
             tell("for nobody")
     assert inner[0] == "org/repo: resolving"
     assert len(inner[1]) == 100
@@ -54,6 +54,6 @@ def test_only_a_terminal_is_written_to(
     for name, value in variables.items():
         monkeypatch.setenv(name, value)
     monkeypatch.setattr(sys, "stderr", Terminal())
-    with progress.progress_shown("org/repo") as tell:
+    with log.progress_shown("org/repo") as tell:
         tell("resolving")
     assert sys.stderr.getvalue() == ""  # type: ignore[attr-defined]

@@ -17,7 +17,7 @@ from envhub_sandbox.errors import (
     RemoteProtocolError,
     WorkerTimeoutError,
 )
-from envhub_sandbox.sandboxes.remote_packages import ServerPackages, order_of, request_packages
+from envhub_sandbox.sandboxes.remote_repository import ServerPackages, order_of, request_packages
 from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_worker.protocol import messages as m

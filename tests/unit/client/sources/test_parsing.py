@@ -12,8 +12,8 @@ from packaging.requirements import Requirement
 
 from envhub_sandbox.check.static import undeclared
 from envhub_sandbox.hub.snapshot import Snapshot, local
-from envhub_sandbox.hub.sources import imports as source
 from envhub_sandbox.hub.sources import parser, parsing
+from envhub_sandbox.hub.sources import parsing as source
 from tests.support.repositories import write_repository
 
 _ENTRY = """

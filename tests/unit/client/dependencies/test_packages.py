@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from envhub_sandbox.dependencies import interpreters
-from envhub_sandbox.dependencies.locks import lockfile, use
+from envhub_sandbox.dependencies import interpreters, packages
+from envhub_sandbox.dependencies.locks import lockfile
 from envhub_sandbox.dependencies.locks.fingerprint import fingerprint_of_task
 from envhub_sandbox.dependencies.locks.lockfile import LockFile, Runner, Spaces
 from envhub_sandbox.dependencies.locks.pylock import PylockPackage, Wheel
@@ -51,15 +51,15 @@ def test_nothing_else_may_choose_packages(snapshot: Snapshot, tmp_path: Path) ->
     path = tmp_path / "pylock.repo.toml"
     lock = locked(snapshot, packages=(PylockPackage("one", "1.0", (Wheel("a" * 64),)),))
     lockfile.write(lock, path)
-    assert use.opened(path, "process", None, "auto") == lock
+    assert packages.opened_lock(path, "process", None, "auto") == lock
     for given in (("process", "3.12", "auto"), ("process", None, "none"), ("process", None, {})):
         with pytest.raises(PolicyError, match="has the packages already"):
-            use.opened(path, *given)
+            packages.opened_lock(path, *given)
     for place in ("docker", "tcp://host:1", ["process"]):
         with pytest.raises(PolicyError, match="lock is for sandbox='process'"):
-            use.opened(path, place, None, "auto")
+            packages.opened_lock(path, place, None, "auto")
     with pytest.raises(LockError):
-        use.opened(tmp_path / "absent.toml", "process", None, "auto")
+        packages.opened_lock(tmp_path / "absent.toml", "process", None, "auto")
 
 
 @pytest.mark.parametrize(
@@ -75,7 +75,7 @@ def test_what_has_drifted_gets_no_packages(
 ) -> None:
     """The repository is named, and nothing is installed."""
     with pytest.raises(LockDriftError, match=said) as caught:
-        use.provided(snapshot, locked(snapshot, **changes))
+        packages.locked_packages(snapshot, locked(snapshot, **changes))
     assert snapshot.label in str(caught.value)
 
 
@@ -88,12 +88,12 @@ def test_spaces_are_held_against_the_lock_for_the_same_arguments(snapshot: Snaps
 
     def check(task: Any, given: dict[str, Any], config: object = None) -> None:
         lock = locked(snapshot, spaces=Spaces(arguments, (task,)))
-        use.checker(lock, "org/repo", given, config)(MANIFEST)
+        packages.lock_checker(lock, "org/repo", given, config)(MANIFEST)
 
     check(same, {"size": 8})
     check(other, {"size": 9})
     check(other, {"size": 8}, config={"a": 1})
     with pytest.raises(LockDriftError, match="actions were"):
         check(other, {"size": 8})
-    use.checker(None, "org/repo", {}, None)(MANIFEST)
-    use.checker(locked(snapshot), "org/repo", {}, None)(MANIFEST)
+    packages.lock_checker(None, "org/repo", {}, None)(MANIFEST)
+    packages.lock_checker(locked(snapshot), "org/repo", {}, None)(MANIFEST)

@@ -1,1 +1,0 @@
-"""``envhub init``: the command, and the files that it writes."""
