@@ -14,8 +14,6 @@ from __future__ import annotations
 import struct
 from types import TracebackType
 
-from envhub_worker.protocol.codec.inert import one_line
-
 
 class EnvHubError(Exception):
     """Base of every error of this project.
@@ -105,6 +103,9 @@ def blamed(error: BaseException) -> RemoteProtocolError:
     """The error to raise for it. Trust: its text may hold the peer's own."""
     if isinstance(error, MemoryError):
         return MessageTooLargeError("there is not enough memory for the peer's message")
+    # it brings inspect, and a server starts its zygote before that
+    from envhub_worker.protocol.codec.inert import one_line
+
     try:
         text = one_line(str(error), _MAX_CHARS)
     except Exception:  # a text is made of values, and these are the peer's
