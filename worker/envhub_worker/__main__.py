@@ -14,7 +14,7 @@
 - in a container: ``F`` is where the socket that takes descriptors shall lie, in a folder that is
   shared with the client; ``D`` need not be. ``D`` is made if it is missing. ``--announce`` prints
   one line of JSON once the endpoint is bound: what holds around this process
-  (``protocol/messages/surroundings.py``).
+  (``protocol/confinement.py``).
 - ``--ahead`` starts a zygote at once, in the interpreter ``X`` and for the packages ``Y``, by
   default this interpreter with its own, for the first jail.
 - environment: nothing is read from it but what Python itself needs.
