@@ -15,14 +15,15 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-import secrets
 import signal
-import subprocess
 import sys
 import unicodedata
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    import subprocess
 
 IS_LINUX: bool = sys.platform == "linux"
 IS_WINDOWS: bool = sys.platform == "win32"
@@ -83,6 +84,8 @@ def own_group() -> dict[str, Any]:
     """For ``subprocess.Popen``: a process to which a terminal sends no Ctrl-C."""
     how: dict[str, Any] = {"start_new_session": True}
     if sys.platform == "win32":
+        import subprocess  # for Windows only: every command would pay for it
+
         how = {"creationflags": subprocess.CREATE_NEW_PROCESS_GROUP}
     return how
 
@@ -146,7 +149,7 @@ def ignores_case(folder: Path) -> bool:
     Found out with a file of ours, for a platform has file systems of both kinds.
     Raises ``OSError``: the folder cannot be written.
     """
-    probe = folder / f".envhub-case-{secrets.token_hex(4)}"
+    probe = folder / f".envhub-case-{os.urandom(4).hex()}"
     os.close(os.open(probe, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600))
     try:
         return os.path.lexists(probe.with_name(probe.name.upper()))

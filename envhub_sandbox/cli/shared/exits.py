@@ -12,9 +12,8 @@ from enum import IntEnum
 
 import typer
 
-from envhub_sandbox import errors
 from envhub_sandbox.cli.shared.console import safe_text, say
-from envhub_sandbox.errors import EnvHubError
+from envhub_worker.protocol.errors import EnvHubError
 from envhub_worker.protocol.text import quoted
 
 _TAIL_LINES = 10
@@ -50,21 +49,6 @@ class Exit(IntEnum):
 
 EXIT_CODES = f"Exit codes: {'; '.join(f'{int(one)} {one.meaning}' for one in Exit)}."
 
-_CODES: tuple[tuple[type[EnvHubError], Exit], ...] = (
-    (errors.HubReferenceError, Exit.USAGE),
-    (errors.PolicyError, Exit.USAGE),
-    (errors.BundleError, Exit.USAGE),
-    (errors.LockDriftError, Exit.DIFFERENT),
-    (errors.LockError, Exit.USAGE),
-    (errors.SnapshotError, Exit.SNAPSHOT),
-    (errors.LoadError, Exit.LOAD),
-    (errors.DependencyError, Exit.LOAD),
-    (errors.WorkerError, Exit.WORKER),
-    (errors.ProtocolError, Exit.WORKER),
-    (errors.SandboxUnavailableError, Exit.SANDBOX),
-)
-
-
 class UsageError(EnvHubError):
     """What was asked for cannot be; the text says what to ask for instead."""
 
@@ -79,11 +63,30 @@ def code_for(error: BaseException) -> Exit:
         return Exit.INTERRUPTED
     if not isinstance(error, EnvHubError):
         return Exit.USAGE if _is_full(error) else Exit.BUG
-    from envhub_sandbox.check.play.plays import VideoError  # numpy, which only a failure may cost
+    codes = _codes()
+    return next((code for kind, code in codes if isinstance(error, kind)), Exit.ENVIRONMENT)
 
-    if isinstance(error, (UsageError, VideoError)):
-        return Exit.USAGE
-    return next((code for kind, code in _CODES if isinstance(error, kind)), Exit.ENVIRONMENT)
+
+def _codes() -> tuple[tuple[type[EnvHubError], Exit], ...]:
+    # imported here: only a failure pays for multiprocessing and numpy
+    from envhub_sandbox import errors
+    from envhub_sandbox.check.play.plays import VideoError
+
+    return (
+        (UsageError, Exit.USAGE),
+        (VideoError, Exit.USAGE),
+        (errors.HubReferenceError, Exit.USAGE),
+        (errors.PolicyError, Exit.USAGE),
+        (errors.BundleError, Exit.USAGE),
+        (errors.LockDriftError, Exit.DIFFERENT),  # before the error of which it is one
+        (errors.LockError, Exit.USAGE),
+        (errors.SnapshotError, Exit.SNAPSHOT),
+        (errors.LoadError, Exit.LOAD),
+        (errors.DependencyError, Exit.LOAD),
+        (errors.WorkerError, Exit.WORKER),
+        (errors.ProtocolError, Exit.WORKER),
+        (errors.SandboxUnavailableError, Exit.SANDBOX),
+    )
 
 
 def describe(error: BaseException) -> str:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import os
 import socket
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from time import monotonic
 from typing import Any
@@ -129,6 +129,19 @@ class Fleet(Sandbox):
     places: str | os.PathLike[str] | Sequence[str | Sandbox]
     remote: Mapping[str, Any] = field(default_factory=dict, repr=False)
     name = "fleet"
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.places, (str, os.PathLike, Sequence)):
+            raise PolicyError(
+                f"a fleet's places are {self.places!r}; they are a list of places, a file with one "
+                "on each line, or dns://HOST:PORT"
+            )
+        known = {one.name for one in fields(RemoteSandbox) if one.init} - {"endpoint"}
+        if unknown := sorted(set(self.remote) - known):
+            raise PolicyError(
+                f"a fleet's remote has {', '.join(map(repr, unknown))}; RemoteSandbox takes "
+                f"{', '.join(sorted(known))}"
+            )
 
     def __getstate__(self) -> dict[str, Any]:
         """No secret key is in a pickle: see ``RemoteSandbox``."""

@@ -103,7 +103,10 @@ class InFlight:
         count = len(self._worker_of)
         if env_ids is None:
             return Rows(list(range(count)), list(range(len(self._queues))), None)
-        ids = np.asarray(env_ids)
+        try:
+            ids = np.asarray(env_ids)
+        except ValueError:  # rows of several lengths
+            ids = np.empty(0)
         if ids.ndim != 1 or not ids.size or ids.dtype.kind not in "iu":
             raise ActionError(f"env_ids is {env_ids!r}; it takes a list such as [0, 3]")
         named: list[int] = ids.tolist()

@@ -49,6 +49,21 @@ def test_a_list_that_names_itself_is_no_place(tmp_path: Path) -> None:
     assert [seat.address for seat in opened.workers(None)] == ["tcp://a:1", "tcp://b:1"]
 
 
+@pytest.mark.parametrize(
+    ("places", "remote", "said"),
+    [
+        (None, {}, "places are None"),
+        (3, {}, "places are 3"),
+        (["tcp://a:1"], {"server": "x"}, "'server'.*server_key"),
+        (["tcp://a:1"], {"endpoint": "tcp://b:1"}, "'endpoint'"),
+    ],
+)
+def test_what_is_no_fleet_says_what_is_one(places: Any, remote: Any, said: str) -> None:
+    """When it is made, and before anything is started."""
+    with pytest.raises(PolicyError, match=said):
+        Fleet(places, remote)
+
+
 def test_a_secret_key_is_in_copies_and_in_no_pickle() -> None:
     """A copy is of this process, as that of a RemoteSandbox is."""
     pair = keys.generate()

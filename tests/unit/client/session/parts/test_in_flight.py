@@ -94,7 +94,7 @@ def test_ids_are_read_as_they_are_meant(flight: InFlight) -> None:
     """In any order, which is kept; each once, and each one that there is."""
     assert flight.rows(None) == ([0, 1], [0, 1], None)
     assert flight.rows(np.array([1, 0])) == ([1, 0], [0, 1], [1, 0])
-    for wrong in ([2], [-1], [0, 0], [], [[0]], [0.5], 1, ["0"]):
+    for wrong in ([2], [-1], [0, 0], [], [[0]], [[0], [0, 1]], [0.5], 1, ["0"]):
         with pytest.raises(ActionError, match="env_ids"):
             flight.rows(wrong)
 
