@@ -48,6 +48,10 @@ with_summary() {
   } >"$CI_WORK/$name.summary"
 }
 
+# The tests of what confines, and of what is confined and installed: for these it matters who runs them.
+differs_by_user=(tests/attacks/{files,kernel,network,packages,processes,resources}
+  tests/integration/{confinement,lifecycle,loading,packages})
+
 # processes: for tests that start much and wait for it: half as many again as there are cores, which
 # one process each leaves idle for a third of the time. Not beyond eight, as in ./test.
 processes() {

@@ -4,8 +4,8 @@
 # there is skipped. What others run is not repeated: root's second command leaves out the unit tests,
 # which root runs in "tests", "oldest" and "newest", with Debian's interpreter and with pyenv's, and what
 # is marked as the same for users; what jails make of root's own interpreter, which no other user may
-# read, is in the rest. The plain user's leaves out the attacks and the integration tests that the step
-# "user" runs whole, with the same interpreter, and what is marked.
+# read, is in the rest. The plain user's leaves out what the step "user" runs whole, with the same
+# interpreter, and what is marked.
 set -euo pipefail
 . "$(dirname "${BASH_SOURCE[0]}")/../lib.sh"
 unset PYTHON "${!ENVHUB_@}"
@@ -33,10 +33,8 @@ if [ "$(id -u)" != 0 ]; then
   exit 0
 fi
 # both side by side: they are two users, and much of an installation is waiting
-elsewhere=(tests/integration \
-  tests/attacks/{files,kernel,network,output,packages,processes,resources,runner})
 (newcomer readme-user bash "$CI_STEPS/../as-user.sh" 0 \
-  env "PYTEST_ADDOPTS=--differs-by users ${elsewhere[*]/#/--ignore=}") >"$CI_WORK/readme-user.out" 2>&1 &
+  env "PYTEST_ADDOPTS=--differs-by users ${differs_by_user[*]/#/--ignore=}") >"$CI_WORK/readme-user.out" 2>&1 &
 user=$!
 (newcomer readme env ENVHUB_CACHE="$CI_WORK/readme-cache" \
   PYTEST_ADDOPTS="--differs-by users --ignore=tests/unit") &

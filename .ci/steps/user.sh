@@ -12,11 +12,9 @@ export ENVHUB_CI=1 ENVHUB_CI_WITHOUT_CGROUPS=1
 unset ENVHUB_TEST_DIR  # each part has its own
 export PYTHON=/usr/bin/python3
 
-# What is marked as the same for users has been run. What comes out of shared memory and what the client
-# makes of a worker's answers does not depend on who runs it either; the plain user of the step "readme"
-# runs the short form of these, and the unit tests.
-elsewhere=(--differs-by users --ignore=tests/attacks/client)
-elsewhere+=(--ignore=tests/attacks/protocol/test_{decoder_fuzz,slabs}.py)
+# What is marked as the same for users has been run. What the client makes of a worker's answers, and what
+# commands print, does not depend on who runs it either; the plain user of the step "readme" runs the short
+# form of these, and the unit tests.
 
 # part NUMBER ARGUMENT...: these tests, by one process of a user of their own: some limits count what a
 # user runs, and two processes would count each other's. What the step "tests" installed serves here
@@ -29,27 +27,29 @@ part() {
     cp -R "$made/checkout" "$CI_WORK/user-$number"
     cd "$CI_WORK/user-$number"
     with_summary "user-$number" "${again[@]}" "$made/venv/bin/python" -m pytest -n 1 \
-      "${elsewhere[@]}" "$@"
+      --differs-by users "$@"
   else
     cp -R . "$CI_WORK/user-$number"
     cd "$CI_WORK/user-$number"
     export ENVHUB_TEST_RUNNER="${again[*]}"
-    with_summary "user-$number" ./test -n 1 "${elsewhere[@]}" "$@"
+    with_summary "user-$number" ./test -n 1 --differs-by users "$@"
   fi
 }
 
-# The attacks by folder: each is in one part, in the second one if its folder is new. More
-# parts than a small machine has cores, as these tests wait for a third of their time. In the
+# More parts than a small machine has cores, as these tests wait for a third of their time. In the
 # background: what is tested by && or || goes on after an error.
 running=()
 begin() {
   (part "$@") >"$CI_WORK/user-$1.out" 2>&1 &
   running+=($!)
 }
-begin 1 tests/integration
-third=(tests/attacks/{files,kernel,network,packages,resources})
-begin 2 "${third[@]/#/--ignore=}" tests/attacks
-begin 3 "${third[@]}"
+for number in 0 1 2; do
+  of_part=()
+  for at in "${!differs_by_user[@]}"; do
+    [ $((at % 3)) != $number ] || of_part+=("${differs_by_user[at]}")
+  done
+  begin $((number + 1)) "${of_part[@]}"
+done
 failed=0
 for one in "${!running[@]}"; do
   wait "${running[one]}" || failed=1
