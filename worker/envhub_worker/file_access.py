@@ -68,7 +68,7 @@ def why_file_unwritable(error: BaseException, root: str) -> str:
         )
     return (
         f"{path} is in {place}, which is read-only in this jail. Write to tempfile.mkdtemp(), or "
-        'use the profile "strict" on Linux 5.11 or later, where a jail writes to its own copy of '
+        'use profile "strict" on Linux 5.11 or later, where a jail writes to its own copy of '
         "the repository and of its packages (dependencies=); `envhub doctor` says what this host "
         "lacks"
     )

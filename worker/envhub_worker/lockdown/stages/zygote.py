@@ -162,7 +162,7 @@ def _check_interpreter() -> None:
                 "unprivileged-user",
                 f"root's jails run as another user, who may not read {path}",
                 "Use an interpreter that all users may read (with umask 077, run 'umask 022' "
-                'before you install it), the profile "strict", or start as a plain user.',
+                'before you install it), profile "strict", or start as a plain user.',
             )
 
 
