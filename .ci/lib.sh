@@ -98,7 +98,8 @@ smoke() {
   shift 2
   built=$(wheel)
   make_venv "$python" "$CI_WORK/$name"
-  local install=("$CI_WORK/$name/bin/uv" pip install --quiet --python "$CI_WORK/$name/bin/python")
+  local install=("$CI_WORK/$name/bin/uv" pip install --quiet --compile-bytecode)
+  install+=(--python "$CI_WORK/$name/bin/python")
   "${install[@]}" "$@" "$built"
   "${install[@]}" --group test
   "$CI_WORK/$name/bin/uv" pip list --python "$CI_WORK/$name/bin/python" --format freeze |

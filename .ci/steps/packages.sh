@@ -7,6 +7,7 @@ built=$(wheel)
 python=$(find_python 3.11 || command -v python3)
 [ "$(id -u)" != 0 ] || [ ! -x /usr/bin/python3 ] || python=/usr/bin/python3
 make_venv "$python" "$CI_WORK/packages"
-"$CI_WORK/packages/bin/uv" pip install --quiet --python "$CI_WORK/packages/bin/python" "$built"
+"$CI_WORK/packages/bin/uv" pip install --quiet --compile-bytecode \
+  --python "$CI_WORK/packages/bin/python" "$built"
 "$CI_WORK/packages/bin/python" -m benchmarks.reach --quick --client "$CI_WORK/packages/bin/python" \
   --results "$CI_WORK/reach.json"
