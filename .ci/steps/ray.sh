@@ -7,7 +7,7 @@ python=$(find_python 3.11 || command -v python3)
 [ "$(id -u)" != 0 ] || [ ! -x /usr/bin/python3 ] || python=/usr/bin/python3
 built=$(wheel)
 make_venv "$python" "$CI_WORK/ray"
-install=("$CI_WORK/ray/bin/uv" pip install --quiet --python "$CI_WORK/ray/bin/python")
+install=("$CI_WORK/ray/bin/uv" pip install --quiet --compile-bytecode --python "$CI_WORK/ray/bin/python")
 if ! "${install[@]}" "$built[ray]"; then
   echo "Ray cannot be installed here, and its tests are not run" | tee "$CI_WORK/ray.summary"
   exit 0
