@@ -48,8 +48,9 @@ with_summary() {
   } >"$CI_WORK/$name.summary"
 }
 
-# The tests of what confines, and of what is confined and installed: for these it matters who runs them.
-differs_by_user=(tests/attacks/{files,kernel,network,packages,processes,resources}
+# The attacks on jails, and the tests of what confines, is confined and installed: for these it matters who
+# runs them. What the client makes of hostile answers (tests/attacks/client) is the same for everybody.
+differs_by_user=(tests/attacks/{files,kernel,network,output,packages,processes,protocol,resources,runner}
   tests/integration/{confinement,lifecycle,loading,packages})
 
 # processes: for tests that start much and wait for it: half as many again as there are cores, which
