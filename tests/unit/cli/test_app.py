@@ -63,7 +63,6 @@ def test_the_list_of_commands_has_the_first_line_of_each(name: str) -> None:
 
 
 def test_a_list_of_commands_imports_none() -> None:
-    """Nor what they need."""
     shown = (
         "import sys\nfrom typer.testing import CliRunner\nfrom envhub_sandbox.cli.app import app\n"
         "assert 'doctor' in CliRunner().invoke(app, ['--help']).output\n"
@@ -92,7 +91,6 @@ def test_no_line_of_a_help_ends_before_it_is_full(name: str) -> None:
 
 @pytest.mark.parametrize("name", _COMMANDS)
 def test_a_help_has_all_words_of_an_option(name: str) -> None:
-    """Brackets as well: they are no markup."""
     shown = plain(help_of(name, 1_000))
     texts = [one.help for one in _COMMANDS[name].params if getattr(one, "help", None)]
     for text in texts:
@@ -119,7 +117,6 @@ def test_brackets_are_in_some_help() -> None:
     ],
 )
 def test_values_are_completed(words: str, completed: set[str]) -> None:
-    """As bash asks for them."""
     typed = f"envhub {words}"
     variables = {
         "_ENVHUB_COMPLETE": "complete_bash",
@@ -220,7 +217,6 @@ def test_a_terminal_wraps_below_the_beginning(
     ],
 )
 def test_wrong_usage_is_one_message(words: list[str], says: str) -> None:
-    """As every other error is: without a box."""
     done = CliRunner().invoke(app, ["run", *words])
     assert (done.exit_code, done.stdout) == (2, "")
     assert done.stderr == f"Error: {says}\n"

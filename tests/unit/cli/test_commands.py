@@ -100,7 +100,6 @@ _MODULES = {
 
 @pytest.mark.parametrize("words", _MODULES)
 def test_a_command_is_a_function_of_its_module(words: str) -> None:
-    """Of its own name, with its help in its docstring."""
     name, *rest = words.split()
     found = whole_command(name)
     for word in rest:
@@ -121,7 +120,6 @@ def test_reading_is_no_running(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_an_empty_store_is_listed() -> None:
-    """For people, and for programs."""
     code, printed = said("cache", "list")
     assert (code, printed.startswith("0 snapshots, 0 environments")) == (0, True)
     code, printed = said("cache", "list", "--json")
@@ -154,13 +152,11 @@ def test_a_repository_has_the_name_of_its_folder(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["-a", "a.", "a..b", "a--b", "a.git", ".env", "x" * 97, "é"])
 def test_other_names_are_refused(name: str) -> None:
-    """Before anything is written."""
     with pytest.raises(exits.UsageError, match="is not a valid name on the Hub"):
         init.repository_name(Path(name))
 
 
 def test_init_writes_all_or_nothing() -> None:
-    """A folder with something in it stays as it is."""
     Path("there").mkdir()
     Path("there/file").touch()
     assert said("init", "there")[0] == 2
@@ -172,7 +168,6 @@ def test_init_writes_all_or_nothing() -> None:
 
 
 def test_severities_of_fail_on() -> None:
-    """By name; another one is a mistake of usage."""
     for one in Severity:
         assert findings.level(one.value) is one
     with pytest.raises(exits.UsageError, match="it takes error, warning or note"):
@@ -180,7 +175,6 @@ def test_severities_of_fail_on() -> None:
 
 
 def test_reports_are_written_in_utf_8() -> None:
-    """Whatever the locale; where they cannot be, that is said."""
     findings.write_report(Path("report"), "ü")
     assert Path("report").read_bytes() == "ü".encode()
     with pytest.raises(exits.UsageError, match="the report cannot be written"):
@@ -190,7 +184,6 @@ def test_reports_are_written_in_utf_8() -> None:
 def test_annotations_are_for_the_job_and_its_summary(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The summary is added to what other steps have written."""
     summary = Path("summary")
     summary.write_text("before\n")
     monkeypatch.setenv("GITHUB_STEP_SUMMARY", str(summary))
@@ -211,7 +204,6 @@ def test_a_warning_is_a_line(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_versions_of_all_that_matters(monkeypatch: pytest.MonkeyPatch) -> None:
-    """None for what is not installed; every value is plain."""
     found = host.versions()
     assert found == json.loads(json.dumps(found))
     assert found["python"]

@@ -50,7 +50,6 @@ def looks() -> Iterator[Examine]:
 def test_quotas_stand_beside_what_is_used(
     looks: Examine, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Bytes as sizes; what has no known use has none shown."""
     assert looks(SAID) is Exit.OK
     text = capsys.readouterr().out
     rows = [line.split() for line in text.splitlines()]
@@ -79,7 +78,6 @@ def test_the_code_is_the_verdict(
     code: Exit,
     said: str,
 ) -> None:
-    """As text and as JSON; the reason stands in both."""
     assert looks(SAID | changed, profile) is code
     assert said in " ".join(capsys.readouterr().out.split())
     assert looks(SAID | changed, profile, json=True) is code

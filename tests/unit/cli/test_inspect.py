@@ -47,7 +47,6 @@ def repository(folder: Path, entry: str = _ENTRY, **files: str) -> Path:
 
 
 def test_a_repository_is_read(tmp_path: Path) -> None:
-    """Entry, files, packages, imports, and what is worth a look."""
     folder = repository(tmp_path / "r", requirements__txt="PyYAML>=6\ngymnasium")
     read = document("inspect", "--static", folder)
     assert read["reference"] == f"{folder}:env.py"
@@ -80,7 +79,6 @@ def test_nothing_of_it_runs(tmp_path: Path) -> None:
 
 
 def test_declarations_that_cannot_be_taken_are_found(tmp_path: Path) -> None:
-    """And are no reason not to read the rest."""
     folder = repository(tmp_path / "r", requirements__txt="x @ https://example.com/x.whl")
     read = document("inspect", "--static", folder)
     assert read["declared"] is None
@@ -89,7 +87,6 @@ def test_declarations_that_cannot_be_taken_are_found(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("least", "code"), [("note", 1), ("warning", 0), ("error", 0)])
 def test_findings_fail_where_that_is_asked_for(least: str, code: int, tmp_path: Path) -> None:
-    """By how much they weigh; SARIF has them either way."""
     folder, sarif = repository(tmp_path / "r"), tmp_path / "sarif"
     done = envhub("inspect", "--static", folder, "--fail-on", least, "--sarif", sarif)
     assert done.exit_code == code
@@ -110,7 +107,6 @@ def test_findings_fail_where_that_is_asked_for(least: str, code: int, tmp_path: 
 def test_options_that_mean_nothing_are_refused(
     options: list[str], says: str, tmp_path: Path
 ) -> None:
-    """Before anything is read."""
     done = envhub("inspect", tmp_path / "nowhere", *options)
     assert (done.exit_code, says in " ".join(done.stderr.split())) == (2, True), done.stderr
 
@@ -154,7 +150,6 @@ def test_what_is_the_same_differs_in_nothing(tmp_path: Path) -> None:
 
 
 def test_each_change_is_told_as_what_it_is(tmp_path: Path) -> None:
-    """Files, the entry, packages, imports, and findings."""
     entry = _ENTRY.replace("import yaml", "import socket, torch").replace("size=8", "size=9")
     entry = entry.replace("'CartPole-v1'", "'Other-v1'")
     found = differing(
@@ -174,7 +169,6 @@ def test_each_change_is_told_as_what_it_is(tmp_path: Path) -> None:
 
 
 def test_a_file_with_another_name_is_renamed(tmp_path: Path) -> None:
-    """By its content."""
     old, new = repository(tmp_path / "old", a__txt="1"), repository(tmp_path / "new", b__txt="1")
     [one] = changes(static(local(old)), static(local(new)))
     assert (one.what, one.how, one.text) == ("file", "renamed", "b.txt: was a.txt")

@@ -61,7 +61,6 @@ def suites(*envs: SyncVectorEnv) -> EnvSuites:
 
 
 def test_each_task_is_closed_before_the_next_begins(monkeypatch: pytest.MonkeyPatch) -> None:
-    """So that only the task in use costs processes."""
     events: list[tuple[str, int]] = []
     envs = suites(Noted(0, events), Noted(1, events))
     code, document = run(monkeypatch, lambda **kwargs: envs)
@@ -71,7 +70,6 @@ def test_each_task_is_closed_before_the_next_begins(monkeypatch: pytest.MonkeyPa
 
 
 def test_a_failing_task_ends_the_run_and_closes_all(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What was finished is reported, with the error and its code."""
     events: list[tuple[str, int]] = []
     envs = suites(Noted(0, events), Dying(1, events), Noted(2, events))
     code, document = run(monkeypatch, lambda **kwargs: envs)
@@ -87,7 +85,6 @@ def test_a_failing_task_ends_the_run_and_closes_all(monkeypatch: pytest.MonkeyPa
 
 
 def test_options_become_arguments_of_make_env(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each under the name that the library has for it."""
     seen: dict[str, Any] = {}
 
     def make_env(**kwargs: Any) -> EnvSuites:

@@ -62,7 +62,6 @@ _ROOT = Path(next(iter(envhub_sandbox.__path__)))
 def test_each_place_has_its_spelling(
     key: str, value: Any, python: str, command: str, lerobot: str
 ) -> None:
-    """Python's is the one that no command line was read for."""
     assert option_name(key, value) == python
     with use_option_names(_ALL):
         assert option_name(key, value) == command
@@ -76,7 +75,6 @@ def test_each_place_has_its_spelling(
 
 
 def test_what_is_wrong_with_an_option_names_it_as_it_was_given() -> None:
-    """In the same error."""
     for spelling, said in (
         (in_python, "limits: memory_bytes is 0;"),
         (_ALL, "--memory is 0;"),

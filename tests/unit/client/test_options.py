@@ -54,7 +54,6 @@ def test_what_cannot_be_is_refused(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """By its name, and not as the repository's fault."""
     (tmp_path / "README.md").touch()
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(*inside.MAKER, None)
@@ -63,7 +62,6 @@ def test_what_cannot_be_is_refused(
 
 
 def test_numpys_numbers_are_numbers() -> None:
-    """As they come out of a configuration or a sweep."""
     given: Any = {"n_envs": np.int64(4), "use_async_envs": np.True_, "num_workers": np.int8(2)}
     made = Options(**given).checked()
     assert (made.n_envs, made.use_async_envs, made.num_workers) == (4, True, 2)
@@ -80,13 +78,11 @@ def test_numpys_numbers_are_numbers() -> None:
     ids=lambda given: next(iter(given)),
 )
 def test_without_a_sandbox_nothing_pretends_to_protect(given: dict[str, Any]) -> None:
-    """What would silently do nothing is refused."""
     with pytest.raises(PolicyError, match=f"^{next(iter(given))}: for environments in a sandbox"):
         make_env(sample("cartpole"), sandbox=None, trust_remote_code=True, **given)
 
 
 def test_a_name_is_looked_up_as_a_shell_does(monkeypatch: pytest.MonkeyPatch) -> None:
-    """And a path is a path."""
     monkeypatch.setattr("shutil.which", lambda name: f"/somewhere/{name}")
     assert arguments.interpreter("python3.12") == "/somewhere/python3.12"
     assert arguments.interpreter("/a/../python3.12") == "/python3.12"

@@ -16,7 +16,6 @@ from envhub_sandbox.settings.policy import limits_from, policy_from, timeouts_fr
 
 
 def test_nothing_given_means_the_strictest() -> None:
-    """The default needs every layer and grants nothing."""
     policy = policy_from(None, None)
     assert policy == Policy()
     assert (policy.profile, policy.network, policy.gpu) == ("strict", "none", False)
@@ -45,7 +44,6 @@ def test_values_are_frozen_and_by_name_only(cls: type) -> None:
     ],
 )
 def test_unknown_names_are_refused(make: Any, complaint: str) -> None:
-    """A misspelt limit that silently did nothing would be a hole."""
     with pytest.raises(PolicyError, match=complaint):
         make()
 
@@ -85,7 +83,6 @@ def test_unknown_names_are_refused(make: Any, complaint: str) -> None:
     ],
 )
 def test_impossible_values_are_refused(make: Any, complaint: str) -> None:
-    """The error names the field, the value, and what it takes."""
     with pytest.raises(PolicyError, match=complaint) as caught:
         make()
     assert isinstance(caught.value, ValueError)
@@ -93,13 +90,11 @@ def test_impossible_values_are_refused(make: Any, complaint: str) -> None:
 
 @pytest.mark.parametrize("value", [None, 0.001, 5, 1e9, float("inf")])
 def test_timeouts_take_seconds_or_none(value: float | None) -> None:
-    """None waits for ever, and so does infinity."""
     assert Timeouts(step_s=value).step_s == value
 
 
 @pytest.mark.parametrize("name", ["cpu_time_s", "file_bytes"])
 def test_some_limits_can_be_lifted(name: str) -> None:
-    """None means no cap, where there may be none."""
     assert getattr(Policy(limits=Limits(**{name: None})).limits, name) is None
 
 
@@ -150,7 +145,6 @@ def test_only_named_variables_get_a_value(monkeypatch: pytest.MonkeyPatch) -> No
 
 
 def test_confinement_says_what_the_policy_says() -> None:
-    """Every permission of the policy travels to the worker."""
     limits = Limits(processes=3)
     policy = Policy(
         profile="no-userns", network="loopback", readable=("/data",), gpu=True, limits=limits
@@ -174,7 +168,6 @@ def test_confinement_says_what_the_policy_says() -> None:
     ],
 )
 def test_where_output_and_bundles_go_is_checked(values: dict[str, Any]) -> None:
-    """Before anything runs; the text names the field."""
     with pytest.raises(PolicyError, match=next(iter(values))):
         Policy(**values)
 

@@ -155,7 +155,6 @@ def words(checkout: Path, hook: str) -> list[str]:
 def test_the_hook_that_reads_fails_for_what_hides(
     text: str, code: int, checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In the folder that pre-commit runs it in."""
     write_repository(tmp_path, f"{text}\ndef make_env(n_envs=1, use_async_envs=False): pass\n")
     monkeypatch.chdir(tmp_path)
     assert CliRunner().invoke(app, words(checkout, "envhub-static")).exit_code == code

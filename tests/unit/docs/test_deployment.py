@@ -79,7 +79,6 @@ def test_the_dashboard_asks_for_what_is_exported() -> None:
 
 
 def test_the_dashboard_groups_by_labels_that_there_are() -> None:
-    """Of that very metric, or given by whoever scrapes it."""
     names = exported()
     for panel in json.loads(DASHBOARD.read_text())["panels"]:
         for target in panel["targets"]:
@@ -94,14 +93,12 @@ def test_the_dashboard_groups_by_labels_that_there_are() -> None:
 
 
 def test_the_panels_have_their_own_places() -> None:
-    """None lies over another, and each has a number of its own."""
     panels = json.loads(DASHBOARD.read_text())["panels"]
     assert len({panel["id"] for panel in panels}) == len(panels)
     assert len({(one["gridPos"]["x"], one["gridPos"]["y"]) for one in panels}) == len(panels)
 
 
 def test_the_page_has_every_metric() -> None:
-    """Of those that are ours."""
     page = (ROOT / "docs" / "observing.md").read_text()
     named = set(re.findall(r"`(envhub_server_\w+)`", page))
     assert named == {name for name in exported() if name.startswith("envhub_")}

@@ -83,7 +83,6 @@ def assert_fit(told: Message) -> None:
 
 
 def test_the_package_is_fit_for_an_index() -> None:
-    """As it is installed here."""
     assert_fit(cast("Message", metadata.metadata("envhub-sandbox")))
 
 
@@ -95,7 +94,6 @@ def test_the_package_holds_no_test() -> None:
 
 
 def test_the_version_stands_in_one_place(checkout: Path) -> None:
-    """The rest is made of it, or is the same."""
     citation = yaml.safe_load((checkout / "CITATION.cff").read_text())
     version = envhub_worker.__version__
     assert version == envhub_sandbox.__version__ == metadata.version("envhub-sandbox")

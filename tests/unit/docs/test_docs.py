@@ -63,7 +63,6 @@ def sources() -> str:
 
 @pytest.mark.parametrize("title", ["Client and server", "Client and runner"])
 def test_protocol_lists_every_message_with_its_fields(title: str) -> None:
-    """Kind, name and fields, in the order of the wire."""
     listed = {
         int(kind): (*code_words(name), code_words(fields))
         for kind, name, fields, _ in rows(section(PROTOCOL, title))
@@ -77,7 +76,6 @@ def test_protocol_lists_every_message_with_its_fields(title: str) -> None:
 
 
 def test_protocol_draws_the_lifecycle_from_its_table() -> None:
-    """Every state in its words, every legal move, and no other."""
     states, moves = [], []
     for row in rows(section(PROTOCOL, "The life of an environment")):
         (states if len(row) == 2 else moves).append(row)
@@ -99,14 +97,12 @@ def flat(text: str) -> str:
 
 
 def test_protocol_states_its_version_and_limits() -> None:
-    """The numbers in the text are those of the code."""
     assert f"Version {m.VERSION}." in PROTOCOL
     for number in (MAX_ENVS, MAX_NUM_ENVS, MAX_NAME):
         assert re.search(rf"\b{number}\b", section(PROTOCOL, "Manifest"))
 
 
 def test_values_lists_the_limits_with_their_defaults() -> None:
-    """Each limit of the wire, and its number."""
     text = (CHECKOUT / "docs" / "values.md").read_text()
     units = {"KiB": 1024, "MiB": 1024**2}
     listed = {}
@@ -122,7 +118,6 @@ def fenced(text: str, language: str) -> list[str]:
 
 
 def test_readme_opens_with_one_command_to_try_and_one_to_test() -> None:
-    """Five lines, then the two commands, each on one line."""
     first, second = fenced(README, "sh")[:2]
     assert first.count("\n") == second.count("\n") == 1
     assert "envhub run ./examples/" in first
@@ -153,7 +148,6 @@ def test_ci_runs_the_commands_of_the_readme() -> None:
 
 
 def test_contributing_names_every_step_and_every_folder_of_tests() -> None:
-    """And no other."""
     text = (CHECKOUT / "CONTRIBUTING.md").read_text()
     tables = rows(section(text, "Before you propose a change"))
     steps = {step.stem for step in (CHECKOUT / ".ci" / "steps").iterdir()}
@@ -164,7 +158,6 @@ def test_contributing_names_every_step_and_every_folder_of_tests() -> None:
 
 
 def test_contributing_names_twenty_modules_to_read_first() -> None:
-    """And for each symptom one that is there."""
     first, symptoms = section((CHECKOUT / "CONTRIBUTING.md").read_text(), "Where to begin").split(
         "From a symptom to a module:"
     )
@@ -181,7 +174,6 @@ def test_contributing_names_twenty_modules_to_read_first() -> None:
 
 @pytest.mark.parametrize("document", ["README.md", "docs/integrations.md"])
 def test_the_python_of_a_document_runs(document: str) -> None:
-    """All of its blocks, one after the other, do what they say."""
     blocks = fenced((CHECKOUT / document).read_text(), "python")
     done = subprocess.run(
         [sys.executable, "-c", "\n".join(blocks)],
@@ -207,7 +199,6 @@ _FOREIGN_TEXTS = {"no module named venv", "ensurepip is not available"}
 
 @pytest.mark.parametrize("text", [text for text in error_texts() if text not in _FOREIGN_TEXTS])
 def test_troubleshooting_quotes_errors_that_exist(text: str) -> None:
-    """A search for what is on the screen finds it."""
     assert text in joined_literals()
 
 
@@ -290,12 +281,10 @@ _FORBIDDEN = re.compile(r"(?<![\w./-])/(work|root)/\w|TODO|FIXME|XXX(?!X)")
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=named)
 def test_documents_are_finished(document: Path) -> None:
-    """No machine's paths, no notes to oneself."""
     assert _FORBIDDEN.findall(document.read_text()) == []
 
 
 def test_sources_are_finished() -> None:
-    """Likewise the code."""
     assert _FORBIDDEN.findall(sources()) == []
 
 
@@ -351,7 +340,6 @@ def test_the_rules_of_interruption_are_those_that_the_source_names() -> None:
 
 @pytest.mark.parametrize("page", ["a-step", "interruption"])
 def test_the_files_that_a_page_on_the_inside_names_are_there(page: str) -> None:
-    """By their path, or by its end."""
     text = (CHECKOUT / "docs" / "internals" / f"{page}.md").read_text()
     files = [
         f"/{prefix}{one.relative_to(root.parent)}"

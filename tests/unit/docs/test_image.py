@@ -39,7 +39,6 @@ def test_the_workers_group_is_a_part_of_the_dependencies(project: dict[str, Any]
 
 
 def test_the_workers_group_is_what_the_worker_imports(project: dict[str, Any]) -> None:
-    """No more and no less."""
     names = {name_of(one) for one in project["dependency-groups"]["worker"]}
     assert {_IMPORTED_AS.get(name, name) for name in names} == WORKERS_OWN - {"envhub_worker"}
 
@@ -56,7 +55,6 @@ def test_the_image_can_be_watched(project: dict[str, Any]) -> None:
 
 
 def test_the_image_carries_the_projects_version() -> None:
-    """The label says which worker it is."""
     text = (CHECKOUT / "Dockerfile").read_text()
     assert f"ARG VERSION={envhub_worker.__version__}\n" in text
 
@@ -69,7 +67,6 @@ def test_nothing_but_the_worker_goes_into_the_image() -> None:
 
 
 def test_the_image_runs_as_nobody() -> None:
-    """Neither root nor a user that owns a file."""
     text = (CHECKOUT / "Dockerfile").read_text()
     final = text.rpartition("\nFROM ")[2]
     assert re.search(r"^USER (\d+):\1$", final, re.MULTILINE)

@@ -193,7 +193,6 @@ def foreign(package: str, own: set[str]) -> list[tuple[str, str]]:
 
 
 def test_both_packages_are_seen() -> None:
-    """The walk below finds something to look at."""
     names = set(modules())
     assert {
         "envhub_sandbox.factory.make_env",
@@ -208,7 +207,6 @@ def test_worker_is_self_contained() -> None:
 
 
 def test_client_needs_what_it_declares() -> None:
-    """Nothing is imported that pyproject.toml does not name."""
     assert foreign("envhub_sandbox", CLIENTS_OWN) == []
 
 
@@ -266,7 +264,6 @@ def test_the_table_has_every_package_and_nothing_else() -> None:
 
 
 def test_the_table_permits_no_arrow_that_nobody_uses() -> None:
-    """It is a picture of the house, not of what might be."""
     used = {
         (package_of(name), package_of(target))
         for name in modules()
@@ -280,7 +277,6 @@ def test_the_table_permits_no_arrow_that_nobody_uses() -> None:
 
 
 def test_the_table_has_a_direction() -> None:
-    """There is no cycle of packages: they stand in a line."""
     graph = {package: may_import(package) - {package} for package in MAY_IMPORT}
     for lowest in LOWEST:
         graph[lowest] = {target for target in graph[lowest] if target < lowest} - LOWEST
@@ -299,7 +295,6 @@ def test_nobody_imports_the_runner() -> None:
 
 
 def test_only_faces_and_the_command_line_import_make_env() -> None:
-    """Everything else is below it."""
     factory = "envhub_sandbox.factory"
     found = {
         (name, target)
@@ -332,7 +327,6 @@ def test_modules_know_nothing_of_what_is_not_their_business(name: str) -> None:
 
 @pytest.mark.parametrize("package", ["envhub_sandbox", "envhub_worker"])
 def test_imports_have_a_direction(package: str) -> None:
-    """There is no cycle, not even one that a late import hides."""
     graph = {
         name: {target for target in imported(name) if target in modules() and target != package}
         for name in modules()
@@ -345,7 +339,6 @@ def test_imports_have_a_direction(package: str) -> None:
 
 
 def test_zeromq_is_spoken_in_a_few_packages() -> None:
-    """Everything else speaks in messages."""
     users = {
         package_of(name)
         for package in ("envhub_sandbox", "envhub_worker")
@@ -470,20 +463,17 @@ def test_reaching_inside_would_be_seen() -> None:
 
 
 def test_the_package_imports_nothing_heavy() -> None:
-    """Names are looked up when they are used."""
     heavy = CLIENTS_OWN - {"envhub_sandbox"} | {"torch"}
     assert not loaded_by("import envhub_sandbox") & heavy
 
 
 def test_the_pytest_plugin_costs_nothing_until_it_is_used() -> None:
-    """Every run of pytest on the machine imports it."""
     loaded = loaded_by("import envhub_sandbox.integrations.pytest_plugin")
     assert "pytest" in loaded
     assert not loaded & (CLIENTS_OWN - {"envhub_sandbox"} | {"torch"}) - loaded_by("import pytest")
 
 
 def test_the_pytest_plugin_is_declared(checkout: Path) -> None:
-    """Under the name by which it can be left out."""
     declared = (checkout / "pyproject.toml").read_text()
     table = declared.partition("[project.entry-points.pytest11]\n")[2].partition("\n[")[0]
     assert table.strip() == 'envhub = "envhub_sandbox.integrations.pytest_plugin"'
@@ -499,7 +489,6 @@ def test_every_public_name_is_there() -> None:
 
 
 def test_the_protocol_loads_neither_zeromq_nor_the_hub() -> None:
-    """Every module of it, in a fresh interpreter."""
     names = [name for name in modules() if below(name, "envhub_worker.protocol")]
     loaded = loaded_by("import " + ", ".join(names))
     assert "numpy" in loaded

@@ -56,7 +56,6 @@ def run(folder: Path, checkout: Path, *arguments: str) -> str:
 
 
 def test_who_names_nothing_gets_the_short_selection(folder: Path, checkout: Path) -> None:
-    """And is told so, and how to have all."""
     said = run(folder, checkout)
     assert "2 passed, 5 deselected" in said
     assert "--full runs every test" in said
@@ -64,7 +63,6 @@ def test_who_names_nothing_gets_the_short_selection(folder: Path, checkout: Path
 
 @pytest.mark.parametrize("argument", ["--full", "test_it.py", "-kone or two or skipped or imports"])
 def test_what_is_asked_for_is_run(folder: Path, checkout: Path, argument: str) -> None:
-    """All of it, or a path, or an expression."""
     said = run(folder, checkout, argument)
     assert "3 passed, 4 skipped" in said
     assert "short selection" not in said

@@ -31,7 +31,6 @@ def wait(translates: bool) -> None:
 
 
 def test_an_error_before_it_is_what_it_is() -> None:
-    """The alarm is put off."""
     with pytest.raises(OSError, match="its own"), deadline_alarm(60):
         raise OSError("its own")
     assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)

@@ -96,7 +96,6 @@ def test_a_file_says_what_one_may_type_about_a_list(
 
 
 def test_every_option_is_handed_on_or_about_the_list() -> None:
-    """A new one is handed on by itself."""
     names = {one.name for one in whole_command("check").params}
     of_the_list = list_run.OF_THE_LIST
     assert names > of_the_list
@@ -138,7 +137,6 @@ def test_every_option_is_handed_on_or_about_the_list() -> None:
 def test_what_cannot_be_is_told_first(
     arguments: str, says: str, started: list[tuple[int, list[str]]]
 ) -> None:
-    """And nothing is run, or made."""
     Path("wrong").write_text("org/repo\nrepo\n")
     done = called(*arguments.split())
     assert done.exit_code == Exit.USAGE, done.output
@@ -177,7 +175,6 @@ def test_limits_stay_within_the_budget(
     ],
 )
 def test_what_fails_counts_most(verdicts: list[Verdict], code: Exit) -> None:
-    """As docs/ci.md says."""
     listed = [ListEntry(f"a/{number}", f"a/{number}", number) for number in range(2)]
     results = [
         Judgement(listed=one, verdict=verdict)

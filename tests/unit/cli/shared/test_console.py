@@ -35,7 +35,6 @@ def shown_in_a_terminal(
 def test_a_terminal_wraps_the_last_column_below_itself(
     shown_in_a_terminal: Callable[..., list[str]],
 ) -> None:
-    """At blanks only: a name stays whole."""
     assert shown_in_a_terminal(_ROWS) == [
         "layer   what it does",
         "memory  8192 MiB, counted by the",
@@ -46,7 +45,6 @@ def test_a_terminal_wraps_the_last_column_below_itself(
 def test_a_column_that_is_too_narrow_is_not_wrapped(
     shown_in_a_terminal: Callable[..., list[str]],
 ) -> None:
-    """The terminal wraps the line by itself."""
     assert len(shown_in_a_terminal([("x" * 20, "one two three four five")])) == 1
 
 
@@ -64,13 +62,11 @@ def test_a_wrapped_line_begins_no_command(
 
 
 def test_a_pipe_has_a_line_for_each_row(capsys: pytest.CaptureFixture[str]) -> None:
-    """Also a long one, for programs that read lines."""
     show_rows([*_ROWS, ("long", "word " * 30)])
     assert len(capsys.readouterr().out.splitlines()) == 3
 
 
 def test_a_fact_is_on_the_stream_that_is_named(capsys: pytest.CaptureFixture[str]) -> None:
-    """With its word in front, and the text on one line."""
     show("packages", "7\nof them")
     show("in", "/cache", stderr=True)
     shown = capsys.readouterr()

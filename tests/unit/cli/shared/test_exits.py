@@ -52,7 +52,6 @@ CODES = {
 
 @pytest.mark.parametrize(("kind", "code"), CODES.items())
 def test_every_error_has_its_code(kind: type[EnvHubError], code: int) -> None:
-    """As the help and the documentation say."""
     assert code_for(kind("text")) == code
 
 
@@ -77,7 +76,6 @@ def test_a_message_carries_no_traceback_and_no_escape_sequence() -> None:
 
 
 def test_the_end_of_the_output_is_kept_short() -> None:
-    """The last lines are those that help."""
     tail = "\n".join(f"line {number}" for number in range(100))
     error = errors.WorkerDiedError(f"it died\nIts last output:\n{quoted(tail)}", log_tail=tail)
     lines = describe(error).splitlines()
@@ -101,7 +99,6 @@ def test_a_failure_is_one_message(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_debug_shows_both_tracebacks(capsys: pytest.CaptureFixture[str]) -> None:
-    """Ours and the worker's, which is escaped."""
     fail(errors.remote_error("ValueError", "ValueError", "x", "far \x1b away"), debug=True)
     shown = capsys.readouterr().err
     assert "Traceback (most recent call last)" in shown
@@ -109,7 +106,6 @@ def test_debug_shows_both_tracebacks(capsys: pytest.CaptureFixture[str]) -> None
 
 
 def test_a_bug_of_ours_says_so(capsys: pytest.CaptureFixture[str]) -> None:
-    """Nothing is blamed on the environment."""
     assert fail(KeyError("x"), debug=False) == 70
     assert "a bug in envhub: KeyError" in capsys.readouterr().err
 
@@ -155,7 +151,6 @@ def test_where_nothing_can_be_written_the_code_is_the_same(how: str, to: str, co
 
 
 def test_a_full_disk_is_no_bug() -> None:
-    """Of what is printed, or of a file."""
     assert describe(OSError(errno.ENOSPC, "full")).startswith("no space is left for what is print")
     assert "left for /x/y;" in describe(OSError(errno.EDQUOT, "full", "/x/y"))
     assert code_for(OSError(errno.ENOSPC, "full")) is Exit.USAGE
@@ -163,13 +158,11 @@ def test_a_full_disk_is_no_bug() -> None:
 
 
 def test_nothing_is_cut_or_coloured_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
-    """A long paragraph stays one line for whoever reads the file."""
     say("word " * 100, style="red")
     assert capsys.readouterr().err == "word " * 100 + "\n"
 
 
 def test_a_line_stays_a_line() -> None:
-    """Escaped, on one line, and cut."""
     assert safe_line("a\nb\tc\x1b[2J\u202e") == "a b c\\x1b[2J\\u202e"
     assert len(safe_line("x" * 1_000_000, 50)) == 50
 
@@ -196,13 +189,11 @@ def test_json_is_valid_whatever_is_in_it(capsys: pytest.CaptureFixture[str]) -> 
 
 
 def test_plain_data_stays_as_it_is() -> None:
-    """Including text that is no ASCII."""
     value = {"a": [1, 2.5, "ü", None, True]}
     assert plain(value) == value
 
 
 def test_statistics_are_the_population_s() -> None:
-    """Of the episodes that were played; nothing of nothing."""
     spread = pytest.approx(1.8708286)
     assert statistics([1, 2, 3, 6]) == {"mean": 3.0, "std": spread, "min": 1.0, "max": 6.0}
     assert statistics([]) is None
@@ -225,7 +216,6 @@ def result(*returns: tuple[float, ...]) -> TaskResult:
 
 
 def test_vector_returns_are_lists() -> None:
-    """One entry per component; a plain number otherwise."""
     two = task_document(result((1.0, -1.0), (3.0, -3.0)))
     assert [component["mean"] for component in two["return"]] == [2.0, -2.0]
     assert [list(episode["return"]) for episode in two["episodes"]] == [[1.0, -1.0], [3.0, -3.0]]
@@ -235,7 +225,6 @@ def test_vector_returns_are_lists() -> None:
 
 
 def test_no_finished_episode_is_no_failure() -> None:
-    """There is nothing to average."""
     assert returns_of(result().rollout) == [None]
     assert task_document(result())["success_rate"] is None
 

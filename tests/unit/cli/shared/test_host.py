@@ -102,6 +102,5 @@ def test_the_least_that_is_left_counts(
 
 
 def test_where_the_kernel_tells_nothing(tmp_path: Path) -> None:
-    """None, and here more than none."""
     assert free_memory_bytes(tmp_path) is None
     assert (free_memory_bytes() or 0) > 0

@@ -28,7 +28,6 @@ def options(**given: Any) -> MakeOptions:
 
 
 def test_gpus_are_all_or_named_by_number() -> None:
-    """Anything else is told in the words of the option."""
     assert [read_gpu(text) for text in (None, "all", "0", "0,2")] == [None, True, [0], [0, 2]]
     for text in ("", "true", "-1", "0,", "0 1"):
         with pytest.raises(UsageError, match="it takes all, or indices"):
@@ -61,7 +60,6 @@ def test_sizes_are_read(text: str | None, size: int | None) -> None:
 
 
 def test_env_kwargs_take_json_and_pairs() -> None:
-    """Values are JSON where they can be; later ones win."""
     pairs = ("size=9", "mode=rgb_array", "on=true", "path=a=b", "empty=")
     assert read_env_kwargs(['{"size": 8, "name": "a"}', *pairs]) == {
         "size": 9,
@@ -75,13 +73,11 @@ def test_env_kwargs_take_json_and_pairs() -> None:
 
 @pytest.mark.parametrize("text", ["size", "=3", "a b=3", "{", '{"a": }', "[1]"])
 def test_env_kwargs_that_are_neither_are_refused(text: str) -> None:
-    """With what to write instead, or what is wrong with the JSON."""
     with pytest.raises(UsageError, match="--env-kwargs"):
         read_env_kwargs([text])
 
 
 def test_only_what_was_given_reaches_the_policy() -> None:
-    """Defaults stay the library's."""
     assert options().arguments()["policy"] == {}
     assert options().arguments()["timeouts"] == {}
     given = options(
@@ -103,14 +99,12 @@ def test_only_what_was_given_reaches_the_policy() -> None:
 
 @pytest.mark.parametrize("name", ["memory_bytes", "disk_bytes", "processes", "cpu_time_s"])
 def test_a_limit_of_nothing_is_refused(name: str) -> None:
-    """And is not taken for the default."""
     given = options(**{name: "0" if name.endswith("_bytes") else 0}).arguments()
     with pytest.raises(PolicyError, match="above 0"):
         policy_from(given["policy"], None)
 
 
 def test_a_timeout_is_for_every_operation_but_close() -> None:
-    """Closing is bounded by itself."""
     keys = {key for key in ALL if OPTIONS[key].command == "--timeout"}
     assert keys == {"startup_s", "reset_s", "step_s", "call_s"}
     given = dict.fromkeys(keys, 7.5)
@@ -153,7 +147,6 @@ def test_selection_keeps_the_order(suites: Any, tasks: Any, expected: list[str])
 
 
 def test_a_selection_of_nothing_names_what_there_is() -> None:
-    """Escaped, since the names are the worker's."""
     with pytest.raises(UsageError, match=r"a/0, .*evil\\x1b/0"):
         select_envs({**SUITES, "evil\x1b": {0: 1}}, ["c"], None)
 

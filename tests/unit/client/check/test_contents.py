@@ -30,7 +30,6 @@ from envhub_sandbox.hub.sources.parsing import parsed
     ],
 )
 def test_a_file_is_what_it_begins_with(name: str, beginning: bytes, kind: str) -> None:
-    """Its suffix decides before, where Python goes by that."""
     assert contents.kind_of_contents(name, beginning) == kind
 
 
@@ -58,7 +57,6 @@ def test_some_kinds_are_worth_a_look(kind: str, is_folder: bool, found: list[str
 
 
 def test_characters_that_nobody_sees_are_named_with_their_line() -> None:
-    """Each once in a line, and some of a flood."""
     found = list(contents.hidden("f", "a\nb\u202ec\u202e\nd\u200b", is_code=False))
     assert [(one.line, one.message[:12]) for one in found] == [
         (2, "holds U+202E"),
@@ -96,6 +94,5 @@ def test_constructs_are_found_where_they_are_written(code: str, check: str | Non
 
 
 def test_lines_that_nobody_reads_to_their_end() -> None:
-    """With their number and length."""
     [found] = contents.long_lines("f.py", "a\n" + "x" * 2_000 + "\n" + "y" * 1_999)
     assert (found.line, found.message) == (2, "a line of 2000 characters")

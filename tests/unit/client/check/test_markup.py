@@ -34,7 +34,6 @@ class Tags(HTMLParser):
 
 @pytest.mark.parametrize("limit", [10, 1_000])
 def test_text_has_no_meaning_for_html(limit: int) -> None:
-    """Between tags and in an attribute; and no terminal obeys it."""
     made = markup.text(_HOSTILE, limit)
     read = Tags(f'<p title="{made}">{made}</p>')
     assert (read.tags, read.names) == ({"p"}, {"title"})
@@ -63,7 +62,6 @@ def test_parts_of_a_page() -> None:
 
 
 def test_a_table_ends_where_a_browser_would_not() -> None:
-    """And says how many rows are left out."""
     made = list(markup.table(["A"], [("x",)] * 2_003))
     assert made[-1] == "<p>3 more are left out.</p>"
     assert sum(row.startswith("<tr><td") for row in made) == 2_000

@@ -41,7 +41,6 @@ def test_a_page_has_the_tags_of_ours_alone(text: str) -> None:
 
 
 def test_the_control_would_be_told() -> None:
-    """A page that did not escape has other tags."""
     made = report_of(_QUIET)
     text = page(made, made.findings)
     assert Page(text.replace(_QUIET, HOSTILE[2])).tags != Page(text).tags
@@ -71,7 +70,6 @@ def test_a_page_needs_and_runs_nothing() -> None:
 
 
 def test_what_was_played_can_be_seen() -> None:
-    """Pictures, a film, and a plot of each thing."""
     found = Page(page(report_of(_QUIET), []))
     tags = [tag for tag, _ in found.tags]
     assert (tags.count("img"), tags.count("video"), tags.count("svg")) == (2, 1, 4)
@@ -95,7 +93,6 @@ def test_pictures_are_no_reason_for_a_page_of_any_size() -> None:
 
 
 def test_what_makes_no_film_is_told() -> None:
-    """Two kinds: pictures alone, and nothing at all."""
     made = report_of(_QUIET)
     made.plays = {
         "one": Play(film=Film((png(FRAME),), frames=1, lacks="pip install it")),
@@ -107,7 +104,6 @@ def test_what_makes_no_film_is_told() -> None:
 
 
 def test_a_page_is_bounded() -> None:
-    """However much a repository says."""
     made = report_of(_QUIET)
     for number in range(5_000):
         made.judged("runs", ["x" * 100_000], f"{number}")
@@ -126,7 +122,6 @@ def test_a_page_is_bounded() -> None:
     ],
 )
 def test_a_page_says_no_film_only_where_there_is_none(film: Film, says: str, says_not: str) -> None:
-    """And why, below what there is."""
     made = Report("./walk:env.py")
     made.plays["a / 0"] = Play(film=film)
     text = page(made, [])
@@ -143,7 +138,6 @@ def test_a_lone_plot_is_as_large_as_one_of_several() -> None:
 
 
 def test_figures_have_units_for_people() -> None:
-    """Sizes and times, in as few characters as say it."""
     made = Report("./walk:env.py")
     made.figures["a / 0"] = {"steps": 200.0, "step_mean_s": 0.0123, "memory_bytes": 3.0 * 2**30}
     words = Page(page(made, [])).text

@@ -68,13 +68,11 @@ _LENGTHS = frozenset({"x", "y", "x1", "y1", "x2", "y2", "width", "height"})
 
 @pytest.mark.parametrize("kind", _DRAWN)
 def test_nothing_is_drawn_of_nothing(kind: str) -> None:
-    """No empty frame."""
     assert _DRAWN[kind]([]) == ""
     assert _DRAWN[kind]([float("nan")]) == ""
 
 
 def test_bars_stand_for_their_numbers() -> None:
-    """Twice as much is twice as high, and below zero is below."""
     high, low, below = (
         one for one in ElementTree.fromstring(bar_plot("x", [4, 2, -2])) if len(one)
     )
@@ -86,7 +84,6 @@ def test_bars_stand_for_their_numbers() -> None:
 
 
 def test_every_step_is_counted_once() -> None:
-    """The fastest and the slowest, too."""
     seconds = [0.001 * value for value in range(1, 400)]
     titles = [
         one[0].text for one in ElementTree.fromstring(histogram_plot("x", seconds)) if len(one)
@@ -95,6 +92,5 @@ def test_every_step_is_counted_once() -> None:
 
 
 def test_a_number_is_short() -> None:
-    """Also where it is none."""
     assert [number(value) for value in (0.12345, 12345.0, 1e9)] == ["0.123", "12,345", "1e+09"]
     assert number(float("nan")) == "none"

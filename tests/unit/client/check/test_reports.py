@@ -82,7 +82,6 @@ def test_all_that_there_can_be_is_a_line_and_no_notice() -> None:
 
 @pytest.mark.parametrize("text", HOSTILE)
 def test_junit_is_well_formed(text: str) -> None:
-    """Two cases, whatever the text."""
     made = report(text)
     suite = ElementTree.fromstring(reports.junit(made, made.findings))
     assert suite.attrib["tests"] == "2"
@@ -94,7 +93,6 @@ def test_junit_is_well_formed(text: str) -> None:
 
 @pytest.mark.parametrize("text", HOSTILE)
 def test_sarif_is_data(text: str) -> None:
-    """A result of a rule that is there, at a place that is a URI."""
     made = report(text)
     [run] = json.loads(reports.sarif(made, made.findings))["runs"]
     assert [rule["id"] for rule in run["tool"]["driver"]["rules"]] == list(CHECKS)
@@ -114,7 +112,6 @@ def test_sarif_has_no_strangers_links() -> None:
 
 
 def test_a_summary_makes_no_links_of_names() -> None:
-    """A host's name is one without any markup."""
     made = report("www.example.com/x __bold__")
     assert "www.example" not in reports.summary(made, made.findings)
     assert "__" not in reports.summary(made, made.findings)

@@ -43,7 +43,6 @@ def test_what_is_no_policy_is_refused(text: str, says: str, tmp_path: Path) -> N
 
 
 def test_a_policy_that_is_not_there_is_told(tmp_path: Path) -> None:
-    """And not taken for one that says nothing."""
     with pytest.raises(PolicyError, match="cannot be read"):
         settings.read_file(tmp_path / "nowhere.toml")
 
@@ -56,7 +55,6 @@ def options(folder: Path, text: str) -> dict[str, object]:
 
 
 def test_options_stand_in_a_file(tmp_path: Path) -> None:
-    """By the names that they have on the command line."""
     found = options(tmp_path, '[check]\nsteps = 9\nfail-on = "note"')
     assert found == {"steps": 9, "fail_on": "note"}
     assert options(tmp_path, "[other]\nsteps = 9") == {}

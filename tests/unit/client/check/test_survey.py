@@ -109,7 +109,6 @@ def test_what_is_worth_a_look_is_found(text: str, check: str, tmp_path: Path) ->
     ],
 )
 def test_honest_code_is_not_named(text: str, tmp_path: Path) -> None:
-    """Names that look alike, and letters of other languages."""
     assert found(tmp_path / "r", text) == []
 
 
@@ -177,13 +176,11 @@ def test_a_long_chain_ends_nothing(tmp_path: Path) -> None:
 
 
 def test_what_is_found_in_a_file_is_bounded(tmp_path: Path) -> None:
-    """And that there is more is found, too."""
     checks = [check for check, _ in found(tmp_path / "r", "eval()\n" * 20_000)]
     assert checks == ["source-dynamic"] * 100 + ["source-unread"]
 
 
 def test_what_is_read_of_a_repository_is_bounded(tmp_path: Path) -> None:
-    """What is left over is named, file by file."""
     folder = repository(tmp_path / "r", "odd.py", "")
     for number in range(70):
         (folder / f"part{number:02}.py").write_bytes((b"#" * 98 + b"\n") * 2_600)
@@ -195,7 +192,6 @@ def test_what_is_read_of_a_repository_is_bounded(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("start", ["MZ = 1", "BZh = 1", "#" + " " * 256 + "ustar"])
 def test_no_beginning_makes_python_anything_else(start: str, tmp_path: Path) -> None:
-    """It runs by its name, and is read by it."""
     assert ("source-process", 2) in found(tmp_path / "r", f"{start}\nimport subprocess")
 
 
@@ -211,7 +207,6 @@ def test_machine_code_in_place_of_a_source_fails(tmp_path: Path) -> None:
 
 
 def test_no_flood_hides_what_weighs_more(tmp_path: Path) -> None:
-    """Neither of findings nor of texts to be read."""
     folder = repository(tmp_path / "r", "z/odd.py", b"# coding: utf-7\n")
     (folder / "z/turned.py").write_text("x = 'a\u202eb'")
     for number in range(220):

@@ -42,7 +42,6 @@ def failing(folder: Path) -> set[str]:
 
 
 def test_an_honest_checkout_has_no_findings(repository: GitRepository) -> None:
-    """Also with changes that are in no commit yet."""
     assert found(repository.folder) == []
     (repository.folder / "new.py").write_text("x = 1\n")
     (repository.folder / "LICENSE").write_text("MIT-0")
@@ -134,7 +133,6 @@ def test_what_git_does_not_look_at_is_reported(repository: GitRepository, tmp_pa
 
 
 def test_a_link_is_read_as_the_hub_has_it(repository: GitRepository) -> None:
-    """Its text is what runs there, whatever it leads to here."""
     (repository.folder / "import os # helper.py").write_text("x = 1\n")
     (repository.folder / "helper.py").symlink_to("import os # helper.py")
     (repository.folder / "other.py").symlink_to("import ctypes")

@@ -72,7 +72,6 @@ def edit(folder: Path, *path: Any, value: Any) -> None:
 
 
 def test_a_bundle_comes_back(tmp_path: Path) -> None:
-    """What was written is what is read."""
     found = load_bundle(bundle(tmp_path))
     assert found.reference == f"models/org/repo@{COMMIT}"
     assert found.doubts == ()
@@ -140,7 +139,6 @@ HARM: dict[str, Callable[[Path], object]] = {
 
 @pytest.mark.parametrize("harm", HARM.values(), ids=HARM)
 def test_a_hostile_file_is_refused(tmp_path: Path, harm: Callable[[Path], object]) -> None:
-    """Nothing is followed, and nothing read beyond the bounds."""
     folder = bundle(tmp_path)
     harm(folder)
     with pytest.raises(BundleError):
@@ -203,7 +201,6 @@ def test_nothing_in_a_bundle_is_executed(tmp_path: Path) -> None:
 
 
 def test_repetition_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A small file cannot stand for an endless number of steps."""
     monkeypatch.setattr(bundle_reader, "MAX_REQUESTS", 100)
     folder = bundle(tmp_path)
     again = {"steps": [0, 3], "of": "actions-int64.npy"}
@@ -245,7 +242,6 @@ def test_the_whole_of_a_wish_is_shown(tmp_path: Path) -> None:
 
 
 def test_wishes_beyond_an_ordinary_run_are_told(tmp_path: Path) -> None:
-    """They are granted by the user, or left out."""
     policy = Policy(
         profile="no-userns",
         network="host",
@@ -318,7 +314,6 @@ class Recorder:
 
 
 def test_a_replay_asks_the_same(tmp_path: Path) -> None:
-    """In order; the verdict compares how and where it ended."""
     env = Recorder()
     found = replay(lambda: env, load_bundle(bundle(tmp_path)))
     assert env.asked == ["reset [1, 2]", "step [0, 0]", "step [1, 1]", "step [2, 2]"]
@@ -347,7 +342,6 @@ def test_a_request_that_does_not_fit_is_said(tmp_path: Path) -> None:
 
 
 def test_what_was_set_before_and_does_not_fit_is_said(tmp_path: Path) -> None:
-    """It is an answer, not a traceback."""
     folder = bundle(tmp_path)
     setting = inside.packet(m.pack(m.SetAttr(0, "size", (1,))))
     (folder / "requests.bin").write_bytes(setting + (folder / "requests.bin").read_bytes())
@@ -363,7 +357,6 @@ def test_what_was_set_before_and_does_not_fit_is_said(tmp_path: Path) -> None:
 
 
 def test_a_document_of_millions_of_lists_is_not_read(tmp_path: Path) -> None:
-    """Its size decides, before any of it is a list."""
     folder = bundle(tmp_path)
     with open(folder / "bundle.json", "w") as file:
         file.write("[" + "[]," * (MAX_DOCUMENT_BYTES // 3) + "[]]")

@@ -95,7 +95,6 @@ def test_requests_come_back_in_order() -> None:
 
 @given(st.lists(st.sampled_from(["int64", "int32", "uint8"]), max_size=12))
 def test_every_step_keeps_its_dtype(dtypes: list[str]) -> None:
-    """An environment may tell them apart."""
     kept = made()
     expected = [np.array([1, 2], dtype) for dtype in dtypes]
     for actions in expected:
@@ -197,7 +196,6 @@ def test_the_oldest_gives_way(limit: int, steps: int) -> None:
     "space", [spaces.Box(-1, 1, (1000,)), spaces.Dict(a=spaces.Box(-1, 1, (1000,)))]
 )
 def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch, space: Any) -> None:
-    """Large actions are fewer; so are large options."""
     monkeypatch.setattr(history, "HISTORY_BYTES", 100_000)
     kept = made(space, 1, limit=1000)
     actions: Any = np.zeros((1, 1000))
@@ -210,7 +208,6 @@ def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch, space: Any) -> None:
 
 
 def test_what_only_pickle_could_carry_is_described() -> None:
-    """The recording knows that it is not the thing itself."""
     kept = made()
     ask(kept, m.Call(0, "add", (object(),), {}))
     [request] = kept.recording().requests
@@ -220,7 +217,6 @@ def test_what_only_pickle_could_carry_is_described() -> None:
 
 
 def test_nothing_is_kept_where_nothing_is_wanted() -> None:
-    """A limit of 0 turns it off."""
     kept = made(limit=0)
     reset(kept, [1, 2])
     kept.step(np.array([1, 2]))

@@ -35,7 +35,6 @@ def script(*lines: str) -> str:
 
 
 def test_plain_requirements_get_through(tmp_path: Path) -> None:
-    """With extras, versions, markers and comments."""
     text = (
         "# wanted\nnumpy>=2\n\n  # more\nminigrid[wfc]==3.0 # pinned\nfoo; python_version<'3.12'\n"
     )
@@ -82,7 +81,6 @@ def test_whatever_could_run_code_does_not(tmp_path: Path, line: str) -> None:
 
 @pytest.mark.parametrize("line", ["-e ./here", "here @ file:///tmp/here", "a" * 3000])
 def test_nor_in_the_other_files(tmp_path: Path, line: str) -> None:
-    """Where a list of TOML holds it."""
     with pytest.raises(RequirementError, match=r"in the script metadata of env\.py"):
         repository(tmp_path, env__py=script(f"dependencies = ['{line}']"))
     project = f"[project]\nname = 'x'\ndependencies = ['{line}']\n"
@@ -91,7 +89,6 @@ def test_nor_in_the_other_files(tmp_path: Path, line: str) -> None:
 
 
 def test_a_file_that_is_no_text_is_refused(tmp_path: Path) -> None:
-    """Or too long to be one that somebody wrote."""
     path = tmp_path / "requirements.txt"
     for data in (b"\xff\xfe\x00", b"\x80numpy"):
         path.write_bytes(data)
@@ -131,7 +128,6 @@ def test_further_files_of_the_repository_are_read(tmp_path: Path) -> None:
     "named", ["../outside.txt", "/etc/hostname", "more", "https://a.example/r"]
 )
 def test_no_file_beyond_the_repository_is_read(tmp_path: Path, named: str) -> None:
-    """Whatever a line names."""
     (tmp_path / "outside.txt").write_text("numpy\n")
     (tmp_path / "repo/more").mkdir(parents=True)
     with pytest.raises(RequirementError, match="not a file of the repository"):
@@ -153,7 +149,6 @@ def test_the_repository_itself_is_its_project(tmp_path: Path) -> None:
 
 
 def test_a_chain_of_files_ends(tmp_path: Path) -> None:
-    """Before it has a thousand."""
     for number in range(module.MAX_FILES + 1):
         (tmp_path / f"{number}.txt").write_text(f"-r {number + 1}.txt\n")
     with pytest.raises(RequirementError, match="includes more than"):
@@ -161,7 +156,6 @@ def test_a_chain_of_files_ends(tmp_path: Path) -> None:
 
 
 def test_the_file_beside_the_entry_counts(tmp_path: Path) -> None:
-    """Before the one at the root."""
     (tmp_path / "deep").mkdir()
     (tmp_path / "deep/env.py").write_text("")
     (tmp_path / "requirements.txt").write_text("of-root\n")

@@ -100,7 +100,6 @@ def test_packages_lie_in_a_folder_that_nobody_can_write(index: Index, tmp_path: 
 def test_a_cache_below_a_folder_of_tests_has_bytecode(
     index: Index, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Only tests of the packages have none."""
     monkeypatch.setenv("ENVHUB_CACHE", str(tmp_path / "tests/cache"))
     make_wheel(index.folder, "wanted", files={"wanted/a.py": "", "wanted/tests/b.py": ""})
     env = made(repository(tmp_path / "repo", "wanted"))
@@ -109,7 +108,6 @@ def test_a_cache_below_a_folder_of_tests_has_bytecode(
 
 
 def test_source_that_cannot_be_compiled_is_nobodys_error(index: Index, tmp_path: Path) -> None:
-    """Packages hold templates and code of other Pythons."""
     make_wheel(index.folder, "wanted", files={"wanted.py": "print 'of another age'\n"})
     assert (made(repository(tmp_path / "repo", "wanted")).packages / "wanted.py").is_file()
 
@@ -141,7 +139,6 @@ def test_what_lost_its_content_is_made_again(index: Index, tmp_path: Path, damag
 
 
 def test_two_repositories_that_need_the_same_share_it(index: Index, tmp_path: Path) -> None:
-    """It is called by what is in it."""
     make_wheel(index.folder, "wanted")
     one, two = (made(repository(tmp_path / name, "wanted")) for name in ("a", "b"))
     other = made(repository(tmp_path / "c", "wanted==1.0", "numpy>=2"))
@@ -161,7 +158,6 @@ def test_newer_versions_come_when_they_are_asked_for(index: Index, tmp_path: Pat
 
 
 def test_many_threads_make_it_once(index: Index, tmp_path: Path) -> None:
-    """The others wait for the one; it lies there once."""
     folder = repository(tmp_path / "repo", "numpy")
     with ThreadPoolExecutor(4) as pool:
         homes = {env.home for env in pool.map(lambda _: made(folder), range(4))}
@@ -189,7 +185,6 @@ def maker(folder: Path) -> subprocess.Popen[str]:
 
 
 def test_ten_processes_make_it_once(index: Index, tmp_path: Path) -> None:
-    """By what the index is asked for: ten download what one does."""
     make_wheel(index.folder, "wanted")
     folder = repository(tmp_path / "repo", "wanted")
     asked = []
@@ -270,7 +265,6 @@ def test_what_a_killed_maker_started_is_waited_for(index: Index, tmp_path: Path)
 
 
 def test_what_was_left_half_made_is_collected(index: Index, tmp_path: Path) -> None:
-    """But not what somebody is making."""
     env = made(repository(tmp_path / "repo"))
     half = environments.root() / ".building-0123-x"
     (half / "packages").mkdir(parents=True)
@@ -309,7 +303,6 @@ def test_a_file_that_is_not_the_one_of_its_hash(index: Index, tmp_path: Path) ->
 
 
 def test_without_a_network_nothing_half_is_left(index: Index, tmp_path: Path) -> None:
-    """The index goes away between choosing and installing."""
     folder = repository(tmp_path / "repo")
     known(folder)
     index.broken = 503
@@ -430,7 +423,6 @@ def test_a_disk_that_fills_up_ends_it(
 
 
 def test_where_others_can_write_nothing_is_used(index: Index, tmp_path: Path) -> None:
-    """Somebody could have put another package in its place."""
     folder = repository(tmp_path / "repo")
     made(folder)
     environments.root().chmod(0o777)

@@ -114,7 +114,6 @@ def test_it_is_installed_and_told(index: Index, tmp_path: Path) -> None:
 
 
 def test_what_a_declared_package_brings_is_declared(index: Index, tmp_path: Path) -> None:
-    """By any of the distributions that bring the module."""
     make_wheel(index.folder, "declared", requires=["opencv-contrib-python"])
     make_wheel(index.folder, "opencv-contrib-python")
     found = snapshot(tmp_path / "r", "import cv2" + MAKE, requirements__txt="declared\n")
@@ -134,7 +133,6 @@ def test_an_extra_of_its_own_says_which(index: Index, tmp_path: Path) -> None:
 
 
 def test_no_index_is_asked_for_the_name_of_a_module(index: Index, tmp_path: Path) -> None:
-    """Anybody may have published it there."""
     make_wheel(index.folder, "nobody-knows-this")
     make_wheel(index.folder, "chess")
     found = snapshot(tmp_path / "r", "import nobody_knows_this, chess" + MAKE)
@@ -170,7 +168,6 @@ def test_a_guess_never_stands_in_the_way(
 
 
 def test_what_is_here_is_not_installed(index: Index, tmp_path: Path) -> None:
-    """As long as this interpreter has all of it."""
     found = snapshot(tmp_path / "r", "import rich, zmq" + MAKE)
     assert requirements(found) == ["rich", "pyzmq"]
     assert made(found) is None
@@ -189,7 +186,6 @@ def test_what_is_here_is_not_installed(index: Index, tmp_path: Path) -> None:
 def test_the_caller_has_the_last_word(
     tmp_path: Path, dependencies: Any, wanted: list[str], guessed: list[str]
 ) -> None:
-    """On what is declared, and on what is imported."""
     found = snapshot(tmp_path / "r", "import chess" + MAKE, requirements__txt="a\n")
     request = request_of(found, chosen(dependencies, None)[0])
     assert request is not None
@@ -250,7 +246,6 @@ def test_another_release_is_tried_and_remembered(
 
 
 def test_all_that_were_tried_are_named(tried: list[str]) -> None:
-    """With the way to one that this machine lacks."""
     with pytest.raises(ResolutionError) as caught:
         resolutions.resolution_for(request("never"))
     said = str(caught.value)
@@ -272,7 +267,6 @@ def test_no_other_release_is_tried_in_vain(
 
 
 def test_uv_fetches_an_interpreter_only_where_it_may(monkeypatch: pytest.MonkeyPatch) -> None:
-    """By its own command, which downloads nothing otherwise."""
     asked: list[Any] = []
     here: list[Interpreter] = []
     monkeypatch.setattr(*inside.finding_interpreters(), lambda wanted: list(here))

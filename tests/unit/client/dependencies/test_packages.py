@@ -73,7 +73,6 @@ def test_nothing_else_may_choose_packages(snapshot: Snapshot, tmp_path: Path) ->
 def test_what_has_drifted_gets_no_packages(
     snapshot: Snapshot, changes: dict[str, Any], said: str
 ) -> None:
-    """The repository is named, and nothing is installed."""
     with pytest.raises(LockDriftError, match=said) as caught:
         packages.locked_packages(snapshot, locked(snapshot, **changes))
     assert snapshot.label in str(caught.value)

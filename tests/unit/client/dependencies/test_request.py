@@ -49,7 +49,6 @@ def snapshot(folder: Path, requirements: str | None = None) -> Snapshot:
 
 
 def test_what_the_caller_says(tmp_path: Path) -> None:
-    """Two words, a path, or a mapping."""
     assert chosen("auto", None) == (AUTO, None)
     assert chosen("host", None) == (HOST, None)
     assert chosen("auto", "python3.12") == (HOST, "python3.12")
@@ -79,7 +78,6 @@ def test_what_the_caller_says(tmp_path: Path) -> None:
     ],
 )
 def test_what_nobody_could_have_meant_is_refused(wrong: Any) -> None:
-    """By the name of the argument."""
     with pytest.raises(PolicyError, match="dependencies"):
         chosen(wrong, None)
 
@@ -108,7 +106,6 @@ def test_no_link_and_no_second_interpreter(
     ],
 )
 def test_what_is_here_is_not_installed_again(lines: list[str]) -> None:
-    """By name and version, without importing any of it."""
     assert interpreters.first_unmet(declares(*lines)) is None
 
 
@@ -135,7 +132,6 @@ def test_a_marker_that_says_nothing_is_left_to_uv(marker: str) -> None:
 def test_a_python_that_was_built_from_a_checkout(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It says a plus behind its version."""
     monkeypatch.setattr(platform, "python_version", lambda: "3.12.1+")
     assert interpreters.first_unmet(declares(python=">=3.12,<3.13")) is None
     assert interpreters.own().version == "3.12.1"
@@ -147,7 +143,6 @@ def test_a_python_that_was_built_from_a_checkout(
 
 
 def test_another_python_is_not_here() -> None:
-    """Whatever is installed."""
     assert interpreters.first_unmet(declares(python=f"=={platform.python_version()}")) is None
     assert interpreters.first_unmet(declares("numpy", python="<3")) == "python<3"
 
@@ -181,7 +176,6 @@ def test_only_what_is_missing_makes_an_environment(tmp_path: Path) -> None:
 
 
 def test_this_interpreter_without_its_packages_comes_first() -> None:
-    """A virtual environment has none that anybody else needs."""
     found = interpreters.find("", ">=3.10")
     assert found == interpreters.own()
     assert Path(found.path).resolve() == Path(found.path)
@@ -190,7 +184,6 @@ def test_this_interpreter_without_its_packages_comes_first() -> None:
 
 @pytest.mark.parametrize(("asked", "declared"), [("3.99", ""), ("", ">=3.99"), ("3.8", "")])
 def test_no_interpreter_is_an_error_that_says_what_to_do(asked: str, declared: str) -> None:
-    """Nothing is downloaded."""
     with pytest.raises(InterpreterUnavailableError, match=r"uv python install"):
         interpreters.find(asked, declared)
 
@@ -210,7 +203,6 @@ def test_a_pyenv_that_is_closed_to_us_has_none(
 
 
 def test_an_interpreter_by_its_path(tmp_path: Path) -> None:
-    """It is asked what it is; what does not answer is none."""
     ours = interpreters.own()
     assert interpreters.find(ours.path) == ours
     with pytest.raises(InterpreterUnavailableError, match="does not work as an interpreter"):
@@ -244,7 +236,6 @@ def test_a_missing_module_has_one_cure(
 
 
 def test_a_repository_that_declares_nothing_is_said_to(tmp_path: Path) -> None:
-    """And one whose file cannot be taken, why."""
     nothing = MissingModule(snapshot(tmp_path), "process", "auto", None, False).advice()
     assert "declares no packages" in nothing
     wrong = snapshot(tmp_path, "-e .\n")

@@ -99,7 +99,6 @@ def test_what_is_named_beside_another_is_built_in_its_turn(
 def test_wheels_are_taken_where_there_are_some(
     index: Index, tmp_path: Path, built: list[Source]
 ) -> None:
-    """An older one, rather than a newer source."""
     source_distribution(index.folder, "only-source", "2.0", tmp_path / "ran")
     make_wheel(index.folder, "only-source", "1.0")
     assert "only-source==1.0" in resolutions.resolution_for(request("only-source")).lock.packages
@@ -107,7 +106,6 @@ def test_wheels_are_taken_where_there_are_some(
 
 
 def test_without_a_builder_there_are_wheels_alone(index: Index, tmp_path: Path) -> None:
-    """Nothing runs, and the text names the package."""
     source_distribution(index.folder, "only-source", "1.5", tmp_path / "ran")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(resolutions, "BUILDER", None)
@@ -120,7 +118,6 @@ def test_without_a_builder_there_are_wheels_alone(index: Index, tmp_path: Path) 
 
 
 def test_a_repository_becomes_the_version_of_its_wheel(index: Index, built: list[Source]) -> None:
-    """uv never hears of it."""
     make_wheel(index.folder, "only-wheel")
     line = f"Of_Git @ git+https://git.example/a/b.git@{COMMIT}#subdirectory=python"
     found = resolutions.resolution_for(request(line)).lock

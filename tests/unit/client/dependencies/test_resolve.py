@@ -102,7 +102,6 @@ def test_what_jails_import_is_what_the_image_installs(project: dict[str, Any]) -
 
 
 def test_a_contradiction_names_both_lines(index: Index) -> None:
-    """And not those that have nothing to do with it."""
     make_wheel(index.folder, "one", requires=["shared<2"])
     make_wheel(index.folder, "innocent")
     make_wheel(index.folder, "shared", "1.0")
@@ -117,20 +116,17 @@ def test_a_contradiction_names_both_lines(index: Index) -> None:
 
 
 def test_what_the_worker_needs_can_be_in_the_way(index: Index) -> None:
-    """It is named as such, and not as a line of the repository."""
     make_wheel(index.folder, "gymnasium", "0.21")
     with pytest.raises(ResolutionError, match=r"gymnasium>=.*the worker of envhub-sandbox"):
         resolve("gymnasium<0.22")
 
 
 def test_a_package_that_is_nowhere(index: Index) -> None:
-    """Its line is named."""
     with pytest.raises(ResolutionError, match=r"no-such-package  \(line 1"):
         resolve("no-such-package")
 
 
 def test_a_requirement_is_left_out_or_replaced(index: Index) -> None:
-    """Whoever needs it."""
     make_wheel(index.folder, "one", requires=["shared<2", "unwanted"])
     make_wheel(index.folder, "shared", "1.0")
     make_wheel(index.folder, "shared", "2.0")
@@ -144,7 +140,6 @@ def test_a_requirement_is_left_out_or_replaced(index: Index) -> None:
 
 
 def test_a_constraint_holds_only_for_what_is_needed(index: Index) -> None:
-    """And is named where nothing satisfies it."""
     make_wheel(index.folder, "one", requires=["shared"])
     make_wheel(index.folder, "shared", "1.0")
     make_wheel(index.folder, "shared", "2.0")
@@ -155,7 +150,6 @@ def test_a_constraint_holds_only_for_what_is_needed(index: Index) -> None:
 
 
 def test_another_python_is_told_from_another_fault(index: Index) -> None:
-    """By what uv says."""
     make_wheel(index.folder, "newer", python=">=3.99")
     make_wheel(index.folder, "tagged", tag="cp399-cp399-any")
     for name in ("newer", "tagged"):
@@ -191,14 +185,12 @@ def test_a_hash_of_the_repositorys_is_kept(index: Index) -> None:
 
 
 def test_a_release_that_was_taken_back(index: Index) -> None:
-    """It is not chosen by itself, and the text says why."""
     index.yanked.add(make_wheel(index.folder, "wanted").name)
     with pytest.raises(ResolutionError, match=r"(?s)yanked by its authors.*yanked"):
         resolve("wanted")
 
 
 def test_no_index(index: Index) -> None:
-    """The one that is named does not answer; what to do is said."""
     index.broken = 503
     with pytest.raises(IndexUnavailableError, match="UV_INDEX_URL"):
         resolve("numpy")
@@ -208,7 +200,6 @@ def test_no_index(index: Index) -> None:
 def test_no_password_of_an_index_is_in_an_error(
     index: Index, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, wrong: str
 ) -> None:
-    """Errors are logged, and shown to others."""
     index.broken = 503
     url = os.environ["UV_DEFAULT_INDEX"]
     monkeypatch.setenv("UV_DEFAULT_INDEX", wrong.format(url=url))
@@ -252,7 +243,6 @@ def test_without_a_uv_that_can_be_used_the_error_says_how_to_get_one(
 
 
 def test_the_project_asks_for_the_oldest_uv_that_is_taken(project: dict[str, Any]) -> None:
-    """So that pip brings one that is."""
     oldest = ".".join(map(str, uv.OLDEST))
     assert f"uv>={oldest}" in project["project"]["dependencies"]
 
@@ -294,7 +284,6 @@ def test_the_users_settings_are_uvs(given: dict[str, str], uvs: dict[str, str | 
 def test_a_relative_path_is_relative_to_the_users_folder(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """uv runs in another one."""
     for name, version in WORKERS.items():
         make_wheel(tmp_path, name, version)
     monkeypatch.chdir(tmp_path.parent)

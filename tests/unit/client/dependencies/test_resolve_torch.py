@@ -37,14 +37,12 @@ def names(request: PackageRequest) -> set[str]:
 
 
 def test_an_index_that_has_both(cuda: Path) -> None:
-    """All of the same versions, without NVIDIA's packages."""
     make_wheel(cuda, "torch", "2.5+cpu")
     make_wheel(cuda, "torchvision", "0.20+cpu", requires=["torch==2.5"])
     assert names(TORCH) == {"torch==2.5+cpu", "torchvision==0.20+cpu"}
 
 
 def test_an_index_without_stays_as_it_is(cuda: Path) -> None:
-    """So does one that has it of another version alone."""
     make_wheel(cuda, "torch", "2.4+cpu")
     assert names(TORCH) == {"torch==2.5", "torchvision==0.20", "nvidia-cublas==1.0"}
 
@@ -65,7 +63,6 @@ def test_who_has_a_gpu_gets_cuda(gpu: bool, monkeypatch: pytest.MonkeyPatch) -> 
 def test_pytorchs_own_index_is_asked_only_by_who_has_chosen_none(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A mirror that was named is all that there is."""
     lock = CUDA
     without = Lock("torch==2.5+cpu \\\n    --hash=sha256:00\n")
     monkeypatch.delenv("UV_TORCH_BACKEND", raising=False)

@@ -22,7 +22,6 @@ def required(wheel: Path) -> list[str]:
 
 
 def test_versions_that_end_in_a_dot(tmp_path: Path) -> None:
-    """As gym 0.21 has them; RECORD says what is there then."""
     wheel = make_wheel(tmp_path, "x", requires=OLD)
     mend(wheel)
     assert required(wheel) == list(NEW)
@@ -30,7 +29,6 @@ def test_versions_that_end_in_a_dot(tmp_path: Path) -> None:
 
 
 def test_what_is_well_stays_as_it_is(tmp_path: Path) -> None:
-    """To the byte."""
     wheel = make_wheel(tmp_path, "x", requires=NEW)
     data = wheel.read_bytes()
     mend(wheel)

@@ -79,8 +79,6 @@ def test_the_second_time_no_jail_is_opened(launcher: Launcher, server: LyingServ
 
 
 def test_what_does_not_agree_leaves_no_jail(launcher: Launcher, server: LyingServer) -> None:
-    """Neither a first one, nor one of what is remembered."""
-
     def refuses(manifest: Manifest) -> None:
         raise LoadError(f"{len(manifest.envs)} was not locked")
 

@@ -39,7 +39,6 @@ def test_headers_that_would_lead_elsewhere_are_refused(name: str, good: str, bad
 
 
 def test_a_body_is_read_to_its_bound(monkeypatch: pytest.MonkeyPatch) -> None:
-    """And no further, however long it goes on."""
     monkeypatch.setattr(answers, "MAX_BODY_BYTES", 10)
     read: list[int] = []
 

@@ -76,14 +76,12 @@ def test_an_entry_that_git_ignores_is_named(repository: GitRepository) -> None:
 
 
 def test_a_deleted_file_is_not_there(repository: GitRepository) -> None:
-    """A commit of everything would delete it."""
     repository.commit({"gone.py": ""})
     (repository.folder / "gone.py").unlink()
     assert files(repository.folder) == {"env.py": "1"}
 
 
 def test_an_empty_repository_and_pipes_are_no_error(tmp_path: Path, snapshot_store: Path) -> None:
-    """Nothing needs to have been committed."""
     folder = GitRepository(tmp_path / "new").folder
     (folder / "env.py").write_text("1")
     os.mkfifo(folder / "pipe")
@@ -241,7 +239,6 @@ def test_without_a_checkout_that_git_can_read_everything_counts(
 def test_without_git_everything_counts(
     repository: GitRepository, monkeypatch: pytest.MonkeyPatch, found: str
 ) -> None:
-    """And no program of the folder's is taken for it."""
     repository.commit({".gitignore": "*.pyc\n"})
     (repository.folder / "a.pyc").write_text("payload")
     program = repository.folder / "git"
@@ -284,7 +281,6 @@ def test_whose_checkout_it_is_counts(repository: GitRepository) -> None:
 
 @pytest.mark.parametrize("name", [b"caf\xe9.py", b"a\nb.py", b"a\\b.py"])
 def test_names_that_the_hub_cannot_have_are_refused(repository: GitRepository, name: bytes) -> None:
-    """No file is left out for its name."""
     (repository.folder / os.fsdecode(name)).write_text("")
     with pytest.raises(SnapshotError, match="in its name"):
         local(repository.folder)

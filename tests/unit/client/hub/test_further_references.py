@@ -85,7 +85,6 @@ def test_form_is_read(text: str) -> None:
 
 @pytest.mark.parametrize(("text", "what", "write"), REFUSED)
 def test_refusal_says_what_to_write(text: str, what: str, write: str) -> None:
-    """And shows no login."""
     with pytest.raises(HubReferenceError, match=what) as caught:
         HubRef.parse(text)
     assert write in str(caught.value)
@@ -100,7 +99,6 @@ def test_a_reference_that_was_not_parsed_is_checked_too(name: str) -> None:
 
 
 def test_what_git_may_be_given() -> None:
-    """No option, no login, no other protocol: whoever asks."""
     assert address.is_url("https://h/x")
     refused = ("--upload-pack=x", "http://h/x", "https://u@h/x", "https://h/x y", "/etc", "ext::x")
     assert not any(map(address.is_url, refused))
@@ -114,7 +112,6 @@ def test_only_a_full_commit_is_pinned() -> None:
 
 
 def test_provenance_becomes_the_reference_again() -> None:
-    """Of each kind of repository."""
     for text, kind, name, commit, path in (
         (f"git+{SITE}@{COMMIT}:a.py", "git", SITE, COMMIT, "a.py"),
         ("pypi:x@1.0#X-v0", "pypi", "x@1.0#X-v0", "pypi-00", "env.py"),

@@ -17,7 +17,6 @@ from envhub_sandbox.hub.sources import toml
     ["owner/name", "owner/name@main", "owner/name:a/b.py", "spaces/owner/name@v1:c.py"],
 )
 def test_what_is_read_is_written_again(text: str) -> None:
-    """A canonical reference stays as it is."""
     parts = grammar.read(text)
     grammar.check(parts)
     assert grammar.join(parts) == text
@@ -42,7 +41,6 @@ def test_what_is_read_is_written_again(text: str) -> None:
     ],
 )
 def test_parts_that_the_hub_cannot_have(parts: grammar.Parts, what: str) -> None:
-    """What is wrong, and what to write instead."""
     with pytest.raises(grammar.Wrong) as wrong:
         grammar.check(parts)
     assert what in wrong.value.what
@@ -65,14 +63,12 @@ def test_an_environment_of_a_package(text: str, write: str) -> None:
 
 
 def test_a_file_that_is_not_here() -> None:
-    """A name of Python code is a file's, not a repository's."""
     with pytest.raises(grammar.Wrong, match="does not exist here") as wrong:
         grammar.read("env.py")
     assert "OWNER/NAME:env.py" in wrong.value.write
 
 
 def test_folders_and_commits_are_told_from_names() -> None:
-    """By their form alone."""
     assert all(map(grammar.is_local, [".", "./env", "../env", "/env", "~/env"]))
     assert not any(map(grammar.is_local, ["env", "owner/name", ".hidden/name"]))
     assert grammar.is_commit("0123456789abcdef" * 2 + "01234567")
@@ -135,7 +131,6 @@ def test_each_failure_has_its_kind(error: BaseException, kind: Kind | None) -> N
 
 
 def test_a_failure_says_what_to_do() -> None:
-    """With the page, the wait and what the Hub said, as one line."""
     failure = failed(answered(429, Retry_After="30", X_Error_Message="too\nmany"))
     assert 'it said: "too many"' in failure.what
     assert "Wait 30 s" in failure.advice
@@ -144,7 +139,6 @@ def test_a_failure_says_what_to_do() -> None:
 
 
 def test_a_secret_that_is_echoed_is_in_no_text() -> None:
-    """Neither in what is said nor in the exceptions below it."""
     error = answered(403, X_Error_Message="hf_secret may not")
     assert "hf_secret" not in failed(error, "hf_secret").what
     inner = ValueError("hf_secret", 3)
@@ -156,7 +150,6 @@ def test_a_secret_that_is_echoed_is_in_no_text() -> None:
 
 
 def test_toml_is_read_within_bounds() -> None:
-    """Its length, and the dots that a parser's time grows with."""
     assert toml.loads("a.b = 1", 100) == {"a": {"b": 1}}
     for text, most in (("a = 1", 4), (".".join("a" * 3_000) + " = 1", 10_000), ("a = [", 100)):
         with pytest.raises(ValueError, match=r".") as error:

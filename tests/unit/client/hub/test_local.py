@@ -93,7 +93,6 @@ def test_forms_of_a_local_reference(
 
 
 def test_a_folders_commit_is_named_without_a_copy(folder: Path) -> None:
-    """By its content, and by whatever file of it."""
     (folder / "new.py").write_text("new = 1")
     named = commit_of(str(folder))
     assert named == commit_of(f"{folder}:new.py") == commit_of(f"{folder}/new.py")
@@ -104,7 +103,6 @@ def test_a_folders_commit_is_named_without_a_copy(folder: Path) -> None:
 
 
 def test_missing_folder_says_what_to_write(folder: Path) -> None:
-    """A typo is answered with the forms that exist."""
     with pytest.raises(RepositoryUnavailableError, match=r"no such folder.*'\./folder'"):
         local(folder.parent / "my-enf")
 
@@ -133,7 +131,6 @@ def test_every_file_counts_but_those_of_git(folder: Path) -> None:
 
 
 def test_a_virtual_environment_is_named(folder: Path) -> None:
-    """It cannot be copied, and the error says what to do."""
     (folder / ".venv/bin").mkdir(parents=True)
     (folder / ".venv/pyvenv.cfg").write_text("")
     (folder / ".venv/bin/python").symlink_to(sys.executable)
@@ -174,14 +171,12 @@ def test_link_without_an_end_is_named(folder: Path, target: str, said: str) -> N
 
 
 def test_bottomless_folder_is_refused(folder: Path) -> None:
-    """Depth is bounded before it could exhaust the stack."""
     folder.joinpath(*["d"] * 80).mkdir(parents=True)
     with pytest.raises(SnapshotError, match="is over 64 folders deep"):
         local(folder)
 
 
 def test_folder_reached_through_a_link_works(folder: Path) -> None:
-    """The folder itself may be a link, as a checkout often is."""
     (folder.parent / "alias").symlink_to(folder)
     assert local(folder.parent / "alias").root == local(folder).root
 
@@ -204,7 +199,6 @@ def test_edited_copy_is_refused(folder: Path) -> None:
 
 
 def test_half_deleted_copy_is_made_again(folder: Path) -> None:
-    """Its source is at hand."""
     snapshot = local(folder)
     snapshot.root.chmod(0o755)
     (snapshot.root / "env.py").unlink()
@@ -234,6 +228,5 @@ def test_an_example_is_found_from_anywhere(
 
 @pytest.mark.parametrize("name", ["", "nope", "../tests", "cartpole/env.py", "ci"])
 def test_what_is_no_example_is_refused_with_those_that_there_are(name: str) -> None:
-    """A name is one of a list, and never a path."""
     with pytest.raises(RepositoryUnavailableError, match="choose one: examples:cartpole, "):
         split_local(f"examples:{name}", "env.py")

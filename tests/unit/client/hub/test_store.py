@@ -371,7 +371,6 @@ def test_copy_is_what_the_record_says_or_an_error(tmp_path: Path, kind: str) -> 
 
 @pytest.mark.skipif(shutil.which("git") is None, reason="needs git")
 def test_git_digest_is_gits_own(tmp_path: Path) -> None:
-    """The blob id agrees with the one that git computes."""
     (tmp_path / "x").write_bytes(b"hello\n")
     command = ["git", "hash-object", str(tmp_path / "x")]
     expected = subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()

@@ -66,7 +66,6 @@ def test_what_is_written_is_read_again(tmp_path: Path) -> None:
 
 
 def test_a_lock_that_cannot_be_written_says_so(tmp_path: Path) -> None:
-    """And leaves nothing."""
     with pytest.raises(LockError, match="cannot be written"):
         lockfile.write(LOCK, tmp_path / "none" / "pylock.repo.toml")
     with pytest.raises(LockError, match="cannot be written"):
@@ -75,7 +74,6 @@ def test_a_lock_that_cannot_be_written_says_so(tmp_path: Path) -> None:
 
 
 def test_it_is_a_lock_of_the_standard(index: Index, tmp_path: Path) -> None:
-    """uv itself installs from it."""
     make_wheel(index.folder, "wanted")
     lock = made(tmp_path / "repo", "wanted")
     path = tmp_path / "pylock.repo.toml"
@@ -119,7 +117,6 @@ def test_a_lock_has_every_package_with_its_files(index: Index, tmp_path: Path) -
 
 
 def test_hashes_of_the_repository_hold_in_its_lock(index: Index, tmp_path: Path) -> None:
-    """Of two files that fit, only the permitted one is locked."""
     wheel = make_wheel(index.folder, "wanted")
     make_wheel(index.folder, "wanted", files={"wanted/other.py": ""}, tag="py2.py3-none-any")
     digest = hashlib.sha256(wheel.read_bytes()).hexdigest()
@@ -325,7 +322,6 @@ def test_a_name_with_a_line_end_would_be_obeyed(index: Index, tmp_path: Path) ->
 def test_an_index_that_has_another_file_gets_no_lock(
     index: Index, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What was chosen is what is locked."""
     make_wheel(index.folder, "wanted")
     made(tmp_path / "repo", "wanted")
     make_wheel(index.folder, "wanted", files={"wanted/__init__.py": "evil = 1\n"})

@@ -122,8 +122,6 @@ def test_termination_is_told_from_truncation() -> None:
 
 
 def test_the_same_seed_gives_the_same_rollout() -> None:
-    """Actions are seeded, not just the environment."""
-
     def returns(seed: int) -> list[tuple[float, ...]]:
         env: Any = gym.make_vec("CartPole-v1", num_envs=3, vectorization_mode="sync")
         return [e.returns for e in rollout(env, episodes=12, seed=seed).episodes]
@@ -133,7 +131,6 @@ def test_the_same_seed_gives_the_same_rollout() -> None:
 
 
 def test_max_steps_stops_and_says_so() -> None:
-    """Unfinished episodes are not counted."""
     result = rollout(scripted("NextStep", 1), episodes=1000, seed=0, max_steps=10)
     assert not result.complete
     assert result.steps <= 10
@@ -150,7 +147,6 @@ def test_a_reset_step_is_no_step() -> None:
 
 
 def test_vector_rewards_are_summed_component_by_component() -> None:
-    """Rewards of shape (num_envs, 2) give returns of two."""
     counter = EpisodeCounter(2, 2, "SameStep")
     counter.step([[1, 2], [3, 4]], [False, True], [False, False], {})
     counter.step([[10, 20], [30, 40]], [True, True], [False, False], {})
@@ -186,7 +182,6 @@ def test_rewards_that_cannot_be_counted_are_refused(rewards: Any) -> None:
 
 
 def test_rewards_that_change_their_shape_are_refused() -> None:
-    """A hostile worker must not have them broadcast."""
     counter = EpisodeCounter(2, 2, None)
     counter.step([1, 2], [False, False], [False, False], {})
     with pytest.raises(RolloutError, match="changed their shape"):
@@ -195,7 +190,6 @@ def test_rewards_that_change_their_shape_are_refused() -> None:
 
 @pytest.mark.parametrize("flags", [[False], [[False, False]], [0.5, 0.5], ["a", "b"]])
 def test_flags_that_are_none_are_refused(flags: Any) -> None:
-    """Of another shape or kind."""
     with pytest.raises(RolloutError, match="terminations are"):
         EpisodeCounter(2, 2, None).step([1, 2], flags, [False, False], {})
 
@@ -240,7 +234,6 @@ def test_an_unknown_action_space_is_explained() -> None:
 
 
 def test_every_state_is_observed_once() -> None:
-    """After the reset, and after every step."""
     steps: list[int] = []
     env = scripted("SameStep", 1)
     rollout(env, episodes=3, seed=0, observe=lambda counter: steps.append(counter.steps))
@@ -272,7 +265,6 @@ SPACES: list[gym.Space[Any]] = [
 
 @pytest.mark.parametrize("space", SPACES, ids=str)
 def test_it_is_a_member(space: gym.Space[Any]) -> None:
-    """Of the single space, and batched of the batched one."""
     assert space.contains(zero_action(space))
     batched = batch_space(space, 3)
     assert batched.contains(zero_action(batched))
@@ -287,6 +279,5 @@ def test_it_is_zero_or_the_nearest() -> None:
 
 
 def test_a_space_of_nobody_is_refused() -> None:
-    """Nothing is guessed."""
     with pytest.raises(gym.error.CustomSpaceError):
         zero_action(gym.Space())

@@ -31,20 +31,17 @@ def pixels(data: bytes) -> NDArray[np.uint8]:
 
 @pytest.mark.parametrize("shape", [(1, 1, 3), (1, 7, 3), (9, 2, 3), (30, 40, 3)])
 def test_a_png_has_the_very_pixels(shape: tuple[int, ...]) -> None:
-    """Noise, of which nothing is guessed."""
     frame = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)
     assert np.array_equal(pixels(png(frame)), frame)
     assert np.array_equal(pixels(png(frame[::-1, ::-1])), frame[::-1, ::-1])
 
 
 def test_what_is_small_stays() -> None:
-    """Nothing is enlarged."""
     frame = np.zeros((5, 8, 3), np.uint8)
     assert small_picture(frame, 8) is frame
 
 
 def test_a_pixel_is_the_mean_of_those_that_it_stands_for() -> None:
-    """Two by two of them."""
     frame = np.zeros((4, 6, 3), np.uint8)
     frame[:2, :2, 1] = [[0, 100], [200, 255]]
     small = small_picture(frame, 3)
@@ -55,7 +52,6 @@ def test_a_pixel_is_the_mean_of_those_that_it_stands_for() -> None:
 
 @pytest.mark.parametrize("size", [(1, 4096), (4096, 1), (2, 321), (4096, 4096), (319, 4095)])
 def test_no_side_is_longer_and_none_is_nothing(size: tuple[int, int]) -> None:
-    """Also of frames that nobody would render."""
     small = small_picture(np.zeros((*size, 3), np.uint8), 320)
     assert min(small.shape[:2]) >= 1
     assert max(small.shape[:2]) <= 320

@@ -38,7 +38,6 @@ def test_the_first_sub_environment_is_taken(rendered: Any) -> None:
 
 
 def test_odd_sides_repeat_their_last_line() -> None:
-    """Encoders want even sides; nothing is rescaled."""
     picture = np.arange(5 * 3 * 3, dtype=np.uint8).reshape(5, 3, 3)
     padded = first_frame((picture,), "rgb_array")
     assert padded.shape == (6, 4, 3)
@@ -58,14 +57,12 @@ def test_odd_sides_repeat_their_last_line() -> None:
     ],
 )
 def test_what_is_no_frame_is_refused(rendered: Any, says: str) -> None:
-    """Wrong types, shapes and sizes, each by its name."""
     with pytest.raises(VideoError, match=says):
         first_frame((rendered,), "rgb_array")
 
 
 @pytest.mark.parametrize("rendered", [None, (None,), ()])
 def test_an_environment_that_draws_nothing_is_told_how(rendered: Any) -> None:
-    """The message names the option that may help."""
     with pytest.raises(VideoError, match="--env-kwargs render_mode=rgb_array"):
         first_frame(rendered, None)
     with pytest.raises(VideoError, match="'human'"):
@@ -86,13 +83,11 @@ def test_an_environment_that_draws_nothing_is_told_how(rendered: Any) -> None:
     ],
 )
 def test_fps_is_sensible_whatever_the_metadata_says(metadata: Any, fps: float) -> None:
-    """The environment's own where it can be one."""
     assert fps_of(metadata) == fps
 
 
 @pytest.mark.parametrize("size", [(64, 48), (2, 2), (130, 6)])
 def test_a_written_video_can_be_read(tmp_path: Path, size: tuple[int, int]) -> None:
-    """With its size, its rate and every frame."""
     path = tmp_path / "out.mp4"
     with VideoWriter(path, 10.0) as writer:
         for value in range(0, 250, 10):
@@ -105,7 +100,6 @@ def test_a_written_video_can_be_read(tmp_path: Path, size: tuple[int, int]) -> N
 
 
 def test_a_name_cannot_be_an_option(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A file that begins with a dash is a file."""
     monkeypatch.chdir(tmp_path)
     with VideoWriter(Path("-version.mp4"), 10.0) as writer:
         writer.add(frame())
@@ -113,7 +107,6 @@ def test_a_name_cannot_be_an_option(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 
 def test_frames_of_another_size_are_refused(tmp_path: Path) -> None:
-    """An encoder would read them as garbage."""
     with VideoWriter(tmp_path / "out.mp4", 10.0) as writer:
         writer.add(frame(4, 6))
         with pytest.raises(VideoError, match=r"changed from \(6, 4\) to \(4, 4\)"):
@@ -122,7 +115,6 @@ def test_frames_of_another_size_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["out.txt", "nowhere/out.mp4", "folder.mp4"])
 def test_targets_that_cannot_work_are_refused_early(tmp_path: Path, name: str) -> None:
-    """Before any environment is run."""
     (tmp_path / "folder.mp4").mkdir()
     with pytest.raises(VideoError):
         check_target(tmp_path / name)
@@ -131,7 +123,6 @@ def test_targets_that_cannot_work_are_refused_early(tmp_path: Path, name: str) -
 def test_a_missing_encoder_comes_with_the_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The extra that brings it is named."""
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(VideoError, match=r"pip install 'envhub-sandbox\[video\]'"):
         check_target(tmp_path / "out.mp4")
@@ -139,7 +130,6 @@ def test_a_missing_encoder_comes_with_the_command(
 
 @pytest.mark.parametrize("fps", [10**400, -(10**400), 1e-300, 0, -1, float("nan"), "30", None])
 def test_rates_that_no_file_has_are_not_taken(tmp_path: Path, fps: object) -> None:
-    """Whatever the metadata says, the video can be written."""
     with VideoWriter(tmp_path / "x.mp4", fps_of({"render_fps": fps})) as writer:
         writer.add(first_frame((frame(),), "rgb_array"))
     assert (tmp_path / "x.mp4").stat().st_size > 0
@@ -155,7 +145,6 @@ def test_rates_that_no_file_has_are_not_taken(tmp_path: Path, fps: object) -> No
     ],
 )
 def test_views_of_every_kind_are_frames(tmp_path: Path, picture: Any) -> None:
-    """Negative strides, none at all, one pixel, the tallest."""
     with VideoWriter(tmp_path / "x.mp4", 30.0) as writer:
         writer.add(first_frame((picture,), "rgb_array"))
     assert (tmp_path / "x.mp4").stat().st_size > 0
@@ -174,7 +163,6 @@ def test_views_of_every_kind_are_frames(tmp_path: Path, picture: Any) -> None:
     ],
 )
 def test_hostile_frames_are_refused_before_they_are_copied(rendered: Any) -> None:
-    """Ten thousand million pixels, objects, nothing."""
     with pytest.raises(VideoError):
         first_frame(rendered, None)
 

@@ -98,8 +98,6 @@ def test_a_dead_one_stays_with_its_users_and_others_get_a_fresh_one(pool: Pool) 
 
 
 def test_what_does_not_start_is_not_remembered(pool: Pool) -> None:
-    """The next one tries again."""
-
     def fails() -> Server:
         raise KeyboardInterrupt
 
@@ -151,7 +149,6 @@ def test_all_are_ended_at_exit_and_none_is_kept(pool: Pool) -> None:
 
 
 def test_a_fork_starts_its_own(pool: Pool) -> None:
-    """Also if another thread held the lock at that moment."""
     ours = pool.acquire("key", Server)
     held, done = threading.Event(), threading.Event()
 
@@ -233,7 +230,6 @@ def test_an_interrupted_release_is_finished_by_the_next(then: str) -> None:
 
 
 def test_the_next_gets_the_idle_one(pool: Pool) -> None:
-    """However often it changes hands, it is not ended."""
     first = given_up(pool, "key", 600)
     for _ in range(100):
         assert given_up(pool, "key", 600) is first
@@ -249,14 +245,12 @@ def test_its_time_comes(pool: Pool) -> None:
 
 
 def test_one_is_kept_at_most(pool: Pool) -> None:
-    """With the next its time has come, however long it was."""
     first, second = given_up(pool, "one", None), given_up(pool, "two", None)
     assert eventually(lambda: bool(first.ends))
     assert not second.ends
 
 
 def test_one_that_has_died_in_use_is_not_kept(pool: Pool) -> None:
-    """It is ended by the one who gives it back."""
     use = pool.acquire("key", Server, None)
     use.server.runs = False
     use.release()
@@ -319,7 +313,6 @@ def test_many_at_once_share_the_idle_one(pool: Pool) -> None:
 
 
 def test_the_end_waits_for_what_is_ending(pool: Pool) -> None:
-    """So that nothing is left half ended."""
     use = pool.acquire("key", Server, 0.01)
     server = use.server
     server.may_end.clear()
@@ -331,7 +324,6 @@ def test_the_end_waits_for_what_is_ending(pool: Pool) -> None:
 
 
 def test_a_fork_has_no_idle_one_and_ends_none(pool: Pool) -> None:
-    """Also if another thread was about to end it at that moment."""
     ours = given_up(pool, "key", 600)
     child = os.fork()
     if child == 0:  # pragma: no cover
@@ -375,7 +367,6 @@ def test_a_container_changes_hands_only_when_it_is_idle(
 
 
 def test_the_setting_takes_nothing_and_for_ever() -> None:
-    """The only time that may be 0."""
     assert timeouts_from({"server_idle_s": 0}).server_idle_s == 0
     assert timeouts_from({"server_idle_s": None}).server_idle_s is None
     with pytest.raises(ValueError, match="server_idle_s is -1"):

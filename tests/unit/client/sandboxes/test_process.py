@@ -73,7 +73,6 @@ def test_stop_leaves_nothing(server: LocalServer) -> None:
 
 
 def test_one_that_does_not_end_is_killed(server: LocalServer) -> None:
-    """After the time that it has for that."""
     started = [sys.executable, "-c", DEAF]
     child = subprocess.Popen(started, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     assert child.stdin is not None
@@ -85,7 +84,6 @@ def test_one_that_does_not_end_is_killed(server: LocalServer) -> None:
 
 
 def test_what_fails_in_its_start_ends_it(server: LocalServer) -> None:
-    """Also an interrupt; and a start that has started nothing."""
     with pytest.raises(KeyboardInterrupt), server.starting(sleeping):
         raise KeyboardInterrupt
     assert has_ended(server.process.pid)
@@ -101,7 +99,6 @@ def test_what_fails_in_its_start_ends_it(server: LocalServer) -> None:
 
 
 def test_a_fork_of_its_owner_ends_nothing(server: LocalServer) -> None:
-    """Its copy is collected at the end, too."""
     with server.starting(sleeping):
         pass
     child = os.fork()

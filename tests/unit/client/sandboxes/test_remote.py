@@ -24,7 +24,6 @@ FAULTS = (
 
 @pytest.mark.parametrize("moment", ["connect", "hello", "request", "close"])
 def test_the_thread_outlives_every_fault(moment: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each is followed by another try, and the last one is heard."""
     left, heard = list(FAULTS), threading.Event()
 
     def fails(at: str) -> None:

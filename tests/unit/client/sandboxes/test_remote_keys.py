@@ -33,7 +33,6 @@ def config(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     ],
 )
 def test_only_host_and_port_are_an_address(wrong: str) -> None:
-    """A login is refused, and is not repeated."""
     assert remote_keys.address_of("tcp://[::1]:80") == "::1:80"
     with pytest.raises(PolicyError, match="tcp://HOST:PORT"):
         remote_keys.address_of(wrong)
@@ -43,7 +42,6 @@ def test_only_host_and_port_are_an_address(wrong: str) -> None:
 
 
 def test_a_name_is_no_loopback() -> None:
-    """Whatever it may be looked up as."""
     assert all(map(remote_keys.is_loopback, ["tcp://127.0.0.2:1", "tcp://[::1]:1"]))
     assert not any(map(remote_keys.is_loopback, ["tcp://localhost:1", "tcp://10.0.0.1:1"]))
 

@@ -101,14 +101,12 @@ def test_its_own_packages_are_no_set(server: LyingServer) -> None:
     ],
 )
 def test_other_answers_break_the_protocol(server: LyingServer, lie: m.Message) -> None:
-    """A state, a name or facts that there are not."""
     says(server, lie)
     with pytest.raises(RemoteProtocolError):
         make(server, [])
 
 
 def test_a_server_that_never_ends_is_given_up(server: LyingServer) -> None:
-    """At the deadline, whatever it shows."""
     says(server, packages("making"))
     client = WorkerConnection(server.endpoint, server.process_fd)
     try:
@@ -120,6 +118,5 @@ def test_a_server_that_never_ends_is_given_up(server: LyingServer) -> None:
 
 @pytest.mark.parametrize("given", [{"python": "/usr/bin/python3"}, {"fetch_python": True}])
 def test_what_is_of_this_machine_is_not_asked_for(given: dict[str, Any]) -> None:
-    """A path here, and a download to here."""
     with pytest.raises(PolicyError, match="dependencies"):
         order_of(PackageRequest("org/repo", (), **given))

@@ -117,7 +117,6 @@ def test_a_folder_for_sockets_has_a_short_path(
 
 
 def test_a_link_is_not_followed(tmp_path: Path) -> None:
-    """A name in a folder that everybody may write proves nothing."""
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     folder(elsewhere, "data", {"alive": ""})
@@ -126,7 +125,6 @@ def test_a_link_is_not_followed(tmp_path: Path) -> None:
 
 
 def test_removing_removes_the_folder_and_nothing_beside(tmp_path: Path) -> None:
-    """And says that it did."""
     folder(tmp_path, "envhub-docker-dead0000", {"alive": "", "seccomp.json": "{}"})
     beside = alive(tmp_path, "envhub-docker-alive000")
     [path] = runtime_folder.stale_folders(tmp_path)

@@ -32,7 +32,6 @@ BUSY = ServerBusyError("a: no room")
     ],
 )
 def test_a_place_that_is_full_or_not_there_is_followed_by_the_next(error: EnvHubError) -> None:
-    """The same worker may start elsewhere."""
     assert may_go_elsewhere(error)
 
 
@@ -47,7 +46,6 @@ def test_a_place_that_is_full_or_not_there_is_followed_by_the_next(error: EnvHub
     ],
 )
 def test_what_would_be_the_same_elsewhere_is_not_tried_again(error: EnvHubError) -> None:
-    """Or is a mistake that has to be known."""
     assert not may_go_elsewhere(error)
 
 

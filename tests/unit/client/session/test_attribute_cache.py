@@ -21,7 +21,6 @@ def stepped(session: EnvSession) -> None:
 
 
 def test_the_second_read_is_watched_and_the_third_is_free(session: EnvSession) -> None:
-    """Once a step: a second read in the same step is a request."""
     cache = AttributeCache(session.lease)
     assert cache.get("task") is None
     assert not cache.should_watch("task")

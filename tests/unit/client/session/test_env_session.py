@@ -25,7 +25,6 @@ def test_the_first_line_names_the_rows_and_the_place(rows: tuple[int, int], name
 
 
 def test_the_place_of_another_part_is_added_to_it() -> None:
-    """Only the same part is not named twice."""
     error = WorkerDiedError("gone")
     for row in range(2):
         session_over(FakeLane(1), (row, row + 1)).name_in(error)
@@ -34,7 +33,6 @@ def test_the_place_of_another_part_is_added_to_it() -> None:
 
 
 def test_errors_of_others_keep_their_text() -> None:
-    """The repository's own, the caller's, and one without a text."""
     part = session_over(FakeLane(1), (0, 1))
     theirs = remote_error("ValueError", "ValueError", "size")
     assert isinstance(theirs, RemoteEnvError)

@@ -69,7 +69,6 @@ def test_the_authors_last_line_is_in_the_text(snapshot: Snapshot, place: str, st
 
 
 def test_a_path_in_the_store_is_taken_for_the_authors_too() -> None:
-    """As older workers name files."""
     error = failed(TRACE.replace('"env.py"', f'"{ROOT}/env.py"').replace('"lib/a.py"', '"x.py"'))
     assert str(error).endswith('  File "/home/me/my-env/env.py", line 12, in step\n    helper(0)')
     assert ROOT not in notes(error)
@@ -85,7 +84,6 @@ def test_only_files_of_the_snapshot_are_pointed_at(name: str) -> None:
 
 
 def test_it_is_told_once() -> None:
-    """However many layers of ours the error goes through."""
     error = failed(TRACE)
     before = str(error), notes(error)
     add_author_line(error, LOCAL)
@@ -104,14 +102,12 @@ def test_it_is_told_once() -> None:
     ids=["plain", "tabs", "of a group", "long line", "far"],
 )
 def test_a_syntax_error_has_its_caret(margin: str, source: str, caret: str, shown: str) -> None:
-    """Below the very character, or not at all."""
     lines = ("Traceback:", '  File "env.py", line 1', margin + source, margin + caret, "no")
     error = failed("\n".join(lines), stage="import")
     assert str(error).endswith(f'  File "/home/me/my-env/env.py", line 1\n{shown}')
 
 
 def test_copies_and_pickles_keep_the_line() -> None:
-    """As those of a pool's worker do."""
     for stage in ("step", "make_env"):
         error = failed(TRACE, stage=stage)
         for made in (copy.copy(error), pickle.loads(pickle.dumps(error))):
@@ -147,7 +143,6 @@ def test_hostile_tracebacks_stay_bounded_and_printable(trace: str, stage: str) -
 
 
 def test_names_of_the_machine_that_a_terminal_would_obey_are_escaped() -> None:
-    """A folder may have any name."""
     folder = Snapshot(f"/home/{HOSTILE}", "local", "local-1", "env.py", Path(ROOT), FILES)
     error = failed(TRACE, folder)
     assert "\\x1b" in str(error)
@@ -179,7 +174,6 @@ def test_files_of_the_repository_have_their_names_in_it(tmp_path: Path) -> None:
 
 
 def test_a_syntax_error_has_its_line(tmp_path: Path) -> None:
-    """It has no frame in the repository."""
     failure = a_failure(tmp_path, "def make_env(:\n")
     assert '  File "env.py", line 1\n    def make_env(:\n                 ^\n' in failure.traceback
 
@@ -233,7 +227,6 @@ def advised(kind: str, message: str, network: str = "none") -> str:
     ],
 )
 def test_each_failure_names_what_brings_it(kind: str, message: str, named: str) -> None:
-    """One line, once."""
     assert named in advised(kind, message)
     assert advised(kind, message).count("\n") == 1
 
@@ -253,7 +246,6 @@ def test_others_get_none(kind: str, message: str, network: str) -> None:
 
 
 def test_its_own_loopback_is_not_named_twice() -> None:
-    """Where it has one, a family that is refused is another one."""
     assert "loopback" not in advised("OSError", "[Errno 97] Address family", "loopback")
 
 
@@ -268,7 +260,6 @@ def test_of_a_death_only_the_display_is_read() -> None:
 
 @pytest.mark.parametrize("said", [None, "ptrace", ["ptrace"], {"ptrace": 1}, 7])
 def test_denials_that_are_no_list_of_texts_are_none(said: Any) -> None:
-    """As where none are recorded."""
     assert read_denials(said) is None
 
 

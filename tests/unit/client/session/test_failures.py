@@ -33,7 +33,6 @@ def test_a_server_is_asked_once_what_a_dead_jail_was_denied(kept: bool) -> None:
 
 
 def test_a_bundle_of_what_came_too_late_has_it_too() -> None:
-    """It was not asked before."""
     lease = MagicMock()
     failures_of(lease).keep_crash(WorkerTimeoutError("late", request="reset", timeout_s=1.0))
     lease.note_denied.assert_called_once()
@@ -52,14 +51,12 @@ def test_a_bundle_of_what_came_too_late_has_it_too() -> None:
     ],
 )
 def test_each_state_has_its_refusal(state: State, kind: type[Exception], said: str) -> None:
-    """By its class, with what to do."""
     error = refusal(state, "step", "never")
     assert type(error) is kind
     assert said in str(error)
 
 
 def test_every_state_but_two_refuses() -> None:
-    """No state that is added later is taken for one that serves."""
     serving = {state for state in State if refusal(state, "step", "never") is None}
     assert serving == {State.IDLE, State.READY}
 
@@ -78,7 +75,6 @@ def test_backoff_doubles_and_is_bounded() -> None:
 
 
 def test_restarts_are_counted_until_the_budget_ends() -> None:
-    """And no more are made once the environment is closed."""
     counters = Counters()
     restarts = Restarts(Policy(restart="on_reset", restart_budget=1), counters)
     restarts.spend("reset")

@@ -50,7 +50,6 @@ def test_a_step_of_all_is_one_step(counters: FleetCounters, parts: list[Counters
 
 
 def test_a_straggler_is_who_was_waited_for(counters: FleetCounters, parts: list[Counters]) -> None:
-    """In all, and at the most; the others waited for no time."""
     for elapsed_ns in (2_000_000_000, 5_000_000_000, 1_000_000_000):
         counters.waited(1, elapsed_ns)
     parts[1].timeouts += 2

@@ -75,7 +75,6 @@ def acquire(lease: Lease) -> None:
 
 
 def test_a_jail_is_taken_built_in_and_given_back_once(taken: tuple[Lease, _Jails]) -> None:
-    """And its lane is closed."""
     lease, jails = taken
     acquire(lease)
     assert lease.lane is not None
@@ -89,7 +88,6 @@ def test_a_jail_is_taken_built_in_and_given_back_once(taken: tuple[Lease, _Jails
 def test_what_cannot_be_built_is_given_back(
     taken: tuple[Lease, _Jails], error: BaseException
 ) -> None:
-    """Nothing of it is kept, and the next attempt takes another."""
     lease, jails = taken
     jails.fails["build"] = [error]
     with pytest.raises(type(error)):
@@ -101,7 +99,6 @@ def test_what_cannot_be_built_is_given_back(
 
 
 def test_an_interrupted_return_is_done_again(taken: tuple[Lease, _Jails]) -> None:
-    """The jail is noted until it has been given back."""
     lease, jails = taken
     acquire(lease)
     jails.fails["give back"] = [KeyboardInterrupt()]
@@ -114,7 +111,6 @@ def test_an_interrupted_return_is_done_again(taken: tuple[Lease, _Jails]) -> Non
 
 
 def test_a_server_is_held_until_the_next_jail_is_there(taken: tuple[Lease, _Jails]) -> None:
-    """Or else it would end with the one that is given up."""
     lease, jails = taken
     acquire(lease)
     jails.done.clear()
@@ -124,7 +120,6 @@ def test_a_server_is_held_until_the_next_jail_is_there(taken: tuple[Lease, _Jail
 
 
 def test_a_full_server_is_asked_again_once_there_is_room(taken: tuple[Lease, _Jails]) -> None:
-    """Where nothing can be given up, its refusal is the answer."""
     lease, jails = taken
     full = ServerBusyError("full", quota="jails", used=1, limit=1, retry_s=0.1)
     jails.fails["take"] = [full]
@@ -137,7 +132,6 @@ def test_a_full_server_is_asked_again_once_there_is_room(taken: tuple[Lease, _Ja
 
 
 def test_a_jail_that_comes_after_close_is_refused(taken: tuple[Lease, _Jails]) -> None:
-    """The thread that brought it sees that, and gives it back."""
     lease, jails = taken
     lease.lifecycle.on(Event.CLOSE)
     with pytest.raises(WorkerDiedError, match="closed during make_env"):
@@ -147,7 +141,6 @@ def test_a_jail_that_comes_after_close_is_refused(taken: tuple[Lease, _Jails]) -
 
 
 def test_a_fork_gives_nothing_back(taken: tuple[Lease, _Jails]) -> None:
-    """The jail is its parent's."""
     lease, jails = taken
     acquire(lease)
     lease.abandon()

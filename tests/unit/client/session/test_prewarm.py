@@ -44,7 +44,6 @@ def suite_of(count: int, ahead: int | None = 1) -> list[_Task]:
 
 
 def test_a_system_without_threads_starts_nothing_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Once there are some again, it does."""
     first, second, third = suite_of(3)
 
     def no_room(thread: threading.Thread) -> Any:
@@ -69,7 +68,6 @@ def test_what_was_passed_over_is_cancelled_before_another_starts() -> None:
 
 
 def test_room_is_made_of_what_is_unused_only() -> None:
-    """And there is none where nothing was started ahead."""
     first, second, third = suite_of(3)
     assert not first.make_room()
     first.used()

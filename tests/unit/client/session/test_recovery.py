@@ -96,7 +96,6 @@ def test_deaths_that_do_not_add_up_are_refused(
 
 
 def test_a_jail_that_is_not_kept_has_no_partial_answers() -> None:
-    """What was not asked for is not taken."""
     said = jail(m.RelayDonePartly((1, 1), (1,)), m.Value(7), DIED, kept=False)
     with pytest.raises(RemoteProtocolError, match="RelayDonePartly"):
         said.receive(said.send("step", ASKED), Deadline(1))
@@ -125,7 +124,6 @@ def test_the_last_seed_counts() -> None:
 def test_environments_that_seed_themselves_get_what_they_were_given(
     seeds: Any, expected: Any
 ) -> None:
-    """A number or a list, as it was."""
     book = SeedBook(1, each=False)
     assert book.derived((0, 1), 1) is None
     book.remember(m.Reset(1, seeds, None, None))
@@ -144,7 +142,6 @@ def test_resets_of_the_fresh_are_those_of_the_dead() -> None:
 
 
 def test_rows_of_the_dead_are_truncated_whatever_the_fresh_say() -> None:
-    """Its flags and rewards are not its own to choose."""
     yes = np.ones(2, np.bool_)
     said = m.StepDone(np.zeros((2, 1)), np.full((2, 3), 9.0), yes, ~yes, {"worker_restarted": ~yes})
     row = revived_step(said, 2)

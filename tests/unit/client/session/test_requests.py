@@ -48,7 +48,6 @@ def warned(session: EnvSession, text: str) -> None:
 
 
 def test_a_request_is_sent_counted_and_kept(session: EnvSession, lane: FakeLane) -> None:
-    """And the environment is usable afterwards."""
     [reply] = session.requests.ask("render", render)
     assert reply == lane.answer
     assert lane.sent == [m.Render(lane.number)]
@@ -59,7 +58,6 @@ def test_a_request_is_sent_counted_and_kept(session: EnvSession, lane: FakeLane)
 
 
 def test_what_is_sent_instead_is_not_what_is_kept(session: EnvSession, lane: FakeLane) -> None:
-    """The history repeats the caller's request."""
     session.requests.submit("call", render, lambda number, _: m.Watch(number, "name"))
     assert lane.sent == [m.Watch(lane.number, "name")]
     [kept] = session.history.recording().requests
@@ -69,7 +67,6 @@ def test_what_is_sent_instead_is_not_what_is_kept(session: EnvSession, lane: Fak
 def test_another_message_than_was_asked_for_gives_the_worker_up(
     session: EnvSession, lane: FakeLane
 ) -> None:
-    """It breaks a rule, and is not asked again."""
     lane.answer = m.ResetDone(0, {})
     with pytest.raises(RemoteProtocolError, match="ResetDone where Value belongs"):
         session.requests.ask("render", render)
@@ -79,7 +76,6 @@ def test_another_message_than_was_asked_for_gives_the_worker_up(
 
 
 def test_of_two_kinds_either_is_taken(session: EnvSession, lane: FakeLane) -> None:
-    """An attribute is a value or a method; a third kind is named."""
     for lane.answer in (m.Value(1), m.Method()):
         assert session.requests.ask_own("name", m.GetOwn, "name") == lane.answer
     lane.answer = m.WatchDone((), False)
@@ -90,7 +86,6 @@ def test_of_two_kinds_either_is_taken(session: EnvSession, lane: FakeLane) -> No
 def test_what_the_repository_raises_leaves_the_environment_usable(
     session: EnvSession, lane: FakeLane
 ) -> None:
-    """It is the repository's error, by its name."""
     lane.answer = m.RaisedException("ValueError", "a.Oops", "no", "trace", "run")
     with pytest.raises(RemoteEnvError, match="no"):
         session.requests.ask("render", render)
@@ -98,7 +93,6 @@ def test_what_the_repository_raises_leaves_the_environment_usable(
 
 
 def test_a_late_reply_is_refused_until_a_reset(session: EnvSession, lane: FakeLane) -> None:
-    """Which drops it."""
     lane.fails = WorkerTimeoutError("late")
     with pytest.raises(WorkerTimeoutError, match="render has not finished after"):
         session.requests.ask("render", render)
@@ -120,8 +114,6 @@ def test_ctrl_c_in_a_wait_says_so_next_time(session: EnvSession, lane: FakeLane)
 
 
 def test_what_cannot_be_sent_was_not_sent(session: EnvSession, lane: FakeLane) -> None:
-    """The next request goes out."""
-
     def unsendable(request: object) -> None:
         raise LocalProtocolError("too large")
 
@@ -167,7 +159,6 @@ def test_a_close_from_a_signal_handler_in_a_wait_says_closed(
 
 
 def test_what_only_sends_is_not_stopped_by_a_filter(session: EnvSession, lane: FakeLane) -> None:
-    """The reply would be owed, and the next request refused."""
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warned(session, "sent")
@@ -179,7 +170,6 @@ def test_what_only_sends_is_not_stopped_by_a_filter(session: EnvSession, lane: F
 
 
 def test_a_filter_does_not_hide_a_ctrl_c(session: EnvSession, lane: FakeLane) -> None:
-    """A program that catches warnings as errors would go on."""
     lane.fails = KeyboardInterrupt()
     warned(session, "one")
     with warnings.catch_warnings():

@@ -143,7 +143,6 @@ def test_links_are_followed_step_by_step(
 
 
 def test_links_in_a_circle_end(tmp_path: Path) -> None:
-    """They are an error, as for the kernel."""
     (tmp_path / "a").symlink_to("b")
     (tmp_path / "b").symlink_to("a")
     with pytest.raises(OSError, match="Too many levels"):
@@ -168,7 +167,6 @@ def test_root_trusts_no_users_folder(snapshot_store: Path, slot: store.Slot, whi
 def test_somebody_elses_link_is_not_followed(
     tmp_path: Path, snapshot_store: Path, slot: store.Slot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In /tmp he may point it elsewhere whenever he likes."""
     tmp_path.chmod(0o1777)
     (tmp_path / "link").symlink_to(snapshot_store)
     os.chown(tmp_path / "link", SOMEBODY, -1, follow_symlinks=False)
@@ -215,14 +213,12 @@ def as_somebody(act: Callable[[], object]) -> None:
 
 @needs_root
 def test_files_of_others_in_a_snapshot_are_refused(slot: store.Slot) -> None:
-    """Whose file it is, he can change it after it was verified."""
     os.chown(slot.tree / "env.py", SOMEBODY, -1)
     with pytest.raises(SnapshotError, match=r"'env\.py' belongs to uid"):
         store.load(slot)
 
 
 def test_file_that_others_can_write_is_closed(slot: store.Slot) -> None:
-    """It is hashed once more, and read-only afterwards."""
     (slot.tree / "env.py").chmod(0o666)
     assert store.load(slot) is not None
     assert mode(slot.tree / "env.py") == 0o444
@@ -243,7 +239,6 @@ def test_nobody_gets_at_a_snapshot_before_it_is_complete(snapshot_store: Path) -
 
 
 def test_a_file_is_replaced_and_nothing_stays_beside_it(tmp_path: Path) -> None:
-    """With its mode, less what the umask takes."""
     path = tmp_path / "file"
     for data in (b"one", b"two"):
         write_whole_file(path, data, durable=data == b"two")
@@ -253,7 +248,6 @@ def test_a_file_is_replaced_and_nothing_stays_beside_it(tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_written_leaves_the_old_one(tmp_path: Path) -> None:
-    """And no half of the new one."""
     path = tmp_path / "file"
     path.mkdir()
     with pytest.raises(OSError, match="director"):
@@ -276,14 +270,12 @@ def test_a_text_is_kept_and_recalled(tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_kept_is_no_error(tmp_path: Path) -> None:
-    """A cache is a favour."""
     (tmp_path / "file").write_text("")
     folders.keep(tmp_path / "file", "key", "text")
     assert (tmp_path / "file").read_text() == ""
 
 
 def test_a_draft_is_private_and_goes_unless_it_is_moved(tmp_path: Path) -> None:
-    """Also where an interrupt ends it."""
     with pytest.raises(KeyboardInterrupt), folders.draft(tmp_path) as made:
         interrupted(made)
     assert list(tmp_path.iterdir()) == []

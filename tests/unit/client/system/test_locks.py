@@ -37,7 +37,6 @@ def test_a_lock_is_held_until_its_context_ends(tmp_path: Path) -> None:
 
 
 def test_the_holder_may_remove_the_file(tmp_path: Path) -> None:
-    """The next makes another, and holds that."""
     path = tmp_path / "lock"
     with held(path):
         path.unlink()
@@ -46,7 +45,6 @@ def test_the_holder_may_remove_the_file(tmp_path: Path) -> None:
 
 
 def test_an_interrupted_wait_leaves_no_descriptor(tmp_path: Path) -> None:
-    """Nor does a lock that was not free."""
     path, before = tmp_path / "lock", len(os.listdir("/proc/self/fd"))
     with held(path):
         for _ in range(3):
@@ -58,7 +56,6 @@ def test_an_interrupted_wait_leaves_no_descriptor(tmp_path: Path) -> None:
 
 
 def test_a_link_is_no_lock(tmp_path: Path) -> None:
-    """Nobody makes us open, or create, what lies elsewhere."""
     (tmp_path / "lock").symlink_to(tmp_path / "elsewhere")
     for asked in (lambda: held(tmp_path / "lock").__enter__(), lambda: is_held(tmp_path / "lock")):
         with pytest.raises(OSError, match="symbolic links"):
@@ -67,7 +64,6 @@ def test_a_link_is_no_lock(tmp_path: Path) -> None:
 
 
 def test_a_life_lock_is_not_held_by_a_fork_nor_by_a_program(tmp_path: Path) -> None:
-    """It ends with its holder, although both live on."""
     source = """
 import os, signal, subprocess, sys
 from pathlib import Path
@@ -101,7 +97,6 @@ signal.pause()
 
 
 def test_a_life_lock_can_be_given_back(tmp_path: Path) -> None:
-    """And again, which does nothing."""
     lock = LifeLock(tmp_path / "life")
     assert is_held(tmp_path / "life")
     for _ in range(2):
@@ -149,6 +144,5 @@ def test_a_shared_lock_ends_with_its_object_and_not_with_a_fork(tmp_path: Path) 
 
 
 def test_nothing_is_shared_where_there_is_nothing(tmp_path: Path) -> None:
-    """No file is made, and none is needed."""
     SharedLock(tmp_path / "record").release()
     assert list(tmp_path.iterdir()) == []

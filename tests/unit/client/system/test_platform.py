@@ -138,7 +138,6 @@ parser.main()
 
 @pytest.mark.parametrize("system", SYSTEMS)
 def test_every_module_can_be_imported(system: str) -> None:
-    """And none of them imports what only Linux uses."""
     alone = interpreter.LINUX_ALONE
     found = json.loads(elsewhere(system, _IMPORT, *alone, *_FACES))
     assert "envhub_sandbox.sandboxes.docker.published" in found
@@ -166,7 +165,6 @@ def test_what_is_not_there_is_not_there(system: str) -> None:
 
 
 def test_this_platform_is_linux() -> None:
-    """Of which everything is there."""
     assert (platform.IS_LINUX, platform.IS_WINDOWS, platform.NAME) == (True, False, "linux")
     assert platform.user_id() == os.geteuid()
     assert platform.cores() == len(os.sched_getaffinity(0))
@@ -224,12 +222,10 @@ def test_a_child_on_macos_ends_with_its_parent() -> None:
 
 
 def test_a_deadline_comes_on_windows_too() -> None:
-    """As a thread's interrupt; a Ctrl-C before it stays one."""
     assert elsewhere("win32", _ALARMED).split() == ["reached", "interrupted"]
 
 
 def test_a_parser_ends_on_windows_too() -> None:
-    """By the clock; what it has answered before counts."""
     texts = [b"import numpy", b"slow", b"import torch"]
     given = b"".join(len(text).to_bytes(4, "big") + text for text in texts)
     done = subprocess.run(
@@ -241,14 +237,12 @@ def test_a_parser_ends_on_windows_too() -> None:
 
 
 def test_the_interpreter_runs_modules() -> None:
-    """With their arguments, as a command does."""
     assert "usage" in ran("darwin", "-m", "json.tool", "--help").stdout
     assert sys.platform == "linux"
 
 
 @pytest.mark.parametrize("name", ["a:b", "C:/x", "con", "CON.py", "x/nul", "lpt\u00b3", "a.", "a "])
 def test_windows_reads_it_as_another(name: str) -> None:
-    """Here it is a name as any other."""
     assert wrong_on_windows(name)
     assert wrong_here(name) is None
 
@@ -271,7 +265,6 @@ def test_what_is_one_without_case_is_found(paths: list[str]) -> None:
 
 
 def test_a_file_system_is_tried(tmp_path: Path) -> None:
-    """With a file that is gone afterwards."""
     assert not ignores_case(tmp_path)
     with without_case(tmp_path):
         assert ignores_case(tmp_path)

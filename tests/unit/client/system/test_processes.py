@@ -100,7 +100,6 @@ def test_without_it_it_would_stay(tmp_path: Path) -> None:
 
 
 def test_who_is_started_by_another_thread_meanwhile_does_not_inherit_it() -> None:
-    """It is for one alone."""
     from envhub_sandbox.system import processes
 
     with processes.pidfd() as ourselves:
@@ -108,7 +107,6 @@ def test_who_is_started_by_another_thread_meanwhile_does_not_inherit_it() -> Non
 
 
 def test_a_fork_is_another_process() -> None:
-    """And is told whose it is, and which one it is itself."""
     owner = OwnerProcess()
     assert owner.is_here
     child = os.fork()

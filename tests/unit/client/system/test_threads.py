@@ -33,7 +33,6 @@ def test_each_keeps_its_own_failure() -> None:
 
 
 def test_a_wait_may_end_before_the_calls() -> None:
-    """They go on, and a later wait finds them done."""
     go_on = threading.Event()
     calls = Calls([lambda: go_on.wait(DEADLINE_S)])
     assert not calls.wait(0.05)
@@ -43,5 +42,4 @@ def test_a_wait_may_end_before_the_calls() -> None:
 
 
 def test_nothing_to_do_is_done() -> None:
-    """Without any thread."""
     assert Calls([]).wait()

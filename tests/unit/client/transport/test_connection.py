@@ -51,7 +51,6 @@ def test_its_end_is_told(script: str, says: str, code: int) -> None:
 
 
 def test_what_another_has_reaped_ended_somehow() -> None:
-    """As far as we know; what lives has not."""
     with process("exit 3") as (child, pidfd):
         child.wait()
         assert describe_exit(pidfd).startswith(". The next")
@@ -119,7 +118,6 @@ def test_other_replies_are_dropped_while_one_is_looked_for() -> None:
 
 
 def test_what_is_no_reply_is_raised_where_it_is_received() -> None:
-    """And not by the look."""
     with connected() as (server, connection):
         server.lies[m.ReadOutput] = lambda asked: [[b"noise"]]
         sent = connection.send(m.ReadOutput(1, ""))
@@ -148,7 +146,6 @@ def test_an_interrupt_in_a_look_is_noted(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_the_end_of_a_server_has_arrived_as_well() -> None:
-    """There is nothing to wait for any more."""
     with process("sleep 1000") as (child, pidfd), lying() as server:
         server.lies[m.ReadOutput] = lambda asked: []
         connection = WorkerConnection(server.endpoint, pidfd)

@@ -12,7 +12,6 @@ from envhub_sandbox.transport.deadline import Deadline, StepDeadline
 
 @pytest.mark.parametrize("kind", [Deadline, StepDeadline])
 def test_no_timeout_never_comes(kind: type[Deadline]) -> None:
-    """None waits for ever, in the words of those who wait."""
     deadline = kind(None)
     assert (deadline.left_s(), deadline.left_ms(), deadline.passed) == (None, None, False)
 

@@ -40,7 +40,6 @@ def test_who_has_answered_is_found_at_once(lanes: list[FakeLane]) -> None:
 
 
 def test_a_deadline_ends_the_wait(lanes: list[FakeLane]) -> None:
-    """Nothing is found then, and nothing is lost."""
     assert found(lanes, 0.05) == []
     lanes[1].silent = False
     assert found(lanes, 0) == [1]
@@ -63,7 +62,6 @@ def test_a_ring_ends_the_sleep(lanes: list[FakeLane], monkeypatch: pytest.Monkey
 
 
 def test_an_answer_that_crosses_with_the_listening_is_found(lanes: list[FakeLane]) -> None:
-    """It rings no more; so it is looked for once again, soon."""
     lanes[2].on_listen = lambda: setattr(lanes[2], "silent", False)
     assert found(lanes, None) == [2]
 

@@ -28,7 +28,6 @@ def told(heard: RemoteWarnings, *some: tuple[str, str]) -> list[Any]:
 
 
 def test_each_is_told_once() -> None:
-    """Whichever process has said it, and however often."""
     heard = RemoteWarnings()
     assert heard.take(REPLY) is REPLY
     [one, other] = told(heard, ("UserWarning", "slow"), ("x.Own", "slow"), ("x.Own", "slow"))
@@ -45,7 +44,6 @@ def test_it_stands_where_the_caller_does() -> None:
 
 
 def test_nothing_is_painted() -> None:
-    """Neither by the text nor by the name of the category."""
     [one] = told(RemoteWarnings(), ("\x1b]0;owned\x07\n", "\x1b[2J\r\u202eslow"))
     assert str(one.message).isprintable()
 
@@ -72,7 +70,6 @@ def test_what_the_filters_raise_leaves_the_rest() -> None:
 
 
 def test_it_can_be_copied() -> None:
-    """As loggers and processes do."""
     one = RemoteEnvWarning("a/b@c", "UserWarning", "slow")
     for twin in (copy.copy(one), pickle.loads(pickle.dumps(one))):
         assert (str(twin), twin.label, twin.category, twin.text) == (

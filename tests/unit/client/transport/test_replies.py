@@ -80,7 +80,6 @@ def test_errors_are_gymnasiums_nearest(raises: type[Exception], kind: type[Excep
 
 @pytest.mark.parametrize("name", ["KeyboardInterrupt", "SystemExit", "Oops", "", "print", "open"])
 def test_other_names_mean_nothing(name: str) -> None:
-    """A worker cannot choose what is raised beyond a fixed table."""
     error = raised(a_raised(builtin=name))
     assert type(error) is errors.RemoteEnvError
 
@@ -98,7 +97,6 @@ def test_escape_sequences_are_not_obeyed(field: str, stage: str) -> None:
 
 
 def test_long_texts_are_cut() -> None:
-    """An exception of megabytes is not a log of megabytes."""
     error = raised(a_raised(message="x" * 3_000_000, type_name="T" * 3_000_000))
     assert len(str(error)) < 20_000
 
@@ -160,7 +158,6 @@ def test_what_the_loader_refuses_is_what_lerobot_raises(
 
 
 def test_a_repository_that_cannot_be_had_is_an_os_error() -> None:
-    """As huggingface_hub's errors are; its text is ours."""
     error = errors.RepositoryUnavailableError("org/repo: there is none")
     assert isinstance(error, OSError)
     error.args = ("here: org/repo: there is none",)
@@ -195,7 +192,6 @@ def test_a_runner_cannot_speak_in_the_servers_name(message: m.Message) -> None:
 
 
 def test_the_kinds_of_both_conversations_are_apart() -> None:
-    """What runners may send begins at one number."""
     runners = {cls.__name__ for kind, cls in m.KINDS.items() if kind >= m.FIRST_RUNNER_KIND}
     assert {
         "LoadDone",
@@ -247,7 +243,6 @@ def test_refusals_come_from_a_table(name: str, expected: type[Exception]) -> Non
 
 
 def test_a_missing_layer_comes_with_its_fix() -> None:
-    """The reader learns the layer, the reason and what to do."""
     error = refusal(m.Refusal("SandboxUnavailableError", "it is off", "landlock", "turn it on"))
     assert str(error) == "this host cannot enforce landlock: it is off\nturn it on"
 
@@ -264,7 +259,6 @@ def test_other_replies_than_expected_break_the_rules() -> None:
 
 
 def test_check_raises_what_a_reply_says() -> None:
-    """Everything else passes."""
     check_reply(m.Value(3))
     with pytest.raises(errors.RemoteEnvError):
         check_reply(a_raised())

@@ -58,7 +58,6 @@ def use(path: Path, times: Mapping[str, float], count: int = 16) -> str:
 def test_the_fastest_of_all_that_were_tried_is_used(
     path: Path, times: dict[str, float], expected: str
 ) -> None:
-    """Each way once, then always the best."""
     assert [use(path, times) for _ in range(3)] == list(times)
     assert {use(path, times) for _ in range(5)} == {expected}
 
@@ -86,7 +85,6 @@ def test_another_load_lets_all_be_tried_again(path: Path) -> None:
 
 
 def test_what_was_far_slower_is_not_tried_again(path: Path) -> None:
-    """It is so under another load, too."""
     times = {"2+2": 1e-3, "3+1": 1.1e-3, "4": 1.9e-3}
     tried = [use(path, times, 4) for _ in range(4)]
     assert tried == ["2+2", "3+1", "4", "2+2"]
@@ -97,7 +95,6 @@ def test_what_was_far_slower_is_not_tried_again(path: Path) -> None:
 def test_another_number_of_cores_is_another_machine(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What was fastest on two says nothing about four."""
     for _ in range(3):
         use(path, {"8+8": 2e-4, "10+6": 2e-4, "16": 1e-4})
     cores(monkeypatch, 4)
@@ -144,7 +141,6 @@ def test_every_sub_environment_has_one_shard(count: int, cpus: int) -> None:
     ],
 )
 def test_a_damaged_file_is_as_none(path: Path, content: bytes) -> None:
-    """The first way is tried, and what it takes is remembered."""
     path.write_bytes(content)
     assert use(path, {"8+8": 1e-3}) == "8+8"
     assert use(path, {"10+6": 1e-3}) == "10+6"
@@ -152,26 +148,22 @@ def test_a_damaged_file_is_as_none(path: Path, content: bytes) -> None:
 
 @pytest.mark.parametrize("step_s", [0.0, float("nan"), float("inf"), -1.0])
 def test_an_impossible_time_is_not_remembered(path: Path, step_s: float) -> None:
-    """A clock may be strange."""
     ShardTrials(path).note(ENV, [(0, 16)], step_s)
     assert not path.exists()
 
 
 @pytest.mark.parametrize("env", [environment(16, sync=True), environment(1)])
 def test_where_there_is_no_choice_nothing_is_remembered(path: Path, env: Any) -> None:
-    """Each close would write a file for it."""
     ShardTrials(path).note(env, [(0, env.num_envs)], 1e-3)
     assert not path.exists()
 
 
 def test_what_must_not_be_remembered_is_not() -> None:
-    """There is no file."""
     trials = ShardTrials(None)
     trials.note(ENV, [(0, 8), (8, 16)], 1e-3)
     assert trials.bounds_for(ENV, None) == [(0, 8), (8, 16)]
 
 
 def test_a_cache_that_cannot_be_written_is_no_error(tmp_path: Path) -> None:
-    """The folder is not there."""
     ShardTrials(tmp_path / "missing" / "entry").note(ENV, [(0, 16)], 1e-3)
     assert not (tmp_path / "missing").exists()

@@ -58,7 +58,6 @@ def test_a_server_that_restarts_is_waited_for() -> None:
 def test_one_that_ends_every_handshake_is_refused(
     keys: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By an error that names every cause that looks like that."""
     monkeypatch.setattr(*inside.cut_s(), 0.3)
     far = TcpServer(_PUBLIC, z85.decode(_SECRET)) if keys else TcpServer(None, None)
     with socket.create_server(("127.0.0.1", 0)) as listener:

@@ -38,7 +38,6 @@ def fresh(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 def test_without_the_variable_no_class_is_changed(
     monkeypatch: pytest.MonkeyPatch, value: str | None
 ) -> None:
-    """A step costs the same."""
     monkeypatch.delenv("ENVHUB_TRACE", raising=False)
     if value is not None:
         monkeypatch.setenv("ENVHUB_TRACE", value)

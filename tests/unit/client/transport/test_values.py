@@ -47,13 +47,11 @@ def arrived(value: object) -> Any:
 @pytest.mark.parametrize("space", SPACES, ids=repr)
 @pytest.mark.parametrize("place", [lambda it: it, lambda it: ({"k": [it]},)], ids=["bare", "deep"])
 def test_spaces_arrive(space: gym.Space[Any], place: Callable[[Any], Any]) -> None:
-    """Wherever they stand in a value."""
     found = arrived(place(space))
     assert_same_space(space, found if found == space else found[0]["k"][0], "it")
 
 
 def test_spaces_in_object_arrays_arrive() -> None:
-    """As infos hold them."""
     array = np.full(3, None, dtype=object)
     array[0], array[2] = spaces.Tuple([spaces.Discrete(2)]), spaces.Dict({})
     assert arrived(array).tolist() == array.tolist()
@@ -68,7 +66,6 @@ class Own(np.random.Generator):
 
 
 def test_what_only_its_owner_knows_is_told() -> None:
-    """A space as an opaque one, any other thing as a text."""
     assert isinstance(arrived(Custom((2,), np.float32)), OpaqueSpace)
     deep: Any = spaces.Discrete(2)
     for _ in range(20):

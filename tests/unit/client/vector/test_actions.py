@@ -90,12 +90,10 @@ def test_mappings_of_any_class_become_dicts_in_the_spaces_order() -> None:
 
 
 def test_values_outside_the_bounds_are_the_environments_business() -> None:
-    """Only shapes and kinds of numbers are looked at."""
     assert_same([7, -1], batch_of(DISCRETE, [7, -1], 2))
 
 
 def test_tensors_are_taken() -> None:
-    """Torch tensors are arrays, with a gradient or without."""
     torch = pytest.importorskip("torch")
     value = torch.ones((2, 2), requires_grad=True)
     assert_same(np.ones((2, 2), np.float32), batch_of(BOX, value, 2))

@@ -130,7 +130,6 @@ def test_infos_lose_their_masks() -> None:
 
 
 def test_several_are_refused() -> None:
-    """It says how to make one."""
     with pytest.raises(ValueError, match="n_envs=1"):
         SingleEnv(SyncVectorEnv([_Story, _Story]))
 
@@ -161,7 +160,6 @@ class _Numbered(_Story):
 
 
 def test_infos_may_have_numbers_for_keys() -> None:
-    """As in Gymnasium, where a mask's name is a text in any case."""
     env = SingleEnv(SyncVectorEnv([_Numbered]))
     env.reset()
     info = env.step(0)[4]

@@ -24,7 +24,6 @@ def one_of_two(value: object) -> SubEnvironment:
 
 
 def test_wrappers_without_end_are_refused() -> None:
-    """A search for the innermost one comes to an end."""
     env: Any = one_of_two(RemoteObject("gymnasium.Wrapper", "<Wrapper>"))
     wrappers = 0
     with pytest.raises(RemoteProtocolError, match="wrap one"):  # noqa: PT012
@@ -35,7 +34,6 @@ def test_wrappers_without_end_are_refused() -> None:
 
 
 def test_what_is_neither_true_nor_false_breaks_the_rules() -> None:
-    """Whether an attribute is there is a question of yes or no."""
     assert one_of_two(1).has_wrapper_attr("a") is True
     with pytest.raises(RemoteProtocolError):
         one_of_two(np.zeros(2)).has_wrapper_attr("a")

@@ -53,7 +53,6 @@ def test_what_is_not_kept_is_closed(
 
 
 def test_keeping_nothing_is_refused() -> None:
-    """With what there is, and nothing is closed."""
     ended: list[str] = []
     kept = suites(ended)
     with pytest.raises(ValueError, match=r"no suite 'a' with a task 'x'.*\['a'\]\[0\]"):
@@ -63,7 +62,6 @@ def test_keeping_nothing_is_refused() -> None:
 
 
 def test_code_of_this_process_has_no_reference() -> None:
-    """Nothing could make it again elsewhere."""
     assert suites([]).reference is None
 
 
@@ -77,7 +75,6 @@ def test_a_suite_that_there_is_not_names_those_there_are() -> None:
 
 
 def test_closing_a_suite_closes_all_of_it() -> None:
-    """Whatever one of them raises; and it is raised in the end."""
     closed = []
 
     def env(name: str) -> Any:

@@ -85,7 +85,6 @@ def test_the_first_failure_ends_it() -> None:
 
 
 def test_how_many_fit() -> None:
-    """What each may take, and no more than were permitted."""
     assert live_tasks("16G", None, 4 * GIB) == 4
     assert live_tasks(16 * GIB, 3, 4 * GIB) == 3
     assert live_tasks(None, 7, 0) == 7
@@ -101,13 +100,11 @@ def test_how_many_fit() -> None:
     ],
 )
 def test_bounds_that_permit_nothing_are_refused(memory: Any, most: Any, why: str) -> None:
-    """Before anything is started."""
     with pytest.raises(ValueError, match=why):
         live_tasks(memory, most, 4 * GIB)
 
 
 def test_a_start_ahead_that_fails_is_raised() -> None:
-    """And not as a result that is missing."""
     suites = _suites(4)
 
     def refuse() -> None:
@@ -128,7 +125,6 @@ def test_environments_without_processes_are_played(monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.parametrize("failure", [RuntimeError("unwilling"), KeyboardInterrupt()])
 def test_a_close_that_fails_leaves_no_other_open(failure: BaseException) -> None:
-    """Each is closed, also where a second Ctrl-C comes into that."""
     suites = _suites(4)
 
     def close() -> None:

@@ -87,18 +87,15 @@ def test_one_frame_of_ours_is_left(error: EnvHubError, asking: Callable[..., Non
     ids=lambda error: type(error).__name__,
 )
 def test_what_may_be_our_fault_keeps_its_frames(error: BaseException) -> None:
-    """There, they are what is known."""
     assert frames(error) == WHOLE
 
 
 def test_a_variable_shows_them_all(monkeypatch: pytest.MonkeyPatch) -> None:
-    """For a bug report."""
     monkeypatch.setenv("ENVHUB_TRACEBACK", "full")
     assert frames(LoadError("no")) == WHOLE
 
 
 def test_the_log_has_them_once(caplog: pytest.LogCaptureFixture) -> None:
-    """At DEBUG, however many methods of ours it comes through."""
     with caplog.at_level(logging.DEBUG, "envhub_sandbox.errors"):
         frames(LoadError("no"), ask_by_another)
     [record] = [one for one in caplog.records if one.name == "envhub_sandbox.errors"]
@@ -107,7 +104,6 @@ def test_the_log_has_them_once(caplog: pytest.LogCaptureFixture) -> None:
 
 
 def test_what_the_caller_was_handling_is_kept() -> None:
-    """With the frames that are his."""
     error, mine = LoadError("no"), KeyError("mine")
     try:
         raise mine
@@ -120,7 +116,6 @@ def test_what_the_caller_was_handling_is_kept() -> None:
 
 
 def test_of_causes_only_ours_are_folded() -> None:
-    """Another library's error keeps what it has to say."""
     ours, theirs = LoadError("ours"), OSError("theirs")
     for error, cause in ((ours, theirs), (PolicyError("on top"), ours)):
         with pytest.raises(type(error)):
@@ -136,7 +131,6 @@ def test_of_causes_only_ours_are_folded() -> None:
 
 
 def test_a_function_keeps_its_face() -> None:
-    """Its name, its text and what it takes."""
     assert ask.__name__ == "ask"
     assert ask.__doc__ == "As a method of ours."
 

@@ -35,7 +35,6 @@ def test_one_reference_a_line(tmp_path: Path) -> None:
 
 
 def test_no_login_is_told() -> None:
-    """A pasted address may have one."""
     with pytest.raises(HubReferenceError) as raised:
         read("https://user:secret@huggingface.co/org/repo")
     assert "secret" not in str(raised.value)
@@ -64,13 +63,11 @@ def test_no_login_is_told() -> None:
     ],
 )
 def test_what_is_wrong_is_told_by_its_line(text: str | bytes, says: str) -> None:
-    """Before anything is run."""
     with pytest.raises(HubReferenceError, match=f"(?s){says}"):
         read(text)
 
 
 def test_all_that_is_wrong_is_told_at_once_and_bounded() -> None:
-    """So that nobody mends a list line by line."""
     with pytest.raises(HubReferenceError) as raised:
         read("\n".join(f"wrong{number}" for number in range(100)))
     told = str(raised.value)
@@ -81,7 +78,6 @@ def test_all_that_is_wrong_is_told_at_once_and_bounded() -> None:
 
 
 def test_the_same_folder_by_another_way_is_told(tmp_path: Path) -> None:
-    """By a link, or from elsewhere."""
     (tmp_path / "env").mkdir()
     (tmp_path / "link").symlink_to(tmp_path / "env")
     with pytest.raises(HubReferenceError, match=r":2: .* already in line 1"):

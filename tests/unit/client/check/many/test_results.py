@@ -60,7 +60,6 @@ def folder(tmp_path: Path) -> Path:
 
 
 def test_a_report_is_read_as_it_was_written() -> None:
-    """From its document, whatever a repository wrote into it."""
     for text in (*HOSTILE, ""):
         document = told(text)
         report, failures = reports.read_report(document)
@@ -72,7 +71,6 @@ def test_a_report_is_read_as_it_was_written() -> None:
 
 
 def test_what_was_judged_is_known_again(folder: Path) -> None:
-    """With the same settings, and with them alone."""
     with Results(folder, "as ever").held() as running:
         made = keep(Results(folder, "as ever"), running)
     assert (made.verdict, made.fails, made.found) == (
@@ -139,7 +137,6 @@ def test_an_interrupted_writer_leaves_what_was_there(
 
 @pytest.mark.parametrize("spoilt", [{"reference": 3}, {"findings": [{}]}, {"passed": True}])
 def test_what_is_no_report_is_not_kept(spoilt: dict[str, Any], folder: Path) -> None:
-    """And leaves nothing."""
     kept = Results(folder, "as ever")
     with kept.held() as running:
         with pytest.raises(ForeignResultError):
@@ -174,7 +171,6 @@ def test_one_run_has_a_folder(folder: Path) -> None:
 
 
 def test_a_folder_with_other_things_is_refused(tmp_path: Path) -> None:
-    """Such as a project's, whose index.html would be overwritten."""
     (tmp_path / "index.html").write_text("mine")
     with pytest.raises(FolderError, match="other files"), Results(tmp_path, "").held():
         pass
@@ -207,7 +203,6 @@ def test_an_index_has_the_tags_of_ours_alone(text: str) -> None:
 
 
 def test_an_index_runs_nothing() -> None:
-    """And a browser is told so."""
     found = Page(index.page(results_of("walk")))
     assert "script" not in found.names
     [policy] = [dict(attrs)["content"] for _, attrs in found.tags if "http-equiv" in dict(attrs)]
@@ -216,7 +211,6 @@ def test_an_index_runs_nothing() -> None:
 
 
 def test_an_index_shows_first_what_fails() -> None:
-    """In the document, JUnit's file and the annotations too."""
     made = list(reversed(results_of("walk")))
     text = Page(index.page(made)).text
     words = ["failed", "not judged", "waiting", "passed"]
@@ -231,7 +225,6 @@ def test_an_index_shows_first_what_fails() -> None:
 
 @pytest.mark.parametrize("text", HOSTILE)
 def test_other_forms_are_well_formed_too(text: str) -> None:
-    """JUnit's file, annotations and the summary of a workflow."""
     made = results_of(text)
     report, failures = reports.read_report(told(text))
     root = ElementTree.fromstring(index.junit(made, lambda _: (report, failures)))
@@ -248,7 +241,6 @@ def test_other_forms_are_well_formed_too(text: str) -> None:
 
 
 def test_an_index_is_bounded() -> None:
-    """However much is said of however many."""
     one = Result(
         listed=ListEntry("x" * 4_096, "y", 1),
         verdict=Verdict.UNJUDGED,

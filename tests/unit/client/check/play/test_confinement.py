@@ -25,7 +25,6 @@ from envhub_sandbox.check.play.confinement import denial_findings
 def test_attempts_are_sorted(
     denied: tuple[str, ...], network: int, files: int, kernel: int, limits: int
 ) -> None:
-    """By what they reach for; what libraries do without is none."""
     found = denial_findings(denied)
     assert {check: len(texts) for check, texts in found.items()} == {
         "denied-network": network,

@@ -65,7 +65,6 @@ def test_a_film_is_of_so_many_frames(mode: Modes) -> None:
 
 
 def test_there_are_pictures_where_nothing_makes_a_film(monkeypatch: pytest.MonkeyPatch) -> None:
-    """And it says what to install."""
     monkeypatch.setattr(plays, "can_encode", lambda: False)
     made = film(walks(), seed=0, seconds=600)
     assert (len(made.stills), made.video) == (4, b"")
@@ -90,13 +89,11 @@ def _broken(number: int) -> Any:
 def test_what_renders_badly_is_told_and_fails_nothing(
     render: Callable[[int], Any], stills: int, says: str
 ) -> None:
-    """There is what there was until then."""
     made = film(walks(render), seed=0, seconds=600)
     assert (len(made.stills), says in made.lacks) == (stills, True), made.lacks
 
 
 def test_what_an_environment_says_is_printable_and_bounded() -> None:
-    """A key of a space may be any text."""
     env = walks()
     env.single_observation_space = gym.spaces.Dict({"\u202e" * 5_000: gym.spaces.Discrete(2)})
     told = facts_of(env)
@@ -129,7 +126,6 @@ def test_a_play_counts_episodes() -> None:
 
 
 def test_rewards_that_nobody_can_count_end_the_counting_alone() -> None:
-    """What they mean for the verdict is for the checks."""
     env = walks()
     step, odd = env.step, [np.zeros(2), np.zeros(2), np.zeros(2), np.zeros((2, 3))]
 

@@ -67,7 +67,6 @@ FRAME = np.zeros((4, 6, 3), np.uint8)
     ],
 )
 def test_frames_fit_their_mode(mode: str, rendered: Any, said: str) -> None:
-    """Modes of which nobody knows what they give are not judged."""
     env: Any = SimpleNamespace(render_mode=mode, num_envs=2, render=lambda: rendered)
     found = list(wrong_frames(env))
     assert len(found) == bool(said)
@@ -76,7 +75,6 @@ def test_frames_fit_their_mode(mode: str, rendered: Any, said: str) -> None:
 
 @pytest.mark.parametrize("declared", [["ansi", "human", 3, "rgb_array"], ("rgb_array", "ansi")])
 def test_modes_that_need_no_window_are_tried(declared: Any) -> None:
-    """Of those that it declares; a lie about them names none."""
     env: Any = SimpleNamespace(metadata={"render_modes": declared}, render_mode="rgb_array")
     assert other_modes(env) == ["ansi"]
     assert other_modes(SimpleNamespace(metadata={"render_modes": 3}, render_mode=None)) == []  # type: ignore[arg-type]
@@ -115,7 +113,6 @@ def test_nothing_is_said_of_what_it_can_play() -> None:
     ],
 )
 def test_what_it_lacks_is_one_text(env: Any, lacking: str) -> None:
-    """It names all that is missing."""
     [text] = lerobot_lacks(env)
     assert text.startswith("LeRobot cannot evaluate it, which needs ")
     assert re.search(lacking, text)

@@ -52,7 +52,6 @@ def target(tmp_path: Path) -> Path:
 
 
 def test_the_files_of_a_commit(url: str, repository: Path, target: Path) -> None:
-    """By a tag, which means its commit; not those of the newest."""
     found = download.resolve(url, "v1")
     assert found == run_git(repository, "rev-parse", "v1^{commit}")
     download.check_out(url, found, target, print)
@@ -63,20 +62,17 @@ def test_the_files_of_a_commit(url: str, repository: Path, target: Path) -> None
 
 
 def test_a_full_commit_is_not_asked_for() -> None:
-    """It means itself."""
     assert download.resolve("https://nowhere.invalid/x", "a" * 40) == "a" * 40
 
 
 @pytest.mark.parametrize("revision", ["v2", "1234567", "main~1"])
 def test_what_is_not_there(url: str, revision: str) -> None:
-    """The error says what to write."""
     with pytest.raises((IndexUnavailableError, RequirementError), match=r"40 digits|not a commit"):
         download.resolve(url, revision)
 
 
 @pytest.mark.parametrize("revision", ["--upload-pack=x", "a b", "", "a..b", "a@{0}", "-x"])
 def test_a_name_that_is_an_option(url: str, revision: str) -> None:
-    """Git would take it for one, or for an expression."""
     with pytest.raises(RequirementError):
         download.resolve(url, revision)
 
@@ -96,13 +92,11 @@ def test_a_name_that_is_an_option(url: str, revision: str) -> None:
     ],
 )
 def test_only_https_without_a_login(url: str, target: Path) -> None:
-    """Nothing else reaches git."""
     with pytest.raises(RequirementError, match="not a supported address"):
         download.check_out(url, "a" * 40, target, print)
 
 
 def test_links_and_submodules_are_left_out(url: str, repository: Path, target: Path) -> None:
-    """They are said; nothing is fetched for them."""
     (repository / "link").symlink_to("/etc/passwd")
     inner = "0" * 39 + "1"
     run_git(repository, "update-index", "--add", "--cacheinfo", f"160000,{inner},module")
@@ -137,7 +131,6 @@ def test_settings_of_the_user_do_nothing(
 
 
 def test_a_name_that_leads_out(url: str, repository: Path, target: Path) -> None:
-    """Git itself makes no such commit, but others can."""
     blob = run_git(repository, "hash-object", "-w", "setup.py")
     (repository / "tree").write_bytes(b"100644 a\\b\0" + bytes.fromhex(blob))
     tree = run_git(repository, "hash-object", "-w", "-t", "tree", "--literally", "tree")
@@ -149,7 +142,6 @@ def test_a_name_that_leads_out(url: str, repository: Path, target: Path) -> None
 
 
 def test_bounds(url: str, repository: Path, target: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Their number before they are read."""
     monkeypatch.setattr(commits, "MAX_FILES", 1)
     with pytest.raises(PackagesTooLargeError, match="more than 1 files"):
         download.check_out(url, run_git(repository, "rev-parse", "HEAD"), target, print)

@@ -54,7 +54,6 @@ def test_how_it_is_built(
     ],
 )
 def test_what_is_not_taken(tmp_path: Path, text: str) -> None:
-    """The error names the sources."""
     (tmp_path / "pyproject.toml").write_text(text)
     with pytest.raises(RequirementError, match=r"x 1\.0"):
         project.read(tmp_path, "x 1.0")
@@ -76,7 +75,6 @@ def test_what_is_not_taken(tmp_path: Path, text: str) -> None:
     ],
 )
 def test_what_was_missing_is_named(log: str, said: str) -> None:
-    """With what to install."""
     assert said in project.advice(f"running build_ext\n{log}\n")
 
 
@@ -116,7 +114,6 @@ def test_downloads_are_bounded_and_verified(
 def test_a_login_goes_to_the_host_of_its_index_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """And no error shows it."""
     monkeypatch.setenv("UV_INDEX", "mine=https://me:secret@index.example/simple")
     monkeypatch.setenv("NETRC", str(tmp_path / "none"))
     assert download.login_for("https://index.example/x") == ("me", "secret")

@@ -26,7 +26,6 @@ def check(wheel: Path, name: str = "some-name", version: str = "1.0") -> None:
 
 
 def test_what_was_asked_for_is_taken(tmp_path: Path) -> None:
-    """Names and versions are compared in their normal form."""
     check(make_wheel(tmp_path, "Some.Name"), version="1")
     minor = "".join(OWN.version.split(".")[:2])
     tag = f"cp{minor}-cp{minor}-linux_{OWN.machine}"
@@ -48,7 +47,6 @@ def test_what_was_asked_for_is_taken(tmp_path: Path) -> None:
 def test_another_package_is_refused(
     tmp_path: Path, name: str, version: str, tag: str, said: str
 ) -> None:
-    """By its file's name already."""
     with pytest.raises(PackageIntegrityError, match=said):
         check(make_wheel(tmp_path, name, version, tag=tag))
 
@@ -97,7 +95,6 @@ def test_what_no_wheel_has_is_refused(
 
 
 def test_a_file_that_is_not_what_record_says(tmp_path: Path) -> None:
-    """The hashes are held against the bytes."""
     wheel = make_wheel(tmp_path, "some-name")
     check(wheel)
     with pytest.raises(PackageIntegrityError, match="not the file that its RECORD says"):
@@ -130,7 +127,6 @@ def test_bounds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bound: str, val
 
 @pytest.mark.parametrize("data", [b"", b"PK\5\6" + bytes(18), b"no zip"])
 def test_what_is_no_wheel(tmp_path: Path, data: bytes) -> None:
-    """A clear error."""
     wheel = tmp_path / "some_name-1.0-py3-none-any.whl"
     wheel.write_bytes(data)
     with pytest.raises(PackageIntegrityError, match="is not taken"):
@@ -190,7 +186,6 @@ def test_a_changed_wheel_is_none_and_is_replaced(wheel: Path) -> None:
 
 
 def test_a_store_that_others_may_write_is_not_read(wheel: Path) -> None:
-    """What lies there would be installed."""
     wheels.keep(wheel, SOURCE, "e" * 64, PYTHON)
     wheels.root().chmod(0o777)
     assert wheels.recall(SOURCE, PYTHON) is None

@@ -118,7 +118,6 @@ def test_a_policy_is_permitted_there() -> None:
 
 
 def test_the_report_says_that_there_is_a_network() -> None:
-    """It does not hold, and no device is missed."""
     said = {**SAID, "user": 65532, "devices": ["lo", "eth0"]}
     found = attestation.parse(json.dumps(said).encode())
     rows = {row["layer"]: row["enforced"] for row in attestation.layers(PUBLISHED, found, "title")}
@@ -204,13 +203,11 @@ def test_an_engine_in_a_virtual_machine_says_what_that_has() -> None:
 
 
 def test_packages_become_an_image_where_nothing_is_mounted() -> None:
-    """Elsewhere they are made here."""
     assert isinstance(DockerSandbox(published=True).package_target(), BuiltImageTarget)
     assert type(DockerSandbox().package_target()) is ImageTarget
 
 
 def test_paths_of_this_machine_are_refused(tmp_path: Path) -> None:
-    """Before the engine is asked for anything."""
     policy = Policy(readable=("/data",))
     with pytest.raises(PolicyError, match="put what is needed into the repository"):
         DockerSandbox(published=True).for_repository(tmp_path, policy, Runtime(""))

@@ -64,7 +64,6 @@ def test_a_container_serves_until_it_is_given_back(tmp_path: Path) -> None:
 
 
 def test_an_order_names_assets_as_they_lie_inside(tmp_path: Path) -> None:
-    """The snapshot, and each tree of the jail's cache of the Hub."""
     place = replace(sandbox(tmp_path, "serves"), assets=(Path("/c/a"), Path("/c/b")))
     own, *others = (("models--org--r", "", ""), ("datasets--a--b", "/c/b", "asset-1"))
     copies = tuple((name, "a" * 40, ("main",), tree) for name, tree, _ in (own, *others))
@@ -86,7 +85,6 @@ def test_an_order_names_assets_as_they_lie_inside(tmp_path: Path) -> None:
 def test_a_start_that_fails_leaves_nothing(
     tmp_path: Path, what: str, said: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Wherever it fails."""
     before, place = descendants(), tmp_path / "t"
     place.mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(place))

@@ -23,7 +23,6 @@ from tests.support import inside
 
 
 def test_a_fleet_is_no_place_of_another(tmp_path: Path) -> None:
-    """Neither at first, nor as a line that a list gets later."""
     other, path = tmp_path / "other", tmp_path / "places"
     other.write_text("tcp://c:1\n")
     path.write_text("tcp://a:1\n")
@@ -37,7 +36,6 @@ def test_a_fleet_is_no_place_of_another(tmp_path: Path) -> None:
 
 
 def test_a_list_that_names_itself_is_no_place(tmp_path: Path) -> None:
-    """Neither at first nor later: what is no place is not read."""
     path = tmp_path / "places"
     resolve = partial(sandbox_of, server_key=None)
     path.write_text(f"file:{path}\n")
@@ -50,7 +48,6 @@ def test_a_list_that_names_itself_is_no_place(tmp_path: Path) -> None:
 
 
 def test_a_secret_key_is_in_copies_and_in_no_pickle() -> None:
-    """A copy is of this process, as that of a RemoteSandbox is."""
     pair = keys.generate()
     text = key_text(pair.secret)
     fleet = Fleet(["tcp://a:1"], remote={"client_key": text})
@@ -63,7 +60,6 @@ def test_a_secret_key_is_in_copies_and_in_no_pickle() -> None:
 
 
 def test_a_list_is_as_it_was_given() -> None:
-    """Names and sandboxes, in their order, also twice."""
     given = ["tcp://a:1", PROCESS, "tcp://a:1"]
     assert PlaceList(given).read() == given
     assert PlaceList("tcp://a:1, process,").read() == ["tcp://a:1", "process"]
@@ -100,19 +96,16 @@ def test_a_file_is_read_again(tmp_path: Path) -> None:
     ],
 )
 def test_no_places_at_first_are_refused(source: Any) -> None:
-    """There is nothing that could hold instead."""
     with pytest.raises(PolicyError, match="fleet"):
         PlaceList(source)
 
 
 def test_too_many_are_refused() -> None:
-    """A list of so many is a mistake."""
     with pytest.raises(PolicyError, match="4097 places"):
         PlaceList(["process"] * (fleet.MOST_PLACES + 1))
 
 
 def test_a_huge_file_is_not_read_whole(tmp_path: Path) -> None:
-    """It is no list of places."""
     path = tmp_path / "places"
     with path.open("wb") as file:
         file.truncate(1 << 30)

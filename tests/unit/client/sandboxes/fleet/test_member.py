@@ -69,7 +69,6 @@ def test_each_place_runs_on_its_own() -> None:
 
 
 def test_alike_on_all_places_it_is_said_once() -> None:
-    """As for one place."""
     facts = {"lock": "a"}
     packages, _ = _packages(
         _Place("a", PackageSet("x", facts)), _Place("b", PackageSet("y", facts))
@@ -91,7 +90,6 @@ def test_what_a_place_has_is_not_made() -> None:
 
 
 def test_one_that_is_not_there_makes_them_when_it_is_used() -> None:
-    """The others do not wait for it."""
     absent = _Place("absent", UnreachableError("nothing answers"))
     packages, members = _packages(_Place("here", PackageSet("x", {})), absent)
     assert packages.make(_request(), print) is not None
@@ -101,7 +99,6 @@ def test_one_that_is_not_there_makes_them_when_it_is_used() -> None:
 
 
 def test_one_that_cannot_make_them_is_an_error() -> None:
-    """It would be another environment there."""
     packages, _ = _packages(
         _Place("a", PackageSet("x", {})), _Place("b", DependencyError("no wheel"))
     )

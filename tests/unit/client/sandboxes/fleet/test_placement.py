@@ -80,20 +80,17 @@ def test_one_worker_each_by_default(rooms: dict[str, Room]) -> None:
 
 
 def test_they_are_spread(rooms: dict[str, Room]) -> None:
-    """Evenly, by how often a place is in the list."""
     placement = _opened(["a", "b", "a"])
     found = [_first(placement, number) for number in range(6)]
     assert sorted(found) == ["a", "a", "a", "a", "b", "b"]
 
 
 def test_of_equal_places_the_one_with_most_room(rooms: dict[str, Room]) -> None:
-    """Other processes with the same key may have taken the rest."""
     rooms |= {"a": Room(workers=3), "b": Room(workers=60)}
     assert _first(_opened(["a", "b"]), 0) == "b"
 
 
 def test_what_is_full_comes_after_what_is_not(rooms: dict[str, Room]) -> None:
-    """And what does not answer after that."""
     rooms |= {"a": Room(workers=0), "b": Room(answers=False, workers=0), "c": Room(workers=1)}
     placement = _opened(["a", "b", "c"])
     assert [one.name for one in placement.candidates(0)] == ["c", "a", "b"]
@@ -124,7 +121,6 @@ def test_a_worker_comes_back_to_where_it_was(rooms: dict[str, Room]) -> None:
 
 
 def test_where_a_worker_is(rooms: dict[str, Room]) -> None:
-    """Before it was placed, where it would go as far as is known."""
     placement = _opened(["a", "b"])
     assert [placement.at(number).name for number in range(3)] == ["a", "b", "a"]
     tries = placement.candidates(0)
@@ -148,7 +144,6 @@ def test_a_place_that_was_absent_is_made_when_it_is_used(rooms: dict[str, Room])
 
 
 def test_all_are_made_where_none_was_there(rooms: dict[str, Room]) -> None:
-    """The first error says why."""
     placement = _placement(["a", "b"])
     for one in placement.members():
         one.absent = vars(one.sandbox)["refuses"] = True
@@ -172,7 +167,6 @@ def test_what_many_places_run_on_has_a_name_of_a_file(rooms: dict[str, Room]) ->
 
 
 def test_a_place_is_asked_once_for_all_workers(rooms: dict[str, Room]) -> None:
-    """There may be a thousand of each."""
     placement = _placement([f"far{number}" for number in range(50)])
     for seat in placement.seats(None):
         seat.for_repository(Path(), Policy(), Runtime("")).runs_on(Runtime(""))

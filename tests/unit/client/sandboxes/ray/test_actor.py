@@ -65,6 +65,5 @@ def test_a_server_is_started_and_its_end_is_told(monkeypatch: pytest.MonkeyPatch
 def test_what_fails_is_a_text(
     monkeypatch: pytest.MonkeyPatch, key: str, changes: dict[str, Any], says: str
 ) -> None:
-    """Never an exception, which Ray would hand over as a pickle."""
     monkeypatch.setitem(sys.modules, "ray", node(**changes))
     assert says in json.loads(WorkerActor().start(key))["error"]

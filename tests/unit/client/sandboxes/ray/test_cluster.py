@@ -30,7 +30,6 @@ def test_an_answer_that_is_none_is_refused(lie: Any) -> None:
 
 
 def test_bytes_of_json_are_an_answer() -> None:
-    """And a subclass is none."""
     assert cluster.read_answer(b'{"code": 3}') == {"code": 3}
     with pytest.raises(WorkerStartupError):
         cluster.read_answer(type("Bytes", (bytes,), {})(b"{}"))
@@ -104,7 +103,6 @@ def use(ray: Ray, monkeypatch: pytest.MonkeyPatch) -> Ray:
 
 
 def test_a_local_ray_is_started_where_none_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Which is said, once."""
     ray = use(Ray(), monkeypatch)
     with pytest.warns(RuntimeWarning, match=r"a local Ray with 2 CPUs was started"):
         cluster.connect()
@@ -130,7 +128,6 @@ def test_an_address_without_a_cluster_is_an_error(monkeypatch: pytest.MonkeyPatc
 
 
 def test_another_cluster_than_the_connected_one_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It cannot be used at once."""
     use(Ray(connected="10.0.0.1:6379"), monkeypatch)
     for good in ("", "auto", "10.0.0.1:6379"):
         cluster.connect(good)

@@ -48,14 +48,12 @@ def test_a_server_is_what_a_node_says() -> None:
     ],
 )
 def test_a_lie_of_a_node_is_refused(lie: dict[str, Any]) -> None:
-    """Before anything is connected to."""
     with pytest.raises(WorkerStartupError, match="no server"):
         sandbox.read_started(GOOD | lie)
 
 
 @pytest.mark.parametrize("left_out", GOOD)
 def test_what_a_node_leaves_out_is_missed(left_out: str) -> None:
-    """Each part is needed."""
     with pytest.raises(WorkerStartupError):
         sandbox.read_started({name: GOOD[name] for name in GOOD if name != left_out})
 
@@ -65,7 +63,6 @@ def test_what_a_node_leaves_out_is_missed(left_out: str) -> None:
     [{"num_cpus": -1}, {"num_gpus": float("nan")}, {"resources": {"x": -1}}, {"placement_s": 0}],
 )
 def test_impossible_numbers_are_refused(options: dict[str, Any]) -> None:
-    """Where they are written, and by name."""
     with pytest.raises(PolicyError, match="RaySandbox"):
         RaySandbox(**options)
 
@@ -81,14 +78,12 @@ def test_impossible_numbers_are_refused(options: dict[str, Any]) -> None:
     ],
 )
 def test_what_a_node_cannot_give_is_refused(policy: Policy, runtime: Runtime, says: str) -> None:
-    """Before anything is placed."""
     place = RaySandbox(num_gpus=0 if says == "num_gpus" else 1)
     with pytest.raises(PolicyError, match=says):
         place.for_repository(Path("/nowhere"), policy, runtime)
 
 
 def test_without_ray_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    """By the name of the extra."""
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(SandboxUnavailableError, match=r"envhub-sandbox\[ray\]"):
         RaySandbox().for_repository(Path("/nowhere"), Policy(), OWN)

@@ -103,7 +103,6 @@ def opened(launcher: Launcher, client: _Client, place: _Place) -> Any:
 
 
 def test_a_jail_is_closed_once(launcher: Launcher, client: _Client, place: _Place) -> None:
-    """And its server is given back once."""
     loaded = opened(launcher, client, place)
     for _ in range(2):
         launcher.close(loaded)
@@ -114,7 +113,6 @@ def test_a_jail_is_closed_once(launcher: Launcher, client: _Client, place: _Plac
 def test_an_interrupted_close_goes_on_over_another_connection(
     launcher: Launcher, client: _Client, place: _Place
 ) -> None:
-    """What was said on its own before the interrupt is not known."""
     loaded = opened(launcher, client, place)
 
     def interrupted() -> Any:
@@ -141,13 +139,11 @@ def test_an_interrupted_close_goes_on_over_another_connection(
 def test_only_words_are_taken_of_a_status(
     launcher: Launcher, client: _Client, place: _Place, status: Any, states: tuple[str, ...]
 ) -> None:
-    """A server on another host may say anything."""
     client.status = status
     assert launcher.states(opened(launcher, client, place)) == states
 
 
 def test_a_silent_server_has_no_status(launcher: Launcher, client: _Client, place: _Place) -> None:
-    """Which is no error: it is for a text."""
     client.refuses = WorkerDiedError("gone")
     assert launcher.status(opened(launcher, client, place)) == {}
 
@@ -191,7 +187,6 @@ def test_a_death_after_a_denial_names_it(
 
 
 def test_no_server_no_use(launcher: Launcher, place: _Place) -> None:
-    """Nothing is left to be released."""
     place.fails = True
     with pytest.raises(WorkerStartupError):
         launcher.hold()

@@ -58,12 +58,10 @@ def test_the_line_ends_with_its_time(now: list[float]) -> None:
 
 @pytest.mark.parametrize("error", [_GONE, WorkerDiedError("killed", reason="signal")])
 def test_a_death_is_no_reason_to_wait(error: EnvHubError) -> None:
-    """Unless the server has said that it ends."""
     with pytest.raises(WorkerDiedError):
         asked(error)
 
 
 def test_who_no_longer_waits_leaves_the_line() -> None:
-    """What is started in advance gives way at once."""
     with pytest.raises(ServerBusyError):
         asked(_FULL, unasked=True)

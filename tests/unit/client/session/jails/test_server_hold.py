@@ -56,7 +56,6 @@ def test_it_lasts_from_the_first_jail_to_the_last_environment(
 def test_it_moves_on_from_a_server_that_has_died(
     hold: ServerHold, use: Callable[[], ServerUse[Server]]
 ) -> None:
-    """It keeps the one that the next jail was opened in."""
     leave = hold.enter()
     dead = use()
     hold.keep(dead.server)

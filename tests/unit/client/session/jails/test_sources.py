@@ -31,7 +31,6 @@ def launcher() -> Any:
 
 
 def test_it_is_opened_once_and_ends_with_its_last_user(launcher: Any) -> None:
-    """The next one gets a fresh one."""
     source = SharedJail(launcher, lambda: None)
     users = [source.take(Deadline(None)) for _ in range(3)]
     assert launcher.open.call_count == 1

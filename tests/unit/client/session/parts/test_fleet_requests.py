@@ -56,7 +56,6 @@ def states(session: FleetSession) -> list[State]:
 
 
 def test_each_worker_is_sent_its_rows(requests: FleetRequests, lanes: list[FakeLane]) -> None:
-    """And the answers come in the rows' order, one step for all."""
     requests.submit_step(ACTIONS)
     observation, rewards, *_ = requests.collect_step(None)
     assert (observation.shape, rewards.shape) == ((2, 3), (2,))
@@ -122,7 +121,6 @@ def test_a_worker_that_was_sent_nothing_falls_behind(
 def test_one_sub_environment_is_asked_of_its_worker_alone(
     requests: FleetRequests, lanes: list[FakeLane]
 ) -> None:
-    """By its place there; an error names it."""
     asked: list[int | None] = []
 
     def message(number: int, place: int | None) -> m.Message:
@@ -138,7 +136,6 @@ def test_one_sub_environment_is_asked_of_its_worker_alone(
 
 
 def test_after_close_every_worker_knows_it(requests: FleetRequests, session: FleetSession) -> None:
-    """For its own errors."""
     requests.closed = True
     assert all(part.requests.closed for part in session.parts)
     with pytest.raises(ClosedEnvironmentError):

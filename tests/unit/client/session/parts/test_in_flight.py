@@ -54,7 +54,6 @@ def received(flight: InFlight, min_ready: int = 1) -> list[int]:
 
 
 def test_who_answers_first_comes_first(flight: InFlight, lanes: list[FakeLane]) -> None:
-    """And who has waited here for longest."""
     lanes[0].silent = True
     send(flight, 0, 1)
     assert received(flight) == [1]
@@ -66,7 +65,6 @@ def test_who_answers_first_comes_first(flight: InFlight, lanes: list[FakeLane]) 
 
 
 def test_the_environment_is_pending_meanwhile(flight: InFlight, session: FleetSession) -> None:
-    """From the first send to the last receipt."""
     with pytest.raises(NoAsyncCallError):
         flight.recv(1, 0)
     send(flight, 0, 1)
@@ -81,7 +79,6 @@ def test_the_environment_is_pending_meanwhile(flight: InFlight, session: FleetSe
 
 
 def test_a_refused_send_leaves_nothing_pending(flight: InFlight, session: FleetSession) -> None:
-    """Nothing was sent, to nobody."""
     session.parts[1].lifecycle.state = State.DEAD
     with pytest.raises(WorkerDiedError) as caught:
         send(flight, 0, 1)
@@ -194,7 +191,6 @@ def test_an_error_names_its_worker_and_keeps_no_other(
 
 
 def test_a_timeout_of_the_caller_takes_nothing(flight: InFlight, lanes: list[FakeLane]) -> None:
-    """Also where some are ready."""
     lanes[1].silent = True
     send(flight, 0, 1)
     with pytest.raises(WorkerTimeoutError, match="nothing is lost"):
@@ -207,7 +203,6 @@ def test_a_timeout_of_the_caller_takes_nothing(flight: InFlight, lanes: list[Fak
 def test_infos_that_break_a_rule_end_their_worker_alone(
     flight: InFlight, lanes: list[FakeLane], session: FleetSession
 ) -> None:
-    """The other's results come."""
     lanes[0].infos = {"x": [1]}
     send(flight, 0, 1)
     with pytest.raises(RemoteProtocolError):
@@ -219,7 +214,6 @@ def test_infos_that_break_a_rule_end_their_worker_alone(
 def test_infos_that_do_not_go_together_are_an_error_of_the_environment(
     flight: InFlight, lanes: list[FakeLane], session: FleetSession
 ) -> None:
-    """As Gymnasium's; the worker goes on."""
     lanes[0].infos = {None: None}
     send(flight, 0)
     with pytest.raises(RemoteEnvError, match="do not go together"):
@@ -228,7 +222,6 @@ def test_infos_that_do_not_go_together_are_an_error_of_the_environment(
 
 
 def test_what_is_dropped_is_waited_for(flight: InFlight, lanes: list[FakeLane]) -> None:
-    """And what waits here is not sent."""
     send(flight, 0, 1)
     send(flight, 0)
     flight.drop()

@@ -85,7 +85,6 @@ def test_a_server_that_has_not_heard_of_the_jail_is_asked_again(
 def test_a_server_that_takes_nothing_is_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """After a few tries, and at once where nobody listens."""
     monkeypatch.chdir(tmp_path)
     serving(Path("fds"), 50)
     with pytest.raises(ConnectionError):

@@ -87,7 +87,6 @@ def test_a_slot_is_written_again_when_no_array_of_it_is_held(
 def test_a_hostile_byte_makes_no_third_boolean(
     slab_of: Callable[..., ObservationSlab], slots: int
 ) -> None:
-    """A 2 is true: of a mask, lent or copied, and of the flags."""
     slab = slab_of(MASK, slots)
     slab.choose()
     layout = slab.layout
@@ -106,7 +105,6 @@ def test_a_hostile_byte_makes_no_third_boolean(
 
 
 def test_received_memory_is_shared_with_nobody() -> None:
-    """There is no descriptor to hand on."""
     layout = slabs.observation_layout(BOX, COUNT, 1)
     assert layout is not None
     received = memoryview(bytearray(layout.total_bytes))

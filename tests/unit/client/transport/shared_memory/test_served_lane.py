@@ -110,7 +110,6 @@ def test_a_batch_is_what_the_runner_wrote(space: Any) -> None:
 
 
 def test_actions_arrive_with_their_dtypes() -> None:
-    """Also where these change from one step to the next."""
     both = Both(SMALL)
     changes = []
     for integers in (np.int64, np.int8, np.int8):
@@ -129,7 +128,6 @@ def test_actions_arrive_with_their_dtypes() -> None:
 
 
 def test_columns_follow_their_schema() -> None:
-    """So much of the slab is sent as the client knows columns of."""
     both = Both(SMALL)
     infos = {"a": np.arange(COUNT), "_a": np.ones(COUNT, bool)}
     both.ask(np.zeros(COUNT, int), np.zeros((COUNT, 2)))
@@ -326,7 +324,6 @@ def test_who_only_looks_has_infos_fetched_once() -> None:
 
 
 def test_infos_that_never_come_are_waited_for_no_longer_than_a_step() -> None:
-    """And before a reset; then all that was owed is taken."""
     served = Served()
     served.step()
     served.server.answer(slab(slabs.FETCH))
@@ -361,7 +358,6 @@ def test_infos_that_were_asked_for_in_vain_are_dropped(kind: int) -> None:
 
 
 def test_a_fetch_that_cannot_be_sent_is_met_by_the_wait() -> None:
-    """To look raises nothing."""
     served = Served()
     served.step()
     served.server.answer(slab(slabs.FETCH))
@@ -373,7 +369,6 @@ def test_a_fetch_that_cannot_be_sent_is_met_by_the_wait() -> None:
 
 @pytest.mark.parametrize("ahead", [False, True])
 def test_who_dies_before_its_infos_came_has_died(ahead: bool) -> None:
-    """By its shard; the others keep what they answered."""
     served = Served(3)
     served.lane.jail.kept = True
     served.step()

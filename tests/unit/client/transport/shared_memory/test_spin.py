@@ -27,12 +27,10 @@ def test_spinning_that_pays_is_chosen() -> None:
 
 
 def test_spinning_that_costs_is_given_up() -> None:
-    """Where it is slower, it is tried seldom."""
     assert run(SpinChooser(True), 10_000, awake_ns=2_000, asleep_ns=20) < 300
 
 
 def test_a_change_of_load_is_noticed() -> None:
-    """A core that gets busy, or free again, changes the decision."""
     chooser = SpinChooser(True)
     run(chooser, 10_000, awake_ns=10, asleep_ns=20)
     run(chooser, 20_000, awake_ns=2_000, asleep_ns=20)
@@ -53,7 +51,6 @@ def test_waits_in_vain_end_spinning_at_once() -> None:
 
 
 def test_the_budget_follows_what_awake_steps_take() -> None:
-    """A reply that is long overdue is not waited for awake."""
     chooser = SpinChooser(True)
     run(chooser, 10_000, awake_ns=50_000, asleep_ns=90_000)
     assert chooser.budget_ns == 150_000
@@ -71,14 +68,12 @@ def test_a_slow_step_now_and_then_does_not_end_spinning() -> None:
 
 
 def test_spinning_that_is_not_allowed_never_happens() -> None:
-    """Where a core may see stores out of order, the lane sleeps."""
     assert run(SpinChooser(False), 1_000, awake_ns=1, asleep_ns=1_000) == 0
 
 
 @pytest.mark.parametrize("client", [0, 1, 2, 3])
 @pytest.mark.parametrize("shards", [1, 2, 3, 4, 9])
 def test_a_shard_that_waits_awake_is_not_on_the_clients_core(shards: int, client: int) -> None:
-    """The client would have to push it away at every step."""
     cpus = [0, 1, 2, 3]
     awake = min(shards, len(cpus) - 1)
     placed = [cpu - 1 for cpu in place(shards, awake, client, cpus)]
@@ -93,12 +88,10 @@ def test_the_first_that_sleeps_shares_the_clients_core() -> None:
 
 
 def test_one_core_holds_all_shards() -> None:
-    """Where there is one core, all shards are on it."""
     assert place(2, 0, 5, [5]) == [6, 6]
 
 
 @pytest.mark.parametrize(("shards", "awake"), [(1, 1), (2, 1), (3, 1)])
 def test_one_core_is_the_clients(monkeypatch: pytest.MonkeyPatch, shards: int, awake: int) -> None:
-    """Shards that find no other core sleep."""
     monkeypatch.setattr(spin, "CPUS", [0, 1])
     assert Cores(shards).awake == awake
