@@ -29,7 +29,6 @@ _PAPERS = {"README__md": "# x", "LICENSE": "MIT"}
 
 
 def envhub(*arguments: str | Path) -> Result:
-    """Run a command in this process."""
     return CliRunner().invoke(app, [*map(str, arguments)], prog_name="envhub")
 
 
@@ -42,7 +41,6 @@ def document(*arguments: str | Path, code: int = 0) -> dict[str, Any]:
 
 
 def repository(folder: Path, entry: str = _ENTRY, **files: str) -> Path:
-    """A repository with its papers."""
     return write_repository(folder, entry, **_PAPERS, **files)
 
 

@@ -26,12 +26,10 @@ class Noted(SyncVectorEnv):
         self.task, self.events = task, events
 
     def reset(self, **kwargs: Any) -> Any:
-        """Note it."""
         self.events.append(("reset", self.task))
         return super().reset(**kwargs)
 
     def close(self, **kwargs: Any) -> None:
-        """Note it, the first time."""
         if not self.closed:
             self.events.append(("close", self.task))
         super().close(**kwargs)
@@ -41,7 +39,6 @@ class Dying(Noted):
     """Dies in its first step."""
 
     def step(self, actions: Any) -> Any:
-        """As a worker does."""
         raise WorkerDiedError("it died", log_tail="")
 
 
@@ -56,7 +53,6 @@ def run(
 
 
 def suites(*envs: SyncVectorEnv) -> EnvSuites:
-    """One suite of these tasks."""
     return EnvSuites({"s": dict(enumerate(envs))}, lambda: dict(PROVENANCE))
 
 

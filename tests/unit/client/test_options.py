@@ -97,12 +97,10 @@ class _Config:
 
     @property
     def type(self) -> str:
-        """As LeRobot's configs have it."""
         return "hub"
 
     @property
     def broken(self) -> str:
-        """What cannot be computed."""
         raise RuntimeError
 
     @property

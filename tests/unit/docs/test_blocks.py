@@ -39,7 +39,6 @@ _RUN_BY = {
 
 
 def named(block: Block) -> str:
-    """A block in a test's name."""
     return f"{block.document}: {block.text.strip().splitlines()[0][:40]}"
 
 

@@ -30,7 +30,6 @@ exit ${ENVHUB_CODE:-0}
 
 
 def loaded(checkout: Path, name: str) -> Any:
-    """A file of YAML."""
     return yaml.safe_load((checkout / name).read_text())
 
 
@@ -47,7 +46,6 @@ def run(script: str, **variables: str) -> subprocess.CompletedProcess[str]:
 
 
 def program(path: Path, text: str) -> None:
-    """Write a program."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text)
     path.chmod(0o755)

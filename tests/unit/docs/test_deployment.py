@@ -62,7 +62,6 @@ def exported() -> dict[str, set[str]]:
 
 
 def expressions(dashboard: Any) -> Iterator[str]:
-    """Every query of the dashboard."""
     for panel in dashboard["panels"]:
         for target in panel["targets"]:
             yield target["expr"]

@@ -67,7 +67,6 @@ def plugin(checkout: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def told_by(wheel: Path) -> Message:
-    """A wheel's metadata."""
     with zipfile.ZipFile(wheel) as archive:
         [name] = [one for one in archive.namelist() if one.endswith(".dist-info/METADATA")]
         return Parser().parsestr(archive.read(name).decode())

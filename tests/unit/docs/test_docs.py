@@ -31,7 +31,6 @@ PROTOCOL = (CHECKOUT / "docs" / "protocol.md").read_text()
 
 
 def named(path: Path) -> str:
-    """A document's name in a test's."""
     return str(path.relative_to(CHECKOUT))
 
 
@@ -92,7 +91,6 @@ def test_protocol_draws_the_lifecycle_from_its_table() -> None:
 
 
 def flat(text: str) -> str:
-    """A text without its line ends."""
     return " ".join(text.split())
 
 
@@ -113,7 +111,6 @@ def test_values_lists_the_limits_with_their_defaults() -> None:
 
 
 def fenced(text: str, language: str) -> list[str]:
-    """The blocks of code in a document."""
     return re.findall(rf"^```{language}\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
 
 

@@ -20,7 +20,6 @@ _IMPORTED_AS = {"pyzmq": "zmq"}
 
 @pytest.fixture(scope="module")
 def project() -> dict[str, Any]:
-    """pyproject.toml, read."""
     if sys.version_info < (3, 11):
         tomllib = pytest.importorskip("pip._vendor.tomli")
     else:

@@ -134,7 +134,6 @@ PRIVATE_NAMES_OF_OTHERS = {
 
 
 def folder(package: str) -> Path:
-    """Where an installed package lies."""
     spec = importlib.util.find_spec(package)
     assert spec is not None
     assert spec.origin is not None

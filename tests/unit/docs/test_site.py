@@ -15,7 +15,6 @@ _PAGE = "<head><meta http-equiv='Content-Security-Policy' content=\"default-src 
 
 @pytest.fixture(scope="module")
 def loads(checkout: Path) -> Any:
-    """The step's own check."""
     spec = importlib.util.spec_from_file_location("loads", checkout / ".ci" / "loads.py")
     assert spec is not None
     assert spec.loader is not None

@@ -21,7 +21,6 @@ def test_what_takes_longer_is_interrupted(translates: bool) -> None:
 
 
 def wait(translates: bool) -> None:
-    """As a download does."""
     try:
         threading.Event().wait(60)
     except KeyboardInterrupt as error:

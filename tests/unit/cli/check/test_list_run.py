@@ -43,7 +43,6 @@ def started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, 
 
 
 def called(*arguments: str) -> Result:
-    """The command, in this process."""
     return _RUNNER.invoke(app, ["check", *arguments])
 
 

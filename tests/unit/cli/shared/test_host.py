@@ -40,7 +40,6 @@ def host(folder: Path, own: str, mounts: dict[str, str], **groups: dict[str, int
 
 
 def v2(limit: int | str, used: int = 0, idle: int = 0) -> dict[str, int | str]:
-    """A group's files."""
     return {
         "memory.max": limit,
         "memory.current": used,
@@ -49,7 +48,6 @@ def v2(limit: int | str, used: int = 0, idle: int = 0) -> dict[str, int | str]:
 
 
 def v1(limit: int | str, used: int = 0, idle: int = 0) -> dict[str, int | str]:
-    """A group's files."""
     return {
         "memory.limit_in_bytes": limit,
         "memory.usage_in_bytes": used,

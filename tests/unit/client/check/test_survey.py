@@ -19,7 +19,6 @@ _ENTRY = "def make_env(n_envs=1, use_async_envs=False): pass"
 
 
 def zipped(*names: str) -> bytes:
-    """An archive of empty files."""
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w") as archive:
         for name in names:
@@ -46,7 +45,6 @@ def from_the_hub(folder: Path) -> Snapshot:
 
 
 def surveyed(snapshot: Snapshot) -> Survey:
-    """All that is read of one."""
     return survey(snapshot, parsing.read(snapshot))
 
 
@@ -117,6 +115,7 @@ def test_honest_code_is_not_named(text: str, tmp_path: Path) -> None:
     [
         ("fast.so", b"", "machine code", "source-native"),
         ("weights.npz", b"\x7fELF\x02", "machine code", "source-native"),
+        ("a.txt", b"MZ\0\0", "machine code", "source-native"),
         ("env.cpython-311.pyc", b"\xa7\r\r\n\0\0", "compiled Python", "source-compiled"),
         ("__pycache__/env.pyc", b"MZ", "compiled Python", "source-compiled"),
         ("policy.pt", b"PK\x03\x04", "pickle", "source-pickle"),
@@ -139,6 +138,8 @@ def test_honest_code_is_not_named(text: str, tmp_path: Path) -> None:
         ("notes.txt", "\u5f3a\u5316 \u5b66\u4e60".encode(), "text", ""),
         ("long.txt", ("\u5f3a" * 5_000).encode(), "text", ""),
         ("turned.md", "a\u2066b".encode(), "text", "source-hidden"),
+        ("a.md", b"\xff\xfe", "binary", ""),
+        ("a.md", b"a\0b", "binary", ""),
     ],
 )
 def test_files_are_told_by_their_beginnings_and_ends(
@@ -167,6 +168,23 @@ def test_what_cannot_be_read_is_said(text: str, check: str, tmp_path: Path) -> N
     checks = {check for check, _ in found(tmp_path / "r", text.encode("latin-1"))}
     assert check in checks
     assert checks <= {check, "source-hidden", "source-obscure"}
+
+
+def test_places_are_named_with_their_lines(tmp_path: Path) -> None:
+    """A hidden character once in each line, and a line that nobody reads to its end."""
+    text = "a = 1\nb = '\u202ec\u202e'\nd = '\u200b'\ne = '" + "x y " * 700 + "'\n"
+    repository(tmp_path / "r", "odd.py", text)
+    told = [one for one in surveyed(local(tmp_path / "r")).findings if one.file == "odd.py"]
+    assert [(one.id, one.line, one.message[:12]) for one in told] == [
+        ("source-hidden", 2, "holds U+202E"),
+        ("source-hidden", 3, "holds U+200B"),
+        ("source-obscure", 4, "a line of 28"),
+    ]
+
+
+def test_a_flood_of_hidden_characters_is_bounded(tmp_path: Path) -> None:
+    checks = [check for check, _ in found(tmp_path / "r", "\u200b\n" * 100, "notes.md")]
+    assert checks.count("source-hidden") == 20
 
 
 def test_a_long_chain_ends_nothing(tmp_path: Path) -> None:

@@ -75,7 +75,7 @@ def one_kind(files: dict[str, tuple[str, bytes]]) -> dict[str, tuple[str, bytes]
     return {path: one for path, one in files.items() if not path.startswith(tuple(links))}
 
 
-@settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(_COMMITS)
 def test_a_clone_is_judged_as_its_commit_or_fails(files: dict[str, tuple[str, bytes]]) -> None:
     """Each file that the Hub would hand out is there, as it is; or it is reported, and fails."""

@@ -299,17 +299,14 @@ class Recorder:
         self.num_envs = 2
 
     def reset(self, **arguments: Any) -> None:
-        """Note it."""
         self.asked.append(f"reset {arguments['seed']}")
 
     def step(self, actions: Any) -> None:
-        """Note it; the third is the last."""
         self.asked.append(f"step {actions.tolist()}")
         if len(self.asked) == 4:
             raise WorkerDiedError("again", exit_code=7)
 
     def close(self) -> None:
-        """Nothing that a bundle may ask for."""
         self.asked.append("close")
 
 

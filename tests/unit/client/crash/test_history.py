@@ -24,12 +24,10 @@ def made(space: Any = None, num_envs: int = 2, limit: int = 1000) -> History:
 
 
 def ask(kept: History, message: m.Message) -> None:
-    """Record any request but a step."""
     kept.requested(requested(message))
 
 
 def reset(kept: History, seeds: Any = None, mask: Any = None) -> None:
-    """Record a reset."""
     ask(kept, m.Reset(0, seeds, None, mask))
 
 
@@ -65,13 +63,11 @@ def test_what_shards_were_sent_is_kept_as_it_was_asked() -> None:
 
 
 def actions_of(recording: Recording) -> list[Any]:
-    """The actions of all steps, as lists."""
     runs = [request.actions for request in recording.requests if isinstance(request, Steps)]
     return [row.tolist() for run in runs for row in run]
 
 
 def names_of(recording: Recording) -> list[str]:
-    """What was asked beside plain steps."""
     return [one.operation for one in recording.requests if isinstance(one, RecordedRequest)]
 
 

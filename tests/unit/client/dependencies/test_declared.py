@@ -23,7 +23,6 @@ def repository(folder: Path, **files: str) -> DeclaredPackages | None:
 
 
 def plain(found: DeclaredPackages | None) -> list[str]:
-    """Its requirements as text."""
     assert found is not None
     return [str(one) for one in found.wanted]
 

@@ -47,7 +47,6 @@ def repository(folder: Path, *lines: str) -> Path:
 
 
 def made(folder: Path, **options: Any) -> Environment:
-    """Its environment."""
     tell = options.pop("tell", lambda line: None)
     request = request_of(local(folder), OWN)
     assert request is not None
@@ -57,7 +56,6 @@ def made(folder: Path, **options: Any) -> Environment:
 
 
 def left_behind() -> list[str]:
-    """What is half-made."""
     return [path.name for path in environments.root().glob(".*")]
 
 
@@ -174,7 +172,6 @@ print(made(Path(sys.argv[1])).home, flush=True)
 
 
 def maker(folder: Path) -> subprocess.Popen[str]:
-    """A process that makes it."""
     return subprocess.Popen(
         [sys.executable, "-c", MAKER, str(folder)],
         stdout=subprocess.PIPE,

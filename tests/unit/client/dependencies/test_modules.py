@@ -46,7 +46,6 @@ def snapshot(folder: Path, text: str, **files: str) -> Snapshot:
 
 
 def requirements(found: Snapshot) -> list[str]:
-    """What is guessed."""
     return [str(one.wanted.requirement) for one in guessed(found)]
 
 

@@ -27,7 +27,6 @@ MANIFEST = Manifest(envs=(wire.env_manifest(BOX, ACTIONS, 2),), lazy=True)
 
 @pytest.fixture
 def snapshot(tmp_path: Path, snapshot_store: Path) -> Snapshot:
-    """A repository of one file."""
     (tmp_path / "repo").mkdir()
     (tmp_path / "repo" / "env.py").write_text("1")
     return local(tmp_path / "repo")

@@ -41,7 +41,6 @@ def declares(*lines: str, python: str = "") -> PackageRequest:
 
 
 def snapshot(folder: Path, requirements: str | None = None) -> Snapshot:
-    """A repository that declares this."""
     (folder / "env.py").write_text("")
     if requirements is not None:
         (folder / "requirements.txt").write_text(requirements)

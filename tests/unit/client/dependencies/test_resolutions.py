@@ -21,7 +21,6 @@ COMMIT = "0123456789abcdef0123456789abcdef01234567"
 
 
 def request(*lines: str) -> PackageRequest:
-    """A repository that needs these."""
     wanted = (parse_requirement(line, f"line {n}") for n, line in enumerate(lines, start=1))
     return PackageRequest("requirements.txt", tuple(wanted))
 

@@ -29,7 +29,6 @@ def cuda(index: Index) -> Path:
 
 
 def names(request: PackageRequest) -> set[str]:
-    """The pins of what is no worker's."""
     return set(resolution_for(request).lock.packages) & {
         *("torch==2.5", "torch==2.5+cpu", "torchvision==0.20", "torchvision==0.20+cpu"),
         "nvidia-cublas==1.0",

@@ -33,14 +33,12 @@ from tests.attacks.client.lying_server import (
 
 @pytest.fixture
 def server() -> Iterator[LyingServer]:
-    """Honest, until a test has a lie."""
     with lying() as found:
         yield found
 
 
 @pytest.fixture
 def launcher(server: LyingServer, tmp_path: Path, snapshot_store: Path) -> Launcher:
-    """Opens jails of a repository there."""
     (tmp_path / "repo").mkdir()
     (tmp_path / "repo" / "env.py").write_text("")
     load = m.Load(NUM_ENVS, False, None, {})
@@ -51,17 +49,14 @@ def launcher(server: LyingServer, tmp_path: Path, snapshot_store: Path) -> Launc
 
 
 def suites(launcher: Launcher, agrees: Callable[[Manifest], None] = lambda _: None) -> Any:
-    """What a caller gets."""
     return EnvFactory([launcher], None, 0, SandboxVectorEnv, agrees).make()
 
 
 def asked(server: LyingServer, kind: type[m.Message]) -> int:
-    """How often."""
     return sum(isinstance(one, kind) for one in server.asked)
 
 
 def says(server: LyingServer, request: type[m.Message], answer: m.Message) -> None:
-    """From now on."""
     server.lies[request] = lambda about: [about.answer(answer)]
 
 

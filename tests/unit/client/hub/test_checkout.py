@@ -28,7 +28,6 @@ PLACES = (
 
 @pytest.fixture
 def repository(tmp_path: Path, snapshot_store: Path) -> GitRepository:
-    """A checkout with an entry file."""
     made = GitRepository(tmp_path / "my-env")
     made.commit({"env.py": "1"})
     return made
@@ -41,7 +40,6 @@ def files(folder: Path) -> dict[str, str]:
 
 
 def left_out(folder: Path) -> list[tuple[str, bool]]:
-    """What it lacks."""
     return [tuple(one) for one in LocalFolder.at(folder).left_out()]
 
 

@@ -98,7 +98,6 @@ def failed(error: BaseException, *secrets: str) -> answers.HubFailure:
 
 
 def answered(status: int, **headers: str) -> BaseException:
-    """An exception of an HTTP client."""
     error = type("HTTPStatusError", (Exception,), {})("status")
     error.response = Response(status, **headers)
     return error

@@ -23,7 +23,6 @@ DIGEST = "sha256:" + "0" * 64
 
 
 def record(path: str, size: int = 1) -> FileRecord:
-    """A file of a listing."""
     return FileRecord(path, size, DIGEST)
 
 

@@ -21,7 +21,6 @@ from envhub_sandbox.hub.snapshot import Snapshot, SnapshotLimits, commit_of, loc
 
 @pytest.fixture
 def folder(tmp_path: Path, snapshot_store: Path) -> Path:
-    """A small environment."""
     folder = tmp_path / "my-env"
     (folder / "sub").mkdir(parents=True)
     (folder / "env.py").write_text("1")

@@ -26,14 +26,12 @@ COMMIT = "c" * 40
 
 @pytest.fixture
 def slot(snapshot_store: Path) -> store.Slot:
-    """A place in an empty store."""
     folder = store.repository_folder("https://huggingface.co", "model", "org/repo")
     assert snapshot_store in folder.parents
     return store.Slot(folder, COMMIT, "model/org/repo@ccc")
 
 
 def records(content: dict[str, bytes] = CONTENT) -> tuple[FileRecord, ...]:
-    """The listing of the content."""
     return tuple(
         FileRecord(path, len(data), f"git-sha1:{git_blob_id(data)}")
         for path, data in sorted(content.items())
@@ -41,13 +39,11 @@ def records(content: dict[str, bytes] = CONTENT) -> tuple[FileRecord, ...]:
 
 
 def write(record: FileRecord, target: Path) -> None:
-    """Lay out a file of the content."""
     target.write_bytes(CONTENT[record.path])
 
 
 @pytest.fixture
 def published(slot: store.Slot) -> store.Slot:
-    """A snapshot in the store."""
     store.publish(slot, records(), write, {"revision": "main"})
     return slot
 

@@ -39,7 +39,6 @@ LOCK = LockFile(
 
 
 def changed(**fields: Any) -> LockFile:
-    """The lock with other fields."""
     return dataclasses.replace(LOCK, **fields)
 
 
@@ -240,7 +239,6 @@ def test_no_two_spaces_look_alike(other: gym.Space[Any]) -> None:
 
 
 def spoiled(tmp_path: Path, change: Callable[[str], str]) -> Path:
-    """The lock with its text changed."""
     text = lockfile.written(LOCK)
     assert change(text) != text
     path = tmp_path / "pylock.repo.toml"
@@ -249,7 +247,6 @@ def spoiled(tmp_path: Path, change: Callable[[str], str]) -> Path:
 
 
 def put(old: str, new: str) -> Callable[[str], str]:
-    """A change of text."""
     return lambda text: text.replace(old, new, 1)
 
 

@@ -40,14 +40,12 @@ class Scripted(gym.Env[Any, Any]):
         self.index, self.episode = index, 0
 
     def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        """Begin an episode."""
         super().reset(seed=seed)
         self.left = int(self.np_random.integers(1, 3 + 4 * self.index))
         self.episode += 1
         return np.zeros(1, np.float32), {"is_success": True}
 
     def step(self, action: Any) -> Any:
-        """One step nearer to its end."""
         assert self.left > 0, "stepped after its end"
         self.left -= 1
         over = self.left == 0
@@ -223,7 +221,6 @@ def test_an_unknown_action_space_is_explained() -> None:
 
     class Own(gym.Space[Any]):
         def sample(self, *args: Any, **kwargs: Any) -> Any:
-            """As an opaque space does."""
             raise gym.error.CustomSpaceError("no")
 
     env: VectorEnv[Any, Any, Any] = scripted("NextStep", 1)

@@ -24,7 +24,6 @@ imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
 
 
 def frame(height: int = 4, width: int = 6, value: int = 7) -> Any:
-    """A frame of one colour."""
     return np.full((height, width, 3), value, np.uint8)
 
 

@@ -43,7 +43,6 @@ class Server(WorkerServer):
 
 
 def given_up(pool: Pool, key: str, idle_s: float | None) -> Server:
-    """One that was used once."""
     use = pool.acquire(key, Server, idle_s)
     use.release()
     return use.server

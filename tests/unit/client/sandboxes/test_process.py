@@ -21,7 +21,6 @@ DEAF = "import os, signal; signal.signal(15, signal.SIG_IGN); os.close(1); os.re
 
 @pytest.fixture
 def server() -> Iterator[LocalServer]:
-    """Not started yet."""
     made = LocalServer(SERVER, "", 0.2)
     yield made
     made.stop()
@@ -34,7 +33,6 @@ def sleeping(ready: int) -> subprocess.Popen[bytes]:
 
 
 def listen(path: str) -> socket.socket:
-    """A socket there."""
     found = socket.socket(socket.AF_UNIX)
     found.bind(path)
     return found

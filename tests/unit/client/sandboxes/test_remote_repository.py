@@ -30,13 +30,11 @@ FACTS: dict[str, object] = {"lock": "abc", "packages": ("numpy==2.0",)}
 
 @pytest.fixture
 def server() -> Iterator[LyingServer]:
-    """It answers as a test says."""
     with lying() as found:
         yield found
 
 
 def says(server: LyingServer, *answers: m.Message) -> None:
-    """From now on, the last one for ever."""
     left = list(answers)
 
     def lie(asked: Asked) -> list[Frames]:
@@ -46,7 +44,6 @@ def says(server: LyingServer, *answers: m.Message) -> None:
 
 
 def packages(state: str, name: str = "", progress: str = "", **facts: object) -> m.Packages:
-    """An answer."""
     return m.Packages(state, name, facts, progress)
 
 

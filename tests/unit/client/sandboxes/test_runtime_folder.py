@@ -19,7 +19,6 @@ from envhub_worker.lockdown.mechanisms.locked_folder import LockedFolder, remove
 
 
 def folder(root: Path, name: str, files: dict[str, str], mode: int = 0o700) -> Path:
-    """A folder with files in it."""
     path = root / name
     path.mkdir()
     for file, text in files.items():

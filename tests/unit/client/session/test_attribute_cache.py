@@ -11,12 +11,10 @@ from tests.support.in_process.fake_lane import FakeLane, session_over
 
 @pytest.fixture
 def session() -> EnvSession:
-    """An environment that is up."""
     return session_over(FakeLane())
 
 
 def stepped(session: EnvSession) -> None:
-    """A step is answered."""
     session.counters.stepped(1)
 
 

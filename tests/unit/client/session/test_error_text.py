@@ -46,7 +46,6 @@ def failed(traceback: str, snapshot: Snapshot = LOCAL, stage: str = "step") -> E
 
 
 def notes(error: EnvHubError) -> str:
-    """What Python prints below the error."""
     return "\n".join(vars(error).get("__notes__", ())).replace(f"\n{MARGIN}", "\n")
 
 
@@ -201,7 +200,6 @@ def test_our_own_frames_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 
 def advised(kind: str, message: str, network: str = "none") -> str:
-    """What is added to a remote error."""
     error = RemoteEnvError(kind, message)
     before = str(error)
     add_reach_advice(error, Policy(network=network))

@@ -15,7 +15,6 @@ from envhub_worker.protocol.lifecycle import State
 
 
 def failures_of(lease: Any) -> Failures:
-    """Of an environment with this jail."""
     lease.lifecycle.closed, lease.lifecycle.request = False, "step"
     return Failures(lease, MagicMock())
 

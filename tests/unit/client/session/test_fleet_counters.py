@@ -18,7 +18,6 @@ class Wired(FakeLane):
 
 @pytest.fixture
 def parts() -> list[Counters]:
-    """Those of three workers."""
     return []
 
 

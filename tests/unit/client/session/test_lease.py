@@ -36,16 +36,13 @@ class _Jails:
             raise self.fails[what].pop()
 
     def take(self, deadline: object) -> Any:
-        """A jail."""
         self.do("take")
         return SimpleNamespace(jail=SimpleNamespace(number=1, report=[]), server=None)
 
     def end(self, loaded: object) -> None:
-        """End it."""
         self.do("end")
 
     def give_back(self, loaded: object, *, wait: bool = True) -> None:
-        """Give it back."""
         self.do("give back")
 
 
@@ -70,7 +67,6 @@ def taken(monkeypatch: pytest.MonkeyPatch) -> tuple[Lease, _Jails]:
 
 
 def acquire(lease: Lease) -> None:
-    """With time enough."""
     lease.acquire(StartupDeadline(60))
 
 

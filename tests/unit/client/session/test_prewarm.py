@@ -23,15 +23,12 @@ class _Task:
         self.used: Callable[[], None] = self.warm.set
 
     def on_first_use(self, used: Callable[[], None], make_room: Callable[[], bool]) -> None:
-        """What to call."""
         self.used, self.make_room = used, make_room
 
     def start(self) -> None:
-        """It is up."""
         self.warm.set()
 
     def cancel(self) -> bool:
-        """It is gone."""
         self.cancelled.set()
         return True
 

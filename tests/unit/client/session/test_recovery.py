@@ -36,11 +36,9 @@ class Told:
         self.payload: list[Buffer] = [frame for part in parts for frame in m.pack(part)]
 
     def send(self, message: m.Message, payload: Any = ()) -> int:
-        """Whatever it is."""
         return 1
 
     def receive(self, request_id: int, deadline: Deadline) -> tuple[m.Message, list[Buffer]]:
-        """What was said."""
         return self.reply, self.payload
 
 

@@ -27,23 +27,19 @@ ACTIONS = np.zeros(2, np.int64)
 
 @pytest.fixture
 def lane() -> FakeLane:
-    """A lane that answers."""
     return FakeLane()
 
 
 @pytest.fixture
 def session(lane: FakeLane) -> EnvSession:
-    """An environment that is up."""
     return session_over(lane)
 
 
 def render(number: int, bounds: tuple[int, int]) -> m.Message:
-    """Ask for it."""
     return m.Render(number)
 
 
 def warned(session: EnvSession, text: str) -> None:
-    """Have the repository warn."""
     session.repository.warnings.unshown.append(("Warning", text))
 
 

@@ -15,7 +15,6 @@ from envhub_worker.protocol.lifecycle import State
 
 @pytest.fixture
 def lease() -> Any:
-    """Of an environment that is up."""
     made = MagicMock()
     made.repository.named = contextlib.nullcontext
     made.lifecycle.state, made.lifecycle.closed = State.READY, False

@@ -25,7 +25,6 @@ PIN = "a" * 40
 
 
 def declared(folder: Path, text: str) -> list[str]:
-    """What a card of this text declares."""
     (folder / "README.md").write_text(text)
     return declared_assets(folder)
 

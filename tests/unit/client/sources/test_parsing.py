@@ -109,7 +109,6 @@ def test_names_are_bounded(tmp_path: Path) -> None:
 
 
 def weaker(folder: Path, *changes: tuple[str, str]) -> str:
-    """The parser's program, changed."""
     text = Path(parser.__file__).read_text()
     for old, new in changes:
         assert text.count(old) == 1

@@ -30,7 +30,6 @@ SOMEBODY = 12345
 
 @contextmanager
 def umask(mask: int) -> Iterator[None]:
-    """Another umask for a while."""
     before = os.umask(mask)
     try:
         yield
@@ -39,7 +38,6 @@ def umask(mask: int) -> Iterator[None]:
 
 
 def mode(path: Path) -> int:
-    """The permission bits."""
     return stat.S_IMODE(path.lstat().st_mode)
 
 
@@ -80,7 +78,6 @@ def test_manifests_are_nobody_elses(tmp_path: Path, mask: int) -> None:
 
 @pytest.fixture
 def slot(snapshot_store: Path) -> store.Slot:
-    """A snapshot in the store."""
     made = store.Slot(store.folder_of("local"), COMMIT, "model/org/repo@ccc")
     _publish(made, GOOD)
     return made
@@ -282,7 +279,6 @@ def test_a_draft_is_private_and_goes_unless_it_is_moved(tmp_path: Path) -> None:
 
 
 def interrupted(made: Path) -> None:
-    """While it is filled."""
     (made / "half").write_text("")
     assert made.stat().st_mode & 0o777 == 0o700
     raise KeyboardInterrupt

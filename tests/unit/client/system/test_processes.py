@@ -71,7 +71,6 @@ def family(how: str, folder: Path) -> Iterator[tuple[subprocess.Popen[str], list
 
 
 def runs(process: psutil.Process) -> bool:
-    """Whether it has not ended."""
     with contextlib.suppress(psutil.NoSuchProcess):
         return process.is_running() and process.status() != psutil.STATUS_ZOMBIE
     return False

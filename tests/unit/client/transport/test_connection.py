@@ -20,7 +20,6 @@ from tests.support.processes import eventually
 
 @contextmanager
 def process(script: str) -> Iterator[tuple[subprocess.Popen[bytes], int]]:
-    """One, and a pidfd of it."""
     with subprocess.Popen(["sh", "-c", script]) as child:
         pidfd = os.pidfd_open(child.pid)
         try:

@@ -15,7 +15,6 @@ from envhub_worker.supervisor.records import OutputTail
 
 
 def lines_of(*chunks: bytes) -> list[str]:
-    """What a sink gets of some bytes."""
     found: list[str] = []
     lines = Lines([found.append])
     for chunk in chunks:

@@ -17,7 +17,6 @@ from tests.support.in_process.fake_lane import FakeLane
 
 @pytest.fixture
 def lanes() -> Iterator[list[FakeLane]]:
-    """Three, of which none has answered."""
     made = [FakeLane(), FakeLane(), FakeLane()]
     for lane in made:
         lane.silent = True
@@ -27,7 +26,6 @@ def lanes() -> Iterator[list[FakeLane]]:
 
 
 def found(lanes: list[FakeLane], timeout_s: float | None) -> list[int]:
-    """Those that have answered first."""
     return answered_first(cast("list[Any]", lanes), Deadline(timeout_s))
 
 

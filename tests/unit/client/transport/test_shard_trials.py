@@ -22,7 +22,6 @@ ENV = environment(16)
 
 
 def cores(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
-    """Let the machine have this many."""
     monkeypatch.setattr(shard_trials.os, "sched_getaffinity", lambda pid: set(range(count)))
 
 
@@ -33,7 +32,6 @@ def _two_cores(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    """Where it is remembered."""
     return tmp_path / "entry.auto-shards"
 
 

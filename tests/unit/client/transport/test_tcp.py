@@ -21,7 +21,6 @@ _PUBLIC, _SECRET = zmq.curve_keypair()
 
 @contextlib.contextmanager
 def linked(port: int, far: TcpServer) -> Iterator[TcpLink]:
-    """A link that has begun to connect."""
     with zmq.Context() as context, context.socket(zmq.DEALER) as client:
         client.linger = 0
         endpoint = f"tcp://127.0.0.1:{port}"

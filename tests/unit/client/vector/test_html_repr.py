@@ -29,17 +29,14 @@ class Tags(HTMLParser):
         self.feed(text)
 
     def handle_starttag(self, tag: str, attrs: list[Any]) -> None:
-        """Ours have none."""
         assert not attrs
         self.found.add(tag)
 
     def handle_data(self, data: str) -> None:
-        """What a reader sees."""
         self.text += f"{data} "
 
 
 def an_env(name: str = "arm", **fields: Any) -> Any:
-    """What is shown of an environment."""
     space = gym.spaces.Dict({name: gym.spaces.Box(0, 1, (2,), np.float32)})
     kept = {"num_envs": 3, "single_observation_space": space, "closed": False}
     return SimpleNamespace(**{**kept, "single_action_space": gym.spaces.Discrete(4), **fields})

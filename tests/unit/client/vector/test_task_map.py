@@ -24,7 +24,6 @@ class _Task:
         self.state = "new"
 
     def live(self) -> None:
-        """It has processes from now on."""
         with self.lock:
             if self.state == "new":
                 self.state = "live"
@@ -34,7 +33,6 @@ class _Task:
     prewarm = live
 
     def close(self) -> None:
-        """It has none."""
         with self.lock:
             _Task.living -= self.state == "live"
             self.state = "closed"

@@ -25,20 +25,17 @@ WHOLE = ["asked", "ask", "deep", "deeper"]
 
 
 def deeper(error: BaseException, cause: BaseException | None) -> None:
-    """As something far inside."""
     if cause is None:
         raise error
     raise error from cause
 
 
 def deep(error: BaseException, cause: BaseException | None) -> None:
-    """As something inside."""
     deeper(error, cause)
 
 
 @short_traceback
 def ask(error: BaseException, cause: BaseException | None = None) -> None:
-    """As a method of ours."""
     deep(error, cause)
 
 

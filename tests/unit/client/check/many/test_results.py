@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 from xml.etree import ElementTree
 
 import pytest
@@ -41,21 +42,18 @@ def told(text: str = "it broke", *, fails: bool = True) -> dict[str, Any]:
     return read
 
 
-def keep(kept: Results, folder: Path, document: dict[str, Any] | None = None) -> Result:
-    """Keep one."""
-    page = folder / "page.html"
+def edit(file: Path, old: str, new: str) -> None:
+    file.write_text(file.read_text().replace(old, new))
+
+
+def keep(kept: Results, running: Path, document: dict[str, Any] | None = None) -> Result:
+    page = running / "page.html"
     page.write_text("a page")
     return kept.keep(_ONE, document or told(), page, seconds=1.5, ended="2026-01-01T00:00:00+00:00")
 
 
-def edit(file: Path, old: str, new: str) -> None:
-    """Change what stands in a report."""
-    file.write_text(file.read_text().replace(old, new))
-
-
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Where results are kept."""
     return tmp_path / "judged"
 
 
@@ -123,12 +121,8 @@ def test_an_interrupted_writer_leaves_what_was_there(
     kept = Results(folder, "as ever")
     with kept.held() as running:
         made = keep(kept, running)
-
-        def fail(*_: object) -> None:
-            raise OSError("no power")
-
         with monkeypatch.context() as patched:
-            patched.setattr(results.os, "replace", fail)
+            patched.setattr(results.os, "replace", Mock(side_effect=OSError("no power")))
             with pytest.raises(OSError, match="no power"):
                 keep(kept, running, told(fails=False))
         assert kept.kept(_ONE) == made
@@ -138,10 +132,9 @@ def test_an_interrupted_writer_leaves_what_was_there(
 @pytest.mark.parametrize("spoilt", [{"reference": 3}, {"findings": [{}]}, {"passed": True}])
 def test_what_is_no_report_is_not_kept(spoilt: dict[str, Any], folder: Path) -> None:
     kept = Results(folder, "as ever")
-    with kept.held() as running:
-        with pytest.raises(ForeignResultError):
-            keep(kept, running, {**told(), **spoilt})
-        assert kept.kept(_ONE) is None
+    with kept.held() as running, pytest.raises(ForeignResultError):
+        keep(kept, running, {**told(), **spoilt})
+    assert kept.kept(_ONE) is None
 
 
 def test_one_run_has_a_folder(folder: Path) -> None:
@@ -171,6 +164,7 @@ def test_one_run_has_a_folder(folder: Path) -> None:
 
 
 def test_a_folder_with_other_things_is_refused(tmp_path: Path) -> None:
+    """Such as a project's, whose index.html would be overwritten."""
     (tmp_path / "index.html").write_text("mine")
     with pytest.raises(FolderError, match="other files"), Results(tmp_path, "").held():
         pass
@@ -195,19 +189,15 @@ def test_an_index_has_the_tags_of_ours_alone(text: str) -> None:
     found = Page(index.page(results_of(text)))
     assert shape(found) == shape(Page(quiet))
     assert printable(text, 500)[:200] in found.text
+    assert "script" not in found.names
     for tag, attributes in found.tags:
         for name, value in attributes if tag == "a" else ():
             assert (name, str(value).rpartition("/")[0]) == ("href", "reports")
-    if "<" in text and set(text) != {"<"}:
-        assert shape(Page(quiet.replace("walk", text))) != shape(Page(quiet))
-
-
-def test_an_index_runs_nothing() -> None:
-    found = Page(index.page(results_of("walk")))
-    assert "script" not in found.names
     [policy] = [dict(attrs)["content"] for _, attrs in found.tags if "http-equiv" in dict(attrs)]
     assert str(policy).startswith("default-src 'none'")
     assert "script" not in str(policy)
+    if "<" in text and set(text) != {"<"}:
+        assert shape(Page(quiet.replace("walk", text))) != shape(Page(quiet))
 
 
 def test_an_index_shows_first_what_fails() -> None:
@@ -241,10 +231,6 @@ def test_other_forms_are_well_formed_too(text: str) -> None:
 
 
 def test_an_index_is_bounded() -> None:
-    one = Result(
-        listed=ListEntry("x" * 4_096, "y", 1),
-        verdict=Verdict.UNJUDGED,
-        said="<" * 100_000,
-        ended="z",
-    )
+    listed = ListEntry("x" * 4_096, "y", 1)
+    one = Result(listed=listed, verdict=Verdict.UNJUDGED, said="<" * 100_000, ended="z")
     assert len(index.page([one] * 2_000)) < 20_000_000

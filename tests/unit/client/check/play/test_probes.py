@@ -18,7 +18,6 @@ _MIB = 1 << 20
 
 
 def seen(*rows: tuple[int, int, int, int]) -> list[probes.Usage]:
-    """One count after each round."""
     return [{"processes": p, "threads": t, "files": f, "memory_bytes": m} for p, t, f, m in rows]
 
 
@@ -85,8 +84,6 @@ VECTOR = spaces.Box(-1, 1, (2,), np.float32)
 
 
 def vector(observations: Any = PLAYABLE, actions: Any = VECTOR, *, limited: bool = True) -> Any:
-    """What is asked of an environment."""
-
     def get_attr(name: str) -> tuple[int, ...]:
         if not limited:
             raise AttributeError(name)
@@ -95,11 +92,6 @@ def vector(observations: Any = PLAYABLE, actions: Any = VECTOR, *, limited: bool
     return SimpleNamespace(
         single_observation_space=observations, single_action_space=actions, get_attr=get_attr
     )
-
-
-def test_nothing_is_said_of_what_it_can_play() -> None:
-    """State or pixels in a mapping, a vector as action, and an end."""
-    assert list(lerobot_lacks(vector())) == []
 
 
 @pytest.mark.parametrize(
@@ -113,6 +105,8 @@ def test_nothing_is_said_of_what_it_can_play() -> None:
     ],
 )
 def test_what_it_lacks_is_one_text(env: Any, lacking: str) -> None:
+    """The control has state in a mapping, a vector as action, and an end, and lacks nothing."""
+    assert list(lerobot_lacks(vector())) == []
     [text] = lerobot_lacks(env)
     assert text.startswith("LeRobot cannot evaluate it, which needs ")
     assert re.search(lacking, text)

@@ -45,7 +45,6 @@ def url(repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> It
 
 @pytest.fixture
 def target(tmp_path: Path) -> Path:
-    """An empty folder."""
     folder = tmp_path / "target"
     folder.mkdir()
     return folder

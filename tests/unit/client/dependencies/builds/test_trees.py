@@ -45,7 +45,6 @@ def test_the_files_of_a_source_distribution(tmp_path: Path) -> None:
 
 
 def zipped(tmp_path: Path, name: str, mode: int, text: str) -> Path:
-    """A zip of one file."""
     path = tmp_path / "x-1.0.zip"
     with zipfile.ZipFile(path, "w") as archive:
         member = zipfile.ZipInfo(name)

@@ -21,7 +21,6 @@ OWN = interpreters.own()
 
 
 def check(wheel: Path, name: str = "some-name", version: str = "1.0") -> None:
-    """For this interpreter."""
     wheels.check(wheel, name, version, OWN)
 
 
@@ -60,8 +59,6 @@ def test_metadata_of_another(tmp_path: Path) -> None:
 
 
 def add(name: str, mode: int = 0o100644) -> Callable[[zipfile.ZipFile], None]:
-    """What adds a file to an archive."""
-
     def change(archive: zipfile.ZipFile) -> None:
         member = zipfile.ZipInfo(name)
         member.external_attr = mode << 16
@@ -152,7 +149,6 @@ def _own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def wheel(tmp_path: Path) -> Path:
-    """One that was built."""
     built = tmp_path / NAME
     built.write_bytes(b"a wheel")
     return built

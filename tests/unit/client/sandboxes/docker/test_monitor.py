@@ -45,7 +45,6 @@ class Kept:
     log: Path
 
     def ends(self) -> bool:
-        """Whether it ends and cleans up."""
         self.monitor.wait(60)
         calls = self.log.read_text().splitlines()
         return not self.folder.exists() and calls[-1] == "rm --force --volumes envhub-test"

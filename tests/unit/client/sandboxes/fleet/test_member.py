@@ -24,19 +24,15 @@ class _Place(Sandbox):
         self.asked = 0
 
     def will_make(self, made: Any) -> None:
-        """From now on."""
         self._made = made
 
     def package_target(self) -> Any:
-        """Itself."""
         return None if self._made is None else self
 
     def meets(self, request: PackageRequest) -> bool:
-        """As the test says."""
         return self._meets
 
     def make(self, request: PackageRequest, tell: Any) -> Any:
-        """Likewise, or raise it."""
         self.asked += 1
         if isinstance(self._made, Exception):
             raise self._made

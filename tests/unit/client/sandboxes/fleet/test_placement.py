@@ -28,7 +28,6 @@ class _Place(Sandbox):
         return Runtime(f"tcp://{self.name} {'k' * 64}" if self.name.startswith("far") else "")
 
     def for_repository(self, *given: Any) -> Sandbox:
-        """As the test says."""
         if self.refuses:
             raise PolicyError(f"{self.name} cannot permit that")
         return self
@@ -41,13 +40,11 @@ class _Rooms:
         self.said: dict[str, Room] = {}
 
     def ask(self, members: list[Member]) -> dict[Member, Room]:
-        """Those that it has said."""
         return {one: self.said[one.name] for one in members if one.name in self.said}
 
 
 @pytest.fixture
 def rooms(monkeypatch: pytest.MonkeyPatch) -> dict[str, Room]:
-    """By the name of the place."""
     made = _Rooms(0)
     monkeypatch.setattr(module, "Rooms", lambda memory_bytes: made)
     return made.said

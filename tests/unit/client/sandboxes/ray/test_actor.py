@@ -17,7 +17,6 @@ from tests.support.processes import eventually
 
 
 def node(**changes: Any) -> Any:
-    """What Ray says of a node."""
     said = {"address": "127.0.0.1", "gpus": [2], **changes}
     return SimpleNamespace(
         util=SimpleNamespace(get_node_ip_address=lambda: said["address"]),

@@ -76,7 +76,6 @@ class Ray:
         return lambda actor: SimpleNamespace(options=lambda **_: placed)
 
     def is_initialized(self) -> bool:
-        """As Ray says it."""
         return bool(self.connected)
 
     def init(self, address: str, **_: Any) -> None:
@@ -91,12 +90,10 @@ class Ray:
         return SimpleNamespace(gcs_address=self.connected, get_job_id=lambda: "01000000")
 
     def cluster_resources(self) -> dict[str, float]:
-        """Of a small machine."""
         return {"CPU": 2.0}
 
 
 def use(ray: Ray, monkeypatch: pytest.MonkeyPatch) -> Ray:
-    """Have it be the Ray of this process."""
     monkeypatch.setitem(sys.modules, "ray", ray)  # type: ignore[arg-type]
     monkeypatch.setattr(cluster, "check_installed", lambda: None)
     return ray

@@ -21,7 +21,6 @@ GOOD = {"endpoint": "tcp://10.0.0.3:4711", "key": "ab" * 32, "node": "0f" * 28, 
 
 @pytest.fixture
 def with_ray(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As where Ray is installed."""
     monkeypatch.setattr(cluster, "check_installed", lambda: None)
 
 

@@ -30,12 +30,10 @@ class _Client:
         self.refuses: BaseException | None = None
 
     def hello(self, deadline: object) -> None:
-        """It answers, or not."""
         if self.refuses is not None:
             raise self.refuses
 
     def request(self, message: m.Message, deadline: object) -> tuple[m.Message, list[Any]]:
-        """An answer to it."""
         self.asked.append(message)
         return m.Status(self.status) if isinstance(message, m.GetStatus) else m.Done(), []
 
@@ -53,19 +51,16 @@ class _Place(Sandbox):
         self.fails = False
 
     def acquire(self, store: Any, runtime: Any = None, idle_s: float | None = 0.0) -> Any:
-        """A use of it."""
         if self.fails:
             raise WorkerStartupError("it did not come up")
         return SimpleNamespace(server=_SERVER, live=False, release=self.release)
 
     def release(self) -> None:
-        """One use less."""
         self.released += 1
 
 
 @pytest.fixture
 def client(monkeypatch: pytest.MonkeyPatch) -> _Client:
-    """What the launcher speaks by."""
     made = _Client()
     monkeypatch.setattr(launcher_module, "WorkerConnection", lambda *_: made)
     return made
@@ -73,7 +68,6 @@ def client(monkeypatch: pytest.MonkeyPatch) -> _Client:
 
 @pytest.fixture
 def place() -> _Place:
-    """Where the worker runs."""
     return _Place()
 
 
@@ -88,7 +82,6 @@ def launcher(client: _Client, place: _Place) -> Launcher:
 
 
 def opened(launcher: Launcher, client: _Client, place: _Place) -> Any:
-    """A jail with the number 7."""
     waits: list[object] = []
     jail = SimpleNamespace(
         number=7,

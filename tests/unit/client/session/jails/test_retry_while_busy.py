@@ -19,7 +19,6 @@ _GONE = WorkerDiedError("no answer", reason="connection")
 
 @pytest.fixture(autouse=True)
 def now(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """A clock that sleeps by being moved."""
     time = [0.0]
     monkeypatch.setattr(module, "monotonic", lambda: time[0])
     monkeypatch.setattr(module, "sleep", lambda for_s: time.__setitem__(0, time[0] + for_s))

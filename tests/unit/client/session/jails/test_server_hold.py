@@ -21,13 +21,11 @@ def use() -> Callable[[], ServerUse[Server]]:
 
 @pytest.fixture
 def events() -> list[str]:
-    """What the hold has said."""
     return []
 
 
 @pytest.fixture
 def hold(use: Callable[[], ServerUse[Server]], events: list[str]) -> ServerHold:
-    """Of a suite without environments."""
     return ServerHold(use, lambda: events.append("enter"), lambda: events.append("empty"))
 
 

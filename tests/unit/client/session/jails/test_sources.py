@@ -20,13 +20,11 @@ class _Loaded(SimpleNamespace):
 
 
 def loaded() -> Any:
-    """One."""
     return _Loaded(jail=MagicMock(number=7))
 
 
 @pytest.fixture
 def launcher() -> Any:
-    """What opens and ends them."""
     return MagicMock(open=MagicMock(side_effect=lambda *_: loaded()), connect=lambda *_: loaded())
 
 

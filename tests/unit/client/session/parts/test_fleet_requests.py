@@ -30,28 +30,23 @@ def lanes() -> list[FakeLane]:
 
 @pytest.fixture
 def session(lanes: list[FakeLane]) -> FleetSession:
-    """Over both of them."""
     return fleet_over(lanes)
 
 
 @pytest.fixture
 def requests(session: FleetSession) -> FleetRequests:
-    """Its requests."""
     return session.requests
 
 
 def call(number: int, bounds: tuple[int, int]) -> m.Call:
-    """A method of all."""
     return m.Call(number, "act", (), {})
 
 
 def raised(text: str) -> m.RaisedException:
-    """By the repository's code."""
     return m.RaisedException("ValueError", "ValueError", text, "", "call")
 
 
 def states(session: FleetSession) -> list[State]:
-    """Of the parts."""
     return [part.lifecycle.state for part in session.parts]
 
 

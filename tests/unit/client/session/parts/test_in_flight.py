@@ -31,24 +31,20 @@ def lanes() -> list[FakeLane]:
 
 @pytest.fixture
 def session(lanes: list[FakeLane]) -> FleetSession:
-    """Over both of them."""
     return fleet_over(lanes)
 
 
 @pytest.fixture
 def flight(session: FleetSession) -> InFlight:
-    """Nothing was sent yet."""
     return InFlight(session.requests, session.parts)
 
 
 def send(flight: InFlight, *ids: int) -> None:
-    """A step of these."""
     rows = flight.rows(list(ids))
     flight.send(rows, np.zeros(len(ids), np.int64))
 
 
 def received(flight: InFlight, min_ready: int = 1) -> list[int]:
-    """Whose results come next."""
     found: list[int] = flight.recv(min_ready, 0).env_ids.tolist()
     return found
 
@@ -125,7 +121,6 @@ class Switching(FakeLane):
         self.wanted = True
 
     def send_step(self, actions: Any, *, ahead: bool = False) -> None:
-        """Owe a step."""
         assert self.takes_more or not ahead
         if not ahead:
             self.takes_more, self.wanted = self.wanted, False

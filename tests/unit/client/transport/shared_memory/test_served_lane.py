@@ -60,7 +60,6 @@ class Both:
         ]
 
     def ask(self, *leaves: Any) -> None:
-        """Send a step."""
         frame = self.shard.ask(leaves, 0)
         assert self.server.fits(frame)
         self.server.ask(frame, "owner")
@@ -180,7 +179,6 @@ class Served:
         return float(rewards[0])
 
     def by_message(self) -> None:
-        """Have the lane take several steps."""
         assert self.step()
         self.lane.expect_more()
         assert not self.lane.takes_more
