@@ -9,7 +9,6 @@ import pytest
 
 from envhub_sandbox.errors import HubReferenceError
 from envhub_sandbox.hub import registered
-from envhub_sandbox.hub.git import address
 from envhub_sandbox.hub.listing import Snapshot
 from envhub_sandbox.hub.reference import HubRef, pinned
 from envhub_sandbox.hub.registered import entry
@@ -96,12 +95,6 @@ def test_a_reference_that_was_not_parsed_is_checked_too(name: str) -> None:
     """What becomes source and a requirement has no quotes, ends of lines or options."""
     with pytest.raises(HubReferenceError):
         HubRef(name, repo_type="pypi")
-
-
-def test_what_git_may_be_given() -> None:
-    assert address.is_url("https://h/x")
-    refused = ("--upload-pack=x", "http://h/x", "https://u@h/x", "https://h/x y", "/etc", "ext::x")
-    assert not any(map(address.is_url, refused))
 
 
 def test_only_a_full_commit_is_pinned() -> None:

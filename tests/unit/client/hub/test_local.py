@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import socket
 import sys
 from pathlib import Path
@@ -46,16 +47,13 @@ def test_folder_becomes_a_read_only_copy(folder: Path) -> None:
 
 
 def test_unchanged_content_is_the_same_snapshot(folder: Path) -> None:
-    """The commit is the content's: equal for a copy elsewhere, other after an edit."""
+    """The commit is the content's: equal for a copy elsewhere or a link, other after an edit."""
     first = local(folder)
     os.utime(folder / "env.py", (0, 0))
     assert local(folder) == first
-    twin = folder.parent / "twin"
-    twin.mkdir()
-    (twin / "env.py").write_text("1")
-    (twin / "sub").mkdir()
-    (twin / "sub" / "other.py").write_text("2")
-    assert local(twin).root == first.root
+    (folder.parent / "alias").symlink_to(folder)
+    shutil.copytree(folder, folder.parent / "twin")
+    assert local(folder.parent / "alias").root == local(folder.parent / "twin").root == first.root
     (folder / "env.py").write_text("3")
     second = local(folder)
     assert second.commit != first.commit
@@ -67,15 +65,13 @@ def test_unchanged_content_is_the_same_snapshot(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "path"),
     [
-        ("{}", "env.py"),
-        ("{}/", "env.py"),
-        ("{}:sub/other.py", "sub/other.py"),
-        ("{}:./sub/other.py", "sub/other.py"),
-        ("{}/env.py", "env.py"),
-        ("./my-env", "env.py"),
-        ("./my-env:sub/other.py", "sub/other.py"),
-        ("my-env/env.py", "env.py"),
-        ("~/my-env", "env.py"),
+        *(("{}", "env.py"), ("{}/", "env.py"), ("{}/env.py", "env.py"), ("./my-env", "env.py")),
+        *(("my-env/env.py", "env.py"), ("~/my-env", "env.py")),
+        *(
+            (f"{one}:{two}sub/other.py", "sub/other.py")
+            for one in ("{}", "./my-env")
+            for two in ("", "./")
+        ),
     ],
 )
 def test_forms_of_a_local_reference(
@@ -85,8 +81,7 @@ def test_forms_of_a_local_reference(
     monkeypatch.chdir(folder.parent)
     monkeypatch.setenv("HOME", str(folder.parent))
     snapshot = local(text.format(folder))
-    assert snapshot.path == path
-    assert snapshot.repo_id == str(folder)
+    assert (snapshot.path, snapshot.repo_id) == (path, str(folder))
     inner = local(folder / "sub" / "other.py")  # the folder around a file, nothing further up
     assert (inner.path, names(inner)) == ("other.py", ["other.py"])
 
@@ -101,16 +96,13 @@ def test_a_folders_commit_is_named_without_a_copy(folder: Path) -> None:
     assert commit_of(str(folder)) != named
 
 
-def test_missing_folder_says_what_to_write(folder: Path) -> None:
-    with pytest.raises(RepositoryUnavailableError, match=r"no such folder.*'\./folder'"):
-        local(folder.parent / "my-enf")
-
-
 @pytest.mark.parametrize("path", ["envs.py", "../my-env/env.py", "/etc/passwd", "sub"])
 def test_missing_entry_lists_the_python_files(folder: Path, path: str) -> None:
-    """A path that is not a file of the folder gets the list of those that are."""
+    """And a missing folder the forms that exist."""
     with pytest.raises(RepositoryUnavailableError, match=r"it has 'env\.py', 'sub/other\.py'"):
         local(folder, path)
+    with pytest.raises(RepositoryUnavailableError, match=r"no such folder.*'\./folder'"):
+        local(folder.parent / "my-enf")
 
 
 def test_every_file_counts_but_those_of_git(folder: Path) -> None:
@@ -175,11 +167,6 @@ def test_bottomless_folder_is_refused(folder: Path) -> None:
         local(folder)
 
 
-def test_folder_reached_through_a_link_works(folder: Path) -> None:
-    (folder.parent / "alias").symlink_to(folder)
-    assert local(folder.parent / "alias").root == local(folder).root
-
-
 @pytest.mark.parametrize("name", ["max_files", "max_bytes", "max_file_bytes"])
 def test_folder_over_a_limit_is_refused(folder: Path, name: str) -> None:
     """A home folder that was given by mistake is not copied; the error says what counts."""
@@ -188,21 +175,18 @@ def test_folder_over_a_limit_is_refused(folder: Path, name: str) -> None:
         local(folder, limits=SnapshotLimits(**{name: 1}))
 
 
-def test_edited_copy_is_refused(folder: Path) -> None:
-    """The copy in the store is verified at every use, as those from the Hub are."""
-    entry = local(folder).root / "env.py"
+def test_edited_copy_is_refused_and_half_of_one_made_again(folder: Path) -> None:
+    """The copy in the store is verified at every use; its source is at hand."""
+    snapshot = local(folder)
+    entry = snapshot.root / "env.py"
+    snapshot.root.chmod(0o755)
+    entry.unlink()
+    assert local(folder) == snapshot
+    assert entry.read_text() == "1"
     entry.chmod(0o644)
     entry.write_text("x")
     with pytest.raises(SnapshotIntegrityError, match="was changed"):
         local(folder)
-
-
-def test_half_deleted_copy_is_made_again(folder: Path) -> None:
-    snapshot = local(folder)
-    snapshot.root.chmod(0o755)
-    (snapshot.root / "env.py").unlink()
-    assert local(folder) == snapshot
-    assert (snapshot.root / "env.py").read_bytes() == (folder / "env.py").read_bytes()
 
 
 def test_forgotten_copies_are_removed_with_the_next_new_one(folder: Path) -> None:
