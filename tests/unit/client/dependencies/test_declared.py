@@ -80,11 +80,14 @@ def test_whatever_could_run_code_does_not(tmp_path: Path, line: str) -> None:
 
 @pytest.mark.parametrize("line", ["-e ./here", "here @ file:///tmp/here", "a" * 3000])
 def test_nor_in_the_other_files(tmp_path: Path, line: str) -> None:
+    """Where a list of TOML holds it; nor is a second block taken, which could be another's."""
     with pytest.raises(RequirementError, match=r"in the script metadata of env\.py"):
         repository(tmp_path, env__py=script(f"dependencies = ['{line}']"))
     project = f"[project]\nname = 'x'\ndependencies = ['{line}']\n"
     with pytest.raises(RequirementError, match=r"in \[project\] of pyproject\.toml"):
         repository(tmp_path, env__py="", pyproject__toml=project)
+    with pytest.raises(RequirementError, match="2 blocks"):
+        repository(tmp_path, env__py=script("dependencies = []") + script("dependencies = []"))
 
 
 def test_a_file_that_is_no_text_is_refused(tmp_path: Path) -> None:
@@ -121,6 +124,10 @@ def test_further_files_of_the_repository_are_read(tmp_path: Path) -> None:
         ("foo<2", "line 1 of more/held.txt"),
         ("bar<3", "line 1 of more/deeper.txt"),
     ]
+    for number in range(module.MAX_FILES + 1):
+        (tmp_path / f"{number}.txt").write_text(f"-r {number + 1}.txt\n")
+    with pytest.raises(RequirementError, match="includes more than"):
+        repository(tmp_path, requirements__txt="-r 0.txt\n")
 
 
 @pytest.mark.parametrize(
@@ -147,13 +154,6 @@ def test_the_repository_itself_is_its_project(tmp_path: Path) -> None:
         read(tmp_path, "requirements.txt")
 
 
-def test_a_chain_of_files_ends(tmp_path: Path) -> None:
-    for number in range(module.MAX_FILES + 1):
-        (tmp_path / f"{number}.txt").write_text(f"-r {number + 1}.txt\n")
-    with pytest.raises(RequirementError, match="includes more than"):
-        repository(tmp_path, requirements__txt="-r 0.txt\n")
-
-
 def test_the_file_beside_the_entry_counts(tmp_path: Path) -> None:
     (tmp_path / "deep").mkdir()
     (tmp_path / "deep/env.py").write_text("")
@@ -177,21 +177,19 @@ def test_what_was_seen_and_not_read_is_said(tmp_path: Path) -> None:
 
 def test_the_most_particular_file_counts(tmp_path: Path) -> None:
     """The entry file's own metadata, then requirements.txt, then the project."""
+
+    def found(**files: str) -> tuple[str, list[str], str]:
+        made = repository(tmp_path, **files)
+        assert made is not None
+        return made.source, plain(made), made.python
+
     project = "[project]\nname = 'x'\nrequires-python = '>=3.11'\ndependencies = ['of-project']\n"
     assert repository(tmp_path) is None
-    found = repository(tmp_path, pyproject__toml=project)
-    assert found is not None
-    assert (found.source, plain(found), found.python) == (
-        *("pyproject.toml", ["of-project"]),
-        ">=3.11",
-    )
-    found = repository(tmp_path, requirements__txt="of-file\n")
-    assert found is not None
-    assert (found.source, plain(found), found.python) == ("requirements.txt", ["of-file"], ">=3.11")
+    assert found(pyproject__toml=project) == ("pyproject.toml", ["of-project"], ">=3.11")
+    of_file = found(requirements__txt="of-file\n")
+    assert of_file == ("requirements.txt", ["of-file"], ">=3.11")
     text = script("requires-python = '<3.13'", "dependencies = [", "  'of-script',", "]")
-    found = repository(tmp_path, env__py=text)
-    assert found is not None
-    assert (found.source, plain(found), found.python) == ("env.py", ["of-script"], "<3.13")
+    assert found(env__py=text) == ("env.py", ["of-script"], "<3.13")
 
 
 @pytest.mark.parametrize(
@@ -233,9 +231,3 @@ def test_a_spoiled_project_is_refused(tmp_path: Path, text: str, said: str) -> N
         repository(tmp_path, pyproject__toml=text)
     assert "pyproject.toml" in str(caught.value)
     assert "dependencies='host'" in str(caught.value)
-
-
-def test_two_blocks_are_refused(tmp_path: Path) -> None:
-    """PEP 723 permits one; to take either could be another's choice."""
-    with pytest.raises(RequirementError, match="2 blocks"):
-        repository(tmp_path, env__py=script("dependencies = []") + script("dependencies = []"))

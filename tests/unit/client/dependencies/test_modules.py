@@ -12,11 +12,10 @@ from envhub_sandbox.dependencies import interpreters, resolutions
 from envhub_sandbox.dependencies import resolve as resolving
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.dependencies.modules import MissingModule, guessed
-from envhub_sandbox.dependencies.packages import PackageSet, packages_for
+from envhub_sandbox.dependencies.packages import packages_for
 from envhub_sandbox.dependencies.request import (
     AUTO,
     DECLARED,
-    Choice,
     PackageRequest,
     chosen,
     request_of,
@@ -47,11 +46,6 @@ def snapshot(folder: Path, text: str, **files: str) -> Snapshot:
 
 def requirements(found: Snapshot) -> list[str]:
     return [str(one.wanted.requirement) for one in guessed(found)]
-
-
-def made(found: Snapshot, choice: Choice = AUTO) -> PackageSet | None:
-    """Its packages, and no warning is an error."""
-    return packages_for(found, choice)
 
 
 @pytest.mark.parametrize(
@@ -101,12 +95,12 @@ def test_it_is_installed_and_told(index: Index, tmp_path: Path) -> None:
         make_wheel(index.folder, name)
     found = snapshot(tmp_path / "r", "import chess" + MAKE, requirements__txt="declared\n")
     with pytest.warns(UserWarning, match=r"chess is installed, .*env\.py, line 1"):
-        first = made(found)
+        first = packages_for(found, AUTO)
     assert first is not None
     assert {"declared==1.0", "chess==1.0"} <= set(first.facts["packages"])
     assert [one["module"] for one in first.facts["inferred"]] == ["chess"]
-    assert made(found) == first
-    strict = made(found, DECLARED)
+    assert packages_for(found, AUTO) == first
+    strict = packages_for(found, DECLARED)
     assert strict is not None
     assert "chess==1.0" not in strict.facts["packages"]
     assert "inferred" not in strict.facts
@@ -116,19 +110,9 @@ def test_what_a_declared_package_brings_is_declared(index: Index, tmp_path: Path
     make_wheel(index.folder, "declared", requires=["opencv-contrib-python"])
     make_wheel(index.folder, "opencv-contrib-python")
     found = snapshot(tmp_path / "r", "import cv2" + MAKE, requirements__txt="declared\n")
-    resolved = made(found, chosen({}, None)[0])
+    resolved = packages_for(found, chosen({}, None)[0])
     assert resolved is not None
     assert "inferred" not in resolved.facts
-
-
-def test_an_extra_of_its_own_says_which(index: Index, tmp_path: Path) -> None:
-    """By name or by the table, with its versions; also of a module that the table lacks."""
-    project = "[project]\nname = 'x'\n[project.optional-dependencies]\n"
-    project += "all = ['chess<2', 'nobody-knows-this>1', 'unrelated']\n"
-    text = "import chess, nobody_knows_this" + MAKE
-    assert requirements(snapshot(tmp_path / "r", text, pyproject__toml=project)) == [
-        *("chess<2", "nobody-knows-this>1"),
-    ]
 
 
 def test_no_index_is_asked_for_the_name_of_a_module(index: Index, tmp_path: Path) -> None:
@@ -136,7 +120,7 @@ def test_no_index_is_asked_for_the_name_of_a_module(index: Index, tmp_path: Path
     make_wheel(index.folder, "chess")
     found = snapshot(tmp_path / "r", "import nobody_knows_this, chess" + MAKE)
     with pytest.warns(UserWarning, match="chess is installed"):
-        assert made(found) is not None
+        assert packages_for(found, AUTO) is not None
     assert any("chess" in path for path in index.asked)
     assert not any("nobody" in path for path in index.asked)
     said = MissingModule(found, "process", "auto", None, True).advice(
@@ -157,19 +141,19 @@ def test_a_guess_never_stands_in_the_way(
     monkeypatch.setattr(interpreters, "others", lambda declared, first: [])
     make_wheel(index.folder, "declared")
     found = snapshot(tmp_path / "r", "import chess" + MAKE, requirements__txt="declared\n")
-    resolved = made(found)
+    resolved = packages_for(found, AUTO)
     assert resolved is not None
     assert "declared==1.0" in resolved.facts["packages"]
     assert "inferred" not in resolved.facts
-    assert made(snapshot(tmp_path / "s", "import chess" + MAKE)) is None
+    assert packages_for(snapshot(tmp_path / "s", "import chess" + MAKE), AUTO) is None
     with pytest.raises(ResolutionError, match="chess"):
-        made(snapshot(tmp_path / "s", "import chess" + MAKE), chosen({}, None)[0])
+        packages_for(snapshot(tmp_path / "s", "import chess" + MAKE), chosen({}, None)[0])
 
 
 def test_what_is_here_is_not_installed(index: Index, tmp_path: Path) -> None:
     found = snapshot(tmp_path / "r", "import rich, zmq" + MAKE)
     assert requirements(found) == ["rich", "pyzmq"]
-    assert made(found) is None
+    assert packages_for(found, AUTO) is None
     assert index.asked == []
 
 
@@ -190,6 +174,15 @@ def test_the_caller_has_the_last_word(
     assert request is not None
     assert list(map(str, request.wanted)) == wanted
     assert [one.module for one in request.guesses] == guessed
+
+
+def test_an_extra_of_its_own_says_which(tmp_path: Path) -> None:
+    """By name or by the table, with its versions; also of a module that the table lacks."""
+    project = "[project]\nname = 'x'\n[project.optional-dependencies]\n"
+    project += "all = ['chess<2', 'nobody-knows-this>1', 'unrelated']\n"
+    text = "import chess, nobody_knows_this" + MAKE
+    found = snapshot(tmp_path / "r", text, pyproject__toml=project)
+    assert requirements(found) == ["chess<2", "nobody-knows-this>1"]
 
 
 # --- another interpreter --------------------------------------------------------------------

@@ -98,28 +98,24 @@ def test_no_link_and_no_second_interpreter(
 
 
 @pytest.mark.parametrize(
-    "lines",
+    ("lines", "python", "unmet"),
     [
-        *([], ["numpy"], [f"numpy=={NUMPY}"], ["numpy>=1.26", "gymnasium"], ["NumPy"]),
-        ["no-such-package; python_version < '3'"],
+        *(((), "", None), (("numpy",), "", None), ((f"numpy=={NUMPY}",), "", None)),
+        *((("numpy>=1.26", "gymnasium"), "", None), (("NumPy",), "", None)),
+        (("no-such-package; python_version < '3'",), "", None),
+        ((), f"=={platform.python_version()}", None),
+        (("numpy",), "<3", "python<3"),
+        (("gymnasium", "no-such-package"), "", "no-such-package"),
+        (("gymnasium", f"numpy!={NUMPY}"), "", f"numpy!={NUMPY}"),
+        (("numpy<1",), "", "numpy<1"),
+        ((f"numpy=={NUMPY} --hash=sha256:{'0' * 64}",), "", f"numpy=={NUMPY}"),
     ],
 )
-def test_what_is_here_is_not_installed_again(lines: list[str]) -> None:
-    assert interpreters.first_unmet(declares(*lines)) is None
-
-
-@pytest.mark.parametrize(
-    "line",
-    [
-        *("no-such-package", f"numpy!={NUMPY}", "numpy<1"),
-        f"numpy=={NUMPY} --hash=sha256:{'0' * 64}",
-    ],
-)
-def test_what_is_not_here_is_named(line: str) -> None:
-    """Another version is not here; nor is one whose files nobody can compare."""
-    assert interpreters.first_unmet(declares("gymnasium", line)) == str(
-        parse_requirement(line, "").requirement
-    )
+def test_what_is_here_is_not_installed_again(
+    lines: tuple[str, ...], python: str, unmet: str | None
+) -> None:
+    """By name and version, without importing any; not what has hashes, which nobody can compare."""
+    assert interpreters.first_unmet(declares(*lines, python=python)) == unmet
 
 
 @pytest.mark.parametrize("marker", ["os_name ~= 'posix'", "python_version ~= '3'", "'a' ~= 'b'"])
@@ -139,11 +135,6 @@ def test_a_python_that_was_built_from_a_checkout(
     other.write_text(f"#!/bin/sh\necho '{json.dumps(facts)}'\n")
     other.chmod(0o755)
     assert interpreters.find(str(other)).version == "3.12.2"
-
-
-def test_another_python_is_not_here() -> None:
-    assert interpreters.first_unmet(declares(python=f"=={platform.python_version()}")) is None
-    assert interpreters.first_unmet(declares("numpy", python="<3")) == "python<3"
 
 
 def test_what_is_here_needs_what_it_needs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -174,11 +165,14 @@ def test_only_what_is_missing_makes_an_environment(tmp_path: Path) -> None:
         assert always.always
 
 
-def test_this_interpreter_without_its_packages_comes_first() -> None:
+def test_this_interpreter_without_its_packages_comes_first(tmp_path: Path) -> None:
+    """A virtual environment has none that anybody else needs; a path is asked what it is."""
     found = interpreters.find("", ">=3.10")
-    assert found == interpreters.own()
+    assert found == interpreters.own() == interpreters.find(found.path)
     assert Path(found.path).resolve() == Path(found.path)
     assert found.version == platform.python_version()
+    with pytest.raises(InterpreterUnavailableError, match="does not work as an interpreter"):
+        interpreters.find(str(tmp_path / "python"))
 
 
 @pytest.mark.parametrize(("asked", "declared"), [("3.99", ""), ("", ">=3.99"), ("3.8", "")])
@@ -201,13 +195,6 @@ def test_a_pyenv_that_is_closed_to_us_has_none(
         interpreters.find("3.99")
 
 
-def test_an_interpreter_by_its_path(tmp_path: Path) -> None:
-    ours = interpreters.own()
-    assert interpreters.find(ours.path) == ours
-    with pytest.raises(InterpreterUnavailableError, match="does not work as an interpreter"):
-        interpreters.find(str(tmp_path / "python"))
-
-
 @pytest.mark.parametrize(
     ("place", "choice", "python", "own", "said"),
     [
@@ -222,21 +209,28 @@ def test_an_interpreter_by_its_path(tmp_path: Path) -> None:
         ("remote", AUTO, None, True, "{'extra': ['NAME-OF-THE-PACKAGE']}"),
     ],
 )
+@pytest.mark.parametrize(
+    ("requirements", "declares"),
+    [
+        ("numpy>=1\n", "Its requirements.txt declares numpy>=1"),
+        (None, "declares no packages"),
+        ("-e .\n", "line 1 of requirements.txt"),
+    ],
+    ids=["some", "none", "wrong"],
+)
 def test_a_missing_module_has_one_cure(
-    tmp_path: Path, place: str, choice: Any, python: Any, own: bool, said: str
+    tmp_path: Path,
+    place: str,
+    choice: Any,
+    python: Any,
+    own: bool,
+    said: str,
+    requirements: str | None,
+    declares: str,
 ) -> None:
     """It depends on the place, and what the repository declares is told."""
-    text = MissingModule(
-        snapshot(tmp_path, "numpy>=1\n"), place, choice.where, python, own
-    ).advice()
+    found = snapshot(tmp_path, requirements)
+    text = MissingModule(found, place, choice.where, python, own).advice()
     assert said in text
     assert place == "process" or "python=" not in text  # which is refused elsewhere
-    assert "Its requirements.txt declares numpy>=1" in text
-
-
-def test_a_repository_that_declares_nothing_is_said_to(tmp_path: Path) -> None:
-    nothing = MissingModule(snapshot(tmp_path), "process", "auto", None, False).advice()
-    assert "declares no packages" in nothing
-    wrong = snapshot(tmp_path, "-e .\n")
-    said = MissingModule(wrong, "docker", "auto", None, False).advice()
-    assert "line 1 of requirements.txt" in said
+    assert declares in text

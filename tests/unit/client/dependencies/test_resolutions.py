@@ -95,24 +95,20 @@ def test_what_is_named_beside_another_is_built_in_its_turn(
     assert "deeper-source" in {one.name for one in built}
 
 
-def test_wheels_are_taken_where_there_are_some(
-    index: Index, tmp_path: Path, built: list[Source]
+def test_without_a_builder_there_are_wheels_alone(
+    index: Index, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    source_distribution(index.folder, "only-source", "2.0", tmp_path / "ran")
-    make_wheel(index.folder, "only-source", "1.0")
-    assert "only-source==1.0" in resolutions.resolution_for(request("only-source")).lock.packages
-    assert built == []
-
-
-def test_without_a_builder_there_are_wheels_alone(index: Index, tmp_path: Path) -> None:
+    """Nothing runs, and the text names the package; an older wheel rather than a newer source."""
+    monkeypatch.setattr(resolutions, "BUILDER", None)
+    monkeypatch.setattr(interpreters, "others", lambda declared, first: [])
     source_distribution(index.folder, "only-source", "1.5", tmp_path / "ran")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(resolutions, "BUILDER", None)
-        patch.setattr(interpreters, "others", lambda declared, first: [])
-        with pytest.raises(ResolutionError, match="only-source"):
-            resolutions.resolution_for(request("only-source"))
-        with pytest.raises(RequirementError, match="line 1 takes of-git from"):
-            resolutions.resolution_for(request(f"of-git @ git+https://git.example/a/b@{COMMIT}"))
+    with pytest.raises(ResolutionError, match=r"(?s)only-source.*wheels"):
+        resolutions.resolution_for(request("only-source"))
+    with pytest.raises(RequirementError, match="line 1 takes of-git from"):
+        resolutions.resolution_for(request(f"of-git @ git+https://git.example/a/b@{COMMIT}"))
+    source_distribution(index.folder, "some-wheel", "2.0", tmp_path / "ran")
+    make_wheel(index.folder, "some-wheel", "1.0")
+    assert "some-wheel==1.0" in resolutions.resolution_for(request("some-wheel")).lock.packages
     assert not (tmp_path / "ran").exists()
 
 

@@ -51,6 +51,7 @@ def target(tmp_path: Path) -> Path:
 
 
 def test_the_files_of_a_commit(url: str, repository: Path, target: Path) -> None:
+    """By a tag, which means its commit; not those of the newest. A full commit means itself."""
     found = download.resolve(url, "v1")
     assert found == run_git(repository, "rev-parse", "v1^{commit}")
     download.check_out(url, found, target, print)
@@ -58,9 +59,6 @@ def test_the_files_of_a_commit(url: str, repository: Path, target: Path) -> None
     assert files == {"setup.py": "1", "a/b.py": "2"}
     newest = run_git(repository, "rev-parse", "main")
     assert download.resolve(url, "main") == download.resolve(url, "HEAD") == newest
-
-
-def test_a_full_commit_is_not_asked_for() -> None:
     assert download.resolve("https://nowhere.invalid/x", "a" * 40) == "a" * 40
 
 
@@ -79,15 +77,9 @@ def test_a_name_that_is_an_option(url: str, revision: str) -> None:
 @pytest.mark.parametrize(
     "url",
     [
-        *(
-            "ssh://git@h/x",
-            "file:///etc",
-            "http://h/x",
-            "git://h/x",
-            "ext::sh -c x",
-            "https://-x/y",
-        ),
-        *("https://u:p@h/x", "/etc", "https://h/x y", "https://h/x?a=b", "https://h"),
+        *("ssh://git@h/x", "file:///etc", "http://h/x", "git://h/x", "ext::sh -c x", "/etc"),
+        *("https://-x/y", "https://u:p@h/x", "https://h/x y", "https://h/x?a=b", "https://h"),
+        "--upload-pack=x",
     ],
 )
 def test_only_https_without_a_login(url: str, target: Path) -> None:
@@ -108,24 +100,21 @@ def test_links_and_submodules_are_left_out(url: str, repository: Path, target: P
     assert "link is a link or a submodule" in "".join(said)
 
 
-def test_filters_and_attributes_do_nothing(url: str, repository: Path, target: Path) -> None:
-    """The bytes are those of the commit, whatever its attributes ask for."""
-    (repository / ".gitattributes").write_text("* export-ignore\n*.py filter=x text eol=crlf\n")
-    (repository / "setup.py").write_bytes(b"$Format:%H$\n")
-    download.check_out(url, commit(repository), target, print)
-    assert (target / "setup.py").read_bytes() == b"$Format:%H$\n"
-
-
-def test_settings_of_the_user_do_nothing(
+def test_settings_and_attributes_do_nothing(
     url: str, repository: Path, target: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """His logins are not sent to a host that a stranger names, and no template brings hooks."""
+    """A user's logins are not sent to a host that a stranger names, and no template brings hooks.
+
+    The bytes are those of the commit, whatever its attributes ask for.
+    """
     ran = tmp_path / "ran"
     settings = tmp_path / "config"
     settings.write_text(f'[credential]\nhelper = "!touch {ran};"\n[url "file:///"]\ninsteadOf = h')
     monkeypatch.setenv("GIT_CONFIG_GLOBAL", str(settings))
-    download.check_out(url, run_git(repository, "rev-parse", "HEAD"), target, print)
-    assert (target / "setup.py").read_text() == "3"
+    (repository / ".gitattributes").write_text("* export-ignore\n*.py filter=x text eol=crlf\n")
+    (repository / "setup.py").write_bytes(b"$Format:%H$\n")
+    download.check_out(url, commit(repository), target, print)
+    assert (target / "setup.py").read_bytes() == b"$Format:%H$\n"
     assert not ran.exists()
 
 
@@ -138,12 +127,6 @@ def test_a_name_that_leads_out(url: str, repository: Path, target: Path) -> None
     with pytest.raises(PackageIntegrityError, match="backslash"):
         download.check_out(url, bad, target, print)
     assert not list(target.iterdir())
-
-
-def test_bounds(url: str, repository: Path, target: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(commits, "MAX_FILES", 1)
-    with pytest.raises(PackagesTooLargeError, match="more than 1 files"):
-        download.check_out(url, run_git(repository, "rev-parse", "HEAD"), target, print)
 
 
 def test_trees_that_hold_each_other(
