@@ -98,10 +98,6 @@ LOCK = Lock(
 )
 
 
-def test_a_lock_names_its_packages() -> None:
-    assert LOCK.packages == ["minigrid==3.0.0", "numpy==2.1.0"]
-
-
 def test_the_tag_is_the_hash_of_all_that_an_image_is_made_of() -> None:
     """Another base, another package or another library is another image."""
     tags = {

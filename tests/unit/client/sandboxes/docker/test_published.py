@@ -77,28 +77,18 @@ def sandbox(tmp_path: Path) -> Callable[[str], PublishedContainer]:
     return made
 
 
-def test_the_command_line_is_this_one() -> None:
+def test_the_command_line_is_that_of_one_that_is_mounted_but_for_its_network() -> None:
     """Word for word: what stands here is what confines, and what others on the machine can see."""
-    assert run_arguments.run_arguments(DOCKER, PUBLISHED) == [
-        *("run", "--rm", "--interactive", "--pull", "never", "--log-driver", "none"),
-        *("--no-healthcheck", "--name", "envhub-0", "--hostname", "sandbox", "--workdir", "/"),
-        *("--label", "dev.envhub.client=1:2:3:4"),
-        *(
-            "--network",
-            "bridge",
-            "--publish",
-            "127.0.0.1::5555",
-            "--read-only",
-            "--cap-drop",
-            "ALL",
-        ),
-        *("--security-opt", "no-new-privileges", "--security-opt", "seccomp=/tmp/f/seccomp.json"),
-        *("--security-opt", "systempaths=unconfined", "--ipc", "private", "--user", "65532:65532"),
-        *("--ulimit", "core=0:0", "--memory", "1073741824", "--memory-swap", "1073741824"),
-        *("--pids-limit", "99", "--cpus", "1.5"),
-        *("--tmpfs", "/tmp:rw,nosuid,nodev,size=1048576,mode=1777", "--shm-size", "1073741824"),
-        *("--mount", "type=volume,dst=/var/lib/envhub-worker"),
-        "sha256:1",
+    words = run_arguments.run_arguments(DOCKER, PUBLISHED)
+    mounted = run_arguments.run_arguments(DOCKER, WANTED)
+    assert words[: words.index("--network")] == mounted[: mounted.index("--network")]
+    network = words.index("--network")
+    assert words[network : network + 4] == ["--network", "bridge", "--publish", "127.0.0.1::5555"]
+    confines = slice(mounted.index("--read-only"), mounted.index("--mount"))
+    expected = [word.replace("1000:1000", "65532:65532") for word in mounted[confines]]
+    assert words[network + 4 :] == [
+        *expected,
+        *("--mount", "type=volume,dst=/var/lib/envhub-worker", "sha256:1"),
         *("listen", "--bind", "tcp://0.0.0.0:5555", "--only-client", _KEY),
         *("--log-level", "warning", "--until-eof", "--announce"),
     ]
@@ -202,12 +192,10 @@ def test_an_engine_in_a_virtual_machine_says_what_that_has() -> None:
             assert engines.is_elsewhere("docker") is elsewhere
 
 
-def test_packages_become_an_image_where_nothing_is_mounted() -> None:
+def test_nothing_of_this_machine_is_mounted(tmp_path: Path) -> None:
+    """Packages become an image; a path is refused before the engine is asked for anything."""
     assert isinstance(DockerSandbox(published=True).package_target(), BuiltImageTarget)
     assert type(DockerSandbox().package_target()) is ImageTarget
-
-
-def test_paths_of_this_machine_are_refused(tmp_path: Path) -> None:
     policy = Policy(readable=("/data",))
     with pytest.raises(PolicyError, match="put what is needed into the repository"):
         DockerSandbox(published=True).for_repository(tmp_path, policy, Runtime(""))

@@ -52,26 +52,19 @@ def _packages(*places: _Place) -> tuple[FleetPackages, list[Member]]:
 
 
 def test_each_place_runs_on_its_own() -> None:
-    """A folder here, a name over there; the facts of each are kept."""
-    packages, members = _packages(
-        _Place("here", PackageSet("/made/here", {"lock": "a"}, "/python"), here=True),
-        _Place("there", PackageSet("name", {"lock": "b"})),
-    )
+    """A folder here, a name over there; the facts of each are kept, and told once if alike."""
+    here = _Place("here", PackageSet("/made/here", {"lock": "a"}, "/python"), here=True)
+    there = _Place("there", PackageSet("name", {"lock": "b"}))
+    packages, members = _packages(here, there)
     made = packages.make(_request(), print)
     assert made is not None
     assert packages.runtime_of(members[0]) == Runtime("/python", "/made/here")
     assert packages.runtime_of(members[1]) == Runtime("", "name")
     assert made.facts["places"] == {"here": {"lock": "a"}, "there": {"lock": "b"}}
-
-
-def test_alike_on_all_places_it_is_said_once() -> None:
-    facts = {"lock": "a"}
-    packages, _ = _packages(
-        _Place("a", PackageSet("x", facts)), _Place("b", PackageSet("y", facts))
-    )
+    there.will_make(PackageSet("name", {"lock": "a"}))
     made = packages.make(_request(), print)
     assert made is not None
-    assert made.facts == facts
+    assert made.facts == {"lock": "a"}
 
 
 def test_what_a_place_has_is_not_made() -> None:

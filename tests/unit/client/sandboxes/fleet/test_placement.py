@@ -70,32 +70,21 @@ def _first(placement: Placement, number: int) -> str:
     return next(placement.candidates(number)).name
 
 
-def test_one_worker_each_by_default(rooms: dict[str, Room]) -> None:
-    """As many as the list has places, also where one stands there twice."""
+def test_they_are_spread(rooms: dict[str, Room]) -> None:
+    """One each by default; evenly, by how often a place is in the list."""
     assert len(_placement(["a", "b", "a"]).seats(None)) == 3
     assert len(_placement(["a", "b"]).seats(5)) == 5
-
-
-def test_they_are_spread(rooms: dict[str, Room]) -> None:
     placement = _opened(["a", "b", "a"])
     found = [_first(placement, number) for number in range(6)]
     assert sorted(found) == ["a", "a", "a", "a", "b", "b"]
 
 
-def test_of_equal_places_the_one_with_most_room(rooms: dict[str, Room]) -> None:
-    rooms |= {"a": Room(workers=3), "b": Room(workers=60)}
-    assert _first(_opened(["a", "b"]), 0) == "b"
-
-
-def test_what_is_full_comes_after_what_is_not(rooms: dict[str, Room]) -> None:
-    rooms |= {"a": Room(workers=0), "b": Room(answers=False, workers=0), "c": Room(workers=1)}
-    placement = _opened(["a", "b", "c"])
-    assert [one.name for one in placement.candidates(0)] == ["c", "a", "b"]
-
-
-def test_room_that_was_given_away_since_is_gone(rooms: dict[str, Room]) -> None:
-    """Workers that start at the same time are told of the same room."""
+def test_the_place_with_most_room_comes_first(rooms: dict[str, Room]) -> None:
+    """Then what is full, and what does not answer; room that was given away since is gone."""
     rooms |= {"a": Room(workers=1), "b": Room(workers=9)}
+    rooms |= {"c": Room(workers=0), "d": Room(answers=False, workers=0)}
+    placement = _opened(["c", "d", "a", "b"])
+    assert [one.name for one in placement.candidates(0)] == ["b", "a", "c", "d"]
     placement = _opened(["a", "b"])
     assert [_first(placement, number) for number in range(4)] == ["b", "a", "b", "b"]
 
@@ -148,14 +137,12 @@ def test_all_are_made_where_none_was_there(rooms: dict[str, Room]) -> None:
         placement.seats(None)[0].for_repository(Path(), Policy(), Runtime(""))
 
 
-def test_what_it_runs_on_is_that_of_all_places(rooms: dict[str, Room]) -> None:
-    """Of places that are alike that of one: a remembered manifest then holds for both."""
-    placement = _opened(["a", "b"])
-    assert placement.runs_on(Runtime("")) == Runtime("")
-
-
 def test_what_many_places_run_on_has_a_name_of_a_file(rooms: dict[str, Room]) -> None:
-    """It is looked up as one; the same places have the same, in any order."""
+    """It is looked up as one; the same places have the same, in any order.
+
+    What places run on that are alike is that of one: a remembered manifest then holds for both.
+    """
+    assert _opened(["a", "b"]).runs_on(Runtime("")) == Runtime("")
     names = [f"far{number}" for number in range(300)]
     found = [_opened(some).runs_on(Runtime("")) for some in (names, names[::-1], names[1:])]
     assert found[0] == found[1] != found[2]

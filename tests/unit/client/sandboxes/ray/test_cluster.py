@@ -20,19 +20,15 @@ from envhub_sandbox.sandboxes.ray import cluster
     [
         *(b"", b"{", b"[]", b"7", b"null", b"{" * 70_000, b"[" * 30_000, b"\xff"),
         *({"endpoint": "x"}, "{}", None, 7, pickle.dumps({})),
-        json.dumps({"log": "x" * 70_000}).encode(),
+        *(json.dumps({"log": "x" * 70_000}).encode(), type("Bytes", (bytes,), {})(b"{}")),
     ],
+    ids=range(15),
 )
 def test_an_answer_that_is_none_is_refused(lie: Any) -> None:
-    """Whatever Ray has made of it; nothing but JSON in bytes is read."""
+    """Whatever Ray has made of it; nothing but JSON in bytes is read, and no subclass of these."""
+    assert cluster.read_answer(b'{"code": 3}') == {"code": 3}
     with pytest.raises(WorkerStartupError, match="none of ours"):
         cluster.read_answer(lie)
-
-
-def test_bytes_of_json_are_an_answer() -> None:
-    assert cluster.read_answer(b'{"code": 3}') == {"code": 3}
-    with pytest.raises(WorkerStartupError):
-        cluster.read_answer(type("Bytes", (bytes,), {})(b"{}"))
 
 
 @pytest.mark.parametrize(
@@ -100,24 +96,17 @@ def use(ray: Ray, monkeypatch: pytest.MonkeyPatch) -> Ray:
 
 
 def test_a_local_ray_is_started_where_none_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Which is said, once. One that runs is used without a word; none is started in its place."""
     ray = use(Ray(), monkeypatch)
     with pytest.warns(RuntimeWarning, match=r"a local Ray with 2 CPUs was started"):
         cluster.connect()
     cluster.connect()
     assert ray.asked == ["auto", "local"]
     assert (cluster.cpus(), cluster.shared_address(), cluster.job()) == (2, "local:1", "01000000")
-
-
-def test_a_cluster_that_runs_is_used_without_a_word(monkeypatch: pytest.MonkeyPatch) -> None:
-    """``ray.init`` is the user's; and none is started beside it."""
     ray = use(Ray(running=True), monkeypatch)
     assert cluster.job() is None
     cluster.connect()
     assert ray.asked == ["auto"]
-
-
-def test_an_address_without_a_cluster_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nothing is started in its place; Ray's words are shown, and do nothing to a terminal."""
     ray = use(Ray(), monkeypatch)
     with pytest.raises(SandboxUnavailableError, match=r"10\.0\.0\.1:6379.*\\x1b"):
         cluster.connect("10.0.0.1:6379")
