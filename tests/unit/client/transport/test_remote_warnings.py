@@ -28,24 +28,20 @@ def told(heard: RemoteWarnings, *some: tuple[str, str]) -> list[Any]:
 
 
 def test_each_is_told_once() -> None:
+    """Whichever process has said it, and however often; at the caller's line, and never painted."""
     heard = RemoteWarnings()
     assert heard.take(REPLY) is REPLY
     [one, other] = told(heard, ("UserWarning", "slow"), ("x.Own", "slow"), ("x.Own", "slow"))
     assert str(one.message) == "a/b@c: UserWarning: slow"
     assert str(other.message) == "a/b@c: x.Own: slow"
     assert one.category is other.category is RemoteEnvWarning
+    assert one.filename == __file__, "Python's filters go by that"
     assert told(heard, ("UserWarning", "slow")) == []
-
-
-def test_it_stands_where_the_caller_does() -> None:
-    """At his line, not in one of ours; Python's filters go by that."""
-    [one] = told(RemoteWarnings(), ("UserWarning", "slow"))
-    assert one.filename == __file__
-
-
-def test_nothing_is_painted() -> None:
-    [one] = told(RemoteWarnings(), ("\x1b]0;owned\x07\n", "\x1b[2J\r\u202eslow"))
-    assert str(one.message).isprintable()
+    [painting] = told(heard, ("\x1b]0;owned\x07\n", "\x1b[2J\r\u202eslow"))
+    assert str(painting.message).isprintable()
+    for twin in (copy.copy(one.message), pickle.loads(pickle.dumps(one.message))):
+        found = (str(twin), twin.label, twin.category, twin.text)
+        assert found == (str(one.message), "a/b@c", "UserWarning", "slow")
 
 
 def test_a_flood_ends_with_a_word() -> None:
@@ -67,11 +63,3 @@ def test_what_the_filters_raise_leaves_the_rest() -> None:
             heard.show("a/b@c")
     [two] = told(heard)
     assert two.message.text == "two"
-
-
-def test_it_can_be_copied() -> None:
-    one = RemoteEnvWarning("a/b@c", "UserWarning", "slow")
-    for twin in (copy.copy(one), pickle.loads(pickle.dumps(one))):
-        assert (str(twin), twin.label, twin.category, twin.text) == (
-            str(one), "a/b@c", "UserWarning", "slow",
-        )  # fmt: skip

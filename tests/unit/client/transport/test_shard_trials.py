@@ -102,17 +102,15 @@ def test_another_number_of_cores_is_another_machine(
 
 
 def test_what_may_share_state_stays_together(path: Path) -> None:
-    """A SyncVectorEnv's sub-environments live in one process, and so does what is no such env."""
+    """A SyncVectorEnv's sub-environments live in one process, and so does what is no such env.
+
+    A number of workers is kept, whatever was measured, if there are as many sub-environments.
+    """
+    use(path, {"8+8": 1e-3})
     trials = ShardTrials(path)
     assert trials.bounds_for(environment(16, sync=True), None) == [(0, 16)]
     assert trials.bounds_for(environment(16, shardable=False), 4) == [(0, 16)]
-
-
-@pytest.mark.parametrize(("workers", "expected"), [(1, 1), (3, 3), (20, 16)])
-def test_a_number_of_workers_is_kept(path: Path, workers: int, expected: int) -> None:
-    """Whatever was measured, if there are as many sub-environments."""
-    use(path, {"8+8": 1e-3})
-    assert len(ShardTrials(path).bounds_for(ENV, workers)) == expected
+    assert [len(trials.bounds_for(ENV, workers)) for workers in (1, 3, 20)] == [1, 3, 16]
 
 
 @given(count=st.integers(1, 200), cpus=st.integers(1, 70))
@@ -144,24 +142,21 @@ def test_a_damaged_file_is_as_none(path: Path, content: bytes) -> None:
     assert use(path, {"10+6": 1e-3}) == "10+6"
 
 
-@pytest.mark.parametrize("step_s", [0.0, float("nan"), float("inf"), -1.0])
-def test_an_impossible_time_is_not_remembered(path: Path, step_s: float) -> None:
-    ShardTrials(path).note(ENV, [(0, 16)], step_s)
+@pytest.mark.parametrize(
+    ("env", "step_s"),
+    [
+        *((ENV, one) for one in (0.0, float("nan"), float("inf"), -1.0)),
+        *((environment(16, sync=True), 1e-3), (environment(1), 1e-3)),
+    ],
+)
+def test_what_is_no_time_or_no_choice_is_not_remembered(
+    path: Path, env: Any, step_s: float
+) -> None:
+    """A clock may be strange; a cache that is not there or cannot be written is no error."""
+    ShardTrials(path).note(env, [(0, env.num_envs)], step_s)
     assert not path.exists()
-
-
-@pytest.mark.parametrize("env", [environment(16, sync=True), environment(1)])
-def test_where_there_is_no_choice_nothing_is_remembered(path: Path, env: Any) -> None:
-    ShardTrials(path).note(env, [(0, env.num_envs)], 1e-3)
-    assert not path.exists()
-
-
-def test_what_must_not_be_remembered_is_not() -> None:
-    trials = ShardTrials(None)
-    trials.note(ENV, [(0, 8), (8, 16)], 1e-3)
-    assert trials.bounds_for(ENV, None) == [(0, 8), (8, 16)]
-
-
-def test_a_cache_that_cannot_be_written_is_no_error(tmp_path: Path) -> None:
-    ShardTrials(tmp_path / "missing" / "entry").note(ENV, [(0, 16)], 1e-3)
-    assert not (tmp_path / "missing").exists()
+    ShardTrials(path.parent / "missing" / "entry").note(ENV, [(0, 16)], 1e-3)
+    assert not (path.parent / "missing").exists()
+    nowhere = ShardTrials(None)
+    nowhere.note(ENV, [(0, 8), (8, 16)], 1e-3)
+    assert nowhere.bounds_for(ENV, None) == [(0, 8), (8, 16)]
