@@ -29,13 +29,10 @@ def test_a_server_is_asked_once_what_a_dead_jail_was_denied(kept: bool) -> None:
     asked = [call[0] for call in lease.mock_calls if call[0] in ("note_denied", "end")]
     assert asked == ["note_denied", *(["end"] if kept else [])]
     lease.repository.keep_crash.assert_called_once()
-
-
-def test_a_bundle_of_what_came_too_late_has_it_too() -> None:
-    lease = MagicMock()
-    failures_of(lease).keep_crash(WorkerTimeoutError("late", request="reset", timeout_s=1.0))
-    lease.note_denied.assert_called_once()
-    lease.repository.keep_crash.assert_called_once()
+    late = MagicMock()  # of what came too late nothing was asked before
+    failures_of(late).keep_crash(WorkerTimeoutError("late", request="reset", timeout_s=1.0))
+    late.note_denied.assert_called_once()
+    late.repository.keep_crash.assert_called_once()
 
 
 @pytest.mark.parametrize(
@@ -53,15 +50,8 @@ def test_each_state_has_its_refusal(state: State, kind: type[Exception], said: s
     error = refusal(state, "step", "never")
     assert type(error) is kind
     assert said in str(error)
-
-
-def test_every_state_but_two_refuses() -> None:
-    serving = {state for state in State if refusal(state, "step", "never") is None}
-    assert serving == {State.IDLE, State.READY}
-
-
-def test_the_advice_follows_from_what_happened() -> None:
-    """An interrupted wait is named, and a death is survived by a reset where the policy says so."""
+    serving = {one for one in State if refusal(one, "step", "never") is None}
+    assert serving == {State.IDLE, State.READY}, "no later state is taken for one that serves"
     assert "the last call was interrupted" in str(refusal(State.LATE, "step", "never", "call"))
     assert str(refusal(State.DEAD, "step", "on_reset")).endswith("has died; call reset() first")
 

@@ -78,6 +78,10 @@ def test_a_jail_is_taken_built_in_and_given_back_once(taken: tuple[Lease, _Jails
         lease.let_go()
     assert jails.done == ["take", "build", "give back"]
     assert (lease.loaded, lease.lane) == (None, None)
+    jails.done.clear()
+    acquire(lease)
+    lease.abandon()  # as a fork does: the jail is its parent's
+    assert (jails.done, lease.lane) == (["take", "build"], None)
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), WorkerDiedError("it died")])
@@ -134,11 +138,3 @@ def test_a_jail_that_comes_after_close_is_refused(taken: tuple[Lease, _Jails]) -
         acquire(lease)
     lease.let_go()
     assert jails.done == ["take", "build", "give back"]
-
-
-def test_a_fork_gives_nothing_back(taken: tuple[Lease, _Jails]) -> None:
-    lease, jails = taken
-    acquire(lease)
-    lease.abandon()
-    assert jails.done == ["take", "build"]
-    assert lease.lane is None

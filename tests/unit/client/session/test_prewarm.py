@@ -54,21 +54,18 @@ def test_a_system_without_threads_starts_nothing_ahead(monkeypatch: pytest.Monke
     assert third.warm.wait(60)
 
 
-def test_what_was_passed_over_is_cancelled_before_another_starts() -> None:
-    """So that there are never more unused jails than were asked for."""
-    first, second, third, fourth = suite_of(4)
-    first.used()
-    assert second.warm.wait(60)
-    third.used()
-    assert second.cancelled.wait(60)
-    assert fourth.warm.wait(60)
-
-
 def test_room_is_made_of_what_is_unused_only() -> None:
-    first, second, third = suite_of(3)
+    """And there is none where nothing was started ahead; what was passed over is cancelled."""
+    first, second, third, fourth = suite_of(4)
     assert not first.make_room()
     first.used()
     assert second.warm.wait(60)
     assert first.make_room()
     assert (first.cancelled.is_set(), second.cancelled.is_set()) == (False, True)
     assert not third.warm.is_set()
+    first, second, third, fourth = suite_of(4)
+    first.used()
+    assert second.warm.wait(60)
+    third.used()
+    assert second.cancelled.wait(60), "so that there are never more unused jails than permitted"
+    assert fourth.warm.wait(60)

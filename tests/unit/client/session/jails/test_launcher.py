@@ -133,12 +133,14 @@ def test_only_words_are_taken_of_a_status(
     launcher: Launcher, client: _Client, place: _Place, status: Any, states: tuple[str, ...]
 ) -> None:
     client.status = status
-    assert launcher.states(opened(launcher, client, place)) == states
-
-
-def test_a_silent_server_has_no_status(launcher: Launcher, client: _Client, place: _Place) -> None:
-    client.refuses = WorkerDiedError("gone")
-    assert launcher.status(opened(launcher, client, place)) == {}
+    loaded = opened(launcher, client, place)
+    assert launcher.states(loaded) == states
+    client.refuses = WorkerDiedError("a silent one, which is no error: it is for a text")
+    assert launcher.status(loaded) == {}
+    place.fails = True
+    with pytest.raises(WorkerStartupError):
+        launcher.hold()
+    assert place.released == 0, "where nothing was started nothing is given back"
 
 
 @pytest.mark.parametrize(("reason", "asked"), [("exit", 1), ("server", 0), ("connection", 0)])
@@ -177,10 +179,3 @@ def test_a_death_after_a_denial_names_it(
         launcher.note_denied(error, _SERVER, 7)
     assert re.search(text, str(error))
     assert str(error).count("\n") <= 1
-
-
-def test_no_server_no_use(launcher: Launcher, place: _Place) -> None:
-    place.fails = True
-    with pytest.raises(WorkerStartupError):
-        launcher.hold()
-    assert place.released == 0

@@ -72,15 +72,30 @@ def test_the_environment_is_pending_meanwhile(flight: InFlight, session: FleetSe
     received(flight)
     assert session.requests.waiting is None
     assert session.lifecycle.state is State.READY
-
-
-def test_a_refused_send_leaves_nothing_pending(flight: InFlight, session: FleetSession) -> None:
     session.parts[1].lifecycle.state = State.DEAD
     with pytest.raises(WorkerDiedError) as caught:
         send(flight, 0, 1)
     assert caught.value.env_ids == (1,)
-    assert session.requests.waiting is None
+    assert session.requests.waiting is None, "nothing was sent, to nobody"
     assert session.parts[0].lifecycle.state is State.READY
+
+
+def test_what_is_dropped_is_waited_for(
+    flight: InFlight, lanes: list[FakeLane], session: FleetSession
+) -> None:
+    """And what waits here is not sent. The history says where workers were sent other steps."""
+    flight.send(flight.rows(None), np.zeros(2, np.int64))
+    flight.recv(2, 0)
+    history = session.parts[0].history
+    assert history.recording().dropped == 0
+    send(flight, 0, 1)
+    send(flight, 0)
+    flight.drop()
+    assert [len(lane.sent) for lane in lanes] == [2, 2]
+    assert [lane.owed for lane in lanes] == [None, None]
+    with pytest.raises(NoAsyncCallError):
+        flight.recv(1, 0)
+    assert history.recording().dropped == 1
 
 
 def test_ids_are_read_as_they_are_meant(flight: InFlight) -> None:
@@ -204,33 +219,8 @@ def test_infos_that_break_a_rule_end_their_worker_alone(
         flight.recv(2, 0)
     assert [part.lifecycle.state for part in session.parts] == [State.DEAD, State.PENDING]
     assert received(flight, 2) == [1]
-
-
-def test_infos_that_do_not_go_together_are_an_error_of_the_environment(
-    flight: InFlight, lanes: list[FakeLane], session: FleetSession
-) -> None:
-    lanes[0].infos = {None: None}
-    send(flight, 0)
-    with pytest.raises(RemoteEnvError, match="do not go together"):
+    lanes[1].infos = {None: None}
+    send(flight, 1)
+    with pytest.raises(RemoteEnvError, match="do not go together"):  # as Gymnasium's
         flight.recv(1, 0)
-    assert session.parts[0].lifecycle.state is State.READY
-
-
-def test_what_is_dropped_is_waited_for(flight: InFlight, lanes: list[FakeLane]) -> None:
-    send(flight, 0, 1)
-    send(flight, 0)
-    flight.drop()
-    assert [len(lane.sent) for lane in lanes] == [1, 1]
-    assert [lane.owed for lane in lanes] == [None, None]
-    with pytest.raises(NoAsyncCallError):
-        flight.recv(1, 0)
-
-
-def test_the_history_says_that_it_is_not_whole(session: FleetSession, flight: InFlight) -> None:
-    """Where workers were not sent the same steps; a step of all is one."""
-    flight.send(flight.rows(None), np.zeros(2, np.int64))
-    flight.recv(2, 0)
-    history = session.parts[0].history
-    assert history.recording().dropped == 0
-    send(flight, 0)
-    assert history.recording().dropped == 1
+    assert session.parts[1].lifecycle.state is State.READY
