@@ -59,6 +59,10 @@ def test_a_repository_is_read(tmp_path: Path) -> None:
     ]
     [finding] = read["findings"]
     assert (finding["check"], finding["file"], finding["line"]) == ("source-dynamic", "env.py", 5)
+    odd = repository(tmp_path / "odd", requirements__txt="x @ https://example.com/x.whl")
+    refused = document("inspect", "--static", odd)
+    assert refused["declared"] is None, "which is no reason not to read the rest"
+    assert [one["check"] for one in refused["findings"]] == ["requirements", "source-dynamic"]
     shown = envhub("inspect", "--static", folder).stdout
     assert "make_env(n_envs=1, use_async_envs=False, size=8)" in shown
     assert "note         source-dynamic: env.py:5: calls eval" in shown
@@ -74,13 +78,6 @@ def test_nothing_of_it_runs(tmp_path: Path) -> None:
     assert not trace.exists()
     subprocess.run([sys.executable, "-I", folder / "env.py"], check=True, timeout=120)
     assert trace.exists()
-
-
-def test_declarations_that_cannot_be_taken_are_found(tmp_path: Path) -> None:
-    folder = repository(tmp_path / "r", requirements__txt="x @ https://example.com/x.whl")
-    read = document("inspect", "--static", folder)
-    assert read["declared"] is None
-    assert [one["check"] for one in read["findings"]] == ["requirements", "source-dynamic"]
 
 
 @pytest.mark.parametrize(("least", "code"), [("note", 1), ("warning", 0), ("error", 0)])
@@ -145,6 +142,9 @@ def test_what_is_the_same_differs_in_nothing(tmp_path: Path) -> None:
     assert differing(tmp_path / "a") == []
     moved = differing(tmp_path / "b", f"# a comment\n{_ENTRY}")
     assert [row[:2] for row in moved] == [("file", "changed")]
+    old, new = repository(tmp_path / "old", a__txt="1"), repository(tmp_path / "new", b__txt="1")
+    [one] = changes(static(local(old)), static(local(new)))
+    assert (one.what, one.how, one.text) == ("file", "renamed", "b.txt: was a.txt")
 
 
 def test_each_change_is_told_as_what_it_is(tmp_path: Path) -> None:
@@ -164,12 +164,6 @@ def test_each_change_is_told_as_what_it_is(tmp_path: Path) -> None:
     assert "numpy>=1, now numpy>=2" in texts
     assert "env.py:2: imports socket" in texts
     assert texts.count("env.py:5: calls eval") == 2, "the line was changed: it is told again"
-
-
-def test_a_file_with_another_name_is_renamed(tmp_path: Path) -> None:
-    old, new = repository(tmp_path / "old", a__txt="1"), repository(tmp_path / "new", b__txt="1")
-    [one] = changes(static(local(old)), static(local(new)))
-    assert (one.what, one.how, one.text) == ("file", "renamed", "b.txt: was a.txt")
 
 
 def test_a_folder_is_held_against_what_the_hub_has(tmp_path: Path) -> None:

@@ -72,12 +72,8 @@ def test_a_failing_task_ends_the_run_and_closes_all(monkeypatch: pytest.MonkeyPa
     assert code == 5
     assert events[-2:] == [("close", 1), ("close", 2)]
     assert [task["task"] for task in document["tasks"]] == [0]
-    assert document["error"] == {
-        "type": "WorkerDiedError",
-        "message": "it died",
-        "exit_code": 5,
-        "bundle": None,
-    }
+    died = {"type": "WorkerDiedError", "message": "it died", "exit_code": 5, "bundle": None}
+    assert document["error"] == died
 
 
 def test_options_become_arguments_of_make_env(monkeypatch: pytest.MonkeyPatch) -> None:

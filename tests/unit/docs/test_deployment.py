@@ -75,6 +75,9 @@ def test_the_dashboard_asks_for_what_is_exported() -> None:
     assert {name for name in names if name.startswith("envhub_")} <= asked
     for variable in dashboard["templating"]["list"][1:]:
         assert set(_OURS.findall(variable["definition"])) <= set(names)
+    panels = dashboard["panels"]
+    assert len({panel["id"] for panel in panels}) == len(panels)
+    assert len({(one["gridPos"]["x"], one["gridPos"]["y"]) for one in panels}) == len(panels)
 
 
 def test_the_dashboard_groups_by_labels_that_there_are() -> None:
@@ -89,12 +92,6 @@ def test_the_dashboard_groups_by_labels_that_there_are() -> None:
                 asked |= set(group.split(", "))
             asked |= set(re.findall(r'([a-z_]+)=~?"', expr))
             assert asked <= known, expr
-
-
-def test_the_panels_have_their_own_places() -> None:
-    panels = json.loads(DASHBOARD.read_text())["panels"]
-    assert len({panel["id"] for panel in panels}) == len(panels)
-    assert len({(one["gridPos"]["x"], one["gridPos"]["y"]) for one in panels}) == len(panels)
 
 
 def test_the_page_has_every_metric() -> None:

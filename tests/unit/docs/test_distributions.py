@@ -81,17 +81,6 @@ def assert_fit(told: Message) -> None:
     assert told["Requires-Python"] == ">=3.10"
 
 
-def test_the_package_is_fit_for_an_index() -> None:
-    assert_fit(cast("Message", metadata.metadata("envhub-sandbox")))
-
-
-def test_the_package_holds_no_test() -> None:
-    """Two packages, their metadata, the programs, and the examples."""
-    files = metadata.files("envhub-sandbox") or []
-    assert files
-    assert [one for one in files if {"tests", "benchmarks", "conftest.py"} & {*one.parts}] == []
-
-
 def test_the_version_stands_in_one_place(checkout: Path) -> None:
     citation = yaml.safe_load((checkout / "CITATION.cff").read_text())
     version = envhub_worker.__version__
@@ -101,10 +90,16 @@ def test_the_version_stands_in_one_place(checkout: Path) -> None:
     assert not re.search(r'^version = "', project, re.M)
 
 
-def test_the_plugin_is_fit_for_an_index(plugin: Path) -> None:
-    """Under the name by which LeRobot finds it, with the module of that name, and our version."""
+def test_both_are_fit_for_an_index(plugin: Path, checkout: Path) -> None:
+    """The plugin under the name by which LeRobot finds it, with that module, and our version."""
+    assert_fit(cast("Message", metadata.metadata("envhub-sandbox")))
+    files = metadata.files("envhub-sandbox") or []
+    assert files
+    assert [one for one in files if {"tests", "benchmarks", "conftest.py"} & {*one.parts}] == []
     told = told_by(plugin)
     assert_fit(told)
+    copy = checkout / "plugins" / NAME / "LICENSE"  # nothing outside gets into a distribution
+    assert copy.read_bytes() == (checkout / "LICENSE").read_bytes()
     assert told["Name"] == NAME
     with zipfile.ZipFile(plugin) as archive:
         modules = [name for name in archive.namelist() if name.endswith(".py")]
@@ -112,9 +107,3 @@ def test_the_plugin_is_fit_for_an_index(plugin: Path) -> None:
     ours = metadata.version("envhub-sandbox")
     assert told["Version"] == ours
     assert told.get_all("Requires-Dist") == [f"envhub-sandbox>={ours}"]
-
-
-def test_the_plugin_has_the_licence_of_all(checkout: Path) -> None:
-    """A copy, because nothing outside of its folder gets into a distribution."""
-    copy = checkout / "plugins" / NAME / "LICENSE"
-    assert copy.read_bytes() == (checkout / "LICENSE").read_bytes()

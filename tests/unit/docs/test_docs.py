@@ -183,25 +183,15 @@ def test_the_python_of_a_document_runs(document: str) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def error_texts() -> list[str]:
-    """Every error text of the table of the most frequent errors."""
+def test_troubleshooting_quotes_errors_that_exist() -> None:
+    """A search for what is on the screen finds it."""
     page = (CHECKOUT / "docs" / "troubleshooting.md").read_text()
     table = rows(section(page, "The most frequent errors"))
-    return [text for symptom, _ in table for text in code_words(symptom)]
-
-
-# said by others than us
-_FOREIGN_TEXTS = {"no module named venv", "ensurepip is not available"}
-
-
-@pytest.mark.parametrize("text", [text for text in error_texts() if text not in _FOREIGN_TEXTS])
-def test_troubleshooting_quotes_errors_that_exist(text: str) -> None:
-    assert text in joined_literals()
-
-
-def joined_literals() -> str:
-    """The source, with texts that go on over a line's end put together."""
-    return re.sub(r'(?<!\\)"\s*\n?\s*f?"', "", sources())
+    quoted = {text for symptom, _ in table for text in code_words(symptom)}
+    said = re.sub(r'(?<!\\)"\s*\n?\s*f?"', "", sources())  # texts that go on over a line's end
+    assert len(quoted) > 5
+    of_others = {"no module named venv", "ensurepip is not available"}
+    assert [text for text in sorted(quoted - of_others) if text not in said] == []
 
 
 def test_the_pages_before_internals_are_few_enough_to_read() -> None:
@@ -232,35 +222,32 @@ def anchors(text: str) -> set[str]:
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=named)
-def test_links_resolve(document: Path) -> None:
-    """Files are there, and so are the titles that an anchor means."""
-    for target in links(document.read_text()):
+def test_a_document_names_what_there_is(document: Path) -> None:
+    """Files are there, and so are the titles that an anchor means, and paths in backquotes.
+
+    Nothing names a person's machine or tools, and nothing is a note to oneself.
+    """
+    text = document.read_text()
+    for target in links(text):
         path, _, anchor = target.partition("#")
         found = (document.parent / path).resolve() if path else document
         assert found.exists(), target
-        if anchor:
-            assert anchor in anchors(found.read_text()), target
-
-
-# files that a user has, or that a repository on the Hub would have
-_ELSEWHERE = re.compile(r"^(\./my-env|envs?/|\./examples/\w+$|org/|~|/|\.\./|\.venv)")
-
-
-@pytest.mark.parametrize("document", DOCUMENTS, ids=named)
-def test_named_files_exist(document: Path) -> None:
-    """A path of this project in backquotes is a path of this project."""
+        assert not anchor or anchor in anchors(found.read_text()), target
     tops = ("tests/", "docs/", "worker/", "envhub_sandbox/", "examples/", ".ci/", "benchmarks/")
-    for word in code_words(document.read_text()):
+    for word in code_words(text):
         path = word.partition(" ")[0].rstrip("/")
-        if not path.startswith(tops) or re.search(r"[*{<(]", path):
-            continue
-        top, _, rest = path.removeprefix("worker/").partition("/")
-        root = folder(top) if top in ("envhub_worker", "envhub_sandbox") else CHECKOUT / top
-        assert (root / rest).exists(), word
+        if path.startswith(tops) and not re.search(r"[*{<(]", path):
+            top, _, rest = path.removeprefix("worker/").partition("/")
+            root = folder(top) if top in ("envhub_worker", "envhub_sandbox") else CHECKOUT / top
+            assert (root / rest).exists(), word
+    assert _FORBIDDEN.findall(text) == []
 
 
 def test_the_map_has_every_package() -> None:
-    """Every folder of the two packages, and every module that stands beside them."""
+    """Every folder of the two packages, and every module that stands beside them.
+
+    The source is as finished as the documents are.
+    """
     words = set(code_words((CHECKOUT / "docs" / "architecture.md").read_text()))
     missing = set()
     for package, place in (("envhub_sandbox", ""), ("envhub_worker", "worker/")):
@@ -270,19 +257,11 @@ def test_the_map_has_every_package() -> None:
         named = {f"{place}{package}/{part.relative_to(root)}" for part in [*parts, *modules]}
         missing |= named - words
     assert missing == set()
+    assert _FORBIDDEN.findall(sources()) == []
 
 
 # said nowhere in the project: they name people's machines and tools, not the project
 _FORBIDDEN = re.compile(r"(?<![\w./-])/(work|root)/\w|TODO|FIXME|XXX(?!X)")
-
-
-@pytest.mark.parametrize("document", DOCUMENTS, ids=named)
-def test_documents_are_finished(document: Path) -> None:
-    assert _FORBIDDEN.findall(document.read_text()) == []
-
-
-def test_sources_are_finished() -> None:
-    assert _FORBIDDEN.findall(sources()) == []
 
 
 def error_tree() -> list[tuple[int, str]]:
@@ -313,10 +292,6 @@ def test_error_tree_is_the_tree() -> None:
 def test_what_is_written_from_the_source_is_up_to_date(written: Any) -> None:
     """``python -m tests.support.documents.settings``, ``options`` or ``charts`` writes it."""
     assert written.DOCUMENT.read_text() == written.document()
-
-
-def test_the_plots_are_drawn_from_what_was_measured() -> None:
-    """``python -m tests.support.documents.charts`` draws them."""
     assert {path: path.read_text() for path in charts.pictures()} == charts.pictures()
 
 

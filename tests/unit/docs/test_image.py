@@ -32,13 +32,11 @@ def name_of(requirement: str) -> str:
     return re.split(r"[^\w-]", requirement, maxsplit=1)[0]
 
 
-def test_the_workers_group_is_a_part_of_the_dependencies(project: dict[str, Any]) -> None:
-    """Word for word, so that a version is raised in both or in neither."""
-    assert set(project["dependency-groups"]["worker"]) <= set(project["project"]["dependencies"])
-
-
 def test_the_workers_group_is_what_the_worker_imports(project: dict[str, Any]) -> None:
-    names = {name_of(one) for one in project["dependency-groups"]["worker"]}
+    """No more and no less; word for word as the package needs it."""
+    group = project["dependency-groups"]["worker"]
+    assert set(group) <= set(project["project"]["dependencies"])
+    names = {name_of(one) for one in group}
     assert {_IMPORTED_AS.get(name, name) for name in names} == WORKERS_OWN - {"envhub_worker"}
 
 
@@ -53,11 +51,6 @@ def test_the_image_can_be_watched(project: dict[str, Any]) -> None:
     }
 
 
-def test_the_image_carries_the_projects_version() -> None:
-    text = (CHECKOUT / "Dockerfile").read_text()
-    assert f"ARG VERSION={envhub_worker.__version__}\n" in text
-
-
 def test_nothing_but_the_worker_goes_into_the_image() -> None:
     """What is not listed never reaches the engine: no tests, no client, no history."""
     lines = (CHECKOUT / ".dockerignore").read_text().splitlines()
@@ -65,8 +58,9 @@ def test_nothing_but_the_worker_goes_into_the_image() -> None:
     assert rules == ["*", "!pyproject.toml", "!worker", "**/__pycache__"]
 
 
-def test_the_image_runs_as_nobody() -> None:
+def test_the_image_runs_as_nobody_and_carries_the_projects_version() -> None:
     text = (CHECKOUT / "Dockerfile").read_text()
+    assert f"ARG VERSION={envhub_worker.__version__}\n" in text
     final = text.rpartition("\nFROM ")[2]
     assert re.search(r"^USER (\d+):\1$", final, re.MULTILINE)
     assert not re.search(r"^USER (root|0)", final, re.MULTILINE)

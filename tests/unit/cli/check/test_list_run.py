@@ -111,7 +111,6 @@ def test_every_option_is_handed_on_or_about_the_list() -> None:
         ("--all list", "needs --output DIR"),
         ("--all list --output out org/repo", "not both"),
         ("--all list --output out --sarif x", "--sarif is about one repository"),
-        ("--all list --output out --html x", "--html is about one repository"),
         ("--all list --output out --fail-on never", "error, warning or note"),
         ("--all list --output out --allow nothing", "there are: requirements"),
         ("--all list --output out --memory much", "takes a size"),
