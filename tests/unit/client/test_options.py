@@ -61,13 +61,6 @@ def test_what_cannot_be_is_refused(
         make_env(**{"cfg": sample("cartpole"), **given})
 
 
-def test_numpys_numbers_are_numbers() -> None:
-    given: Any = {"n_envs": np.int64(4), "use_async_envs": np.True_, "num_workers": np.int8(2)}
-    made = Options(**given).checked()
-    assert (made.n_envs, made.use_async_envs, made.num_workers) == (4, True, 2)
-    assert [type(one) for one in (made.n_envs, made.use_async_envs)] == [int, bool]
-
-
 @pytest.mark.parametrize(
     "given",
     [
@@ -82,7 +75,12 @@ def test_without_a_sandbox_nothing_pretends_to_protect(given: dict[str, Any]) ->
         make_env(sample("cartpole"), sandbox=None, trust_remote_code=True, **given)
 
 
-def test_a_name_is_looked_up_as_a_shell_does(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_given_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Numpy's numbers are numbers; a name is looked up as a shell does, and a path is a path."""
+    given: Any = {"n_envs": np.int64(4), "use_async_envs": np.True_, "num_workers": np.int8(2)}
+    made = Options(**given).checked()
+    assert (made.n_envs, made.use_async_envs, made.num_workers) == (4, True, 2)
+    assert [type(one) for one in (made.n_envs, made.use_async_envs)] == [int, bool]
     monkeypatch.setattr("shutil.which", lambda name: f"/somewhere/{name}")
     assert arguments.interpreter("python3.12") == "/somewhere/python3.12"
     assert arguments.interpreter("/a/../python3.12") == "/python3.12"

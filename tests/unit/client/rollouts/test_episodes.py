@@ -86,6 +86,7 @@ def test_episodes_are_those_of_each_environment_alone(mode: str, episodes: int) 
     ]
     assert sorted(found) == sorted(expected)
     assert result.complete
+    assert all(one.terminated is (one.sub_env == 0) for one in result.episodes)
 
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
@@ -97,13 +98,6 @@ def test_a_mode_that_is_not_stated_is_found_out(mode: str) -> None:
     assert rollout(env, episodes=9, seed=1).episodes == stated.episodes
 
 
-def test_short_episodes_are_not_favoured() -> None:
-    """Each sub-environment plays its share, however fast the others are."""
-    result = rollout(scripted("NextStep", 4), episodes=10, seed=0)
-    counts = [sum(e.sub_env == index for e in result.episodes) for index in range(4)]
-    assert counts == [3, 3, 2, 2]
-
-
 @pytest.mark.parametrize(("num_envs", "episodes"), [(1, 1), (3, 10), (4, 3), (5, 5), (7, 100)])
 def test_quotas_add_up(num_envs: int, episodes: int) -> None:
     """They are even, the first ones take the rest, and the sum is exact."""
@@ -111,12 +105,9 @@ def test_quotas_add_up(num_envs: int, episodes: int) -> None:
     assert sum(shares) == episodes
     assert shares == sorted(shares, reverse=True)
     assert shares[0] - shares[-1] <= 1
-
-
-def test_termination_is_told_from_truncation() -> None:
-    """The first sub-environment terminates, the others are truncated."""
-    result = rollout(scripted("SameStep"), episodes=6, seed=0)
-    assert {e.sub_env: e.terminated for e in result.episodes} == {0: True, 1: False, 2: False}
+    result = rollout(scripted("NextStep", num_envs), episodes=episodes, seed=0)
+    played = [sum(e.sub_env == index for e in result.episodes) for index in range(num_envs)]
+    assert played == shares, "short episodes are not favoured"
 
 
 def test_the_same_seed_gives_the_same_rollout() -> None:
@@ -129,26 +120,29 @@ def test_the_same_seed_gives_the_same_rollout() -> None:
 
 
 def test_max_steps_stops_and_says_so() -> None:
-    result = rollout(scripted("NextStep", 1), episodes=1000, seed=0, max_steps=10)
+    """Unfinished episodes are not counted; every state is observed once."""
+    steps: list[int] = []
+    given: dict[str, Any] = {"episodes": 1000, "seed": 0, "max_steps": 10}
+    result = rollout(
+        scripted("NextStep", 1), observe=lambda counter: steps.append(counter.steps), **given
+    )
     assert not result.complete
     assert result.steps <= 10
     assert sum(e.length for e in result.episodes) <= 10
+    assert sorted(set(steps)) == list(range(result.steps + 1))
 
 
-def test_a_reset_step_is_no_step() -> None:
-    """NEXT_STEP: what the step after an end returns counts for nothing."""
+def test_vector_rewards_are_summed_component_by_component() -> None:
+    """Rewards of shape (num_envs, 2) give returns of two; the step after an end is no step."""
+    counter = EpisodeCounter(2, 2, "SameStep")
+    counter.step([[1, 2], [3, 4]], [False, True], [False, False], {})
+    counter.step([[10, 20], [30, 40]], [True, True], [False, False], {})
+    assert [e.returns for e in counter.counted] == [(3.0, 4.0), (11.0, 22.0)]
     counter = EpisodeCounter(1, 2, "NextStep")
     for reward, done in [(1.0, True), (100.0, True), (2.0, True)]:
         counter.step([reward], [done], [False], {})
     assert [(e.returns, e.length) for e in counter.counted] == [((1.0,), 1), ((2.0,), 1)]
     assert counter.steps == 2
-
-
-def test_vector_rewards_are_summed_component_by_component() -> None:
-    counter = EpisodeCounter(2, 2, "SameStep")
-    counter.step([[1, 2], [3, 4]], [False, True], [False, False], {})
-    counter.step([[10, 20], [30, 40]], [True, True], [False, False], {})
-    assert [e.returns for e in counter.counted] == [(3.0, 4.0), (11.0, 22.0)]
 
 
 def test_only_ended_environments_are_reset_by_hand() -> None:
@@ -175,21 +169,16 @@ def test_only_ended_environments_are_reset_by_hand() -> None:
 )
 def test_rewards_that_cannot_be_counted_are_refused(rewards: Any) -> None:
     """Wrong shapes, too many components and things that are no numbers."""
+    no = [False, False]
     with pytest.raises(RolloutError, match="rewards"):
-        EpisodeCounter(2, 2, None).step(rewards, [False, False], [False, False], {})
-
-
-def test_rewards_that_change_their_shape_are_refused() -> None:
+        EpisodeCounter(2, 2, None).step(rewards, no, no, {})
     counter = EpisodeCounter(2, 2, None)
-    counter.step([1, 2], [False, False], [False, False], {})
+    counter.step([1, 2], no, no, {})
     with pytest.raises(RolloutError, match="changed their shape"):
-        counter.step([[1], [2]], [False, False], [False, False], {})
-
-
-@pytest.mark.parametrize("flags", [[False], [[False, False]], [0.5, 0.5], ["a", "b"]])
-def test_flags_that_are_none_are_refused(flags: Any) -> None:
-    with pytest.raises(RolloutError, match="terminations are"):
-        EpisodeCounter(2, 2, None).step([1, 2], flags, [False, False], {})
+        counter.step([[1], [2]], no, no, {})
+    for flags in ([False], [no], [0.5, 0.5], ["a", "b"]):
+        with pytest.raises(RolloutError, match="terminations are"):
+            EpisodeCounter(2, 2, None).step([1, 2], flags, no, {})
 
 
 @pytest.mark.parametrize(
@@ -230,13 +219,6 @@ def test_an_unknown_action_space_is_explained() -> None:
             rollout(env, episodes=1, seed=0, actions=actions)
 
 
-def test_every_state_is_observed_once() -> None:
-    steps: list[int] = []
-    env = scripted("SameStep", 1)
-    rollout(env, episodes=3, seed=0, observe=lambda counter: steps.append(counter.steps))
-    assert steps == list(range(len(steps)))
-
-
 FEATURES = spaces.Box(1, 2, (2,), np.float32)
 SPACES: list[gym.Space[Any]] = [
     spaces.Box(-1, 1, (2, 3), np.float32),
@@ -268,13 +250,10 @@ def test_it_is_a_member(space: gym.Space[Any]) -> None:
 
 
 def test_it_is_zero_or_the_nearest() -> None:
-    """Bounds and starts pull it away from zero, and nothing else does."""
+    """Bounds and starts pull it away from zero, and nothing else does; nothing is guessed."""
     assert zero_action(SPACES[0]).tolist() == [[0.0] * 3] * 2
     assert zero_action(SPACES[2]).tolist() == [-3, 2]
     assert [zero_action(space) for space in SPACES[4:7]] == [5, -3, 0]
     assert zero_action(SPACES[7]).tolist() == [1, -3]
-
-
-def test_a_space_of_nobody_is_refused() -> None:
     with pytest.raises(gym.error.CustomSpaceError):
         zero_action(gym.Space())
