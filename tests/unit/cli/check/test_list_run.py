@@ -115,8 +115,6 @@ def test_every_option_is_handed_on_or_about_the_list() -> None:
         ("--all list --output out --allow nothing", "there are: requirements"),
         ("--all list --output out --memory much", "takes a size"),
         ("--all list --output out --max-memory 4G", "is too little"),
-        ("--all list --output out --policy nowhere.toml", "cannot be read"),
-        ("--all list --output out --profile weak", "'weak'"),
         ("--all nowhere --output out", "cannot be read"),
         ("--all list --output .", "has other files"),
         ("--all list --output env/out", "is inside the repository that is checked, ./env (line 2"),
@@ -128,8 +126,6 @@ def test_every_option_is_handed_on_or_about_the_list() -> None:
         ("--all wrong --output out", "wrong:2: "),
         ("", "name a repository, or a list"),
         ("org/repo --jobs 2", "are for --all FILE"),
-        ("org/repo --output out", "are for --all FILE"),
-        ("org/repo --deadline inf", "--deadline is inf"),
     ],
 )
 def test_what_cannot_be_is_told_first(

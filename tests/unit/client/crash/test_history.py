@@ -87,6 +87,15 @@ def test_requests_come_back_in_order() -> None:
     assert isinstance(render, RecordedRequest)
     assert isinstance(last, Steps)
     assert kept.recording().exact
+    ask(kept, m.Call(0, "add", (object(),), {}))
+    described = kept.recording().requests[-1]
+    assert isinstance(described, RecordedRequest)
+    assert not kept.recording().exact, "what only pickle could carry is not the thing itself"
+    assert "remote object" in repr(m.unpack(described.frames))
+    nothing = made(limit=0)  # which turns it off
+    reset(nothing, [1, 2])
+    nothing.step(np.array([1, 2]))
+    assert nothing.recording() == Recording()
 
 
 @given(st.lists(st.sampled_from(["int64", "int32", "uint8"]), max_size=12))
@@ -201,22 +210,6 @@ def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch, space: Any) -> None:
     for _ in range(30):
         ask(kept, m.Reset(0, None, {"map": np.zeros(5000)}, np.array([True])))
     assert len(kept.recording().requests) <= 3
-
-
-def test_what_only_pickle_could_carry_is_described() -> None:
-    kept = made()
-    ask(kept, m.Call(0, "add", (object(),), {}))
-    [request] = kept.recording().requests
-    assert isinstance(request, RecordedRequest)
-    assert not kept.recording().exact
-    assert "remote object" in repr(m.unpack(request.frames))
-
-
-def test_nothing_is_kept_where_nothing_is_wanted() -> None:
-    kept = made(limit=0)
-    reset(kept, [1, 2])
-    kept.step(np.array([1, 2]))
-    assert kept.recording() == Recording()
 
 
 def test_after_a_transparent_restart_nobody_knows_before_all_are_seeded() -> None:

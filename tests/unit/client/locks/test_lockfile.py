@@ -228,9 +228,7 @@ def put(old: str, new: str) -> Callable[[str], str]:
     ("change", "said"),
     [
         (put('name = "one"', 'name = "one\\n--index-url http://evil"'), "not a normalized name"),
-        (put('name = "one"', 'name = "--index-url"'), "not a normalized name"),
         (put('\nversion = "1.0"', '\nversion = "1.0 \\\\\\n--pre"'), "no version"),
-        (put('\nversion = "1.0"', '\nversion = "1.0\\n-e ./evil"'), "no version"),
         (put(A, "a" * 63 + "\\n"), "no SHA-256"),
         (put("wheels = [", "wheelz = ["), "no list of 1 to"),
         (put("wheels = [", "vcs = { type = 'git' }\nwheels = ["), "only wheels of an index"),

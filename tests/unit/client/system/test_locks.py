@@ -34,14 +34,17 @@ def test_a_lock_is_held_until_its_context_ends(tmp_path: Path) -> None:
             pass
     assert waits == [1]
     assert not is_held(path)
-
-
-def test_the_holder_may_remove_the_file(tmp_path: Path) -> None:
-    path = tmp_path / "lock"
     with held(path):
-        path.unlink()
+        path.unlink()  # the next makes another, and holds that
         with held(path):
             assert is_held(path)
+    lock = LifeLock(tmp_path / "life")
+    assert is_held(tmp_path / "life")
+    for _ in range(2):
+        lock.release()
+    assert not is_held(tmp_path / "life")
+    SharedLock(tmp_path / "record").release()
+    assert not (tmp_path / "record").exists(), "no file is made, and none is needed"
 
 
 def test_an_interrupted_wait_leaves_no_descriptor(tmp_path: Path) -> None:
@@ -96,14 +99,6 @@ signal.pause()
         os.kill(int(said["holds"]), signal.SIGKILL)
 
 
-def test_a_life_lock_can_be_given_back(tmp_path: Path) -> None:
-    lock = LifeLock(tmp_path / "life")
-    assert is_held(tmp_path / "life")
-    for _ in range(2):
-        lock.release()
-    assert not is_held(tmp_path / "life")
-
-
 def test_what_several_share_none_has_alone(tmp_path: Path) -> None:
     """Until the last one gives it back, or has gone; the kernel says who they are."""
     path = tmp_path / "record"
@@ -141,8 +136,3 @@ def test_a_shared_lock_ends_with_its_object_and_not_with_a_fork(tmp_path: Path) 
     del lock
     with held(path):
         pass
-
-
-def test_nothing_is_shared_where_there_is_nothing(tmp_path: Path) -> None:
-    SharedLock(tmp_path / "record").release()
-    assert list(tmp_path.iterdir()) == []

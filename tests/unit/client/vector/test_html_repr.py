@@ -55,6 +55,9 @@ def test_spaces_and_layers_are_shown() -> None:
     text = Tags(environment_html(an_env(), layers)).text
     for word in ("3", "'arm': Box", "Discrete(4)", "seccomp", "open"):
         assert word in text
+    suites = Tags(suites_html({"kitchen": {0: an_env(), "lift": an_env("leg")}})).text
+    for word in ("kitchen", "0 ", "'lift'", "'leg': Box"):
+        assert word in suites
     assert "1 layer: seccomp" in text
     assert "cgroup" not in text
     assert "does not run" in Tags(environment_html(an_env(), [])).text
@@ -78,12 +81,6 @@ def test_a_rendered_frame_is_a_picture() -> None:
 )
 def test_what_is_no_frame_is_not_shown(rendered: object) -> None:
     assert environment_html(an_env(), [], rendered) == environment_html(an_env(), [])
-
-
-def test_each_task_has_its_line() -> None:
-    shown = Tags(suites_html({"kitchen": {0: an_env(), "lift": an_env("leg")}}))
-    for word in ("kitchen", "0 ", "'lift'", "'leg': Box"):
-        assert word in shown.text
 
 
 def test_names_are_text_and_no_markup() -> None:

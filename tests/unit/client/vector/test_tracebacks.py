@@ -85,19 +85,20 @@ def test_one_frame_of_ours_is_left(error: EnvHubError, asking: Callable[..., Non
 )
 def test_what_may_be_our_fault_keeps_its_frames(error: BaseException) -> None:
     assert frames(error) == WHOLE
+    assert (ask.__name__, ask.__doc__) == ("ask", "As a method of ours."), "it keeps its face"
 
 
-def test_a_variable_shows_them_all(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ENVHUB_TRACEBACK", "full")
-    assert frames(LoadError("no")) == WHOLE
-
-
-def test_the_log_has_them_once(caplog: pytest.LogCaptureFixture) -> None:
+def test_the_log_has_them_once(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At DEBUG, however many methods of ours it comes through; a variable shows them all."""
     with caplog.at_level(logging.DEBUG, "envhub_sandbox.errors"):
         frames(LoadError("no"), ask_by_another)
     [record] = [one for one in caplog.records if one.name == "envhub_sandbox.errors"]
     assert record.exc_info is not None
     assert [frame.name for frame in traceback.extract_tb(record.exc_info[2])] == WHOLE
+    monkeypatch.setenv("ENVHUB_TRACEBACK", "full")
+    assert frames(LoadError("no")) == WHOLE
 
 
 def test_what_the_caller_was_handling_is_kept() -> None:
@@ -125,11 +126,6 @@ def test_of_causes_only_ours_are_folded() -> None:
     assert caught.value.__cause__ is ours
     assert ours.__traceback__ is None
     assert theirs.__traceback__ is not None
-
-
-def test_a_function_keeps_its_face() -> None:
-    assert ask.__name__ == "ask"
-    assert ask.__doc__ == "As a method of ours."
 
 
 @pytest.mark.parametrize(
