@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+import threading
 from dataclasses import fields
 from pathlib import Path
 
@@ -15,6 +17,7 @@ from envhub_sandbox.check.many.results import Verdict
 from envhub_sandbox.cli.app import app, whole_command
 from envhub_sandbox.cli.check import list_run
 from envhub_sandbox.cli.check.check import check
+from envhub_sandbox.cli.check.deadline import DeadlineReached, deadline_alarm
 from envhub_sandbox.cli.check.options import OF_A_LIST, SETTINGS
 from envhub_sandbox.cli.shared.exits import Exit
 
@@ -177,3 +180,31 @@ def test_what_fails_counts_most(verdicts: list[Verdict], code: Exit) -> None:
     given = dict.fromkeys(one.name for one in fields(list_run.ListRun) if one.init)
     given |= {"of": dict(zip(listed, results, strict=True))}
     assert list_run.ListRun(**given).exit is code
+
+
+# --- ``--deadline`` interrupts what takes longer, whatever error is made of the interrupt
+
+
+@pytest.mark.parametrize("translates", [False, True])
+def test_what_takes_longer_is_interrupted(translates: bool) -> None:
+    """Whatever it waits for, and whatever it makes of the interrupt."""
+    before = signal.getsignal(signal.SIGALRM)
+    with pytest.raises(DeadlineReached), deadline_alarm(0.01):
+        wait(translates)
+    assert signal.getsignal(signal.SIGALRM) is before
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
+
+
+def wait(translates: bool) -> None:
+    try:
+        threading.Event().wait(60)
+    except KeyboardInterrupt as error:
+        if translates:
+            raise OSError("the download broke off") from error
+        raise
+
+
+def test_an_error_before_it_is_what_it_is() -> None:
+    with pytest.raises(OSError, match="its own"), deadline_alarm(60):
+        raise OSError("its own")
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)

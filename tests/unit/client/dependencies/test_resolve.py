@@ -26,7 +26,7 @@ from envhub_sandbox.errors import (
     ResolutionError,
 )
 from tests.support.packages.wheels import WORKERS, Index, make_wheel
-from tests.unit.docs.test_image import project
+from tests.unit.docs.test_distributions import project
 
 __all__ = ["project"]
 
