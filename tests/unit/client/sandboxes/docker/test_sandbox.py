@@ -1,4 +1,4 @@
-"""A container that is reached by a port, with a program for an engine that makes none."""
+"""A container by a port or by mounts, with a program for an engine that makes none."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from tests.unit.client.sandboxes.docker.test_run_arguments import DOCKER, PODMAN
 
 _KEY = "00" * 32
 _ENGINE = """#!{python} -S
-import json, sys
+import json, socket, sys
 given = dict(zip(sys.argv, sys.argv[1:]))
 what = "{what}"
 if sys.argv[1] == "port":
@@ -46,17 +46,24 @@ if sys.argv[1] == "port":
 if what == "fails":
     print("no such runtime")
     sys.exit(125)
+mounted = [word for word in sys.argv if '"dst=/run/envhub"' in word]
+if mounted and what != "shares nothing":
+    folder = mounted[0].split('"src=')[1].partition('"')[0]
+    sockets = [socket.socket(socket.AF_UNIX) for _ in range(2)]
+    for one, name in zip(sockets, ("server", "fds")):
+        one.bind(folder + "/" + name)
 said = {{
     "envhub-worker": "0", "profiles": ["container"], "landlock": 7, "capabilities": 0,
     "user": int(given["--user"].partition(":")[0]), "no_new_privileges": True, "seccomp": True,
-    "read_only": what != "is open", "devices": ["lo", "eth0"], "memory": int(given["--memory"]),
-    "pids": int(given["--pids-limit"]), "cpus": float(given["--cpus"]), "python": "",
+    "read_only": what != "is open", "devices": ["lo"] if mounted else ["lo", "eth0"],
+    "memory": int(given["--memory"]), "pids": int(given["--pids-limit"]),
+    "cpus": float(given["--cpus"]), "python": "",
 }}
-print("Unable to find something\\n" + json.dumps(
-    said if what == "has no key" else {{**said, "server_key": "{key}"}}
-), flush=True)
-if what != "stays":
-    sys.stdin.read()
+if not mounted:
+    print("Unable to find something")
+    said |= {{}} if what == "has no key" else {{"server_key": "{key}"}}
+print(json.dumps(said), flush=True)
+sys.stdin.read()
 """
 PUBLISHED = replace(
     WANTED, sockets="", snapshot="", readable=(), user=(65532, 65532), only_client=_KEY
@@ -72,17 +79,16 @@ def temporary(monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 @pytest.fixture
-def sandbox(tmp_path: Path) -> Callable[[str], PublishedContainer]:
+def sandbox(tmp_path: Path) -> Callable[..., Any]:
     """That of a repository whose engine does this."""
 
-    def made(what: str) -> PublishedContainer:
+    def made(what: str, *, mounts: bool = False) -> PublishedContainer | RepositoryContainer:
         program = tmp_path / "docker"
         program.write_text(_ENGINE.format(python=sys.executable, what=what, key=_KEY))
         program.chmod(0o755)
         engine = Engine("docker", str(program), "28", rootless=False, machine="aarch64", cpus=3)
-        return PublishedContainer(
-            DockerSandbox(published=True), engine, "sha256:0", tmp_path, Policy()
-        )
+        kind = RepositoryContainer if mounts else PublishedContainer
+        return kind(DockerSandbox(published=not mounts), engine, "sha256:0", tmp_path, Policy())
 
     return made
 
@@ -126,7 +132,7 @@ def test_the_report_says_that_there_is_a_network() -> None:
 
 
 def test_a_container_serves_until_it_is_given_back(
-    sandbox: Callable[[str], PublishedContainer], temporary: Path, tmp_path: Path
+    sandbox: Callable[..., Any], temporary: Path, tmp_path: Path
 ) -> None:
     """Its processors are the engine's; then its process and its folder are gone."""
     before = descendants()
@@ -149,34 +155,36 @@ def test_a_container_serves_until_it_is_given_back(
 
 
 @pytest.mark.parametrize(
-    ("what", "kind", "text"),
+    ("what", "mounts", "kind", "text"),
     [
-        ("fails", SandboxUnavailableError, "no such runtime"),
-        ("is open", SandboxUnavailableError, "container-files does not hold"),
-        ("has no key", WorkerStartupError, "build the image again"),
-        ("publishes elsewhere", SandboxUnavailableError, "does not publish"),
-        ("publishes nothing", SandboxUnavailableError, "does not publish"),
+        ("fails", False, SandboxUnavailableError, "no such runtime"),
+        ("is open", False, SandboxUnavailableError, "container-files does not hold"),
+        ("has no key", False, WorkerStartupError, "build the image again"),
+        ("publishes elsewhere", False, SandboxUnavailableError, "does not publish"),
+        ("publishes nothing", False, SandboxUnavailableError, "does not publish"),
+        ("fails", True, EnvHubError, "no such runtime"),
+        ("is open", True, EnvHubError, "container-files"),
+        ("shares nothing", True, EnvHubError, "whose socket this process cannot use"),
     ],
 )
 def test_what_does_not_start_leaves_nothing(
-    sandbox: Callable[[str], PublishedContainer],
+    sandbox: Callable[..., Any],
     temporary: Path,
     tmp_path: Path,
     what: str,
+    mounts: bool,
     kind: type[Exception],
     text: str,
 ) -> None:
     """And says why; a port that other machines could reach is none."""
     before = descendants()
     with pytest.raises(kind, match=text):
-        sandbox(what).acquire(tmp_path)
+        sandbox(what, mounts=mounts).acquire(tmp_path)
     assert not list(temporary.iterdir())
     assert eventually(lambda: not descendants() - before)
 
 
-def test_a_fork_does_not_keep_a_container(
-    sandbox: Callable[[str], PublishedContainer], tmp_path: Path
-) -> None:
+def test_a_fork_does_not_keep_a_container(sandbox: Callable[..., Any], tmp_path: Path) -> None:
     """It has no copy of the other end of its stdin, and does not end it either."""
     use = sandbox("serves").acquire(tmp_path)
     fork = os.fork()
@@ -211,43 +219,15 @@ def test_nothing_of_this_machine_is_mounted(tmp_path: Path) -> None:
         DockerSandbox(published=True).for_repository(tmp_path, policy, Runtime(""))
 
 
-# --- A container from its start to its end, with a program for an engine that makes none
+# --- with mounts, in place of a port
 
 
-_MOUNTED_ENGINE = """#!{python} -S
-import json, socket, sys
-given = dict(zip(sys.argv, sys.argv[1:]))
-if "{what}" == "fails":
-    print("no such runtime")
-    sys.exit(125)
-mount = next(word for word in sys.argv if '"dst=/run/envhub"' in word)
-folder = mount.split('"src=')[1].partition('"')[0]
-sockets = [socket.socket(socket.AF_UNIX) for _ in range(2)]
-for one, name in zip(sockets, ("server", "fds")):
-    "{what}" == "shares nothing" or one.bind(folder + "/" + name)
-print(json.dumps({{
-    "envhub-worker": "0", "profiles": ["container"], "landlock": 7, "capabilities": 0,
-    "user": int(given["--user"].partition(":")[0]), "no_new_privileges": True, "seccomp": True,
-    "read_only": "{what}" != "is open", "devices": ["lo"], "memory": int(given["--memory"]),
-    "pids": int(given["--pids-limit"]), "cpus": float(given["--cpus"]), "python": "",
-}}), flush=True)
-sys.stdin.read()
-"""
-
-
-def mounted(folder: Path, what: str) -> RepositoryContainer:
-    """That of a repository whose engine does this."""
-    program = folder / "docker"
-    program.write_text(_MOUNTED_ENGINE.format(python=sys.executable, what=what))
-    program.chmod(0o755)
-    engine = Engine("docker", str(program), "28", rootless=False)
-    return RepositoryContainer(DockerSandbox(), engine, "sha256:0", folder, Policy())
-
-
-def test_a_container_that_is_mounted_serves_until_it_is_given_back(tmp_path: Path) -> None:
+def test_a_container_that_is_mounted_serves_until_it_is_given_back(
+    sandbox: Callable[..., Any], tmp_path: Path
+) -> None:
     """Its layers are those that hold; then its processes and its folder are gone."""
     before = descendants()
-    use = mounted(tmp_path, "serves").acquire(tmp_path)
+    use = sandbox("serves", mounts=True).acquire(tmp_path)
     server = use.server
     assert server.runs
     assert server.profile == "container"
@@ -257,8 +237,8 @@ def test_a_container_that_is_mounted_serves_until_it_is_given_back(tmp_path: Pat
     assert eventually(lambda: descendants() <= before)
 
 
-def test_an_order_names_assets_as_they_lie_inside(tmp_path: Path) -> None:
-    place = replace(mounted(tmp_path, "serves"), assets=(Path("/c/a"), Path("/c/b")))
+def test_an_order_names_assets_as_they_lie_inside(sandbox: Callable[..., Any]) -> None:
+    place = replace(sandbox("serves", mounts=True), assets=(Path("/c/a"), Path("/c/b")))
     own, *others = (("models--org--r", "", ""), ("datasets--a--b", "/c/b", "asset-1"))
     copies = tuple((name, "a" * 40, ("main",), tree) for name, tree, _ in (own, *others))
     order = m.OpenJail("x", "", "", "/c/own", "env.py", {}, 1, hub_copies=copies)
@@ -266,23 +246,3 @@ def test_an_order_names_assets_as_they_lie_inside(tmp_path: Path) -> None:
     made = place.prepare(order, server, cast("Any", None), Deadline(1))
     assert made.snapshot == "/snapshots/this"
     assert [copy.tree for copy in made.repositories] == ["", "/snapshots/asset-1"]
-
-
-@pytest.mark.parametrize(
-    ("what", "said"),
-    [
-        ("fails", "no such runtime"),
-        ("shares nothing", "whose socket this process cannot use"),
-        ("is open", "container-files"),
-    ],
-)
-def test_a_start_that_fails_leaves_nothing(
-    tmp_path: Path, what: str, said: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    before, place = descendants(), tmp_path / "t"
-    place.mkdir()
-    monkeypatch.setattr("tempfile.tempdir", str(place))
-    with pytest.raises(EnvHubError, match=said):
-        mounted(tmp_path, what).acquire(tmp_path)
-    assert os.listdir(place) == []
-    assert eventually(lambda: descendants() <= before)
