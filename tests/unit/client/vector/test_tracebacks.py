@@ -36,6 +36,7 @@ def deep(error: BaseException, cause: BaseException | None) -> None:
 
 @short_traceback
 def ask(error: BaseException, cause: BaseException | None = None) -> None:
+    """As a method of ours."""
     deep(error, cause)
 
 
