@@ -75,10 +75,15 @@ def test_who_names_nothing_gets_the_short_selection(folder: Path, checkout: Path
     assert "the short selection names no case by 'gone' of test_it.py::test_two" in said
 
 
-@pytest.mark.parametrize("argument", ["--full", "test_it.py", "-kone or two or skipped or imports"])
-def test_what_is_asked_for_is_run(folder: Path, checkout: Path, argument: str) -> None:
-    """All of it, or a path, or an expression; each reason to skip is one line with its number."""
-    said = run(folder, checkout, argument)
+@pytest.mark.parametrize(
+    "arguments", ["--full -n 2", "test_it.py", "-k one or two or skipped or imports"]
+)
+def test_what_is_asked_for_is_run(folder: Path, checkout: Path, arguments: str) -> None:
+    """All of it, or a path, or an expression; by however many processes they were run.
+
+    Each reason to skip is one line, with the number of its tests.
+    """
+    said = run(folder, checkout, *arguments.split(" ", 1))
     assert "3 passed, 4 skipped" in said
     assert "short selection" not in said
     assert [line for line in said.splitlines() if "skipped:" in line] == SKIPPED
@@ -96,9 +101,3 @@ def test_what_is_the_same_is_not_repeated(folder: Path, checkout: Path) -> None:
         assert said in run(folder, checkout, "--full", f"--differs-by={by}")
     (folder / "test_it.py").write_text("import pytest\n" + text.replace("users", "user"))
     assert "same_for names user; CI repeats for" in run(folder, checkout, "--full")
-
-
-def test_each_reason_to_skip_is_one_line(folder: Path, checkout: Path) -> None:
-    """By however many processes they were run."""
-    lines = run(folder, checkout, "--full", "-n", "2").splitlines()
-    assert [line for line in lines if "skipped:" in line] == SKIPPED

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from envhub_sandbox.errors import PolicyError, SnapshotError, SnapshotTooLargeError
@@ -80,6 +80,7 @@ def test_ordinary_names_pass() -> None:
     check_listing_names(map(record, [".gitattributes", "A.py", "a.py", "my env/ж.txt", "..a"]), "t")
 
 
+@settings(max_examples=30)
 @given(st.lists(st.text(min_size=1, max_size=12), max_size=4))
 def test_accepted_names_stay_below_the_root(names: list[str]) -> None:
     root = Path("/store/tree")

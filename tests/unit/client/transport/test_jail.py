@@ -145,6 +145,6 @@ def test_endless_rings_hide_no_other(lanes: list[FakeLane]) -> None:
     """A hostile runner rings and never answers: another's answer is found, and the deadline is."""
     lanes[0].ring()  # and it stays readable
     assert found(lanes, 0.05) == []
-    looks = iter(range(50))
-    lanes[1].on_look = lambda: setattr(lanes[1], "silent", next(looks) < 40)
+    looks = iter(range(20))
+    lanes[1].on_look = lambda: setattr(lanes[1], "silent", next(looks) < 10)
     assert found(lanes, None) == [1]
