@@ -262,9 +262,7 @@ def test_a_wrapped_line_begins_no_command(
     assert obeyed(shown) == []
 
 
-def test_what_takes_long_has_lines_in_a_log(
-    capfd: pytest.CaptureFixture[str],
-) -> None:
+def test_what_takes_long_has_lines_in_a_log(capfd: pytest.CaptureFixture[str]) -> None:
     """It says what and for how long, and again; nothing of what was over before."""
     written: list[str] = []
 

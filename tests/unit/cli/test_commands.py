@@ -15,12 +15,7 @@ from typing import Any, cast
 import pytest
 from typer.testing import CliRunner
 
-from envhub_sandbox.cli import (
-    cache,
-    init,
-    inspect,
-    starter,
-)
+from envhub_sandbox.cli import cache, init, inspect, starter
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.cli.doctor.remote import examine
 from envhub_sandbox.cli.shared import exits, findings, host

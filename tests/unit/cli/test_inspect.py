@@ -184,8 +184,7 @@ def test_a_folder_is_held_against_what_the_hub_has(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "code"),
-    [([], 7), (["--fail-on", "note"], 1), (["--fail-on", "warning"], 0)],
+    ("options", "code"), [([], 7), (["--fail-on", "note"], 1), (["--fail-on", "warning"], 0)]
 )
 def test_the_exit_code_says_whether_a_pin_may_move(
     options: list[str], code: int, tmp_path: Path

@@ -35,11 +35,7 @@ def exported() -> dict[str, set[str]]:
     """Every sample that a server with a client exports, and its labels."""
     parser = pytest.importorskip("prometheus_client.parser", reason="prometheus-client is missing")
     facts = ServerFigures(
-        profile="strict",
-        permissions=Permissions(),
-        quotas=Quotas(),
-        state="/",
-        max_connections=1,
+        profile="strict", permissions=Permissions(), quotas=Quotas(), state="/", max_connections=1
     )
     share = vars(Client(requests={"step": 1}))
     told = {

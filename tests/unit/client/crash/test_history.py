@@ -50,7 +50,7 @@ def test_what_shards_were_sent_is_kept_as_it_was_asked() -> None:
     assert recording.exact
     found = [m.unpack(one.frames) for one in recording.requests if isinstance(one, RecordedRequest)]
     assert [one.operation for one in recording.requests if isinstance(one, RecordedRequest)] == [
-        *("reset", "setattr", "call", "callone"),
+        *("reset", "setattr", "call", "callone")
     ]
     reset_of_all, set_for_all, called, called_one = found
     assert isinstance(reset_of_all, m.Reset)

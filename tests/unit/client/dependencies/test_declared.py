@@ -38,7 +38,7 @@ def test_plain_requirements_get_through(tmp_path: Path) -> None:
         "# wanted\nnumpy>=2\n\n  # more\nminigrid[wfc]==3.0 # pinned\nfoo; python_version<'3.12'\n"
     )
     assert plain(repository(tmp_path, requirements__txt=text)) == [
-        *("numpy>=2", "minigrid[wfc]==3.0", 'foo; python_version < "3.12"'),
+        *("numpy>=2", "minigrid[wfc]==3.0", 'foo; python_version < "3.12"')
     ]
 
 

@@ -13,13 +13,7 @@ from envhub_sandbox.dependencies import resolve as resolving
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.dependencies.modules import MissingModule, guessed
 from envhub_sandbox.dependencies.packages import packages_for
-from envhub_sandbox.dependencies.request import (
-    AUTO,
-    DECLARED,
-    PackageRequest,
-    chosen,
-    request_of,
-)
+from envhub_sandbox.dependencies.request import AUTO, DECLARED, PackageRequest, chosen, request_of
 from envhub_sandbox.dependencies.resolve import Lock, Target
 from envhub_sandbox.errors import ResolutionError
 from envhub_sandbox.hub.snapshot import Snapshot, local
@@ -223,10 +217,7 @@ def test_another_release_is_tried_and_remembered(
 ) -> None:
     """The newest first, after our own; the next time it is known which."""
     stamps = {"/opt/3.98.0": [1, 1]}
-    monkeypatch.setattr(
-        *inside.telling_releases_apart(),
-        lambda one: stamps.get(one.path, [0, 0]),
-    )
+    monkeypatch.setattr(*inside.telling_releases_apart(), lambda one: stamps.get(one.path, [0, 0]))
     found = resolutions.resolution_for(request("a"))
     assert found.interpreter.version == "3.98.0"
     assert tried == [OURS.path, "/opt/3.99.1", "/opt/3.98.0"]

@@ -32,8 +32,7 @@ def frame(height: int = 4, width: int = 6, value: int = 7) -> Any:
 
 
 @pytest.mark.parametrize(
-    "rendered",
-    [(frame(), frame(2, 2)), [frame()], np.stack([frame(), frame(value=9)]), frame()],
+    "rendered", [(frame(), frame(2, 2)), [frame()], np.stack([frame(), frame(value=9)]), frame()]
 )
 def test_the_first_sub_environment_is_taken(rendered: Any) -> None:
     """From tuples, lists, stacked arrays, or an environment that draws all of them at once."""

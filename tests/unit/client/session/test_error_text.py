@@ -181,10 +181,7 @@ def test_our_own_frames_are_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyP
         for name in [name for name in sys.modules if name.split(".")[0] == "hub_env"]:
             del sys.modules[name]
     _, *lines = [line.strip() for line in failure.splitlines() if "File" in line]
-    assert lines == [
-        'File "env.py", line 3, in <module>',
-        'File "other.py", line 1, in <module>',
-    ]
+    assert lines == ['File "env.py", line 3, in <module>', 'File "other.py", line 1, in <module>']
 
 
 def advised(kind: str, message: str, network: str = "none") -> str:

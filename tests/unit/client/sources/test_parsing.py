@@ -87,7 +87,7 @@ def test_an_environment_of_its_own_brings_what_lies_in_it(tmp_path: Path) -> Non
     }
     told = undeclared(found, {}, packages, taken)
     assert [one.message.partition(",")[0] for one in told] == [
-        *("pytest is imported", "yaml is imported", "env.py"),
+        *("pytest is imported", "yaml is imported", "env.py")
     ]
     assert "line 9, which needs Box2D, and nothing declares it" in told[2].message
 
@@ -119,10 +119,7 @@ def weaker(folder: Path, *changes: tuple[str, str]) -> str:
 
 @pytest.mark.parametrize(
     ("bound", "spend"),
-    [
-        ("CPU_S = 0.5", "any(iter(int, 1))"),
-        ("MEMORY = 1 << 29", "bytes(1 << 30)"),
-    ],
+    [("CPU_S = 0.5", "any(iter(int, 1))"), ("MEMORY = 1 << 29", "bytes(1 << 30)")],
     ids=["time", "memory"],
 )
 def test_a_file_that_costs_too_much_is_not_read(

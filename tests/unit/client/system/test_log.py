@@ -23,10 +23,7 @@ def test_each_line_is_logged_and_shown(caplog: pytest.LogCaptureFixture) -> None
     outer, inner = list[str](), list[str]()
     with caplog.at_level(logging.INFO, log.DEPENDENCIES.name):
         with log.progress_shown_by(outer.append):
-            with (
-                log.progress_shown_by(inner.append),
-                log.progress_shown("org/repo") as tell,
-            ):
+            with log.progress_shown_by(inner.append), log.progress_shown("org/repo") as tell:
                 tell("resolving")
                 tell("x" * 300)
             with log.progress_shown("org/repo") as tell:
