@@ -199,8 +199,6 @@ _PAGE = "<head><meta http-equiv='Content-Security-Policy' content=\"default-src 
 @pytest.fixture(scope="module")
 def loads(checkout: Path) -> Any:
     spec = importlib.util.spec_from_file_location("loads", checkout / ".ci" / "loads.py")
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

@@ -61,7 +61,6 @@ def plugin(checkout: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
                 unpacked = folder / "again" / member.name
                 unpacked.parent.mkdir(parents=True, exist_ok=True)
                 extracted = packed.extractfile(member)
-                assert extracted is not None
                 unpacked.write_bytes(extracted.read())
     [root] = (folder / "again").iterdir()
     return built("wheel", root, folder / "wheel")

@@ -135,7 +135,6 @@ PRIVATE_NAMES_OF_OTHERS = {
 
 def folder(package: str) -> Path:
     spec = importlib.util.find_spec(package)
-    assert spec is not None
     assert spec.origin is not None
     return Path(spec.origin).parent
 

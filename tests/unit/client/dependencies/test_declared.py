@@ -23,7 +23,6 @@ def repository(folder: Path, **files: str) -> DeclaredPackages | None:
 
 
 def plain(found: DeclaredPackages | None) -> list[str]:
-    assert found is not None
     return [str(one) for one in found.wanted]
 
 
@@ -46,7 +45,6 @@ def test_hashes_stand_on_the_line_or_on_the_next(tmp_path: Path) -> None:
     """As pip and uv write them; the line that is named is the first."""
     text = f"numpy==2.0 --hash={HASH}\nfoo==1 \\\n    --hash={HASH} \\\n    --hash={HASH}\nbar\n"
     found = repository(tmp_path, requirements__txt=text)
-    assert found is not None
     assert [(len(one.hashes), one.where) for one in found.wanted] == [
         (1, "line 1 of requirements.txt"),
         (2, "line 2 of requirements.txt"),
@@ -118,7 +116,6 @@ def test_further_files_of_the_repository_are_read(tmp_path: Path) -> None:
     (tmp_path / "more/held.txt").write_text("foo<2\n-r deeper.txt\n")
     (tmp_path / "more/deeper.txt").write_text("bar<3\n")
     found = repository(tmp_path, requirements__txt="a\n-r more/base.txt\n")
-    assert found is not None
     assert [str(one) for one in found.wanted] == ["a", "numpy"]
     assert [(str(one), one.where) for one in found.constraints] == [
         ("foo<2", "line 1 of more/held.txt"),
@@ -180,7 +177,6 @@ def test_the_most_particular_file_counts(tmp_path: Path) -> None:
 
     def found(**files: str) -> tuple[str, list[str], str]:
         made = repository(tmp_path, **files)
-        assert made is not None
         return made.source, plain(made), made.python
 
     project = "[project]\nname = 'x'\nrequires-python = '>=3.11'\ndependencies = ['of-project']\n"

@@ -90,12 +90,10 @@ def test_it_is_installed_and_told(index: Index, tmp_path: Path) -> None:
     found = snapshot(tmp_path / "r", "import chess" + MAKE, requirements__txt="declared\n")
     with pytest.warns(UserWarning, match=r"chess is installed, .*env\.py, line 1"):
         first = packages_for(found, AUTO)
-    assert first is not None
     assert {"declared==1.0", "chess==1.0"} <= set(first.facts["packages"])
     assert [one["module"] for one in first.facts["inferred"]] == ["chess"]
     assert packages_for(found, AUTO) == first
     strict = packages_for(found, DECLARED)
-    assert strict is not None
     assert "chess==1.0" not in strict.facts["packages"]
     assert "inferred" not in strict.facts
 
@@ -105,7 +103,6 @@ def test_what_a_declared_package_brings_is_declared(index: Index, tmp_path: Path
     make_wheel(index.folder, "opencv-contrib-python")
     found = snapshot(tmp_path / "r", "import cv2" + MAKE, requirements__txt="declared\n")
     resolved = packages_for(found, chosen({}, None)[0])
-    assert resolved is not None
     assert "inferred" not in resolved.facts
 
 
@@ -136,7 +133,6 @@ def test_a_guess_never_stands_in_the_way(
     make_wheel(index.folder, "declared")
     found = snapshot(tmp_path / "r", "import chess" + MAKE, requirements__txt="declared\n")
     resolved = packages_for(found, AUTO)
-    assert resolved is not None
     assert "declared==1.0" in resolved.facts["packages"]
     assert "inferred" not in resolved.facts
     assert packages_for(snapshot(tmp_path / "s", "import chess" + MAKE), AUTO) is None
@@ -165,7 +161,6 @@ def test_the_caller_has_the_last_word(
 ) -> None:
     found = snapshot(tmp_path / "r", "import chess" + MAKE, requirements__txt="a\n")
     request = request_of(found, chosen(dependencies, None)[0])
-    assert request is not None
     assert list(map(str, request.wanted)) == wanted
     assert [one.module for one in request.guesses] == guessed
 

@@ -92,7 +92,6 @@ def test_files_that_git_does_not_look_at_are_named(repository: GitRepository) ->
 
     def held_back() -> tuple[str, ...]:
         here = LocalFolder.at(repository.folder).checkout
-        assert here is not None
         return here.held_back
 
     repository.commit({"a.py": "1", "b.py": "1", "far/c.py": "1", "near/d.py": "1"})
@@ -165,7 +164,6 @@ def test_conversions_by_git_are_named(repository: GitRepository) -> None:
     names = ("a.py", "b.txt", "c.bin", "d.sh", "e.md")
     repository.commit({**dict.fromkeys(names, ""), ".gitattributes": attributes})
     here = LocalFolder.at(repository.folder)
-    assert here.checkout is not None
     assert list(here.checkout.converted(names)) == [
         ("a.py", "ident=set"),
         ("b.txt", "working-tree-encoding=UTF-16"),

@@ -62,7 +62,6 @@ def test_what_another_puts_there_meanwhile_is_not_damaged(
 
     monkeypatch.setattr(os.path, "lexists", appearing)
     found = store.load(published)
-    assert found is not None
     assert [one.path for one in found] == sorted(CONTENT)
 
 

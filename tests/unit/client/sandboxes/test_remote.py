@@ -201,7 +201,6 @@ def test_it_is_asked_until_they_are_made(server: LyingServer) -> None:
     says(server, half, half, packages("made", "k1", inferred=inferred, **FACTS))
     lines: list[str] = []
     made, target = make(server, lines)
-    assert made is not None
     own = {"module": "cv2", "requirement": "opencv-python", "where": "env.py, line 1"}
     assert made.facts == {"lock": "abc", "packages": ["numpy==2.0"], "inferred": [own]}
     assert target.orders == {"k1": order_of(REQUEST)}

@@ -88,7 +88,6 @@ signal.pause()
         stdout=subprocess.PIPE,
         text=True,
     ) as process:
-        assert process.stdout is not None
         said = dict((*process.stdout.readline().split(), "")[:2] for _ in range(2))
         assert set(said) == {"here", "holds"}
         assert path.read_text() == "who"
@@ -105,7 +104,6 @@ def test_what_several_share_none_has_alone(tmp_path: Path) -> None:
     path.touch()
     words = [sys.executable, "-c", SHARE, str(path)]
     with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
-        assert process.stdout is not None
         assert process.stdout.readline() == b"held\n"
         mine = SharedLock(path)
         assert set(sharers(path)) == {os.getpid(), process.pid}

@@ -194,11 +194,9 @@ def test_locks_hold_between_processes(system: str, tmp_path: Path) -> None:
         return subprocess.Popen(command(system, "-c", program, tmp_path), text=True, **pipes)
 
     with started(_HOLDS) as holder:
-        assert holder.stdout is not None
         assert holder.stdout.readline() == "holds\n"
         with started(_ASKS) as asking:
             assert asking.stdin is not None
-            assert asking.stdout is not None
             assert asking.stdout.readline() == "[True, True, True] words\n"
             holder.kill()
             holder.wait()
@@ -212,7 +210,6 @@ def test_a_child_on_macos_ends_with_its_parent() -> None:
     parent = subprocess.Popen(
         command("darwin", "-c", _STARTS, _FOLLOWS), stdout=subprocess.PIPE, text=True
     )
-    assert parent.stdout is not None
     with parent:
         child, fork = map(int, parent.stdout.readline().split())
         assert psutil.pid_exists(child)

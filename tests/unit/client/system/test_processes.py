@@ -62,7 +62,6 @@ def family(how: str, folder: Path) -> Iterator[tuple[subprocess.Popen[str], list
     """A parent, and who was started by it and below that."""
     command = [sys.executable, "-I", "-c", _PARENT, how, _CHILD]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=folder) as parent:
-        assert parent.stdout is not None
         below = [psutil.Process(int(word)) for word in parent.stdout.readline().split()]
         try:
             assert len(below) == 2

@@ -70,12 +70,9 @@ def frames(error: BaseException, asking: Callable[..., None] = ask) -> list[str]
 def test_one_frame_of_ours_is_left(error: EnvHubError, asking: Callable[..., None]) -> None:
     """Which pytest hides, and whose line says how to see the others."""
     assert frames(error, asking) == ["asked"]
-    assert error.__traceback__ is not None
     last = error.__traceback__.tb_next
-    assert last is not None
     assert last.tb_frame.f_locals["__tracebackhide__"] is True
     [*_, shown] = traceback.extract_tb(error.__traceback__)
-    assert shown.line is not None
     assert shown.line.endswith("# ENVHUB_TRACEBACK=full shows where")
 
 
@@ -96,7 +93,6 @@ def test_the_log_has_them_once(
     with caplog.at_level(logging.DEBUG, "envhub_sandbox.errors"):
         frames(LoadError("no"), ask_by_another)
     [record] = [one for one in caplog.records if one.name == "envhub_sandbox.errors"]
-    assert record.exc_info is not None
     assert [frame.name for frame in traceback.extract_tb(record.exc_info[2])] == WHOLE
     monkeypatch.setenv("ENVHUB_TRACEBACK", "full")
     assert frames(LoadError("no")) == WHOLE

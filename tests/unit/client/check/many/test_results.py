@@ -150,7 +150,6 @@ def test_one_run_has_a_folder(folder: Path) -> None:
     )
     command = [sys.executable, "-I", "-c", code, str(folder)]
     with subprocess.Popen(command, stdout=subprocess.PIPE) as other:
-        assert other.stdout is not None
         try:
             assert other.stdout.readline() == b"held\n"
             with pytest.raises(FolderError, match="another run"), kept.held():

@@ -149,7 +149,6 @@ def test_what_is_kept_is_found_again(wheel: Path) -> None:
     assert kept == wheels.recall(SOURCE, PYTHON)
     assert kept.read_bytes() == b"a wheel"
     origin = wheels.describe(kept)
-    assert origin is not None
     assert origin.source == replace(SOURCE, url="https://index/toy-1.0.tar.gz", where="")
     assert "secret" not in (kept.parent / "built.json").read_text()
     assert wheels.recall(replace(SOURCE, sha256="b" * 64), PYTHON) is None

@@ -243,7 +243,6 @@ def test_each_place_runs_on_its_own() -> None:
     assert made.facts["places"] == {"here": {"lock": "a"}, "there": {"lock": "b"}}
     there.will_make(PackageSet("name", {"lock": "a"}))
     made = packages.make(_request(), print)
-    assert made is not None
     assert made.facts == {"lock": "a"}
 
 

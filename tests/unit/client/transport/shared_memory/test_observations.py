@@ -113,7 +113,6 @@ def test_a_hostile_byte_makes_no_third_boolean(
 
 def test_received_memory_is_shared_with_nobody() -> None:
     layout = slabs.observation_layout(BOX, COUNT, 1)
-    assert layout is not None
     received = memoryview(bytearray(layout.total_bytes))
     slab = ObservationSlab(BOX, layout, received)
     slabs.view(received, layout.leaves[0])[...] = 3

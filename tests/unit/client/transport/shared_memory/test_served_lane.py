@@ -183,7 +183,6 @@ def slab(outcome: int = slabs.DONE, reward: float = 0, said: m.Message | None = 
     """What the server sends of one runner's slabs."""
     infos = b"" if said is None else bytes(m.pack(said)[0])
     layout = slabs.observation_layout(SMALL, 1, 1)
-    assert layout is not None
     batch = bytearray(layout.total_bytes)
     struct.pack_into("<d", batch, layout.results, reward)
     return [struct.pack("<QQ", outcome, len(infos)) + infos + batch]
