@@ -159,7 +159,7 @@ def test_nothing_is_folded(capsys: pytest.CaptureFixture[str], monkeypatch: Any)
     monkeypatch.setenv("COLUMNS", "20")
     words = "word " * 100 + "end"
     out(words)
-    say(words)
+    say(words, style="red")
     show_rows([("name", "n"), (words[:150], "1"), ("short", "10")], right=(1,))
     show("in", "/cache\nof them", stderr=True)
     shown = capsys.readouterr()

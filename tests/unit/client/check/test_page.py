@@ -73,6 +73,8 @@ def test_what_was_played_can_be_seen() -> None:
     told = ("Return, component 1 of 2, per episode", "mean 1", "Length of episodes", "Memory")
     for words in (*told, "12.3 ms", "3 GiB"):
         assert words in found.text
+    [plots] = re.findall(r"\.plots \{([^}]*)\}", page(made, []))
+    assert "auto-fill" in plots, "a lone plot is as large as one of several"
 
 
 def test_pictures_are_no_reason_for_a_page_of_any_size() -> None:

@@ -138,6 +138,7 @@ def test_honest_code_is_not_named(text: str, tmp_path: Path) -> None:
         ("notes.txt", "\u5f3a\u5316 \u5b66\u4e60".encode(), "text", ""),
         ("long.txt", ("\u5f3a" * 5_000).encode(), "text", ""),
         ("turned.md", "a\u2066b".encode(), "text", "source-hidden"),
+        ("mixed.md", "p\u0430ss".encode(), "text", ""),
         ("a.md", b"\xff\xfe", "binary", ""),
         ("a.md", b"a\0b", "binary", ""),
     ],

@@ -248,7 +248,12 @@ def test_what_a_killed_maker_started_is_waited_for(index: Index, tmp_path: Path)
     assert left_behind() == []
 
 
-def test_what_was_left_half_made_is_collected(index: Index, tmp_path: Path) -> None:
+def test_one_that_is_used_stays_and_the_answer_names_its_user(index: Index, tmp_path: Path) -> None:
+    """By a server that could start a jail, or a client whose environment could.
+
+    What is half made is collected, but not what somebody is making. Where others can write nothing
+    is used: somebody could have put another package in its place.
+    """
     env = made(repository(tmp_path / "repo"))
     half = environments.root() / ".building-0123-x"
     (half / "packages").mkdir(parents=True)
@@ -257,20 +262,17 @@ def test_what_was_left_half_made_is_collected(index: Index, tmp_path: Path) -> N
     assert environments.every() == [env], "nobody removes it under its maker's hands"
     environments.remove_abandoned()
     assert left_behind() == []
-    assert environments.every() == [env]
-
-
-def test_one_that_is_used_stays_and_the_answer_names_its_user(index: Index, tmp_path: Path) -> None:
-    """By a server that could start a jail, or a client whose environment could."""
-    env = made(repository(tmp_path / "repo"))
     used = SharedLock(env.home / RECORD)
     why = environments.remove(env)
     assert f"{env.key[:12]} is in use by process {os.getpid()} (" in why
     assert environments.every() == [env]
     used.release()
+    environments.root().chmod(0o777)
+    with pytest.raises(DependencyError, match="other users"):
+        made(tmp_path / "repo")
+    environments.root().chmod(0o755)
     assert environments.remove(env) == ""
-    assert environments.every() == []
-    assert left_behind() == []
+    assert (environments.every(), left_behind()) == ([], [])
     assert made(tmp_path / "repo").home == env.home
 
 
@@ -400,15 +402,6 @@ def test_a_disk_that_fills_up_ends_it(
         made(folder)
     assert environments.every() == []
     assert left_behind() == []
-
-
-def test_where_others_can_write_nothing_is_used(index: Index, tmp_path: Path) -> None:
-    folder = repository(tmp_path / "repo")
-    made(folder)
-    environments.root().chmod(0o777)
-    with pytest.raises(DependencyError, match="other users"):
-        made(folder)
-    environments.root().chmod(0o755)
 
 
 def test_a_script_lies_where_the_others_do(index: Index, tmp_path: Path) -> None:
