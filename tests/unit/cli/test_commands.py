@@ -56,6 +56,7 @@ _REFUSED = [
     ("doctor --profile gone", 2, "it is one of strict, no-userns, container"),
     ("doctor tcp://host", 2, "a remote server is tcp://HOST:PORT"),
     ("doctor tcp://127.0.0.1:9", 6, "another program could imitate that server"),
+    ("init a--b", 2, "is not a valid name on the Hub"),
     ("inspect ./gone", 3, _NO_FOLDER),
     ("inspect ./gone --sarif x", 2, "--sarif means nothing here"),
     ("inspect ./gone --static --render", 2, "No such option"),

@@ -119,6 +119,7 @@ def test_every_option_is_handed_on_or_about_the_list() -> None:
         ("--all list --output out --memory much", "takes a size"),
         ("--all list --output out --max-memory 4G", "is too little"),
         ("--all nowhere --output out", "cannot be read"),
+        ("--all list --output out --policy nowhere.toml", "cannot be read"),
         ("--all list --output .", "has other files"),
         ("--all list --output env/out", "is inside the repository that is checked, ./env (line 2"),
         ("--all list --output out --policy env/x", "--policy env/x is inside the repository"),

@@ -102,6 +102,10 @@ def test_a_bundle_comes_back(tmp_path: Path) -> None:
         (("history", "requests", 1, "of"), "../../../etc/passwd"),
         (("history", "requests", 1, "of"), "actions-object.npy"),
         (("history", "requests"), [{"operation": "reset"}] * 2),
+        (("label",), 5),
+        (("task", "num_envs"), "2"),
+        (("history", "requests", 1, "steps"), [0, 4]),
+        (("history", "requests"), []),
         (("history", "dropped"), True),
     ],
 )

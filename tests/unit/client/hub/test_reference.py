@@ -52,6 +52,7 @@ WORKING = {
     f"{SITE}/datasets/org/repo/blob/refs%2Fpr%2F3/a.py": HubRef(
         "org/repo", "refs/pr/3", "a.py", "dataset"
     ),
+    f"{SITE}/org/repo/tree/refs/pr/3": HubRef("org/repo", "refs/pr/3"),
     f"{SITE}/org/repo/commit/{COMMIT}": HubRef("org/repo", COMMIT),
     # hf:// as in huggingface_hub's file system, and with a colon.
     "hf://org/repo": HubRef("org/repo"),
@@ -74,6 +75,7 @@ REFUSED = [
     ("spaces/org/repo/envs", "after a colon", "'spaces/org/repo:envs/env.py'"),
     ("org//repo", "one slash", "owner/name"),
     ("org/repo:../a.py", "'..'", "inside the repository"),
+    ("org/repo@v1:a/../b.py", "'..'", "'org/repo@v1:b.py'"),
     ("org/repo:/a.py", "absolute", "'org/repo:a.py'"),
     ("org/repo:envs\\a.py", "backslashes", "'org/repo:envs/a.py'"),
     ("org/repo:C:/a.py", "drive letter", "inside the repository"),

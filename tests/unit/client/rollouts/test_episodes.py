@@ -193,6 +193,7 @@ def test_rewards_that_cannot_be_counted_are_refused(rewards: Any) -> None:
         ({"is_success": "no"}, None),
         ({"is_success": [[], []], "_is_success": 3}, None),
         ({}, None),
+        ([], None),
     ],
 )
 def test_success_is_read_where_it_is_stated(infos: Any, expected: bool | None) -> None:
