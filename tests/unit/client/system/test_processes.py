@@ -17,6 +17,7 @@ import pytest
 from envhub_sandbox.system import processes
 from envhub_sandbox.system.processes import OwnerProcess, fork_error_text
 from envhub_sandbox.system.threads import Calls
+from tests.support.command_line import runs
 from tests.support.processes import eventually
 
 _PARENT = """
@@ -70,12 +71,6 @@ def family(how: str, folder: Path) -> Iterator[tuple[subprocess.Popen[str], list
             for one in (parent, *below):
                 with contextlib.suppress(psutil.NoSuchProcess):
                     one.kill()
-
-
-def runs(process: psutil.Process) -> bool:
-    with contextlib.suppress(psutil.NoSuchProcess):
-        return process.is_running() and process.status() != psutil.STATUS_ZOMBIE
-    return False
 
 
 @pytest.mark.parametrize("how", ["high", "at once", "stubborn"])

@@ -13,6 +13,7 @@ import pytest
 
 from envhub_sandbox.check.many.judgements import Outcome, judgements
 from envhub_sandbox.errors import WorkerStartupError
+from tests.support.command_line import runs
 from tests.support.processes import eventually
 
 _PROGRAMS = {
@@ -115,9 +116,3 @@ def test_whoever_stops_leaves_none(tmp_path: Path) -> None:
     assert len(below) == 3, "the control: two of ours, and one of theirs"
     found.close()
     assert eventually(lambda: not any(map(runs, below)))
-
-
-def runs(process: psutil.Process) -> bool:
-    with contextlib.suppress(psutil.NoSuchProcess):
-        return process.is_running() and process.status() != psutil.STATUS_ZOMBIE
-    return False
