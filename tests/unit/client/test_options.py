@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-import envhub_sandbox
 from envhub_sandbox import Limits, Policy, Timeouts, make_env
 from envhub_sandbox.cli.app import whole_command
 from envhub_sandbox.errors import HubReferenceError, PolicyError, RepositoryUnavailableError
@@ -33,6 +32,7 @@ from envhub_sandbox.settings.options import (
 from envhub_worker.protocol.messages import CONFIG_CLASS
 from tests.support import inside
 from tests.support.samples import sample
+from tests.unit.docs.test_imports import modules
 
 MIB = 1 << 20
 
@@ -151,7 +151,6 @@ def test_a_folder_written_like_a_repository_gets_a_hint(
 _COMMANDS = {name for one in OPTIONS.values() for name in one.command.split()}
 _ALL = on_command_line(_COMMANDS)
 _GROUPS: dict[str, Any] = {"policy": Policy, "limits": Limits, "timeouts": Timeouts}
-_ROOT = Path(next(iter(envhub_sandbox.__path__)))
 
 
 @pytest.mark.parametrize(
@@ -226,13 +225,13 @@ def test_no_error_has_a_spelling_of_its_own() -> None:
     names = "|".join({one.argument for one in OPTIONS.values()} - {"copy", "token", "n_envs"})
     written = re.compile(rf"(?<![-\w.])(?:{names})=(?:['\"{{.]|[A-Z]{{2}})|Policy\(|Timeouts\(")
     found = []
-    for path in _ROOT.rglob("*.py"):
-        if path.name in ("starter.py", "options.py", "inprocess.py", "make_env.py", "app.py"):
+    ours = ("starter", "options", "inprocess", "make_env", "app")
+    for name, module in modules().items():
+        if name.startswith("envhub_worker") or name.endswith(tuple(f".{one}" for one in ours)):
             continue
-        module = ast.parse(path.read_text())
         docs = {id(one.value) for one in ast.walk(module) if isinstance(one, ast.Expr)}
         found += [
-            f"{path.name}:{one.lineno}: {one.value}"
+            f"{name}:{one.lineno}: {one.value}"
             for one in ast.walk(module)
             if isinstance(one, ast.Constant) and isinstance(one.value, str)
             if id(one) not in docs and written.search(one.value)
