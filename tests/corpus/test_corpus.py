@@ -21,7 +21,7 @@ _ELSEWHERE = {
     "lerobot": "test_findings.py",
     "licence": "test_findings.py",
     "limits-reached": "test_judged.py",
-    "pinned": "test_survey_clones.py",
+    "pinned": "test_survey_checkouts.py",
     "source-ignored": "test_survey_checkouts.py",
     "source-link": "test_survey.py",
     "source-uncommitted": "test_survey_checkouts.py",

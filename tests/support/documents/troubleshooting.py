@@ -11,6 +11,7 @@ import ast
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -156,7 +157,7 @@ class Message:
 
 def document() -> str:
     """What the file has to hold."""
-    parts, found = list[str](), list(messages())
+    parts, found = list[str](), messages()
     texts = {one.text for one in found}
     whole = [one for one in found if not any(one.text in text != one.text for text in texts)]
     for title, _, more in _PARTS:
@@ -177,14 +178,17 @@ def _part(file: str) -> str:
     )[1]
 
 
-def messages() -> Iterator[Message]:
+@cache
+def messages() -> list[Message]:
     """Every message of the two packages that names a cure."""
+    found = []
     for package in (envhub_sandbox, envhub_worker):
         root = Path(next(iter(package.__path__)))
         for path in sorted(root.rglob("*.py")):
             place = f"{package.__name__}/{path.relative_to(root)}"
             if place not in _NO_FILES:
-                yield from of_source(path.read_text(), place)
+                found += of_source(path.read_text(), place)
+    return found
 
 
 def of_source(source: str, place: str) -> Iterator[Message]:

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import ast
-import inspect
+import os
 import re
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +19,10 @@ from typer.testing import CliRunner
 
 import envhub_sandbox.cli
 from envhub_sandbox.cli.app import app, functions, whole_command
-from envhub_sandbox.cli.shared.console import neutralised, out, say, show, show_rows
+from envhub_sandbox.cli.shared import console
+from envhub_sandbox.cli.shared.console import guarded, neutralised, out, say, show, show_rows
 from tests.support.output.ci import obeyed
+from tests.support.processes import eventually
 
 _WIDTH = 80
 
@@ -63,7 +65,6 @@ def test_the_list_of_commands_has_the_first_line_of_each(name: str) -> None:
 
 
 def test_a_list_of_commands_imports_none() -> None:
-    """Nor what they need."""
     shown = (
         "import sys\nfrom typer.testing import CliRunner\nfrom envhub_sandbox.cli.app import app\n"
         "assert 'doctor' in CliRunner().invoke(app, ['--help']).output\n"
@@ -73,35 +74,13 @@ def test_a_list_of_commands_imports_none() -> None:
 
 
 @pytest.mark.parametrize("name", _COMMANDS)
-def test_no_line_of_a_help_ends_before_it_is_full(name: str) -> None:
-    """A sentence goes on where the terminal ends, and not where the source does."""
-    lines = [line.strip() for line in help_of(name).splitlines()]
-    documented = inspect.cleandoc(_COMMANDS[name].callback.__doc__).split("\n\n")
-    for paragraph in documented:
-        words = re.sub(r"\[/?bold\]", "", paragraph).split()
-        first = next(at for at, line in enumerate(lines) if line.split()[:3] == words[:3])
-        left = words
-        for line in lines[first:]:
-            shown = line.split()
-            assert left[: len(shown)] == shown
-            left = left[len(shown) :]
-            if not left:
-                break
-            assert len(line) + 1 + len(left[0]) > _WIDTH - 2, f"{line!r} has room for {left[0]!r}"
-
-
-@pytest.mark.parametrize("name", _COMMANDS)
 def test_a_help_has_all_words_of_an_option(name: str) -> None:
-    """Brackets as well: they are no markup."""
     shown = plain(help_of(name, 1_000))
     texts = [one.help for one in _COMMANDS[name].params if getattr(one, "help", None)]
     for text in texts:
         assert " ".join(text.split()) in shown
-
-
-def test_brackets_are_in_some_help() -> None:
-    """The control of the one above."""
-    assert any("[limits]" in (one.help or "") for one in _COMMANDS["check"].params[1:])
+    with_brackets = [one.help or "" for one in _COMMANDS["check"].params[1:]]
+    assert any("[limits]" in one for one in with_brackets), "the control"
 
 
 @pytest.mark.parametrize(
@@ -119,7 +98,6 @@ def test_brackets_are_in_some_help() -> None:
     ],
 )
 def test_values_are_completed(words: str, completed: set[str]) -> None:
-    """As bash asks for them."""
     typed = f"envhub {words}"
     variables = {
         "_ENVHUB_COMPLETE": "complete_bash",
@@ -160,6 +138,8 @@ def test_a_command_in_pieces_is_none(pieces: list[str]) -> None:
     assert obeyed(whole) == []
     if not obeyed("".join(pieces)):
         assert whole == "".join(pieces)
+    for text in ("a::b", "see x::y\n  a ::b", "# [x]", "[x]", "#", "section_start"):
+        assert neutralised(text) == text, "in the middle of a line it is a name"
     runner = typer.Typer(cls=type(typer.main.get_command(app)))
 
     @runner.command("a")
@@ -174,21 +154,16 @@ def test_a_command_in_pieces_is_none(pieces: list[str]) -> None:
     assert obeyed(shown) == []
 
 
-def test_text_in_the_middle_of_a_line_stays() -> None:
-    """``a::b`` is a name, and ``::`` in a path is no command."""
-    for text in ("a::b", "see x::y\n  a ::b", "# [x]", "[x]", "#", "section_start"):
-        assert neutralised(text) == text
-
-
 def test_nothing_is_folded(capsys: pytest.CaptureFixture[str], monkeypatch: Any) -> None:
     """Whatever the number of columns is said to be: what is folded begins lines."""
     monkeypatch.setenv("COLUMNS", "20")
     words = "word " * 100 + "end"
     out(words)
-    say(words)
+    say(words, style="red")
     show_rows([("name", "n"), (words[:150], "1"), ("short", "10")], right=(1,))
+    show("in", "/cache\nof them", stderr=True)
     shown = capsys.readouterr()
-    assert shown.err == f"{words}\n"
+    assert shown.err == f"{words}\nin           /cache of them\n"
     first, head, long, short = shown.out.splitlines()
     assert first == words
     assert head.split() == ["name", "n"]
@@ -220,7 +195,6 @@ def test_a_terminal_wraps_below_the_beginning(
     ],
 )
 def test_wrong_usage_is_one_message(words: list[str], says: str) -> None:
-    """As every other error is: without a box."""
     done = CliRunner().invoke(app, ["run", *words])
     assert (done.exit_code, done.stdout) == (2, "")
     assert done.stderr == f"Error: {says}\n"
@@ -239,3 +213,65 @@ def test_one_place_writes() -> None:
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("rich"):
                 found.append(f"{path.name}:{node.lineno}: {node.module}")
     assert found == []
+
+
+# --- How a command prints: what is printed is text and no more, whoever chose it
+
+
+_ROWS = [("layer", "what it does"), ("memory", "8192 MiB, counted by the kernel; not file-locks")]
+
+
+@pytest.fixture
+def shown_in_a_terminal(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> Callable[[Sequence[Sequence[str]]], list[str]]:
+    """The lines of a table in a terminal of 32 columns, without colours."""
+
+    def shown(rows: Sequence[Sequence[str]]) -> list[str]:
+        monkeypatch.setenv("TERM", "dumb")
+        monkeypatch.setattr(sys.stdout, "isatty", lambda: True)
+        monkeypatch.setattr("shutil.get_terminal_size", lambda: os.terminal_size((32, 40)))
+        show_rows(rows)
+        return capsys.readouterr().out.splitlines()
+
+    return shown
+
+
+def test_a_terminal_wraps_the_last_column_below_itself(
+    shown_in_a_terminal: Callable[..., list[str]],
+) -> None:
+    assert shown_in_a_terminal(_ROWS) == [
+        "layer   what it does",
+        "memory  8192 MiB, counted by the",
+        "        kernel; not file-locks",
+    ]
+    narrow = [("x" * 20, "one two three four five")]
+    assert len(shown_in_a_terminal(narrow)) == 1, "the terminal wraps it by itself"
+
+
+def test_a_wrapped_line_begins_no_command(
+    shown_in_a_terminal: Callable[..., list[str]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A CI system skips blanks; the control is the same without the guard."""
+    rows = [("a", "a layer of a hostile server ::error::forged")]
+    assert obeyed("\n".join(shown_in_a_terminal(rows))) == ["::error::forged"]
+    with guarded():
+        show_rows(rows)
+    shown = capsys.readouterr().out
+    assert len(shown.splitlines()) == 2
+    assert obeyed(shown) == []
+
+
+def test_what_takes_long_has_lines_in_a_log(capfd: pytest.CaptureFixture[str]) -> None:
+    """It says what and for how long, and again; nothing of what was over before."""
+    written: list[str] = []
+
+    def lines() -> list[str]:
+        written.append(capfd.readouterr().err)
+        return "".join(written).splitlines()
+
+    with console.ProgressBar(quiet=True, long_s=0.05) as bar:
+        bar.begin("brief")
+        bar.begin("a / 0: ::error::8 resets, round 1 of 4")
+        assert eventually(lambda: len(lines()) >= 2)
+    assert all("a / 0: " in line and line.endswith(" so far") for line in lines())

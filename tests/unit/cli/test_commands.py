@@ -3,36 +3,27 @@
 from __future__ import annotations
 
 import ast
-import inspect as python
 import json
 import os
 import shlex
 import warnings
+from collections.abc import Callable, Iterator
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import pytest
 from typer.testing import CliRunner
 
-from envhub_sandbox.check.checks import Severity
-from envhub_sandbox.cli import (
-    cache,
-    diff,
-    image,
-    init,
-    inspect,
-    lock,
-    prefetch,
-    push,
-    replay,
-    run,
-    starter,
-)
-from envhub_sandbox.cli.app import app, whole_command
-from envhub_sandbox.cli.doctor import doctor
+from envhub_sandbox.cli import cache, init, inspect, starter
+from envhub_sandbox.cli.app import app
+from envhub_sandbox.cli.doctor.remote import examine
 from envhub_sandbox.cli.shared import exits, findings, host
 from envhub_sandbox.cli.shared.console import guarded
+from envhub_sandbox.cli.shared.exits import Exit
+from envhub_sandbox.sandboxes.remote import RemoteSandbox
+from envhub_worker.protocol import messages as m
+from tests.attacks.client.lying_server import LyingServer, lying
 
 
 @pytest.fixture(autouse=True)
@@ -58,7 +49,6 @@ _REFUSED = [
     ("diff ./gone ./gone", 3, _NO_FOLDER),
     ("run ./gone", 3, _NO_FOLDER),
     ("run 'no spaces allowed'", 2, "Error: hub reference 'no spaces allowed'"),
-    ("run org/repo/sub/dir", 2, "the path comes after a colon"),
     ("push ./gone owner/name", 3, _NO_FOLDER),
     ("push . no-owner", 2, "the owner is missing"),
     ("prefetch ./gone", 3, _NO_FOLDER),
@@ -82,35 +72,6 @@ def test_what_cannot_be_done_is_said_in_one_line(words: str, code: int, text: st
     assert os.listdir() == []
 
 
-_MODULES = {
-    "lock": lock,
-    "verify": lock,
-    "image build": image,
-    "replay": replay,
-    "diff": diff,
-    "run": run,
-    "push": push,
-    "prefetch": prefetch,
-    "cache remove": cache,
-    "init": init,
-    "doctor": doctor,
-    "inspect": inspect,
-}
-
-
-@pytest.mark.parametrize("words", _MODULES)
-def test_a_command_is_a_function_of_its_module(words: str) -> None:
-    """Of its own name, with its help in its docstring."""
-    name, *rest = words.split()
-    found = whole_command(name)
-    for word in rest:
-        found = found.commands[word]
-    callback = python.unwrap(found.callback)
-    assert callback.__module__ == _MODULES[words].__name__
-    assert callback.__name__ == words.split()[-1]
-    assert found.help.split(".")[0].split("\n")[0] in " ".join(python.getdoc(callback).split())
-
-
 def test_reading_is_no_running(monkeypatch: pytest.MonkeyPatch) -> None:
     """``--static`` goes another way, with its own options."""
     asked = list[Any]()
@@ -121,7 +82,6 @@ def test_reading_is_no_running(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_an_empty_store_is_listed() -> None:
-    """For people, and for programs."""
     code, printed = said("cache", "list")
     assert (code, printed.startswith("0 snapshots, 0 environments")) == (0, True)
     code, printed = said("cache", "list", "--json")
@@ -150,17 +110,12 @@ def test_a_repository_has_the_name_of_its_folder(name: str) -> None:
             ast.parse(text)
     assert name in files["env.py"]
     assert "2026" in files["LICENSE"]
-
-
-@pytest.mark.parametrize("name", ["-a", "a.", "a..b", "a--b", "a.git", ".env", "x" * 97, "é"])
-def test_other_names_are_refused(name: str) -> None:
-    """Before anything is written."""
-    with pytest.raises(exits.UsageError, match="is not a valid name on the Hub"):
-        init.repository_name(Path(name))
+    for wrong in ("-a", "a.", "a..b", "a--b", "a.git", ".env", "x" * 97, "é"):
+        with pytest.raises(exits.UsageError, match="is not a valid name on the Hub"):
+            init.repository_name(Path(wrong))
 
 
 def test_init_writes_all_or_nothing() -> None:
-    """A folder with something in it stays as it is."""
     Path("there").mkdir()
     Path("there/file").touch()
     assert said("init", "there")[0] == 2
@@ -171,16 +126,7 @@ def test_init_writes_all_or_nothing() -> None:
     }
 
 
-def test_severities_of_fail_on() -> None:
-    """By name; another one is a mistake of usage."""
-    for one in Severity:
-        assert findings.level(one.value) is one
-    with pytest.raises(exits.UsageError, match="it takes error, warning or note"):
-        findings.level("fatal")
-
-
 def test_reports_are_written_in_utf_8() -> None:
-    """Whatever the locale; where they cannot be, that is said."""
     findings.write_report(Path("report"), "ü")
     assert Path("report").read_bytes() == "ü".encode()
     with pytest.raises(exits.UsageError, match="the report cannot be written"):
@@ -190,7 +136,6 @@ def test_reports_are_written_in_utf_8() -> None:
 def test_annotations_are_for_the_job_and_its_summary(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The summary is added to what other steps have written."""
     summary = Path("summary")
     summary.write_text("before\n")
     monkeypatch.setenv("GITHUB_STEP_SUMMARY", str(summary))
@@ -211,7 +156,6 @@ def test_a_warning_is_a_line(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_versions_of_all_that_matters(monkeypatch: pytest.MonkeyPatch) -> None:
-    """None for what is not installed; every value is plain."""
     found = host.versions()
     assert found == json.loads(json.dumps(found))
     assert found["python"]
@@ -222,3 +166,91 @@ def test_versions_of_all_that_matters(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(metadata, "version", gone)
     assert host.versions()["numpy"] is None
+
+
+# --- ``envhub doctor tcp://HOST:PORT``: a server's words become a verdict, and nothing but text
+
+
+SAID: dict[Any, Any] = {
+    "python": "3.12.1", "profile": "no-userns", "weakest_profile": "container", "network": True,
+    "quotas": {"jails": 4000, "memory_bytes": 3 << 30, "other": 7}, "draining_s": None,
+    "clients": {"alice": {"jails": 1200, "memory_limit_bytes": 1 << 30}},
+}  # fmt: skip
+Examine = Callable[..., Exit]
+
+
+class _Place:
+    """A server that is reached by a socket in a folder, without keys."""
+
+    insecure_loopback = True
+
+    def __init__(self, server: LyingServer) -> None:
+        self.endpoint = server.endpoint
+
+    def far(self) -> None:
+        """It is here."""
+
+
+@pytest.fixture
+def looks() -> Iterator[Examine]:
+    """``examine`` of a server that says this of itself."""
+    with lying() as server:
+
+        def run(said: dict[Any, Any], profile: str = "no-userns", *, json: bool = False) -> Exit:
+            answer = m.Sessions((), said)
+            server.lies[m.GetSessions] = lambda asked: [asked.answer(answer)]
+            return examine(cast("RemoteSandbox", _Place(server)), profile, json=json)
+
+        yield run
+
+
+def test_quotas_stand_beside_what_is_used(
+    looks: Examine, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert looks(SAID) is Exit.OK
+    text = capsys.readouterr().out
+    rows = [line.split() for line in text.splitlines()]
+    assert ["jails", "1,200", "4,000"] in rows
+    assert ["other", "7"] in rows
+    assert "permits network" in " ".join(text.split())
+    [memory] = [row for row in rows if row[:1] == ["memory"]]
+    assert memory[1][0] == "1"
+    assert "3" in memory[-2] + memory[-1]
+
+
+@pytest.mark.parametrize(
+    ("changed", "profile", "code", "said"),
+    [
+        ({}, "strict", Exit.SANDBOX, "'no-userns' is the strongest"),
+        ({"profile": "magic"}, "no-userns", Exit.SANDBOX, "no jail with the profile"),
+        ({"draining_s": 3.0}, "no-userns", Exit.WORKER, "it drains"),
+        ({"draining_s": 3.0}, "strict", Exit.WORKER, "it drains"),
+    ],
+)
+def test_the_code_is_the_verdict(
+    looks: Examine,
+    capsys: pytest.CaptureFixture[str],
+    changed: dict[str, Any],
+    profile: str,
+    code: Exit,
+    said: str,
+) -> None:
+    assert looks(SAID | changed, profile) is code
+    assert said in " ".join(capsys.readouterr().out.split())
+    assert looks(SAID | changed, profile, json=True) is code
+    document = json.loads(capsys.readouterr().out)
+    assert (document["code"], document["profile"]) == (code, profile)
+    assert said in document["problem"]
+    assert document["server"]["quotas"] == SAID["quotas"]
+
+
+def test_a_server_that_says_nothing_is_older(
+    looks: Examine, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """That is no reason to refuse it; and a hostile name is one line of text."""
+    assert looks({}) is Exit.OK
+    assert "older than this client" in capsys.readouterr().out
+    looks(SAID | {"quotas": {"a\n\x1b[2J[red]b_bytes": 1}})
+    text = capsys.readouterr().out
+    assert "\x1b" not in text
+    assert "[red]b" in text.splitlines()[-1]

@@ -29,7 +29,6 @@ _PAPERS = {"README__md": "# x", "LICENSE": "MIT"}
 
 
 def envhub(*arguments: str | Path) -> Result:
-    """Run a command in this process."""
     return CliRunner().invoke(app, [*map(str, arguments)], prog_name="envhub")
 
 
@@ -42,12 +41,10 @@ def document(*arguments: str | Path, code: int = 0) -> dict[str, Any]:
 
 
 def repository(folder: Path, entry: str = _ENTRY, **files: str) -> Path:
-    """A repository with its papers."""
     return write_repository(folder, entry, **_PAPERS, **files)
 
 
 def test_a_repository_is_read(tmp_path: Path) -> None:
-    """Entry, files, packages, imports, and what is worth a look."""
     folder = repository(tmp_path / "r", requirements__txt="PyYAML>=6\ngymnasium")
     read = document("inspect", "--static", folder)
     assert read["reference"] == f"{folder}:env.py"
@@ -62,6 +59,10 @@ def test_a_repository_is_read(tmp_path: Path) -> None:
     ]
     [finding] = read["findings"]
     assert (finding["check"], finding["file"], finding["line"]) == ("source-dynamic", "env.py", 5)
+    odd = repository(tmp_path / "odd", requirements__txt="x @ https://example.com/x.whl")
+    refused = document("inspect", "--static", odd)
+    assert refused["declared"] is None, "which is no reason not to read the rest"
+    assert [one["check"] for one in refused["findings"]] == ["requirements", "source-dynamic"]
     shown = envhub("inspect", "--static", folder).stdout
     assert "make_env(n_envs=1, use_async_envs=False, size=8)" in shown
     assert "note         source-dynamic: env.py:5: calls eval" in shown
@@ -79,17 +80,8 @@ def test_nothing_of_it_runs(tmp_path: Path) -> None:
     assert trace.exists()
 
 
-def test_declarations_that_cannot_be_taken_are_found(tmp_path: Path) -> None:
-    """And are no reason not to read the rest."""
-    folder = repository(tmp_path / "r", requirements__txt="x @ https://example.com/x.whl")
-    read = document("inspect", "--static", folder)
-    assert read["declared"] is None
-    assert [one["check"] for one in read["findings"]] == ["requirements", "source-dynamic"]
-
-
 @pytest.mark.parametrize(("least", "code"), [("note", 1), ("warning", 0), ("error", 0)])
 def test_findings_fail_where_that_is_asked_for(least: str, code: int, tmp_path: Path) -> None:
-    """By how much they weigh; SARIF has them either way."""
     folder, sarif = repository(tmp_path / "r"), tmp_path / "sarif"
     done = envhub("inspect", "--static", folder, "--fail-on", least, "--sarif", sarif)
     assert done.exit_code == code
@@ -110,7 +102,6 @@ def test_findings_fail_where_that_is_asked_for(least: str, code: int, tmp_path: 
 def test_options_that_mean_nothing_are_refused(
     options: list[str], says: str, tmp_path: Path
 ) -> None:
-    """Before anything is read."""
     done = envhub("inspect", tmp_path / "nowhere", *options)
     assert (done.exit_code, says in " ".join(done.stderr.split())) == (2, True), done.stderr
 
@@ -151,10 +142,12 @@ def test_what_is_the_same_differs_in_nothing(tmp_path: Path) -> None:
     assert differing(tmp_path / "a") == []
     moved = differing(tmp_path / "b", f"# a comment\n{_ENTRY}")
     assert [row[:2] for row in moved] == [("file", "changed")]
+    old, new = repository(tmp_path / "old", a__txt="1"), repository(tmp_path / "new", b__txt="1")
+    [one] = changes(static(local(old)), static(local(new)))
+    assert (one.what, one.how, one.text) == ("file", "renamed", "b.txt: was a.txt")
 
 
 def test_each_change_is_told_as_what_it_is(tmp_path: Path) -> None:
-    """Files, the entry, packages, imports, and findings."""
     entry = _ENTRY.replace("import yaml", "import socket, torch").replace("size=8", "size=9")
     entry = entry.replace("'CartPole-v1'", "'Other-v1'")
     found = differing(
@@ -171,13 +164,6 @@ def test_each_change_is_told_as_what_it_is(tmp_path: Path) -> None:
     assert "numpy>=1, now numpy>=2" in texts
     assert "env.py:2: imports socket" in texts
     assert texts.count("env.py:5: calls eval") == 2, "the line was changed: it is told again"
-
-
-def test_a_file_with_another_name_is_renamed(tmp_path: Path) -> None:
-    """By its content."""
-    old, new = repository(tmp_path / "old", a__txt="1"), repository(tmp_path / "new", b__txt="1")
-    [one] = changes(static(local(old)), static(local(new)))
-    assert (one.what, one.how, one.text) == ("file", "renamed", "b.txt: was a.txt")
 
 
 def test_a_folder_is_held_against_what_the_hub_has(tmp_path: Path) -> None:
@@ -198,8 +184,7 @@ def test_a_folder_is_held_against_what_the_hub_has(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "code"),
-    [([], 7), (["--fail-on", "note"], 1), (["--fail-on", "warning"], 0)],
+    ("options", "code"), [([], 7), (["--fail-on", "note"], 1), (["--fail-on", "warning"], 0)]
 )
 def test_the_exit_code_says_whether_a_pin_may_move(
     options: list[str], code: int, tmp_path: Path

@@ -26,12 +26,10 @@ class Noted(SyncVectorEnv):
         self.task, self.events = task, events
 
     def reset(self, **kwargs: Any) -> Any:
-        """Note it."""
         self.events.append(("reset", self.task))
         return super().reset(**kwargs)
 
     def close(self, **kwargs: Any) -> None:
-        """Note it, the first time."""
         if not self.closed:
             self.events.append(("close", self.task))
         super().close(**kwargs)
@@ -41,7 +39,6 @@ class Dying(Noted):
     """Dies in its first step."""
 
     def step(self, actions: Any) -> Any:
-        """As a worker does."""
         raise WorkerDiedError("it died", log_tail="")
 
 
@@ -56,12 +53,10 @@ def run(
 
 
 def suites(*envs: SyncVectorEnv) -> EnvSuites:
-    """One suite of these tasks."""
     return EnvSuites({"s": dict(enumerate(envs))}, lambda: dict(PROVENANCE))
 
 
 def test_each_task_is_closed_before_the_next_begins(monkeypatch: pytest.MonkeyPatch) -> None:
-    """So that only the task in use costs processes."""
     events: list[tuple[str, int]] = []
     envs = suites(Noted(0, events), Noted(1, events))
     code, document = run(monkeypatch, lambda **kwargs: envs)
@@ -71,23 +66,17 @@ def test_each_task_is_closed_before_the_next_begins(monkeypatch: pytest.MonkeyPa
 
 
 def test_a_failing_task_ends_the_run_and_closes_all(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What was finished is reported, with the error and its code."""
     events: list[tuple[str, int]] = []
     envs = suites(Noted(0, events), Dying(1, events), Noted(2, events))
     code, document = run(monkeypatch, lambda **kwargs: envs)
     assert code == 5
     assert events[-2:] == [("close", 1), ("close", 2)]
     assert [task["task"] for task in document["tasks"]] == [0]
-    assert document["error"] == {
-        "type": "WorkerDiedError",
-        "message": "it died",
-        "exit_code": 5,
-        "bundle": None,
-    }
+    died = {"type": "WorkerDiedError", "message": "it died", "exit_code": 5, "bundle": None}
+    assert document["error"] == died
 
 
 def test_options_become_arguments_of_make_env(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each under the name that the library has for it."""
     seen: dict[str, Any] = {}
 
     def make_env(**kwargs: Any) -> EnvSuites:

@@ -39,7 +39,6 @@ _RUN_BY = {
 
 
 def named(block: Block) -> str:
-    """A block in a test's name."""
     return f"{block.document}: {block.text.strip().splitlines()[0][:40]}"
 
 
@@ -67,7 +66,6 @@ def test_what_is_executed_has_its_test() -> None:
 
 
 def test_no_code_is_merely_indented() -> None:
-    """It would be no block to those who look for blocks."""
     for document in blocks.DOCUMENTS:
         text = re.sub(r"^```.*?^```$", "", (CHECKOUT / document).read_text(), flags=re.M | re.S)
         assert re.findall(r"^[^\s*-].*\n\n {4}\S.*$", text, re.M) == [], document
@@ -87,14 +85,12 @@ def commands(text: str) -> Iterator[list[str]]:
     "block", [one for one in blocks.blocks() if one.language == "sh"], ids=named
 )
 def test_commands_are_ones_that_there_are(block: Block) -> None:
-    """Their programs, subcommands and options."""
     for words in commands(block.text):
         held(words)
 
 
 @pytest.mark.parametrize("block", blocks.tested(SHOWN), ids=named)
 def test_commands_that_are_shown_with_their_output_are_too(block: Block) -> None:
-    """What stands behind a prompt."""
     for line in re.findall(r"^\$ (.*)$", block.text, re.M):
         for words in commands(line):
             held(words)
@@ -140,13 +136,11 @@ def held(words: list[str]) -> None:
     ],
 )
 def test_a_command_that_is_not_there_is_found(wrong: str) -> None:
-    """So the tests above can fail."""
     with pytest.raises(AssertionError):
         held(shlex.split(wrong))
 
 
 def test_what_ci_takes_has_inputs_and_hooks_that_there_are(checkout: Any) -> None:
-    """The two blocks of docs/ci.md."""
     workflow, hooks = (yaml.safe_load(block.text) for block in blocks.tested(PARSED))
     step = workflow["jobs"]["check"]["steps"][1]
     action = yaml.safe_load((checkout / "action.yml").read_text())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import re
 import shlex
@@ -30,7 +31,6 @@ exit ${ENVHUB_CODE:-0}
 
 
 def loaded(checkout: Path, name: str) -> Any:
-    """A file of YAML."""
     return yaml.safe_load((checkout / name).read_text())
 
 
@@ -47,7 +47,6 @@ def run(script: str, **variables: str) -> subprocess.CompletedProcess[str]:
 
 
 def program(path: Path, text: str) -> None:
-    """Write a program."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text)
     path.chmod(0o755)
@@ -155,7 +154,6 @@ def words(checkout: Path, hook: str) -> list[str]:
 def test_the_hook_that_reads_fails_for_what_hides(
     text: str, code: int, checkout: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """In the folder that pre-commit runs it in."""
     write_repository(tmp_path, f"{text}\ndef make_env(n_envs=1, use_async_envs=False): pass\n")
     monkeypatch.chdir(tmp_path)
     assert CliRunner().invoke(app, words(checkout, "envhub-static")).exit_code == code
@@ -190,3 +188,46 @@ def test_what_is_named_exists(checkout: Path) -> None:
     used = {word for text in texts for word in re.findall(r"--[a-z][a-z-]+", text)}
     assert {"--github", "--junit", "--fail-on"} <= used
     assert [word for word in sorted(used) if word not in done.stdout] == []
+
+
+# --- The documents' site loads nothing from elsewhere: what CI asks of it would find it
+
+
+_PAGE = "<head><meta http-equiv='Content-Security-Policy' content=\"default-src 'self'\">%s</head>"
+
+
+@pytest.fixture(scope="module")
+def loads(checkout: Path) -> Any:
+    spec = importlib.util.spec_from_file_location("loads", checkout / ".ci" / "loads.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("a.html", _PAGE % '<script src="https://cdn.example/x.js"></script>'),
+        ("a.html", _PAGE % '<link rel="stylesheet" href="//cdn.example/x.css">'),
+        ("a.html", _PAGE % '<img srcset="x.png, https://cdn.example/y.png 2x">'),
+        ("a.html", _PAGE % "<style>@import 'https://cdn.example/x.css'</style>"),
+        ("a.html", _PAGE % '<p style="background: url(https://cdn.example/x.png)">'),
+        ("a.html", _PAGE % "<script>fetch('https://cdn.example/x')</script>"),
+        ("a.html", "<head></head>"),
+        ("a.css", "p { background: url('//cdn.example/x.png') }"),
+        ("a.js", 'import("https://cdn.example/x.js")'),
+    ],
+)
+def test_what_a_page_loads_from_elsewhere_is_found(
+    loads: Any, tmp_path: Path, name: str, text: str
+) -> None:
+    """Each way to load something, and a page that does not forbid it.
+
+    The site's own files, a link that a reader follows, and names of XML's vocabularies are none.
+    """
+    own = '<script src="../x.js"></script><a href="https://example.com/">there</a>'
+    (tmp_path / "own.html").write_text(_PAGE % own)
+    (tmp_path / "own.js").write_text('of("http://www.w3.org/2000/svg") // see https://x.example')
+    (tmp_path / name).write_text(text)
+    [line] = loads.foreign(tmp_path)
+    assert line.startswith(f"{name}: ")

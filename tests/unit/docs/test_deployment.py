@@ -35,11 +35,7 @@ def exported() -> dict[str, set[str]]:
     """Every sample that a server with a client exports, and its labels."""
     parser = pytest.importorskip("prometheus_client.parser", reason="prometheus-client is missing")
     facts = ServerFigures(
-        profile="strict",
-        permissions=Permissions(),
-        quotas=Quotas(),
-        state="/",
-        max_connections=1,
+        profile="strict", permissions=Permissions(), quotas=Quotas(), state="/", max_connections=1
     )
     share = vars(Client(requests={"step": 1}))
     told = {
@@ -62,7 +58,6 @@ def exported() -> dict[str, set[str]]:
 
 
 def expressions(dashboard: Any) -> Iterator[str]:
-    """Every query of the dashboard."""
     for panel in dashboard["panels"]:
         for target in panel["targets"]:
             yield target["expr"]
@@ -76,10 +71,12 @@ def test_the_dashboard_asks_for_what_is_exported() -> None:
     assert {name for name in names if name.startswith("envhub_")} <= asked
     for variable in dashboard["templating"]["list"][1:]:
         assert set(_OURS.findall(variable["definition"])) <= set(names)
+    panels = dashboard["panels"]
+    assert len({panel["id"] for panel in panels}) == len(panels)
+    assert len({(one["gridPos"]["x"], one["gridPos"]["y"]) for one in panels}) == len(panels)
 
 
 def test_the_dashboard_groups_by_labels_that_there_are() -> None:
-    """Of that very metric, or given by whoever scrapes it."""
     names = exported()
     for panel in json.loads(DASHBOARD.read_text())["panels"]:
         for target in panel["targets"]:
@@ -93,15 +90,7 @@ def test_the_dashboard_groups_by_labels_that_there_are() -> None:
             assert asked <= known, expr
 
 
-def test_the_panels_have_their_own_places() -> None:
-    """None lies over another, and each has a number of its own."""
-    panels = json.loads(DASHBOARD.read_text())["panels"]
-    assert len({panel["id"] for panel in panels}) == len(panels)
-    assert len({(one["gridPos"]["x"], one["gridPos"]["y"]) for one in panels}) == len(panels)
-
-
 def test_the_page_has_every_metric() -> None:
-    """Of those that are ours."""
     page = (ROOT / "docs" / "observing.md").read_text()
     named = set(re.findall(r"`(envhub_server_\w+)`", page))
     assert named == {name for name in exported() if name.startswith("envhub_")}

@@ -1,4 +1,4 @@
-"""Both distributions are fit for an index: what PyPI looks at, and that the plugin can be built.
+"""Both distributions and the image hold what they should, and what an index looks at.
 
 ``python -m tests.distributions`` builds, checks and installs both; this is what needs no network.
 """
@@ -14,13 +14,14 @@ from email.message import Message
 from email.parser import Parser
 from importlib import metadata
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import pytest
 import yaml
 
 import envhub_sandbox
 import envhub_worker
+from tests.unit.docs.test_imports import WORKERS_OWN
 
 pytestmark = pytest.mark.same_for("users", "versions")
 
@@ -60,14 +61,12 @@ def plugin(checkout: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
                 unpacked = folder / "again" / member.name
                 unpacked.parent.mkdir(parents=True, exist_ok=True)
                 extracted = packed.extractfile(member)
-                assert extracted is not None
                 unpacked.write_bytes(extracted.read())
     [root] = (folder / "again").iterdir()
     return built("wheel", root, folder / "wheel")
 
 
 def told_by(wheel: Path) -> Message:
-    """A wheel's metadata."""
     with zipfile.ZipFile(wheel) as archive:
         [name] = [one for one in archive.namelist() if one.endswith(".dist-info/METADATA")]
         return Parser().parsestr(archive.read(name).decode())
@@ -82,20 +81,7 @@ def assert_fit(told: Message) -> None:
     assert told["Requires-Python"] == ">=3.10"
 
 
-def test_the_package_is_fit_for_an_index() -> None:
-    """As it is installed here."""
-    assert_fit(cast("Message", metadata.metadata("envhub-sandbox")))
-
-
-def test_the_package_holds_no_test() -> None:
-    """Two packages, their metadata, the programs, and the examples."""
-    files = metadata.files("envhub-sandbox") or []
-    assert files
-    assert [one for one in files if {"tests", "benchmarks", "conftest.py"} & {*one.parts}] == []
-
-
 def test_the_version_stands_in_one_place(checkout: Path) -> None:
-    """The rest is made of it, or is the same."""
     citation = yaml.safe_load((checkout / "CITATION.cff").read_text())
     version = envhub_worker.__version__
     assert version == envhub_sandbox.__version__ == metadata.version("envhub-sandbox")
@@ -104,10 +90,16 @@ def test_the_version_stands_in_one_place(checkout: Path) -> None:
     assert not re.search(r'^version = "', project, re.M)
 
 
-def test_the_plugin_is_fit_for_an_index(plugin: Path) -> None:
-    """Under the name by which LeRobot finds it, with the module of that name, and our version."""
+def test_both_are_fit_for_an_index(plugin: Path, checkout: Path) -> None:
+    """The plugin under the name by which LeRobot finds it, with that module, and our version."""
+    assert_fit(cast("Message", metadata.metadata("envhub-sandbox")))
+    files = metadata.files("envhub-sandbox") or []
+    assert files
+    assert [one for one in files if {"tests", "benchmarks", "conftest.py"} & {*one.parts}] == []
     told = told_by(plugin)
     assert_fit(told)
+    copy = checkout / "plugins" / NAME / "LICENSE"  # nothing outside gets into a distribution
+    assert copy.read_bytes() == (checkout / "LICENSE").read_bytes()
     assert told["Name"] == NAME
     with zipfile.ZipFile(plugin) as archive:
         modules = [name for name in archive.namelist() if name.endswith(".py")]
@@ -117,7 +109,56 @@ def test_the_plugin_is_fit_for_an_index(plugin: Path) -> None:
     assert told.get_all("Requires-Dist") == [f"envhub-sandbox>={ours}"]
 
 
-def test_the_plugin_has_the_licence_of_all(checkout: Path) -> None:
-    """A copy, because nothing outside of its folder gets into a distribution."""
-    copy = checkout / "plugins" / NAME / "LICENSE"
-    assert copy.read_bytes() == (checkout / "LICENSE").read_bytes()
+# --- The container image installs what the worker imports, and cannot drift from pyproject.toml
+
+
+CHECKOUT = Path(__file__).resolve().parents[3]
+_IMPORTED_AS = {"pyzmq": "zmq"}
+
+
+@pytest.fixture(scope="module")
+def project() -> dict[str, Any]:
+    if sys.version_info < (3, 11):
+        tomllib = pytest.importorskip("pip._vendor.tomli")
+    else:
+        import tomllib
+    return tomllib.loads((CHECKOUT / "pyproject.toml").read_text())
+
+
+def name_of(requirement: str) -> str:
+    """The distribution that a requirement names."""
+    return re.split(r"[^\w-]", requirement, maxsplit=1)[0]
+
+
+def test_the_workers_group_is_what_the_worker_imports(project: dict[str, Any]) -> None:
+    """No more and no less; word for word as the package needs it."""
+    group = project["dependency-groups"]["worker"]
+    assert set(group) <= set(project["project"]["dependencies"])
+    names = {name_of(one) for one in group}
+    assert {_IMPORTED_AS.get(name, name) for name in names} == WORKERS_OWN - {"envhub_worker"}
+
+
+def test_the_image_can_be_watched(project: dict[str, Any]) -> None:
+    """It installs what the worker imports, and what its figures need, word for word."""
+    installed = re.findall(r"--group (\S+)", (CHECKOUT / "Dockerfile").read_text())
+    group = project["dependency-groups"]["image"]
+    assert installed == ["image"]
+    assert {"include-group": "worker"} in group
+    assert set(project["project"]["optional-dependencies"]["metrics"]) <= {
+        one for one in group if isinstance(one, str)
+    }
+
+
+def test_nothing_but_the_worker_goes_into_the_image() -> None:
+    """What is not listed never reaches the engine: no tests, no client, no history."""
+    lines = (CHECKOUT / ".dockerignore").read_text().splitlines()
+    rules = [line for line in lines if line and not line.startswith("#")]
+    assert rules == ["*", "!pyproject.toml", "!worker", "**/__pycache__"]
+
+
+def test_the_image_runs_as_nobody_and_carries_the_projects_version() -> None:
+    text = (CHECKOUT / "Dockerfile").read_text()
+    assert f"ARG VERSION={envhub_worker.__version__}\n" in text
+    final = text.rpartition("\nFROM ")[2]
+    assert re.search(r"^USER (\d+):\1$", final, re.MULTILINE)
+    assert not re.search(r"^USER (root|0)", final, re.MULTILINE)

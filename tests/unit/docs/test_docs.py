@@ -31,7 +31,6 @@ PROTOCOL = (CHECKOUT / "docs" / "protocol.md").read_text()
 
 
 def named(path: Path) -> str:
-    """A document's name in a test's."""
     return str(path.relative_to(CHECKOUT))
 
 
@@ -63,7 +62,6 @@ def sources() -> str:
 
 @pytest.mark.parametrize("title", ["Client and server", "Client and runner"])
 def test_protocol_lists_every_message_with_its_fields(title: str) -> None:
-    """Kind, name and fields, in the order of the wire."""
     listed = {
         int(kind): (*code_words(name), code_words(fields))
         for kind, name, fields, _ in rows(section(PROTOCOL, title))
@@ -77,7 +75,6 @@ def test_protocol_lists_every_message_with_its_fields(title: str) -> None:
 
 
 def test_protocol_draws_the_lifecycle_from_its_table() -> None:
-    """Every state in its words, every legal move, and no other."""
     states, moves = [], []
     for row in rows(section(PROTOCOL, "The life of an environment")):
         (states if len(row) == 2 else moves).append(row)
@@ -94,19 +91,16 @@ def test_protocol_draws_the_lifecycle_from_its_table() -> None:
 
 
 def flat(text: str) -> str:
-    """A text without its line ends."""
     return " ".join(text.split())
 
 
 def test_protocol_states_its_version_and_limits() -> None:
-    """The numbers in the text are those of the code."""
     assert f"Version {m.VERSION}." in PROTOCOL
     for number in (MAX_ENVS, MAX_NUM_ENVS, MAX_NAME):
         assert re.search(rf"\b{number}\b", section(PROTOCOL, "Manifest"))
 
 
 def test_values_lists_the_limits_with_their_defaults() -> None:
-    """Each limit of the wire, and its number."""
     text = (CHECKOUT / "docs" / "values.md").read_text()
     units = {"KiB": 1024, "MiB": 1024**2}
     listed = {}
@@ -117,12 +111,10 @@ def test_values_lists_the_limits_with_their_defaults() -> None:
 
 
 def fenced(text: str, language: str) -> list[str]:
-    """The blocks of code in a document."""
     return re.findall(rf"^```{language}\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
 
 
 def test_readme_opens_with_one_command_to_try_and_one_to_test() -> None:
-    """Five lines, then the two commands, each on one line."""
     first, second = fenced(README, "sh")[:2]
     assert first.count("\n") == second.count("\n") == 1
     assert "envhub run ./examples/" in first
@@ -153,7 +145,6 @@ def test_ci_runs_the_commands_of_the_readme() -> None:
 
 
 def test_contributing_names_every_step_and_every_folder_of_tests() -> None:
-    """And no other."""
     text = (CHECKOUT / "CONTRIBUTING.md").read_text()
     tables = rows(section(text, "Before you propose a change"))
     steps = {step.stem for step in (CHECKOUT / ".ci" / "steps").iterdir()}
@@ -164,7 +155,6 @@ def test_contributing_names_every_step_and_every_folder_of_tests() -> None:
 
 
 def test_contributing_names_twenty_modules_to_read_first() -> None:
-    """And for each symptom one that is there."""
     first, symptoms = section((CHECKOUT / "CONTRIBUTING.md").read_text(), "Where to begin").split(
         "From a symptom to a module:"
     )
@@ -181,7 +171,6 @@ def test_contributing_names_twenty_modules_to_read_first() -> None:
 
 @pytest.mark.parametrize("document", ["README.md", "docs/integrations.md"])
 def test_the_python_of_a_document_runs(document: str) -> None:
-    """All of its blocks, one after the other, do what they say."""
     blocks = fenced((CHECKOUT / document).read_text(), "python")
     done = subprocess.run(
         [sys.executable, "-c", "\n".join(blocks)],
@@ -194,26 +183,15 @@ def test_the_python_of_a_document_runs(document: str) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def error_texts() -> list[str]:
-    """Every error text of the table of the most frequent errors."""
+def test_troubleshooting_quotes_errors_that_exist() -> None:
+    """A search for what is on the screen finds it."""
     page = (CHECKOUT / "docs" / "troubleshooting.md").read_text()
     table = rows(section(page, "The most frequent errors"))
-    return [text for symptom, _ in table for text in code_words(symptom)]
-
-
-# said by others than us
-_FOREIGN_TEXTS = {"no module named venv", "ensurepip is not available"}
-
-
-@pytest.mark.parametrize("text", [text for text in error_texts() if text not in _FOREIGN_TEXTS])
-def test_troubleshooting_quotes_errors_that_exist(text: str) -> None:
-    """A search for what is on the screen finds it."""
-    assert text in joined_literals()
-
-
-def joined_literals() -> str:
-    """The source, with texts that go on over a line's end put together."""
-    return re.sub(r'(?<!\\)"\s*\n?\s*f?"', "", sources())
+    quoted = {text for symptom, _ in table for text in code_words(symptom)}
+    said = re.sub(r'(?<!\\)"\s*\n?\s*f?"', "", sources())  # texts that go on over a line's end
+    assert len(quoted) > 5
+    of_others = {"no module named venv", "ensurepip is not available"}
+    assert [text for text in sorted(quoted - of_others) if text not in said] == []
 
 
 def test_the_pages_before_internals_are_few_enough_to_read() -> None:
@@ -244,35 +222,32 @@ def anchors(text: str) -> set[str]:
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=named)
-def test_links_resolve(document: Path) -> None:
-    """Files are there, and so are the titles that an anchor means."""
-    for target in links(document.read_text()):
+def test_a_document_names_what_there_is(document: Path) -> None:
+    """Files are there, and so are the titles that an anchor means, and paths in backquotes.
+
+    Nothing names a person's machine or tools, and nothing is a note to oneself.
+    """
+    text = document.read_text()
+    for target in links(text):
         path, _, anchor = target.partition("#")
         found = (document.parent / path).resolve() if path else document
         assert found.exists(), target
-        if anchor:
-            assert anchor in anchors(found.read_text()), target
-
-
-# files that a user has, or that a repository on the Hub would have
-_ELSEWHERE = re.compile(r"^(\./my-env|envs?/|\./examples/\w+$|org/|~|/|\.\./|\.venv)")
-
-
-@pytest.mark.parametrize("document", DOCUMENTS, ids=named)
-def test_named_files_exist(document: Path) -> None:
-    """A path of this project in backquotes is a path of this project."""
+        assert not anchor or anchor in anchors(found.read_text()), target
     tops = ("tests/", "docs/", "worker/", "envhub_sandbox/", "examples/", ".ci/", "benchmarks/")
-    for word in code_words(document.read_text()):
+    for word in code_words(text):
         path = word.partition(" ")[0].rstrip("/")
-        if not path.startswith(tops) or re.search(r"[*{<(]", path):
-            continue
-        top, _, rest = path.removeprefix("worker/").partition("/")
-        root = folder(top) if top in ("envhub_worker", "envhub_sandbox") else CHECKOUT / top
-        assert (root / rest).exists(), word
+        if path.startswith(tops) and not re.search(r"[*{<(]", path):
+            top, _, rest = path.removeprefix("worker/").partition("/")
+            root = folder(top) if top in ("envhub_worker", "envhub_sandbox") else CHECKOUT / top
+            assert (root / rest).exists(), word
+    assert _FORBIDDEN.findall(text) == []
 
 
 def test_the_map_has_every_package() -> None:
-    """Every folder of the two packages, and every module that stands beside them."""
+    """Every folder of the two packages, and every module that stands beside them.
+
+    The source is as finished as the documents are.
+    """
     words = set(code_words((CHECKOUT / "docs" / "architecture.md").read_text()))
     missing = set()
     for package, place in (("envhub_sandbox", ""), ("envhub_worker", "worker/")):
@@ -282,21 +257,11 @@ def test_the_map_has_every_package() -> None:
         named = {f"{place}{package}/{part.relative_to(root)}" for part in [*parts, *modules]}
         missing |= named - words
     assert missing == set()
+    assert _FORBIDDEN.findall(sources()) == []
 
 
 # said nowhere in the project: they name people's machines and tools, not the project
 _FORBIDDEN = re.compile(r"(?<![\w./-])/(work|root)/\w|TODO|FIXME|XXX(?!X)")
-
-
-@pytest.mark.parametrize("document", DOCUMENTS, ids=named)
-def test_documents_are_finished(document: Path) -> None:
-    """No machine's paths, no notes to oneself."""
-    assert _FORBIDDEN.findall(document.read_text()) == []
-
-
-def test_sources_are_finished() -> None:
-    """Likewise the code."""
-    assert _FORBIDDEN.findall(sources()) == []
 
 
 def error_tree() -> list[tuple[int, str]]:
@@ -327,10 +292,6 @@ def test_error_tree_is_the_tree() -> None:
 def test_what_is_written_from_the_source_is_up_to_date(written: Any) -> None:
     """``python -m tests.support.documents.settings``, ``options`` or ``charts`` writes it."""
     assert written.DOCUMENT.read_text() == written.document()
-
-
-def test_the_plots_are_drawn_from_what_was_measured() -> None:
-    """``python -m tests.support.documents.charts`` draws them."""
     assert {path: path.read_text() for path in charts.pictures()} == charts.pictures()
 
 
@@ -351,7 +312,6 @@ def test_the_rules_of_interruption_are_those_that_the_source_names() -> None:
 
 @pytest.mark.parametrize("page", ["a-step", "interruption"])
 def test_the_files_that_a_page_on_the_inside_names_are_there(page: str) -> None:
-    """By their path, or by its end."""
     text = (CHECKOUT / "docs" / "internals" / f"{page}.md").read_text()
     files = [
         f"/{prefix}{one.relative_to(root.parent)}"

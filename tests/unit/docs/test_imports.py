@@ -134,9 +134,7 @@ PRIVATE_NAMES_OF_OTHERS = {
 
 
 def folder(package: str) -> Path:
-    """Where an installed package lies."""
     spec = importlib.util.find_spec(package)
-    assert spec is not None
     assert spec.origin is not None
     return Path(spec.origin).parent
 
@@ -192,24 +190,12 @@ def foreign(package: str, own: set[str]) -> list[tuple[str, str]]:
     ]
 
 
-def test_both_packages_are_seen() -> None:
-    """The walk below finds something to look at."""
-    names = set(modules())
-    assert {
-        "envhub_sandbox.factory.make_env",
-        "envhub_worker.server",
-        "envhub_worker.runner.loader",
-    } <= names
-
-
-def test_worker_is_self_contained() -> None:
-    """This one folder can be put in front of any interpreter that has five packages."""
-    assert foreign("envhub_worker", WORKERS_OWN) == []
-
-
-def test_client_needs_what_it_declares() -> None:
-    """Nothing is imported that pyproject.toml does not name."""
-    assert foreign("envhub_sandbox", CLIENTS_OWN) == []
+@pytest.mark.parametrize(
+    ("package", "own"), [("envhub_worker", WORKERS_OWN), ("envhub_sandbox", CLIENTS_OWN)]
+)
+def test_a_package_needs_what_it_declares(package: str, own: set[str]) -> None:
+    """The worker's one folder can be put in front of any interpreter that has five packages."""
+    assert foreign(package, own) == []
 
 
 def test_client_knows_of_the_worker_only_the_protocol() -> None:
@@ -266,7 +252,7 @@ def test_the_table_has_every_package_and_nothing_else() -> None:
 
 
 def test_the_table_permits_no_arrow_that_nobody_uses() -> None:
-    """It is a picture of the house, not of what might be."""
+    """It is a picture of the house, not of what might be; and it has a direction: no cycle."""
     used = {
         (package_of(name), package_of(target))
         for name in modules()
@@ -277,10 +263,6 @@ def test_the_table_permits_no_arrow_that_nobody_uses() -> None:
         (package, target) for package in MAY_IMPORT for target in may_import(package) - LOWEST
     }
     assert permitted - used == set()
-
-
-def test_the_table_has_a_direction() -> None:
-    """There is no cycle of packages: they stand in a line."""
     graph = {package: may_import(package) - {package} for package in MAY_IMPORT}
     for lowest in LOWEST:
         graph[lowest] = {target for target in graph[lowest] if target < lowest} - LOWEST
@@ -299,7 +281,6 @@ def test_nobody_imports_the_runner() -> None:
 
 
 def test_only_faces_and_the_command_line_import_make_env() -> None:
-    """Everything else is below it."""
     factory = "envhub_sandbox.factory"
     found = {
         (name, target)
@@ -332,7 +313,6 @@ def test_modules_know_nothing_of_what_is_not_their_business(name: str) -> None:
 
 @pytest.mark.parametrize("package", ["envhub_sandbox", "envhub_worker"])
 def test_imports_have_a_direction(package: str) -> None:
-    """There is no cycle, not even one that a late import hides."""
     graph = {
         name: {target for target in imported(name) if target in modules() and target != package}
         for name in modules()
@@ -345,7 +325,6 @@ def test_imports_have_a_direction(package: str) -> None:
 
 
 def test_zeromq_is_spoken_in_a_few_packages() -> None:
-    """Everything else speaks in messages."""
     users = {
         package_of(name)
         for package in ("envhub_sandbox", "envhub_worker")
@@ -356,8 +335,15 @@ def test_zeromq_is_spoken_in_a_few_packages() -> None:
 
 
 def test_nothing_unpickles_but_the_jail() -> None:
-    """There is one ``loads`` of anything but JSON and TOML in the tree, and it is in the jail."""
+    """There is one ``loads`` of anything but JSON and TOML in the tree, and it is in the jail.
+
+    Neither package has a deserialiser at hand; cloudpickle is the client's way out, the jail's in.
+    """
     assert list(loaders()) == [("envhub_worker.runner.runner", "cloudpickle.loads")]
+    every = [*arrows("envhub_sandbox"), *arrows("envhub_worker")]
+    assert [one for one in every if one[1].split(".")[0] in DESERIALISERS] == []
+    users = {name for name in modules() if "cloudpickle" in imported(name)}
+    assert users == {"envhub_sandbox.transport.values", "envhub_worker.runner.runner"}
 
 
 _LOADERS = ("load", "loads", "Unpickler")
@@ -381,19 +367,6 @@ def loaders() -> Iterator[tuple[str, str]]:
                 base = ast.unparse(node.value)
                 if aliases.get(base, "") not in ("", "json", "tomli", "tomllib"):
                     yield name, f"{aliases[base]}.{node.attr}"
-
-
-def test_no_deserialiser_is_imported() -> None:
-    """Neither package has one at hand; cloudpickle is the client's way out, the jail's way in."""
-    found = [
-        (name, target)
-        for package in ("envhub_sandbox", "envhub_worker")
-        for name, target in arrows(package)
-        if target.split(".")[0] in DESERIALISERS
-    ]
-    assert found == []
-    users = {name for name in modules() if "cloudpickle" in imported(name)}
-    assert users == {"envhub_sandbox.transport.values", "envhub_worker.runner.runner"}
 
 
 def test_only_the_loader_imports_by_computed_names() -> None:
@@ -441,6 +414,10 @@ def test_tests_reach_inside_in_one_place(checkout: Path) -> None:
     ]
     assert checkout / SEAM in ours
     assert found == [], f"add what they need to {SEAM}"
+    wrong = ("env._session", "from a import _b", "patch.setattr(a, '_b', 1)", "setattr('a._b', 1)")
+    right = ("self._own", "env.remote", "env._add_info({}, {}, 0)", "setattr('a.b', 1)", "a.__b__")
+    seen = {one for one in wrong + right if any(map(reaches_inside, ast.walk(ast.parse(one))))}
+    assert seen == set(wrong), "the control"
 
 
 def reaches_inside(node: ast.AST) -> bool:
@@ -461,29 +438,15 @@ def private(name: str) -> bool:
     return name.startswith("_") and name[:2] != "__" and name not in PRIVATE_NAMES_OF_OTHERS
 
 
-def test_reaching_inside_would_be_seen() -> None:
-    """In each of the ways that there are; what is one's own, public or Gymnasium's is not."""
-    wrong = ("env._session", "from a import _b", "patch.setattr(a, '_b', 1)", "setattr('a._b', 1)")
-    right = ("self._own", "env.remote", "env._add_info({}, {}, 0)", "setattr('a.b', 1)", "a.__b__")
-    seen = {one: any(map(reaches_inside, ast.walk(ast.parse(one)))) for one in wrong + right}
-    assert seen == {one: one in wrong for one in wrong + right}
-
-
 def test_the_package_imports_nothing_heavy() -> None:
-    """Names are looked up when they are used."""
     heavy = CLIENTS_OWN - {"envhub_sandbox"} | {"torch"}
     assert not loaded_by("import envhub_sandbox") & heavy
 
 
-def test_the_pytest_plugin_costs_nothing_until_it_is_used() -> None:
-    """Every run of pytest on the machine imports it."""
+def test_the_pytest_plugin_costs_nothing_until_it_is_used(checkout: Path) -> None:
     loaded = loaded_by("import envhub_sandbox.integrations.pytest_plugin")
     assert "pytest" in loaded
     assert not loaded & (CLIENTS_OWN - {"envhub_sandbox"} | {"torch"}) - loaded_by("import pytest")
-
-
-def test_the_pytest_plugin_is_declared(checkout: Path) -> None:
-    """Under the name by which it can be left out."""
     declared = (checkout / "pyproject.toml").read_text()
     table = declared.partition("[project.entry-points.pytest11]\n")[2].partition("\n[")[0]
     assert table.strip() == 'envhub = "envhub_sandbox.integrations.pytest_plugin"'
@@ -499,7 +462,6 @@ def test_every_public_name_is_there() -> None:
 
 
 def test_the_protocol_loads_neither_zeromq_nor_the_hub() -> None:
-    """Every module of it, in a fresh interpreter."""
     names = [name for name in modules() if below(name, "envhub_worker.protocol")]
     loaded = loaded_by("import " + ", ".join(names))
     assert "numpy" in loaded

@@ -32,6 +32,9 @@ def test_imports():
 """
 
 
+SKIPPED = ["3 tests skipped: needs a wind machine", "1 test skipped: needs nothing_of_this_name"]
+
+
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """A suite of its own, of which the short selection has two tests."""
@@ -56,63 +59,45 @@ def run(folder: Path, checkout: Path, *arguments: str) -> str:
 
 
 def test_who_names_nothing_gets_the_short_selection(folder: Path, checkout: Path) -> None:
-    """And is told so, and how to have all."""
+    """And is told how to have all. What lies in ``tests/unit`` is in it without a marker.
+
+    A case that was renamed does not fall out of the selection silently.
+    """
+    for where in ("unit", "other"):
+        there = folder / "tests" / where
+        there.mkdir(parents=True)
+        (there / f"test_{where}.py").write_text("def test_three():\n    pass\n")
     said = run(folder, checkout)
-    assert "2 passed, 5 deselected" in said
+    assert "3 passed, 6 deselected" in said
     assert "--full runs every test" in said
-
-
-@pytest.mark.parametrize("argument", ["--full", "test_it.py", "-kone or two or skipped or imports"])
-def test_what_is_asked_for_is_run(folder: Path, checkout: Path, argument: str) -> None:
-    """All of it, or a path, or an expression."""
-    said = run(folder, checkout, argument)
-    assert "3 passed, 4 skipped" in said
-    assert "short selection" not in said
-
-
-@pytest.mark.parametrize("where", ["unit", "other"])
-def test_unit_tests_need_no_marker(folder: Path, checkout: Path, where: str) -> None:
-    """All that lies in ``tests/unit`` is in it."""
-    there = folder / "tests" / where
-    there.mkdir(parents=True)
-    (there / "test_more.py").write_text("def test_three():\n    pass\n")
-    expected = {"unit": "3 passed, 5 deselected", "other": "2 passed, 6 deselected"}
-    assert expected[where] in run(folder, checkout)
-
-
-def test_a_marker_that_names_no_case_is_an_error(folder: Path, checkout: Path) -> None:
-    """A case that was renamed does not fall out of the selection silently."""
     (folder / "test_it.py").write_text(TESTS.replace('short("few")', 'short("gone", "few")'))
     said = run(folder, checkout)
     assert "the short selection names no case by 'gone' of test_it.py::test_two" in said
 
 
+@pytest.mark.parametrize(
+    "arguments", ["--full -n 2", "test_it.py", "-k one or two or skipped or imports"]
+)
+def test_what_is_asked_for_is_run(folder: Path, checkout: Path, arguments: str) -> None:
+    """All of it, or a path, or an expression; by however many processes they were run.
+
+    Each reason to skip is one line, with the number of its tests.
+    """
+    said = run(folder, checkout, *arguments.split(" ", 1))
+    assert "3 passed, 4 skipped" in said
+    assert "short selection" not in said
+    assert [line for line in said.splitlines() if "skipped:" in line] == SKIPPED
+
+
 def test_what_is_the_same_is_not_repeated(folder: Path, checkout: Path) -> None:
-    """As another user or with other versions, each by itself; the control is a run of its own."""
+    """As another user or with other versions, each by itself."""
     marked = {"one": '"users"', "two": '"users", "versions"'}
     text = "".join(
         f"@pytest.mark.same_for({names})\ndef test_{which}():\n    pass\n"
         for which, names in marked.items()
     )
     (folder / "test_it.py").write_text(f"import pytest\ndef test_other():\n    pass\n{text}")
-    for arguments, said in {
-        (): "3 passed",
-        ("--differs-by=users",): "1 passed, 2 deselected",
-        ("--differs-by=versions",): "2 passed, 1 deselected",
-    }.items():
-        assert said in run(folder, checkout, "--full", *arguments)
+    for by, said in (("users", "1 passed, 2 deselected"), ("versions", "2 passed, 1 deselected")):
+        assert said in run(folder, checkout, "--full", f"--differs-by={by}")
     (folder / "test_it.py").write_text("import pytest\n" + text.replace("users", "user"))
     assert "same_for names user; CI repeats for" in run(folder, checkout, "--full")
-
-
-@pytest.mark.parametrize("arguments", [(), ("-n", "2")])
-def test_each_reason_to_skip_is_one_line(
-    folder: Path, checkout: Path, arguments: tuple[str, ...]
-) -> None:
-    """With the number of its tests; by however many processes they were run."""
-    lines = run(folder, checkout, "--full", *arguments).splitlines()
-    told = [line for line in lines if "skipped:" in line]
-    assert told == [
-        "3 tests skipped: needs a wind machine",
-        "1 test skipped: needs nothing_of_this_name",
-    ]

@@ -31,7 +31,7 @@ def test_the_page_is_written_from_the_messages() -> None:
 def test_every_message_that_names_a_cure_is_found_by_its_words() -> None:
     """All that is the same each time, as a person searches for it."""
     page = as_shown(_PAGE).replace(" | ", " ")
-    messages = list(troubleshooting.messages())
+    messages = troubleshooting.messages()
     assert len({one.place for one in messages}) > 50
     missing = [part for one in messages for part in words(one) if part not in page]
     assert missing == []

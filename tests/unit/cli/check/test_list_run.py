@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+import threading
 from dataclasses import fields
 from pathlib import Path
 
@@ -15,6 +17,7 @@ from envhub_sandbox.check.many.results import Verdict
 from envhub_sandbox.cli.app import app, whole_command
 from envhub_sandbox.cli.check import list_run
 from envhub_sandbox.cli.check.check import check
+from envhub_sandbox.cli.check.deadline import DeadlineReached, deadline_alarm
 from envhub_sandbox.cli.check.options import OF_A_LIST, SETTINGS
 from envhub_sandbox.cli.shared.exits import Exit
 
@@ -43,7 +46,6 @@ def started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, 
 
 
 def called(*arguments: str) -> Result:
-    """The command, in this process."""
     return _RUNNER.invoke(app, ["check", *arguments])
 
 
@@ -96,7 +98,6 @@ def test_a_file_says_what_one_may_type_about_a_list(
 
 
 def test_every_option_is_handed_on_or_about_the_list() -> None:
-    """A new one is handed on by itself."""
     names = {one.name for one in whole_command("check").params}
     of_the_list = list_run.OF_THE_LIST
     assert names > of_the_list
@@ -113,14 +114,12 @@ def test_every_option_is_handed_on_or_about_the_list() -> None:
         ("--all list", "needs --output DIR"),
         ("--all list --output out org/repo", "not both"),
         ("--all list --output out --sarif x", "--sarif is about one repository"),
-        ("--all list --output out --html x", "--html is about one repository"),
         ("--all list --output out --fail-on never", "error, warning or note"),
         ("--all list --output out --allow nothing", "there are: requirements"),
         ("--all list --output out --memory much", "takes a size"),
         ("--all list --output out --max-memory 4G", "is too little"),
-        ("--all list --output out --policy nowhere.toml", "cannot be read"),
-        ("--all list --output out --profile weak", "'weak'"),
         ("--all nowhere --output out", "cannot be read"),
+        ("--all list --output out --policy nowhere.toml", "cannot be read"),
         ("--all list --output .", "has other files"),
         ("--all list --output env/out", "is inside the repository that is checked, ./env (line 2"),
         ("--all list --output out --policy env/x", "--policy env/x is inside the repository"),
@@ -131,14 +130,11 @@ def test_every_option_is_handed_on_or_about_the_list() -> None:
         ("--all wrong --output out", "wrong:2: "),
         ("", "name a repository, or a list"),
         ("org/repo --jobs 2", "are for --all FILE"),
-        ("org/repo --output out", "are for --all FILE"),
-        ("org/repo --deadline inf", "--deadline is inf"),
     ],
 )
 def test_what_cannot_be_is_told_first(
     arguments: str, says: str, started: list[tuple[int, list[str]]]
 ) -> None:
-    """And nothing is run, or made."""
     Path("wrong").write_text("org/repo\nrepo\n")
     done = called(*arguments.split())
     assert done.exit_code == Exit.USAGE, done.output
@@ -177,7 +173,6 @@ def test_limits_stay_within_the_budget(
     ],
 )
 def test_what_fails_counts_most(verdicts: list[Verdict], code: Exit) -> None:
-    """As docs/ci.md says."""
     listed = [ListEntry(f"a/{number}", f"a/{number}", number) for number in range(2)]
     results = [
         Judgement(listed=one, verdict=verdict)
@@ -186,3 +181,31 @@ def test_what_fails_counts_most(verdicts: list[Verdict], code: Exit) -> None:
     given = dict.fromkeys(one.name for one in fields(list_run.ListRun) if one.init)
     given |= {"of": dict(zip(listed, results, strict=True))}
     assert list_run.ListRun(**given).exit is code
+
+
+# --- ``--deadline`` interrupts what takes longer, whatever error is made of the interrupt
+
+
+@pytest.mark.parametrize("translates", [False, True])
+def test_what_takes_longer_is_interrupted(translates: bool) -> None:
+    """Whatever it waits for, and whatever it makes of the interrupt."""
+    before = signal.getsignal(signal.SIGALRM)
+    with pytest.raises(DeadlineReached), deadline_alarm(0.01):
+        wait(translates)
+    assert signal.getsignal(signal.SIGALRM) is before
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
+
+
+def wait(translates: bool) -> None:
+    try:
+        threading.Event().wait(60)
+    except KeyboardInterrupt as error:
+        if translates:
+            raise OSError("the download broke off") from error
+        raise
+
+
+def test_an_error_before_it_is_what_it_is() -> None:
+    with pytest.raises(OSError, match="its own"), deadline_alarm(60):
+        raise OSError("its own")
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)

@@ -18,66 +18,47 @@ import typer
 from envhub_sandbox import errors
 from envhub_sandbox.check.play.episodes import Episode, Rollout, RolloutError
 from envhub_sandbox.check.play.plays import VideoError
-from envhub_sandbox.cli.shared.console import plain, print_json, safe_line, say
-from envhub_sandbox.cli.shared.exits import (
-    Exit,
-    UsageError,
-    code_for,
-    describe,
-    reported,
-)
+from envhub_sandbox.cli.shared.console import plain, print_json, safe_line
+from envhub_sandbox.cli.shared.exits import Exit, UsageError, code_for, describe, reported
 from envhub_sandbox.cli.shared.results import TaskResult, returns_of, statistics, task_document
 from envhub_sandbox.errors import EnvHubError
 from envhub_worker.protocol.text import quoted
 
 CODES = {
-    errors.HubReferenceError: 2,
-    errors.PolicyError: 2,
-    UsageError: 2,
-    VideoError: 2,
-    errors.SnapshotError: 3,
-    errors.SnapshotTooLargeError: 3,
-    errors.SnapshotIntegrityError: 3,
-    errors.RepositoryUnavailableError: 3,
-    errors.LoadError: 4,
-    errors.DependencyError: 4,
-    errors.WorkerStartupError: 5,
-    errors.WorkerDiedError: 5,
-    errors.WorkerTimeoutError: 5,
-    errors.RemoteProtocolError: 5,
-    errors.SandboxUnavailableError: 6,
-    RolloutError: 1,
+    2: (errors.HubReferenceError, errors.PolicyError, UsageError, VideoError),
+    3: (
+        *(errors.SnapshotError, errors.SnapshotTooLargeError, errors.SnapshotIntegrityError),
+        errors.RepositoryUnavailableError,
+    ),
+    4: (errors.LoadError, errors.DependencyError),
+    5: (
+        *(errors.WorkerStartupError, errors.WorkerDiedError, errors.WorkerTimeoutError),
+        errors.RemoteProtocolError,
+    ),
+    6: (errors.SandboxUnavailableError,),
+    1: (RolloutError,),
 }
 
 
-@pytest.mark.parametrize(("kind", "code"), CODES.items())
-def test_every_error_has_its_code(kind: type[EnvHubError], code: int) -> None:
-    """As the help and the documentation say."""
-    assert code_for(kind("text")) == code
+def test_every_error_has_its_code(checkout: Path) -> None:
+    """As the table of ``docs/cli.md`` says.
 
-
-def test_what_the_environment_raises_is_told_from_bugs() -> None:
-    """A remote ValueError is the environment's; one of this process is ours."""
+    A remote ValueError is the environment's; one of this process is ours.
+    """
+    for code, kinds in CODES.items():
+        assert [code_for(kind("text")) for kind in kinds] == [code] * len(kinds)
     assert code_for(errors.remote_error("ValueError", "ValueError", "x")) == Exit.ENVIRONMENT
     assert code_for(ValueError("x")) == Exit.BUG
     assert code_for(KeyboardInterrupt()) == Exit.INTERRUPTED
-
-
-def test_every_code_is_in_the_documentation(checkout: Path) -> None:
-    """In the table of ``docs/cli.md``."""
     table = re.findall(r"^\| (\d+) \|", (checkout / "docs" / "cli.md").read_text(), re.MULTILINE)
     assert {int(code) for code in table} == {int(code) for code in Exit}
 
 
 def test_a_message_carries_no_traceback_and_no_escape_sequence() -> None:
-    """The worker's traceback is for --debug; the line that it ends in is in the text."""
-    error = errors.LoadError("repo: bad \x1b[31mred\n  File x, line 1")
+    """The worker's traceback is for --debug; of its output the last lines are those that help."""
+    error: EnvHubError = errors.LoadError("repo: bad \x1b[31mred\n  File x, line 1")
     vars(error)["__notes__"] = ["Traceback ..."]
     assert describe(error) == "repo: bad \\x1b[31mred\n  File x, line 1"
-
-
-def test_the_end_of_the_output_is_kept_short() -> None:
-    """The last lines are those that help."""
     tail = "\n".join(f"line {number}" for number in range(100))
     error = errors.WorkerDiedError(f"it died\nIts last output:\n{quoted(tail)}", log_tail=tail)
     lines = describe(error).splitlines()
@@ -93,23 +74,19 @@ def fail(error: BaseException, *, debug: bool) -> int:
 
 
 def test_a_failure_is_one_message(capsys: pytest.CaptureFixture[str]) -> None:
-    """On stderr, with a hint at --debug where there is more to see."""
+    """On stderr, with a hint at --debug, which shows both tracebacks, where there is more to see.
+
+    Nothing of a bug of ours is blamed on the environment.
+    """
     assert fail(UsageError("say [red]this[/red]"), debug=False) == 2
     assert capsys.readouterr() == ("", "Error: say [red]this[/red]\n")
-    assert fail(errors.remote_error("ValueError", "ValueError", "x", "trace"), debug=False) == 1
+    theirs = errors.remote_error("ValueError", "ValueError", "x", "far \x1b away")
+    assert fail(theirs, debug=False) == 1
     assert "(--debug shows the traceback)" in capsys.readouterr().err
-
-
-def test_debug_shows_both_tracebacks(capsys: pytest.CaptureFixture[str]) -> None:
-    """Ours and the worker's, which is escaped."""
-    fail(errors.remote_error("ValueError", "ValueError", "x", "far \x1b away"), debug=True)
+    fail(theirs, debug=True)
     shown = capsys.readouterr().err
     assert "Traceback (most recent call last)" in shown
     assert "far \\x1b away" in shown
-
-
-def test_a_bug_of_ours_says_so(capsys: pytest.CaptureFixture[str]) -> None:
-    """Nothing is blamed on the environment."""
     assert fail(KeyError("x"), debug=False) == 70
     assert "a bug in envhub: KeyError" in capsys.readouterr().err
 
@@ -155,21 +132,13 @@ def test_where_nothing_can_be_written_the_code_is_the_same(how: str, to: str, co
 
 
 def test_a_full_disk_is_no_bug() -> None:
-    """Of what is printed, or of a file."""
     assert describe(OSError(errno.ENOSPC, "full")).startswith("no space is left for what is print")
     assert "left for /x/y;" in describe(OSError(errno.EDQUOT, "full", "/x/y"))
     assert code_for(OSError(errno.ENOSPC, "full")) is Exit.USAGE
     assert code_for(OSError(errno.EBADF, "bad")) is Exit.BUG
 
 
-def test_nothing_is_cut_or_coloured_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
-    """A long paragraph stays one line for whoever reads the file."""
-    say("word " * 100, style="red")
-    assert capsys.readouterr().err == "word " * 100 + "\n"
-
-
 def test_a_line_stays_a_line() -> None:
-    """Escaped, on one line, and cut."""
     assert safe_line("a\nb\tc\x1b[2J\u202e") == "a b c\\x1b[2J\\u202e"
     assert len(safe_line("x" * 1_000_000, 50)) == 50
 
@@ -193,16 +162,11 @@ def test_json_is_valid_whatever_is_in_it(capsys: pytest.CaptureFixture[str]) -> 
     assert read["array"] == [[0, 1], [2, 3]]
     assert (read["scalar"], read["flag"], read["tuple"]) == (0.5, True, [1, None])
     assert read["3"] == "<class 'object'>"
-
-
-def test_plain_data_stays_as_it_is() -> None:
-    """Including text that is no ASCII."""
     value = {"a": [1, 2.5, "ü", None, True]}
     assert plain(value) == value
 
 
 def test_statistics_are_the_population_s() -> None:
-    """Of the episodes that were played; nothing of nothing."""
     spread = pytest.approx(1.8708286)
     assert statistics([1, 2, 3, 6]) == {"mean": 3.0, "std": spread, "min": 1.0, "max": 6.0}
     assert statistics([]) is None
@@ -210,33 +174,20 @@ def test_statistics_are_the_population_s() -> None:
 
 def result(*returns: tuple[float, ...]) -> TaskResult:
     """A task in which these returns were earned."""
-    episodes = [
-        Episode(sub_env=0, returns=value, length=3, terminated=True, success=None)
-        for value in returns
-    ]
-    return TaskResult(
-        suite="s",
-        task=0,
-        num_envs=1,
-        autoreset_mode=None,
-        rollout=Rollout(episodes=episodes),
-        video=None,
-    )
+    fields: dict[str, Any] = {"sub_env": 0, "length": 3, "terminated": True, "success": None}
+    rollout = Rollout(episodes=[Episode(returns=value, **fields) for value in returns])
+    task: dict[str, Any] = {"suite": "s", "task": 0, "num_envs": 1, "autoreset_mode": None}
+    return TaskResult(rollout=rollout, video=None, **task)
 
 
 def test_vector_returns_are_lists() -> None:
-    """One entry per component; a plain number otherwise."""
     two = task_document(result((1.0, -1.0), (3.0, -3.0)))
     assert [component["mean"] for component in two["return"]] == [2.0, -2.0]
     assert [list(episode["return"]) for episode in two["episodes"]] == [[1.0, -1.0], [3.0, -3.0]]
     one = task_document(result((1.0,), (3.0,)))
     assert one["return"]["mean"] == 2.0
     assert [episode["return"] for episode in one["episodes"]] == [1.0, 3.0]
-
-
-def test_no_finished_episode_is_no_failure() -> None:
-    """There is nothing to average."""
-    assert returns_of(result().rollout) == [None]
+    assert returns_of(result().rollout) == [None], "there is nothing to average"
     assert task_document(result())["success_rate"] is None
 
 

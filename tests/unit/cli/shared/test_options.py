@@ -28,7 +28,6 @@ def options(**given: Any) -> MakeOptions:
 
 
 def test_gpus_are_all_or_named_by_number() -> None:
-    """Anything else is told in the words of the option."""
     assert [read_gpu(text) for text in (None, "all", "0", "0,2")] == [None, True, [0], [0, 2]]
     for text in ("", "true", "-1", "0,", "0 1"):
         with pytest.raises(UsageError, match="it takes all, or indices"):
@@ -61,56 +60,36 @@ def test_sizes_are_read(text: str | None, size: int | None) -> None:
 
 
 def test_env_kwargs_take_json_and_pairs() -> None:
-    """Values are JSON where they can be; later ones win."""
+    """Values are JSON where they can be; later ones win. What is neither is refused."""
     pairs = ("size=9", "mode=rgb_array", "on=true", "path=a=b", "empty=")
-    assert read_env_kwargs(['{"size": 8, "name": "a"}', *pairs]) == {
-        "size": 9,
-        "name": "a",
-        "mode": "rgb_array",
-        "on": True,
-        "path": "a=b",
-        "empty": "",
-    }
-
-
-@pytest.mark.parametrize("text", ["size", "=3", "a b=3", "{", '{"a": }', "[1]"])
-def test_env_kwargs_that_are_neither_are_refused(text: str) -> None:
-    """With what to write instead, or what is wrong with the JSON."""
-    with pytest.raises(UsageError, match="--env-kwargs"):
-        read_env_kwargs([text])
+    merged = {"size": 9, "name": "a", "mode": "rgb_array", "on": True, "path": "a=b", "empty": ""}
+    assert read_env_kwargs(['{"size": 8, "name": "a"}', *pairs]) == merged
+    for text in ("size", "=3", "a b=3", "{", '{"a": }', "[1]"):
+        with pytest.raises(UsageError, match="--env-kwargs"):
+            read_env_kwargs([text])
 
 
 def test_only_what_was_given_reaches_the_policy() -> None:
-    """Defaults stay the library's."""
-    assert options().arguments()["policy"] == {}
-    assert options().arguments()["timeouts"] == {}
-    given = options(
-        memory_bytes="1G",
-        cpu_time_s=5,
-        network="loopback",
-        gpu="all",
-        readable=["/data"],
-        environment=["A"],
-    )
-    assert given.arguments()["policy"] == {
-        "network": "loopback",
-        "gpu": True,
-        "readable": ["/data"],
-        "environment": ["A"],
-        "limits": {"memory_bytes": "1G", "cpu_time_s": 5},
-    }
-
-
-@pytest.mark.parametrize("name", ["memory_bytes", "disk_bytes", "processes", "cpu_time_s"])
-def test_a_limit_of_nothing_is_refused(name: str) -> None:
-    """And is not taken for the default."""
-    given = options(**{name: "0" if name.endswith("_bytes") else 0}).arguments()
-    with pytest.raises(PolicyError, match="above 0"):
-        policy_from(given["policy"], None)
+    """Defaults stay the library's; a limit of nothing is refused, and not taken for one."""
+    nothing = options().arguments()
+    assert (nothing["policy"], nothing["timeouts"], nothing["server_key"]) == ({}, {}, None)
+    granted: dict[str, Any] = {"network": "loopback", "readable": ["/data"], "environment": ["A"]}
+    limits: dict[str, Any] = {"memory_bytes": "1G", "cpu_time_s": 5}
+    given = options(gpu="all", sandbox="tcp://127.0.0.1:5555", server_key="k", **granted, **limits)
+    assert given.arguments()["policy"] == {**granted, "gpu": True, "limits": limits}
+    assert given.arguments()["sandbox"] == "tcp://127.0.0.1:5555"
+    assert given.arguments()["server_key"] == "k"
+    for name, zero in (
+        ("memory_bytes", "0"),
+        ("disk_bytes", "0"),
+        ("processes", 0),
+        ("cpu_time_s", 0),
+    ):
+        with pytest.raises(PolicyError, match="above 0"):
+            policy_from(options(**{name: zero}).arguments()["policy"], None)
 
 
 def test_a_timeout_is_for_every_operation_but_close() -> None:
-    """Closing is bounded by itself."""
     keys = {key for key in ALL if OPTIONS[key].command == "--timeout"}
     assert keys == {"startup_s", "reset_s", "step_s", "call_s"}
     given = dict.fromkeys(keys, 7.5)
@@ -150,19 +129,8 @@ SUITES: dict[str, dict[Any, Any]] = {"a": {0: "a0", 1: "a1"}, "b": {"x": "bx", 0
 def test_selection_keeps_the_order(suites: Any, tasks: Any, expected: list[str]) -> None:
     """Task ids may be numbers or text; on the command line both are text."""
     assert [env for _, _, env in select_envs(SUITES, suites, tasks)] == expected
-
-
-def test_a_selection_of_nothing_names_what_there_is() -> None:
-    """Escaped, since the names are the worker's."""
-    with pytest.raises(UsageError, match=r"a/0, .*evil\\x1b/0"):
+    with pytest.raises(UsageError, match=r"a/0, .*evil\\x1b/0"):  # with what there is, escaped
         select_envs({**SUITES, "evil\x1b": {0: 1}}, ["c"], None)
-
-
-def test_a_servers_key_reaches_make_env_and_is_none_without_a_word() -> None:
-    """For ``--sandbox tcp://...``; ``make_env`` says where it does not belong."""
-    given = options(sandbox="tcp://127.0.0.1:5555", server_key="k").arguments()
-    assert (given["sandbox"], given["server_key"]) == ("tcp://127.0.0.1:5555", "k")
-    assert options().arguments()["server_key"] is None
 
 
 def test_an_option_is_named_as_its_key_is_in_python() -> None:

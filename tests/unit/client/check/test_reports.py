@@ -26,25 +26,42 @@ def report(text: str) -> Report:
 
 
 @pytest.mark.parametrize("text", HOSTILE)
-def test_a_workflow_command_is_one_line(text: str) -> None:
-    """And begins where it begins; the control is the text itself, which has a line of its own."""
-    [line] = reports.workflow_commands(report(text))
-    assert len(line.splitlines()) == 1
-    assert line.startswith("::error file=")
-    assert line.count("::") == 2 + text.replace("\r", "").count("::")
-    head = line.split("title=")[0]
-    assert "\n" not in head
-    assert head.count("::") == 1
-
-
-@pytest.mark.parametrize("text", HOSTILE)
-def test_a_summary_has_no_strangers_markup(text: str) -> None:
-    """One row of four cells, in which nothing is a tag, a link or an image."""
+def test_what_a_stranger_writes_is_text_in_every_form(text: str) -> None:
     made = report(text)
+    [line] = reports.workflow_commands(made)
+    assert len(line.splitlines()) == 1, "the control is the text, which has a line of its own"
+    head = line.split("title=")[0]
+    assert head.startswith("::error file=")
+    assert ("\n" in head, head.count("::")) == (False, 1)
+    assert line.count("::") == 2 + text.replace("\r", "").count("::")
+
     table = reports.summary(made, made.findings).splitlines()
     [row] = [line for line in table if line.startswith("| **fails**")]
-    assert row.count("|") == 5
-    assert not set("<>[]!`") & set(row)
+    assert row.count("|") == 5, "one row of four cells"
+    assert not set("<>[]!`") & set(row), "nothing is a tag, a link or an image"
+
+    suite = ElementTree.fromstring(reports.junit(made, made.findings))
+    assert (suite.attrib["tests"], suite.attrib["failures"]) == ("2", "1")
+    assert [case.attrib["name"] for case in suite] == ["runs", "loads"]
+    [failure] = suite.findall("testcase/failure")
+    assert failure.text
+
+    [run] = json.loads(reports.sarif(made, made.findings))["runs"]
+    assert [rule["id"] for rule in run["tool"]["driver"]["rules"]] == list(CHECKS)
+    place = run["results"][0]["locations"][0]["physicalLocation"]
+    assert place["artifactLocation"]["uri"].isascii()
+    assert not set(" <>\n") & set(place["artifactLocation"]["uri"])
+    assert place["region"] == {"startLine": 3}
+
+
+def test_names_and_messages_make_no_links() -> None:
+    """In a summary a host's name is one without markup; SARIF has placeholders, too."""
+    made = report("[Approve](https://example.com) {0} \\ www.example.com/x __bold__")
+    [result] = json.loads(reports.sarif(made, made.findings))["runs"][0]["results"]
+    assert "\\[Approve\\](" in result["message"]["text"]
+    assert "{{0}} \\\\" in result["message"]["text"]
+    assert "www.example" not in reports.summary(made, made.findings)
+    assert "__" not in reports.summary(made, made.findings)
 
 
 @pytest.mark.parametrize("text", HOSTILE)
@@ -78,46 +95,6 @@ def test_all_that_there_can_be_is_a_line_and_no_notice() -> None:
         assert line.startswith("confined by: strict")
         assert list(reports.workflow_commands(made)) == []
         assert made.confinement.document()["recorded"] is True
-
-
-@pytest.mark.parametrize("text", HOSTILE)
-def test_junit_is_well_formed(text: str) -> None:
-    """Two cases, whatever the text."""
-    made = report(text)
-    suite = ElementTree.fromstring(reports.junit(made, made.findings))
-    assert suite.attrib["tests"] == "2"
-    assert suite.attrib["failures"] == "1"
-    assert [case.attrib["name"] for case in suite] == ["runs", "loads"]
-    [failure] = suite.findall("testcase/failure")
-    assert failure.text
-
-
-@pytest.mark.parametrize("text", HOSTILE)
-def test_sarif_is_data(text: str) -> None:
-    """A result of a rule that is there, at a place that is a URI."""
-    made = report(text)
-    [run] = json.loads(reports.sarif(made, made.findings))["runs"]
-    assert [rule["id"] for rule in run["tool"]["driver"]["rules"]] == list(CHECKS)
-    [result] = run["results"]
-    place = result["locations"][0]["physicalLocation"]
-    assert place["artifactLocation"]["uri"].isascii()
-    assert not set(" <>\n") & set(place["artifactLocation"]["uri"])
-    assert place["region"] == {"startLine": 3}
-
-
-def test_sarif_has_no_strangers_links() -> None:
-    """Nor placeholders: what has a meaning in a message is escaped."""
-    made = report("[Approve](https://example.com) {0} \\")
-    [result] = json.loads(reports.sarif(made, made.findings))["runs"][0]["results"]
-    assert "\\[Approve\\](" in result["message"]["text"]
-    assert "{{0}} \\\\" in result["message"]["text"]
-
-
-def test_a_summary_makes_no_links_of_names() -> None:
-    """A host's name is one without any markup."""
-    made = report("www.example.com/x __bold__")
-    assert "www.example" not in reports.summary(made, made.findings)
-    assert "__" not in reports.summary(made, made.findings)
 
 
 def test_findings_are_bounded() -> None:
@@ -161,17 +138,13 @@ def test_the_most_severe_stands_first_in_every_form() -> None:
     assert cases == [*order, "loads"]
     [run] = json.loads(reports.sarif(made, failures))["runs"]
     assert [one["ruleId"] for one in run["results"]] == order
-    commands = [line.partition("title=envhub check%3A ")[2] for line in workflow(made)]
+    lines = reports.workflow_commands(made)
+    commands = [line.partition("title=envhub check%3A ")[2] for line in lines]
     assert [line.partition(" ")[0] for line in commands] == order
     rows = reports.summary(made, failures).splitlines()[-6:]
     assert [row.split("|")[2].strip() for row in rows] == order
     words = page(made, failures)
     assert sorted(order, key=lambda check: words.index(f"about {check}")) == order
-
-
-def workflow(made: Report) -> list[str]:
-    """GitHub's annotations."""
-    return list(reports.workflow_commands(made))
 
 
 @pytest.mark.parametrize(
@@ -217,7 +190,7 @@ def test_advice_follows_from_the_error(cause: str, says: str) -> None:
     made.judged("runs", ["it broke"], cause=cause)
     [told] = reports.document(made, [])["findings"]
     assert says in told["cure"]
-    assert says in workflow(made)[0]
+    assert says in next(iter(reports.workflow_commands(made)))
     assert told["cure"] in unescape(page(made, []))
 
 

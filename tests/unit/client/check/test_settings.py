@@ -32,31 +32,26 @@ def test_a_policy_is_a_file(tmp_path: Path) -> None:
         ("x = " + "[" * 5_000, "not valid TOML"),
         ("limits = 3", r"\[limits\]"),
         ('netwrok = "none"', "has no field netwrok"),
+        (None, "cannot be read"),
     ],
+    ids=range(6),
 )
-def test_what_is_no_policy_is_refused(text: str, says: str, tmp_path: Path) -> None:
+def test_what_is_no_policy_is_refused(text: str | None, says: str, tmp_path: Path) -> None:
     """With the reason; a misspelt field that did nothing would be a hole."""
     file = tmp_path / "policy.toml"
-    file.write_text(text)
+    if text is not None:
+        file.write_text(text)
     with pytest.raises(PolicyError, match=says):
         policy_from(settings.merged_settings(settings.read_file(file), {}), None)
 
 
-def test_a_policy_that_is_not_there_is_told(tmp_path: Path) -> None:
-    """And not taken for one that says nothing."""
-    with pytest.raises(PolicyError, match="cannot be read"):
-        settings.read_file(tmp_path / "nowhere.toml")
-
-
 def options(folder: Path, text: str) -> dict[str, object]:
-    """What a caller's file comes to."""
     file = folder / "envhub.toml"
     file.write_text(text)
     return settings.read_settings(file, ["steps", "fail_on"])
 
 
 def test_options_stand_in_a_file(tmp_path: Path) -> None:
-    """By the names that they have on the command line."""
     found = options(tmp_path, '[check]\nsteps = 9\nfail-on = "note"')
     assert found == {"steps": 9, "fail_on": "note"}
     assert options(tmp_path, "[other]\nsteps = 9") == {}

@@ -19,7 +19,6 @@ _ENTRY = "def make_env(n_envs=1, use_async_envs=False): pass"
 
 
 def zipped(*names: str) -> bytes:
-    """An archive of empty files."""
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w") as archive:
         for name in names:
@@ -46,7 +45,6 @@ def from_the_hub(folder: Path) -> Snapshot:
 
 
 def surveyed(snapshot: Snapshot) -> Survey:
-    """All that is read of one."""
     return survey(snapshot, parsing.read(snapshot))
 
 
@@ -109,7 +107,6 @@ def test_what_is_worth_a_look_is_found(text: str, check: str, tmp_path: Path) ->
     ],
 )
 def test_honest_code_is_not_named(text: str, tmp_path: Path) -> None:
-    """Names that look alike, and letters of other languages."""
     assert found(tmp_path / "r", text) == []
 
 
@@ -118,6 +115,7 @@ def test_honest_code_is_not_named(text: str, tmp_path: Path) -> None:
     [
         ("fast.so", b"", "machine code", "source-native"),
         ("weights.npz", b"\x7fELF\x02", "machine code", "source-native"),
+        ("a.txt", b"MZ\0\0", "machine code", "source-native"),
         ("env.cpython-311.pyc", b"\xa7\r\r\n\0\0", "compiled Python", "source-compiled"),
         ("__pycache__/env.pyc", b"MZ", "compiled Python", "source-compiled"),
         ("policy.pt", b"PK\x03\x04", "pickle", "source-pickle"),
@@ -140,6 +138,9 @@ def test_honest_code_is_not_named(text: str, tmp_path: Path) -> None:
         ("notes.txt", "\u5f3a\u5316 \u5b66\u4e60".encode(), "text", ""),
         ("long.txt", ("\u5f3a" * 5_000).encode(), "text", ""),
         ("turned.md", "a\u2066b".encode(), "text", "source-hidden"),
+        ("mixed.md", "p\u0430ss".encode(), "text", ""),
+        ("a.md", b"\xff\xfe", "binary", ""),
+        ("a.md", b"a\0b", "binary", ""),
     ],
 )
 def test_files_are_told_by_their_beginnings_and_ends(
@@ -170,6 +171,23 @@ def test_what_cannot_be_read_is_said(text: str, check: str, tmp_path: Path) -> N
     assert checks <= {check, "source-hidden", "source-obscure"}
 
 
+def test_places_are_named_with_their_lines(tmp_path: Path) -> None:
+    """A hidden character once in each line, and a line that nobody reads to its end."""
+    text = "a = 1\nb = '\u202ec\u202e'\nd = '\u200b'\ne = '" + "x y " * 700 + "'\n"
+    repository(tmp_path / "r", "odd.py", text)
+    told = [one for one in surveyed(local(tmp_path / "r")).findings if one.file == "odd.py"]
+    assert [(one.id, one.line, one.message[:12]) for one in told] == [
+        ("source-hidden", 2, "holds U+202E"),
+        ("source-hidden", 3, "holds U+200B"),
+        ("source-obscure", 4, "a line of 28"),
+    ]
+
+
+def test_a_flood_of_hidden_characters_is_bounded(tmp_path: Path) -> None:
+    checks = [check for check, _ in found(tmp_path / "r", "\u200b\n" * 100, "notes.md")]
+    assert checks.count("source-hidden") == 20
+
+
 def test_a_long_chain_ends_nothing(tmp_path: Path) -> None:
     """Some versions of Python's parser take it, and others do not."""
     chain = "if x: pass\n" + "elif x: pass\n" * 5_000
@@ -177,13 +195,11 @@ def test_a_long_chain_ends_nothing(tmp_path: Path) -> None:
 
 
 def test_what_is_found_in_a_file_is_bounded(tmp_path: Path) -> None:
-    """And that there is more is found, too."""
     checks = [check for check, _ in found(tmp_path / "r", "eval()\n" * 20_000)]
     assert checks == ["source-dynamic"] * 100 + ["source-unread"]
 
 
 def test_what_is_read_of_a_repository_is_bounded(tmp_path: Path) -> None:
-    """What is left over is named, file by file."""
     folder = repository(tmp_path / "r", "odd.py", "")
     for number in range(70):
         (folder / f"part{number:02}.py").write_bytes((b"#" * 98 + b"\n") * 2_600)
@@ -195,7 +211,6 @@ def test_what_is_read_of_a_repository_is_bounded(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("start", ["MZ = 1", "BZh = 1", "#" + " " * 256 + "ustar"])
 def test_no_beginning_makes_python_anything_else(start: str, tmp_path: Path) -> None:
-    """It runs by its name, and is read by it."""
     assert ("source-process", 2) in found(tmp_path / "r", f"{start}\nimport subprocess")
 
 
@@ -211,7 +226,6 @@ def test_machine_code_in_place_of_a_source_fails(tmp_path: Path) -> None:
 
 
 def test_no_flood_hides_what_weighs_more(tmp_path: Path) -> None:
-    """Neither of findings nor of texts to be read."""
     folder = repository(tmp_path / "r", "z/odd.py", b"# coding: utf-7\n")
     (folder / "z/turned.py").write_text("x = 'a\u202eb'")
     for number in range(220):

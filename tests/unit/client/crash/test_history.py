@@ -24,12 +24,10 @@ def made(space: Any = None, num_envs: int = 2, limit: int = 1000) -> History:
 
 
 def ask(kept: History, message: m.Message) -> None:
-    """Record any request but a step."""
     kept.requested(requested(message))
 
 
 def reset(kept: History, seeds: Any = None, mask: Any = None) -> None:
-    """Record a reset."""
     ask(kept, m.Reset(0, seeds, None, mask))
 
 
@@ -52,7 +50,7 @@ def test_what_shards_were_sent_is_kept_as_it_was_asked() -> None:
     assert recording.exact
     found = [m.unpack(one.frames) for one in recording.requests if isinstance(one, RecordedRequest)]
     assert [one.operation for one in recording.requests if isinstance(one, RecordedRequest)] == [
-        *("reset", "setattr", "call", "callone"),
+        *("reset", "setattr", "call", "callone")
     ]
     reset_of_all, set_for_all, called, called_one = found
     assert isinstance(reset_of_all, m.Reset)
@@ -65,13 +63,11 @@ def test_what_shards_were_sent_is_kept_as_it_was_asked() -> None:
 
 
 def actions_of(recording: Recording) -> list[Any]:
-    """The actions of all steps, as lists."""
     runs = [request.actions for request in recording.requests if isinstance(request, Steps)]
     return [row.tolist() for run in runs for row in run]
 
 
 def names_of(recording: Recording) -> list[str]:
-    """What was asked beside plain steps."""
     return [one.operation for one in recording.requests if isinstance(one, RecordedRequest)]
 
 
@@ -91,11 +87,19 @@ def test_requests_come_back_in_order() -> None:
     assert isinstance(render, RecordedRequest)
     assert isinstance(last, Steps)
     assert kept.recording().exact
+    ask(kept, m.Call(0, "add", (object(),), {}))
+    described = kept.recording().requests[-1]
+    assert isinstance(described, RecordedRequest)
+    assert not kept.recording().exact, "what only pickle could carry is not the thing itself"
+    assert "remote object" in repr(m.unpack(described.frames))
+    nothing = made(limit=0)  # which turns it off
+    reset(nothing, [1, 2])
+    nothing.step(np.array([1, 2]))
+    assert nothing.recording() == Recording()
 
 
 @given(st.lists(st.sampled_from(["int64", "int32", "uint8"]), max_size=12))
 def test_every_step_keeps_its_dtype(dtypes: list[str]) -> None:
-    """An environment may tell them apart."""
     kept = made()
     expected = [np.array([1, 2], dtype) for dtype in dtypes]
     for actions in expected:
@@ -197,7 +201,6 @@ def test_the_oldest_gives_way(limit: int, steps: int) -> None:
     "space", [spaces.Box(-1, 1, (1000,)), spaces.Dict(a=spaces.Box(-1, 1, (1000,)))]
 )
 def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch, space: Any) -> None:
-    """Large actions are fewer; so are large options."""
     monkeypatch.setattr(history, "HISTORY_BYTES", 100_000)
     kept = made(space, 1, limit=1000)
     actions: Any = np.zeros((1, 1000))
@@ -207,24 +210,6 @@ def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch, space: Any) -> None:
     for _ in range(30):
         ask(kept, m.Reset(0, None, {"map": np.zeros(5000)}, np.array([True])))
     assert len(kept.recording().requests) <= 3
-
-
-def test_what_only_pickle_could_carry_is_described() -> None:
-    """The recording knows that it is not the thing itself."""
-    kept = made()
-    ask(kept, m.Call(0, "add", (object(),), {}))
-    [request] = kept.recording().requests
-    assert isinstance(request, RecordedRequest)
-    assert not kept.recording().exact
-    assert "remote object" in repr(m.unpack(request.frames))
-
-
-def test_nothing_is_kept_where_nothing_is_wanted() -> None:
-    """A limit of 0 turns it off."""
-    kept = made(limit=0)
-    reset(kept, [1, 2])
-    kept.step(np.array([1, 2]))
-    assert kept.recording() == Recording()
 
 
 def test_after_a_transparent_restart_nobody_knows_before_all_are_seeded() -> None:

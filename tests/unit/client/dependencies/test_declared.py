@@ -23,8 +23,6 @@ def repository(folder: Path, **files: str) -> DeclaredPackages | None:
 
 
 def plain(found: DeclaredPackages | None) -> list[str]:
-    """Its requirements as text."""
-    assert found is not None
     return [str(one) for one in found.wanted]
 
 
@@ -35,12 +33,11 @@ def script(*lines: str) -> str:
 
 
 def test_plain_requirements_get_through(tmp_path: Path) -> None:
-    """With extras, versions, markers and comments."""
     text = (
         "# wanted\nnumpy>=2\n\n  # more\nminigrid[wfc]==3.0 # pinned\nfoo; python_version<'3.12'\n"
     )
     assert plain(repository(tmp_path, requirements__txt=text)) == [
-        *("numpy>=2", "minigrid[wfc]==3.0", 'foo; python_version < "3.12"'),
+        *("numpy>=2", "minigrid[wfc]==3.0", 'foo; python_version < "3.12"')
     ]
 
 
@@ -48,7 +45,6 @@ def test_hashes_stand_on_the_line_or_on_the_next(tmp_path: Path) -> None:
     """As pip and uv write them; the line that is named is the first."""
     text = f"numpy==2.0 --hash={HASH}\nfoo==1 \\\n    --hash={HASH} \\\n    --hash={HASH}\nbar\n"
     found = repository(tmp_path, requirements__txt=text)
-    assert found is not None
     assert [(len(one.hashes), one.where) for one in found.wanted] == [
         (1, "line 1 of requirements.txt"),
         (2, "line 2 of requirements.txt"),
@@ -82,16 +78,17 @@ def test_whatever_could_run_code_does_not(tmp_path: Path, line: str) -> None:
 
 @pytest.mark.parametrize("line", ["-e ./here", "here @ file:///tmp/here", "a" * 3000])
 def test_nor_in_the_other_files(tmp_path: Path, line: str) -> None:
-    """Where a list of TOML holds it."""
+    """Where a list of TOML holds it; nor is a second block taken, which could be another's."""
     with pytest.raises(RequirementError, match=r"in the script metadata of env\.py"):
         repository(tmp_path, env__py=script(f"dependencies = ['{line}']"))
     project = f"[project]\nname = 'x'\ndependencies = ['{line}']\n"
     with pytest.raises(RequirementError, match=r"in \[project\] of pyproject\.toml"):
         repository(tmp_path, env__py="", pyproject__toml=project)
+    with pytest.raises(RequirementError, match="2 blocks"):
+        repository(tmp_path, env__py=script("dependencies = []") + script("dependencies = []"))
 
 
 def test_a_file_that_is_no_text_is_refused(tmp_path: Path) -> None:
-    """Or too long to be one that somebody wrote."""
     path = tmp_path / "requirements.txt"
     for data in (b"\xff\xfe\x00", b"\x80numpy"):
         path.write_bytes(data)
@@ -119,19 +116,21 @@ def test_further_files_of_the_repository_are_read(tmp_path: Path) -> None:
     (tmp_path / "more/held.txt").write_text("foo<2\n-r deeper.txt\n")
     (tmp_path / "more/deeper.txt").write_text("bar<3\n")
     found = repository(tmp_path, requirements__txt="a\n-r more/base.txt\n")
-    assert found is not None
     assert [str(one) for one in found.wanted] == ["a", "numpy"]
     assert [(str(one), one.where) for one in found.constraints] == [
         ("foo<2", "line 1 of more/held.txt"),
         ("bar<3", "line 1 of more/deeper.txt"),
     ]
+    for number in range(module.MAX_FILES + 1):
+        (tmp_path / f"{number}.txt").write_text(f"-r {number + 1}.txt\n")
+    with pytest.raises(RequirementError, match="includes more than"):
+        repository(tmp_path, requirements__txt="-r 0.txt\n")
 
 
 @pytest.mark.parametrize(
     "named", ["../outside.txt", "/etc/hostname", "more", "https://a.example/r"]
 )
 def test_no_file_beyond_the_repository_is_read(tmp_path: Path, named: str) -> None:
-    """Whatever a line names."""
     (tmp_path / "outside.txt").write_text("numpy\n")
     (tmp_path / "repo/more").mkdir(parents=True)
     with pytest.raises(RequirementError, match="not a file of the repository"):
@@ -152,16 +151,7 @@ def test_the_repository_itself_is_its_project(tmp_path: Path) -> None:
         read(tmp_path, "requirements.txt")
 
 
-def test_a_chain_of_files_ends(tmp_path: Path) -> None:
-    """Before it has a thousand."""
-    for number in range(module.MAX_FILES + 1):
-        (tmp_path / f"{number}.txt").write_text(f"-r {number + 1}.txt\n")
-    with pytest.raises(RequirementError, match="includes more than"):
-        repository(tmp_path, requirements__txt="-r 0.txt\n")
-
-
 def test_the_file_beside_the_entry_counts(tmp_path: Path) -> None:
-    """Before the one at the root."""
     (tmp_path / "deep").mkdir()
     (tmp_path / "deep/env.py").write_text("")
     (tmp_path / "requirements.txt").write_text("of-root\n")
@@ -184,21 +174,18 @@ def test_what_was_seen_and_not_read_is_said(tmp_path: Path) -> None:
 
 def test_the_most_particular_file_counts(tmp_path: Path) -> None:
     """The entry file's own metadata, then requirements.txt, then the project."""
+
+    def found(**files: str) -> tuple[str, list[str], str]:
+        made = repository(tmp_path, **files)
+        return made.source, plain(made), made.python
+
     project = "[project]\nname = 'x'\nrequires-python = '>=3.11'\ndependencies = ['of-project']\n"
     assert repository(tmp_path) is None
-    found = repository(tmp_path, pyproject__toml=project)
-    assert found is not None
-    assert (found.source, plain(found), found.python) == (
-        *("pyproject.toml", ["of-project"]),
-        ">=3.11",
-    )
-    found = repository(tmp_path, requirements__txt="of-file\n")
-    assert found is not None
-    assert (found.source, plain(found), found.python) == ("requirements.txt", ["of-file"], ">=3.11")
+    assert found(pyproject__toml=project) == ("pyproject.toml", ["of-project"], ">=3.11")
+    of_file = found(requirements__txt="of-file\n")
+    assert of_file == ("requirements.txt", ["of-file"], ">=3.11")
     text = script("requires-python = '<3.13'", "dependencies = [", "  'of-script',", "]")
-    found = repository(tmp_path, env__py=text)
-    assert found is not None
-    assert (found.source, plain(found), found.python) == ("env.py", ["of-script"], "<3.13")
+    assert found(env__py=text) == ("env.py", ["of-script"], "<3.13")
 
 
 @pytest.mark.parametrize(
@@ -240,9 +227,3 @@ def test_a_spoiled_project_is_refused(tmp_path: Path, text: str, said: str) -> N
         repository(tmp_path, pyproject__toml=text)
     assert "pyproject.toml" in str(caught.value)
     assert "dependencies='host'" in str(caught.value)
-
-
-def test_two_blocks_are_refused(tmp_path: Path) -> None:
-    """PEP 723 permits one; to take either could be another's choice."""
-    with pytest.raises(RequirementError, match="2 blocks"):
-        repository(tmp_path, env__py=script("dependencies = []") + script("dependencies = []"))

@@ -12,15 +12,8 @@ from envhub_sandbox.dependencies import interpreters, resolutions
 from envhub_sandbox.dependencies import resolve as resolving
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.dependencies.modules import MissingModule, guessed
-from envhub_sandbox.dependencies.packages import PackageSet, packages_for
-from envhub_sandbox.dependencies.request import (
-    AUTO,
-    DECLARED,
-    Choice,
-    PackageRequest,
-    chosen,
-    request_of,
-)
+from envhub_sandbox.dependencies.packages import packages_for
+from envhub_sandbox.dependencies.request import AUTO, DECLARED, PackageRequest, chosen, request_of
 from envhub_sandbox.dependencies.resolve import Lock, Target
 from envhub_sandbox.errors import ResolutionError
 from envhub_sandbox.hub.snapshot import Snapshot, local
@@ -46,13 +39,7 @@ def snapshot(folder: Path, text: str, **files: str) -> Snapshot:
 
 
 def requirements(found: Snapshot) -> list[str]:
-    """What is guessed."""
     return [str(one.wanted.requirement) for one in guessed(found)]
-
-
-def made(found: Snapshot, choice: Choice = AUTO) -> PackageSet | None:
-    """Its packages, and no warning is an error."""
-    return packages_for(found, choice)
 
 
 @pytest.mark.parametrize(
@@ -102,44 +89,29 @@ def test_it_is_installed_and_told(index: Index, tmp_path: Path) -> None:
         make_wheel(index.folder, name)
     found = snapshot(tmp_path / "r", "import chess" + MAKE, requirements__txt="declared\n")
     with pytest.warns(UserWarning, match=r"chess is installed, .*env\.py, line 1"):
-        first = made(found)
-    assert first is not None
+        first = packages_for(found, AUTO)
     assert {"declared==1.0", "chess==1.0"} <= set(first.facts["packages"])
     assert [one["module"] for one in first.facts["inferred"]] == ["chess"]
-    assert made(found) == first
-    strict = made(found, DECLARED)
-    assert strict is not None
+    assert packages_for(found, AUTO) == first
+    strict = packages_for(found, DECLARED)
     assert "chess==1.0" not in strict.facts["packages"]
     assert "inferred" not in strict.facts
 
 
 def test_what_a_declared_package_brings_is_declared(index: Index, tmp_path: Path) -> None:
-    """By any of the distributions that bring the module."""
     make_wheel(index.folder, "declared", requires=["opencv-contrib-python"])
     make_wheel(index.folder, "opencv-contrib-python")
     found = snapshot(tmp_path / "r", "import cv2" + MAKE, requirements__txt="declared\n")
-    resolved = made(found, chosen({}, None)[0])
-    assert resolved is not None
+    resolved = packages_for(found, chosen({}, None)[0])
     assert "inferred" not in resolved.facts
 
 
-def test_an_extra_of_its_own_says_which(index: Index, tmp_path: Path) -> None:
-    """By name or by the table, with its versions; also of a module that the table lacks."""
-    project = "[project]\nname = 'x'\n[project.optional-dependencies]\n"
-    project += "all = ['chess<2', 'nobody-knows-this>1', 'unrelated']\n"
-    text = "import chess, nobody_knows_this" + MAKE
-    assert requirements(snapshot(tmp_path / "r", text, pyproject__toml=project)) == [
-        *("chess<2", "nobody-knows-this>1"),
-    ]
-
-
 def test_no_index_is_asked_for_the_name_of_a_module(index: Index, tmp_path: Path) -> None:
-    """Anybody may have published it there."""
     make_wheel(index.folder, "nobody-knows-this")
     make_wheel(index.folder, "chess")
     found = snapshot(tmp_path / "r", "import nobody_knows_this, chess" + MAKE)
     with pytest.warns(UserWarning, match="chess is installed"):
-        assert made(found) is not None
+        assert packages_for(found, AUTO) is not None
     assert any("chess" in path for path in index.asked)
     assert not any("nobody" in path for path in index.asked)
     said = MissingModule(found, "process", "auto", None, True).advice(
@@ -160,20 +132,18 @@ def test_a_guess_never_stands_in_the_way(
     monkeypatch.setattr(interpreters, "others", lambda declared, first: [])
     make_wheel(index.folder, "declared")
     found = snapshot(tmp_path / "r", "import chess" + MAKE, requirements__txt="declared\n")
-    resolved = made(found)
-    assert resolved is not None
+    resolved = packages_for(found, AUTO)
     assert "declared==1.0" in resolved.facts["packages"]
     assert "inferred" not in resolved.facts
-    assert made(snapshot(tmp_path / "s", "import chess" + MAKE)) is None
+    assert packages_for(snapshot(tmp_path / "s", "import chess" + MAKE), AUTO) is None
     with pytest.raises(ResolutionError, match="chess"):
-        made(snapshot(tmp_path / "s", "import chess" + MAKE), chosen({}, None)[0])
+        packages_for(snapshot(tmp_path / "s", "import chess" + MAKE), chosen({}, None)[0])
 
 
 def test_what_is_here_is_not_installed(index: Index, tmp_path: Path) -> None:
-    """As long as this interpreter has all of it."""
     found = snapshot(tmp_path / "r", "import rich, zmq" + MAKE)
     assert requirements(found) == ["rich", "pyzmq"]
-    assert made(found) is None
+    assert packages_for(found, AUTO) is None
     assert index.asked == []
 
 
@@ -189,12 +159,19 @@ def test_what_is_here_is_not_installed(index: Index, tmp_path: Path) -> None:
 def test_the_caller_has_the_last_word(
     tmp_path: Path, dependencies: Any, wanted: list[str], guessed: list[str]
 ) -> None:
-    """On what is declared, and on what is imported."""
     found = snapshot(tmp_path / "r", "import chess" + MAKE, requirements__txt="a\n")
     request = request_of(found, chosen(dependencies, None)[0])
-    assert request is not None
     assert list(map(str, request.wanted)) == wanted
     assert [one.module for one in request.guesses] == guessed
+
+
+def test_an_extra_of_its_own_says_which(tmp_path: Path) -> None:
+    """By name or by the table, with its versions; also of a module that the table lacks."""
+    project = "[project]\nname = 'x'\n[project.optional-dependencies]\n"
+    project += "all = ['chess<2', 'nobody-knows-this>1', 'unrelated']\n"
+    text = "import chess, nobody_knows_this" + MAKE
+    found = snapshot(tmp_path / "r", text, pyproject__toml=project)
+    assert requirements(found) == ["chess<2", "nobody-knows-this>1"]
 
 
 # --- another interpreter --------------------------------------------------------------------
@@ -235,10 +212,7 @@ def test_another_release_is_tried_and_remembered(
 ) -> None:
     """The newest first, after our own; the next time it is known which."""
     stamps = {"/opt/3.98.0": [1, 1]}
-    monkeypatch.setattr(
-        *inside.telling_releases_apart(),
-        lambda one: stamps.get(one.path, [0, 0]),
-    )
+    monkeypatch.setattr(*inside.telling_releases_apart(), lambda one: stamps.get(one.path, [0, 0]))
     found = resolutions.resolution_for(request("a"))
     assert found.interpreter.version == "3.98.0"
     assert tried == [OURS.path, "/opt/3.99.1", "/opt/3.98.0"]
@@ -250,7 +224,6 @@ def test_another_release_is_tried_and_remembered(
 
 
 def test_all_that_were_tried_are_named(tried: list[str]) -> None:
-    """With the way to one that this machine lacks."""
     with pytest.raises(ResolutionError) as caught:
         resolutions.resolution_for(request("never"))
     said = str(caught.value)
@@ -272,7 +245,6 @@ def test_no_other_release_is_tried_in_vain(
 
 
 def test_uv_fetches_an_interpreter_only_where_it_may(monkeypatch: pytest.MonkeyPatch) -> None:
-    """By its own command, which downloads nothing otherwise."""
     asked: list[Any] = []
     here: list[Interpreter] = []
     monkeypatch.setattr(*inside.finding_interpreters(), lambda wanted: list(here))

@@ -27,7 +27,6 @@ MANIFEST = Manifest(envs=(wire.env_manifest(BOX, ACTIONS, 2),), lazy=True)
 
 @pytest.fixture
 def snapshot(tmp_path: Path, snapshot_store: Path) -> Snapshot:
-    """A repository of one file."""
     (tmp_path / "repo").mkdir()
     (tmp_path / "repo" / "env.py").write_text("1")
     return local(tmp_path / "repo")
@@ -73,7 +72,6 @@ def test_nothing_else_may_choose_packages(snapshot: Snapshot, tmp_path: Path) ->
 def test_what_has_drifted_gets_no_packages(
     snapshot: Snapshot, changes: dict[str, Any], said: str
 ) -> None:
-    """The repository is named, and nothing is installed."""
     with pytest.raises(LockDriftError, match=said) as caught:
         packages.locked_packages(snapshot, locked(snapshot, **changes))
     assert snapshot.label in str(caught.value)

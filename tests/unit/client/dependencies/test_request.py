@@ -41,7 +41,6 @@ def declares(*lines: str, python: str = "") -> PackageRequest:
 
 
 def snapshot(folder: Path, requirements: str | None = None) -> Snapshot:
-    """A repository that declares this."""
     (folder / "env.py").write_text("")
     if requirements is not None:
         (folder / "requirements.txt").write_text(requirements)
@@ -49,7 +48,6 @@ def snapshot(folder: Path, requirements: str | None = None) -> Snapshot:
 
 
 def test_what_the_caller_says(tmp_path: Path) -> None:
-    """Two words, a path, or a mapping."""
     assert chosen("auto", None) == (AUTO, None)
     assert chosen("host", None) == (HOST, None)
     assert chosen("auto", "python3.12") == (HOST, "python3.12")
@@ -79,7 +77,6 @@ def test_what_the_caller_says(tmp_path: Path) -> None:
     ],
 )
 def test_what_nobody_could_have_meant_is_refused(wrong: Any) -> None:
-    """By the name of the argument."""
     with pytest.raises(PolicyError, match="dependencies"):
         chosen(wrong, None)
 
@@ -101,29 +98,24 @@ def test_no_link_and_no_second_interpreter(
 
 
 @pytest.mark.parametrize(
-    "lines",
+    ("lines", "python", "unmet"),
     [
-        *([], ["numpy"], [f"numpy=={NUMPY}"], ["numpy>=1.26", "gymnasium"], ["NumPy"]),
-        ["no-such-package; python_version < '3'"],
+        *(((), "", None), (("numpy",), "", None), ((f"numpy=={NUMPY}",), "", None)),
+        *((("numpy>=1.26", "gymnasium"), "", None), (("NumPy",), "", None)),
+        (("no-such-package; python_version < '3'",), "", None),
+        ((), f"=={platform.python_version()}", None),
+        (("numpy",), "<3", "python<3"),
+        (("gymnasium", "no-such-package"), "", "no-such-package"),
+        (("gymnasium", f"numpy!={NUMPY}"), "", f"numpy!={NUMPY}"),
+        (("numpy<1",), "", "numpy<1"),
+        ((f"numpy=={NUMPY} --hash=sha256:{'0' * 64}",), "", f"numpy=={NUMPY}"),
     ],
 )
-def test_what_is_here_is_not_installed_again(lines: list[str]) -> None:
-    """By name and version, without importing any of it."""
-    assert interpreters.first_unmet(declares(*lines)) is None
-
-
-@pytest.mark.parametrize(
-    "line",
-    [
-        *("no-such-package", f"numpy!={NUMPY}", "numpy<1"),
-        f"numpy=={NUMPY} --hash=sha256:{'0' * 64}",
-    ],
-)
-def test_what_is_not_here_is_named(line: str) -> None:
-    """Another version is not here; nor is one whose files nobody can compare."""
-    assert interpreters.first_unmet(declares("gymnasium", line)) == str(
-        parse_requirement(line, "").requirement
-    )
+def test_what_is_here_is_not_installed_again(
+    lines: tuple[str, ...], python: str, unmet: str | None
+) -> None:
+    """By name and version, without importing any; not what has hashes, which nobody can compare."""
+    assert interpreters.first_unmet(declares(*lines, python=python)) == unmet
 
 
 @pytest.mark.parametrize("marker", ["os_name ~= 'posix'", "python_version ~= '3'", "'a' ~= 'b'"])
@@ -135,7 +127,6 @@ def test_a_marker_that_says_nothing_is_left_to_uv(marker: str) -> None:
 def test_a_python_that_was_built_from_a_checkout(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It says a plus behind its version."""
     monkeypatch.setattr(platform, "python_version", lambda: "3.12.1+")
     assert interpreters.first_unmet(declares(python=">=3.12,<3.13")) is None
     assert interpreters.own().version == "3.12.1"
@@ -144,12 +135,6 @@ def test_a_python_that_was_built_from_a_checkout(
     other.write_text(f"#!/bin/sh\necho '{json.dumps(facts)}'\n")
     other.chmod(0o755)
     assert interpreters.find(str(other)).version == "3.12.2"
-
-
-def test_another_python_is_not_here() -> None:
-    """Whatever is installed."""
-    assert interpreters.first_unmet(declares(python=f"=={platform.python_version()}")) is None
-    assert interpreters.first_unmet(declares("numpy", python="<3")) == "python<3"
 
 
 def test_what_is_here_needs_what_it_needs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -176,45 +161,31 @@ def test_only_what_is_missing_makes_an_environment(tmp_path: Path) -> None:
         request = request_of(found, AUTO)
         assert (request is not None and not HERE.meets(request)) == auto
         always = request_of(found, own)
-        assert always is not None
         assert always.always
 
 
-def test_this_interpreter_without_its_packages_comes_first() -> None:
-    """A virtual environment has none that anybody else needs."""
+def test_this_interpreter_without_its_packages_comes_first(tmp_path: Path) -> None:
+    """A virtual environment has none that anybody else needs; a path is asked what it is."""
     found = interpreters.find("", ">=3.10")
-    assert found == interpreters.own()
+    assert found == interpreters.own() == interpreters.find(found.path)
     assert Path(found.path).resolve() == Path(found.path)
     assert found.version == platform.python_version()
-
-
-@pytest.mark.parametrize(("asked", "declared"), [("3.99", ""), ("", ">=3.99"), ("3.8", "")])
-def test_no_interpreter_is_an_error_that_says_what_to_do(asked: str, declared: str) -> None:
-    """Nothing is downloaded."""
-    with pytest.raises(InterpreterUnavailableError, match=r"uv python install"):
-        interpreters.find(asked, declared)
-
-
-def test_a_pyenv_that_is_closed_to_us_has_none(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """It is another user's, and no error; nor is one that holds something else."""
-    (tmp_path / "versions/3.99.0/bin").mkdir(parents=True)
-    (tmp_path / "versions/3.99.0/bin/python3").write_text("")
-    monkeypatch.setenv("PYENV_ROOT", str(tmp_path))
-    with pytest.raises(InterpreterUnavailableError):
-        interpreters.find("3.99")
-    monkeypatch.setenv("PYENV_ROOT", "/proc/1/root")
-    with pytest.raises(InterpreterUnavailableError):
-        interpreters.find("3.99")
-
-
-def test_an_interpreter_by_its_path(tmp_path: Path) -> None:
-    """It is asked what it is; what does not answer is none."""
-    ours = interpreters.own()
-    assert interpreters.find(ours.path) == ours
     with pytest.raises(InterpreterUnavailableError, match="does not work as an interpreter"):
         interpreters.find(str(tmp_path / "python"))
+
+
+@pytest.mark.parametrize(
+    ("asked", "declared", "pyenv"), [("3.99", "", "{}"), ("", ">=3.99", "/proc/1/root")]
+)
+def test_no_interpreter_is_an_error_that_says_what_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, asked: str, declared: str, pyenv: str
+) -> None:
+    """Nothing is downloaded; a pyenv that is closed to us has none, nor one without a program."""
+    (tmp_path / "versions/3.99.0/bin").mkdir(parents=True)
+    (tmp_path / "versions/3.99.0/bin/python3").write_text("")
+    monkeypatch.setenv("PYENV_ROOT", pyenv.format(tmp_path))
+    with pytest.raises(InterpreterUnavailableError, match=r"uv python install"):
+        interpreters.find(asked, declared)
 
 
 @pytest.mark.parametrize(
@@ -235,18 +206,19 @@ def test_a_missing_module_has_one_cure(
     tmp_path: Path, place: str, choice: Any, python: Any, own: bool, said: str
 ) -> None:
     """It depends on the place, and what the repository declares is told."""
-    text = MissingModule(
-        snapshot(tmp_path, "numpy>=1\n"), place, choice.where, python, own
-    ).advice()
+    found = snapshot(tmp_path, "numpy>=1\n")
+    text = MissingModule(found, place, choice.where, python, own).advice()
     assert said in text
     assert place == "process" or "python=" not in text  # which is refused elsewhere
     assert "Its requirements.txt declares numpy>=1" in text
 
 
-def test_a_repository_that_declares_nothing_is_said_to(tmp_path: Path) -> None:
-    """And one whose file cannot be taken, why."""
-    nothing = MissingModule(snapshot(tmp_path), "process", "auto", None, False).advice()
-    assert "declares no packages" in nothing
-    wrong = snapshot(tmp_path, "-e .\n")
-    said = MissingModule(wrong, "docker", "auto", None, False).advice()
-    assert "line 1 of requirements.txt" in said
+@pytest.mark.parametrize(
+    ("requirements", "said"),
+    [(None, "declares no packages"), ("-e .\n", "line 1 of requirements.txt")],
+)
+def test_what_declares_nothing_that_can_be_taken_is_told(
+    tmp_path: Path, requirements: str | None, said: str
+) -> None:
+    found = snapshot(tmp_path, requirements)
+    assert said in MissingModule(found, "docker", "auto", None, False).advice()

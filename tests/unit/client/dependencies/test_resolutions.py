@@ -6,14 +6,17 @@ import hashlib
 import io
 import tarfile
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
-from envhub_sandbox.dependencies import interpreters, packages, resolutions
+from envhub_sandbox.dependencies import interpreters, packages, resolutions, resolve
 from envhub_sandbox.dependencies.declared import Source, of_git, parse_requirement
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.dependencies.request import PackageRequest
+from envhub_sandbox.dependencies.resolutions import resolution_for
+from envhub_sandbox.dependencies.resolve import Lock
 from envhub_sandbox.errors import RequirementError, ResolutionError
 from tests.support.packages.wheels import Index, make_wheel
 
@@ -21,7 +24,6 @@ COMMIT = "0123456789abcdef0123456789abcdef01234567"
 
 
 def request(*lines: str) -> PackageRequest:
-    """A repository that needs these."""
     wanted = (parse_requirement(line, f"line {n}") for n, line in enumerate(lines, start=1))
     return PackageRequest("requirements.txt", tuple(wanted))
 
@@ -96,31 +98,24 @@ def test_what_is_named_beside_another_is_built_in_its_turn(
     assert "deeper-source" in {one.name for one in built}
 
 
-def test_wheels_are_taken_where_there_are_some(
-    index: Index, tmp_path: Path, built: list[Source]
+def test_without_a_builder_there_are_wheels_alone(
+    index: Index, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """An older one, rather than a newer source."""
-    source_distribution(index.folder, "only-source", "2.0", tmp_path / "ran")
-    make_wheel(index.folder, "only-source", "1.0")
-    assert "only-source==1.0" in resolutions.resolution_for(request("only-source")).lock.packages
-    assert built == []
-
-
-def test_without_a_builder_there_are_wheels_alone(index: Index, tmp_path: Path) -> None:
-    """Nothing runs, and the text names the package."""
+    """Nothing runs, and the text names the package; an older wheel rather than a newer source."""
+    monkeypatch.setattr(resolutions, "BUILDER", None)
+    monkeypatch.setattr(interpreters, "others", lambda declared, first: [])
     source_distribution(index.folder, "only-source", "1.5", tmp_path / "ran")
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(resolutions, "BUILDER", None)
-        patch.setattr(interpreters, "others", lambda declared, first: [])
-        with pytest.raises(ResolutionError, match="only-source"):
-            resolutions.resolution_for(request("only-source"))
-        with pytest.raises(RequirementError, match="line 1 takes of-git from"):
-            resolutions.resolution_for(request(f"of-git @ git+https://git.example/a/b@{COMMIT}"))
+    with pytest.raises(ResolutionError, match=r"(?s)only-source.*wheels"):
+        resolutions.resolution_for(request("only-source"))
+    with pytest.raises(RequirementError, match="line 1 takes of-git from"):
+        resolutions.resolution_for(request(f"of-git @ git+https://git.example/a/b@{COMMIT}"))
+    source_distribution(index.folder, "some-wheel", "2.0", tmp_path / "ran")
+    make_wheel(index.folder, "some-wheel", "1.0")
+    assert "some-wheel==1.0" in resolutions.resolution_for(request("some-wheel")).lock.packages
     assert not (tmp_path / "ran").exists()
 
 
 def test_a_repository_becomes_the_version_of_its_wheel(index: Index, built: list[Source]) -> None:
-    """uv never hears of it."""
     make_wheel(index.folder, "only-wheel")
     line = f"Of_Git @ git+https://git.example/a/b.git@{COMMIT}#subdirectory=python"
     found = resolutions.resolution_for(request(line)).lock
@@ -151,3 +146,74 @@ def test_nothing_else_is_a_repository(url: str) -> None:
         parse_requirement(f"a @ {url}", "line 1")
     good = parse_requirement("a @ git+https://git.example/a", "line 1")
     assert of_git(good.requirement, "line 1") is not None
+
+
+# --- Where jails have no GPU, PyTorch comes without CUDA, if the index has it so
+
+
+TORCH = PackageRequest("requirements.txt", (parse_requirement("vision", "line 1"),))
+CUDA = Lock("torch==2.5 \\\n    --hash=sha256:00\nnvidia-cublas==1 \\\n    --hash=sha256:00\n")
+
+
+@pytest.fixture
+def cuda(index: Index) -> Path:
+    """An index whose torch needs packages of NVIDIA's."""
+    make_wheel(index.folder, "vision", requires=["torch", "torchvision"])
+    make_wheel(index.folder, "torch", "2.5", requires=["nvidia-cublas"])
+    make_wheel(index.folder, "torchvision", "0.20", requires=["torch==2.5"])
+    make_wheel(index.folder, "nvidia-cublas")
+    return index.folder
+
+
+def names(request: PackageRequest) -> set[str]:
+    return set(resolution_for(request).lock.packages) & {
+        *("torch==2.5", "torch==2.5+cpu", "torchvision==0.20", "torchvision==0.20+cpu"),
+        "nvidia-cublas==1.0",
+    }
+
+
+def test_an_index_that_has_both(cuda: Path) -> None:
+    make_wheel(cuda, "torch", "2.5+cpu")
+    make_wheel(cuda, "torchvision", "0.20+cpu", requires=["torch==2.5"])
+    assert names(TORCH) == {"torch==2.5+cpu", "torchvision==0.20+cpu"}
+
+
+def test_an_index_without_stays_as_it_is(cuda: Path) -> None:
+    make_wheel(cuda, "torch", "2.4+cpu")
+    assert names(TORCH) == {"torch==2.5", "torchvision==0.20", "nvidia-cublas==1.0"}
+
+
+@pytest.mark.parametrize("gpu", [True, False])
+def test_who_has_a_gpu_gets_cuda(gpu: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a second look at the index; likewise who has told uv which build he wants."""
+    lock = CUDA
+    if not gpu:
+        monkeypatch.setenv("UV_TORCH_BACKEND", "cu128")
+
+    def resolved(*given: object) -> Lock:
+        pytest.fail("the index was asked again")
+
+    assert resolve.without_cuda(replace(TORCH, gpu=gpu), lock, resolved) is lock
+
+
+def test_pytorchs_own_index_is_asked_only_by_who_has_chosen_none(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    lock = CUDA
+    without = Lock("torch==2.5+cpu \\\n    --hash=sha256:00\n")
+    monkeypatch.delenv("UV_TORCH_BACKEND", raising=False)
+    for chosen, asked in ((True, [()]), (False, [(), ("--torch-backend", "cpu")])):
+        monkeypatch.setattr(
+            "envhub_sandbox.dependencies.index.is_chosen", lambda chosen=chosen: chosen
+        )
+        given: list[object] = []
+
+        def resolved(request: PackageRequest, options: object, given: list[object] = given) -> Lock:
+            given.append(options)
+            return without if options else lock
+
+        assert resolve.without_cuda(TORCH, lock, resolved) is (lock if chosen else without)
+        assert given == asked
+        # a lock file has versions alone
+        assert resolve.torch_options(without) == (() if chosen else ("--torch-backend", "cpu"))
+        assert resolve.torch_options(lock) == ()

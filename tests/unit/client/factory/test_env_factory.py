@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from envhub_sandbox.dependencies import interpreters
+from envhub_sandbox.dependencies.builds import wheels
 from envhub_sandbox.errors import LoadError
+from envhub_sandbox.factory.build_env import mend
 from envhub_sandbox.factory.env_factory import EnvFactory
 from envhub_sandbox.hub.snapshot import local
 from envhub_sandbox.session.jails.builder import Builder, JailSource
@@ -29,18 +33,17 @@ from tests.attacks.client.lying_server import (
     env_manifest,
     lying,
 )
+from tests.support.packages.wheels import make_wheel
 
 
 @pytest.fixture
 def server() -> Iterator[LyingServer]:
-    """Honest, until a test has a lie."""
     with lying() as found:
         yield found
 
 
 @pytest.fixture
 def launcher(server: LyingServer, tmp_path: Path, snapshot_store: Path) -> Launcher:
-    """Opens jails of a repository there."""
     (tmp_path / "repo").mkdir()
     (tmp_path / "repo" / "env.py").write_text("")
     load = m.Load(NUM_ENVS, False, None, {})
@@ -51,17 +54,14 @@ def launcher(server: LyingServer, tmp_path: Path, snapshot_store: Path) -> Launc
 
 
 def suites(launcher: Launcher, agrees: Callable[[Manifest], None] = lambda _: None) -> Any:
-    """What a caller gets."""
     return EnvFactory([launcher], None, 0, SandboxVectorEnv, agrees).make()
 
 
 def asked(server: LyingServer, kind: type[m.Message]) -> int:
-    """How often."""
     return sum(isinstance(one, kind) for one in server.asked)
 
 
 def says(server: LyingServer, request: type[m.Message], answer: m.Message) -> None:
-    """From now on."""
     server.lies[request] = lambda about: [about.answer(answer)]
 
 
@@ -79,8 +79,6 @@ def test_the_second_time_no_jail_is_opened(launcher: Launcher, server: LyingServ
 
 
 def test_what_does_not_agree_leaves_no_jail(launcher: Launcher, server: LyingServer) -> None:
-    """Neither a first one, nor one of what is remembered."""
-
     def refuses(manifest: Manifest) -> None:
         raise LoadError(f"{len(manifest.envs)} was not locked")
 
@@ -134,3 +132,27 @@ def test_another_environment_is_refused_and_forgotten(
         launcher.close(loaded)
     assert forgotten == [True]
     assert asked(server, m.Build) == int(not described)
+
+
+# --- Metadata of years ago are written as they are read today; nothing else of a wheel is touched
+
+
+OLD = ("opencv-python (>=3.) ; extra == 'all'", "b (>=1.,<2.)", "c>=4.", "d (==1.*)")
+NEW = ("opencv-python (>=3) ; extra == 'all'", "b (>=1,<2)", "c>=4", "d (==1.*)")
+
+
+def required(wheel: Path) -> list[str]:
+    """What its metadata say that it needs."""
+    with zipfile.ZipFile(wheel) as archive:
+        text = archive.read("x-1.0.dist-info/METADATA").decode()
+    return [line[15:] for line in text.splitlines() if line.startswith("Requires-Dist: ")]
+
+
+def test_versions_that_end_in_a_dot(tmp_path: Path) -> None:
+    wheel = make_wheel(tmp_path, "x", requires=OLD)
+    mend(wheel)
+    assert required(wheel) == list(NEW)
+    wheels.check(wheel, "x", "1.0", interpreters.own())
+    data = wheel.read_bytes()
+    mend(wheel)
+    assert wheel.read_bytes() == data, "what is well stays as it is"

@@ -61,7 +61,6 @@ def read(tmp_path: Path) -> dict[str, bytes]:
 
 
 def test_files_are_read_in_any_order(serve: dict[str, bytes], tmp_path: Path) -> None:
-    """Each under the digest that git names it by."""
     serve |= {"env.py": b"x = 1\n", "empty": b"", "data/a": b"\0" * 5000}
     assert read(tmp_path) == serve
     with HOST.files(REPO, COMMIT) as files:
@@ -70,7 +69,6 @@ def test_files_are_read_in_any_order(serve: dict[str, bytes], tmp_path: Path) ->
 
 
 def test_other_bytes_than_those_named_are_refused(serve: dict[str, bytes], tmp_path: Path) -> None:
-    """The error names the file, and what was expected."""
     serve |= {"env.py": b"good", "!data": b"0123"}
     with pytest.raises(
         SnapshotIntegrityError, match=r"org/repo: git returned .* as 'data', which is"
@@ -81,7 +79,6 @@ def test_other_bytes_than_those_named_are_refused(serve: dict[str, bytes], tmp_p
 def test_what_is_left_out_is_said(
     serve: dict[str, bytes], tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Submodules in one line, however many, and files of LFS."""
     serve |= {"env.py": b"good", ".gitattributes": b"*.bin filter=lfs\n"}
     with caplog.at_level(logging.WARNING):
         read(tmp_path)

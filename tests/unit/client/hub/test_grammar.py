@@ -3,50 +3,14 @@
 from __future__ import annotations
 
 import errno
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
 from envhub_sandbox.hub import answers, grammar
-from envhub_sandbox.hub.answers import Kind
+from envhub_sandbox.hub.answers import HostileAnswerError, Kind, bounded_body, guarded
 from envhub_sandbox.hub.sources import toml
-
-
-@pytest.mark.parametrize(
-    "text",
-    ["owner/name", "owner/name@main", "owner/name:a/b.py", "spaces/owner/name@v1:c.py"],
-)
-def test_what_is_read_is_written_again(text: str) -> None:
-    """A canonical reference stays as it is."""
-    parts = grammar.read(text)
-    grammar.check(parts)
-    assert grammar.join(parts) == text
-
-
-@pytest.mark.parametrize(
-    ("parts", "what"),
-    [
-        (grammar.Parts("name"), "owner is missing"),
-        (grammar.Parts("owner/name.git"), "does not end in '.git'"),
-        (grammar.Parts("owner/a--b"), "is not a valid name"),
-        (grammar.Parts("owner/name", ""), "revision after '@' is empty"),
-        (grammar.Parts("owner/name", "a..b"), "cannot be a revision"),
-        (grammar.Parts("owner/name", path="../env.py"), "has '..'"),
-        (grammar.Parts("owner/name", path="/env.py"), "absolute"),
-        (grammar.Parts("owner/name", path="a\\env.py"), "backslashes"),
-        (grammar.Parts("owner/name", path="C:/env.py"), "drive letter"),
-        (grammar.Parts("owner/name", path="env.txt"), "not a .py file"),
-        (grammar.Parts("owner/name", path="envs"), "a folder"),
-        (grammar.Parts("owner/name", path="env.py@main"), "comes before the path"),
-        (grammar.Parts("owner/name", repo_type="paper"), "no repository type"),
-    ],
-)
-def test_parts_that_the_hub_cannot_have(parts: grammar.Parts, what: str) -> None:
-    """What is wrong, and what to write instead."""
-    with pytest.raises(grammar.Wrong) as wrong:
-        grammar.check(parts)
-    assert what in wrong.value.what
-    assert wrong.value.write
 
 
 @pytest.mark.parametrize(
@@ -65,46 +29,29 @@ def test_an_environment_of_a_package(text: str, write: str) -> None:
 
 
 def test_a_file_that_is_not_here() -> None:
-    """A name of Python code is a file's, not a repository's."""
     with pytest.raises(grammar.Wrong, match="does not exist here") as wrong:
         grammar.read("env.py")
     assert "OWNER/NAME:env.py" in wrong.value.write
 
 
-def test_folders_and_commits_are_told_from_names() -> None:
-    """By their form alone."""
-    assert all(map(grammar.is_local, [".", "./env", "../env", "/env", "~/env"]))
-    assert not any(map(grammar.is_local, ["env", "owner/name", ".hidden/name"]))
+def test_commits_are_told_from_names() -> None:
     assert grammar.is_commit("0123456789abcdef" * 2 + "01234567")
     assert not grammar.is_commit("0123456789ABCDEF" * 2 + "01234567")
     assert grammar.has_control_characters("a\x1b[2J")
     assert not grammar.has_control_characters("a ü")
 
 
-class Response:
-    """What a request was answered with."""
-
-    def __init__(self, status: int, **headers: str) -> None:
-        self.status_code = status
-        self.headers = {name.replace("_", "-"): value for name, value in headers.items()}
-
-
 def failed(error: BaseException, *secrets: str) -> answers.HubFailure:
     """What an exception of the Hub's client means."""
-    return answers.explain(
-        error,
-        secrets,
-        repo_type="space",
-        repo_id="owner/name",
-        revision=None,
-        endpoint="https://hub.example",
-    )
+    about = {"repo_type": "space", "repo_id": "owner/name", "endpoint": "https://hub.example"}
+    return answers.explain(error, secrets, revision=None, **about)
 
 
 def answered(status: int, **headers: str) -> BaseException:
     """An exception of an HTTP client."""
     error = type("HTTPStatusError", (Exception,), {})("status")
-    error.response = Response(status, **headers)
+    named = {name.replace("_", "-"): value for name, value in headers.items()}
+    error.response = SimpleNamespace(status_code=status, headers=named)
     return error
 
 
@@ -135,7 +82,6 @@ def test_each_failure_has_its_kind(error: BaseException, kind: Kind | None) -> N
 
 
 def test_a_failure_says_what_to_do() -> None:
-    """With the page, the wait and what the Hub said, as one line."""
     failure = failed(answered(429, Retry_After="30", X_Error_Message="too\nmany"))
     assert 'it said: "too many"' in failure.what
     assert "Wait 30 s" in failure.advice
@@ -144,7 +90,6 @@ def test_a_failure_says_what_to_do() -> None:
 
 
 def test_a_secret_that_is_echoed_is_in_no_text() -> None:
-    """Neither in what is said nor in the exceptions below it."""
     error = answered(403, X_Error_Message="hf_secret may not")
     assert "hf_secret" not in failed(error, "hf_secret").what
     inner = ValueError("hf_secret", 3)
@@ -156,7 +101,6 @@ def test_a_secret_that_is_echoed_is_in_no_text() -> None:
 
 
 def test_toml_is_read_within_bounds() -> None:
-    """Its length, and the dots that a parser's time grows with."""
     assert toml.loads("a.b = 1", 100) == {"a": {"b": 1}}
     for text, most in (("a = 1", 4), (".".join("a" * 3_000) + " = 1", 10_000), ("a = [", 100)):
         with pytest.raises(ValueError, match=r".") as error:
@@ -172,3 +116,48 @@ def test_dots_in_texts_of_a_generated_document_do_not_count() -> None:
         toml.loads(f'a = "{"." * 3_000}"', 10_000)
     with pytest.raises(ValueError, match="several lines"):
         toml.loads('a = """\nb"""', 100, generated=True)
+
+
+# --- Answers of a Hub are bounded, and their headers make no hostile names
+
+
+def sessions() -> list[tuple[Any, list[Any]]]:
+    """One of httpx and one of requests, with the hooks that each calls with an answer."""
+    of_httpx = SimpleNamespace(event_hooks={"response": []})
+    of_requests = SimpleNamespace(hooks={"response": []})
+    return [(of_httpx, of_httpx.event_hooks), (of_requests, of_requests.hooks)]
+
+
+@pytest.mark.parametrize(
+    ("name", "good", "bad"),
+    [
+        ("ETag", '"0123abc"', '"../../etc/x"'),
+        ("X-Linked-ETag", 'W/"0123abc"', "a/b"),
+        ("X-Repo-Commit", "0" * 40, "../" * 10),
+        ("X-Xet-Hash", "0a", "."),
+    ],
+)
+def test_headers_that_would_lead_elsewhere_are_refused(name: str, good: str, bad: str) -> None:
+    """While a session is guarded, and no longer; honest ones pass."""
+    for session, hooks in sessions():
+        with guarded(session):
+            [judge] = hooks["response"]
+            judge(SimpleNamespace(headers={name: good}))
+            with pytest.raises(HostileAnswerError, match=name):
+                judge(SimpleNamespace(headers={name: bad}))
+        assert hooks["response"] == []
+
+
+def test_a_body_is_read_to_its_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(answers, "MAX_BODY_BYTES", 10)
+    read: list[int] = []
+
+    def chunks() -> Any:
+        for number in range(10**6):
+            read.append(number)
+            yield b"123"
+
+    assert bounded_body(SimpleNamespace(iter_bytes=lambda: [b"12345", b"67890"])) == b"1234567890"
+    with pytest.raises(HostileAnswerError, match="over 10 bytes"):
+        bounded_body(SimpleNamespace(iter_content=lambda size: chunks()))
+    assert len(read) == 4

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from envhub_sandbox.errors import PolicyError, SnapshotError, SnapshotTooLargeError
@@ -23,13 +23,11 @@ DIGEST = "sha256:" + "0" * 64
 
 
 def record(path: str, size: int = 1) -> FileRecord:
-    """A file of a listing."""
     return FileRecord(path, size, DIGEST)
 
 
 @pytest.mark.parametrize("value", [0, -1, True, 1.5, "9", None])
 def test_limit_must_be_a_positive_int(value: object) -> None:
-    """A limit that could not be enforced cannot be made."""
     with pytest.raises(PolicyError, match="max_files"):
         SnapshotLimits(max_files=value)  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="max_size"):
@@ -37,14 +35,12 @@ def test_limit_must_be_a_positive_int(value: object) -> None:
 
 
 def test_listing_exactly_at_the_limits_passes_sorted() -> None:
-    """Limits are inclusive, and the files come sorted by path."""
     limits = SnapshotLimits(max_bytes=5, max_files=2, max_file_bytes=3)
     files = [record("b", 3), record("a", 2)]
     assert [file.path for file in listing_within_limits(files, limits, "t")] == ["a", "b"]
 
 
 def test_limit_stops_reading_the_listing() -> None:
-    """An endless listing is read no further than the limit needs."""
     read: list[int] = []
 
     def endless() -> object:
@@ -84,9 +80,9 @@ def test_ordinary_names_pass() -> None:
     check_listing_names(map(record, [".gitattributes", "A.py", "a.py", "my env/ж.txt", "..a"]), "t")
 
 
+@settings(max_examples=30)
 @given(st.lists(st.text(min_size=1, max_size=12), max_size=4))
 def test_accepted_names_stay_below_the_root(names: list[str]) -> None:
-    """Whatever passes, joined to a root, lies below that root."""
     root = Path("/store/tree")
     try:
         check_listing_names(map(record, names), "t")
@@ -101,11 +97,9 @@ def test_accepted_names_stay_below_the_root(names: list[str]) -> None:
     ("revision", "found"),
     [
         ("v1.0", ("main", "v1.0")),
-        ("feature+x", ("feature+x", "main")),
         ("fix#3=a@b,c%d", ("fix#3=a@b,c%d", "main")),
         ("refs/pr/3", ("main", "refs/pr/3")),
         ("main", ("main",)),
-        ("main/x", ("main",)),
         ("a" * 40, ("main",)),
         ("\u00e9", ("main",)),
         ("a/b/c/d/e/f", ("main",)),

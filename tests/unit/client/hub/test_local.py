@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import socket
 import sys
 from pathlib import Path
@@ -21,7 +22,6 @@ from envhub_sandbox.hub.snapshot import Snapshot, SnapshotLimits, commit_of, loc
 
 @pytest.fixture
 def folder(tmp_path: Path, snapshot_store: Path) -> Path:
-    """A small environment."""
     folder = tmp_path / "my-env"
     (folder / "sub").mkdir(parents=True)
     (folder / "env.py").write_text("1")
@@ -47,16 +47,13 @@ def test_folder_becomes_a_read_only_copy(folder: Path) -> None:
 
 
 def test_unchanged_content_is_the_same_snapshot(folder: Path) -> None:
-    """The commit is the content's: equal for a copy elsewhere, other after an edit."""
+    """The commit is the content's: equal for a copy elsewhere or a link, other after an edit."""
     first = local(folder)
     os.utime(folder / "env.py", (0, 0))
     assert local(folder) == first
-    twin = folder.parent / "twin"
-    twin.mkdir()
-    (twin / "env.py").write_text("1")
-    (twin / "sub").mkdir()
-    (twin / "sub" / "other.py").write_text("2")
-    assert local(twin).root == first.root
+    (folder.parent / "alias").symlink_to(folder)
+    shutil.copytree(folder, folder.parent / "twin")
+    assert local(folder.parent / "alias").root == local(folder.parent / "twin").root == first.root
     (folder / "env.py").write_text("3")
     second = local(folder)
     assert second.commit != first.commit
@@ -68,15 +65,13 @@ def test_unchanged_content_is_the_same_snapshot(folder: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "path"),
     [
-        ("{}", "env.py"),
-        ("{}/", "env.py"),
-        ("{}:sub/other.py", "sub/other.py"),
-        ("{}:./sub/other.py", "sub/other.py"),
-        ("{}/env.py", "env.py"),
-        ("./my-env", "env.py"),
-        ("./my-env:sub/other.py", "sub/other.py"),
-        ("my-env/env.py", "env.py"),
-        ("~/my-env", "env.py"),
+        *(("{}", "env.py"), ("{}/", "env.py"), ("{}/env.py", "env.py"), ("./my-env", "env.py")),
+        *(("my-env/env.py", "env.py"), ("~/my-env", "env.py")),
+        *(
+            (f"{one}:{two}sub/other.py", "sub/other.py")
+            for one in ("{}", "./my-env")
+            for two in ("", "./")
+        ),
     ],
 )
 def test_forms_of_a_local_reference(
@@ -86,14 +81,12 @@ def test_forms_of_a_local_reference(
     monkeypatch.chdir(folder.parent)
     monkeypatch.setenv("HOME", str(folder.parent))
     snapshot = local(text.format(folder))
-    assert snapshot.path == path
-    assert snapshot.repo_id == str(folder)
+    assert (snapshot.path, snapshot.repo_id) == (path, str(folder))
     inner = local(folder / "sub" / "other.py")  # the folder around a file, nothing further up
     assert (inner.path, names(inner)) == ("other.py", ["other.py"])
 
 
 def test_a_folders_commit_is_named_without_a_copy(folder: Path) -> None:
-    """By its content, and by whatever file of it."""
     (folder / "new.py").write_text("new = 1")
     named = commit_of(str(folder))
     assert named == commit_of(f"{folder}:new.py") == commit_of(f"{folder}/new.py")
@@ -103,17 +96,13 @@ def test_a_folders_commit_is_named_without_a_copy(folder: Path) -> None:
     assert commit_of(str(folder)) != named
 
 
-def test_missing_folder_says_what_to_write(folder: Path) -> None:
-    """A typo is answered with the forms that exist."""
-    with pytest.raises(RepositoryUnavailableError, match=r"no such folder.*'\./folder'"):
-        local(folder.parent / "my-enf")
-
-
 @pytest.mark.parametrize("path", ["envs.py", "../my-env/env.py", "/etc/passwd", "sub"])
 def test_missing_entry_lists_the_python_files(folder: Path, path: str) -> None:
-    """A path that is not a file of the folder gets the list of those that are."""
+    """And a missing folder the forms that exist."""
     with pytest.raises(RepositoryUnavailableError, match=r"it has 'env\.py', 'sub/other\.py'"):
         local(folder, path)
+    with pytest.raises(RepositoryUnavailableError, match=r"no such folder.*'\./folder'"):
+        local(folder.parent / "my-enf")
 
 
 def test_every_file_counts_but_those_of_git(folder: Path) -> None:
@@ -133,7 +122,6 @@ def test_every_file_counts_but_those_of_git(folder: Path) -> None:
 
 
 def test_a_virtual_environment_is_named(folder: Path) -> None:
-    """It cannot be copied, and the error says what to do."""
     (folder / ".venv/bin").mkdir(parents=True)
     (folder / ".venv/pyvenv.cfg").write_text("")
     (folder / ".venv/bin/python").symlink_to(sys.executable)
@@ -174,16 +162,9 @@ def test_link_without_an_end_is_named(folder: Path, target: str, said: str) -> N
 
 
 def test_bottomless_folder_is_refused(folder: Path) -> None:
-    """Depth is bounded before it could exhaust the stack."""
     folder.joinpath(*["d"] * 80).mkdir(parents=True)
     with pytest.raises(SnapshotError, match="is over 64 folders deep"):
         local(folder)
-
-
-def test_folder_reached_through_a_link_works(folder: Path) -> None:
-    """The folder itself may be a link, as a checkout often is."""
-    (folder.parent / "alias").symlink_to(folder)
-    assert local(folder.parent / "alias").root == local(folder).root
 
 
 @pytest.mark.parametrize("name", ["max_files", "max_bytes", "max_file_bytes"])
@@ -194,22 +175,18 @@ def test_folder_over_a_limit_is_refused(folder: Path, name: str) -> None:
         local(folder, limits=SnapshotLimits(**{name: 1}))
 
 
-def test_edited_copy_is_refused(folder: Path) -> None:
-    """The copy in the store is verified at every use, as those from the Hub are."""
-    entry = local(folder).root / "env.py"
+def test_edited_copy_is_refused_and_half_of_one_made_again(folder: Path) -> None:
+    """The copy in the store is verified at every use; its source is at hand."""
+    snapshot = local(folder)
+    entry = snapshot.root / "env.py"
+    snapshot.root.chmod(0o755)
+    entry.unlink()
+    assert local(folder) == snapshot
+    assert entry.read_text() == "1"
     entry.chmod(0o644)
     entry.write_text("x")
     with pytest.raises(SnapshotIntegrityError, match="was changed"):
         local(folder)
-
-
-def test_half_deleted_copy_is_made_again(folder: Path) -> None:
-    """Its source is at hand."""
-    snapshot = local(folder)
-    snapshot.root.chmod(0o755)
-    (snapshot.root / "env.py").unlink()
-    assert local(folder) == snapshot
-    assert (snapshot.root / "env.py").read_bytes() == (folder / "env.py").read_bytes()
 
 
 def test_forgotten_copies_are_removed_with_the_next_new_one(folder: Path) -> None:
@@ -234,6 +211,5 @@ def test_an_example_is_found_from_anywhere(
 
 @pytest.mark.parametrize("name", ["", "nope", "../tests", "cartpole/env.py", "ci"])
 def test_what_is_no_example_is_refused_with_those_that_there_are(name: str) -> None:
-    """A name is one of a list, and never a path."""
     with pytest.raises(RepositoryUnavailableError, match="choose one: examples:cartpole, "):
         split_local(f"examples:{name}", "env.py")

@@ -34,7 +34,6 @@ KEY = "5e" * 32
     ],
 )
 def test_logins_are_taken_out(url: str, plain: str, login: tuple[str, str] | None) -> None:
-    """All of it up to the last @ before the path."""
     assert without_login(url) == plain
     assert login_of(url) == login
 
@@ -79,7 +78,6 @@ def test_whoever_unpickles_uses_a_login_of_their_own(monkeypatch: pytest.MonkeyP
 
 @pytest.mark.parametrize("url", [f"ftp://a:{SECRET}@hub", f"https://a:{SECRET}/b@hub", HUB])
 def test_no_endpoint_is_shown_with_its_login(url: str) -> None:
-    """Not where it is refused, and not by its client."""
     try:
         shown = repr(HubClient(checked_endpoint(url))) + HubClient(url).public_endpoint
     except HubReferenceError as error:
@@ -101,7 +99,6 @@ def test_remote_sandboxes_pickle_without_their_key(tmp_path: Path) -> None:
 
 
 def test_a_login_for_a_remote_server_is_refused_unseen() -> None:
-    """There are keys for that."""
     with pytest.raises(PolicyError, match=r"'tcp://10\.0\.0\.1:5555'") as caught:
         RemoteSandbox(f"tcp://me:{SECRET}@10.0.0.1:5555")
     assert SECRET not in str(caught.value)

@@ -11,7 +11,6 @@ from envhub_sandbox.integrations.lerobot_eval import main, split_eval_arguments
 
 
 def test_ours_are_taken_out() -> None:
-    """JSON, or text; the others stay as they are, in order."""
     ours = ['--sandbox.policy={"gpu": true}', "--sandbox.num-workers=2", "--sandbox.lane=frames"]
     theirs = ["--env.type=pusht", "--env.sandbox=process", "--seed", "1"]
     options, rest = split_eval_arguments([theirs[0], *ours, *theirs[1:]])
@@ -20,14 +19,12 @@ def test_ours_are_taken_out() -> None:
 
 
 def test_an_option_without_a_value_is_refused() -> None:
-    """It would be taken for something else."""
     with pytest.raises(SystemExit, match=r"--sandbox\.policy takes a value"):
         split_eval_arguments(["--sandbox.policy", "{}"])
 
 
 @pytest.mark.skipif(find_spec("lerobot") is not None, reason="there is LeRobot here")
 def test_without_lerobot_it_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    """And how to get it."""
     monkeypatch.setattr(sys, "argv", ["lerobot-eval-sandboxed"])
     with pytest.raises(SystemExit, match="needs LeRobot"):
         main()

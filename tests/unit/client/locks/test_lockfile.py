@@ -12,7 +12,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 
-from envhub_sandbox.dependencies import uv
+from envhub_sandbox.dependencies import interpreters, uv
 from envhub_sandbox.dependencies.locks import lockfile, making, pylock
 from envhub_sandbox.dependencies.locks.fingerprint import fingerprint_of_spaces, fingerprint_of_task
 from envhub_sandbox.dependencies.locks.lockfile import LockFile, Runner, Spaces
@@ -39,7 +39,6 @@ LOCK = LockFile(
 
 
 def changed(**fields: Any) -> LockFile:
-    """The lock with other fields."""
     return dataclasses.replace(LOCK, **fields)
 
 
@@ -66,7 +65,6 @@ def test_what_is_written_is_read_again(tmp_path: Path) -> None:
 
 
 def test_a_lock_that_cannot_be_written_says_so(tmp_path: Path) -> None:
-    """And leaves nothing."""
     with pytest.raises(LockError, match="cannot be written"):
         lockfile.write(LOCK, tmp_path / "none" / "pylock.repo.toml")
     with pytest.raises(LockError, match="cannot be written"):
@@ -74,29 +72,7 @@ def test_a_lock_that_cannot_be_written_says_so(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
-def test_it_is_a_lock_of_the_standard(index: Index, tmp_path: Path) -> None:
-    """uv itself installs from it."""
-    make_wheel(index.folder, "wanted")
-    lock = made(tmp_path / "repo", "wanted")
-    path = tmp_path / "pylock.repo.toml"
-    lockfile.write(lock, path)
-    target = tmp_path / "target"
-    uv.run(
-        [
-            *("pip", "install", "--no-config", "--no-build", "--python", chosen_python()),
-            *("--target", str(target), "-r", str(path)),
-        ],
-        what="the lock is none",
-        timeout_s=300,
-    )
-    assert (target / "wanted/__init__.py").is_file()
-
-
-def chosen_python() -> str:
-    """The interpreter that locks are made for here."""
-    from envhub_sandbox.dependencies import interpreters
-
-    return interpreters.own().path
+PYTHON = interpreters.own().path
 
 
 def made(folder: Path, *lines: str, **options: Any) -> LockFile:
@@ -107,36 +83,42 @@ def made(folder: Path, *lines: str, **options: Any) -> LockFile:
     return making.locked(local(folder), chosen({}, None)[0], **options)
 
 
-def test_a_lock_has_every_package_with_its_files(index: Index, tmp_path: Path) -> None:
-    """What the repository needs and what the worker imports; nothing is installed."""
+def test_a_lock_has_every_package_with_its_files(
+    index: Index, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What the repository needs and what the worker imports; uv itself installs from it.
+
+    A file that was replaced on the index is told; a further one for the same version is no drift.
+    """
     make_wheel(index.folder, "wanted")
     lock = made(tmp_path / "repo", "wanted")
-    pins = {package.name: package.version for package in lock.packages}
-    assert pins == {**WORKERS, "wanted": "1.0"}
+    assert {one.name: one.version for one in lock.packages} == {**WORKERS, "wanted": "1.0"}
     assert lock.repository == lockfile.LOCAL
     assert set(lock.files) == {"env.py", "requirements.txt"}
+    path, target = tmp_path / "pylock.repo.toml", tmp_path / "target"
+    lockfile.write(lock, path)
+    command = ["pip", "install", "--no-config", "--no-build", "--python", PYTHON]
+    command += ["--target", str(target), "-r", str(path)]
+    uv.run(command, what="the lock is none", timeout_s=300)
+    assert (target / "wanted/__init__.py").is_file()
+
+    make_wheel(index.folder, "wanted", tag="py2.py3-none-any")
     assert making.differences(lock, making.relisted(lock)) == []
+    make_wheel(index.folder, "wanted", files={"wanted/__init__.py": "evil = 1\n"})
+    [said] = making.differences(lock, making.relisted(lock))
+    assert said.startswith("package wanted==1.0: the file with SHA-256 ")
+    monkeypatch.setenv("UV_CACHE_DIR", str(tmp_path / "another"))
+    with pytest.raises(PackageIntegrityError, match=r"wanted==1\.0"):
+        made(tmp_path / "repo", "wanted")
 
 
 def test_hashes_of_the_repository_hold_in_its_lock(index: Index, tmp_path: Path) -> None:
-    """Of two files that fit, only the permitted one is locked."""
     wheel = make_wheel(index.folder, "wanted")
     make_wheel(index.folder, "wanted", files={"wanted/other.py": ""}, tag="py2.py3-none-any")
     digest = hashlib.sha256(wheel.read_bytes()).hexdigest()
     lock = made(tmp_path / "repo", f"wanted==1.0 --hash=sha256:{digest}")
     [wanted] = [package for package in lock.packages if package.name == "wanted"]
     assert [one.sha256 for one in wanted.wheels] == [digest]
-
-
-def test_a_file_that_was_replaced_on_the_index_is_told(index: Index, tmp_path: Path) -> None:
-    """By package, version and hash; a further file for the same version is no drift."""
-    make_wheel(index.folder, "wanted")
-    lock = made(tmp_path / "repo", "wanted")
-    make_wheel(index.folder, "wanted", tag="py2.py3-none-any")
-    assert making.differences(lock, making.relisted(lock)) == []
-    make_wheel(index.folder, "wanted", files={"wanted/__init__.py": "evil = 1\n"})
-    [said] = making.differences(lock, making.relisted(lock))
-    assert said.startswith("package wanted==1.0: the file with SHA-256 ")
 
 
 def test_upgrading_shows_what_differs(index: Index, tmp_path: Path) -> None:
@@ -154,6 +136,7 @@ def test_upgrading_shows_what_differs(index: Index, tmp_path: Path) -> None:
 
 
 OTHER_BOX = gym.spaces.Box(-1, 2, (3,), np.float32)
+OTHER_TASK = fingerprint_of_task("suite", 0, "NextStep", OTHER_BOX, gym.spaces.Discrete(2))
 
 
 @pytest.mark.parametrize(
@@ -184,16 +167,7 @@ OTHER_BOX = gym.spaces.Box(-1, 2, (3,), np.float32)
             "environment suite/0: gone",
         ),
         (
-            changed(
-                spaces=Spaces(
-                    '{"size": 8}',
-                    (
-                        fingerprint_of_task(
-                            "suite", 0, "NextStep", OTHER_BOX, gym.spaces.Discrete(2)
-                        ),
-                    ),
-                )
-            ),
+            changed(spaces=Spaces('{"size": 8}', (OTHER_TASK,))),
             "environment suite/0: observations were Box(-1.0, 1.0, (3,), float32), now "
             "Box(-1.0, 2.0, (3,), float32)",
         ),
@@ -206,6 +180,8 @@ OTHER_BOX = gym.spaces.Box(-1, 2, (3,), np.float32)
 def test_what_differs_is_said(now: LockFile, said: str) -> None:
     """Commit, file, package, Python, spaces; a line each, fit for a terminal."""
     assert making.differences(LOCK, LOCK) == []
+    of_other_arguments = Spaces("{}", (dataclasses.replace(TASK, mode="SameStep"),))
+    assert making.differences(LOCK, changed(spaces=of_other_arguments)) == []
     found = making.differences(LOCK, now)
     assert said in found
     with pytest.raises(LockDriftError) as caught:
@@ -214,12 +190,6 @@ def test_what_differs_is_said(now: LockFile, said: str) -> None:
     assert isinstance(caught.value, EnvHubError)
     assert isinstance(caught.value, ValueError)
     assert said in str(caught.value)
-
-
-def test_other_arguments_make_other_environments() -> None:
-    """Spaces of other arguments are not held against those that were locked."""
-    other = fingerprint_of_task("suite", 0, None, OTHER_BOX, gym.spaces.Discrete(2))
-    assert making.differences(LOCK, changed(spaces=Spaces("{}", (other,)))) == []
 
 
 @pytest.mark.parametrize(
@@ -243,7 +213,6 @@ def test_no_two_spaces_look_alike(other: gym.Space[Any]) -> None:
 
 
 def spoiled(tmp_path: Path, change: Callable[[str], str]) -> Path:
-    """The lock with its text changed."""
     text = lockfile.written(LOCK)
     assert change(text) != text
     path = tmp_path / "pylock.repo.toml"
@@ -252,7 +221,6 @@ def spoiled(tmp_path: Path, change: Callable[[str], str]) -> Path:
 
 
 def put(old: str, new: str) -> Callable[[str], str]:
-    """A change of text."""
     return lambda text: text.replace(old, new, 1)
 
 
@@ -260,9 +228,7 @@ def put(old: str, new: str) -> Callable[[str], str]:
     ("change", "said"),
     [
         (put('name = "one"', 'name = "one\\n--index-url http://evil"'), "not a normalized name"),
-        (put('name = "one"', 'name = "--index-url"'), "not a normalized name"),
         (put('\nversion = "1.0"', '\nversion = "1.0 \\\\\\n--pre"'), "no version"),
-        (put('\nversion = "1.0"', '\nversion = "1.0\\n-e ./evil"'), "no version"),
         (put(A, "a" * 63 + "\\n"), "no SHA-256"),
         (put("wheels = [", "wheelz = ["), "no list of 1 to"),
         (put("wheels = [", "vcs = { type = 'git' }\nwheels = ["), "only wheels of an index"),
@@ -312,7 +278,7 @@ def test_a_name_with_a_line_end_would_be_obeyed(index: Index, tmp_path: Path) ->
         name = f"--extra-index-url {evil.url}\none"
         lock = changed(packages=(PylockPackage(name, "1.0", (Wheel(A),)),))
         pins = pylock.pins(lock.packages).text.replace(f" \\\n    --hash=sha256:{A}", "")
-        command = ["pip", "compile", "-", *uv.NO_BUILDS, "--python", chosen_python()]
+        command = ["pip", "compile", "-", *uv.NO_BUILDS, "--python", PYTHON]
         uv.run(command, what="the control", given=pins, timeout_s=300)
         assert evil.asked
         evil.asked.clear()
@@ -320,15 +286,3 @@ def test_a_name_with_a_line_end_would_be_obeyed(index: Index, tmp_path: Path) ->
         with pytest.raises(LockError, match="normalized"):
             lockfile.read(tmp_path / "pylock.toml")
         assert evil.asked == []
-
-
-def test_an_index_that_has_another_file_gets_no_lock(
-    index: Index, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """What was chosen is what is locked."""
-    make_wheel(index.folder, "wanted")
-    made(tmp_path / "repo", "wanted")
-    make_wheel(index.folder, "wanted", files={"wanted/__init__.py": "evil = 1\n"})
-    monkeypatch.setenv("UV_CACHE_DIR", str(tmp_path / "another"))
-    with pytest.raises(PackageIntegrityError, match=r"wanted==1\.0"):
-        made(tmp_path / "repo", "wanted")

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import importlib.util
+import struct
+import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from envhub_sandbox.check.play.plays import (
     MAX_SIDE,
@@ -19,18 +22,17 @@ from envhub_sandbox.check.play.plays import (
     frame_of,
 )
 from envhub_sandbox.errors import RemoteEnvError
+from envhub_sandbox.vector.pictures import png, small_picture
 
 imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
 
 
 def frame(height: int = 4, width: int = 6, value: int = 7) -> Any:
-    """A frame of one colour."""
     return np.full((height, width, 3), value, np.uint8)
 
 
 @pytest.mark.parametrize(
-    "rendered",
-    [(frame(), frame(2, 2)), [frame()], np.stack([frame(), frame(value=9)]), frame()],
+    "rendered", [(frame(), frame(2, 2)), [frame()], np.stack([frame(), frame(value=9)]), frame()]
 )
 def test_the_first_sub_environment_is_taken(rendered: Any) -> None:
     """From tuples, lists, stacked arrays, or an environment that draws all of them at once."""
@@ -38,7 +40,6 @@ def test_the_first_sub_environment_is_taken(rendered: Any) -> None:
 
 
 def test_odd_sides_repeat_their_last_line() -> None:
-    """Encoders want even sides; nothing is rescaled."""
     picture = np.arange(5 * 3 * 3, dtype=np.uint8).reshape(5, 3, 3)
     padded = first_frame((picture,), "rgb_array")
     assert padded.shape == (6, 4, 3)
@@ -55,17 +56,22 @@ def test_odd_sides_repeat_their_last_line() -> None:
         (np.zeros((0, 6, 3), np.uint8), "6x0"),
         (np.broadcast_to(np.uint8(0), (2, MAX_SIDE + 1, 3)), f"{MAX_SIDE + 1}x2"),
         ("a text", "a str"),
+        (np.zeros((4, 4, 3), object), "object"),
+        (np.lib.stride_tricks.as_strided(np.zeros(1, np.uint8), (10**5, 10**5, 3), (0,) * 3), "x"),
     ],
+    ids=range(8),
 )
 def test_what_is_no_frame_is_refused(rendered: Any, says: str) -> None:
-    """Wrong types, shapes and sizes, each by its name."""
+    """Wrong types, shapes and sizes, each by its name; ten thousand million pixels uncopied."""
     with pytest.raises(VideoError, match=says):
         first_frame((rendered,), "rgb_array")
+    for nothing in (np.zeros((0, 4, 4, 3), np.uint8), np.array(3, np.uint8), {}):
+        with pytest.raises(VideoError):
+            first_frame(nothing, None)
 
 
 @pytest.mark.parametrize("rendered", [None, (None,), ()])
 def test_an_environment_that_draws_nothing_is_told_how(rendered: Any) -> None:
-    """The message names the option that may help."""
     with pytest.raises(VideoError, match="--env-kwargs render_mode=rgb_array"):
         first_frame(rendered, None)
     with pytest.raises(VideoError, match="'human'"):
@@ -75,15 +81,13 @@ def test_an_environment_that_draws_nothing_is_told_how(rendered: Any) -> None:
 @pytest.mark.parametrize(
     ("metadata", "fps"),
     [
-        ({"render_fps": 12}, 12.0),
-        ({"render_fps": 29.97}, 29.97),
-        ({}, 30.0),
-        (None, 30.0),
-        ({"render_fps": float("nan")}, 30.0),
-        ({"render_fps": 0}, 30.0),
-        ({"render_fps": 1e9}, 30.0),
-        ({"render_fps": "fast"}, 30.0),
+        *(({"render_fps": 12}, 12.0), ({"render_fps": 29.97}, 29.97), ({}, 30.0), (None, 30.0)),
+        *(
+            ({"render_fps": one}, 30.0)
+            for one in (0, 1e9, "fast", None, 10**400, -(10**400), 1e-300, -1, float("nan"))
+        ),
     ],
+    ids=range(13),
 )
 def test_fps_is_sensible_whatever_the_metadata_says(metadata: Any, fps: float) -> None:
     """The environment's own where it can be one."""
@@ -91,8 +95,9 @@ def test_fps_is_sensible_whatever_the_metadata_says(metadata: Any, fps: float) -
 
 
 @pytest.mark.parametrize("size", [(64, 48), (2, 2), (130, 6)])
-def test_a_written_video_can_be_read(tmp_path: Path, size: tuple[int, int]) -> None:
-    """With its size, its rate and every frame."""
+def test_a_written_video_can_be_read(
+    tmp_path: Path, size: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / "out.mp4"
     with VideoWriter(path, 10.0) as writer:
         for value in range(0, 250, 10):
@@ -102,18 +107,13 @@ def test_a_written_video_can_be_read(tmp_path: Path, size: tuple[int, int]) -> N
     meta = next(imageio_ffmpeg.read_frames(str(path)))
     assert meta["size"] == size[::-1]
     assert meta["fps"] == 10.0
-
-
-def test_a_name_cannot_be_an_option(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A file that begins with a dash is a file."""
-    monkeypatch.chdir(tmp_path)
+    monkeypatch.chdir(tmp_path)  # a file that begins with a dash is a file, and no option
     with VideoWriter(Path("-version.mp4"), 10.0) as writer:
         writer.add(frame())
     assert (tmp_path / "-version.mp4").stat().st_size > 0
 
 
 def test_frames_of_another_size_are_refused(tmp_path: Path) -> None:
-    """An encoder would read them as garbage."""
     with VideoWriter(tmp_path / "out.mp4", 10.0) as writer:
         writer.add(frame(4, 6))
         with pytest.raises(VideoError, match=r"changed from \(6, 4\) to \(4, 4\)"):
@@ -121,28 +121,16 @@ def test_frames_of_another_size_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["out.txt", "nowhere/out.mp4", "folder.mp4"])
-def test_targets_that_cannot_work_are_refused_early(tmp_path: Path, name: str) -> None:
-    """Before any environment is run."""
+def test_targets_that_cannot_work_are_refused_early(
+    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Before any environment is run; of a missing encoder the extra that brings it is named."""
     (tmp_path / "folder.mp4").mkdir()
     with pytest.raises(VideoError):
         check_target(tmp_path / name)
-
-
-def test_a_missing_encoder_comes_with_the_command(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The extra that brings it is named."""
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(VideoError, match=r"pip install 'envhub-sandbox\[video\]'"):
         check_target(tmp_path / "out.mp4")
-
-
-@pytest.mark.parametrize("fps", [10**400, -(10**400), 1e-300, 0, -1, float("nan"), "30", None])
-def test_rates_that_no_file_has_are_not_taken(tmp_path: Path, fps: object) -> None:
-    """Whatever the metadata says, the video can be written."""
-    with VideoWriter(tmp_path / "x.mp4", fps_of({"render_fps": fps})) as writer:
-        writer.add(first_frame((frame(),), "rgb_array"))
-    assert (tmp_path / "x.mp4").stat().st_size > 0
 
 
 @pytest.mark.parametrize(
@@ -155,28 +143,9 @@ def test_rates_that_no_file_has_are_not_taken(tmp_path: Path, fps: object) -> No
     ],
 )
 def test_views_of_every_kind_are_frames(tmp_path: Path, picture: Any) -> None:
-    """Negative strides, none at all, one pixel, the tallest."""
     with VideoWriter(tmp_path / "x.mp4", 30.0) as writer:
         writer.add(first_frame((picture,), "rgb_array"))
     assert (tmp_path / "x.mp4").stat().st_size > 0
-
-
-@pytest.mark.parametrize(
-    "rendered",
-    [
-        np.lib.stride_tricks.as_strided(np.zeros(1, np.uint8), (1, 10**5, 10**5, 3), (0,) * 4),
-        np.zeros((1, 4, 4, 3), object),
-        np.zeros((0, 4, 4, 3), np.uint8),
-        np.array(3, np.uint8),
-        (),
-        (None,),
-        {},
-    ],
-)
-def test_hostile_frames_are_refused_before_they_are_copied(rendered: Any) -> None:
-    """Ten thousand million pixels, objects, nothing."""
-    with pytest.raises(VideoError):
-        first_frame(rendered, None)
 
 
 def test_an_environment_that_cannot_render_says_what_to_do() -> None:
@@ -192,3 +161,47 @@ def test_an_environment_that_cannot_render_says_what_to_do() -> None:
         frame_of(Blind())
     assert "NotImplementedError" in str(caught.value)
     assert "\x1b" not in str(caught.value)
+
+
+# --- Small pictures: what is shown is what was rendered, whatever its size
+
+
+def pixels(data: bytes) -> NDArray[np.uint8]:
+    """Those of a PNG with eight bits of RGB, as its standard says to read it."""
+    assert data[:8] == b"\x89PNG\r\n\x1a\n"
+    found, at = {}, 8
+    while at < len(data):
+        length, name = struct.unpack_from(">I4s", data, at)
+        body = data[at + 8 : at + 8 + length]
+        assert struct.unpack_from(">I", data, at + 8 + length) == (zlib.crc32(name + body),)
+        found[name], at = body, at + 12 + length
+    width, height, *form = struct.unpack(">IIBBBBB", found[b"IHDR"])
+    assert form == [8, 2, 0, 0, 0]
+    lines = np.frombuffer(zlib.decompress(found[b"IDAT"]), np.uint8).reshape(height, -1)
+    assert set(lines[:, 0].tolist()) == {2}, "each line is what is added to the one above"
+    summed = np.cumsum(lines[:, 1:].astype(np.int64), axis=0) % 256
+    return summed.astype(np.uint8).reshape(height, width, 3)
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 3), (1, 7, 3), (9, 2, 3), (30, 40, 3)])
+def test_a_png_has_the_very_pixels(shape: tuple[int, ...]) -> None:
+    frame = np.random.default_rng(0).integers(0, 256, shape).astype(np.uint8)
+    assert np.array_equal(pixels(png(frame)), frame)
+    assert np.array_equal(pixels(png(frame[::-1, ::-1])), frame[::-1, ::-1])
+
+
+def test_a_pixel_is_the_mean_of_those_that_it_stands_for() -> None:
+    frame = np.zeros((4, 6, 3), np.uint8)
+    frame[:2, :2, 1] = [[0, 100], [200, 255]]
+    small = small_picture(frame, 3)
+    assert small.shape == (2, 3, 3)
+    assert small[0, 0].tolist() == [0, 139, 0]
+    assert not small[1:].any()
+    assert small_picture(frame, 6) is frame, "nothing is enlarged"
+
+
+@pytest.mark.parametrize("size", [(1, 4096), (4096, 1), (2, 321), (4096, 4096), (319, 4095)])
+def test_no_side_is_longer_and_none_is_nothing(size: tuple[int, int]) -> None:
+    small = small_picture(np.zeros((*size, 3), np.uint8), 320)
+    assert min(small.shape[:2]) >= 1
+    assert max(small.shape[:2]) <= 320

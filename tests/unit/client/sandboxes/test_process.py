@@ -21,7 +21,6 @@ DEAF = "import os, signal; signal.signal(15, signal.SIG_IGN); os.close(1); os.re
 
 @pytest.fixture
 def server() -> Iterator[LocalServer]:
-    """Not started yet."""
     made = LocalServer(SERVER, "", 0.2)
     yield made
     made.stop()
@@ -34,7 +33,6 @@ def sleeping(ready: int) -> subprocess.Popen[bytes]:
 
 
 def listen(path: str) -> socket.socket:
-    """A socket there."""
     found = socket.socket(socket.AF_UNIX)
     found.bind(path)
     return found
@@ -73,11 +71,9 @@ def test_stop_leaves_nothing(server: LocalServer) -> None:
 
 
 def test_one_that_does_not_end_is_killed(server: LocalServer) -> None:
-    """After the time that it has for that."""
     started = [sys.executable, "-c", DEAF]
     child = subprocess.Popen(started, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     assert child.stdin is not None
-    assert child.stdout is not None
     with child.stdin, child.stdout, server.starting(lambda _: child):
         assert child.stdout.read() == b"", "it ignores SIGTERM from now on"
         server.stop()
@@ -85,7 +81,6 @@ def test_one_that_does_not_end_is_killed(server: LocalServer) -> None:
 
 
 def test_what_fails_in_its_start_ends_it(server: LocalServer) -> None:
-    """Also an interrupt; and a start that has started nothing."""
     with pytest.raises(KeyboardInterrupt), server.starting(sleeping):
         raise KeyboardInterrupt
     assert has_ended(server.process.pid)
@@ -101,7 +96,6 @@ def test_what_fails_in_its_start_ends_it(server: LocalServer) -> None:
 
 
 def test_a_fork_of_its_owner_ends_nothing(server: LocalServer) -> None:
-    """Its copy is collected at the end, too."""
     with server.starting(sleeping):
         pass
     child = os.fork()

@@ -19,7 +19,6 @@ from envhub_worker.lockdown.mechanisms.locked_folder import LockedFolder, remove
 
 
 def folder(root: Path, name: str, files: dict[str, str], mode: int = 0o700) -> Path:
-    """A folder with files in it."""
     path = root / name
     path.mkdir()
     for file, text in files.items():
@@ -44,13 +43,24 @@ locks: list[LifeLock] = []
 
 
 def test_a_containers_folder_is_left_behind_when_its_client_is(tmp_path: Path) -> None:
-    """No process holds the lock of its client; without one nothing can be told."""
-    folder(tmp_path, "envhub-docker-dead0000", {"alive": ""})
+    """No process holds the lock of its client; without one nothing can be told.
+
+    A name in a folder that everybody may write proves nothing: no link is followed.
+    """
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    folder(elsewhere, "data", {"alive": ""})
+    (tmp_path / "envhub-docker-link0000").symlink_to(elsewhere / "data")
+    folder(tmp_path, "envhub-docker-dead0000", {"alive": "", "seccomp.json": "{}"})
     alive(tmp_path, "envhub-docker-alive000")
     folder(tmp_path, "envhub-docker-nothing0", {})
     folder(tmp_path, "envhub-docker-not-ours-at-all", {"alive": ""})
     folder(tmp_path, "envhub-docker-open0000", {"alive": ""}, mode=0o755)
-    assert found(tmp_path) == {"envhub-docker-dead0000"}
+    there = set(tmp_path.iterdir())
+    [path] = runtime_folder.stale_folders(tmp_path)
+    assert path.name == "envhub-docker-dead0000"
+    assert leftovers.Leftover("folder", str(path)).remove()
+    assert set(tmp_path.iterdir()) == there - {path}
 
 
 def test_a_servers_folder_is_left_behind_when_nobody_holds_its_lock(tmp_path: Path) -> None:
@@ -114,24 +124,6 @@ def test_a_folder_for_sockets_has_a_short_path(
     monkeypatch.setattr(runtime_folder, "places", lambda: [long])
     with pytest.raises(SandboxUnavailableError, match="set TMPDIR to a shorter path"):
         runtime_folder.RuntimeFolder(runtime_folder.SERVER)
-
-
-def test_a_link_is_not_followed(tmp_path: Path) -> None:
-    """A name in a folder that everybody may write proves nothing."""
-    elsewhere = tmp_path / "elsewhere"
-    elsewhere.mkdir()
-    folder(elsewhere, "data", {"alive": ""})
-    (tmp_path / "envhub-docker-link0000").symlink_to(elsewhere / "data")
-    assert found(tmp_path) == set()
-
-
-def test_removing_removes_the_folder_and_nothing_beside(tmp_path: Path) -> None:
-    """And says that it did."""
-    folder(tmp_path, "envhub-docker-dead0000", {"alive": "", "seccomp.json": "{}"})
-    beside = alive(tmp_path, "envhub-docker-alive000")
-    [path] = runtime_folder.stale_folders(tmp_path)
-    assert leftovers.Leftover("folder", str(path)).remove()
-    assert list(tmp_path.iterdir()) == [beside]
 
 
 def test_control_groups_of_ended_servers_are_left_behind(tmp_path: Path) -> None:

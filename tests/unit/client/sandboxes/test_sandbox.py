@@ -21,34 +21,26 @@ BUSY = ServerBusyError("a: no room")
 
 
 @pytest.mark.parametrize(
-    "error",
+    ("error", "elsewhere"),
     [
-        BUSY,
-        UnreachableError("nothing answers"),
-        WorkerStartupError("it did not start"),
-        WorkerDiedError("lost", reason="connection"),
-        WorkerDiedError("ended", reason="server"),
-        WorkerTimeoutError("the worker did not answer in time"),
+        (BUSY, True),
+        (UnreachableError("nothing answers"), True),
+        (WorkerStartupError("it did not start"), True),
+        (WorkerDiedError("lost", reason="connection"), True),
+        (WorkerDiedError("ended", reason="server"), True),
+        (WorkerTimeoutError("the worker did not answer in time"), True),
+        (LoadError("the repository failed"), False),
+        (WorkerDiedError("it was killed", reason="signal"), False),
+        (WorkerTimeoutError("make_env takes too long", request="make_env"), False),
+        (SandboxUnavailableError("the server does not know our key"), False),
+        (PolicyError("not permitted"), False),
     ],
 )
-def test_a_place_that_is_full_or_not_there_is_followed_by_the_next(error: EnvHubError) -> None:
-    """The same worker may start elsewhere."""
-    assert may_go_elsewhere(error)
-
-
-@pytest.mark.parametrize(
-    "error",
-    [
-        LoadError("the repository failed"),
-        WorkerDiedError("it was killed", reason="signal"),
-        WorkerTimeoutError("make_env takes too long", request="make_env"),
-        SandboxUnavailableError("the server does not know our key"),
-        PolicyError("not permitted"),
-    ],
-)
-def test_what_would_be_the_same_elsewhere_is_not_tried_again(error: EnvHubError) -> None:
-    """Or is a mistake that has to be known."""
-    assert not may_go_elsewhere(error)
+def test_a_place_that_is_full_or_not_there_is_followed_by_the_next(
+    error: EnvHubError, elsewhere: bool
+) -> None:
+    """What would be the same elsewhere is not tried again, or is a mistake to be known."""
+    assert may_go_elsewhere(error) is elsewhere
 
 
 def test_the_error_for_all_is_one_that_may_pass() -> None:

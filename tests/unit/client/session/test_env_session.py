@@ -2,9 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
+from typing import Any
+from unittest.mock import MagicMock
+
 import pytest
 
-from envhub_sandbox.errors import LocalProtocolError, RemoteEnvError, WorkerDiedError, remote_error
+from envhub_sandbox.errors import (
+    ActionError,
+    LocalProtocolError,
+    RemoteEnvError,
+    RemoteProtocolError,
+    WorkerDiedError,
+    remote_error,
+)
+from envhub_sandbox.session.attribute_cache import AttributeCache
+from envhub_sandbox.session.use_lock import UseLock
+from envhub_worker.protocol.lifecycle import State
 from tests.attacks.client.lying_server import NUM_ENVS
 from tests.support.in_process.fake_lane import FakeLane, session_over
 
@@ -22,19 +36,11 @@ def test_the_first_line_names_the_rows_and_the_place(rows: tuple[int, int], name
         part.name_in(error)
         assert error.args == (f"it has ended ({named}, on here)\nits last words", "more")
     assert part.rows == rows
-
-
-def test_the_place_of_another_part_is_added_to_it() -> None:
-    """Only the same part is not named twice."""
-    error = WorkerDiedError("gone")
-    for row in range(2):
-        session_over(FakeLane(1), (row, row + 1)).name_in(error)
-    first, second = (f"(sub-environment {row} of 2, on here)" for row in range(2))
-    assert str(error) == f"gone {first} {second}"
+    session_over(FakeLane(1), (0, 1)).name_in(error)
+    assert error.args[0].splitlines()[0].endswith("on here) (sub-environment 0 of 2, on here)")
 
 
 def test_errors_of_others_keep_their_text() -> None:
-    """The repository's own, the caller's, and one without a text."""
     part = session_over(FakeLane(1), (0, 1))
     theirs = remote_error("ValueError", "ValueError", "size")
     assert isinstance(theirs, RemoteEnvError)
@@ -44,3 +50,93 @@ def test_errors_of_others_keep_their_text() -> None:
         before = error.args
         part.name_in(error)
         assert error.args == before
+
+
+# --- An attribute that is read after each step is watched, and then needs no request
+
+
+def test_the_second_read_is_watched_and_the_third_is_free() -> None:
+    """Once a step: a second read in the same step is a request."""
+    session = session_over(FakeLane())
+    cache = AttributeCache(session.lease)
+    assert cache.get("task") is None
+    assert not cache.should_watch("task")
+    session.counters.stepped(1)
+    assert cache.should_watch("task")
+    cache.put("task", ("a", "b"), watched=True)
+    assert cache.get("task") is None
+    session.counters.stepped(1)
+    assert cache.get("task") == ("a", "b")
+    assert cache.get("task") is None
+
+
+@pytest.mark.parametrize(("values", "watched"), [(("a", "b"), False), (([], []), True)])
+def test_what_is_not_watched_is_not_asked_for_again(values: tuple[Any, ...], watched: bool) -> None:
+    """The runners say so, or its values can change without them: a list."""
+    session = session_over(FakeLane())
+    cache = AttributeCache(session.lease)
+    for _ in range(2):
+        cache.should_watch("name")
+        session.counters.stepped(1)
+    assert cache.should_watch("name")
+    cache.put("name", values, watched=watched)
+    session.counters.stepped(1)
+    assert cache.get("name") is None
+    assert not cache.should_watch("name")
+
+
+# --- One use of an environment at a time, and what is done where a close or a lie came meanwhile
+
+
+@pytest.fixture
+def lease() -> Any:
+    made = MagicMock()
+    made.repository.named = contextlib.nullcontext
+    made.lifecycle.state, made.lifecycle.closed = State.READY, False
+    return made
+
+
+def closed(lease: Any, fails: BaseException) -> BaseException:
+    """What a request meets while another thread closes, which does not wait."""
+    lease.lifecycle.state, lease.lifecycle.closed = State.CLOSED, True
+    return fails
+
+
+@pytest.mark.parametrize(
+    ("fails", "told"),
+    [
+        (OSError("the socket is gone"), WorkerDiedError),
+        (WorkerDiedError("closed"), WorkerDiedError),
+        (KeyboardInterrupt(), KeyboardInterrupt),
+    ],
+)
+def test_a_close_in_its_midst_is_finished_and_told(
+    lease: Any, fails: BaseException, told: type[BaseException]
+) -> None:
+    """What is left is given back once, and a Ctrl-C stays one; so without an error."""
+    with pytest.raises(told) as caught, UseLock(lease, MagicMock()).hold("step"):
+        raise closed(lease, fails)
+    assert isinstance(caught.value, type(fails)) or caught.value.__cause__ is fails
+    with UseLock(lease, MagicMock()).hold("step"):
+        pass
+    assert lease.let_go.call_count == 2
+
+
+@pytest.mark.parametrize(
+    ("fails", "state", "told", "ends"),
+    [
+        (TypeError("unhashable"), State.READY, RemoteProtocolError, True),
+        (RemoteProtocolError("a lie"), State.READY, RemoteProtocolError, True),
+        (ActionError("the caller's"), State.READY, ActionError, False),
+        (TypeError("dealt with"), State.LATE, TypeError, False),
+    ],
+)
+def test_a_worker_whose_replies_break_a_rule_is_given_up(
+    lease: Any, fails: Exception, state: State, told: type[Exception], ends: bool
+) -> None:
+    """Whatever the handling of them raised; errors of the caller's, and old ones, end nothing."""
+    failures = MagicMock()
+    lease.lifecycle.state = state
+    with pytest.raises(told), UseLock(lease, failures).judging("step"):
+        raise fails
+    assert failures.dead.called == ends

@@ -8,14 +8,14 @@ from unittest.mock import MagicMock
 import pytest
 
 from envhub_sandbox.errors import WorkerDiedError, WorkerError, WorkerTimeoutError
-from envhub_sandbox.session.counters import Counters
+from envhub_sandbox.session.counters import Counters, FleetCounters
 from envhub_sandbox.session.failures import Failures, Restarts, backoff_s, refusal
 from envhub_sandbox.settings.policy import Policy
 from envhub_worker.protocol.lifecycle import State
+from tests.support.in_process.fake_lane import FakeLane, session_over
 
 
 def failures_of(lease: Any) -> Failures:
-    """Of an environment with this jail."""
     lease.lifecycle.closed, lease.lifecycle.request = False, "step"
     return Failures(lease, MagicMock())
 
@@ -30,14 +30,10 @@ def test_a_server_is_asked_once_what_a_dead_jail_was_denied(kept: bool) -> None:
     asked = [call[0] for call in lease.mock_calls if call[0] in ("note_denied", "end")]
     assert asked == ["note_denied", *(["end"] if kept else [])]
     lease.repository.keep_crash.assert_called_once()
-
-
-def test_a_bundle_of_what_came_too_late_has_it_too() -> None:
-    """It was not asked before."""
-    lease = MagicMock()
-    failures_of(lease).keep_crash(WorkerTimeoutError("late", request="reset", timeout_s=1.0))
-    lease.note_denied.assert_called_once()
-    lease.repository.keep_crash.assert_called_once()
+    late = MagicMock()  # of what came too late nothing was asked before
+    failures_of(late).keep_crash(WorkerTimeoutError("late", request="reset", timeout_s=1.0))
+    late.note_denied.assert_called_once()
+    late.repository.keep_crash.assert_called_once()
 
 
 @pytest.mark.parametrize(
@@ -52,20 +48,11 @@ def test_a_bundle_of_what_came_too_late_has_it_too() -> None:
     ],
 )
 def test_each_state_has_its_refusal(state: State, kind: type[Exception], said: str) -> None:
-    """By its class, with what to do."""
     error = refusal(state, "step", "never")
     assert type(error) is kind
     assert said in str(error)
-
-
-def test_every_state_but_two_refuses() -> None:
-    """No state that is added later is taken for one that serves."""
-    serving = {state for state in State if refusal(state, "step", "never") is None}
-    assert serving == {State.IDLE, State.READY}
-
-
-def test_the_advice_follows_from_what_happened() -> None:
-    """An interrupted wait is named, and a death is survived by a reset where the policy says so."""
+    serving = {one for one in State if refusal(one, "step", "never") is None}
+    assert serving == {State.IDLE, State.READY}, "no later state is taken for one that serves"
     assert "the last call was interrupted" in str(refusal(State.LATE, "step", "never", "call"))
     assert str(refusal(State.DEAD, "step", "on_reset")).endswith("has died; call reset() first")
 
@@ -78,7 +65,6 @@ def test_backoff_doubles_and_is_bounded() -> None:
 
 
 def test_restarts_are_counted_until_the_budget_ends() -> None:
-    """And no more are made once the environment is closed."""
     counters = Counters()
     restarts = Restarts(Policy(restart="on_reset", restart_budget=1), counters)
     restarts.spend("reset")
@@ -89,3 +75,57 @@ def test_restarts_are_counted_until_the_budget_ends() -> None:
     closed.give_up()
     with pytest.raises(WorkerDiedError, match="closed during reset"):
         closed.spend("reset")
+
+
+# --- What is counted once for all workers, what is their sum, and who is waited for
+
+
+class Wired(FakeLane):
+    """A lane with traffic."""
+
+    def traffic(self) -> tuple[int, int, int]:
+        """Stale replies, bytes sent and bytes received."""
+        return 1, 20, 300
+
+
+@pytest.fixture
+def parts() -> list[Counters]:
+    return []
+
+
+@pytest.fixture
+def counters(parts: list[Counters]) -> FleetCounters:
+    """Of an environment over three workers."""
+    sessions = [session_over(Wired(1), (0, 1)) for _ in range(3)]
+    parts += [session.counters for session in sessions]
+    for session in sessions:
+        session.counters.connected(session.lease.lane)
+    return FleetCounters(parts)
+
+
+def test_a_step_of_all_is_one_step(counters: FleetCounters, parts: list[Counters]) -> None:
+    """Its time is that of the slowest; deaths, restarts and bytes are added up."""
+    counters.requests += 1
+    counters.stepped(4_000_000_000)
+    for number, part in enumerate(parts):
+        part.requests += 1
+        part.stepped(1_000_000_000)
+        part.deaths += number
+        part.restarts += 1
+    whole = counters.numbers()
+    assert (whole["requests"], whole["steps"], whole["step_seconds"]) == (1, 1, 4.0)
+    assert (whole["deaths"], whole["restarts"], whole["timeouts"]) == (3, 3, 0)
+    names = ("stale_replies", "sent_bytes", "received_bytes")
+    assert [whole[name] for name in names] == [3, 60, 900]
+    assert counters.snapshot()["step_latency_s"]["max"] == 4.0
+
+
+def test_a_straggler_is_who_was_waited_for(counters: FleetCounters, parts: list[Counters]) -> None:
+    for elapsed_ns in (2_000_000_000, 5_000_000_000, 1_000_000_000):
+        counters.waited(1, elapsed_ns)
+    parts[1].timeouts += 2
+    straggler = counters.of_worker(1)
+    assert straggler["waited_s"] == {"total": 8.0, "max": 5.0}
+    assert (straggler["timeouts"], straggler["sent_bytes"]) == (2, 20)
+    assert "requests" not in straggler, "a worker's requests are those of the whole"
+    assert counters.of_worker(0)["waited_s"] == {"total": 0.0, "max": 0.0}

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -10,8 +12,9 @@ import pytest
 from envhub_sandbox.errors import ServerBusyError, WorkerDiedError
 from envhub_sandbox.session import lease as lease_module
 from envhub_sandbox.session.lease import Lease
+from envhub_sandbox.session.prewarm import Prewarm, SuitePrewarm
 from envhub_sandbox.transport.deadline import StartupDeadline
-from envhub_worker.protocol.lifecycle import Event, State
+from envhub_worker.protocol.lifecycle import Event, Lifecycle, State
 from tests.support.in_process.fake_lane import FakeLane, session_over
 
 
@@ -36,16 +39,13 @@ class _Jails:
             raise self.fails[what].pop()
 
     def take(self, deadline: object) -> Any:
-        """A jail."""
         self.do("take")
         return SimpleNamespace(jail=SimpleNamespace(number=1, report=[]), server=None)
 
     def end(self, loaded: object) -> None:
-        """End it."""
         self.do("end")
 
     def give_back(self, loaded: object, *, wait: bool = True) -> None:
-        """Give it back."""
         self.do("give back")
 
 
@@ -70,12 +70,10 @@ def taken(monkeypatch: pytest.MonkeyPatch) -> tuple[Lease, _Jails]:
 
 
 def acquire(lease: Lease) -> None:
-    """With time enough."""
     lease.acquire(StartupDeadline(60))
 
 
 def test_a_jail_is_taken_built_in_and_given_back_once(taken: tuple[Lease, _Jails]) -> None:
-    """And its lane is closed."""
     lease, jails = taken
     acquire(lease)
     assert lease.lane is not None
@@ -83,13 +81,16 @@ def test_a_jail_is_taken_built_in_and_given_back_once(taken: tuple[Lease, _Jails
         lease.let_go()
     assert jails.done == ["take", "build", "give back"]
     assert (lease.loaded, lease.lane) == (None, None)
+    jails.done.clear()
+    acquire(lease)
+    lease.abandon()  # as a fork does: the jail is its parent's
+    assert (jails.done, lease.lane) == (["take", "build"], None)
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), WorkerDiedError("it died")])
 def test_what_cannot_be_built_is_given_back(
     taken: tuple[Lease, _Jails], error: BaseException
 ) -> None:
-    """Nothing of it is kept, and the next attempt takes another."""
     lease, jails = taken
     jails.fails["build"] = [error]
     with pytest.raises(type(error)):
@@ -101,7 +102,6 @@ def test_what_cannot_be_built_is_given_back(
 
 
 def test_an_interrupted_return_is_done_again(taken: tuple[Lease, _Jails]) -> None:
-    """The jail is noted until it has been given back."""
     lease, jails = taken
     acquire(lease)
     jails.fails["give back"] = [KeyboardInterrupt()]
@@ -114,7 +114,6 @@ def test_an_interrupted_return_is_done_again(taken: tuple[Lease, _Jails]) -> Non
 
 
 def test_a_server_is_held_until_the_next_jail_is_there(taken: tuple[Lease, _Jails]) -> None:
-    """Or else it would end with the one that is given up."""
     lease, jails = taken
     acquire(lease)
     jails.done.clear()
@@ -124,7 +123,6 @@ def test_a_server_is_held_until_the_next_jail_is_there(taken: tuple[Lease, _Jail
 
 
 def test_a_full_server_is_asked_again_once_there_is_room(taken: tuple[Lease, _Jails]) -> None:
-    """Where nothing can be given up, its refusal is the answer."""
     lease, jails = taken
     full = ServerBusyError("full", quota="jails", used=1, limit=1, retry_s=0.1)
     jails.fails["take"] = [full]
@@ -137,7 +135,6 @@ def test_a_full_server_is_asked_again_once_there_is_room(taken: tuple[Lease, _Ja
 
 
 def test_a_jail_that_comes_after_close_is_refused(taken: tuple[Lease, _Jails]) -> None:
-    """The thread that brought it sees that, and gives it back."""
     lease, jails = taken
     lease.lifecycle.on(Event.CLOSE)
     with pytest.raises(WorkerDiedError, match="closed during make_env"):
@@ -146,10 +143,63 @@ def test_a_jail_that_comes_after_close_is_refused(taken: tuple[Lease, _Jails]) -
     assert jails.done == ["take", "build", "give back"]
 
 
-def test_a_fork_gives_nothing_back(taken: tuple[Lease, _Jails]) -> None:
-    """The jail is its parent's."""
-    lease, jails = taken
-    acquire(lease)
-    lease.abandon()
-    assert jails.done == ["take", "build"]
-    assert lease.lane is None
+# --- What is started ahead is a favour: a request for something else does not fail for it
+
+
+class _Task:
+    """One environment of a suite, as far as this concerns it."""
+
+    lifecycle = Lifecycle()
+    closed = False
+
+    def __init__(self) -> None:
+        self.warm, self.cancelled = threading.Event(), threading.Event()
+        self.used: Callable[[], None] = self.warm.set
+
+    def on_first_use(self, used: Callable[[], None], make_room: Callable[[], bool]) -> None:
+        self.used, self.make_room = used, make_room
+
+    def start(self) -> None:
+        self.warm.set()
+
+    def cancel(self) -> bool:
+        self.cancelled.set()
+        return True
+
+
+def suite_of(count: int, ahead: int | None = 1) -> list[_Task]:
+    """Tasks, of which so many are started ahead."""
+    tasks = [_Task() for _ in range(count)]
+    SuitePrewarm([cast("list[Prewarm]", tasks)], ahead)
+    return tasks
+
+
+def test_a_system_without_threads_starts_nothing_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
+    first, second, third = suite_of(3)
+
+    def no_room(thread: threading.Thread) -> Any:
+        raise RuntimeError("can't start new thread")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(threading.Thread, "start", no_room)
+        first.used()
+    assert not second.warm.is_set()
+    second.used()
+    assert third.warm.wait(60)
+
+
+def test_room_is_made_of_what_is_unused_only() -> None:
+    """And there is none where nothing was started ahead; what was passed over is cancelled."""
+    first, second, third, fourth = suite_of(4)
+    assert not first.make_room()
+    first.used()
+    assert second.warm.wait(60)
+    assert first.make_room()
+    assert (first.cancelled.is_set(), second.cancelled.is_set()) == (False, True)
+    assert not third.warm.is_set()
+    first, second, third, fourth = suite_of(4)
+    first.used()
+    assert second.warm.wait(60)
+    third.used()
+    assert second.cancelled.wait(60), "so that there are never more unused jails than permitted"
+    assert fourth.warm.wait(60)

@@ -36,11 +36,9 @@ class Told:
         self.payload: list[Buffer] = [frame for part in parts for frame in m.pack(part)]
 
     def send(self, message: m.Message, payload: Any = ()) -> int:
-        """Whatever it is."""
         return 1
 
     def receive(self, request_id: int, deadline: Deadline) -> tuple[m.Message, list[Buffer]]:
-        """What was said."""
         return self.reply, self.payload
 
 
@@ -93,12 +91,8 @@ def test_deaths_that_do_not_add_up_are_refused(
     said = jail(reply, *parts)
     with pytest.raises(RemoteProtocolError):
         said.receive(said.send("step", ASKED), Deadline(1))
-
-
-def test_a_jail_that_is_not_kept_has_no_partial_answers() -> None:
-    """What was not asked for is not taken."""
     said = jail(m.RelayDonePartly((1, 1), (1,)), m.Value(7), DIED, kept=False)
-    with pytest.raises(RemoteProtocolError, match="RelayDonePartly"):
+    with pytest.raises(RemoteProtocolError, match="RelayDonePartly"):  # it was not asked for
         said.receive(said.send("step", ASKED), Deadline(1))
 
 
@@ -119,17 +113,11 @@ def test_the_last_seed_counts() -> None:
     book.remember(m.Reset(1, [8, 8, 8], None, np.array([False, True, False])))
     assert book.derived((0, 3), 4) == [derived_seed(seed, 4) for seed in (7, 8, 9)]
     assert book.derived((1, 2), 4) == [derived_seed(8, 4)]
-
-
-@pytest.mark.parametrize(("seeds", "expected"), [(5, derived_seed(5, 1)), ([5], None)])
-def test_environments_that_seed_themselves_get_what_they_were_given(
-    seeds: Any, expected: Any
-) -> None:
-    """A number or a list, as it was."""
-    book = SeedBook(1, each=False)
-    assert book.derived((0, 1), 1) is None
-    book.remember(m.Reset(1, seeds, None, None))
-    assert book.derived((0, 1), 1) == (expected or [derived_seed(5, 1)])
+    for seeds, derived in ((5, derived_seed(5, 1)), ([5], [derived_seed(5, 1)])):
+        of_its_own = SeedBook(1, each=False)  # which seeds itself, by a number or a list
+        assert of_its_own.derived((0, 1), 1) is None
+        of_its_own.remember(m.Reset(1, seeds, None, None))
+        assert of_its_own.derived((0, 1), 1) == derived
 
 
 def test_resets_of_the_fresh_are_those_of_the_dead() -> None:
@@ -144,7 +132,6 @@ def test_resets_of_the_fresh_are_those_of_the_dead() -> None:
 
 
 def test_rows_of_the_dead_are_truncated_whatever_the_fresh_say() -> None:
-    """Its flags and rewards are not its own to choose."""
     yes = np.ones(2, np.bool_)
     said = m.StepDone(np.zeros((2, 1)), np.full((2, 3), 9.0), yes, ~yes, {"worker_restarted": ~yes})
     row = revived_step(said, 2)

@@ -27,39 +27,42 @@ ACTIONS = np.zeros(2, np.int64)
 
 @pytest.fixture
 def lane() -> FakeLane:
-    """A lane that answers."""
     return FakeLane()
 
 
 @pytest.fixture
 def session(lane: FakeLane) -> EnvSession:
-    """An environment that is up."""
     return session_over(lane)
 
 
 def render(number: int, bounds: tuple[int, int]) -> m.Message:
-    """Ask for it."""
     return m.Render(number)
 
 
-def warned(session: EnvSession, text: str) -> None:
-    """Have the repository warn."""
-    session.repository.warnings.unshown.append(("Warning", text))
-
-
 def test_a_request_is_sent_counted_and_kept(session: EnvSession, lane: FakeLane) -> None:
-    """And the environment is usable afterwards."""
     [reply] = session.requests.ask("render", render)
     assert reply == lane.answer
     assert lane.sent == [m.Render(lane.number)]
     assert session.counters.requests == 1
     [kept] = session.history.recording().requests
     assert getattr(kept, "operation", None) == "render"
+    lane.answer = m.RaisedException("ValueError", "a.Oops", "no", "trace", "run")
+    with pytest.raises(RemoteEnvError, match="no"):
+        session.requests.ask("render", render)
     assert session.lifecycle.state is State.READY
 
 
 def test_what_is_sent_instead_is_not_what_is_kept(session: EnvSession, lane: FakeLane) -> None:
-    """The history repeats the caller's request."""
+    """The history repeats the caller's request; what cannot be sent was not sent."""
+
+    def unsendable(request: object) -> None:
+        raise LocalProtocolError("too large")
+
+    send, lane.send = lane.send, unsendable  # type: ignore[method-assign]
+    with pytest.raises(LocalProtocolError):
+        session.requests.submit("render", render)
+    lane.send = send  # type: ignore[method-assign]
+    assert session.counters.requests == 0
     session.requests.submit("call", render, lambda number, _: m.Watch(number, "name"))
     assert lane.sent == [m.Watch(lane.number, "name")]
     [kept] = session.history.recording().requests
@@ -69,7 +72,6 @@ def test_what_is_sent_instead_is_not_what_is_kept(session: EnvSession, lane: Fak
 def test_another_message_than_was_asked_for_gives_the_worker_up(
     session: EnvSession, lane: FakeLane
 ) -> None:
-    """It breaks a rule, and is not asked again."""
     lane.answer = m.ResetDone(0, {})
     with pytest.raises(RemoteProtocolError, match="ResetDone where Value belongs"):
         session.requests.ask("render", render)
@@ -79,7 +81,6 @@ def test_another_message_than_was_asked_for_gives_the_worker_up(
 
 
 def test_of_two_kinds_either_is_taken(session: EnvSession, lane: FakeLane) -> None:
-    """An attribute is a value or a method; a third kind is named."""
     for lane.answer in (m.Value(1), m.Method()):
         assert session.requests.ask_own("name", m.GetOwn, "name") == lane.answer
     lane.answer = m.WatchDone((), False)
@@ -87,18 +88,7 @@ def test_of_two_kinds_either_is_taken(session: EnvSession, lane: FakeLane) -> No
         session.requests.ask_own("name", m.GetOwn, "name")
 
 
-def test_what_the_repository_raises_leaves_the_environment_usable(
-    session: EnvSession, lane: FakeLane
-) -> None:
-    """It is the repository's error, by its name."""
-    lane.answer = m.RaisedException("ValueError", "a.Oops", "no", "trace", "run")
-    with pytest.raises(RemoteEnvError, match="no"):
-        session.requests.ask("render", render)
-    assert session.lifecycle.state is State.READY
-
-
 def test_a_late_reply_is_refused_until_a_reset(session: EnvSession, lane: FakeLane) -> None:
-    """Which drops it."""
     lane.fails = WorkerTimeoutError("late")
     with pytest.raises(WorkerTimeoutError, match="render has not finished after"):
         session.requests.ask("render", render)
@@ -117,20 +107,6 @@ def test_ctrl_c_in_a_wait_says_so_next_time(session: EnvSession, lane: FakeLane)
         session.requests.collect_step(1.0)
     with pytest.raises(WorkerTimeoutError, match="the last step was interrupted"):
         session.requests.ask("render", render)
-
-
-def test_what_cannot_be_sent_was_not_sent(session: EnvSession, lane: FakeLane) -> None:
-    """The next request goes out."""
-
-    def unsendable(request: object) -> None:
-        raise LocalProtocolError("too large")
-
-    send, lane.send = lane.send, unsendable  # type: ignore[method-assign]
-    with pytest.raises(LocalProtocolError):
-        session.requests.submit("render", render)
-    lane.send = send  # type: ignore[method-assign]
-    assert session.counters.requests == 0
-    session.requests.ask("render", render)
 
 
 def test_the_order_is_gymnasiums(session: EnvSession) -> None:
@@ -167,22 +143,17 @@ def test_a_close_from_a_signal_handler_in_a_wait_says_closed(
 
 
 def test_what_only_sends_is_not_stopped_by_a_filter(session: EnvSession, lane: FakeLane) -> None:
-    """The reply would be owed, and the next request refused."""
+    """The reply would be owed, and the next request refused. No filter hides a Ctrl-C."""
+    unshown = session.repository.warnings.unshown
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        warned(session, "sent")
+        unshown.append(("Warning", "sent"))
         session.requests.submit("render", render)
         with pytest.raises(RemoteEnvWarning, match="sent"):
             session.requests.collect(1.0, m.Value)
-    assert lane.owed is None
-    session.requests.ask("render", render)
-
-
-def test_a_filter_does_not_hide_a_ctrl_c(session: EnvSession, lane: FakeLane) -> None:
-    """A program that catches warnings as errors would go on."""
-    lane.fails = KeyboardInterrupt()
-    warned(session, "one")
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
+        assert lane.owed is None
+        session.requests.ask("render", render)
+        unshown.append(("Warning", "one"))
+        lane.fails = KeyboardInterrupt()
         with pytest.raises(KeyboardInterrupt):
             session.requests.ask("render", render)

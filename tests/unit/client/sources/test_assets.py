@@ -25,7 +25,6 @@ PIN = "a" * 40
 
 
 def declared(folder: Path, text: str) -> list[str]:
-    """What a card of this text declares."""
     (folder / "README.md").write_text(text)
     return declared_assets(folder)
 
@@ -85,7 +84,6 @@ def test_merges_are_not_followed(tmp_path: Path) -> None:
 
 
 def test_the_documented_card_is_read(tmp_path: Path) -> None:
-    """The block in docs/authors.md, as an author copies it."""
     page = (Path(__file__).parents[4] / "docs" / "authors.md").read_text()
     block = next(one for one in page.split("```") if one.strip().startswith("---"))
     model, dataset = declared(tmp_path, block.lstrip())
@@ -128,7 +126,6 @@ def own(stub_hub: StubHub, hub: dict[str, Any], *declared: str) -> Snapshot:
 def test_what_is_no_asset_is_refused_before_any_request(
     stub_hub: StubHub, hub: dict[str, Any], text: str, said: str
 ) -> None:
-    """The error says who names it, and repeats no login."""
     snapshot = own(stub_hub, hub)
     before = len(stub_hub.requests)
     with pytest.raises(HubReferenceError, match=said) as caught:

@@ -74,7 +74,6 @@ def test_what_is_declared_brings_what_it_needs(tmp_path: Path) -> None:
 
 
 def test_an_environment_of_its_own_brings_what_lies_in_it(tmp_path: Path) -> None:
-    """Whatever this interpreter has beside."""
     packages = tmp_path / "packages"
     (packages / "yaml").mkdir(parents=True)
     (packages / "single.py").touch()
@@ -88,7 +87,7 @@ def test_an_environment_of_its_own_brings_what_lies_in_it(tmp_path: Path) -> Non
     }
     told = undeclared(found, {}, packages, taken)
     assert [one.message.partition(",")[0] for one in told] == [
-        *("pytest is imported", "yaml is imported", "env.py"),
+        *("pytest is imported", "yaml is imported", "env.py")
     ]
     assert "line 9, which needs Box2D, and nothing declares it" in told[2].message
 
@@ -103,7 +102,6 @@ def test_a_file_does_not_choose_how_it_is_read(tmp_path: Path) -> None:
 
 
 def test_names_are_bounded(tmp_path: Path) -> None:
-    """Neither long names nor many of them multiply."""
     folder = write_repository(tmp_path / "r", "import odd\ndef make_env(): pass")
     (folder / "odd.py").write_text(f"from {'a' * 100_000} import {'b,' * 50_000}b")
     [one] = imports(local(folder))
@@ -111,7 +109,6 @@ def test_names_are_bounded(tmp_path: Path) -> None:
 
 
 def weaker(folder: Path, *changes: tuple[str, str]) -> str:
-    """The parser's program, changed."""
     text = Path(parser.__file__).read_text()
     for old, new in changes:
         assert text.count(old) == 1
@@ -122,10 +119,7 @@ def weaker(folder: Path, *changes: tuple[str, str]) -> str:
 
 @pytest.mark.parametrize(
     ("bound", "spend"),
-    [
-        ("CPU_S = 0.5", "any(iter(int, 1))"),
-        ("MEMORY = 1 << 29", "bytes(1 << 30)"),
-    ],
+    [("CPU_S = 0.5", "any(iter(int, 1))"), ("MEMORY = 1 << 29", "bytes(1 << 30)")],
     ids=["time", "memory"],
 )
 def test_a_file_that_costs_too_much_is_not_read(
@@ -146,7 +140,6 @@ def test_a_file_that_costs_too_much_is_not_read(
 def test_children_that_are_lost_are_counted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A thousand deadly files end no thousand of them."""
     ended = weaker(
         tmp_path, ("\n        tree = ", "\n        signal.raise_signal(9)\n        tree = ")
     )

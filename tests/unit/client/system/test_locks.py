@@ -34,19 +34,20 @@ def test_a_lock_is_held_until_its_context_ends(tmp_path: Path) -> None:
             pass
     assert waits == [1]
     assert not is_held(path)
-
-
-def test_the_holder_may_remove_the_file(tmp_path: Path) -> None:
-    """The next makes another, and holds that."""
-    path = tmp_path / "lock"
     with held(path):
-        path.unlink()
+        path.unlink()  # the next makes another, and holds that
         with held(path):
             assert is_held(path)
+    lock = LifeLock(tmp_path / "life")
+    assert is_held(tmp_path / "life")
+    for _ in range(2):
+        lock.release()
+    assert not is_held(tmp_path / "life")
+    SharedLock(tmp_path / "record").release()
+    assert not (tmp_path / "record").exists(), "no file is made, and none is needed"
 
 
 def test_an_interrupted_wait_leaves_no_descriptor(tmp_path: Path) -> None:
-    """Nor does a lock that was not free."""
     path, before = tmp_path / "lock", len(os.listdir("/proc/self/fd"))
     with held(path):
         for _ in range(3):
@@ -58,7 +59,6 @@ def test_an_interrupted_wait_leaves_no_descriptor(tmp_path: Path) -> None:
 
 
 def test_a_link_is_no_lock(tmp_path: Path) -> None:
-    """Nobody makes us open, or create, what lies elsewhere."""
     (tmp_path / "lock").symlink_to(tmp_path / "elsewhere")
     for asked in (lambda: held(tmp_path / "lock").__enter__(), lambda: is_held(tmp_path / "lock")):
         with pytest.raises(OSError, match="symbolic links"):
@@ -67,7 +67,6 @@ def test_a_link_is_no_lock(tmp_path: Path) -> None:
 
 
 def test_a_life_lock_is_not_held_by_a_fork_nor_by_a_program(tmp_path: Path) -> None:
-    """It ends with its holder, although both live on."""
     source = """
 import os, signal, subprocess, sys
 from pathlib import Path
@@ -89,7 +88,6 @@ signal.pause()
         stdout=subprocess.PIPE,
         text=True,
     ) as process:
-        assert process.stdout is not None
         said = dict((*process.stdout.readline().split(), "")[:2] for _ in range(2))
         assert set(said) == {"here", "holds"}
         assert path.read_text() == "who"
@@ -100,22 +98,12 @@ signal.pause()
         os.kill(int(said["holds"]), signal.SIGKILL)
 
 
-def test_a_life_lock_can_be_given_back(tmp_path: Path) -> None:
-    """And again, which does nothing."""
-    lock = LifeLock(tmp_path / "life")
-    assert is_held(tmp_path / "life")
-    for _ in range(2):
-        lock.release()
-    assert not is_held(tmp_path / "life")
-
-
 def test_what_several_share_none_has_alone(tmp_path: Path) -> None:
     """Until the last one gives it back, or has gone; the kernel says who they are."""
     path = tmp_path / "record"
     path.touch()
     words = [sys.executable, "-c", SHARE, str(path)]
     with subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
-        assert process.stdout is not None
         assert process.stdout.readline() == b"held\n"
         mine = SharedLock(path)
         assert set(sharers(path)) == {os.getpid(), process.pid}
@@ -146,9 +134,3 @@ def test_a_shared_lock_ends_with_its_object_and_not_with_a_fork(tmp_path: Path) 
     del lock
     with held(path):
         pass
-
-
-def test_nothing_is_shared_where_there_is_nothing(tmp_path: Path) -> None:
-    """No file is made, and none is needed."""
-    SharedLock(tmp_path / "record").release()
-    assert list(tmp_path.iterdir()) == []

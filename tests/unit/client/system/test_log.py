@@ -12,7 +12,6 @@ from envhub_sandbox.system import log
 
 
 def test_loggers_are_ours_and_silent() -> None:
-    """Each below one name, without a handler that prints."""
     for one in (log.WORKER, log.OUTPUT, log.SNAPSHOT, log.DEPENDENCIES, log.CRASHES, log.ERRORS):
         assert one.name.startswith(f"{log.ROOT.name}.")
         assert one.handlers == []
@@ -24,10 +23,7 @@ def test_each_line_is_logged_and_shown(caplog: pytest.LogCaptureFixture) -> None
     outer, inner = list[str](), list[str]()
     with caplog.at_level(logging.INFO, log.DEPENDENCIES.name):
         with log.progress_shown_by(outer.append):
-            with (
-                log.progress_shown_by(inner.append),
-                log.progress_shown("org/repo") as tell,
-            ):
+            with log.progress_shown_by(inner.append), log.progress_shown("org/repo") as tell:
                 tell("resolving")
                 tell("x" * 300)
             with log.progress_shown("org/repo") as tell:
@@ -44,8 +40,6 @@ def test_each_line_is_logged_and_shown(caplog: pytest.LogCaptureFixture) -> None
 def test_only_a_terminal_is_written_to(
     variables: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Neither a pipe nor the log of a CI system."""
-
     class Terminal(io.StringIO):
         def isatty(self) -> bool:
             return bool(variables)

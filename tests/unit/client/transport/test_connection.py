@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import importlib
 import os
+import re
 import select
 import subprocess
 from collections.abc import Iterator
@@ -10,9 +12,13 @@ from contextlib import contextmanager
 
 import pytest
 
-from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
+from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError, WorkerTimeoutError
+from envhub_sandbox.transport import trace
 from envhub_sandbox.transport.connection import WorkerConnection, describe_exit
 from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.lane import RelayLane
+from envhub_sandbox.transport.shared_memory.lane import SharedMemoryLane
+from envhub_sandbox.transport.shared_memory.served_lane import ServedLane
 from envhub_worker.protocol import messages as m
 from tests.attacks.client.lying_server import Asked, Frames, LyingServer, lying
 from tests.support.processes import eventually
@@ -20,7 +26,6 @@ from tests.support.processes import eventually
 
 @contextmanager
 def process(script: str) -> Iterator[tuple[subprocess.Popen[bytes], int]]:
-    """One, and a pidfd of it."""
     with subprocess.Popen(["sh", "-c", script]) as child:
         pidfd = os.pidfd_open(child.pid)
         try:
@@ -51,7 +56,6 @@ def test_its_end_is_told(script: str, says: str, code: int) -> None:
 
 
 def test_what_another_has_reaped_ended_somehow() -> None:
-    """As far as we know; what lives has not."""
     with process("exit 3") as (child, pidfd):
         child.wait()
         assert describe_exit(pidfd).startswith(". The next")
@@ -119,7 +123,6 @@ def test_other_replies_are_dropped_while_one_is_looked_for() -> None:
 
 
 def test_what_is_no_reply_is_raised_where_it_is_received() -> None:
-    """And not by the look."""
     with connected() as (server, connection):
         server.lies[m.ReadOutput] = lambda asked: [[b"noise"]]
         sent = connection.send(m.ReadOutput(1, ""))
@@ -148,7 +151,6 @@ def test_an_interrupt_in_a_look_is_noted(monkeypatch: pytest.MonkeyPatch) -> Non
 
 
 def test_the_end_of_a_server_has_arrived_as_well() -> None:
-    """There is nothing to wait for any more."""
     with process("sleep 1000") as (child, pidfd), lying() as server:
         server.lies[m.ReadOutput] = lambda asked: []
         connection = WorkerConnection(server.endpoint, pidfd)
@@ -159,3 +161,63 @@ def test_the_end_of_a_server_has_arrived_as_well() -> None:
         with pytest.raises(WorkerDiedError, match="by SIGKILL"):
             connection.receive(sent, Deadline(0))
         connection.close()
+
+
+# --- ``ENVHUB_TRACE=1``: names of messages, both ways, and no value of them
+
+
+NAMES = ("send", "receive", "send_step", "send_for_infos", "wait", "replies")
+CLASSES = (WorkerConnection, RelayLane, SharedMemoryLane, ServedLane)
+
+
+@pytest.fixture
+def fresh(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """No class is changed yet, and none will be after the test."""
+    for cls in CLASSES:
+        for name in vars(cls).keys() & set(NAMES):
+            monkeypatch.setattr(cls, name, vars(cls)[name])
+    importlib.reload(trace)  # it starts once
+    yield
+    importlib.reload(trace)
+
+
+@pytest.mark.usefixtures("fresh")
+@pytest.mark.parametrize("value", [None, "0", "yes"])
+def test_without_the_variable_no_class_is_changed(
+    monkeypatch: pytest.MonkeyPatch, value: str | None
+) -> None:
+    monkeypatch.delenv("ENVHUB_TRACE", raising=False)
+    if value is not None:
+        monkeypatch.setenv("ENVHUB_TRACE", value)
+    before = [dict(vars(cls)) for cls in CLASSES]
+    trace.start_if_wanted()
+    assert [dict(vars(cls)) for cls in CLASSES] == before
+
+
+@pytest.mark.usefixtures("fresh")
+def test_each_message_is_a_line(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Once, however often it is asked for; what fails is named by its error."""
+    monkeypatch.setenv("ENVHUB_TRACE", "1")
+    trace.start_if_wanted()
+    trace.start_if_wanted()
+    with lying() as server:
+        client = WorkerConnection(server.endpoint, server.process_fd)
+        client.request(m.Hello(m.VERSION, b"a secret"), deadline=Deadline(60))
+        client.request(m.ReadOutput(1, "step"), deadline=Deadline(60))
+        with pytest.raises(WorkerTimeoutError):
+            client.receive(99, Deadline(0))
+        client.close()
+    lines = capsys.readouterr().err.splitlines()
+    ends = [
+        "> WorkerConnection.send Hello",
+        "< WorkerConnection.receive Welcome (N ms)",
+        "> WorkerConnection.send ReadOutput step",
+        "< WorkerConnection.receive Output (N ms)",
+        "< WorkerConnection.receive WorkerTimeoutError (N ms)",
+    ]
+    shown = [re.sub(r"\(\d+\.\d{3} ms\)", "(N ms)", line) for line in lines]
+    assert [line.split(" MainThread ")[1] for line in shown] == ends
+    assert all(re.match(r"\+\d+\.\d{6} ", line) for line in lines)
+    assert "secret" not in "".join(lines)

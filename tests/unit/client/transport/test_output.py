@@ -15,7 +15,6 @@ from envhub_worker.supervisor.records import OutputTail
 
 
 def lines_of(*chunks: bytes) -> list[str]:
-    """What a sink gets of some bytes."""
     found: list[str] = []
     lines = Lines([found.append])
     for chunk in chunks:
@@ -25,28 +24,22 @@ def lines_of(*chunks: bytes) -> list[str]:
 
 
 def test_lines_are_cut_at_every_end() -> None:
-    """Carriage returns count, for progress bars; the last line need not be ended."""
+    """Carriage returns count, for progress bars; the last line need not be ended.
+
+    Escape sequences and broken encodings become visible text; a line without end is cut.
+    """
     assert lines_of(b"a\nb\r\nc\rd") == ["a", "b", "c", "d"]
     assert lines_of(b"one ", b"line\nand", b" another") == ["one line", "and another"]
-
-
-def test_control_characters_are_escaped() -> None:
-    """Escape sequences and broken encodings become visible text."""
     assert lines_of(b"\x1b[31mred\x07\n\xff\xfe\n") == ["\\x1b[31mred\\x07", "\\xff\\xfe"]
+    found = lines_of(*[b"x" * 10_000] * 10)
+    assert sum(map(len, found)) >= 20_000
+    assert max(map(len, found)) <= 4096 + 100
 
 
 @given(st.lists(st.binary(max_size=60), max_size=20))
 def test_any_bytes_become_printable_lines(chunks: list[bytes]) -> None:
-    """Nothing that is printed can end a line of ours, or paint."""
     for line in lines_of(*chunks):
         assert line.isprintable() or "\t" in line
-
-
-def test_a_line_without_end_is_cut() -> None:
-    """It does not pile up here."""
-    found = lines_of(*[b"x" * 10_000] * 10)
-    assert sum(map(len, found)) >= 20_000
-    assert max(map(len, found)) <= 4096 + 100
 
 
 def test_a_file_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -66,7 +59,6 @@ def test_a_file_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_a_file_that_cannot_be_written_is_said(tmp_path: Path) -> None:
-    """Whoever asked for it hears of it before anything runs."""
     with pytest.raises(output.PolicyError, match="output"):
         OutputSinks("label", tmp_path)
 

@@ -22,7 +22,6 @@ ENV = environment(16)
 
 
 def cores(monkeypatch: pytest.MonkeyPatch, count: int) -> None:
-    """Let the machine have this many."""
     monkeypatch.setattr(shard_trials.os, "sched_getaffinity", lambda pid: set(range(count)))
 
 
@@ -33,7 +32,6 @@ def _two_cores(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
-    """Where it is remembered."""
     return tmp_path / "entry.auto-shards"
 
 
@@ -58,7 +56,6 @@ def use(path: Path, times: Mapping[str, float], count: int = 16) -> str:
 def test_the_fastest_of_all_that_were_tried_is_used(
     path: Path, times: dict[str, float], expected: str
 ) -> None:
-    """Each way once, then always the best."""
     assert [use(path, times) for _ in range(3)] == list(times)
     assert {use(path, times) for _ in range(5)} == {expected}
 
@@ -86,7 +83,6 @@ def test_another_load_lets_all_be_tried_again(path: Path) -> None:
 
 
 def test_what_was_far_slower_is_not_tried_again(path: Path) -> None:
-    """It is so under another load, too."""
     times = {"2+2": 1e-3, "3+1": 1.1e-3, "4": 1.9e-3}
     tried = [use(path, times, 4) for _ in range(4)]
     assert tried == ["2+2", "3+1", "4", "2+2"]
@@ -97,7 +93,6 @@ def test_what_was_far_slower_is_not_tried_again(path: Path) -> None:
 def test_another_number_of_cores_is_another_machine(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What was fastest on two says nothing about four."""
     for _ in range(3):
         use(path, {"8+8": 2e-4, "10+6": 2e-4, "16": 1e-4})
     cores(monkeypatch, 4)
@@ -107,17 +102,15 @@ def test_another_number_of_cores_is_another_machine(
 
 
 def test_what_may_share_state_stays_together(path: Path) -> None:
-    """A SyncVectorEnv's sub-environments live in one process, and so does what is no such env."""
+    """A SyncVectorEnv's sub-environments live in one process, and so does what is no such env.
+
+    A number of workers is kept, whatever was measured, if there are as many sub-environments.
+    """
+    use(path, {"8+8": 1e-3})
     trials = ShardTrials(path)
     assert trials.bounds_for(environment(16, sync=True), None) == [(0, 16)]
     assert trials.bounds_for(environment(16, shardable=False), 4) == [(0, 16)]
-
-
-@pytest.mark.parametrize(("workers", "expected"), [(1, 1), (3, 3), (20, 16)])
-def test_a_number_of_workers_is_kept(path: Path, workers: int, expected: int) -> None:
-    """Whatever was measured, if there are as many sub-environments."""
-    use(path, {"8+8": 1e-3})
-    assert len(ShardTrials(path).bounds_for(ENV, workers)) == expected
+    assert [len(trials.bounds_for(ENV, workers)) for workers in (1, 3, 20)] == [1, 3, 16]
 
 
 @given(count=st.integers(1, 200), cpus=st.integers(1, 70))
@@ -144,34 +137,26 @@ def test_every_sub_environment_has_one_shard(count: int, cpus: int) -> None:
     ],
 )
 def test_a_damaged_file_is_as_none(path: Path, content: bytes) -> None:
-    """The first way is tried, and what it takes is remembered."""
     path.write_bytes(content)
     assert use(path, {"8+8": 1e-3}) == "8+8"
     assert use(path, {"10+6": 1e-3}) == "10+6"
 
 
-@pytest.mark.parametrize("step_s", [0.0, float("nan"), float("inf"), -1.0])
-def test_an_impossible_time_is_not_remembered(path: Path, step_s: float) -> None:
-    """A clock may be strange."""
-    ShardTrials(path).note(ENV, [(0, 16)], step_s)
+@pytest.mark.parametrize(
+    ("env", "step_s"),
+    [
+        *((ENV, one) for one in (0.0, float("nan"), float("inf"), -1.0)),
+        *((environment(16, sync=True), 1e-3), (environment(1), 1e-3)),
+    ],
+)
+def test_what_is_no_time_or_no_choice_is_not_remembered(
+    path: Path, env: Any, step_s: float
+) -> None:
+    """A clock may be strange; a cache that is not there or cannot be written is no error."""
+    ShardTrials(path).note(env, [(0, env.num_envs)], step_s)
     assert not path.exists()
-
-
-@pytest.mark.parametrize("env", [environment(16, sync=True), environment(1)])
-def test_where_there_is_no_choice_nothing_is_remembered(path: Path, env: Any) -> None:
-    """Each close would write a file for it."""
-    ShardTrials(path).note(env, [(0, env.num_envs)], 1e-3)
-    assert not path.exists()
-
-
-def test_what_must_not_be_remembered_is_not() -> None:
-    """There is no file."""
-    trials = ShardTrials(None)
-    trials.note(ENV, [(0, 8), (8, 16)], 1e-3)
-    assert trials.bounds_for(ENV, None) == [(0, 8), (8, 16)]
-
-
-def test_a_cache_that_cannot_be_written_is_no_error(tmp_path: Path) -> None:
-    """The folder is not there."""
-    ShardTrials(tmp_path / "missing" / "entry").note(ENV, [(0, 16)], 1e-3)
-    assert not (tmp_path / "missing").exists()
+    ShardTrials(path.parent / "missing" / "entry").note(ENV, [(0, 16)], 1e-3)
+    assert not (path.parent / "missing").exists()
+    nowhere = ShardTrials(None)
+    nowhere.note(ENV, [(0, 8), (8, 16)], 1e-3)
+    assert nowhere.bounds_for(ENV, None) == [(0, 8), (8, 16)]

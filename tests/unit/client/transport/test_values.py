@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -13,11 +14,13 @@ import pytest
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
-from envhub_sandbox.errors import RemoteProtocolError
+from envhub_sandbox.errors import RemoteEnvWarning, RemoteProtocolError
+from envhub_sandbox.transport.remote_warnings import MOST, RemoteWarnings
 from envhub_sandbox.transport.values import DescriptionReader
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.inert import RemoteObject
 from envhub_worker.protocol.limits import WireLimits
+from envhub_worker.protocol.messages.prefix import WARNINGS
 from envhub_worker.protocol.spaces.spaces import OpaqueSpace
 from envhub_worker.runner.described import described
 from tests.support.compare import assert_same, assert_same_space
@@ -47,15 +50,10 @@ def arrived(value: object) -> Any:
 @pytest.mark.parametrize("space", SPACES, ids=repr)
 @pytest.mark.parametrize("place", [lambda it: it, lambda it: ({"k": [it]},)], ids=["bare", "deep"])
 def test_spaces_arrive(space: gym.Space[Any], place: Callable[[Any], Any]) -> None:
-    """Wherever they stand in a value."""
     found = arrived(place(space))
     assert_same_space(space, found if found == space else found[0]["k"][0], "it")
-
-
-def test_spaces_in_object_arrays_arrive() -> None:
-    """As infos hold them."""
-    array = np.full(3, None, dtype=object)
-    array[0], array[2] = spaces.Tuple([spaces.Discrete(2)]), spaces.Dict({})
+    array = np.full(3, None, dtype=object)  # as infos hold them
+    array[0], array[2] = space, spaces.Dict({})
     assert arrived(array).tolist() == array.tolist()
 
 
@@ -68,7 +66,6 @@ class Own(np.random.Generator):
 
 
 def test_what_only_its_owner_knows_is_told() -> None:
-    """A space as an opaque one, any other thing as a text."""
     assert isinstance(arrived(Custom((2,), np.float32)), OpaqueSpace)
     deep: Any = spaces.Discrete(2)
     for _ in range(20):
@@ -118,3 +115,57 @@ def test_nobody_else_makes_anything_of_descriptions() -> None:
     plain = m.unpack(m.pack(m.Value(spaces.Discrete(2))), things=DescriptionReader)
     assert isinstance(plain, m.Value)
     assert isinstance(plain.value, RemoteObject)
+
+
+# --- What a client makes of warnings: Python's own, once each, bounded, where the caller stands
+
+
+REPLY = m.pack(m.Value(1))
+
+
+def told(heard: RemoteWarnings, *some: tuple[str, str]) -> list[Any]:
+    """What the caller is told after a reply with these."""
+    if some:
+        assert heard.take(WARNINGS.put(some, REPLY)) == REPLY
+    with warnings.catch_warnings(record=True) as shown:
+        warnings.simplefilter("always")
+        heard.show("a/b@c")
+    return shown
+
+
+def test_each_is_told_once() -> None:
+    """Whichever process has said it, and however often; at the caller's line, and never painted."""
+    heard = RemoteWarnings()
+    assert heard.take(REPLY) is REPLY
+    [one, other] = told(heard, ("UserWarning", "slow"), ("x.Own", "slow"), ("x.Own", "slow"))
+    assert str(one.message) == "a/b@c: UserWarning: slow"
+    assert str(other.message) == "a/b@c: x.Own: slow"
+    assert one.category is other.category is RemoteEnvWarning
+    assert one.filename == __file__, "Python's filters go by that"
+    assert told(heard, ("UserWarning", "slow")) == []
+    [painting] = told(heard, ("\x1b]0;owned\x07\n", "\x1b[2J\r\u202eslow"))
+    assert str(painting.message).isprintable()
+    for twin in (copy.copy(one.message), pickle.loads(pickle.dumps(one.message))):
+        found = (str(twin), twin.label, twin.category, twin.text)
+        assert found == (str(one.message), "a/b@c", "UserWarning", "slow")
+
+
+def test_a_flood_ends_with_a_word() -> None:
+    """Who has more than so many different ones is not listened to any more."""
+    heard, shown = RemoteWarnings(), []
+    for number in range(3 * MOST):
+        shown += told(heard, ("UserWarning", str(number)))
+    assert len(shown) == MOST + 1
+    assert "more than" in str(shown[-1].message)
+
+
+def test_what_the_filters_raise_leaves_the_rest() -> None:
+    """As an error it comes out; what follows is told the next time."""
+    heard = RemoteWarnings()
+    heard.take(WARNINGS.put([("UserWarning", "one"), ("UserWarning", "two")], REPLY))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(RemoteEnvWarning, match="one"):
+            heard.show("a/b@c")
+    [two] = told(heard)
+    assert two.message.text == "two"

@@ -55,6 +55,7 @@ def test_samples_of_the_batched_space_are_taken_as_they_are(
     [
         (DISCRETE, [0, 2], [0, 2]),
         (DISCRETE, (0, 2), [0, 2]),
+        (DISCRETE, [7, -1], [7, -1]),  # only shapes and kinds of numbers are looked at
         (spaces.Box(0, 1, (0,), np.int16), [[], []], [[], []]),
         (DISCRETE, np.array([0, 2], np.int8), np.array([0, 2], np.int8)),
         (DISCRETE, np.array([False, True]), np.array([False, True])),
@@ -71,6 +72,9 @@ def test_lists_tuples_and_other_dtypes_are_taken(
 ) -> None:
     """Dtypes stay as they are: that is what an environment in this process would see."""
     assert_same(expected, batch_of(space, value, 2))
+    mapping = types.MappingProxyType({"grip": [0, 1], "move": np.zeros((2, 2)), "more": 1})
+    made = batch_of(DICT, mapping, 2)
+    assert (type(made), list(made)) == (dict, list(DICT.spaces)), "as Gymnasium's own iteration"
 
 
 @pytest.mark.parametrize("name", sorted({*SINGLE_SPACES} - {"discrete", "dict", "tuple"}))
@@ -81,21 +85,7 @@ def test_without_a_count_the_space_is_that_of_the_whole_batch(name: str) -> None
     assert_same(sample, batch_of(space, sample, None))
 
 
-def test_mappings_of_any_class_become_dicts_in_the_spaces_order() -> None:
-    """Further keys are left out, as Gymnasium's own iteration does."""
-    value = types.MappingProxyType({"grip": [0, 1], "move": np.zeros((2, 2)), "more": 1})
-    made = batch_of(DICT, value, 2)
-    assert type(made) is dict
-    assert list(made) == list(DICT.spaces)
-
-
-def test_values_outside_the_bounds_are_the_environments_business() -> None:
-    """Only shapes and kinds of numbers are looked at."""
-    assert_same([7, -1], batch_of(DISCRETE, [7, -1], 2))
-
-
 def test_tensors_are_taken() -> None:
-    """Torch tensors are arrays, with a gradient or without."""
     torch = pytest.importorskip("torch")
     value = torch.ones((2, 2), requires_grad=True)
     assert_same(np.ones((2, 2), np.float32), batch_of(BOX, value, 2))
@@ -106,13 +96,10 @@ def test_tensors_are_taken() -> None:
     [
         (DISCRETE, [0, 1, 2], r"int64 of shape \(2,\).*got int64 of shape \(3,\)"),
         (DISCRETE, 1, r"got int64 of shape \(\)"),
-        (DISCRETE, None, "got object"),
         (DISCRETE, [0.5, 1.0], "got float64"),
         (DISCRETE, ["0", "1"], "got <U1"),
         (DISCRETE, [[0], [1]], r"got int64 of shape \(2, 1\)"),
         (BOX, np.zeros((2, 3), np.float32), r"float32 of shape \(2, 2\).*got .* \(2, 3\)"),
-        (BOX, np.zeros(2, np.float32), r"got float32 of shape \(2,\)"),
-        (BOX, np.zeros((2, 2), complex), "got complex128"),
         (BOX, np.full((2, 2), None), "got object"),
         (BOX, [[0.5], [1, 2]], "not a batch for"),
         (IMAGE, np.zeros((2, 2, 2), np.float32), "got float32"),
@@ -120,7 +107,6 @@ def test_tensors_are_taken() -> None:
         (DICT, {"move": np.zeros((2, 2))}, "'grip'. missing"),
         (DICT, {"move": np.zeros((2, 2)), "grip": [0]}, r"actions\['grip'\]: expected"),
         (TUPLE, ([0, 1],), "expected a tuple of 2 batches .*, got builtins.tuple"),
-        (TUPLE, np.zeros((2, 2)), "got numpy.ndarray"),
         (TUPLE, ([0, 1], {"x": np.zeros(2)}), r"actions\[1\]\['x'\]: expected"),
         (TEXT, ["a"], "expected 2 members of .*, got 1"),
         (TEXT, 5, "expected 2 members of .*, got builtins.int"),
@@ -148,11 +134,11 @@ def test_objects_that_fail_to_be_arrays_are_refused() -> None:
 
 
 @pytest.mark.parametrize("value", [5, 1.5, None])
-@pytest.mark.parametrize("space", [spaces.Text(3), spaces.Graph(spaces.Discrete(2), None)])
-def test_a_scalar_for_members_is_gymnasiums_error_too(space: Any, value: Any) -> None:
+def test_a_scalar_for_members_is_gymnasiums_error_too(value: Any) -> None:
     """Code that catches what ``SyncVectorEnv`` raises catches ours."""
-    with pytest.raises(CustomSpaceError):
-        list(iterate(batch_space(space, 2), value))
-    with pytest.raises(CustomSpaceError) as caught:
-        batch_of(space, value, 2)
-    assert isinstance(caught.value, ActionTypeError)
+    for space in (spaces.Text(3), spaces.Graph(spaces.Discrete(2), None)):
+        with pytest.raises(CustomSpaceError):
+            list(iterate(batch_space(space, 2), value))
+        with pytest.raises(CustomSpaceError) as caught:
+            batch_of(space, value, 2)
+        assert isinstance(caught.value, ActionTypeError)

@@ -29,24 +29,20 @@ class Tags(HTMLParser):
         self.feed(text)
 
     def handle_starttag(self, tag: str, attrs: list[Any]) -> None:
-        """Ours have none."""
         assert not attrs
         self.found.add(tag)
 
     def handle_data(self, data: str) -> None:
-        """What a reader sees."""
         self.text += f"{data} "
 
 
 def an_env(name: str = "arm", **fields: Any) -> Any:
-    """What is shown of an environment."""
     space = gym.spaces.Dict({name: gym.spaces.Box(0, 1, (2,), np.float32)})
     kept = {"num_envs": 3, "single_observation_space": space, "closed": False}
     return SimpleNamespace(**{**kept, "single_action_space": gym.spaces.Discrete(4), **fields})
 
 
 def test_a_box_is_shown_without_the_spaces_that_align_it() -> None:
-    """Numpy writes bounds of several lengths in columns."""
     high = np.array([4.8, np.inf, 0.418])
     box = gym.spaces.Box(-high, high, dtype=np.float64)
     assert "  " in str(box)
@@ -55,18 +51,19 @@ def test_a_box_is_shown_without_the_spaces_that_align_it() -> None:
 
 
 def test_spaces_and_layers_are_shown() -> None:
-    """Of the layers those that hold."""
     layers = [{"layer": "seccomp", "enforced": True}, {"layer": "cgroup", "enforced": False}]
     text = Tags(environment_html(an_env(), layers)).text
     for word in ("3", "'arm': Box", "Discrete(4)", "seccomp", "open"):
         assert word in text
+    suites = Tags(suites_html({"kitchen": {0: an_env(), "lift": an_env("leg")}})).text
+    for word in ("kitchen", "0 ", "'lift'", "'leg': Box"):
+        assert word in suites
     assert "1 layer: seccomp" in text
     assert "cgroup" not in text
     assert "does not run" in Tags(environment_html(an_env(), [])).text
 
 
 def test_a_rendered_frame_is_a_picture() -> None:
-    """Encoded here, and small however large the frame is."""
     frame = np.full((600, 900, 3), 7, np.uint8)
     shown = environment_html(an_env(), [], frame)
     [data] = re.findall(
@@ -83,19 +80,10 @@ def test_a_rendered_frame_is_a_picture() -> None:
     ],
 )
 def test_what_is_no_frame_is_not_shown(rendered: object) -> None:
-    """Texts, other shapes and dtypes."""
     assert environment_html(an_env(), [], rendered) == environment_html(an_env(), [])
 
 
-def test_each_task_has_its_line() -> None:
-    """By suite and task id, as they are asked for."""
-    shown = Tags(suites_html({"kitchen": {0: an_env(), "lift": an_env("leg")}}))
-    for word in ("kitchen", "0 ", "'lift'", "'leg': Box"):
-        assert word in shown.text
-
-
 def test_names_are_text_and_no_markup() -> None:
-    """Of suites, tasks, keys and layers; nor do they paint."""
     env = an_env(SCRIPT)
     layers = [{"layer": SCRIPT, "enforced": True}]
     for shown in (environment_html(env, layers), suites_html({SCRIPT: {SCRIPT: env}})):
@@ -105,7 +93,6 @@ def test_names_are_text_and_no_markup() -> None:
 
 
 def test_what_is_shown_is_bounded() -> None:
-    """A suite of thousands with names of megabytes is one screen."""
     env = an_env("x" * 100_000)
     tasks = dict.fromkeys(range(5000), env)
     shown = suites_html({"y" * 100_000: tasks})

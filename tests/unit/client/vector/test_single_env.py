@@ -118,23 +118,6 @@ def test_actions_and_observations_are_of_the_single_spaces(space: spaces.Space[A
         assert repr(observation) == repr(action) or np.array_equal(observation, action)
 
 
-def test_infos_lose_their_masks() -> None:
-    """Only the infos of this step, mappings within mappings included."""
-    env = SingleEnv(SyncVectorEnv([_Story]))
-    env.reset()
-    assert set(env.step(0)[4]) == {"step", "deep"}
-    info = env.step(1)[4]
-    assert set(info) == {"step", "deep", "rare"}
-    assert info["deep"] == {"action": 1, "word": "up"}
-    assert info["rare"].tolist() == [0, 1, 2]
-
-
-def test_several_are_refused() -> None:
-    """It says how to make one."""
-    with pytest.raises(ValueError, match="n_envs=1"):
-        SingleEnv(SyncVectorEnv([_Story, _Story]))
-
-
 class _Boasting(_Story):
     """Has an attribute that is the client's name for the sandbox."""
 
@@ -160,13 +143,18 @@ class _Numbered(_Story):
         return *result, {**info, 7: self.steps, (1, 2): {3: "deep"}}
 
 
-def test_infos_may_have_numbers_for_keys() -> None:
-    """As in Gymnasium, where a mask's name is a text in any case."""
+def test_infos_lose_their_masks() -> None:
+    """Only those of this step, mappings within mappings included; a key may be a number."""
     env = SingleEnv(SyncVectorEnv([_Numbered]))
     env.reset()
-    info = env.step(0)[4]
-    assert set(info) == {"step", "deep", 7, (1, 2)}
-    assert (info[7], info[1, 2]) == (1, {3: "deep"})
+    assert set(env.step(0)[4]) == {"step", "deep", 7, (1, 2)}
+    info = env.step(1)[4]
+    assert set(info) == {"step", "deep", "rare", 7, (1, 2)}
+    assert info["deep"] == {"action": 1, "word": "up"}
+    assert info["rare"].tolist() == [0, 1, 2]
+    assert (info[7], info[1, 2]) == (2, {3: "deep"})
+    with pytest.raises(ValueError, match="n_envs=1"):
+        SingleEnv(SyncVectorEnv([_Story, _Story]))
 
 
 class _Liar(VectorEnv[Any, Any, Any]):

@@ -25,14 +25,12 @@ WHOLE = ["asked", "ask", "deep", "deeper"]
 
 
 def deeper(error: BaseException, cause: BaseException | None) -> None:
-    """As something far inside."""
     if cause is None:
         raise error
     raise error from cause
 
 
 def deep(error: BaseException, cause: BaseException | None) -> None:
-    """As something inside."""
     deeper(error, cause)
 
 
@@ -72,12 +70,9 @@ def frames(error: BaseException, asking: Callable[..., None] = ask) -> list[str]
 def test_one_frame_of_ours_is_left(error: EnvHubError, asking: Callable[..., None]) -> None:
     """Which pytest hides, and whose line says how to see the others."""
     assert frames(error, asking) == ["asked"]
-    assert error.__traceback__ is not None
     last = error.__traceback__.tb_next
-    assert last is not None
     assert last.tb_frame.f_locals["__tracebackhide__"] is True
     [*_, shown] = traceback.extract_tb(error.__traceback__)
-    assert shown.line is not None
     assert shown.line.endswith("# ENVHUB_TRACEBACK=full shows where")
 
 
@@ -87,27 +82,23 @@ def test_one_frame_of_ours_is_left(error: EnvHubError, asking: Callable[..., Non
     ids=lambda error: type(error).__name__,
 )
 def test_what_may_be_our_fault_keeps_its_frames(error: BaseException) -> None:
-    """There, they are what is known."""
     assert frames(error) == WHOLE
+    assert (ask.__name__, ask.__doc__) == ("ask", "As a method of ours."), "it keeps its face"
 
 
-def test_a_variable_shows_them_all(monkeypatch: pytest.MonkeyPatch) -> None:
-    """For a bug report."""
+def test_the_log_has_them_once(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At DEBUG, however many methods of ours it comes through; a variable shows them all."""
+    with caplog.at_level(logging.DEBUG, "envhub_sandbox.errors"):
+        frames(LoadError("no"), ask_by_another)
+    [record] = [one for one in caplog.records if one.name == "envhub_sandbox.errors"]
+    assert [frame.name for frame in traceback.extract_tb(record.exc_info[2])] == WHOLE
     monkeypatch.setenv("ENVHUB_TRACEBACK", "full")
     assert frames(LoadError("no")) == WHOLE
 
 
-def test_the_log_has_them_once(caplog: pytest.LogCaptureFixture) -> None:
-    """At DEBUG, however many methods of ours it comes through."""
-    with caplog.at_level(logging.DEBUG, "envhub_sandbox.errors"):
-        frames(LoadError("no"), ask_by_another)
-    [record] = [one for one in caplog.records if one.name == "envhub_sandbox.errors"]
-    assert record.exc_info is not None
-    assert [frame.name for frame in traceback.extract_tb(record.exc_info[2])] == WHOLE
-
-
 def test_what_the_caller_was_handling_is_kept() -> None:
-    """With the frames that are his."""
     error, mine = LoadError("no"), KeyError("mine")
     try:
         raise mine
@@ -120,7 +111,6 @@ def test_what_the_caller_was_handling_is_kept() -> None:
 
 
 def test_of_causes_only_ours_are_folded() -> None:
-    """Another library's error keeps what it has to say."""
     ours, theirs = LoadError("ours"), OSError("theirs")
     for error, cause in ((ours, theirs), (PolicyError("on top"), ours)):
         with pytest.raises(type(error)):
@@ -133,12 +123,6 @@ def test_of_causes_only_ours_are_folded() -> None:
     assert caught.value.__cause__ is ours
     assert ours.__traceback__ is None
     assert theirs.__traceback__ is not None
-
-
-def test_a_function_keeps_its_face() -> None:
-    """Its name, its text and what it takes."""
-    assert ask.__name__ == "ask"
-    assert ask.__doc__ == "As a method of ours."
 
 
 @pytest.mark.parametrize(

@@ -2,20 +2,30 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 from collections.abc import Callable
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
 
+from envhub_sandbox.errors import RemoteProtocolError
 from envhub_sandbox.session import requests
 from envhub_sandbox.transport.shared_memory import shard
 from envhub_sandbox.transport.shared_memory.shard import LaneShard
 from envhub_sandbox.vector import vector_env
+from envhub_sandbox.vector.sandbox_view import SandboxView
+from envhub_sandbox.vector.sub_environment import SubEnvironment
+from envhub_sandbox.vector.validated import holds
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.codec.inert import RemoteObject
 from envhub_worker.protocol.shared_memory import slabs
+from envhub_worker.protocol.spaces.spaces import OpaqueSpace
 from tests.support import inside
 from tests.support.in_process.fake_lane import FakeLane, session_over
 from tests.support.in_process.interrupts import before_line
@@ -95,3 +105,69 @@ def test_a_runner_is_told_all_after_an_interrupt(what: str, afterwards: tuple[st
             break
         line += 1
     assert line > 4
+
+
+# --- Which values are in a space, for ``validate=True``
+
+
+def test_holds_counts_numbers_as_what_they_are_worth() -> None:
+    """Not by their dtype, as ``contains`` does."""
+    box = gym.spaces.Box(0, 1, (2,), np.float32)
+    nested = gym.spaces.Dict(a=gym.spaces.Tuple([box, gym.spaces.Discrete(3)]))
+    good = {"a": (np.array([0.0, 1.0]), np.int64(2))}
+    assert holds(nested, good)
+    assert not holds(nested, {"a": (good["a"][0], np.int64(3))})
+    assert not holds(nested, {"a": good["a"][:1]})
+    assert not holds(nested, {"b": good["a"]})
+    assert not holds(box, np.array(["0", "1"]))
+    assert holds(OpaqueSpace("their.Space", "Space()"), object())
+
+
+# --- ``env.sandbox`` beside other programs of the caller's: copies, pickles, logs
+
+
+class Session:
+    """One that notes whether a copy of it was begun."""
+
+    repository = SimpleNamespace(label="org/repo")
+    begun = False
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        self.begun = True
+        return Session, ()
+
+
+@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy, pickle.dumps])
+def test_it_is_not_copied(copied: Callable[[object], object]) -> None:
+    """Nor is the session behind it, whose sockets a half-made copy would close."""
+    session: Any = Session()
+    with pytest.raises(TypeError, match=r"<sandbox of org/repo> .* pickle that environment"):
+        copied(SandboxView(session))
+    assert not session.begun
+
+
+# --- A handle on one sub-environment, and a worker that answers as it likes
+
+
+def one_of_two(value: object) -> SubEnvironment:
+    """The first of two, of which everything is the same."""
+    space = spaces.Discrete(2)
+    vector: Any = SimpleNamespace(num_envs=2, single_observation_space=space)
+    manifest: Any = SimpleNamespace(sync=True, shardable=True)
+    return SubEnvironment(vector, manifest, lambda name, index, message: m.Value(value), 0)
+
+
+def test_wrappers_without_end_are_refused() -> None:
+    env: Any = one_of_two(RemoteObject("gymnasium.Wrapper", "<Wrapper>"))
+    wrappers = 0
+    with pytest.raises(RemoteProtocolError, match="wrap one"):  # noqa: PT012
+        while hasattr(env, "env"):
+            env, wrappers = env.env, wrappers + 1
+    assert wrappers == 1000
+    assert isinstance(env.unwrapped, SubEnvironment)
+
+
+def test_what_is_neither_true_nor_false_breaks_the_rules() -> None:
+    assert one_of_two(1).has_wrapper_attr("a") is True
+    with pytest.raises(RemoteProtocolError):
+        one_of_two(np.zeros(2)).has_wrapper_attr("a")

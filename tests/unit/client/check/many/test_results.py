@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 from xml.etree import ElementTree
 
 import pytest
@@ -41,26 +42,22 @@ def told(text: str = "it broke", *, fails: bool = True) -> dict[str, Any]:
     return read
 
 
-def keep(kept: Results, folder: Path, document: dict[str, Any] | None = None) -> Result:
-    """Keep one."""
-    page = folder / "page.html"
+def edit(file: Path, old: str, new: str) -> None:
+    file.write_text(file.read_text().replace(old, new))
+
+
+def keep(kept: Results, running: Path, document: dict[str, Any] | None = None) -> Result:
+    page = running / "page.html"
     page.write_text("a page")
     return kept.keep(_ONE, document or told(), page, seconds=1.5, ended="2026-01-01T00:00:00+00:00")
 
 
-def edit(file: Path, old: str, new: str) -> None:
-    """Change what stands in a report."""
-    file.write_text(file.read_text().replace(old, new))
-
-
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Where results are kept."""
     return tmp_path / "judged"
 
 
 def test_a_report_is_read_as_it_was_written() -> None:
-    """From its document, whatever a repository wrote into it."""
     for text in (*HOSTILE, ""):
         document = told(text)
         report, failures = reports.read_report(document)
@@ -72,7 +69,6 @@ def test_a_report_is_read_as_it_was_written() -> None:
 
 
 def test_what_was_judged_is_known_again(folder: Path) -> None:
-    """With the same settings, and with them alone."""
     with Results(folder, "as ever").held() as running:
         made = keep(Results(folder, "as ever"), running)
     assert (made.verdict, made.fails, made.found) == (
@@ -125,12 +121,8 @@ def test_an_interrupted_writer_leaves_what_was_there(
     kept = Results(folder, "as ever")
     with kept.held() as running:
         made = keep(kept, running)
-
-        def fail(*_: object) -> None:
-            raise OSError("no power")
-
         with monkeypatch.context() as patched:
-            patched.setattr(results.os, "replace", fail)
+            patched.setattr(results.os, "replace", Mock(side_effect=OSError("no power")))
             with pytest.raises(OSError, match="no power"):
                 keep(kept, running, told(fails=False))
         assert kept.kept(_ONE) == made
@@ -139,12 +131,10 @@ def test_an_interrupted_writer_leaves_what_was_there(
 
 @pytest.mark.parametrize("spoilt", [{"reference": 3}, {"findings": [{}]}, {"passed": True}])
 def test_what_is_no_report_is_not_kept(spoilt: dict[str, Any], folder: Path) -> None:
-    """And leaves nothing."""
     kept = Results(folder, "as ever")
-    with kept.held() as running:
-        with pytest.raises(ForeignResultError):
-            keep(kept, running, {**told(), **spoilt})
-        assert kept.kept(_ONE) is None
+    with kept.held() as running, pytest.raises(ForeignResultError):
+        keep(kept, running, {**told(), **spoilt})
+    assert kept.kept(_ONE) is None
 
 
 def test_one_run_has_a_folder(folder: Path) -> None:
@@ -160,7 +150,6 @@ def test_one_run_has_a_folder(folder: Path) -> None:
     )
     command = [sys.executable, "-I", "-c", code, str(folder)]
     with subprocess.Popen(command, stdout=subprocess.PIPE) as other:
-        assert other.stdout is not None
         try:
             assert other.stdout.readline() == b"held\n"
             with pytest.raises(FolderError, match="another run"), kept.held():
@@ -199,24 +188,18 @@ def test_an_index_has_the_tags_of_ours_alone(text: str) -> None:
     found = Page(index.page(results_of(text)))
     assert shape(found) == shape(Page(quiet))
     assert printable(text, 500)[:200] in found.text
+    assert "script" not in found.names
     for tag, attributes in found.tags:
         for name, value in attributes if tag == "a" else ():
             assert (name, str(value).rpartition("/")[0]) == ("href", "reports")
+    [policy] = [dict(attrs)["content"] for _, attrs in found.tags if "http-equiv" in dict(attrs)]
+    assert str(policy).startswith("default-src 'none'")
+    assert "script" not in str(policy)
     if "<" in text and set(text) != {"<"}:
         assert shape(Page(quiet.replace("walk", text))) != shape(Page(quiet))
 
 
-def test_an_index_runs_nothing() -> None:
-    """And a browser is told so."""
-    found = Page(index.page(results_of("walk")))
-    assert "script" not in found.names
-    [policy] = [dict(attrs)["content"] for _, attrs in found.tags if "http-equiv" in dict(attrs)]
-    assert str(policy).startswith("default-src 'none'")
-    assert "script" not in str(policy)
-
-
 def test_an_index_shows_first_what_fails() -> None:
-    """In the document, JUnit's file and the annotations too."""
     made = list(reversed(results_of("walk")))
     text = Page(index.page(made)).text
     words = ["failed", "not judged", "waiting", "passed"]
@@ -231,7 +214,6 @@ def test_an_index_shows_first_what_fails() -> None:
 
 @pytest.mark.parametrize("text", HOSTILE)
 def test_other_forms_are_well_formed_too(text: str) -> None:
-    """JUnit's file, annotations and the summary of a workflow."""
     made = results_of(text)
     report, failures = reports.read_report(told(text))
     root = ElementTree.fromstring(index.junit(made, lambda _: (report, failures)))
@@ -248,11 +230,6 @@ def test_other_forms_are_well_formed_too(text: str) -> None:
 
 
 def test_an_index_is_bounded() -> None:
-    """However much is said of however many."""
-    one = Result(
-        listed=ListEntry("x" * 4_096, "y", 1),
-        verdict=Verdict.UNJUDGED,
-        said="<" * 100_000,
-        ended="z",
-    )
-    assert len(index.page([one] * 2_000)) < 20_000_000
+    listed = ListEntry("x" * 4_096, "y", 1)
+    one = Result(listed=listed, verdict=Verdict.UNJUDGED, said="<" * 100_000, ended="z")
+    assert len(index.page([one] * 200)) < 2_000_000

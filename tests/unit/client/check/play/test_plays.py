@@ -29,17 +29,14 @@ class Walk(gym.Env[Any, Any]):
         self._render, self._rendered, self._count = render, 0, 0
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        """To the start."""
         self._count = 0
         return np.zeros(1, np.float32), {}
 
     def step(self, action: Any) -> Any:
-        """One further."""
         self._count += 1
         return np.zeros(1, np.float32), 2.0, self._count >= 3, False, {}
 
     def render(self) -> Any:
-        """A frame of its number."""
         self._rendered += 1
         return self._render(self._rendered)
 
@@ -48,7 +45,6 @@ def walks(
     render: Callable[[int], Any] = lambda number: np.full((8, 9, 3), number, np.uint8),
     mode: Modes = Modes.NEXT_STEP,
 ) -> Any:
-    """Two of them."""
     return gym.vector.SyncVectorEnv([lambda: Walk(render)] * 2, autoreset_mode=mode)
 
 
@@ -65,7 +61,6 @@ def test_a_film_is_of_so_many_frames(mode: Modes) -> None:
 
 
 def test_there_are_pictures_where_nothing_makes_a_film(monkeypatch: pytest.MonkeyPatch) -> None:
-    """And it says what to install."""
     monkeypatch.setattr(plays, "can_encode", lambda: False)
     made = film(walks(), seed=0, seconds=600)
     assert (len(made.stills), made.video) == (4, b"")
@@ -90,13 +85,11 @@ def _broken(number: int) -> Any:
 def test_what_renders_badly_is_told_and_fails_nothing(
     render: Callable[[int], Any], stills: int, says: str
 ) -> None:
-    """There is what there was until then."""
     made = film(walks(render), seed=0, seconds=600)
     assert (len(made.stills), says in made.lacks) == (stills, True), made.lacks
 
 
 def test_what_an_environment_says_is_printable_and_bounded() -> None:
-    """A key of a space may be any text."""
     env = walks()
     env.single_observation_space = gym.spaces.Dict({"\u202e" * 5_000: gym.spaces.Discrete(2)})
     told = facts_of(env)
@@ -114,23 +107,17 @@ def test_memory_is_counted_a_few_times() -> None:
     assert play.memory == [3] * 11
     play.counting(lambda: {"memory_bytes": 4})()
     assert (play.memory[11:], play.played) == ([4], 11)
-    few = Play()
-    told = few.sampling(dict, 3)
-    for number in range(4):
-        told(number)
-    assert few.memory == [], "nobody counts there"
+    nobody_counts = Play()
+    nobody_counts.sampling(dict, 3)(0)
+    assert nobody_counts.memory == []
 
 
-def test_a_play_counts_episodes() -> None:
-    """As ``envhub run`` does: resets are no steps."""
-    trace = traces.play(walks(), "NextStep", seed=0, steps=8)
+def test_a_play_counts_episodes_until_rewards_cannot_be_counted() -> None:
+    """As ``envhub run`` does: resets are no steps. What odd rewards mean is for the checks."""
+    env = walks()
+    trace = traces.play(env, "NextStep", seed=0, steps=8)
     assert [(one.returns, one.length) for one in trace.counted] == [((6.0,), 3)] * 4
     assert len(trace.spent) == 8
-
-
-def test_rewards_that_nobody_can_count_end_the_counting_alone() -> None:
-    """What they mean for the verdict is for the checks."""
-    env = walks()
     step, odd = env.step, [np.zeros(2), np.zeros(2), np.zeros(2), np.zeros((2, 3))]
 
     def stepped(actions: Any) -> Any:

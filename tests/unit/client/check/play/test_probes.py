@@ -12,13 +12,13 @@ import pytest
 from gymnasium import spaces
 
 from envhub_sandbox.check.play import probes
+from envhub_sandbox.check.play.confinement import denial_findings
 from envhub_sandbox.check.play.probes import lerobot_lacks, other_modes, wrong_frames
 
 _MIB = 1 << 20
 
 
 def seen(*rows: tuple[int, int, int, int]) -> list[probes.Usage]:
-    """One count after each round."""
     return [{"processes": p, "threads": t, "files": f, "memory_bytes": m} for p, t, f, m in rows]
 
 
@@ -67,7 +67,6 @@ FRAME = np.zeros((4, 6, 3), np.uint8)
     ],
 )
 def test_frames_fit_their_mode(mode: str, rendered: Any, said: str) -> None:
-    """Modes of which nobody knows what they give are not judged."""
     env: Any = SimpleNamespace(render_mode=mode, num_envs=2, render=lambda: rendered)
     found = list(wrong_frames(env))
     assert len(found) == bool(said)
@@ -76,7 +75,6 @@ def test_frames_fit_their_mode(mode: str, rendered: Any, said: str) -> None:
 
 @pytest.mark.parametrize("declared", [["ansi", "human", 3, "rgb_array"], ("rgb_array", "ansi")])
 def test_modes_that_need_no_window_are_tried(declared: Any) -> None:
-    """Of those that it declares; a lie about them names none."""
     env: Any = SimpleNamespace(metadata={"render_modes": declared}, render_mode="rgb_array")
     assert other_modes(env) == ["ansi"]
     assert other_modes(SimpleNamespace(metadata={"render_modes": 3}, render_mode=None)) == []  # type: ignore[arg-type]
@@ -87,8 +85,6 @@ VECTOR = spaces.Box(-1, 1, (2,), np.float32)
 
 
 def vector(observations: Any = PLAYABLE, actions: Any = VECTOR, *, limited: bool = True) -> Any:
-    """What is asked of an environment."""
-
     def get_attr(name: str) -> tuple[int, ...]:
         if not limited:
             raise AttributeError(name)
@@ -97,11 +93,6 @@ def vector(observations: Any = PLAYABLE, actions: Any = VECTOR, *, limited: bool
     return SimpleNamespace(
         single_observation_space=observations, single_action_space=actions, get_attr=get_attr
     )
-
-
-def test_nothing_is_said_of_what_it_can_play() -> None:
-    """State or pixels in a mapping, a vector as action, and an end."""
-    assert list(lerobot_lacks(vector())) == []
 
 
 @pytest.mark.parametrize(
@@ -115,7 +106,38 @@ def test_nothing_is_said_of_what_it_can_play() -> None:
     ],
 )
 def test_what_it_lacks_is_one_text(env: Any, lacking: str) -> None:
-    """It names all that is missing."""
+    """The control has state in a mapping, a vector as action, and an end, and lacks nothing."""
+    assert list(lerobot_lacks(vector())) == []
     [text] = lerobot_lacks(env)
     assert text.startswith("LeRobot cannot evaluate it, which needs ")
     assert re.search(lacking, text)
+
+
+# --- What of a jail's denials is worth a finding
+
+
+@pytest.mark.parametrize(
+    ("denied", "network", "files", "kernel", "limits"),
+    [
+        ((), 0, 0, 0, 0),
+        (("setpriority", "mbind", "socket AF_NETLINK"), 0, 0, 0, 0),
+        (("socket AF_INET", "socket AF_NETLINK_OTHER", "socket AF_PACKET"), 3, 0, 0, 0),
+        (("socket AF_UNIX", "ptrace", "mount"), 0, 0, 3, 0),
+        (("setpriority OTHER_PROCESS", "kill OTHER_PROCESS"), 0, 0, 2, 0),
+        (("ptrace", "ptrace"), 0, 0, 1, 0),
+        (("read /etc/shadow", "unlink /socket AF_INET", "sendto /run/x"), 0, 3, 0, 0),
+        (("limit PROCESSES", "limit DISK_BYTES"), 0, 0, 0, 2),
+        (("unlink /a OTHER_PROCESS", "read /limit PROCESSES"), 0, 2, 0, 0),
+    ],
+    ids=["nothing", "harmless", "network", "kernel", "others", "once", "files", "limits", "names"],
+)
+def test_attempts_are_sorted(
+    denied: tuple[str, ...], network: int, files: int, kernel: int, limits: int
+) -> None:
+    found = denial_findings(denied)
+    assert {check: len(texts) for check, texts in found.items()} == {
+        "denied-network": network,
+        "denied-files": files,
+        "denied-kernel": kernel,
+        "limits-reached": limits,
+    }

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
-from envhub_sandbox.dependencies.builds import download
+from envhub_sandbox.dependencies.builds import download, project
 from envhub_sandbox.errors import (
     IndexUnavailableError,
     PackageIntegrityError,
@@ -18,6 +19,7 @@ from envhub_sandbox.errors import (
 from envhub_sandbox.hub.git import address, commits
 from tests.support.packages.git_server import commit, git_served, make_repository
 from tests.support.packages.git_server import git as run_git
+from tests.support.packages.wheels import served
 
 pytestmark = pytest.mark.same_for("versions")
 
@@ -45,14 +47,13 @@ def url(repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> It
 
 @pytest.fixture
 def target(tmp_path: Path) -> Path:
-    """An empty folder."""
     folder = tmp_path / "target"
     folder.mkdir()
     return folder
 
 
 def test_the_files_of_a_commit(url: str, repository: Path, target: Path) -> None:
-    """By a tag, which means its commit; not those of the newest."""
+    """By a tag, which means its commit; not those of the newest. A full commit means itself."""
     found = download.resolve(url, "v1")
     assert found == run_git(repository, "rev-parse", "v1^{commit}")
     download.check_out(url, found, target, print)
@@ -60,23 +61,17 @@ def test_the_files_of_a_commit(url: str, repository: Path, target: Path) -> None
     assert files == {"setup.py": "1", "a/b.py": "2"}
     newest = run_git(repository, "rev-parse", "main")
     assert download.resolve(url, "main") == download.resolve(url, "HEAD") == newest
-
-
-def test_a_full_commit_is_not_asked_for() -> None:
-    """It means itself."""
     assert download.resolve("https://nowhere.invalid/x", "a" * 40) == "a" * 40
 
 
 @pytest.mark.parametrize("revision", ["v2", "1234567", "main~1"])
 def test_what_is_not_there(url: str, revision: str) -> None:
-    """The error says what to write."""
     with pytest.raises((IndexUnavailableError, RequirementError), match=r"40 digits|not a commit"):
         download.resolve(url, revision)
 
 
 @pytest.mark.parametrize("revision", ["--upload-pack=x", "a b", "", "a..b", "a@{0}", "-x"])
 def test_a_name_that_is_an_option(url: str, revision: str) -> None:
-    """Git would take it for one, or for an expression."""
     with pytest.raises(RequirementError):
         download.resolve(url, revision)
 
@@ -84,25 +79,17 @@ def test_a_name_that_is_an_option(url: str, revision: str) -> None:
 @pytest.mark.parametrize(
     "url",
     [
-        *(
-            "ssh://git@h/x",
-            "file:///etc",
-            "http://h/x",
-            "git://h/x",
-            "ext::sh -c x",
-            "https://-x/y",
-        ),
-        *("https://u:p@h/x", "/etc", "https://h/x y", "https://h/x?a=b", "https://h"),
+        *("ssh://git@h/x", "file:///etc", "http://h/x", "git://h/x", "ext::sh -c x", "/etc"),
+        *("https://-x/y", "https://u:p@h/x", "https://h/x y", "https://h/x?a=b", "https://h"),
+        "--upload-pack=x",
     ],
 )
 def test_only_https_without_a_login(url: str, target: Path) -> None:
-    """Nothing else reaches git."""
     with pytest.raises(RequirementError, match="not a supported address"):
         download.check_out(url, "a" * 40, target, print)
 
 
 def test_links_and_submodules_are_left_out(url: str, repository: Path, target: Path) -> None:
-    """They are said; nothing is fetched for them."""
     (repository / "link").symlink_to("/etc/passwd")
     inner = "0" * 39 + "1"
     run_git(repository, "update-index", "--add", "--cacheinfo", f"160000,{inner},module")
@@ -115,29 +102,25 @@ def test_links_and_submodules_are_left_out(url: str, repository: Path, target: P
     assert "link is a link or a submodule" in "".join(said)
 
 
-def test_filters_and_attributes_do_nothing(url: str, repository: Path, target: Path) -> None:
-    """The bytes are those of the commit, whatever its attributes ask for."""
-    (repository / ".gitattributes").write_text("* export-ignore\n*.py filter=x text eol=crlf\n")
-    (repository / "setup.py").write_bytes(b"$Format:%H$\n")
-    download.check_out(url, commit(repository), target, print)
-    assert (target / "setup.py").read_bytes() == b"$Format:%H$\n"
-
-
-def test_settings_of_the_user_do_nothing(
+def test_settings_and_attributes_do_nothing(
     url: str, repository: Path, target: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """His logins are not sent to a host that a stranger names, and no template brings hooks."""
+    """A user's logins are not sent to a host that a stranger names, and no template brings hooks.
+
+    The bytes are those of the commit, whatever its attributes ask for.
+    """
     ran = tmp_path / "ran"
     settings = tmp_path / "config"
     settings.write_text(f'[credential]\nhelper = "!touch {ran};"\n[url "file:///"]\ninsteadOf = h')
     monkeypatch.setenv("GIT_CONFIG_GLOBAL", str(settings))
-    download.check_out(url, run_git(repository, "rev-parse", "HEAD"), target, print)
-    assert (target / "setup.py").read_text() == "3"
+    (repository / ".gitattributes").write_text("* export-ignore\n*.py filter=x text eol=crlf\n")
+    (repository / "setup.py").write_bytes(b"$Format:%H$\n")
+    download.check_out(url, commit(repository), target, print)
+    assert (target / "setup.py").read_bytes() == b"$Format:%H$\n"
     assert not ran.exists()
 
 
 def test_a_name_that_leads_out(url: str, repository: Path, target: Path) -> None:
-    """Git itself makes no such commit, but others can."""
     blob = run_git(repository, "hash-object", "-w", "setup.py")
     (repository / "tree").write_bytes(b"100644 a\\b\0" + bytes.fromhex(blob))
     tree = run_git(repository, "hash-object", "-w", "-t", "tree", "--literally", "tree")
@@ -146,13 +129,6 @@ def test_a_name_that_leads_out(url: str, repository: Path, target: Path) -> None
     with pytest.raises(PackageIntegrityError, match="backslash"):
         download.check_out(url, bad, target, print)
     assert not list(target.iterdir())
-
-
-def test_bounds(url: str, repository: Path, target: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Their number before they are read."""
-    monkeypatch.setattr(commits, "MAX_FILES", 1)
-    with pytest.raises(PackagesTooLargeError, match="more than 1 files"):
-        download.check_out(url, run_git(repository, "rev-parse", "HEAD"), target, print)
 
 
 def test_trees_that_hold_each_other(
@@ -176,3 +152,113 @@ def test_trees_that_hold_each_other(
     finally:
         tracemalloc.stop()
     assert listed.count("\n") == 10**5 - 1
+
+
+# --- What sources say of their build, what a build lacked, and downloads: all of it is data
+
+
+LEGACY = "setuptools.build_meta:__legacy__"
+
+
+@pytest.mark.parametrize(
+    ("text", "requires", "backend"),
+    [
+        (None, ["setuptools", "wheel"], LEGACY),
+        ("[tool.x]\n", ["setuptools", "wheel"], LEGACY),
+        ("[build-system]\nrequires = ['cython<4']\n", ["cython<4"], LEGACY),
+        ("[build-system]\nrequires = []\nbuild-backend = 'a.b:c'\n", [], "a.b:c"),
+    ],
+)
+def test_how_it_is_built(
+    tmp_path: Path, text: str | None, requires: list[str], backend: str
+) -> None:
+    """As the standards have it: setuptools is what builds where nothing is said."""
+    if text is not None:
+        (tmp_path / "pyproject.toml").write_text(text)
+    found = project.read(tmp_path, "x 1.0")
+    assert [str(one.requirement) for one in found.requires] == requires
+    assert found.backend == backend
+    assert found.uses_setuptools == (backend == LEGACY)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "[build-system]\nrequires = ['x @ file:///etc']\n",
+        "[build-system]\nrequires = ['--index-url=http://x']\n",
+        "[build-system]\nrequires = 3\n",
+        "[build-system]\nrequires = []\nbuild-backend = 'a; import os'\n",
+        '[build-system]\nrequires = []\nbackend-path = ["a\\nb"]\n',
+        "build-system = 3\n",
+        "no toml",
+        "a" + ".a" * 3000 + " = 1\n",
+    ],
+)
+def test_what_is_not_taken(tmp_path: Path, text: str) -> None:
+    (tmp_path / "pyproject.toml").write_text(text)
+    with pytest.raises(RequirementError, match=r"x 1\.0"):
+        project.read(tmp_path, "x 1.0")
+
+
+@pytest.mark.parametrize(
+    ("log", "said"),
+    [
+        ("error: command 'gcc' failed: No such file or directory", "apt-get install gcc"),
+        ("error: command '/usr/bin/x86_64-linux-gnu-g++' failed: No such file or directory", "g++"),
+        ("FileNotFoundError: [Errno 2] No such file or directory: 'cmake'", "install cmake"),
+        ("/bin/sh: 1: sdl2-config: not found", "apt-get install libsdl2-dev"),
+        ("RuntimeError: CMake must be installed to build", "apt-get install cmake"),
+        ("No CMAKE_C_COMPILER could be found.", "apt-get install gcc g++"),
+        ("x.c:1:10: fatal error: Python.h: No such file or directory", "python3-dev"),
+        ("x.c:1:10: fatal error: foo/bar.h: No such file or directory", "header foo/bar.h"),
+        ("/usr/bin/ld: cannot find -lGLEW: No such file", "library GLEW"),
+        ("urllib.error.URLError: <urlopen error [Errno -3] Temporary failure", "the network"),
+    ],
+)
+def test_what_was_missing_is_named(log: str, said: str) -> None:
+    assert said in project.advice(f"running build_ext\n{log}\n")
+
+
+def test_nothing_is_guessed() -> None:
+    """A file of its own that is missing is no program, and few programs come as wheels."""
+    assert project.wheel_for("error: command 'swig' failed: No such file or directory") == "swig<5"
+    assert project.wheel_for("error: command 'gcc' failed: No such file or directory") == ""
+    assert project.advice("No such file or directory: 'README.md'\nSyntaxError") == ""
+
+
+def test_downloads_are_bounded_and_verified(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another file than the one that is known is refused, and so is one that is too large."""
+    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+    shelf, target = tmp_path / "shelf", tmp_path / "target"
+    shelf.mkdir()
+    (shelf / "x-1.tar.gz").write_bytes(b"data")
+    known = hashlib.sha256(b"data").hexdigest()
+    with served(shelf) as index:
+        url = index.url.replace("/simple", "/files/x-1.tar.gz")
+        download.download(url, known, target)
+        assert target.read_bytes() == b"data"
+        index.replaced["x-1.tar.gz"] = b"tada"
+        with pytest.raises(PackageIntegrityError, match="it was replaced"):
+            download.download(url, known, target)
+        with pytest.raises(IndexUnavailableError, match="404"):
+            download.download(url + "x", known, target)
+        monkeypatch.setattr(download, "MAX_BYTES", 3)
+        with pytest.raises(PackagesTooLargeError):
+            download.download(url, known, target)
+    for other in ("ftp://127.0.0.1/x", "http://127.0.0.1:1/x", "file:///dev/zero"):
+        with pytest.raises(IndexUnavailableError):
+            download.download(other, known, target)
+
+
+def test_a_login_goes_to_the_host_of_its_index_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("UV_INDEX", "mine=https://me:secret@index.example/simple")
+    monkeypatch.setenv("NETRC", str(tmp_path / "none"))
+    assert download.login_for("https://index.example/x") == ("me", "secret")
+    assert download.login_for("https://other.example/x") is None
+    with pytest.raises(IndexUnavailableError) as caught:
+        download.download("http://me:secret@127.0.0.1:1/x", "", tmp_path / "x")
+    assert "secret" not in str(caught.value)

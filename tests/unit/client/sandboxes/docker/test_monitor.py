@@ -45,7 +45,6 @@ class Kept:
     log: Path
 
     def ends(self) -> bool:
-        """Whether it ends and cleans up."""
         self.monitor.wait(60)
         calls = self.log.read_text().splitlines()
         return not self.folder.exists() and calls[-1] == "rm --force --volumes envhub-test"
@@ -79,7 +78,6 @@ def kept(tmp_path: Path, what: str, script: Path | None = None) -> Iterator[Kept
 
 @pytest.mark.parametrize("how", ["the client exits", "the client is killed", "it is told to"])
 def test_the_container_ends_with_its_client(tmp_path: Path, how: str) -> None:
-    """Or at SIGTERM: its stdin ends, and nothing is left."""
     with kept(tmp_path, _SERVES) as made:
         assert made.said == {"envhub-worker": "0"}
         if how == "it is told to":
@@ -91,7 +89,7 @@ def test_the_container_ends_with_its_client(tmp_path: Path, how: str) -> None:
         assert made.ends()
 
 
-@pytest.mark.parametrize("code", [0, 1, 137])
+@pytest.mark.parametrize("code", [0, 137])
 def test_the_monitor_ends_as_its_container_did(tmp_path: Path, code: int) -> None:
     """So that the client can tell how that was: 137 is SIGKILL inside."""
     with kept(tmp_path, f"{_ANNOUNCES}; exit {code}") as made:
@@ -100,7 +98,6 @@ def test_the_monitor_ends_as_its_container_did(tmp_path: Path, code: int) -> Non
 
 
 def test_the_lifeline_is_cut_when_the_monitor_is_killed(tmp_path: Path) -> None:
-    """Nobody else holds the container's stdin."""
     with kept(tmp_path, _SERVES) as made:
         pid = int((tmp_path / "calls.pid").read_text())
         made.monitor.send_signal(signal.SIGKILL)
@@ -116,17 +113,16 @@ def test_an_engine_that_fails_is_quoted(tmp_path: Path) -> None:
         assert made.ends()
 
 
-def test_a_server_that_talks_much_does_not_wait_for_a_reader(tmp_path: Path) -> None:
-    """What it says after its announcement is read and dropped."""
-    talks = f"{_ANNOUNCES}; head -c 3000000 /dev/zero; echo done >{tmp_path / 'calls.talked'}; cat"
-    with kept(tmp_path, talks) as made:
-        assert eventually((tmp_path / "calls.talked").exists)
+def test_what_a_server_says_later_is_read_and_dropped(tmp_path: Path) -> None:
+    """So that it does not wait for a reader."""
+    talked = tmp_path / "calls.talked"
+    with kept(tmp_path, f"{_ANNOUNCES}; head -c 3000000 /dev/zero; echo >{talked}; cat") as made:
+        assert eventually(talked.exists)
         made.monitor.terminate()
         assert made.ends()
 
 
 def test_a_container_that_ignores_the_end_of_its_stdin_is_removed(tmp_path: Path) -> None:
-    """By the engine's own means, after some patience."""
     text = inside.monitor_script().read_text()
     script = tmp_path / "monitor.py"
     script.write_text(text.replace("\n_END_S = 8.0\n", "\n_END_S = 0.2\n"))

@@ -83,7 +83,6 @@ def test_one_of_another_kind_does_not(theirs: interpreters.Interpreter, said: st
 
 
 def test_the_images_python_is_the_one_that_there_is() -> None:
-    """Who asks for another one, or declares one, hears so."""
     for request in (
         declares(python="3.99"),
         declares(python="/usr/bin/python3"),
@@ -97,11 +96,6 @@ LOCK = Lock(
     "minigrid==3.0.0 \\\n    --hash=sha256:aa \\\n    --hash=sha256:bb\nnumpy==2.1.0 \\\n"
     "    --hash=sha256:cc\n"
 )
-
-
-def test_a_lock_names_its_packages() -> None:
-    """Without their hashes."""
-    assert LOCK.packages == ["minigrid==3.0.0", "numpy==2.1.0"]
 
 
 def test_the_tag_is_the_hash_of_all_that_an_image_is_made_of() -> None:
@@ -118,7 +112,6 @@ def test_the_tag_is_the_hash_of_all_that_an_image_is_made_of() -> None:
 
 @pytest.mark.parametrize("name", ["org/Repo.Name_1", "datasets/x/--y--", "../..", "Ünïcode/env"])
 def test_a_repositorys_name_makes_a_tag(name: str) -> None:
-    """Whatever it has in it."""
     repository, _, tag = packages.tag_for(name, "sha256:1", LOCK, ()).partition(":")
     assert set(repository) <= set("abcdefghijklmnopqrstuvwxyz0123456789-")
     assert not repository.endswith("-")
@@ -136,6 +129,5 @@ def test_the_recipe_is_this_one() -> None:
 
 @pytest.mark.parametrize("name", ["libgl1; reboot", "-o", "", "a b", "$(id)", "--allow-x"])
 def test_a_system_package_is_a_name(name: str) -> None:
-    """It stands in a shell's command line."""
     with pytest.raises(DependencyError, match="Debian"):
         packages.dockerfile("envhub-worker", LOCK, [name])

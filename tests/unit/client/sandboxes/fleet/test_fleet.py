@@ -23,29 +23,17 @@ from tests.support import inside
 
 
 def test_a_fleet_is_no_place_of_another(tmp_path: Path) -> None:
-    """Neither at first, nor as a line that a list gets later."""
+    """Neither at first, nor as a line that a list gets later; nor is a list one of itself."""
     other, path = tmp_path / "other", tmp_path / "places"
     other.write_text("tcp://c:1\n")
-    path.write_text("tcp://a:1\n")
+    path.write_text(f"file:{path}\n")
     resolve = partial(sandbox_of, server_key=None)
-    for nested in (Fleet(["tcp://a:1"]), f"file:{other}"):
+    for nested in (Fleet(["tcp://a:1"]), f"file:{other}", f"file:{path}"):
         with pytest.raises(PolicyError, match="no fleet"):
             Fleet([nested]).opened(resolve, None)
-    opened = Fleet(path).opened(resolve, None)
-    path.write_text(f"file:{other}\ntcp://a:1\ntcp://b:1\n")
-    assert [seat.address for seat in opened.workers(None)] == ["tcp://a:1", "tcp://b:1"]
-
-
-def test_a_list_that_names_itself_is_no_place(tmp_path: Path) -> None:
-    """Neither at first nor later: what is no place is not read."""
-    path = tmp_path / "places"
-    resolve = partial(sandbox_of, server_key=None)
-    path.write_text(f"file:{path}\n")
-    with pytest.raises(PolicyError, match="no fleet"):
-        Fleet(path).opened(resolve, None)
     path.write_text("tcp://a:1\n")
     opened = Fleet(path).opened(resolve, None)
-    path.write_text(f"file:{path}\ntcp://a:1\ntcp://b:1,file:{path}\ntcp://b:1\n")
+    path.write_text(f"file:{other}\nfile:{path}\ntcp://a:1\ntcp://b:1,file:{path}\ntcp://b:1\n")
     assert [seat.address for seat in opened.workers(None)] == ["tcp://a:1", "tcp://b:1"]
 
 
@@ -65,7 +53,6 @@ def test_what_is_no_fleet_says_what_is_one(places: Any, remote: Any, said: str) 
 
 
 def test_a_secret_key_is_in_copies_and_in_no_pickle() -> None:
-    """A copy is of this process, as that of a RemoteSandbox is."""
     pair = keys.generate()
     text = key_text(pair.secret)
     fleet = Fleet(["tcp://a:1"], remote={"client_key": text})
@@ -77,19 +64,17 @@ def test_a_secret_key_is_in_copies_and_in_no_pickle() -> None:
     assert text not in repr(fleet)
 
 
-def test_a_list_is_as_it_was_given() -> None:
-    """Names and sandboxes, in their order, also twice."""
+def test_places_stand_in_a_list_a_text_or_a_file(tmp_path: Path) -> None:
+    """In their order, also twice; behind an address its key. Comments and empty lines are none."""
     given = ["tcp://a:1", PROCESS, "tcp://a:1"]
     assert PlaceList(given).read() == given
     assert PlaceList("tcp://a:1, process,").read() == ["tcp://a:1", "process"]
-
-
-def test_a_file_has_one_on_each_line(tmp_path: Path) -> None:
-    """Behind an address its key; comments and empty lines are none."""
     path = tmp_path / "places"
     path.write_text("# all\n\ntcp://a:1   KEY # the first\n  process\n")
     for source in (path, f"file:{path}"):
         assert PlaceList(source).read() == ["tcp://a:1 KEY", "process"]
+    assert all(map(is_list, ["tcp://a:1,tcp://b:1", "file:x", "dns://x:1"]))
+    assert not any(map(is_list, ["process", "docker:image", "tcp://a:1"]))
 
 
 def test_a_file_is_read_again(tmp_path: Path) -> None:
@@ -115,19 +100,13 @@ def test_a_file_is_read_again(tmp_path: Path) -> None:
     ],
 )
 def test_no_places_at_first_are_refused(source: Any) -> None:
-    """There is nothing that could hold instead."""
     with pytest.raises(PolicyError, match="fleet"):
         PlaceList(source)
 
 
-def test_too_many_are_refused() -> None:
-    """A list of so many is a mistake."""
+def test_a_list_without_bounds_is_refused(tmp_path: Path) -> None:
     with pytest.raises(PolicyError, match="4097 places"):
         PlaceList(["process"] * (fleet.MOST_PLACES + 1))
-
-
-def test_a_huge_file_is_not_read_whole(tmp_path: Path) -> None:
-    """It is no list of places."""
     path = tmp_path / "places"
     with path.open("wb") as file:
         file.truncate(1 << 30)
@@ -152,9 +131,3 @@ def test_dns_gives_each_address(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(*inside.freshness_of_dns(), 0)
     places = PlaceList(source)
     assert places.read() == ["tcp://[fd00::1]:5555"]
-
-
-def test_what_names_several() -> None:
-    """A text with commas, a file, a name of DNS; one place is none of these."""
-    assert all(map(is_list, ["tcp://a:1,tcp://b:1", "file:x", "dns://x:1"]))
-    assert not any(map(is_list, ["process", "docker:image", "tcp://a:1"]))

@@ -7,13 +7,16 @@ from typing import Any
 
 import pytest
 
-from envhub_sandbox.errors import PolicyError
+from envhub_sandbox.dependencies.packages import PackageSet
+from envhub_sandbox.dependencies.request import PackageRequest
+from envhub_sandbox.errors import DependencyError, PolicyError
 from envhub_sandbox.sandboxes.fleet import placement as module
 from envhub_sandbox.sandboxes.fleet.fleet import PlaceList
-from envhub_sandbox.sandboxes.fleet.member import Member
+from envhub_sandbox.sandboxes.fleet.member import FleetPackages, Member
 from envhub_sandbox.sandboxes.fleet.placement import Placement, Room
 from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.settings.policy import Policy
+from envhub_sandbox.transport.tcp import UnreachableError
 from envhub_worker.protocol.runtime import Runtime
 
 
@@ -28,7 +31,6 @@ class _Place(Sandbox):
         return Runtime(f"tcp://{self.name} {'k' * 64}" if self.name.startswith("far") else "")
 
     def for_repository(self, *given: Any) -> Sandbox:
-        """As the test says."""
         if self.refuses:
             raise PolicyError(f"{self.name} cannot permit that")
         return self
@@ -41,13 +43,11 @@ class _Rooms:
         self.said: dict[str, Room] = {}
 
     def ask(self, members: list[Member]) -> dict[Member, Room]:
-        """Those that it has said."""
         return {one: self.said[one.name] for one in members if one.name in self.said}
 
 
 @pytest.fixture
 def rooms(monkeypatch: pytest.MonkeyPatch) -> dict[str, Room]:
-    """By the name of the place."""
     made = _Rooms(0)
     monkeypatch.setattr(module, "Rooms", lambda memory_bytes: made)
     return made.said
@@ -73,35 +73,21 @@ def _first(placement: Placement, number: int) -> str:
     return next(placement.candidates(number)).name
 
 
-def test_one_worker_each_by_default(rooms: dict[str, Room]) -> None:
-    """As many as the list has places, also where one stands there twice."""
+def test_they_are_spread(rooms: dict[str, Room]) -> None:
+    """One each by default; evenly, by how often a place is in the list."""
     assert len(_placement(["a", "b", "a"]).seats(None)) == 3
     assert len(_placement(["a", "b"]).seats(5)) == 5
-
-
-def test_they_are_spread(rooms: dict[str, Room]) -> None:
-    """Evenly, by how often a place is in the list."""
     placement = _opened(["a", "b", "a"])
     found = [_first(placement, number) for number in range(6)]
     assert sorted(found) == ["a", "a", "a", "a", "b", "b"]
 
 
-def test_of_equal_places_the_one_with_most_room(rooms: dict[str, Room]) -> None:
-    """Other processes with the same key may have taken the rest."""
-    rooms |= {"a": Room(workers=3), "b": Room(workers=60)}
-    assert _first(_opened(["a", "b"]), 0) == "b"
-
-
-def test_what_is_full_comes_after_what_is_not(rooms: dict[str, Room]) -> None:
-    """And what does not answer after that."""
-    rooms |= {"a": Room(workers=0), "b": Room(answers=False, workers=0), "c": Room(workers=1)}
-    placement = _opened(["a", "b", "c"])
-    assert [one.name for one in placement.candidates(0)] == ["c", "a", "b"]
-
-
-def test_room_that_was_given_away_since_is_gone(rooms: dict[str, Room]) -> None:
-    """Workers that start at the same time are told of the same room."""
+def test_the_place_with_most_room_comes_first(rooms: dict[str, Room]) -> None:
+    """Then what is full, and what does not answer; room that was given away since is gone."""
     rooms |= {"a": Room(workers=1), "b": Room(workers=9)}
+    rooms |= {"c": Room(workers=0), "d": Room(answers=False, workers=0)}
+    placement = _opened(["c", "d", "a", "b"])
+    assert [one.name for one in placement.candidates(0)] == ["b", "a", "c", "d"]
     placement = _opened(["a", "b"])
     assert [_first(placement, number) for number in range(4)] == ["b", "a", "b", "b"]
 
@@ -124,7 +110,6 @@ def test_a_worker_comes_back_to_where_it_was(rooms: dict[str, Room]) -> None:
 
 
 def test_where_a_worker_is(rooms: dict[str, Room]) -> None:
-    """Before it was placed, where it would go as far as is known."""
     placement = _opened(["a", "b"])
     assert [placement.at(number).name for number in range(3)] == ["a", "b", "a"]
     tries = placement.candidates(0)
@@ -148,7 +133,6 @@ def test_a_place_that_was_absent_is_made_when_it_is_used(rooms: dict[str, Room])
 
 
 def test_all_are_made_where_none_was_there(rooms: dict[str, Room]) -> None:
-    """The first error says why."""
     placement = _placement(["a", "b"])
     for one in placement.members():
         one.absent = vars(one.sandbox)["refuses"] = True
@@ -156,14 +140,12 @@ def test_all_are_made_where_none_was_there(rooms: dict[str, Room]) -> None:
         placement.seats(None)[0].for_repository(Path(), Policy(), Runtime(""))
 
 
-def test_what_it_runs_on_is_that_of_all_places(rooms: dict[str, Room]) -> None:
-    """Of places that are alike that of one: a remembered manifest then holds for both."""
-    placement = _opened(["a", "b"])
-    assert placement.runs_on(Runtime("")) == Runtime("")
-
-
 def test_what_many_places_run_on_has_a_name_of_a_file(rooms: dict[str, Room]) -> None:
-    """It is looked up as one; the same places have the same, in any order."""
+    """It is looked up as one; the same places have the same, in any order.
+
+    What places run on that are alike is that of one: a remembered manifest then holds for both.
+    """
+    assert _opened(["a", "b"]).runs_on(Runtime("")) == Runtime("")
     names = [f"far{number}" for number in range(300)]
     found = [_opened(some).runs_on(Runtime("")) for some in (names, names[::-1], names[1:])]
     assert found[0] == found[1] != found[2]
@@ -172,7 +154,6 @@ def test_what_many_places_run_on_has_a_name_of_a_file(rooms: dict[str, Room]) ->
 
 
 def test_a_place_is_asked_once_for_all_workers(rooms: dict[str, Room]) -> None:
-    """There may be a thousand of each."""
     placement = _placement([f"far{number}" for number in range(50)])
     for seat in placement.seats(None):
         seat.for_repository(Path(), Policy(), Runtime("")).runs_on(Runtime(""))
@@ -209,3 +190,89 @@ def test_a_place_that_is_wrong_later_is_left_out(tmp_path: Path, rooms: dict[str
     assert [member.name for member in made.members()] == ["a", "b"], "the last ones hold"
     with pytest.raises(PolicyError, match="10"):
         Placement(PlaceList(path).read, resolve, lambda member: Runtime("")).members()
+
+
+# --- A repository's packages on each place of a fleet, as that place makes them
+
+
+class _Maker(Sandbox):
+    """A place whose packages are as a test says; None: it has its own only."""
+
+    def __init__(self, name: str, made: Any, *, meets: bool = False, here: bool = False) -> None:
+        self.name, self.is_here = name, here
+        self._made, self._meets = made, meets
+        self.asked = 0
+
+    def will_make(self, made: Any) -> None:
+        self._made = made
+
+    def package_target(self) -> Any:
+        return None if self._made is None else self
+
+    def meets(self, request: PackageRequest) -> bool:
+        return self._meets
+
+    def make(self, request: PackageRequest, tell: Any) -> Any:
+        self.asked += 1
+        if isinstance(self._made, Exception):
+            raise self._made
+        return self._made
+
+
+def _request(*, always: bool = False) -> PackageRequest:
+    request: Any = type("Request", (), {"always": always})()
+    return request  # type: ignore[no-any-return]
+
+
+def _packages(*places: _Maker) -> tuple[FleetPackages, list[Member]]:
+    packages = FleetPackages()
+    members = [Member(place, packages.runtime_of) for place in places]
+    packages.members = lambda: members
+    return packages, members
+
+
+def test_each_place_runs_on_its_own() -> None:
+    """A folder here, a name over there; the facts of each are kept, and told once if alike."""
+    here = _Maker("here", PackageSet("/made/here", {"lock": "a"}, "/python"), here=True)
+    there = _Maker("there", PackageSet("name", {"lock": "b"}))
+    packages, members = _packages(here, there)
+    made = packages.make(_request(), print)
+    assert made is not None
+    assert packages.runtime_of(members[0]) == Runtime("/python", "/made/here")
+    assert packages.runtime_of(members[1]) == Runtime("", "name")
+    assert made.facts["places"] == {"here": {"lock": "a"}, "there": {"lock": "b"}}
+    there.will_make(PackageSet("name", {"lock": "a"}))
+    made = packages.make(_request(), print)
+    assert made.facts == {"lock": "a"}
+
+
+def test_what_a_place_has_is_not_made() -> None:
+    """Its own interpreter runs it then: here the one that the caller named."""
+    here, there = _Maker("here", 1, meets=True, here=True), _Maker("there", 1, meets=True)
+    packages, members = _packages(here, there)
+    packages.host = Runtime("/named")
+    assert packages.meets(_request())
+    assert packages.make(_request(), print) is None
+    assert here.asked == there.asked == 0
+    assert [packages.runtime_of(one) for one in members] == [Runtime("/named"), Runtime("")]
+
+
+def test_one_that_is_not_there_makes_them_when_it_is_used() -> None:
+    absent = _Maker("absent", UnreachableError("nothing answers"))
+    packages, members = _packages(_Maker("here", PackageSet("x", {})), absent)
+    assert packages.make(_request(), print) is not None
+    absent.will_make(PackageSet("later", {}))
+    assert packages.runtime_of(members[1]) == Runtime("", "later")
+    assert absent.asked == 2
+
+
+def test_one_that_cannot_make_them_is_an_error() -> None:
+    packages, _ = _packages(
+        _Maker("a", PackageSet("x", {})), _Maker("b", DependencyError("no wheel"))
+    )
+    with pytest.raises(DependencyError, match="no wheel"):
+        packages.make(_request(), print)
+    without, _ = _packages(_Maker("own", None))
+    with pytest.raises(PolicyError, match="own has packages of its own"):
+        without.make(_request(always=True), print)
+    assert not without.meets(_request())

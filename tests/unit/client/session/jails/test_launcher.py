@@ -9,12 +9,15 @@ from typing import Any, cast
 
 import pytest
 
-from envhub_sandbox.errors import WorkerDiedError, WorkerStartupError
+from envhub_sandbox.errors import EnvHubError, ServerBusyError, WorkerDiedError, WorkerStartupError
 from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.session.jails import launcher as launcher_module
-from envhub_sandbox.session.jails.launcher import Launcher
+from envhub_sandbox.session.jails import launcher as module
+from envhub_sandbox.session.jails.launcher import Launcher, retry_while_busy
 from envhub_sandbox.session.jails.loaded import LoadedJail
+from envhub_sandbox.transport.deadline import StartupDeadline
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.messages.busy import DRAINING
 from tests.support.in_process.fake_lane import FakeLane, session_over
 
 _SERVER: Any = SimpleNamespace(endpoint="", process_fd=0, far=None)
@@ -30,12 +33,10 @@ class _Client:
         self.refuses: BaseException | None = None
 
     def hello(self, deadline: object) -> None:
-        """It answers, or not."""
         if self.refuses is not None:
             raise self.refuses
 
     def request(self, message: m.Message, deadline: object) -> tuple[m.Message, list[Any]]:
-        """An answer to it."""
         self.asked.append(message)
         return m.Status(self.status) if isinstance(message, m.GetStatus) else m.Done(), []
 
@@ -53,19 +54,16 @@ class _Place(Sandbox):
         self.fails = False
 
     def acquire(self, store: Any, runtime: Any = None, idle_s: float | None = 0.0) -> Any:
-        """A use of it."""
         if self.fails:
             raise WorkerStartupError("it did not come up")
         return SimpleNamespace(server=_SERVER, live=False, release=self.release)
 
     def release(self) -> None:
-        """One use less."""
         self.released += 1
 
 
 @pytest.fixture
 def client(monkeypatch: pytest.MonkeyPatch) -> _Client:
-    """What the launcher speaks by."""
     made = _Client()
     monkeypatch.setattr(launcher_module, "WorkerConnection", lambda *_: made)
     return made
@@ -73,7 +71,6 @@ def client(monkeypatch: pytest.MonkeyPatch) -> _Client:
 
 @pytest.fixture
 def place() -> _Place:
-    """Where the worker runs."""
     return _Place()
 
 
@@ -88,7 +85,6 @@ def launcher(client: _Client, place: _Place) -> Launcher:
 
 
 def opened(launcher: Launcher, client: _Client, place: _Place) -> Any:
-    """A jail with the number 7."""
     waits: list[object] = []
     jail = SimpleNamespace(
         number=7,
@@ -103,7 +99,6 @@ def opened(launcher: Launcher, client: _Client, place: _Place) -> Any:
 
 
 def test_a_jail_is_closed_once(launcher: Launcher, client: _Client, place: _Place) -> None:
-    """And its server is given back once."""
     loaded = opened(launcher, client, place)
     for _ in range(2):
         launcher.close(loaded)
@@ -114,7 +109,6 @@ def test_a_jail_is_closed_once(launcher: Launcher, client: _Client, place: _Plac
 def test_an_interrupted_close_goes_on_over_another_connection(
     launcher: Launcher, client: _Client, place: _Place
 ) -> None:
-    """What was said on its own before the interrupt is not known."""
     loaded = opened(launcher, client, place)
 
     def interrupted() -> Any:
@@ -141,15 +135,15 @@ def test_an_interrupted_close_goes_on_over_another_connection(
 def test_only_words_are_taken_of_a_status(
     launcher: Launcher, client: _Client, place: _Place, status: Any, states: tuple[str, ...]
 ) -> None:
-    """A server on another host may say anything."""
     client.status = status
-    assert launcher.states(opened(launcher, client, place)) == states
-
-
-def test_a_silent_server_has_no_status(launcher: Launcher, client: _Client, place: _Place) -> None:
-    """Which is no error: it is for a text."""
-    client.refuses = WorkerDiedError("gone")
-    assert launcher.status(opened(launcher, client, place)) == {}
+    loaded = opened(launcher, client, place)
+    assert launcher.states(loaded) == states
+    client.refuses = WorkerDiedError("a silent one, which is no error: it is for a text")
+    assert launcher.status(loaded) == {}
+    place.fails = True
+    with pytest.raises(WorkerStartupError):
+        launcher.hold()
+    assert place.released == 0, "where nothing was started nothing is given back"
 
 
 @pytest.mark.parametrize(("reason", "asked"), [("exit", 1), ("server", 0), ("connection", 0)])
@@ -190,9 +184,54 @@ def test_a_death_after_a_denial_names_it(
     assert str(error).count("\n") <= 1
 
 
-def test_no_server_no_use(launcher: Launcher, place: _Place) -> None:
-    """Nothing is left to be released."""
-    place.fails = True
-    with pytest.raises(WorkerStartupError):
-        launcher.hold()
-    assert place.released == 0
+# --- Waiting for a server that has no room: as long as that is worth it, and no longer
+
+
+_FULL = ServerBusyError("full", quota="jails", used=1, limit=1, retry_s=0.1)
+_ENDING = ServerBusyError("it ends", quota=DRAINING, used=0, limit=0, retry_s=0.1)
+_GONE = WorkerDiedError("no answer", reason="connection")
+
+
+@pytest.fixture(autouse=True)
+def now(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    time = [0.0]
+    monkeypatch.setattr(module, "monotonic", lambda: time[0])
+    monkeypatch.setattr(module, "sleep", lambda for_s: time.__setitem__(0, time[0] + for_s))
+    return time
+
+
+def asked(*answers: EnvHubError, retry_s: float = 60.0, **deadline: Any) -> int:
+    """How often it was asked until there was room."""
+    left = list(answers)
+    count = 0
+
+    def ask() -> int:
+        nonlocal count
+        count += 1
+        if left:
+            raise left.pop(0)
+        return count
+
+    return retry_while_busy(ask, retry_s, StartupDeadline(None, **deadline), "org/repo")
+
+
+@pytest.mark.parametrize("answers", [(), (_FULL,), (_FULL, _FULL), (_ENDING, _GONE, _GONE)])
+def test_it_is_asked_until_there_is_room(answers: tuple[EnvHubError, ...]) -> None:
+    """Also where the server ends, and another is about to stand in its place."""
+    assert asked(*answers) == len(answers) + 1
+
+
+def test_the_line_ends_with_its_time(now: list[float]) -> None:
+    """The refusal is the answer then; what is started in advance gives way at once."""
+    with pytest.raises(ServerBusyError):
+        asked(*[_FULL] * 1000, retry_s=5.0)
+    assert 5.0 <= now[0] < 6.0
+    for given in ({"retry_s": 0.0}, {"unasked": True}):
+        with pytest.raises(ServerBusyError):
+            asked(_FULL, **given)
+
+
+@pytest.mark.parametrize("error", [_GONE, WorkerDiedError("killed", reason="signal")])
+def test_a_death_is_no_reason_to_wait(error: EnvHubError) -> None:
+    with pytest.raises(WorkerDiedError):
+        asked(error)

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from types import SimpleNamespace
+from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 
 from envhub_sandbox.sandboxes.pool import ServerPool, ServerUse
+from envhub_sandbox.session.jails.builder import JailSource, SharedJail
 from envhub_sandbox.session.jails.loaded import ServerHold
+from envhub_sandbox.transport.deadline import Deadline
 from tests.unit.client.sandboxes.test_pool import Server
 
 
@@ -21,13 +26,11 @@ def use() -> Callable[[], ServerUse[Server]]:
 
 @pytest.fixture
 def events() -> list[str]:
-    """What the hold has said."""
     return []
 
 
 @pytest.fixture
 def hold(use: Callable[[], ServerUse[Server]], events: list[str]) -> ServerHold:
-    """Of a suite without environments."""
     return ServerHold(use, lambda: events.append("enter"), lambda: events.append("empty"))
 
 
@@ -56,7 +59,6 @@ def test_it_lasts_from_the_first_jail_to_the_last_environment(
 def test_it_moves_on_from_a_server_that_has_died(
     hold: ServerHold, use: Callable[[], ServerUse[Server]]
 ) -> None:
-    """It keeps the one that the next jail was opened in."""
     leave = hold.enter()
     dead = use()
     hold.keep(dead.server)
@@ -123,3 +125,57 @@ def test_each_end_is_waited_for_once_by_the_next_or_the_last(
     further()
     assert not hold.close_later(taken.server, lambda: waited.append(-1))  # no other is to come
     leave()
+
+
+# --- One jail for all environments of a repository: opened by the first, ended with the last
+
+
+class _Loaded(SimpleNamespace):
+    """A connection to the jail number 7; by identity."""
+
+    __hash__ = object.__hash__
+    __eq__ = object.__eq__
+
+
+def loaded() -> Any:
+    return _Loaded(jail=MagicMock(number=7))
+
+
+@pytest.fixture
+def launcher() -> Any:
+    return MagicMock(open=MagicMock(side_effect=lambda *_: loaded()), connect=lambda *_: loaded())
+
+
+def test_it_is_opened_once_and_ends_with_its_last_user(launcher: Any) -> None:
+    source = SharedJail(launcher, lambda: None)
+    users = [source.take(Deadline(None)) for _ in range(3)]
+    assert launcher.open.call_count == 1
+    for user in users:
+        assert not launcher.close.called
+        source.give_back(user)
+    assert launcher.close.call_count == 1
+    source.take(Deadline(None))
+    assert launcher.open.call_count == 2
+
+
+def test_one_that_was_provided_and_never_taken_is_ended(launcher: Any) -> None:
+    """By the close of its suite, once; while somebody uses it that ends nothing."""
+    source = SharedJail(launcher, lambda: None)
+    source.provide(loaded())
+    user = source.take(Deadline(None))
+    assert not launcher.open.called
+    source.close()
+    assert not launcher.close.called
+    source.give_back(user)
+    source.close()
+    assert launcher.close.call_count == 1
+
+
+def test_a_worker_that_is_given_up_is_given_up_for_all(launcher: Any) -> None:
+    """They share its process; a jail of one's own is nobody else's."""
+    source = SharedJail(launcher, lambda: None)
+    one, _ = source.take(Deadline(None)), source.take(Deadline(None))
+    source.end(one)
+    assert (launcher.interrupt.call_count, launcher.close.call_count) == (1, 1)
+    own = JailSource(launcher, lambda: None)
+    assert own.take(Deadline(None)) is not own.take(Deadline(None))

@@ -30,33 +30,29 @@ def lanes() -> list[FakeLane]:
 
 @pytest.fixture
 def session(lanes: list[FakeLane]) -> FleetSession:
-    """Over both of them."""
     return fleet_over(lanes)
 
 
 @pytest.fixture
 def requests(session: FleetSession) -> FleetRequests:
-    """Its requests."""
     return session.requests
 
 
 def call(number: int, bounds: tuple[int, int]) -> m.Call:
-    """A method of all."""
     return m.Call(number, "act", (), {})
 
 
 def raised(text: str) -> m.RaisedException:
-    """By the repository's code."""
     return m.RaisedException("ValueError", "ValueError", text, "", "call")
 
 
 def states(session: FleetSession) -> list[State]:
-    """Of the parts."""
     return [part.lifecycle.state for part in session.parts]
 
 
-def test_each_worker_is_sent_its_rows(requests: FleetRequests, lanes: list[FakeLane]) -> None:
-    """And the answers come in the rows' order, one step for all."""
+def test_each_worker_is_sent_its_rows(
+    requests: FleetRequests, lanes: list[FakeLane], session: FleetSession
+) -> None:
     requests.submit_step(ACTIONS)
     observation, rewards, *_ = requests.collect_step(None)
     assert (observation.shape, rewards.shape) == ((2, 3), (2,))
@@ -66,13 +62,22 @@ def test_each_worker_is_sent_its_rows(requests: FleetRequests, lanes: list[FakeL
     requests.waiting = "step"
     with pytest.raises(AlreadyPendingCallError):
         requests.ask("act", call)
+    requests.closed = True
+    assert all(part.requests.closed for part in session.parts)
+    with pytest.raises(ClosedEnvironmentError):
+        requests.ask("act", call)
 
 
 def test_every_worker_is_waited_for_where_one_fails(
     requests: FleetRequests, lanes: list[FakeLane], session: FleetSession
 ) -> None:
     """A death is raised rather than an exception of the repository; no lane owes an answer."""
-    lanes[0].answer = raised("size")
+    for row, lane in enumerate(lanes):
+        lane.answer = raised(f"row {row}")
+    for _ in range(2):
+        with pytest.raises(RemoteEnvError, match="row 0"):  # of equal ones the first, by the rows
+            requests.ask("act", call)
+    assert states(session) == [State.READY, State.READY]
     lanes[1].fails = WorkerDiedError("gone")
     with pytest.raises(WorkerDiedError, match=r"sub-environment 1 of 2, on here"):
         requests.ask("act", call)
@@ -81,18 +86,6 @@ def test_every_worker_is_waited_for_where_one_fails(
     with pytest.raises(WorkerDiedError, match="sub-environment 1 of 2"):
         requests.submit_step(ACTIONS)
     assert lanes[0].owed is None, "nothing is sent unless all workers are ready"
-
-
-def test_the_first_of_equal_failures_is_raised(
-    requests: FleetRequests, lanes: list[FakeLane], session: FleetSession
-) -> None:
-    """In the order of the rows, whichever was waited for first; the environment goes on."""
-    for row, lane in enumerate(lanes):
-        lane.answer = raised(f"row {row}")
-    for _ in range(2):
-        with pytest.raises(RemoteEnvError, match="row 0"):
-            requests.ask("act", call)
-    assert states(session) == [State.READY, State.READY]
 
 
 def test_a_worker_that_was_sent_nothing_falls_behind(
@@ -122,7 +115,6 @@ def test_a_worker_that_was_sent_nothing_falls_behind(
 def test_one_sub_environment_is_asked_of_its_worker_alone(
     requests: FleetRequests, lanes: list[FakeLane]
 ) -> None:
-    """By its place there; an error names it."""
     asked: list[int | None] = []
 
     def message(number: int, place: int | None) -> m.Message:
@@ -135,14 +127,6 @@ def test_one_sub_environment_is_asked_of_its_worker_alone(
     lanes[1].fails = WorkerDiedError("gone")
     with pytest.raises(WorkerDiedError, match="sub-environment 1 of 2"):
         requests.ask_one("act", 1, message)
-
-
-def test_after_close_every_worker_knows_it(requests: FleetRequests, session: FleetSession) -> None:
-    """For its own errors."""
-    requests.closed = True
-    assert all(part.requests.closed for part in session.parts)
-    with pytest.raises(ClosedEnvironmentError):
-        requests.ask("act", call)
 
 
 def test_the_locks_of_all_are_held_at_once(requests: FleetRequests, session: FleetSession) -> None:

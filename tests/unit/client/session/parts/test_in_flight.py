@@ -31,30 +31,25 @@ def lanes() -> list[FakeLane]:
 
 @pytest.fixture
 def session(lanes: list[FakeLane]) -> FleetSession:
-    """Over both of them."""
     return fleet_over(lanes)
 
 
 @pytest.fixture
 def flight(session: FleetSession) -> InFlight:
-    """Nothing was sent yet."""
     return InFlight(session.requests, session.parts)
 
 
 def send(flight: InFlight, *ids: int) -> None:
-    """A step of these."""
     rows = flight.rows(list(ids))
     flight.send(rows, np.zeros(len(ids), np.int64))
 
 
 def received(flight: InFlight, min_ready: int = 1) -> list[int]:
-    """Whose results come next."""
     found: list[int] = flight.recv(min_ready, 0).env_ids.tolist()
     return found
 
 
 def test_who_answers_first_comes_first(flight: InFlight, lanes: list[FakeLane]) -> None:
-    """And who has waited here for longest."""
     lanes[0].silent = True
     send(flight, 0, 1)
     assert received(flight) == [1]
@@ -66,7 +61,6 @@ def test_who_answers_first_comes_first(flight: InFlight, lanes: list[FakeLane]) 
 
 
 def test_the_environment_is_pending_meanwhile(flight: InFlight, session: FleetSession) -> None:
-    """From the first send to the last receipt."""
     with pytest.raises(NoAsyncCallError):
         flight.recv(1, 0)
     send(flight, 0, 1)
@@ -78,16 +72,30 @@ def test_the_environment_is_pending_meanwhile(flight: InFlight, session: FleetSe
     received(flight)
     assert session.requests.waiting is None
     assert session.lifecycle.state is State.READY
-
-
-def test_a_refused_send_leaves_nothing_pending(flight: InFlight, session: FleetSession) -> None:
-    """Nothing was sent, to nobody."""
     session.parts[1].lifecycle.state = State.DEAD
     with pytest.raises(WorkerDiedError) as caught:
         send(flight, 0, 1)
     assert caught.value.env_ids == (1,)
-    assert session.requests.waiting is None
+    assert session.requests.waiting is None, "nothing was sent, to nobody"
     assert session.parts[0].lifecycle.state is State.READY
+
+
+def test_what_is_dropped_is_waited_for(
+    flight: InFlight, lanes: list[FakeLane], session: FleetSession
+) -> None:
+    """And what waits here is not sent. The history says where workers were sent other steps."""
+    flight.send(flight.rows(None), np.zeros(2, np.int64))
+    flight.recv(2, 0)
+    history = session.parts[0].history
+    assert history.recording().dropped == 0
+    send(flight, 0, 1)
+    send(flight, 0)
+    flight.drop()
+    assert [len(lane.sent) for lane in lanes] == [2, 2]
+    assert [lane.owed for lane in lanes] == [None, None]
+    with pytest.raises(NoAsyncCallError):
+        flight.recv(1, 0)
+    assert history.recording().dropped == 1
 
 
 def test_ids_are_read_as_they_are_meant(flight: InFlight) -> None:
@@ -128,7 +136,6 @@ class Switching(FakeLane):
         self.wanted = True
 
     def send_step(self, actions: Any, *, ahead: bool = False) -> None:
-        """Owe a step."""
         assert self.takes_more or not ahead
         if not ahead:
             self.takes_more, self.wanted = self.wanted, False
@@ -194,7 +201,6 @@ def test_an_error_names_its_worker_and_keeps_no_other(
 
 
 def test_a_timeout_of_the_caller_takes_nothing(flight: InFlight, lanes: list[FakeLane]) -> None:
-    """Also where some are ready."""
     lanes[1].silent = True
     send(flight, 0, 1)
     with pytest.raises(WorkerTimeoutError, match="nothing is lost"):
@@ -207,42 +213,14 @@ def test_a_timeout_of_the_caller_takes_nothing(flight: InFlight, lanes: list[Fak
 def test_infos_that_break_a_rule_end_their_worker_alone(
     flight: InFlight, lanes: list[FakeLane], session: FleetSession
 ) -> None:
-    """The other's results come."""
     lanes[0].infos = {"x": [1]}
     send(flight, 0, 1)
     with pytest.raises(RemoteProtocolError):
         flight.recv(2, 0)
     assert [part.lifecycle.state for part in session.parts] == [State.DEAD, State.PENDING]
     assert received(flight, 2) == [1]
-
-
-def test_infos_that_do_not_go_together_are_an_error_of_the_environment(
-    flight: InFlight, lanes: list[FakeLane], session: FleetSession
-) -> None:
-    """As Gymnasium's; the worker goes on."""
-    lanes[0].infos = {None: None}
-    send(flight, 0)
-    with pytest.raises(RemoteEnvError, match="do not go together"):
+    lanes[1].infos = {None: None}
+    send(flight, 1)
+    with pytest.raises(RemoteEnvError, match="do not go together"):  # as Gymnasium's
         flight.recv(1, 0)
-    assert session.parts[0].lifecycle.state is State.READY
-
-
-def test_what_is_dropped_is_waited_for(flight: InFlight, lanes: list[FakeLane]) -> None:
-    """And what waits here is not sent."""
-    send(flight, 0, 1)
-    send(flight, 0)
-    flight.drop()
-    assert [len(lane.sent) for lane in lanes] == [1, 1]
-    assert [lane.owed for lane in lanes] == [None, None]
-    with pytest.raises(NoAsyncCallError):
-        flight.recv(1, 0)
-
-
-def test_the_history_says_that_it_is_not_whole(session: FleetSession, flight: InFlight) -> None:
-    """Where workers were not sent the same steps; a step of all is one."""
-    flight.send(flight.rows(None), np.zeros(2, np.int64))
-    flight.recv(2, 0)
-    history = session.parts[0].history
-    assert history.recording().dropped == 0
-    send(flight, 0)
-    assert history.recording().dropped == 1
+    assert session.parts[1].lifecycle.state is State.READY

@@ -28,18 +28,15 @@ def lane() -> FakeLane:
 
 @pytest.fixture
 def part(lane: FakeLane) -> EnvSession:
-    """Its session."""
     return fleet_over([FakeLane(1), lane]).parts[1]
 
 
 @pytest.fixture
 def queue(part: EnvSession) -> WorkerQueue:
-    """Nothing is owed yet."""
     return WorkerQueue(part, sliced=True)
 
 
 def taken(queue: WorkerQueue) -> StepResult:
-    """The oldest answer."""
     kept: list[StepResult] = []
     queue.take(kept.append)
     [result] = kept
@@ -47,12 +44,10 @@ def taken(queue: WorkerQueue) -> StepResult:
 
 
 def reset(number: int, bounds: tuple[int, int]) -> m.Reset:
-    """Of all its rows."""
     return m.Reset(number, None, None, None)
 
 
 def step(queue: WorkerQueue) -> None:
-    """As a caller sends one."""
     queue.prepare()
     queue.step(ACTIONS)
 

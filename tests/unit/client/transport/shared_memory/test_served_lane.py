@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mmap
 import os
 import struct
 from typing import Any, cast
@@ -60,7 +61,6 @@ class Both:
         ]
 
     def ask(self, *leaves: Any) -> None:
-        """Send a step."""
         frame = self.shard.ask(leaves, 0)
         assert self.server.fits(frame)
         self.server.ask(frame, "owner")
@@ -76,10 +76,8 @@ class Both:
         return self.shard.read([bytes(one) for one in self.server.take()[1]])
 
 
-def memory(fd: int, size: int) -> Any:
+def memory(fd: int, size: int) -> mmap.mmap:
     """A slab as the jail maps it; that of requests to be read alone."""
-    import mmap
-
     try:
         return mmap.mmap(fd, size)
     except PermissionError:
@@ -110,7 +108,6 @@ def test_a_batch_is_what_the_runner_wrote(space: Any) -> None:
 
 
 def test_actions_arrive_with_their_dtypes() -> None:
-    """Also where these change from one step to the next."""
     both = Both(SMALL)
     changes = []
     for integers in (np.int64, np.int8, np.int8):
@@ -129,7 +126,6 @@ def test_actions_arrive_with_their_dtypes() -> None:
 
 
 def test_columns_follow_their_schema() -> None:
-    """So much of the slab is sent as the client knows columns of."""
     both = Both(SMALL)
     infos = {"a": np.arange(COUNT), "_a": np.ones(COUNT, bool)}
     both.ask(np.zeros(COUNT, int), np.zeros((COUNT, 2)))
@@ -140,14 +136,6 @@ def test_columns_follow_their_schema() -> None:
     found = both.shard.slabs.columns()
     assert found["a"].tolist() == [7, 8, 9]
     assert found["_a"].tolist() == [True, True, False]
-
-
-def test_a_fresh_shard_knows_nothing() -> None:
-    """In the place of one that has died: no columns, and no more than a first step."""
-    both = Both(SMALL)
-    infos = {"a": np.arange(COUNT), "_a": np.ones(COUNT, bool)}
-    both.ask(np.zeros(COUNT, int), np.zeros((COUNT, 2)))
-    both.answer(infos=bytes(m.pack(m.Value(infos))[0]))
     fresh = both.shard.again()
     assert (both.shard.slabs.known > 0, fresh.slabs.known) == (True, 0)
     with pytest.raises(RemoteProtocolError, match="before their schema"):
@@ -182,7 +170,6 @@ class Served:
         return float(rewards[0])
 
     def by_message(self) -> None:
-        """Have the lane take several steps."""
         assert self.step()
         self.lane.expect_more()
         assert not self.lane.takes_more
@@ -196,7 +183,6 @@ def slab(outcome: int = slabs.DONE, reward: float = 0, said: m.Message | None = 
     """What the server sends of one runner's slabs."""
     infos = b"" if said is None else bytes(m.pack(said)[0])
     layout = slabs.observation_layout(SMALL, 1, 1)
-    assert layout is not None
     batch = bytearray(layout.total_bytes)
     struct.pack_into("<d", batch, layout.results, reward)
     return [struct.pack("<QQ", outcome, len(infos)) + infos + batch]
@@ -326,7 +312,6 @@ def test_who_only_looks_has_infos_fetched_once() -> None:
 
 
 def test_infos_that_never_come_are_waited_for_no_longer_than_a_step() -> None:
-    """And before a reset; then all that was owed is taken."""
     served = Served()
     served.step()
     served.server.answer(slab(slabs.FETCH))
@@ -360,20 +345,8 @@ def test_infos_that_were_asked_for_in_vain_are_dropped(kind: int) -> None:
     assert served.reward() == 1
 
 
-def test_a_fetch_that_cannot_be_sent_is_met_by_the_wait() -> None:
-    """To look raises nothing."""
-    served = Served()
-    served.step()
-    served.server.answer(slab(slabs.FETCH))
-    served.server.refuses = WorkerError("the worker took no request")
-    assert served.lane.answered()
-    with pytest.raises(WorkerError, match="took no request"):
-        served.lane.wait(Deadline(0))
-
-
 @pytest.mark.parametrize("ahead", [False, True])
 def test_who_dies_before_its_infos_came_has_died(ahead: bool) -> None:
-    """By its shard; the others keep what they answered."""
     served = Served(3)
     served.lane.jail.kept = True
     served.step()
@@ -395,8 +368,15 @@ def test_who_dies_before_its_infos_came_has_died(ahead: bool) -> None:
     assert (first.rewards.tolist(), third.info["a"].tolist()) == ([1], [0])
 
 
-def test_an_interrupted_message_is_not_caught_up_with() -> None:
-    """How much of it has left is not known, and the next would be taken into it."""
+def test_what_cannot_be_sent_or_was_interrupted_is_met_by_the_wait() -> None:
+    """To look raises nothing; how much of an interrupted message has left is not known."""
+    served = Served()
+    served.step()
+    served.server.answer(slab(slabs.FETCH))
+    served.server.refuses = WorkerError("the worker took no request")
+    assert served.lane.answered()
+    with pytest.raises(WorkerError, match="took no request"):
+        served.lane.wait(Deadline(0))
     served = Served()
     served.step()
     served.server.answer(slab())

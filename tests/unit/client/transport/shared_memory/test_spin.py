@@ -21,18 +21,21 @@ def run(chooser: SpinChooser, steps: int, awake_ns: int, asleep_ns: int) -> int:
     return awake
 
 
-def test_spinning_that_pays_is_chosen() -> None:
-    """Where waiting awake is faster, nearly all steps are waited for awake."""
-    assert run(SpinChooser(True), 10_000, awake_ns=10, asleep_ns=20) > 9_000
-
-
-def test_spinning_that_costs_is_given_up() -> None:
-    """Where it is slower, it is tried seldom."""
-    assert run(SpinChooser(True), 10_000, awake_ns=2_000, asleep_ns=20) < 300
+@pytest.mark.parametrize(
+    ("allowed", "awake_ns", "asleep_ns", "least", "most"),
+    [
+        (True, 10, 20, 9_001, 10_000),  # where it pays, nearly all steps are waited for awake
+        (True, 2_000, 20, 0, 299),  # where it costs, it is tried seldom
+        (False, 1, 1_000, 0, 0),  # where a core may see stores out of order, the lane sleeps
+    ],
+)
+def test_spinning_is_chosen_where_it_pays(
+    allowed: bool, awake_ns: int, asleep_ns: int, least: int, most: int
+) -> None:
+    assert least <= run(SpinChooser(allowed), 10_000, awake_ns, asleep_ns) <= most
 
 
 def test_a_change_of_load_is_noticed() -> None:
-    """A core that gets busy, or free again, changes the decision."""
     chooser = SpinChooser(True)
     run(chooser, 10_000, awake_ns=10, asleep_ns=20)
     run(chooser, 20_000, awake_ns=2_000, asleep_ns=20)
@@ -42,21 +45,17 @@ def test_a_change_of_load_is_noticed() -> None:
 
 
 def test_waits_in_vain_end_spinning_at_once() -> None:
-    """A core that somebody else takes does not cost the rest of a long interval."""
+    """A core that somebody else takes does not cost the rest of a long interval.
+
+    The budget follows what awake steps take: a reply that is long overdue is waited for asleep.
+    """
     chooser = SpinChooser(True)
-    run(chooser, 10_000, awake_ns=10_000, asleep_ns=20_000)
-    assert chooser.budget_ns > 0
+    run(chooser, 10_000, awake_ns=50_000, asleep_ns=90_000)
+    assert chooser.budget_ns == 150_000
     for _ in range(3):
         chooser.missed()
         chooser.measured(1_000_000)
     assert chooser.budget_ns == 0
-
-
-def test_the_budget_follows_what_awake_steps_take() -> None:
-    """A reply that is long overdue is not waited for awake."""
-    chooser = SpinChooser(True)
-    run(chooser, 10_000, awake_ns=50_000, asleep_ns=90_000)
-    assert chooser.budget_ns == 150_000
 
 
 def test_a_slow_step_now_and_then_does_not_end_spinning() -> None:
@@ -70,15 +69,9 @@ def test_a_slow_step_now_and_then_does_not_end_spinning() -> None:
     assert chooser.budget_ns > 0
 
 
-def test_spinning_that_is_not_allowed_never_happens() -> None:
-    """Where a core may see stores out of order, the lane sleeps."""
-    assert run(SpinChooser(False), 1_000, awake_ns=1, asleep_ns=1_000) == 0
-
-
 @pytest.mark.parametrize("client", [0, 1, 2, 3])
 @pytest.mark.parametrize("shards", [1, 2, 3, 4, 9])
 def test_a_shard_that_waits_awake_is_not_on_the_clients_core(shards: int, client: int) -> None:
-    """The client would have to push it away at every step."""
     cpus = [0, 1, 2, 3]
     awake = min(shards, len(cpus) - 1)
     placed = [cpu - 1 for cpu in place(shards, awake, client, cpus)]
@@ -87,18 +80,10 @@ def test_a_shard_that_waits_awake_is_not_on_the_clients_core(shards: int, client
     assert set(placed) <= set(cpus)
 
 
-def test_the_first_that_sleeps_shares_the_clients_core() -> None:
-    """It works while the client sleeps; further ones take the other cores in turn."""
+@pytest.mark.parametrize("shards", [1, 2, 3])
+def test_one_core_is_the_clients(monkeypatch: pytest.MonkeyPatch, shards: int) -> None:
+    """Shards that find no other core sleep: the first of them shares the client's."""
     assert place(4, 1, 0, [0, 1]) == [2, 1, 2, 1]
-
-
-def test_one_core_holds_all_shards() -> None:
-    """Where there is one core, all shards are on it."""
     assert place(2, 0, 5, [5]) == [6, 6]
-
-
-@pytest.mark.parametrize(("shards", "awake"), [(1, 1), (2, 1), (3, 1)])
-def test_one_core_is_the_clients(monkeypatch: pytest.MonkeyPatch, shards: int, awake: int) -> None:
-    """Shards that find no other core sleep."""
     monkeypatch.setattr(spin, "CPUS", [0, 1])
-    assert Cores(shards).awake == awake
+    assert Cores(shards).awake == 1
