@@ -32,14 +32,12 @@ _ELSEWHERE = {
 @pytest.mark.filterwarnings("ignore::envhub_sandbox.errors.RemoteEnvWarning")
 @pytest.mark.parametrize("name", _ENTRIES)
 def test_it_is_judged_as_it_stands(name: str, tmp_path: Path) -> None:
-    """Its check finds something, and no other does."""
     entry = _ENTRIES[name]
     found = entry.judged(tmp_path)
     assert set(found) == entry.expected, found
 
 
 def test_the_corpus_is_large() -> None:
-    """And each check has a fault that it finds."""
     assert len(HONEST) >= 30
     assert len(FAULTS) >= 60
     assert not set(HONEST) & set(FAULTS)
@@ -51,8 +49,6 @@ def test_the_corpus_is_large() -> None:
 
 
 def test_entries_differ() -> None:
-    """No repository is in it twice."""
-
     def text(entry: Entry) -> tuple[str, ...]:
         return entry.source(), *map(repr, sorted(entry.files.items()))
 

@@ -75,7 +75,6 @@ PLACES: dict[str, Callable[[Any], m.Message]] = {
 
 
 def values(evil: Any) -> m.Message:
-    """One for each sub-environment."""
     return m.Value((evil,) * NUM_ENVS)
 
 
@@ -107,7 +106,6 @@ def test_pickles_in_replies_are_never_loaded(
 def test_pickles_in_manifests_are_never_loaded(
     liar: LyingServer, folder: str, tmp_path: Path, name: str
 ) -> None:
-    """Nor in what is said of an environment before it exists."""
     canary = tmp_path / "executed"
     described = manifest()
     evil: Any = Canary(canary)
@@ -156,7 +154,6 @@ WRONG: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize("what", list(WRONG))
 def test_wrong_arrays_are_refused(liar: LyingServer, folder: str, what: str) -> None:
-    """A result that is not what was declared never reaches the caller."""
     liar.lies[m.Step] = relayed(step_done(**WRONG[what]))
     with started(liar, folder) as env:
         error = refuses(lambda: env.step(ACTIONS))
@@ -181,12 +178,10 @@ def observed(space: object) -> dict[str, Any]:
 
 
 def text(longest: int) -> dict[str, Any]:
-    """The description of a Text."""
     return {"kind": "text", "min_length": 0, "max_length": longest, "characters": "ab"}
 
 
 def box(**fields: Any) -> dict[str, Any]:
-    """The description of a Box, changed."""
     return {**encode_space(spaces.Box(-1, 1, (3,), np.float32)), **fields}  # type: ignore[dict-item]
 
 
@@ -319,6 +314,7 @@ def test_manifest_that_contradicts_itself_does_no_harm(
         assert len(suites.env.step(suites.env.action_space.sample())) == 5
 
 
+# some: test_codec_hostile and the decoder's bombs have all that a document may be
 DOCUMENTS: dict[str, Callable[[], Frames]] = {
     "nothing": lambda: [b""],
     "noise": lambda: [os.urandom(4096)],
@@ -333,14 +329,7 @@ DOCUMENTS: dict[str, Callable[[], Frames]] = {
         b"\xdd" + struct.pack(">I", 4_000_000) + b"\x80" * 4_000_000
     ),
     "an array that claims four billion": lambda: value(b"\xdd\xff\xff\xff\xff"),
-    "a map that claims four billion": lambda: value(b"\xdf\xff\xff\xff\xff"),
-    "a text that claims four billion": lambda: value(b"\xdb\xff\xff\xff\xff"),
-    "an unknown extension": lambda: packed([m.Value.kind, ext(99, b"x")]),
-    "a timestamp": lambda: value(b"\xd7\xff" + b"\0" * 8),
-    "a key twice": lambda: value(b"\x82\xa1a\x01\xa1a\x02"),
-    "a map for a key": lambda: value(b"\x81\x80\x01"),
     "an array of objects by hand": lambda: packed([m.Value.kind, ext(1, b"|O8")]),
-    "an array of void by hand": lambda: packed([m.Value.kind, ext(1, b"V2000000000")]),
     "an array that is not there": lambda: packed([m.Value.kind, ext(1, b"\x0b\x01" + b"\xff")]),
     "frames that nobody mentioned": lambda: [*m.pack(m.Value(None)), b"x" * 4096],
     "a thousand frames": lambda: [*m.pack(m.Value(None)), *[b"x"] * 5000],
@@ -359,7 +348,9 @@ def test_malformed_answers_are_refused(liar: LyingServer, folder: str, what: str
     assert isinstance(error, RemoteProtocolError)
 
 
-@pytest.mark.parametrize("what", list(DOCUMENTS))
+@pytest.mark.parametrize(
+    "what", ["nothing", "noise", "no message", "a thousand frames", "nested a million deep"]
+)
 def test_malformed_answers_of_the_server_are_refused(
     liar: LyingServer, folder: str, what: str
 ) -> None:
@@ -463,7 +454,6 @@ def test_flood_of_unasked_answers_is_bounded(liar: LyingServer, folder: str) -> 
 def test_parts_that_do_not_add_up_are_refused(
     liar: LyingServer, folder: str, parts: tuple[int, ...]
 ) -> None:
-    """The server's count of frames has to fit what came, and what was asked."""
     frames = m.pack(step_done())
     liar.lies[m.Step] = lambda asked: [
         [*m.pack_header(m.RelayDone(parts), asked.request_id), *frames]

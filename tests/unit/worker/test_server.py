@@ -30,7 +30,6 @@ class Failing(LocalGate):
         self.witness = Events(log, lambda key: None, lambda key: None)
 
     def authorize(self, asked: ClientRequest) -> m.Message:
-        """Raises."""
         raise self.error
 
 
@@ -49,7 +48,6 @@ def serving(gate: LocalGate) -> Iterator[str]:
 
 
 def refused(endpoint: str) -> m.Refusal:
-    """The reply to a request."""
     with zmq.Context() as context, context.socket(zmq.DEALER) as peer:
         peer.setsockopt(zmq.LINGER, 0)
         peer.connect(endpoint)
@@ -105,7 +103,6 @@ class Ticking(LocalGate):
         self.witness = Events(log, lambda key: None, lambda key: None)
 
     def tick(self, sessions: object, jails: object) -> None:
-        """Raises, and is waited for."""
         if self.failed.is_set():
             return
         self.failed.set()
@@ -113,7 +110,6 @@ class Ticking(LocalGate):
 
 
 def test_what_the_loop_meets_is_in_the_log_too(capfd: pytest.CaptureFixture[str]) -> None:
-    """As an event, and as no text beside it."""
     said = list[str]()
     gate = Ticking(Log(said.append, form=json_line))
     with serving(gate):
