@@ -140,16 +140,10 @@ def test_golden_bytes_are_read(name: str) -> None:
     assert_same(values_of(BY_NAME[name]), values_of(message))
 
 
-@pytest.mark.parametrize("request_id", [1, 200, 2**62, 2**63 - 1])
-def test_request_ids_arrive(request_id: int) -> None:
-    [frame] = m.pack_header(m.Done(), request_id)
-    assert m.unpack_header(frame) == (request_id, m.Done())
-    assert m.id_of(frame) == m.id_of(memoryview(frame)) == request_id
-
-
 def test_a_header_is_golden() -> None:
     [frame] = m.pack_header(m.CloseJail(3), REQUEST_ID)
     assert bytes(frame).hex() == "000000000000000703000000920a03"
+    assert m.id_of(memoryview(frame)) == REQUEST_ID
 
 
 def test_the_id_of_a_header_that_cannot_be_read_is_known() -> None:
@@ -210,28 +204,6 @@ def test_arbitrary_headers_raise_nothing_but_protocol_errors(noise: bytes, with_
         return
     assert type(message) in m.KINDS.values()
     assert number.bit_length() <= 63
-
-
-@given(st.lists(st.binary(max_size=64), max_size=3))
-def test_arbitrary_bytes_raise_nothing_but_protocol_errors(frames: list[bytes]) -> None:
-    try:
-        message = m.unpack(frames)
-    except RemoteProtocolError:
-        return
-    assert type(message) in m.KINDS.values()
-
-
-@given(st.sampled_from(sorted(BY_NAME)), st.integers(0, 2**32), st.integers(0, 255))
-def test_one_changed_byte_raises_nothing_but_protocol_errors(
-    name: str, place: int, byte: int
-) -> None:
-    frames = [bytearray(frame) for frame in m.pack(BY_NAME[name])]
-    frames[0][place % len(frames[0])] = byte
-    try:
-        message = m.unpack(frames)
-    except RemoteProtocolError:
-        return
-    assert type(message) in m.KINDS.values()
 
 
 def test_unsendable_fields_are_our_own_fault() -> None:
