@@ -258,7 +258,7 @@ def test_many_clients_at_once_do_not_meet(folder: Path) -> None:
     test = folder / "test_one.py"
     test.write_text(
         "import pytest\nfrom envhub_sandbox import make_env\n"
-        f"@pytest.mark.parametrize('n', range(4))\ndef test_one(n):\n"
+        f"@pytest.mark.parametrize('n', range(2))\ndef test_one(n):\n"
         f"    env = make_env({str(sample('faulty'))!r}).env\n    env.reset()\n"
         "    assert env.step([0])[0].tolist() == [[1.0]]\n"
     )
@@ -272,7 +272,7 @@ def test_many_clients_at_once_do_not_meet(folder: Path) -> None:
         cwd=folder,
     )
     out, _ = client.communicate(timeout=240)
-    assert "4 passed" in out, out
+    assert "2 passed" in out, out
     for path in [*folder.rglob("__pycache__"), test]:
         shutil.rmtree(path) if path.is_dir() else path.unlink()
     pytest_of = [path for path in folder.iterdir() if path.name.startswith("pytest-of")]
