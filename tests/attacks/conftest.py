@@ -17,14 +17,14 @@ import pytest
 from envhub_sandbox.sandboxes.process import PROCESS
 from envhub_sandbox.system.folders import cache_root
 from tests.attacks import table
-from tests.attacks.harness import Arena
+from tests.attacks.harness import Arena, LastingJail, OpenJail
 from tests.support.interpreter import profiles
 
 _TABLE = table.Collected("attack", "ENVHUB_ATTACK_TABLE")
 
 
 @pytest.fixture(scope="package")
-def _open_ground() -> Iterator[Path]:
+def open_ground() -> Iterator[Path]:
     """A folder that every user may enter. File modes shall not be what stops an attack."""
     folder = Path(tempfile.mkdtemp(prefix="envhub-attacks-"))
     folder.chmod(0o755)
@@ -33,28 +33,28 @@ def _open_ground() -> Iterator[Path]:
 
 
 @pytest.fixture(scope="package", autouse=True)
-def _warm_server(_own_cache: None, _open_ground: Path) -> Iterator[None]:
+def warm_server(_own_cache: None, open_ground: Path) -> Iterator[None]:
     """One worker server for all tests in a row: its zygotes stay warm between them."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("ENVHUB_CACHE", str(_open_ground / "cache"))
+        patch.setenv("ENVHUB_CACHE", str(open_ground / "cache"))
         use = PROCESS.acquire(cache_root() / "snapshots")
         yield
         use.release()
 
 
 @pytest.fixture
-def home(_open_ground: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def home(open_ground: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A home of the caller's, outside of every snapshot, that everybody may enter and write."""
-    folder = Path(tempfile.mkdtemp(prefix="home-", dir=_open_ground))
+    folder = Path(tempfile.mkdtemp(prefix="home-", dir=open_ground))
     folder.chmod(0o777)
     monkeypatch.setenv("HOME", str(folder))
     return folder
 
 
 @pytest.fixture
-def other_cache(_open_ground: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def other_cache(open_ground: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Another store, and so another worker server. Not in a home that everybody may write."""
-    folder = Path(tempfile.mkdtemp(prefix="cache-", dir=_open_ground))
+    folder = Path(tempfile.mkdtemp(prefix="cache-", dir=open_ground))
     folder.chmod(0o755)
     monkeypatch.setenv("ENVHUB_CACHE", str(folder))
     return folder
@@ -68,13 +68,35 @@ def arena(request: pytest.FixtureRequest) -> Iterator[Arena]:
     _TABLE.found(request.node, made.rows)
 
 
+@pytest.fixture(params=profiles("strict"))
+def strict(request: pytest.FixtureRequest) -> Iterator[Arena]:
+    """The same for one profile: what only that one has, or what a client makes of a jail."""
+    made = Arena(request.param, request.node.module.FAMILY)
+    yield made
+    _TABLE.found(request.node, made.rows)
+
+
+@pytest.fixture(scope="module", params=profiles("strict", "no-userns"))
+def lasting(warm_server: None, request: pytest.FixtureRequest) -> Iterator[LastingJail]:
+    """One for the attacks of a module, for each profile."""
+    made = LastingJail(request.param)
+    yield made
+    made.close()
+
+
+@pytest.fixture
+def jail(lasting: LastingJail, request: pytest.FixtureRequest) -> Iterator[OpenJail]:
+    """Where a test attacks that leaves its jail for the next one, once for each profile."""
+    made = lasting.open(request.node.module.FAMILY)
+    yield made
+    _TABLE.found(request.node, made.arena.rows)
+
+
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:
-    """Collect the rows."""
     _TABLE.read(report)
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
-    """Write the table, if asked to."""
     _TABLE.write(session)
 
 

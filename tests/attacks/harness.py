@@ -84,30 +84,23 @@ class StoppedNowError(AssertionError):
 class Attacks:
     """Where a payload is run as a control and inside."""
 
-    def attack(self, title: str, payload: str, succeeded: Succeeded, **arguments: Any) -> None:
-        """Fail unless it succeeds as a control only."""
+    @contextlib.contextmanager
+    def inside(self, payload: str, arguments: Mapping[str, Any], **place: Any) -> Iterator[Run]:
+        """Run a payload in a jail, which lives as long as the context."""
         raise NotImplementedError
+        yield
 
-    def steal(self, title: str, payload: str, wanted: str, /, **arguments: Any) -> None:
-        """``attack`` that succeeds where ``wanted`` comes back."""
-        self.attack(title, payload, lambda run: wanted in run.text, **arguments)
-
-
-@dataclass
-class Arena(Attacks):
-    """Where one test attacks: one profile, as the user that this process is.
-
-    Attributes:
-        profile: The policy's profile.
-        family: Heading in the table.
-        rows: What was found out, for the table.
-        report: What the last jail said of its layers.
-    """
-
-    profile: str
-    family: str
-    rows: list[Row] = field(default_factory=list)
-    report: list[dict[str, Any]] = field(default_factory=list)
+    def judge(
+        self,
+        title: str,
+        control: str,
+        through: bool,
+        detail: str,
+        impossible: str = "",
+        judged: str = OUTSIDE,
+    ) -> None:
+        """Note what an attack did, and fail unless that is what is expected of this place."""
+        raise NotImplementedError
 
     def attack(
         self,
@@ -147,9 +140,31 @@ class Arena(Attacks):
                     raise StoppedNowError(f"the control of {title!r} failed: {run.text[-3000:]}")
             control = "succeeds"
         before()
-        with self.inside(payload, {**arguments, **(inside or {})}, policy, limits) as run:
+        place = {name: one for name, one in (("policy", policy), ("limits", limits)) if one}
+        with self.inside(payload, {**arguments, **(inside or {})}, **place) as run:
             through = bool(succeeded(run))
         self.judge(title, control, through, run.text, impossible, judged)
+
+    def steal(self, title: str, payload: str, wanted: str, /, **arguments: Any) -> None:
+        """``attack`` that succeeds where ``wanted`` comes back."""
+        self.attack(title, payload, lambda run: wanted in run.text, **arguments)
+
+
+@dataclass
+class Arena(Attacks):
+    """Where one test attacks: one profile, as the user that this process is.
+
+    Attributes:
+        profile: The policy's profile.
+        family: Heading in the table.
+        rows: What was found out, for the table.
+        report: What the last jail said of its layers.
+    """
+
+    profile: str
+    family: str
+    rows: list[Row] = field(default_factory=list)
+    report: list[dict[str, Any]] = field(default_factory=list)
 
     def judge(
         self,
@@ -160,7 +175,7 @@ class Arena(Attacks):
         impossible: str = "",
         judged: str = OUTSIDE,
     ) -> None:
-        """Note what an attack did, and fail unless that is what is expected of this profile."""
+        """As ``Attacks.judge``."""
         verdict = "NOT STOPPED" if through else "no proof" if impossible else "stopped"
         note = impossible or (_brief(detail) if not through else "")
         row = Row(title, self.family, self.profile, USER, control, verdict, note, judged)
@@ -216,7 +231,7 @@ class Arena(Attacks):
 
 @dataclass(frozen=True)
 class OpenJail(Attacks):
-    """The same attacks in a jail that is open already.
+    """The same attacks in a jail that is open already, and is left open for the next one.
 
     Attributes:
         arena: Where it is.
@@ -228,24 +243,38 @@ class OpenJail(Attacks):
     env: Any
     prefix: str = ""
 
-    def attack(
-        self,
-        title: str,
-        payload: str,
-        succeeded: Succeeded,
-        *,
-        inside: Mapping[str, Any] | None = None,
-        before: Callable[[], object] = lambda: None,
-        **arguments: Any,
-    ) -> None:
-        """As ``Arena.attack``."""
-        before()
-        with control_run(payload, arguments) as control:
-            assert succeeded(control), f"the control of {title!r} failed: {control.text}"
-        before()
-        run = run_in(self.env, payload, **{**arguments, **(inside or {})})
-        through = bool(succeeded(run))
-        self.arena.judge(self.prefix + title, "succeeds", through, run.text)
+    def judge(self, title: str, *found: Any, **more: Any) -> None:
+        """As ``Attacks.judge``."""
+        self.arena.judge(self.prefix + title, *found, **more)
+
+    @contextlib.contextmanager
+    def inside(self, payload: str, arguments: Mapping[str, Any]) -> Iterator[Run]:
+        """Run a payload in the jail."""
+        yield run_in(self.env, payload, **arguments)
+
+
+class LastingJail:
+    """A jail for many attacks of one profile; another one follows where an attack was its end."""
+
+    def __init__(self, profile: str) -> None:
+        self.profile = profile
+        self._held = contextlib.ExitStack()
+        self._env: Any = None
+
+    def open(self, family: str) -> OpenJail:
+        """It, for the next attacks."""
+        arena = Arena(self.profile, family)
+        if self._env is None or self._env.sandbox.stats()["state"] != "READY":
+            self.close()
+            self._env = self._held.enter_context(arena.environment())
+            self._env.reset()
+        arena.report = self._env.sandbox.report()
+        return OpenJail(arena, self._env)
+
+    def close(self) -> None:
+        """End it."""
+        self._env = None
+        self._held.close()
 
 
 def run_in(env: Any, payload: str, **arguments: Any) -> Run:

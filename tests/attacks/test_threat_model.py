@@ -57,7 +57,6 @@ def test_table_agrees_with_the_expectations() -> None:
 
 
 def test_updates_keep_the_other_users_columns(tmp_path: Path) -> None:
-    """A run as one user leaves what a run as another has written."""
     page = tmp_path / "attacks.md"
     for user in ("root", "user"):
         table.update(page, [Row("tcp", "Network", "strict", user, "succeeds", "stopped", "")])

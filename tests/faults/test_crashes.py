@@ -31,7 +31,6 @@ def brittle(folder: Path, actions: str = "array", ending: str = "exit", **option
 
 
 def play(env: Any, steps: int = 2000) -> errors.WorkerDiedError:
-    """Sample actions until it dies."""
     env.action_space.seed(5)
     try:
         for _ in range(steps):
@@ -91,7 +90,6 @@ def test_every_ending_and_every_action_comes_again(
 
 @pytest.mark.short
 def test_a_bundle_holds_what_is_promised(tmp_path: Path) -> None:
-    """For its owner alone, whole, in plain formats, and readable by people."""
     with brittle(tmp_path, n_envs=2) as suites:
         suites.env.reset(seed=[4, 5], options={"toll": 1})
         error = play(suites.env)
@@ -119,7 +117,6 @@ def test_a_bundle_holds_what_is_promised(tmp_path: Path) -> None:
 
 
 def test_an_older_reset_is_forgotten_and_a_new_jail_begins_anew(tmp_path: Path) -> None:
-    """The second death's bundle has nothing of what led to the first."""
     with brittle(tmp_path, policy={"restart": "on_reset", "restart_backoff_s": 0}) as suites:
         env = suites.env
         env.set_attr("weight", 3.0)
@@ -152,7 +149,6 @@ def test_a_mended_repository_survives(tmp_path: Path) -> None:
 
 
 def test_a_death_in_make_env_is_repeated_too(tmp_path: Path) -> None:
-    """There are no requests then, and no environment."""
     kwargs = {"when": "make", "ending": "exit"}
     policy = {"crash_folder": str(tmp_path)}
     with pytest.raises(errors.WorkerDiedError) as caught:
@@ -186,7 +182,6 @@ def test_what_was_forgotten_is_said(tmp_path: Path) -> None:
 
 
 def test_no_bundle_where_none_is_wanted(tmp_path: Path) -> None:
-    """Neither with a history of 0, nor for what the caller has closed."""
     with brittle(tmp_path, policy={"crash_history": 0}) as suites:
         suites.env.reset(seed=1)
         error = play(suites.env)
@@ -199,7 +194,6 @@ def test_no_bundle_where_none_is_wanted(tmp_path: Path) -> None:
 
 
 def test_a_death_is_told_although_no_bundle_can_be_written(tmp_path: Path) -> None:
-    """What hinders the bundle does not hide the death."""
     (tmp_path / "taken").write_text("a file")
     with brittle(tmp_path / "taken") as suites:
         suites.env.reset(seed=1)
@@ -208,7 +202,6 @@ def test_a_death_is_told_although_no_bundle_can_be_written(tmp_path: Path) -> No
 
 
 def test_the_oldest_bundles_give_way(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Other things in the folder stay."""
     monkeypatch.setattr(bundle_writer, "KEPT", 2)
     (tmp_path / "mine").mkdir()
     policy = {"restart": "on_reset", "restart_backoff_s": 0}
@@ -225,7 +218,6 @@ def test_the_oldest_bundles_give_way(tmp_path: Path, monkeypatch: pytest.MonkeyP
 
 
 def test_envhub_run_names_the_bundle() -> None:
-    """In its text, after the last output."""
     arguments = ("--env-kwargs", "moment=step", "--env-kwargs", "fault=kill", "--episodes", "1")
     done = envhub("run", sample("faulty"), *arguments, "--steps", "50")
     assert done.returncode == 5
@@ -238,7 +230,6 @@ def test_envhub_run_names_the_bundle() -> None:
 def test_a_death_that_is_hidden_leaves_a_bundle_too(
     tmp_path: Path, lane: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """With transparent restarts nothing is raised; the log names the bundle."""
     caplog.set_level("INFO", "envhub_sandbox.crashes")
     place = {"n_envs": 3, "use_async_envs": True, "num_workers": 2, "lane": lane}
     policy = {"restart": "transparent", "restart_backoff_s": 0}

@@ -97,7 +97,6 @@ def test_idle_processes_end_and_a_reset_starts_others(lane: str, restart: str) -
 @lanes
 @policies
 def test_a_step_after_that_says_that_a_reset_is_needed(lane: str, restart: str) -> None:
-    """Its episodes have gone with it; so it is, until there was a reset."""
     with made(lane, restart) as env:
         assert ended(played(env))
         for ask in (lambda: env.step(ALL_LIVE), lambda: env.call("hello")):
@@ -111,7 +110,6 @@ def test_a_step_after_that_says_that_a_reset_is_needed(lane: str, restart: str) 
 
 @lanes
 def test_who_works_is_not_idle(lane: str) -> None:
-    """Steps count, by whichever way they go."""
     with made(lane, idle_s=WORKING_S) as env:
 
         def works_on() -> bool:
@@ -123,7 +121,6 @@ def test_who_works_is_not_idle(lane: str) -> None:
 
 @lanes
 def test_a_long_step_is_not_idleness(lane: str) -> None:
-    """Whoever owes an answer is busy, even asleep."""
     with made(lane, shards=1) as env:
 
         def play() -> None:
@@ -136,7 +133,6 @@ def test_a_long_step_is_not_idleness(lane: str) -> None:
 
 
 def test_without_it_nothing_ends() -> None:
-    """The default leaves everybody alone."""
     with made(idle_s=None) as env:
         env.reset()
         runners = pids(env)
@@ -145,7 +141,6 @@ def test_without_it_nothing_ends() -> None:
 
 
 def test_other_tasks_go_on() -> None:
-    """Each task of a suite has processes of its own, and a clock of its own."""
     with make_env(sample("many_tasks"), timeouts={"idle_s": WORKING_S}) as suites:
         first, second = list(next(iter(suites.values())).values())[:2]
         action = second.action_space.sample()

@@ -83,7 +83,6 @@ def test_a_second_ctrl_c_in_recovery_leaves_a_usable_environment(
 def test_ctrl_c_while_what_was_started_ahead_is_given_up(
     why: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its jail has gone already, and it is not taken for ready."""
     make_env(sample("counter"), n_envs=2).close()  # known from here on: it starts later
     with make_env(sample("counter"), n_envs=2) as suites:
         env = suites.env
@@ -106,7 +105,6 @@ def test_ctrl_c_while_what_was_started_ahead_is_given_up(
 def test_ctrl_c_in_sending_a_step_leaves_a_late_reply(
     moment: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is not known whether it was done, so the next request is refused."""
     with begun("frames") as env:
         jail = inside.jail(env)
         with monkeypatch.context() as patch:
@@ -157,17 +155,14 @@ class Inside:
         self._there, self._go_on, self._then = threading.Event(), threading.Event(), then
 
     def __call__(self, *arguments: Any, **options: Any) -> Any:
-        """Say that we are there, and wait."""
         self._there.set()
         assert self._go_on.wait(60)
         return self._then(*arguments, **options)
 
     def wait(self) -> None:
-        """Until somebody is there."""
         assert self._there.wait(60)
 
     def leave(self) -> None:
-        """Let him go on."""
         self._go_on.set()
 
 
@@ -200,7 +195,6 @@ def close_during_reset(env: Any, inside: Inside) -> None:
 def test_close_ends_the_wait_before_a_restart(
     restart: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """However long a backoff is; nothing is left of the environment."""
     waiting = Inside(lambda *_: 3600.0)
     waiting.leave()
     policy = {"restart": restart, "crash_history": 0}
@@ -248,7 +242,6 @@ class Held:
         self.waited: list[float] = []
 
     def acquire(self, blocking: bool = True, timeout: float = 0.0) -> bool:
-        """In vain."""
         self.waited.append(timeout)
         return False
 

@@ -42,7 +42,6 @@ def connected() -> Iterator[tuple[WorkerConnection, zmq.Socket[bytes]]]:
 
 
 def answer(number: int) -> list[Buffer]:
-    """What the server says to a request."""
     return m.pack_header(m.Output(f"to {number}"), number)
 
 

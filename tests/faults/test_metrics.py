@@ -62,7 +62,6 @@ def repository(tmp_path: Path) -> Path:
 
 @pytest.mark.parametrize("lane", ["auto", "frames"])
 def test_everything_is_exported(registry: Any, repository: Path, lane: str) -> None:
-    """Under standard names, with the numbers of ``stats()``."""
     label = f"{repository}:env.py"
     with started(repository, lane=lane, policy={"restart": "on_reset"}, seed=None) as env:
         for _ in range(7):
@@ -129,7 +128,6 @@ class Env:
 
 
 def test_what_is_gone_takes_no_room() -> None:
-    """A thousand environments leave one line of numbers."""
     ledger, labels = Ledger(), Labels("r", "s", "t")
     for _ in range(1000):
         env, counted = Env(), Counters()
@@ -148,7 +146,6 @@ def test_what_is_gone_takes_no_room() -> None:
 def test_names_of_the_worker_cannot_break_the_exposition(
     registry: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A task's name is a stranger's text."""
     ledger, env = Ledger(), Env()
     nasty = 'a"b\\c\nd} 5\x1b[31m'
     ledger.add(env, Labels("r", nasty, nasty * 1000), Counters(), Lifecycle())

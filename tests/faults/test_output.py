@@ -98,7 +98,6 @@ def make_env(n_envs=1, use_async_envs=False, how=""):
 
 
 def test_output_of_loading_and_closing_is_there(tmp_path: Path) -> None:
-    """From the first line to the last."""
     with pytest.raises(errors.LoadError):
         made(tmp_path / "make.log", "raise", "make")
     assert "about to raise" in (tmp_path / "make.log").read_text()
@@ -109,7 +108,6 @@ def test_output_of_loading_and_closing_is_there(tmp_path: Path) -> None:
 
 
 def test_a_file_for_each_jail(tmp_path: Path) -> None:
-    """So that a restarted worker's output is not taken for the first one's."""
     with made(tmp_path / "w.log", "kill", restart="on_reset", restart_backoff_s=0) as suites:
         for _ in range(2):
             suites.env.reset()
@@ -121,7 +119,6 @@ def test_a_file_for_each_jail(tmp_path: Path) -> None:
 
 
 def test_a_flood_is_bounded_and_said(tmp_path: Path) -> None:
-    """What came too fast is counted, and nothing of what is there paints."""
     path = tmp_path / "w.log"
     with made(path, "flood") as suites:
         suites.env.reset()
@@ -183,7 +180,6 @@ def test_an_ordinary_life_clutters_nobodys_log(caplog: pytest.LogCaptureFixture)
 
 
 def test_nobody_is_followed_without_need() -> None:
-    """No thread, no request: the default costs nothing."""
     with made(None, "exit") as suites:
         suites.env.reset()
         assert followers() == []

@@ -61,7 +61,6 @@ def test_options_and_tasks_travel() -> None:
 
 @pytest.mark.usefixtures("neighbour")
 def test_config_object_travels_as_its_attributes() -> None:
-    """What the repository saw of the caller's object, it sees again."""
     config = SimpleNamespace(
         hub_path=str(sample("cfg_reader")),
         task="CartPole-v1",
@@ -81,14 +80,12 @@ def test_config_object_travels_as_its_attributes() -> None:
 
 
 def test_token_stays(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A pickle holds no token, and of a repository its commit."""
     with make_env(sample("faulty"), token="hf_do_not_tell") as suites:
         assert b"hf_do_not_tell" not in pickle.dumps(suites)
         assert b"hf_do_not_tell" not in pickle.dumps(suites.env)
 
 
 def test_environments_of_this_process_are_not_pickled() -> None:
-    """Without a sandbox there is no recipe, and the text says so."""
     with (
         make_env(sample("faulty"), sandbox=None, trust_remote_code=True) as suites,
         pytest.raises(TypeError, match="in this process"),

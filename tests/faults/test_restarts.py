@@ -34,7 +34,6 @@ def test_never_means_never() -> None:
 
 @pytest.mark.usefixtures("neighbour")
 def test_budget_ends() -> None:
-    """After the last restart a death is final, and the text names the budget."""
     with made(restart="on_reset", restart_budget=2, restart_backoff_s=0) as suites:
         env = suites.env
         for _ in range(3):
@@ -59,6 +58,5 @@ def test_budget_ends() -> None:
     ],
 )
 def test_impossible_values_are_refused(name: str, value: Any) -> None:
-    """A budget is a count, a backoff is seconds."""
     with pytest.raises(errors.PolicyError, match=name):
         Policy(**{name: value})

@@ -15,7 +15,7 @@ from tests.support import inside
 @pytest.mark.usefixtures("neighbour")
 @pytest.mark.parametrize(
     ("lane", "workers", "restart"),
-    [("auto", 2, "transparent"), ("frames", 2, "transparent"), ("auto", 1, "on_reset")],
+    [("auto", 2, "transparent"), ("frames", 1, "on_reset")],
 )
 def test_short_soak(
     lane: str,
@@ -42,7 +42,6 @@ def _result(**changes: Any) -> Any:
 
 
 def test_soak_would_notice_a_difference() -> None:
-    """The comparison is not satisfied by anything but the very same results."""
     assert soak.same(_result(), _result())
     assert not soak.same(_result(), _result(infos={}))
     assert not soak.same(_result(), _result(second=np.zeros(2)))
@@ -50,7 +49,6 @@ def test_soak_would_notice_a_difference() -> None:
 
 
 def test_soak_would_notice_growth() -> None:
-    """Neither memory, nor descriptors, nor processes may become more."""
     flat = {"processes": 4, "client_descriptors": 9, "client_mib": 80.0}
     found: dict[str, Any] = {"mismatches": 0, "after_warm_up": flat, "at_the_end": flat}
     assert soak.passed(found)
@@ -60,8 +58,7 @@ def test_soak_would_notice_growth() -> None:
 
 
 def test_a_short_hour(capsys: pytest.CaptureFixture[str]) -> None:
-    """In child processes and over TCP: no result differs, nothing grows."""
-    code = monkey.main(["--operations", "60", "--kill-every", "3", "--environments", "3"])
+    code = monkey.main(["--operations", "30", "--kill-every", "3", "--environments", "3"])
     found = json.loads(capsys.readouterr().out)
     assert code == 0, found
     for place in monkey.PLACES:
@@ -70,7 +67,6 @@ def test_a_short_hour(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_the_monkey_would_notice_a_difference(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of every result, and it goes on with the others."""
     one = monkey.Monkey("process", environments=2, seed=0, kill_every=10**9)
     monkeypatch.setattr(monkey, "same", lambda *_: False)
     for _ in range(10):
@@ -83,7 +79,6 @@ def test_the_monkey_would_notice_a_difference(monkeypatch: pytest.MonkeyPatch) -
 def test_the_monkey_would_notice_a_death_that_nobody_caused(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The model allows a death only where something was killed."""
     one = monkey.Monkey("process", environments=1, seed=0, kill_every=3)
     monkeypatch.setattr(monkey.Subject, "doubted", lambda _: None)
     while not one.mismatches and one.counts["operations"] < 1000:
@@ -93,7 +88,6 @@ def test_the_monkey_would_notice_a_death_that_nobody_caused(
 
 
 def test_the_monkey_would_notice_growth() -> None:
-    """Neither files, nor descriptors, nor processes may become more."""
     flat = {"processes": 5, "client_descriptors": 22, "client_mib": 35.0, "files": 6}
     found: dict[str, Any] = {"mismatches": [], "grown": monkey.more(flat, flat)}
     assert monkey.passed(found)
@@ -106,7 +100,7 @@ def test_the_monkey_would_notice_growth() -> None:
 
 def test_short_clients_leave_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     """Nor do those that are there at once; and a client may have several environments."""
-    code = clients.main(["--in-a-row", "4", "--at-once", "2", "--environments", "3"])
+    code = clients.main(["--in-a-row", "3", "--at-once", "2", "--environments", "3"])
     found = json.loads(capsys.readouterr().out)
     assert (code, found["grown"]) == (0, [])
     assert found["at_once"]["jails_pss_mib"] > 0
@@ -124,7 +118,6 @@ def test_growth_would_be_noticed() -> None:
 
 
 def test_short_auto(capsys: pytest.CaptureFixture[str]) -> None:
-    """One size of one workload: it runs, and each column has something in it."""
     short = ["--rounds", "1", "--seconds", "0.01", "--busy", "1"]
     auto.main(["--workloads", "cartpole", "--sizes", "2", *short])
     header, _, row = [line for line in capsys.readouterr().out.splitlines() if "|" in line]

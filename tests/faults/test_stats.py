@@ -50,7 +50,6 @@ def test_counters_follow_what_happens(lane: str, monkeypatch: pytest.MonkeyPatch
 
 
 def test_latencies_are_those_of_the_last_steps() -> None:
-    """Old latencies are forgotten, new ones are not."""
     counters = Counters()
     assert counters.snapshot()["step_latency_s"] == {"total": 0.0}
     for _ in range(KEPT):

@@ -85,7 +85,6 @@ def restarted(info: dict[str, Any], rows: slice = DEAD) -> bool:
 
 @contextmanager
 def begun(lane: str = "auto", **options: Any) -> Iterator[Any]:
-    """The same, reset with SEED."""
     with made(lane, **options) as suites:
         suites.env.reset(seed=SEED)
         yield suites.env
@@ -93,7 +92,6 @@ def begun(lane: str = "auto", **options: Any) -> Iterator[Any]:
 
 @pytest.fixture(params=["auto", "frames"])
 def env(request: pytest.FixtureRequest) -> Iterator[Any]:
-    """The same, over either lane."""
     with begun(request.param) as found:
         yield found
 
@@ -160,7 +158,6 @@ def test_disabled_wants_a_reset_of_what_came_back(lane: str) -> None:
 
 @lanes
 def test_the_only_process_comes_back_whole(lane: str) -> None:
-    """With one shard all rows are its own."""
     with begun(lane, shards=1) as env:
         jail = inside.jail(env).number
         for restart in (1, 2):
@@ -184,7 +181,6 @@ def test_seeded_runs_with_the_same_deaths_are_the_same() -> None:
 
 
 def test_unseeded_deaths_do_not_repeat_episodes() -> None:
-    """Nothing was seeded, so nothing comes back twice."""
     with made() as suites:
         env = suites.env
         env.reset()
@@ -207,7 +203,6 @@ def test_a_reset_is_done_again_in_the_fresh_process(lane: str) -> None:
 @lanes
 @pytest.mark.parametrize("dies_in", ["step", "reset"])
 def test_infos_that_differ_in_kind_survive_a_death(tmp_path: Path, lane: str, dies_in: str) -> None:
-    """They are joined as without a death, and say who came back."""
     folder = write_repository(tmp_path / "mixed", _MIXED)
     policy = {"restart": "transparent", "restart_backoff_s": 0, "crash_history": 0}
     options: dict[str, Any] = {"num_workers": 2, "lane": lane, "policy": policy}
@@ -317,7 +312,6 @@ def test_attributes_that_were_set_are_set_again(env: Any) -> None:
 
 
 def test_attributes_are_set_again_as_they_were_sent() -> None:
-    """Whatever the caller has done with the values since."""
     with begun() as env:
         goals = {"goal": np.zeros(2)}
         env.set_attr("goals", [goals] * 4)
@@ -351,7 +345,6 @@ def test_a_death_that_is_mended_is_logged(env: Any, caplog: pytest.LogCaptureFix
 
 @lanes
 def test_a_fresh_jail_has_no_attributes_of_the_last(lane: str) -> None:
-    """What was set in a jail that was given up, no row of the next one gets."""
     with begun(lane, timeouts={"step_s": 0.05}) as env:
         env.set_attr("weight", 7)
         with pytest.raises(errors.WorkerTimeoutError):
@@ -379,7 +372,6 @@ def test_a_death_between_requests_is_met_by_the_next(env: Any) -> None:
 
 
 def test_a_reset_brings_back_who_died_between_requests(env: Any) -> None:
-    """It is a reset as any other; the infos say what happened."""
     os.kill(inside.pids(env)[1], signal.SIGKILL)
     observation, info = env.reset(seed=SEED)
     assert np.array_equal(observation, oracle().reset(seed=SEED)[0])
@@ -387,7 +379,6 @@ def test_a_reset_brings_back_who_died_between_requests(env: Any) -> None:
 
 
 def test_the_end_of_the_jail_takes_all_rows(env: Any) -> None:
-    """Its first process holds the others: all come back, in another jail."""
     jail = inside.jail(env).number
     runners = inside.pids(env)
     init = psutil.Process(runners[0]).parent()
@@ -415,7 +406,6 @@ def test_memory_of_all_takes_all_rows(lane: str) -> None:
 
 
 def test_the_cpu_limit_takes_one_process() -> None:
-    """It is each process's own, and the fresh one has it from the start."""
     with begun(policy={"limits": {"cpu_time_s": 2}}) as env:
         observation, _, _, truncated, info = env.step([LIVE, LIVE, LIVE, SPIN])
         assert truncated.tolist() == [False, False, True, True]
@@ -424,7 +414,6 @@ def test_the_cpu_limit_takes_one_process() -> None:
 
 
 def test_one_that_raises_beside_a_death_is_told_first(env: Any) -> None:
-    """The exception is the step's; the death is met by the next step."""
     with pytest.raises(errors.RemoteEnvError, match="as told"):
         env.step([LIVE, RAISE, LIVE, EXIT])
     assert inside.state(env) is State.READY
@@ -432,7 +421,6 @@ def test_one_that_raises_beside_a_death_is_told_first(env: Any) -> None:
 
 
 def test_a_late_sibling_is_a_timeout_all_the_same(env: Any) -> None:
-    """The dead do not make the living answer; a reset brings everybody back."""
     with halted(inside.pids(env)[:1]):
         env.step_async([LIVE, LIVE, LIVE, EXIT])
         with pytest.raises(errors.WorkerTimeoutError):
@@ -444,7 +432,6 @@ def test_a_late_sibling_is_a_timeout_all_the_same(env: Any) -> None:
 
 
 def test_a_slow_sibling_is_waited_for(env: Any) -> None:
-    """Its row is its real result."""
     observation, _, _, truncated, _ = env.step([SLOW, LIVE, LIVE, EXIT])
     assert observation[:, 1].tolist() == [1, 1, 0, 0]
     assert truncated.tolist() == [False, False, True, True]
@@ -468,7 +455,6 @@ def test_budget_ends_in_the_death_itself(lane: str) -> None:
 
 
 def test_lent_observations_come_back_too() -> None:
-    """Rows that are lent out are nobody's to overwrite."""
     with begun(copy=False) as env:
         before = env.step(ALL_LIVE)[0]
         kept = before.copy()
@@ -480,7 +466,6 @@ def test_lent_observations_come_back_too() -> None:
 
 
 def test_an_environment_with_a_step_of_its_own_comes_back_whole() -> None:
-    """It is reset, all rows are truncated, and its next step is a step."""
     with begun(shards=1, env_kwargs={"form": "whole"}) as env:
         observation, rewards, _, truncated, info = env.step(LAST_DIES)
         assert truncated.all()
@@ -504,7 +489,6 @@ def test_environments_of_one_jail_come_back_each_on_its_own() -> None:
 
 
 def test_close_does_not_wait_for_who_is_coming_back() -> None:
-    """From another thread, while ``make_env`` hangs in the fresh process."""
     with begun(env_kwargs={"form": "slow"}, shards=1) as env:
         closing = threading.Timer(0.3, env.close)
         closing.start()
@@ -527,7 +511,6 @@ def test_coming_back_has_a_deadline() -> None:
 
 
 def test_interrupted_in_coming_back_it_starts_afresh(tmp_path: Path) -> None:
-    """Ctrl-C ends the wait at once; a reset brings it back in another jail."""
     before = signal.signal(signal.SIGALRM, signal.default_int_handler)
     output, caller = tmp_path / "output", threading.get_ident()
 

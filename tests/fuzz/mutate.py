@@ -180,7 +180,7 @@ class Spoiler:
             donor = rng_part(self.rng, _tree(_document_of(self.rng.choice(others))))
         except Exception:  # spoiled before
             return self.raw(document)
-        return _packed(self._tree(tree, donor, 0))
+        return packed(self._tree(tree, donor, 0))
 
     def _tree(self, tree: Any, donor: Any, depth: int) -> Any:
         rng = self.rng
@@ -253,15 +253,14 @@ def _tree(document: bytes) -> Any:
     return unpacker.unpack()
 
 
-def _packed(value: Any) -> bytes:
+def packed(value: Any) -> bytes:
     """Packs what no dict can hold."""
     if isinstance(value, Pairs):
-        content = b"".join(_packed(part) for pair in value for part in pair)
+        content = b"".join(packed(part) for pair in value for part in pair)
         return b"\xdf" + struct.pack(">I", len(value)) + content
     if isinstance(value, list):
-        return b"\xdd" + struct.pack(">I", len(value)) + b"".join(map(_packed, value))
-    packed: bytes = msgpack.packb(value)
-    return packed
+        return b"\xdd" + struct.pack(">I", len(value)) + b"".join(map(packed, value))
+    return bytes(msgpack.packb(value))
 
 
 def wire(value: Any) -> Any:

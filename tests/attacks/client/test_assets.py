@@ -162,7 +162,6 @@ def test_a_card_that_names_what_is_no_asset(
 
 
 def test_two_names_for_one_repository(stub_hub: StubHub, make: Make) -> None:
-    """One of them would be shown for the other."""
     stub_hub.add("org/data", {"x": "x"}).earlier["b" * 40] = {"x": b"y"}
     with pytest.raises(EnvHubError, match="shown once, at one commit"):
         make(f"org/data@{COMMIT}", f"models/org/data@{'b' * 40}")
@@ -173,7 +172,6 @@ def test_two_names_for_one_repository(stub_hub: StubHub, make: Make) -> None:
 def test_the_callers_own_cache_of_the_hub_stays_out_of_reach(
     make: Make, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Neither its tokens nor its files; outside, the same line reads them."""
     token = tmp_path / "mine" / "token"
     token.parent.mkdir()
     token.write_text("hf_mine")

@@ -71,7 +71,6 @@ def test_lies_about_changes_are_refused(liar: LyingServer, folder: str, lie: str
 
 
 def test_what_can_be_changed_is_not_kept(liar: LyingServer, folder: str) -> None:
-    """Who changes what he was given would change what the next one gets."""
     liar.lies[m.Watch] = relayed(m.WatchDone(tuple([["reach"]] * NUM_ENVS), True))
     with watching(liar, folder) as suites:
         before = suites.env.sandbox.stats()["requests"]
@@ -87,14 +86,12 @@ def test_what_can_be_changed_is_not_kept(liar: LyingServer, folder: str) -> None
     ids=["too few", "no tuple", "another reply"],
 )
 def test_other_answers_are_refused(liar: LyingServer, folder: str, lie: m.Message) -> None:
-    """As those of a call are."""
     liar.lies[m.Watch] = relayed(lie)
     with pytest.raises(RemoteProtocolError):
         watching(liar, folder)
 
 
 def test_a_flood_of_changes_is_one_reply(liar: LyingServer, folder: str) -> None:
-    """As many frames as one likes are no reply; and it is not read one by one."""
     with watching(liar, folder) as suites:
         front = [m.Changes(((1, "task"),))] * (DEFAULT_LIMITS.frames // 4)
         liar.lies[m.Step] = relayed(*front, step_done())

@@ -45,7 +45,6 @@ INFO = {"a": np.arange(NUM_ENVS), "_a": np.ones(NUM_ENVS, bool)}
 
 @pytest.fixture
 def honest() -> Iterator[LyingServer]:
-    """A server that says what is true."""
     with lying() as server:
         yield server
 
@@ -107,7 +106,6 @@ def test_what_is_not_checked_changes_the_others_rows(liar: LyingServer) -> None:
 def test_rows_that_are_not_its_own_are_refused(
     liar: LyingServer, honest: LyingServer, folder: str, what: str
 ) -> None:
-    """The error names the liar's rows; the honest worker goes on where it was."""
     with fleet(liar, honest, folder, restart="on_reset") as env:
         before = liar.lies[m.Step]
         liar.lies[m.Step] = relayed(step_done(**(TRUE | LIES[what])))
@@ -125,7 +123,6 @@ def test_rows_that_are_not_its_own_are_refused(
 
 
 def test_values_for_others_are_refused(liar: LyingServer, honest: LyingServer, folder: str) -> None:
-    """One value each, and no more: else all that follow would be another's."""
     with fleet(liar, honest, folder) as env:
         assert env.call("x", 1) == ("true",) * ALL  # the control
         liar.lies[m.Call] = relayed(m.Value(("lie",) * ALL))
@@ -197,7 +194,6 @@ def test_another_space_is_refused_before_the_first_step(
 def test_more_rows_are_refused_before_the_first_step(
     liar: LyingServer, honest: LyingServer, folder: str
 ) -> None:
-    """A worker that has built all of them has not built its own."""
     built = wire.env_manifest(OBSERVATION, ACTION, ALL, sync=True)
     liar.lies[m.Build] = relayed(m.BuildDone(encode_env(built)))
     with pytest.raises(EnvHubError), fleet(liar, honest, folder):

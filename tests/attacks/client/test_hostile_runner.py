@@ -1,7 +1,7 @@
 """A hostile runner in a real jail: the repository replaces our code next to it, and lies.
 
 Jail and repository share a process, so that nothing our code does there can be relied on. What
-counts is what the server and the client make of it.
+counts is what the server and the client make of it: the same under every profile.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import pickle
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,29 +26,28 @@ from envhub_sandbox.errors import (
 )
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.wire import Buffer
-from tests.attacks.client.lies import Canary, peak_growth
+from tests.attacks.client.lies import GROWTH, MIB, Canary, peak_growth
 from tests.attacks.client.lying_server import step_done
 from tests.attacks.harness import TIMEOUTS, Arena
 from tests.attacks.repositories import write_environment
+from tests.support import inside
 from tests.support.processes import most_grown, resident
 from tests.support.wire import value
 
-FAMILY = "The client, from inside a jail"
-
-MIB = 1 << 20
-GROWTH = 192 * MIB
-
 _ENV = """
-import os, socket, struct, time
+import os, pickle, socket, stat, struct, time
 from envhub_worker.runner import runner
 from envhub_worker.protocol import messages as m
 
-FRAMES = {frames!r}
-MODE = {mode!r}
 honest = runner.Runner.answer
+told = {}
 
 class Three(Plain):
     observation_space = gym.spaces.Box(-1, 1, (3,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        told.update(options)
+        return super().reset(seed=seed)
 
 def lie(self, packet):
     request = m.unpack(packet.frames)
@@ -56,21 +56,22 @@ def lie(self, packet):
         return m.pack(m.Value(False))  # so that steps come as messages
     if not isinstance(request, m.Step):
         return honest(self, packet)
-    if MODE == "frames":
-        return FRAMES
-    if MODE == "silence":
+    if "frames" in told:
+        with open(told["frames"], "rb") as file:
+            return pickle.load(file)
+    if told["mode"] == "silence":
         time.sleep(600)
-    if MODE == "exit":
+    if told["mode"] == "exit":
         os._exit(0)
     answer = m.pack(m.Value(None))
     stream = next(fd for fd in range(3, 64) if is_stream(fd))
     one = b"".join(map(bytes, runner.pack_packet(packet.request_id, answer)))
-    if MODE == "twice":
+    if told["mode"] == "twice":
         os.write(stream, one)
-    if MODE == "other id":
+    if told["mode"] == "other id":
         return_id = packet.request_id + 1
         os.write(stream, b"".join(map(bytes, runner.pack_packet(return_id, answer))))
-    if MODE == "dribble":
+    if told["mode"] == "dribble":
         for byte in one[:8]:
             os.write(stream, bytes([byte]))
             time.sleep(0.05)
@@ -78,7 +79,6 @@ def lie(self, packet):
     return answer
 
 def is_stream(fd):
-    import stat
     try:
         return stat.S_ISSOCK(os.fstat(fd).st_mode)
     except OSError:
@@ -86,56 +86,6 @@ def is_stream(fd):
 
 runner.Runner.answer = lie
 """
-
-
-def liar(folder: Path, mode: str, frames: list[Buffer] | None = None) -> str:
-    """A repository whose runner lies about steps."""
-    raw = [bytes(frame) for frame in frames or []]
-    return str(write_environment(folder / "liar", _ENV.format(frames=raw, mode=mode)))
-
-
-def lies_to(arena: Arena, folder: str, **timeouts: float) -> tuple[Exception, int]:
-    """The error of a step of a lying repository, and by how much the server grew."""
-    options: dict[str, Any] = {"lane": "frames", "policy": {"profile": arena.profile}}
-    options["timeouts"] = {**TIMEOUTS, **timeouts}
-    with make_env(folder, n_envs=2, **options) as suites:
-        suites.env.reset()
-        before = resident()
-        del before[os.getpid()]
-        with pytest.raises(EnvHubError) as caught:
-            suites.env.step([0, 0])
-        grown = most_grown(before)
-    return caught.value, grown
-
-
-@pytest.fixture
-def neighbour(arena: Arena) -> Any:
-    """An honest environment in the same server, which must not notice anything."""
-    with arena.environment() as env:
-        env.reset()
-        yield env
-        env.step([0])
-
-
-@pytest.mark.short("strict")
-@pytest.mark.parametrize(
-    "place", ["observation", "rewards", "info"], ids=["observation", "rewards", "info"]
-)
-def test_pickles_from_a_jail_are_never_loaded(
-    arena: Arena, neighbour: Any, home: Path, place: str
-) -> None:
-    """A pickle that a jail sends is refused by the client, which loads none."""
-    canary = home / "executed"
-    evil: Any = Canary(canary)
-    done = step_done(**{place: {"a": evil} if place == "info" else evil})
-    frames = m.pack(done, pickler=cloudpickle.dumps)
-    assert any(str(canary).encode() in bytes(frame) for frame in frames)
-    lies_to(arena, liar(home, "frames", frames))
-    assert not canary.exists()
-    pickle.loads(cloudpickle.dumps(evil))
-    assert canary.exists(), "the control failed: loaded, the pickle does nothing"
-
-
 BOMBS: dict[str, list[Buffer]] = {
     "a header of noise": [os.urandom(1000)],
     "four million empty maps": value(
@@ -148,24 +98,84 @@ BOMBS: dict[str, list[Buffer]] = {
     "a wrong shape": m.pack(step_done(observation=np.zeros((2, 99), np.float32))),
     "the server's own words": m.pack(m.JailOpened(1, (1,), ())),
 }
+PLACES = ("observation", "rewards", "info")
 
 
-@pytest.mark.short("strict")
-@pytest.mark.parametrize("what", list(BOMBS))
-def test_bombs_from_a_jail_are_refused(arena: Arena, neighbour: Any, home: Path, what: str) -> None:
+@pytest.fixture(scope="module")
+def canary(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder that is not there, as long as no pickle is loaded."""
+    return tmp_path_factory.mktemp("canary") / "executed"
+
+
+@pytest.fixture(scope="module")
+def liar(warm_server: None, open_ground: Path, canary: Path) -> Iterator[Any]:
+    """An environment whose runner lies about steps as the options of a reset say."""
+    folder = write_environment(open_ground / "liar", _ENV)
+    lies = dict(BOMBS)
+    for place in PLACES:
+        evil: Any = Canary(canary)
+        done = step_done(**{place: {"a": evil} if place == "info" else evil})
+        lies[place] = m.pack(done, pickler=cloudpickle.dumps)
+        assert any(str(canary).encode() in bytes(frame) for frame in lies[place])
+    for name, frames in lies.items():
+        (folder / name).write_bytes(pickle.dumps([bytes(frame) for frame in frames]))
+    policy = {"restart": "on_reset", "restart_backoff_s": 0, "restart_budget": 1000}
+    options: dict[str, Any] = {"lane": "frames", "policy": policy, "timeouts": TIMEOUTS}
+    with make_env(str(folder), n_envs=2, **options) as suites:
+        yield suites.env
+
+
+def told_lies(env: Any, **lie: str) -> tuple[Exception, int]:
+    """The error of a step in which its runner lies, and by how much the server grew."""
+    env.reset(options=lie)
+    before = resident()
+    del before[os.getpid()]
+    with pytest.raises(EnvHubError) as caught:
+        env.step([0, 0])
+    return caught.value, most_grown(before)
+
+
+@pytest.fixture(scope="module")
+def neighbour(warm_server: None) -> Iterator[Any]:
+    """An honest environment in the same server."""
+    with Arena("strict", "").environment() as env:
+        env.reset()
+        yield env
+
+
+@pytest.fixture(autouse=True)
+def _noticed_by_nobody(neighbour: Any) -> Iterator[None]:
+    yield
+    neighbour.step([0])
+
+
+@pytest.mark.short
+@pytest.mark.parametrize("place", PLACES)
+def test_pickles_from_a_jail_are_never_loaded(liar: Any, canary: Path, place: str) -> None:
+    told_lies(liar, frames=place)
+    assert not canary.exists()
+
+
+def test_the_control_loads_a_pickle(tmp_path: Path) -> None:
+    pickle.loads(cloudpickle.dumps(Canary(tmp_path / "executed")))
+    assert (tmp_path / "executed").exists()
+
+
+@pytest.mark.short
+@pytest.mark.parametrize("what", BOMBS)
+def test_bombs_from_a_jail_are_refused(liar: Any, what: str) -> None:
     """Whatever frames a jail sends, client and server refuse them in bounded memory."""
     found: list[tuple[Exception, int]] = []
-    folder = liar(home, "frames", BOMBS[what])
-    client_grew = peak_growth(lambda: found.append(lies_to(arena, folder)))
+    client_grew = peak_growth(lambda: found.append(told_lies(liar, frames=what)))
     _, server_grew = found[0]
     assert client_grew < GROWTH
     assert server_grew < GROWTH
 
 
 @pytest.mark.parametrize("mode", ["twice", "other id", "exit"])
-def test_rule_breakers_lose_their_jail(arena: Arena, neighbour: Any, home: Path, mode: str) -> None:
+def test_rule_breakers_lose_their_jail(liar: Any, mode: str) -> None:
     """Two answers, another id, no answer at all: the environment is dead, in plain words."""
-    error, _ = lies_to(arena, liar(home, mode))
+    error, _ = told_lies(liar, mode=mode)
     if mode == "twice" and isinstance(error, RemoteProtocolError):
         return  # the first answer came alone, and was of a wrong kind
     assert isinstance(error, WorkerDiedError)
@@ -174,10 +184,13 @@ def test_rule_breakers_lose_their_jail(arena: Arena, neighbour: Any, home: Path,
 
 @pytest.mark.parametrize("mode", ["silence", "dribble"])
 def test_silence_from_a_jail_ends_at_the_deadline(
-    arena: Arena, neighbour: Any, home: Path, mode: str
+    liar: Any, mode: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A runner that does not answer, or a byte at a time, costs the time that was given."""
+    monkeypatch.setattr(*inside.LATE_REPLY_GRACE, 0.0)
     started = time.monotonic()
-    error, _ = lies_to(arena, liar(home, mode), step_s=0.5, close_s=0.5)
+    with inside.hurried(liar, step_s=0.5):
+        error, _ = told_lies(liar, mode=mode)
     assert isinstance(error, WorkerTimeoutError)
     assert time.monotonic() - started < TIMEOUTS["step_s"]
+    liar.reset(options={"mode": "nothing"})

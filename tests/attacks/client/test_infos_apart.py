@@ -69,7 +69,6 @@ LIES: dict[str, Any] = {
 
 @pytest.mark.parametrize("what", LIES)
 def test_infos_of_another_form_are_refused(liar: LyingServer, folder: str, what: str) -> None:
-    """It is the worker's fault, and the error says so."""
     with _single(liar, folder) as env:
         action = env.action_space.sample()
         liar.lies[m.Step] = relayed(_done(LIES[what]))
@@ -77,7 +76,6 @@ def test_infos_of_another_form_are_refused(liar: LyingServer, folder: str, what:
 
 
 def test_a_last_observation_that_is_missing_is_refused(liar: LyingServer, folder: str) -> None:
-    """Where an episode ends in the step that begins the next."""
     with _single(liar, folder, autoreset_mode="SameStep") as env:
         action = env.action_space.sample()
         liar.lies[m.Step] = relayed(_done({0: {"a": 1}}, terminations=np.ones(1, bool)))

@@ -24,12 +24,11 @@ from envhub_sandbox import make_env
 from envhub_sandbox.errors import EnvHubError, RemoteProtocolError, WorkerError, WorkerTimeoutError
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest.manifest import encode_env
-from envhub_worker.protocol.spaces.spaces import MAX_SPACE_DEPTH, encode_space
+from envhub_worker.protocol.spaces.spaces import encode_space
 from tests.attacks.client.lies import (
     ACTIONS,
     MIB,
     Canary,
-    nested,
     opened,
     peak_growth,
     pickled,
@@ -75,7 +74,6 @@ PLACES: dict[str, Callable[[Any], m.Message]] = {
 
 
 def values(evil: Any) -> m.Message:
-    """One for each sub-environment."""
     return m.Value((evil,) * NUM_ENVS)
 
 
@@ -107,7 +105,6 @@ def test_pickles_in_replies_are_never_loaded(
 def test_pickles_in_manifests_are_never_loaded(
     liar: LyingServer, folder: str, tmp_path: Path, name: str
 ) -> None:
-    """Nor in what is said of an environment before it exists."""
     canary = tmp_path / "executed"
     described = manifest()
     evil: Any = Canary(canary)
@@ -156,7 +153,6 @@ WRONG: dict[str, dict[str, Any]] = {
 
 @pytest.mark.parametrize("what", list(WRONG))
 def test_wrong_arrays_are_refused(liar: LyingServer, folder: str, what: str) -> None:
-    """A result that is not what was declared never reaches the caller."""
     liar.lies[m.Step] = relayed(step_done(**WRONG[what]))
     with started(liar, folder) as env:
         error = refuses(lambda: env.step(ACTIONS))
@@ -181,12 +177,10 @@ def observed(space: object) -> dict[str, Any]:
 
 
 def text(longest: int) -> dict[str, Any]:
-    """The description of a Text."""
     return {"kind": "text", "min_length": 0, "max_length": longest, "characters": "ab"}
 
 
 def box(**fields: Any) -> dict[str, Any]:
-    """The description of a Box, changed."""
     return {**encode_space(spaces.Box(-1, 1, (3,), np.float32)), **fields}  # type: ignore[dict-item]
 
 
@@ -203,28 +197,12 @@ def test_a_wide_box_is_accepted() -> None:
     assert decode_space(wide(1), max_elements=ELEMENTS).shape == (WIDE,)
 
 
+# some: test_manifest and test_spaces have all that a description may be
 MANIFESTS: dict[str, Callable[[], dict[str, Any]]] = {
-    "no environments": lambda: {**manifest(), "envs": ()},
-    "a million environments": lambda: {**manifest(), "envs": (None,) * 100_000},
-    "the same task twice": lambda: {**manifest(), "envs": manifest()["envs"] * 2},
-    "other fields": lambda: {**manifest(), "more": 1},
-    "no sub-environments": lambda: changed(num_envs=0),
     "absurdly many sub-environments": lambda: changed(num_envs=2**40),
-    "a negative number of them": lambda: changed(num_envs=-1),
-    "a number that is a flag": lambda: changed(num_envs=True),
-    "an unknown autoreset mode": lambda: changed(autoreset_mode="Sometimes"),
-    "a name of a megabyte": lambda: changed(suite="x" * MIB),
-    "a name of bytes": lambda: changed(suite=b"x"),
     "a name with an escape sequence": lambda: changed(task="\x1b[2J"),
-    "a float for a task": lambda: changed(task=0.5),
-    "attributes that are numbers": lambda: changed(attributes=(1, 2)),
-    "a hundred thousand attributes": lambda: changed(attributes=("a",) * 100_000),
     "an absurd Box": lambda: observed(box(shape=(2**40, 2**20))),
     "a Box just over the limit": lambda: changed(observation_space=box(shape=(200_000_001,))),
-    "a Box of objects": lambda: observed(box(dtype="object")),
-    "a Box of void": lambda: observed(box(dtype="V2000000000")),
-    "a Box of negative shape": lambda: observed(box(shape=(-1,))),
-    "a Box whose bounds do not fit": lambda: observed(box(low=np.zeros(4, np.float32))),
     "an absurd Text": lambda: observed(text(2**62)),
     "a Text that nobody could draw": lambda: observed(text(200_000_000)),
     "a hundred Boxes that would each pass": lambda: {
@@ -234,13 +212,7 @@ MANIFESTS: dict[str, Callable[[], dict[str, Any]]] = {
     "a Box of Boxes that would each pass": lambda: changed(
         observation_space={"kind": "tuple", "spaces": [wide(n) for n in range(100)]}
     ),
-    "an absurd MultiBinary": lambda: observed({"kind": "multi_binary", "n": 2**40}),
-    "an absurd Discrete": lambda: changed(
-        single_action_space={"kind": "discrete", "n": 2**70, "start": 0, "dtype": "int64"}
-    ),
-    "spaces in spaces in spaces": lambda: observed(nested(MAX_SPACE_DEPTH + 1)),
     "an unknown kind of space": lambda: observed({"kind": "os.system"}),
-    "a space that is a name": lambda: observed("os.system"),
 }
 
 
@@ -319,6 +291,7 @@ def test_manifest_that_contradicts_itself_does_no_harm(
         assert len(suites.env.step(suites.env.action_space.sample())) == 5
 
 
+# some: test_codec_hostile and the decoder's bombs have all that a document may be
 DOCUMENTS: dict[str, Callable[[], Frames]] = {
     "nothing": lambda: [b""],
     "noise": lambda: [os.urandom(4096)],
@@ -333,14 +306,7 @@ DOCUMENTS: dict[str, Callable[[], Frames]] = {
         b"\xdd" + struct.pack(">I", 4_000_000) + b"\x80" * 4_000_000
     ),
     "an array that claims four billion": lambda: value(b"\xdd\xff\xff\xff\xff"),
-    "a map that claims four billion": lambda: value(b"\xdf\xff\xff\xff\xff"),
-    "a text that claims four billion": lambda: value(b"\xdb\xff\xff\xff\xff"),
-    "an unknown extension": lambda: packed([m.Value.kind, ext(99, b"x")]),
-    "a timestamp": lambda: value(b"\xd7\xff" + b"\0" * 8),
-    "a key twice": lambda: value(b"\x82\xa1a\x01\xa1a\x02"),
-    "a map for a key": lambda: value(b"\x81\x80\x01"),
     "an array of objects by hand": lambda: packed([m.Value.kind, ext(1, b"|O8")]),
-    "an array of void by hand": lambda: packed([m.Value.kind, ext(1, b"V2000000000")]),
     "an array that is not there": lambda: packed([m.Value.kind, ext(1, b"\x0b\x01" + b"\xff")]),
     "frames that nobody mentioned": lambda: [*m.pack(m.Value(None)), b"x" * 4096],
     "a thousand frames": lambda: [*m.pack(m.Value(None)), *[b"x"] * 5000],
@@ -359,7 +325,9 @@ def test_malformed_answers_are_refused(liar: LyingServer, folder: str, what: str
     assert isinstance(error, RemoteProtocolError)
 
 
-@pytest.mark.parametrize("what", list(DOCUMENTS))
+@pytest.mark.parametrize(
+    "what", ["nothing", "noise", "no message", "a thousand frames", "nested a million deep"]
+)
 def test_malformed_answers_of_the_server_are_refused(
     liar: LyingServer, folder: str, what: str
 ) -> None:
@@ -463,7 +431,6 @@ def test_flood_of_unasked_answers_is_bounded(liar: LyingServer, folder: str) -> 
 def test_parts_that_do_not_add_up_are_refused(
     liar: LyingServer, folder: str, parts: tuple[int, ...]
 ) -> None:
-    """The server's count of frames has to fit what came, and what was asked."""
     frames = m.pack(step_done())
     liar.lies[m.Step] = lambda asked: [
         [*m.pack_header(m.RelayDone(parts), asked.request_id), *frames]

@@ -218,7 +218,6 @@ def templated(thing: Any) -> str:
 def test_notebooks_show_the_clients_own_text(
     liar: LyingServer, folder: str, wrap: Callable[[Any], Any]
 ) -> None:
-    """Neither IPython nor a template gets a word of the worker's."""
     with greedy(liar, folder) as suites:
         env = wrap(suites.env)
         own = getattr(env, HTML)() if isinstance(env, SandboxVectorEnv) else ""
@@ -335,7 +334,6 @@ def test_sub_environments_run_nothing_when_looked_at(liar: LyingServer, folder: 
 def test_sub_environments_take_only_values_and_methods(
     liar: LyingServer, folder: str, lie: m.Message
 ) -> None:
-    """Any other answer breaks the rules."""
     with greedy(liar, folder) as suites:
         liar.lies |= {m.GetOne: relayed(lie), m.CallOne: relayed(lie)}
         sub = suites.env.envs[0]

@@ -151,7 +151,6 @@ class Among:
         env.reset(seed=1)
 
     def receive(self) -> Any:
-        """What is ready first."""
         received = self.env.recv(1)
         self._has_answered |= HOSTILE in received.env_ids
         return received
@@ -195,9 +194,9 @@ def _of_the_hostile(error: EnvHubError) -> EnvHubError:
 
 
 @contextmanager
-def among(arena: Arena, folder: str, lane: str, **options: Any) -> Iterator[Any]:
+def among(strict: Arena, folder: str, lane: str, **options: Any) -> Iterator[Any]:
     """Three sub-environments, each with a worker of its own; the way to them may be TCP."""
-    given = {"min_ready": 1, "policy": {"profile": arena.profile}, **options}
+    given = {"min_ready": 1, "policy": {"profile": strict.profile}, **options}
     with ExitStack() as stack:
         if lane == "tcp":
             with_keys = stack.enter_context(listening(Path(folder).parent / "server"))
@@ -210,17 +209,18 @@ def among(arena: Arena, folder: str, lane: str, **options: Any) -> Iterator[Any]
 
 NEVER = [
     *(("auto", mode) for mode in ("never", "rings", "elsewhere", "twice")),
-    *(("frames", mode) for mode in ("never", "rings", "elsewhere", "never by message")),
+    *(("frames", mode) for mode in ("never", "elsewhere", "never by message")),
     ("tcp", "elsewhere"),
 ]
 
 
 @pytest.mark.short("strict")
 @pytest.mark.parametrize(("lane", "mode"), NEVER)
-def test_who_is_never_ready_holds_nobody_up(arena: Arena, home: Path, lane: str, mode: str) -> None:
-    """The others' results come while it is waited for; then it alone is late."""
+def test_who_is_never_ready_holds_nobody_up(
+    strict: Arena, home: Path, lane: str, mode: str
+) -> None:
     folder = liar(home, mode)
-    with among(arena, folder, lane) as suites:
+    with among(strict, folder, lane) as suites:
         found = Among(suites.env)
         late = found.others_go_on()  # unless they took longer than a step may
         if not late:
@@ -228,15 +228,14 @@ def test_who_is_never_ready_holds_nobody_up(arena: Arena, home: Path, lane: str,
                 found.env.recv(COUNT)
             late = [_of_the_hostile(caught.value)]
         assert [type(one) for one in late] == [WorkerTimeoutError]
-    with among(arena, folder, lane, min_ready=None, num_workers=COUNT) as suites:
+    with among(strict, folder, lane, min_ready=None, num_workers=COUNT) as suites:
         suites.env.reset(seed=1)
-        with pytest.raises(WorkerTimeoutError):
+        with inside.hurried(suites.env, step_s=1.0), pytest.raises(WorkerTimeoutError):
             suites.env.step(np.zeros(COUNT, np.int64))  # the control: it holds up a step of all
 
 
-def test_who_is_always_ready_has_its_own_results_alone(arena: Arena, tmp_path: Path) -> None:
-    """They are its lie; the others' are theirs, and come in time."""
-    with among(arena, liar(tmp_path, "always"), "auto") as suites:
+def test_who_is_always_ready_has_its_own_results_alone(strict: Arena, tmp_path: Path) -> None:
+    with among(strict, liar(tmp_path, "always"), "auto") as suites:
         found = Among(suites.env)
         of_it = found.others_go_on()
         while not of_it:
@@ -255,10 +254,9 @@ BROKEN = [
 @pytest.mark.short("strict")
 @pytest.mark.parametrize(("lane", "mode"), BROKEN)
 def test_who_breaks_a_rule_is_given_up_alone(
-    arena: Arena, tmp_path: Path, lane: str, mode: str
+    strict: Arena, tmp_path: Path, lane: str, mode: str
 ) -> None:
-    """By the client or the server; the others never notice."""
-    with among(arena, liar(tmp_path, mode), lane) as suites:
+    with among(strict, liar(tmp_path, mode), lane) as suites:
         found = Among(suites.env)
         given_up = [one for one in found.others_go_on() if isinstance(one, EnvHubError)]
         deadline = time.monotonic() + 120
@@ -280,13 +278,13 @@ def test_who_breaks_a_rule_is_given_up_alone(
 @pytest.mark.short("strict")
 @pytest.mark.parametrize("word", ["SEQUENCE", "OUTCOME"])
 def test_an_answer_that_is_taken_back_holds_nobody_up(
-    arena: Arena, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, word: str
+    strict: Arena, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, word: str
 ) -> None:
     """It was there, and a jail writes its slab whenever it likes: as if there were none yet, or as
     if there were more elsewhere, which never comes.
     """
     value = {"SEQUENCE": 0, "OUTCOME": slabs.FETCH}[word]
-    with among(arena, liar(tmp_path, "silent elsewhere"), "auto") as suites:
+    with among(strict, liar(tmp_path, "silent elsewhere"), "auto") as suites:
         found = Among(suites.env)
         lane: Any = inside.parts(suites.env)[HOSTILE].lease.lane
         changed = inside.written_later(lane, getattr(slabs, word), value)

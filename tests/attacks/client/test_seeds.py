@@ -33,18 +33,15 @@ def described(space: Any = None) -> dict[str, Any]:
 
 
 def space_of(value: Any) -> dict[str, Any]:
-    """The seeded space in it."""
     found: dict[str, Any] = value["envs"][0]["single_action_space"]
     return found
 
 
 def read(value: object, elements: int = ELEMENTS) -> Manifest:
-    """As the client does it."""
     return decode_manifest(value, max_elements=elements, generator=generator)
 
 
 def state(**fields: Any) -> dict[str, Any]:
-    """A state with other fields."""
     honest = dict(np.random.PCG64(5).state)
     return {**honest, **fields}
 
@@ -65,7 +62,6 @@ LIES: dict[str, Any] = {
 
 
 def test_the_honest_one_is_taken() -> None:
-    """And draws as it says."""
     found = read(described()).envs[0].single_action_space
     assert [found.sample() for _ in range(5)] == [
         drawn.sample() for drawn in [spaces.Discrete(1000, seed=5)] for _ in range(5)
@@ -74,7 +70,6 @@ def test_the_honest_one_is_taken() -> None:
 
 @pytest.mark.parametrize("lie", LIES)
 def test_a_state_that_there_cannot_be_is_refused(lie: str) -> None:
-    """Before anything draws from it."""
     value = described()
     assert space_of(value)["generators"]
     space_of(value)["generators"] = LIES[lie]
@@ -93,7 +88,6 @@ def test_generators_cost_what_spaces_do() -> None:
 
 
 def test_one_inside_of_a_space_is_refused() -> None:
-    """They stand beside the outermost space, and nowhere else."""
     value = described(spaces.Tuple([spaces.Discrete(2, seed=1)]))
     inner = space_of(value)["spaces"][0]
     inner["generators"] = [state()]

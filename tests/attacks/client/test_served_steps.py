@@ -30,7 +30,6 @@ MOST = slabs.INFO_BYTES
 
 
 def head(outcome: int, length: int = 0) -> bytes:
-    """How a step went."""
     return struct.pack("<QQ", outcome, length)
 
 
@@ -61,7 +60,6 @@ LIES = {
 
 @pytest.fixture
 def liar() -> Iterator[LyingServer]:
-    """A server that takes steps."""
     with lying() as made:
         made.lies[m.ShareSlabs] = lambda asked: [asked.answer(m.Done())]
         made.lies[m.Attach] = relayed(m.Value(True))
@@ -97,14 +95,12 @@ def test_what_is_honest_is_read(liar: LyingServer, folder: str) -> None:
 
 @pytest.mark.parametrize("lie", LIES)
 def test_a_lie_is_refused(liar: LyingServer, folder: str, lie: str) -> None:
-    """In bounded memory; nothing of it comes out."""
     liar.lies[m.Relay] = relayed(LIES[lie])
     with started(liar, folder) as env:
         assert isinstance(refuses(lambda: env.step(ACTIONS)), RemoteProtocolError)
 
 
 def test_a_pickle_among_infos_is_not_loaded(liar: LyingServer, folder: str, tmp_path: Path) -> None:
-    """It is decoded by the same suspicious code as a message."""
     canary = Canary(tmp_path / "executed")
     infos = bytes(m.pack(m.Value({"a": canary}), pickler=cloudpickle.dumps)[0])
     liar.lies[m.Relay] = relayed([head(slabs.DONE, len(infos)) + infos + BATCH])
@@ -114,7 +110,6 @@ def test_a_pickle_among_infos_is_not_loaded(liar: LyingServer, folder: str, tmp_
 
 
 def test_more_parts_than_were_asked_are_refused(liar: LyingServer, folder: str) -> None:
-    """One runner was asked."""
     liar.lies[m.Relay] = lambda asked: [
         [*m.pack_header(m.RelayDone((1, 1)), asked.request_id), PLAIN + BATCH, PLAIN + BATCH]
     ]

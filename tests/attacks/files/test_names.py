@@ -85,7 +85,6 @@ def test_a_name_that_windows_reads_as_another_is_refused(
 
 
 def test_ordinary_names_are_names_on_windows() -> None:
-    """What only looks like one of those."""
     for name in ("console.py", "auxiliary/a.txt", "com/x", "a.b.c", ".gitignore", "com10", "nul_"):
         assert platform.wrong_on_windows(name) is None
 
@@ -134,7 +133,6 @@ def test_files_that_differ_in_case_are_kept_apart_where_they_can_be(
     "pair", [("a/x.py", "A/y.py"), ("a", "A/b"), ("\u00e9.py", "e\u0301.py"), ("a/B/c", "a/b")]
 )
 def test_what_clashes_is_found_at_any_depth(pair: tuple[str, str]) -> None:
-    """Folders and files, by case and by Unicode's form."""
     assert platform.taken_as_one(["other", *pair]) is not None
     assert platform.taken_as_one([pair[0], "other", f"{pair[0]}2"]) is None
 

@@ -10,7 +10,7 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import SnapshotError
-from tests.attacks.harness import HOSTILE, USER, Arena, token
+from tests.attacks.harness import HOSTILE, USER, Arena, OpenJail, token
 from tests.attacks.repositories import write_environment
 
 FAMILY = "Reading files"
@@ -34,29 +34,27 @@ def secret_file(path: Path) -> str:
         ("a file next to the snapshot", "projects/notes.txt"),
     ],
 )
-def test_private_files_cannot_be_read(arena: Arena, home: Path, what: str, place: str) -> None:
-    """A file in the caller's home cannot be opened by its path."""
+def test_private_files_cannot_be_read(jail: OpenJail, home: Path, what: str, place: str) -> None:
     secret = secret_file(home / place)
-    arena.steal(f"read {what}", "read_file", secret, path=str(home / place))
+    jail.steal(f"read {what}", "read_file", secret, path=str(home / place))
 
 
 @pytest.mark.parametrize("folder", ["/tmp", "/dev/shm"])
-def test_shared_folders_of_the_host_cannot_be_read(arena: Arena, folder: str) -> None:
-    """A jail's /tmp and /dev/shm are its own."""
+def test_shared_folders_of_the_host_cannot_be_read(jail: OpenJail, folder: str) -> None:
     path = Path(f"{folder}/envhub-attack-{token()}")
     try:
-        arena.steal(f"read a file in {folder}", "read_file", secret_file(path), path=str(path))
+        jail.steal(f"read a file in {folder}", "read_file", secret_file(path), path=str(path))
     finally:
         path.unlink()
 
 
 @pytest.mark.parametrize("way", ["symlink", "hard_link", "proc"])
-def test_detours_lead_nowhere(arena: Arena, home: Path, way: str) -> None:
+def test_detours_lead_nowhere(jail: OpenJail, home: Path, way: str) -> None:
     """A link made at run time, or a way through another process, opens nothing more."""
     secret = secret_file(home / "private")
     more = {"folders": [str(home)]} if way == "hard_link" else {}
     title = f"read a file through a {way.replace('_', ' ')}" + (" entry" if way == "proc" else "")
-    arena.steal(title, f"read_through_{way}", secret, path=str(home / "private"), **more)
+    jail.steal(title, f"read_through_{way}", secret, path=str(home / "private"), **more)
 
 
 def test_links_in_the_repository_do_not_leave_it(arena: Arena, home: Path) -> None:
@@ -73,18 +71,16 @@ def test_links_in_the_repository_do_not_leave_it(arena: Arena, home: Path) -> No
     arena.judge("read through a link in the repository", "succeeds", secret in text, text)
 
 
-def test_folders_cannot_be_listed(arena: Arena, home: Path) -> None:
-    """Names of files are secrets too."""
+def test_folders_cannot_be_listed(jail: OpenJail, home: Path) -> None:
     name = f"name-{token()}"
     (home / name).touch()
-    arena.steal("list the home", "list_folder", name, path=str(home))
+    jail.steal("list the home", "list_folder", name, path=str(home))
 
 
-def test_files_cannot_be_probed_for(arena: Arena, home: Path) -> None:
-    """Whether a file is there, and how large it is, needs no right to open it."""
+def test_files_cannot_be_probed_for(jail: OpenJail, home: Path) -> None:
     size = 100_000 + int(token()[:4], 16)
     (home / "model.bin").write_bytes(b"x" * size)
-    arena.attack(
+    jail.attack(
         "learn that a file exists, and its size",
         "stat_file",
         lambda run: run.value == size,
@@ -92,11 +88,11 @@ def test_files_cannot_be_probed_for(arena: Arena, home: Path) -> None:
     )
 
 
-def test_files_cannot_be_opened_by_handle(arena: Arena, home: Path) -> None:
+def test_files_cannot_be_opened_by_handle(jail: OpenJail, home: Path) -> None:
     """A file handle goes around paths, mounts and chroots; only root's capability opens one."""
     secret = secret_file(home / "private")
     handle, kind = file_handle(home / "private")
-    arena.steal(
+    jail.steal(
         "open a file by its handle",
         "read_by_handle",
         secret,

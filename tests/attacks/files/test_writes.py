@@ -12,7 +12,17 @@ import pytest
 
 from envhub_sandbox.hub import snapshot
 from envhub_sandbox.system.folders import cache_root
-from tests.attacks.harness import HOSTILE, USER, Arena, Run, call, control_run, run_in, token
+from tests.attacks.harness import (
+    HOSTILE,
+    USER,
+    Arena,
+    OpenJail,
+    Run,
+    call,
+    control_run,
+    run_in,
+    token,
+)
 
 FAMILY = "Changing files"
 
@@ -38,11 +48,12 @@ def open_file(path: Path, text: str) -> Path:
         ("/dev/shm", "/dev/shm/envhub-attack-{token}"),  # a jail has its own
     ],
 )
-def test_files_outside_cannot_be_written(arena: Arena, home: Path, title: str, place: str) -> None:
-    """Appending, replacing, truncating: the bytes stay what they were."""
+def test_files_outside_cannot_be_written(
+    jail: OpenJail, home: Path, title: str, place: str
+) -> None:
     path = home / place.format(token=token())
     try:
-        arena.attack(
+        jail.attack(
             f"write into {title}",
             "write_file",
             lambda run: path.read_text() != "as it was",
@@ -65,14 +76,16 @@ def test_files_outside_cannot_be_written(arena: Arena, home: Path, title: str, p
         ("the store of snapshots", "{cache}/snapshots/planted"),
     ],
 )
-def test_files_outside_cannot_be_created(arena: Arena, home: Path, title: str, folder: str) -> None:
+def test_files_outside_cannot_be_created(
+    jail: OpenJail, home: Path, title: str, folder: str
+) -> None:
     """No new file appears in a folder that everybody may write, nor in our own caches."""
     place = Path(folder.format(home=home, cache=cache_root()))
     ours = not place.exists()
     place.mkdir(parents=True, exist_ok=True)
     path, sticky = place / f"planted-{token()}", place.stat().st_mode & stat.S_ISVTX
     try:
-        arena.attack(
+        jail.attack(
             f"create a file in {title}",
             "create_file",
             lambda run: path.exists(),
@@ -94,8 +107,7 @@ def stored(folder: Path) -> Path:
     return snapshot.local(str(folder)).root / "env.py"
 
 
-def test_other_snapshots_cannot_be_written(arena: Arena, home: Path) -> None:
-    """What was verified for another repository stays as it was."""
+def test_other_snapshots_cannot_be_written(jail: OpenJail, home: Path) -> None:
     outer, inner = stored(home / "outer"), stored(home / "inner")
     was = {path: path.read_text() for path in (outer, inner)}
 
@@ -103,7 +115,7 @@ def test_other_snapshots_cannot_be_written(arena: Arena, home: Path) -> None:
         path = inner if run.inside else outer
         return path.read_text() != was[path]
 
-    arena.attack(
+    jail.attack(
         "write into another repository's snapshot",
         "write_file",
         changed,
@@ -113,10 +125,9 @@ def test_other_snapshots_cannot_be_written(arena: Arena, home: Path) -> None:
     )
 
 
-def test_other_snapshots_cannot_be_read(arena: Arena, home: Path) -> None:
-    """A repository may be private: the others do not see it."""
+def test_other_snapshots_cannot_be_read(jail: OpenJail, home: Path) -> None:
     path = stored(home / "private")
-    arena.steal("read another repository's snapshot", "read_file", path.read_text(), path=str(path))
+    jail.steal("read another repository's snapshot", "read_file", path.read_text(), path=str(path))
 
 
 @pytest.mark.parametrize("payload", ["write_file", "delete_file", "rename_file", "create_file"])
@@ -162,9 +173,8 @@ def fingerprint(tree: Path) -> dict[Path, tuple[bytes, int]]:
     ],
 )
 def test_files_outside_cannot_be_altered(
-    arena: Arena, home: Path, title: str, payload: str, changed: Callable[[Path], bool]
+    jail: OpenJail, home: Path, title: str, payload: str, changed: Callable[[Path], bool]
 ) -> None:
-    """What Landlock leaves open (modes, times, attributes) is closed as well."""
     path = home / "file"
 
     def prepare() -> None:
@@ -173,7 +183,7 @@ def test_files_outside_cannot_be_altered(
         with contextlib.suppress(OSError):
             os.removexattr(path, "user.attack")
 
-    arena.attack(
+    jail.attack(
         f"{title} outside",
         payload,
         lambda run: changed(path),
@@ -182,12 +192,12 @@ def test_files_outside_cannot_be_altered(
     )
 
 
-def test_owner_of_files_outside_cannot_be_changed(arena: Arena, home: Path) -> None:
+def test_owner_of_files_outside_cannot_be_changed(jail: OpenJail, home: Path) -> None:
     """chown leaves a file's group alone; a plain user needs a second group to show it."""
     path = home / "file"
     others = [group for group in os.getgroups() if group != os.getgid()]
     gid = 65533 if USER == "root" else (others or [0])[0]
-    arena.attack(
+    jail.attack(
         "chown a file outside",
         "change_owner",
         lambda run: path.stat().st_gid == gid,
@@ -198,10 +208,10 @@ def test_owner_of_files_outside_cannot_be_changed(arena: Arena, home: Path) -> N
     )
 
 
-def test_scratch_of_another_jail_is_closed(arena: Arena) -> None:
+def test_scratch_of_another_jail_is_closed(jail: OpenJail) -> None:
     """A jail neither reads nor changes what another one keeps in its temporary files."""
     secret = token()
-    with arena.environment() as victim:
+    with jail.arena.environment() as victim:
         owner = run_in(victim, "plant", text=secret)
         [pid] = owner.pids()
         outer = Path(f"/proc/{pid}/root{owner.value}")
@@ -210,7 +220,7 @@ def test_scratch_of_another_jail_is_closed(arena: Arena) -> None:
         def raided(run: Run) -> bool:
             return secret in run.text or outer.read_text() != secret
 
-        arena.attack(
+        jail.attack(
             "read and write another jail's scratch",
             "raid",
             raided,

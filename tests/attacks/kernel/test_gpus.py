@@ -43,7 +43,10 @@ def attempt(profile: str) -> tuple[Mapping[str, Any], dict[str, str], str]:
 
 
 def test_a_jail_has_the_gpus_that_it_was_given(arena: Arena) -> None:
-    """Their nodes and their own folders of /sys; no other GPU, and no name of a network device."""
+    """Their nodes and their own folders of /sys; no other GPU, and no name of a network device.
+
+    What nobody counts is in the report; and a GPU that is not there is refused with those that are.
+    """
     found, words, net = attempt(arena.profile)
     outside, inside = found["outside"], found["inside"]
     assert inside, found["error"]
@@ -68,11 +71,6 @@ def test_a_jail_has_the_gpus_that_it_was_given(arena: Arena) -> None:
     arena.judge(title, "succeeds", f"vendor of {OTHER}" in json.dumps(inside), "")
     title = "with gpu=[0]: map /dev/zero, which is memory in no account"
     arena.judge(title, "succeeds", inside["zeros"] == "mapped", "", judged=ANSWER)
-
-
-def test_what_nobody_counts_is_in_the_report(arena: Arena) -> None:
-    """With a GPU it is more; and a GPU that is not there is refused with those that are."""
-    found, *_ = attempt(arena.profile)
     [memory] = [layer["detail"] for layer in found["report"] if layer["layer"] == "memory"]
     assert "not counted: file locks, memory of the GPU's driver" in memory
     if "measured by" in memory:

@@ -11,24 +11,21 @@ from pathlib import Path
 import psutil
 import pytest
 
-from tests.attacks.harness import ANSWER, USER, Arena, Run, control_run, new_alias, pids_named
+from tests.attacks.harness import (
+    ANSWER,
+    USER,
+    Arena,
+    OpenJail,
+    Run,
+    control_run,
+    new_alias,
+    pids_named,
+)
 from tests.support.processes import eventually
 
 FAMILY = "The kernel"
 
 Look = Callable[[int, int], object]
-
-
-def child_differs(arena: Arena, title: str, payload: str, look: Look, **arguments: object) -> None:
-    """Attack in a child; ``look(child, parent)`` says whether it got what it wanted."""
-    child = new_alias()
-
-    def got(run: Run) -> bool:
-        # a child that was forked by hand takes its name a moment later
-        eventually(lambda: bool(pids_named(child)), 0.5 if run.inside else 60.0)
-        return any(look(pid, parent) for pid in pids_named(child) for parent in run.pids())
-
-    arena.attack(title, payload, got, before=lambda: end(child), alias=child, **arguments)
 
 
 def end(alias: str) -> None:
@@ -42,7 +39,6 @@ def user_namespace(pid: int) -> str:
 
 
 def mounts(pid: int) -> list[str]:
-    """A process's mounts."""
     return Path(f"/proc/{pid}/mountinfo").read_text().splitlines()
 
 
@@ -53,7 +49,6 @@ def root_options(pid: int) -> set[str]:
 
 
 def root_of(pid: int) -> tuple[int, int]:
-    """Which folder is a process's root."""
     status = os.stat(f"/proc/{pid}/root")
     return status.st_dev, status.st_ino
 
@@ -81,20 +76,26 @@ CHILDREN: dict[str, tuple[str, dict[str, str], Look]] = {
 
 @pytest.mark.short("strict-user", "strict-mount")
 @pytest.mark.parametrize("title", CHILDREN)
-def test_no_child_has_other_namespaces_mounts_or_roots(arena: Arena, title: str) -> None:
+def test_no_child_has_other_namespaces_mounts_or_roots(jail: OpenJail, title: str) -> None:
     """No process of a jail leaves its user namespace, and none of its mounts can be changed."""
     payload, arguments, look = CHILDREN[title]
-    child_differs(arena, title, payload, look, **arguments)
+    child = new_alias()
+
+    def got(run: Run) -> bool:
+        # a child that was forked by hand takes its name a moment later
+        eventually(lambda: bool(pids_named(child)), 0.5 if run.inside else 60.0)
+        return any(look(pid, parent) for pid in pids_named(child) for parent in run.pids())
+
+    jail.attack(title, payload, got, before=lambda: end(child), alias=child, **arguments)
 
 
-def test_other_namespaces_cannot_be_entered(arena: Arena) -> None:
-    """setns into the client's namespaces fails, by /proc and by pidfd."""
+def test_other_namespaces_cannot_be_entered(jail: OpenJail) -> None:
     child = new_alias()
     with control_run("user_namespace", {"alias": child}):
         [elsewhere] = pids_named(child)
         assert user_namespace(elsewhere) != user_namespace(os.getpid())
         joined = new_alias()
-        arena.attack(
+        jail.attack(
             "setns into the client's namespaces",
             "enter_namespaces",
             lambda run: any(
@@ -119,9 +120,7 @@ OBJECTS = {
 
 
 @pytest.mark.parametrize("kind", list(OBJECTS))
-def test_kernel_objects_cannot_be_made(arena: Arena, kind: str) -> None:
-    """No descriptor of the kernel's larger machines appears among a jail's."""
-
+def test_kernel_objects_cannot_be_made(jail: OpenJail, kind: str) -> None:
     def has_it(run: Run) -> bool:
         return any(
             OBJECTS[kind] in os.readlink(f"/proc/{pid}/fd/{fd}")
@@ -131,7 +130,7 @@ def test_kernel_objects_cannot_be_made(arena: Arena, kind: str) -> None:
 
     with control_run("kernel_object", {"kind": kind}) as probe:
         why = probe.error.strip().rpartition("\n")[2]
-    arena.attack(f"make: {kind}", "kernel_object", has_it, kind=kind, impossible=why)
+    jail.attack(f"make: {kind}", "kernel_object", has_it, kind=kind, impossible=why)
 
 
 # Harmless even for root: every argument is a descriptor or a pointer that leads nowhere, or a
@@ -216,7 +215,7 @@ WITHOUT_EFFECT = ("readahead", "sync_file_range", "utime")
 """Said to have worked: the kernel, which is not asked, finds nothing there."""
 
 
-def test_rare_calls_do_not_reach_the_kernel(arena: Arena) -> None:
+def test_rare_calls_do_not_reach_the_kernel(jail: OpenJail) -> None:
     """What a program of this kind never calls is answered by the filter: EPERM, ENOSYS, or success.
 
     These calls leave no trace outside, so their answers have to do: outside, the kernel looks at
@@ -224,7 +223,7 @@ def test_rare_calls_do_not_reach_the_kernel(arena: Arena) -> None:
     """
     with control_run("answers", {"calls": CALLS}) as run:
         outside = run.value
-    with arena.inside("answers", {"calls": CALLS}) as run:
+    with jail.inside("answers", {"calls": CALLS}) as run:
         inside = run.value
     assert outside, "the control never answered"
     assert inside, run.error
@@ -236,7 +235,7 @@ def test_rare_calls_do_not_reach_the_kernel(arena: Arena) -> None:
         try:
             answers = ("0",) if name in WITHOUT_EFFECT else UNREACHED
             reached = inside[name] not in answers
-            arena.judge(f"call {name}", control, reached, inside[name], note, ANSWER)
+            jail.judge(f"call {name}", control, reached, inside[name], note, ANSWER)
         except AssertionError as error:
             failures.append(str(error))
     assert not failures, failures
@@ -255,12 +254,12 @@ def most_filters(run: Run) -> int:
 
 
 @pytest.mark.parametrize("way", ["prctl", "seccomp"])
-def test_system_call_filters_cannot_be_stacked(arena: Arena, way: str) -> None:
+def test_system_call_filters_cannot_be_stacked(jail: OpenJail, way: str) -> None:
     """Each is up to 4096 instructions of the kernel's memory, which no process's account shows."""
-    with arena.inside("where_am_i", {}) as run:
+    with jail.inside("where_am_i", {}) as run:
         ours = most_filters(run)
     assert ours, "this kernel does not count them"
-    arena.attack(
+    jail.attack(
         f"stack system call filters: {way}",
         "stack_filters",
         lambda run: most_filters(run) > ours + 2,
@@ -287,15 +286,13 @@ def test_other_numbering_schemes_are_closed(arena: Arena, abi: str) -> None:
     )
 
 
-def test_setuid_programs_gain_nothing(arena: Arena) -> None:
-    """su runs as whoever called it."""
+def test_setuid_programs_gain_nothing(jail: OpenJail) -> None:
     uid = None if USER == "user" else 65533
     arguments = {"command": ["/usr/bin/su", "-c", "true"], "uid": uid, "inside": {"uid": None}}
-    arena.attack("run a set-user-id program (su)", "setuid_program", became_root, **arguments)
+    jail.attack("run a set-user-id program (su)", "setuid_program", became_root, **arguments)
 
 
 def test_setuid_copies_gain_nothing(arena: Arena, home: Path) -> None:
-    """Nor does a program of root's in a folder that was granted."""
     program = home / "granted" / "sleep"
     program.parent.mkdir()
     shutil.copy("/bin/sleep", program)

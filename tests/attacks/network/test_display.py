@@ -15,7 +15,7 @@ from envhub_sandbox import make_env
 from envhub_sandbox.errors import LoadError, SandboxUnavailableError
 from tests.attacks.harness import Arena, OpenJail
 from tests.attacks.network.listeners import listening, sends
-from tests.support.interpreter import needs, profiles
+from tests.support.interpreter import needs
 from tests.support.repositories import STILL, write_repository
 
 FAMILY = "Network"
@@ -62,15 +62,14 @@ def hosts_display() -> Iterator[tuple[int, Any, Any]]:
 
 
 @_NEEDED
-@pytest.mark.parametrize("arena", profiles("strict"), indirect=True)
-def test_the_hosts_display_is_not_there(arena: Arena) -> None:
+def test_the_hosts_display_is_not_there(strict: Arena) -> None:
     """Neither its socket file nor its abstract socket, with the network of its own and none."""
     for network in ("none", "loopback"):
         with (
             hosts_display() as (_, named, abstract),
-            arena.environment({**DISPLAY, "network": network}) as env,
+            strict.environment({**DISPLAY, "network": network}) as env,
         ):
-            jail = OpenJail(arena, env, f'with display="virtual", network="{network}": ')
+            jail = OpenJail(strict, env, f'with display="virtual", network="{network}": ')
             sends(jail, "the host's display, by its file", "unix_stream", named)
             sends(jail, "the host's display, by its abstract name", "unix_stream", abstract)
 
@@ -109,7 +108,6 @@ def unix_names() -> set[str]:
 
 @needs("strict")
 def test_without_xvfb_the_error_says_so(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Before anything of the repository runs."""
     folder = write_repository(tmp_path / "repo", WINDOWS)
     monkeypatch.setenv("PATH", "/nowhere")
     with pytest.raises(SandboxUnavailableError, match="needs Xvfb, which is not installed"):
@@ -117,7 +115,6 @@ def test_without_xvfb_the_error_says_so(tmp_path: Path, monkeypatch: pytest.Monk
 
 
 def test_a_window_without_a_display_names_the_option(tmp_path: Path) -> None:
-    """And a display that a weaker profile cannot have is refused."""
     folder = write_repository(tmp_path / "repo", WINDOWS)
     with pytest.raises(SandboxUnavailableError, match="permits no socket files"):
         make_env(str(folder), policy={**DISPLAY, "profile": "no-userns"})

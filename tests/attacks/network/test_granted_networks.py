@@ -12,8 +12,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import pytest
-
 from envhub_sandbox.sandboxes.process import PROCESS
 from envhub_sandbox.system.folders import cache_root
 from tests.attacks.harness import USER, Arena, OpenJail, control_run, run_in, token
@@ -27,7 +25,6 @@ from tests.attacks.network.listeners import (
     network_addresses,
     sends,
 )
-from tests.support.interpreter import profiles
 
 FAMILY = "Network"
 
@@ -44,11 +41,10 @@ def with_loopback(arena: Arena, port: int = 0) -> Iterator[tuple[Any, int]]:
         yield env, int(run.value)
 
 
-@pytest.mark.parametrize("arena", profiles("strict"), indirect=True)
-def test_its_own_loopback_is_not_the_hosts(arena: Arena) -> None:
+def test_its_own_loopback_is_not_the_hosts(strict: Arena) -> None:
     """What listens on the host's loopback device hears nothing, over no protocol."""
-    with with_loopback(arena) as (env, _):
-        jail = OpenJail(arena, env, 'with network="loopback": ')
+    with with_loopback(strict) as (env, _):
+        jail = OpenJail(strict, env, 'with network="loopback": ')
         for what, payload, options in (
             ("TCP", "tcp", TCP),
             ("UDP", "udp", UDP),
@@ -60,8 +56,7 @@ def test_its_own_loopback_is_not_the_hosts(arena: Arena) -> None:
                 sends(jail, what, payload, listener)
 
 
-@pytest.mark.parametrize("arena", profiles("strict"), indirect=True)
-def test_its_own_loopback_is_not_another_jails(arena: Arena) -> None:
+def test_its_own_loopback_is_not_another_jails(strict: Arena) -> None:
     """A jail listens on a port, and so does the host: each hears only itself.
 
     The host is the first: which of its ports are free, no jail knows.
@@ -69,19 +64,18 @@ def test_its_own_loopback_is_not_another_jails(arena: Arena) -> None:
     title, message = 'with network="loopback": TCP to another jail', token()
     with (
         listening(**TCP) as outside,
-        with_loopback(arena, outside.port) as (other, port),
-        with_loopback(arena) as (env, _),
+        with_loopback(strict, outside.port) as (other, port),
+        with_loopback(strict) as (env, _),
     ):
         with control_run("tcp", {"host": "127.0.0.1", "port": port, "message": message}) as control:
             assert outside.heard(message, wait=True), control.text
         run = run_in(env, "tcp", host="127.0.0.1", port=port, message=message)
         heard = run_in(other, "listen", port=None, message="")
         assert not heard.error
-        arena.judge(title, "succeeds", message in heard.text, run.text)
+        strict.judge(title, "succeeds", message in heard.text, run.text)
 
 
-@pytest.mark.parametrize("arena", profiles("strict"), indirect=True)
-def test_nothing_is_served_from_its_own_loopback(arena: Arena) -> None:
+def test_nothing_is_served_from_its_own_loopback(strict: Arena) -> None:
     """The caller finds none of a jail's ports on the host: it cannot pose as a service there."""
 
     def reached(port: int) -> bool:
@@ -93,13 +87,16 @@ def test_nothing_is_served_from_its_own_loopback(arena: Arena) -> None:
         assert reached(control.value), control.text
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))  # and so nobody else on the host comes to listen there
-        with with_loopback(arena, taken.getsockname()[1]) as (_, port):
+        with with_loopback(strict, taken.getsockname()[1]) as (_, port):
             title = 'with network="loopback": serve on a port of the host'
-            arena.judge(title, "succeeds", reached(port), "nobody listens there")
+            strict.judge(title, "succeeds", reached(port), "nobody listens there")
 
 
 def test_the_hosts_network_is_no_more_than_tcp_and_udp(arena: Arena, home: Path) -> None:
-    """Both arrive, since they were granted. Other protocols and socket files do not."""
+    """Both arrive, since they were granted. Other protocols and socket files do not.
+
+    Netlink stays shut, too: no routes, neighbours, or rules of a firewall are asked for.
+    """
     path = home / "service.sock"
     with arena.environment({"network": "host"}) as env:
         granted(env, "tcp", TCP)
@@ -116,6 +113,13 @@ def test_the_hosts_network_is_no_more_than_tcp_and_udp(arena: Arena, home: Path)
                 if path.exists():
                     path.chmod(0o777)
                 sends(jail, what, payload, listener)
+        macs = network_addresses()
+        jail.attack(
+            "list devices over netlink",
+            "netlink_routes",
+            lambda run: any(mac in run.text for mac in macs),
+            impossible="" if macs else "this host has no network device besides lo",
+        )
 
 
 def granted(env: Any, payload: str, options: dict[str, Any]) -> None:
@@ -143,15 +147,3 @@ def test_servers_sockets_are_not_part_of_the_hosts_network(arena: Arena) -> None
     finally:
         server.folder.chmod(0o700)
         use.release()
-
-
-def test_addresses_are_not_listed_over_netlink_with_the_hosts_network(arena: Arena) -> None:
-    """Netlink stays shut: no routes, neighbours, or rules of a firewall are asked for."""
-    macs = network_addresses()
-    arena.attack(
-        'with network="host": list devices over netlink',
-        "netlink_routes",
-        lambda run: any(mac in run.text for mac in macs),
-        policy={"network": "host"},
-        impossible="" if macs else "this host has no network device besides lo",
-    )

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.attacks.harness import USER, Arena, token
+from tests.attacks.harness import USER, Arena, OpenJail, token
 from tests.attacks.network.listeners import listening, sends
 
 FAMILY = "AF_UNIX sockets"
@@ -23,16 +23,15 @@ FAMILY = "AF_UNIX sockets"
     ],
 )
 def test_socket_files_cannot_be_connected_to(
-    arena: Arena, home: Path, title: str, place: str
+    jail: OpenJail, home: Path, title: str, place: str
 ) -> None:
-    """A stream socket at a path, wherever it is and whoever may write to it."""
     path = Path(place.format(run=run_folder(), tmp=f"/tmp/ssh-{token()[:8]}", home=home))
     path.parent.mkdir(exist_ok=True)
     try:
         with listening(socket.AF_UNIX, socket.SOCK_STREAM, str(path)) as listener:
             path.parent.chmod(0o755)
             path.chmod(0o777)
-            sends(arena, f"connect to {title}", "unix_stream", listener)
+            sends(jail, f"connect to {title}", "unix_stream", listener)
     finally:
         path.unlink()
         if path.parent != home:
@@ -47,25 +46,24 @@ def run_folder() -> Path:
     return Path("/run" if USER == "root" else "/var/tmp") / f"envhub-{token()[:8]}"
 
 
-@pytest.mark.parametrize(
-    ("title", "payload", "policy"),
-    [
-        ("connect to an abstract socket", "unix_stream", {}),
-        ("datagram to an abstract socket", "unix_datagram", {}),
-        # who grants the network grants TCP and UDP, and no service that has only a name
-        *(
-            (f"reach an abstract socket on the host's network: {one}", one, {"network": "host"})
-            for one in ("unix_stream", "unix_datagram")
-        ),
-    ],
-)
-def test_abstract_sockets_cannot_be_reached(
-    arena: Arena, title: str, payload: str, policy: dict[str, str]
-) -> None:
-    """A socket that has a name and no file."""
+def send_to_an_abstract_socket(jail: OpenJail, title: str, payload: str) -> None:
+    """Attack a socket that has a name and no file."""
     kind = socket.SOCK_STREAM if payload == "unix_stream" else socket.SOCK_DGRAM
     with listening(socket.AF_UNIX, kind, f"\0envhub-{token()}") as listener:
-        sends(arena, title, payload, listener, policy=policy)
+        sends(jail, title, payload, listener)
+
+
+def test_abstract_sockets_cannot_be_reached(jail: OpenJail) -> None:
+    send_to_an_abstract_socket(jail, "connect to an abstract socket", "unix_stream")
+    send_to_an_abstract_socket(jail, "datagram to an abstract socket", "unix_datagram")
+
+
+def test_abstract_sockets_are_not_part_of_the_hosts_network(arena: Arena) -> None:
+    """Who grants the network grants TCP and UDP, and no service that has only a name."""
+    with arena.environment({"network": "host"}) as env:
+        jail = OpenJail(arena, env, "reach an abstract socket on the host's network: ")
+        for payload in ("unix_stream", "unix_datagram"):
+            send_to_an_abstract_socket(jail, payload, payload)
 
 
 @pytest.mark.parametrize(
@@ -75,9 +73,8 @@ def test_abstract_sockets_cannot_be_reached(
         ("datagram to a socket file, from a socket pair", "unix_datagram_of_a_pair"),
     ],
 )
-def test_datagrams_do_not_arrive(arena: Arena, home: Path, title: str, payload: str) -> None:
-    """The system's log and its like take datagrams from anybody."""
+def test_datagrams_do_not_arrive(jail: OpenJail, home: Path, title: str, payload: str) -> None:
     path = home / "log"
     with listening(socket.AF_UNIX, socket.SOCK_DGRAM, str(path)) as listener:
         path.chmod(0o777)
-        sends(arena, title, payload, listener)
+        sends(jail, title, payload, listener)

@@ -71,7 +71,6 @@ def lies(form: str) -> list[str]:
 
 @pytest.mark.parametrize("form", ["text", "json"])
 def test_no_name_ends_a_line(form: str) -> None:
-    """The twin's log is forged by the same values."""
     control = "\n".join(naively("jail_died", client="x", environment=lie) for lie in lies(form))
     assert forged(control, form)
     assert "\x1b" in control
@@ -84,9 +83,9 @@ def test_no_name_ends_a_line(form: str) -> None:
     assert not forged("\n".join(written), form)
 
 
-@pytest.mark.parametrize("form", ["text", "json"])
-def test_a_hostile_client_and_its_environment_forge_nothing(tmp_path: Path, form: str) -> None:
+def test_a_hostile_client_and_its_environment_forge_nothing(tmp_path: Path) -> None:
     """By the client's name in the list, what it asks for, and what its environment writes."""
+    form = "text"
     assert forged(naively("jail_died", client=lies(form)[0]), form)
     listed, code = tmp_path / "clients", ENVIRONMENT.format(forged=list(FORGED.values())).encode()
     name = "mallory\x1b[2K\x1b[1G" + '" client=admin x="'
@@ -97,8 +96,9 @@ def test_a_hostile_client_and_its_environment_forge_nothing(tmp_path: Path, form
             mallory.ask(m.Hello(m.VERSION, b"\n" + FORGED[form].encode()[:40])), m.Welcome
         )
         snapshot = brought(mallory, code)
+        died_in(mallory, server, lies(form)[0], snapshot)
+        died_in(mallory, server, lies(form)[-1], snapshot)
         for lie in lies(form):
-            died_in(mallory, server, lie, snapshot)
             mallory.refused(m.OpenJail("x", "", "", snapshot, lie, asdict(Confinement()), 1))
             mallory.refused(m.OpenJail("x", "", "", lie, "env.py", asdict(Confinement()), 1))
             weak = {**asdict(Confinement()), "profile": lie}

@@ -123,7 +123,6 @@ def _with(said: Any) -> Callable[[Asked], list[Frames]]:
 
 
 def test_two_in_front_of_one_reply_are_refused(tmp_path: Path) -> None:
-    """As many frames as one likes are no reply."""
     folder = write_repository(tmp_path / "repository", f"# {tmp_path}")
     front = m.pack(m.Warnings((("UserWarning", "x"),)))
     with lying() as liar:

@@ -25,45 +25,38 @@ from tests.support.processes import eventually
 FAMILY = "Sources that are built"
 _CONTROL_S = 120.0
 
-LOOT = """
-def further():
-    import os
-    found = [repr(dict(os.environ))]
-    for path in {paths!r}:
-        try:
-            found.append(open(path, errors="replace").read())
-        except OSError as error:
-            found.append(str(error))
-    return {{"hostile/loot.txt": "\\n".join(found)}}
-"""
-CALL = """
-def further():
-    import socket
+ATTACK = """
+def attempt(work):
     try:
-        with socket.create_connection(("127.0.0.1", {port}), 10) as peer:
-            peer.sendall({secret!r}.encode())
-    except OSError:
-        pass
-    return {{}}
-"""
-WRITE = """
+        return work()
+    except OSError as error:
+        return str(error)
+
+def tell(port, secret):
+    with socket.create_connection(("127.0.0.1", port), 10) as peer:
+        peer.sendall(secret.encode())
+
+def write(path):
+    os.makedirs(os.path.dirname(path), exist_ok=True)
+    open(path, "w").write("hostile")
+
 def further():
-    import os
-    for path in {paths!r}:
-        try:
-            os.makedirs(os.path.dirname(path), exist_ok=True)
-            open(path, "w").write("hostile")
-        except OSError:
-            pass
-    return {{}}
+    found = [repr(dict(os.environ))]
+    found += [attempt(lambda: open(path, errors="replace").read()) for path in {read!r}]
+    attempt(lambda: tell({port}, {secret!r}))
+    for path in {written!r}:
+        attempt(lambda: write(path))
+    return {{"hostile/loot.txt": "\\n".join(found)}}
+
+import os, socket
 """
-SPIN = """
+ENDLESS = """
 def further():
-    import ctypes, os
+    import ctypes, os, time
     ctypes.CDLL(None).prctl(15, {alias!r}.encode())
     os.fork()
     while True:
-        pass
+        time.sleep(1)
 """
 
 
@@ -98,71 +91,52 @@ def built(folder: Path, files: dict[str, str]) -> tuple[Path | None, str]:
     return wheel, ""
 
 
-def read(wheel: Path | None) -> str:
-    """All texts of a wheel."""
-    if wheel is None:
-        return ""
+def text_of(wheel: Path) -> str:
     with zipfile.ZipFile(wheel) as archive:
         return "\n".join(archive.read(name).decode() for name in archive.namelist())
 
 
-def test_the_token(
-    arena: Arena, home: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_what_a_build_reads_tells_and_writes(
+    arena: Arena, home: Path, other_cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is neither among the variables, nor in a file, nor in another process's."""
-    secrets = [token(), token()]
-    monkeypatch.setenv("HF_TOKEN", secrets[0])
+    """No token, be it a variable, in a file or in another process's; no network; no cache."""
+    secrets = {"a variable": token(), "the Hub's file": token()}
+    monkeypatch.setenv("HF_TOKEN", secrets["a variable"])
     file = home / ".cache" / "huggingface" / "token"
     file.parent.mkdir(parents=True)
-    file.write_text(secrets[1])
-    paths = [str(file), "/proc/1/environ", *(f"/proc/{n}/environ" for n in range(2, 50))]
-    files = backend("hostile", further=LOOT.format(paths=paths))
-    stolen = read(control(tmp_path, files) / "hostile-1.0-py3-none-any.whl")
-    assert all(secret in stolen for secret in secrets), "the control failed"
-    wheel, why = built(tmp_path, files)
-    assert wheel is not None, why
-    for secret, title in zip(secrets, ("a variable", "the Hub's file"), strict=True):
-        arena.judge(f"read the token: {title}", "succeeds", secret in read(wheel), why)
-
-
-def test_the_network(arena: Arena, tmp_path: Path) -> None:
-    """Nothing answers, not even on loopback."""
+    file.write_text(secrets["the Hub's file"])
+    read = [str(file), "/proc/1/environ", *(f"/proc/{n}/environ" for n in range(2, 50))]
+    places = [other_cache / name / "hostile" / "x" for name in ("wheels", "environments")]
+    words = {name: token() for name in ("control", "inside")}
     with listening(**TCP) as listener:
-        words = {name: token() for name in ("control", "inside")}
+        aims = {"port": listener.port, "read": read, "written": list(map(str, places))}
         sources = {
-            name: backend("hostile", further=CALL.format(port=listener.port, secret=word))
+            name: backend("hostile", further=ATTACK.format(secret=word, **aims))
             for name, word in words.items()
         }
-        control(tmp_path, sources["control"])
+        stolen = text_of(control(tmp_path, sources["control"]) / "hostile-1.0-py3-none-any.whl")
+        assert all(secret in stolen for secret in secrets.values()), "the control failed"
+        assert listener.heard(words["control"], wait=True), "the control failed"
+        assert all(place.exists() for place in places), "the control failed"
+        for place in places:
+            place.unlink()
+            place.parent.rmdir()
+            place.parent.parent.rmdir()
         wheel, why = built(tmp_path, sources["inside"])
         assert wheel is not None, why
-        assert listener.heard(words["control"], wait=True), "the control failed"
-        through = listener.heard(words["inside"], wait=False)
-        arena.judge("reach the network while it is built", "succeeds", through, "")
-
-
-def test_the_cache(arena: Arena, other_cache: Path, tmp_path: Path) -> None:
-    """Neither wheels nor environments nor snapshots of others can be written."""
-    places = [other_cache / name / "hostile" / "x" for name in ("wheels", "environments")]
-    files = backend("hostile", further=WRITE.format(paths=list(map(str, places))))
-    control(tmp_path, files)
-    assert all(place.exists() for place in places), "the control failed"
-    for place in places:
-        place.unlink()
-        place.parent.rmdir()
-        place.parent.parent.rmdir()
-    wheel, why = built(tmp_path, files)
-    assert wheel is not None, why
-    through = any(place.exists() for place in places)
-    arena.judge("write into another package's cache", "succeeds", through, "")
+        heard = listener.heard(words["inside"], wait=False)
+    for title, secret in secrets.items():
+        arena.judge(f"read the token: {title}", "succeeds", secret in text_of(wheel), why)
+    arena.judge("reach the network while it is built", "succeeds", heard, "")
+    written = any(place.exists() for place in places)
+    arena.judge("write into another package's cache", "succeeds", written, "")
 
 
 def test_a_build_that_never_ends(
     arena: Arena, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It is ended with all its processes, and the error says so."""
     alias = new_alias()
-    files = backend("hostile", further=SPIN.format(alias=alias))
+    files = backend("hostile", further=ENDLESS.format(alias=alias))
     process = building(tmp_path / "control", files)
     try:
         assert eventually(lambda: len(pids_named(alias)) == 2, _CONTROL_S), "the control failed"
@@ -170,17 +144,16 @@ def test_a_build_that_never_ends(
         process.kill()
         process.wait()
         kill_named(alias)
-    monkeypatch.setattr(build, "WALL_S", 8.0)
+    monkeypatch.setattr(build, "WALL_S", 5.0)
     wheel, why = built(tmp_path, files)
     assert wheel is None
-    assert "it was not done after 8 s, and was ended" in why
+    assert "it was not done after 5 s, and was ended" in why
     through = not eventually(lambda: not pids_named(alias))
     kill_named(alias)
     arena.judge("build without end", "succeeds", through, why)
 
 
 def test_a_wheel_of_another_name(arena: Arena, other_cache: Path, tmp_path: Path) -> None:
-    """It would be installed as the package that it claims to be."""
     files = backend("numpy", further="")
     assert (control(tmp_path, files) / "numpy-1.0-py3-none-any.whl").exists(), "the control failed"
     wheel, why = built(tmp_path, files)

@@ -32,7 +32,6 @@ def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> GitRepository:
 
 
 def watched(repository: GitRepository, program: Path) -> list[str]:
-    """Git asks it what has changed."""
     repository.git("config", "core.fsmonitor", str(program))
     return ["ls-files", "--modified"]
 
@@ -76,7 +75,6 @@ def fetched(repository: GitRepository, program: Path) -> list[str]:
 def test_no_program_of_a_checkout_runs(
     checkout: GitRepository, program: Path, trap: Callable[[GitRepository, Path], list[str]]
 ) -> None:
-    """Git itself runs each of them, in the same checkout."""
     command = ["git", "-C", str(checkout.folder), *trap(checkout, program)]
     subprocess.run(command, capture_output=True, check=False, stdin=subprocess.DEVNULL, timeout=60)
     assert ran(program)
@@ -88,7 +86,6 @@ def test_no_program_of_a_checkout_runs(
 def test_a_checkout_does_not_say_which_folder_is_looked_at(
     checkout: GitRepository, tmp_path: Path
 ) -> None:
-    """Git itself looks into the one that is named there."""
     (tmp_path / "home").mkdir()
     (tmp_path / "home/secret.txt").write_text("secret")
     checkout.git("config", "core.worktree", str(tmp_path / "home"))
@@ -101,7 +98,6 @@ def test_a_checkout_does_not_say_which_folder_is_looked_at(
 
 
 def test_what_is_ignored_cannot_hold_the_client(checkout: GitRepository) -> None:
-    """Git itself waits for ever on a pipe in place of a file that it reads."""
     (checkout.folder / "hidden.py").write_text("")
     (checkout.folder / ".gitignore").write_text("hidden.py\n")
     exclude = checkout.folder / ".git/info/exclude"

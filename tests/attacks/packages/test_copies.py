@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from envhub_worker.protocol.runtime import Runtime
-from tests.attacks.harness import Arena, control_run, run_in, token
+from tests.attacks.harness import Arena, OpenJail, control_run, run_in, token
 from tests.attacks.hostile.payloads.change_tree import WAYS
 from tests.attacks.packages import trapped_packages as traps
 from tests.support.packages.environments import base_interpreter, running_on
@@ -32,17 +32,17 @@ def fill(place: Path) -> Path:
     return place
 
 
-@pytest.fixture
-def packages(home: Path) -> Iterator[Path]:
+@pytest.fixture(scope="module", autouse=True)
+def packages(open_ground: Path) -> Iterator[Path]:
     """Packages of the repository's own, shared by all jails here; what is attacked in them."""
-    folder = home / "packages"
+    folder = open_ground / "packages"
     traps.real_packages(folder)
     folder.chmod(0o777)
     with running_on(Runtime(base_interpreter(), str(folder))):
         yield fill(folder / "robot")
 
 
-def test_no_change_of_the_packages_gets_out(arena: Arena, home: Path, packages: Path) -> None:
+def test_no_change_of_the_packages_gets_out(jail: OpenJail, home: Path, packages: Path) -> None:
     """Whatever is done to a file or a folder: content, modes, times, links and attributes stay."""
     control = fill(home / "control")
     before = {way: fingerprint(control / way) for way in WAYS}
@@ -50,37 +50,38 @@ def test_no_change_of_the_packages_gets_out(arena: Arena, home: Path, packages: 
         same = [way for way in WAYS if fingerprint(control / way) == before[way]]
         assert not same, run.text
     before = {way: fingerprint(packages / way) for way in WAYS}
-    with arena.inside("change_tree", {"place": str(packages)}) as run:
+    with jail.inside("change_tree", {"place": str(packages)}) as run:
         after = {way: fingerprint(packages / way) for way in WAYS}
     for way in WAYS:
         title = f"change the packages that jails share: {way}"
-        arena.judge(title, "succeeds", after[way] != before[way], run.text)
+        jail.judge(title, "succeeds", after[way] != before[way], run.text)
 
 
-@pytest.mark.parametrize("what", ["packages", "repository"])
-def test_no_other_jail_sees_a_change(arena: Arena, home: Path, packages: Path, what: str) -> None:
-    """Neither one that runs at the same time, nor the next one."""
+def test_no_other_jail_sees_a_change(arena: Arena, home: Path, packages: Path) -> None:
     secret, name = token(), f"planted-{token()}"
     outside = {"path": str(home / name)}
     with control_run("create_file", {**outside, "text": secret}):
         pass
     with control_run("read_file", outside) as run:
         assert secret in run.text
-    found = ""
     with arena.environment() as first, arena.environment() as second:
         root = str(run_in(first, "where_am_i").value["root"])
-        path = f"{packages if what == 'packages' else root}/{name}"
-        run_in(first, "create_file", path=path, text=secret)
-        found += run_in(second, "read_file", path=path).text
+        paths = {"packages": f"{packages}/{name}", "repository": f"{root}/{name}"}
+        for path in paths.values():
+            run_in(first, "create_file", path=path, text=secret)
+        found = {what: run_in(second, "read_file", path=path).text for what, path in paths.items()}
     with arena.environment() as third:
-        found += run_in(third, "read_file", path=path).text
-    arena.judge(f"plant a file for the next jail: the {what}", "succeeds", secret in found, found)
+        for what, path in paths.items():
+            found[what] += run_in(third, "read_file", path=path).text
+    for what, text in found.items():
+        title = f"plant a file for the next jail: the {what}"
+        arena.judge(title, "succeeds", secret in text, text)
 
 
-def test_nothing_leads_below_a_view(arena: Arena, packages: Path) -> None:
+def test_nothing_leads_below_a_view(jail: OpenJail, packages: Path) -> None:
     """Not a descriptor that was left open, not the layers of a mount, not the jail's init."""
     path = packages / "planted"
-    arena.attack(
+    jail.attack(
         "write below the view of the packages",
         "reach_below",
         lambda run: path.exists(),
@@ -90,10 +91,10 @@ def test_nothing_leads_below_a_view(arena: Arena, packages: Path) -> None:
     )
 
 
-def test_no_attribute_leads_out_of_a_view(arena: Arena, home: Path, packages: Path) -> None:
+def test_no_attribute_leads_out_of_a_view(jail: OpenJail, home: Path, packages: Path) -> None:
     """An overlay keeps notes on its upper folders, where to look for what is below: not ours."""
     secret = token()
     (home / "private").mkdir()
     (home / "private" / "file").write_text(secret)
     at = {"folder": str(packages), "path": str(home / "private" / "file")}
-    arena.steal("read a file outside by an overlay's own attributes", "redirect", secret, **at)
+    jail.steal("read a file outside by an overlay's own attributes", "redirect", secret, **at)

@@ -86,7 +86,6 @@ def plain_git(*arguments: str) -> subprocess.CompletedProcess[bytes]:
 
 
 def setting(text: str) -> None:
-    """One of this user's own settings."""
     with Path(os.environ["HOME"], ".gitconfig").open("a") as file:
         file.write(text)
 
@@ -121,7 +120,6 @@ def watched(repository: Path, program: Path) -> None:
 def test_no_program_runs(
     repository: Path, program: Path, trap: Callable[[Path, Path], None], tmp_path: Path
 ) -> None:
-    """Plain git runs each; ours brings the very bytes of the commit."""
     trap(repository, program)
     with git_served(tmp_path / "served") as where:
         plain_git("clone", f"{where}/org/repo", str(tmp_path / "clone"))
@@ -135,7 +133,6 @@ def test_no_program_runs(
 def test_variables_of_the_user_do_nothing(
     repository: Path, program: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Git obeys settings in variables, too."""
     pairs = {f"url.ext::{program} .insteadOf": "http://", "protocol.allow": "always"}
     monkeypatch.setenv("GIT_CONFIG_COUNT", str(len(pairs)))
     for number, (key, value) in enumerate(pairs.items()):
@@ -151,7 +148,6 @@ def test_variables_of_the_user_do_nothing(
 def test_submodules_are_not_fetched(
     repository: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """Plain git asks the host that the repository names."""
     with canary() as (elsewhere, asked), git_served(tmp_path / "served") as where:
         text = f'[submodule "m"]\n\tpath = m\n\turl = {elsewhere}/m\n'
         (repository / ".gitmodules").write_text(text)
@@ -261,7 +257,6 @@ OPTION = "--upload-pack={}"
 def test_nothing_in_a_reference_is_an_option_or_a_program(
     repository: Path, program: Path, text: str
 ) -> None:
-    """Plain git takes what begins with a dash for an option."""
     option = OPTION.format(program)
     plain_git("ls-remote", option, str(repository))
     assert ran(program), "the control failed"

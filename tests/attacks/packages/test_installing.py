@@ -116,7 +116,6 @@ def test_what_an_interpreter_runs_at_its_start(
 def test_a_plugin_of_a_package_that_is_loaded_early(
     real_index: Index, tmp_path: Path, traces: Path
 ) -> None:
-    """Gymnasium before 1.0 imports these; whatever reads entry points would."""
     files = {**BAIT, "trap_plugin.py": trap(traces, "plugin") + "def register(): pass\n"}
     files["bait-2.0.dist-info/entry_points.txt"] = (
         "[gymnasium.envs]\n__root__ = trap_plugin:register\n"

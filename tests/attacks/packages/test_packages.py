@@ -94,23 +94,6 @@ def test_plugins_of_gymnasium_run_in_the_jail_only(arena: Arena, place: Path) ->
     arena.judge(f"run before there is a jail: {name}", "succeeds", through, "")
 
 
-def test_packages_cannot_be_changed(arena: Arena, place: Path) -> None:
-    """They are shared with every other repository that needs the same."""
-    folder = place / "real"
-    traps.real_packages(folder)
-    target = folder / "numpy" / "added.py"
-    (folder / "numpy").chmod(0o777)
-    with running_on(Runtime(base_interpreter(), str(folder))):
-        arena.attack(
-            "write into the packages",
-            "create_file",
-            lambda run: target.exists(),
-            before=lambda: target.unlink(missing_ok=True),
-            path=str(target),
-            text="",
-        )
-
-
 def test_a_jail_of_another_environment_is_out_of_reach(arena: Arena, place: Path) -> None:
     """Two environments in one client have a zygote each, and nothing in common."""
     runtimes = []

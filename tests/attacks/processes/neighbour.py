@@ -20,10 +20,12 @@ class Neighbour:
 
     Attributes:
         env: Its environment.
+        secret: What it holds.
         path: Its file that holds the secret, as the jail calls it.
     """
 
     env: Any
+    secret: str
     pid: int
     address: int
     size: int
@@ -42,7 +44,7 @@ def neighbour(arena: Arena, secret: str) -> Iterator[Neighbour]:
         run = run_in(env, "be_victim", secret=secret)
         assert run.value, run.error
         [pid] = run.pids()
-        yield Neighbour(env, pid, **run.value)
+        yield Neighbour(env, secret, pid, **run.value)
 
 
 @dataclass(frozen=True)
@@ -93,13 +95,6 @@ class Pair:
             )
 
         place.attack(title, payload, came, before=look, **more)
-
-
-@contextmanager
-def between(arena: Arena) -> Iterator[Pair]:
-    """A process of the caller's and another jail, which hold one secret."""
-    with victim(token()) as outside, neighbour(arena, outside.secret) as inside:
-        yield Pair(outside, inside)
 
 
 @contextmanager

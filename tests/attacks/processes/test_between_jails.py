@@ -11,72 +11,73 @@ from pathlib import Path
 
 import pytest
 
-from tests.attacks.harness import Arena, new_alias, run_in, token
-from tests.attacks.processes.neighbour import Pair, between
-from tests.attacks.processes.victim import READS, SIGNALS, WORD
+from tests.attacks.harness import Arena, LastingJail, OpenJail, new_alias, run_in, token
+from tests.attacks.processes.neighbour import Neighbour, Pair, neighbour
+from tests.attacks.processes.victim import READS, SIGNALS, WORD, victim
 from tests.support.interpreter import can_run
 from tests.support.processes import may_change_niceness, other_niceness
 
 FAMILY = "Other jails"
 
 
-@pytest.fixture
-def pair(arena: Arena) -> Iterator[Pair]:
-    """A process of the caller's and another jail."""
-    with between(arena) as made:
+@pytest.fixture(scope="module")
+def other(lasting: LastingJail) -> Iterator[Neighbour]:
+    """Another jail than the one that attacks."""
+    with neighbour(Arena(lasting.profile, FAMILY), token()) as made:
         yield made
+
+
+@pytest.fixture
+def pair(other: Neighbour) -> Iterator[Pair]:
+    """A process of the caller's and another jail, which hold one secret."""
+    with victim(other.secret) as outside:
+        yield Pair(outside, other)
 
 
 @pytest.mark.parametrize("title", READS)
 def test_memory_and_files_of_another_jail_cannot_be_read(
-    arena: Arena, pair: Pair, title: str
+    jail: OpenJail, pair: Pair, title: str
 ) -> None:
-    """Nothing that one jail keeps to itself comes back from another one."""
     payload, names = READS[title]
-    arena.steal(f"read another jail: {title}", payload, pair.secret, **pair.at(*names))
+    jail.steal(f"read another jail: {title}", payload, pair.secret, **pair.at(*names))
 
 
-def test_another_jail_cannot_be_written_to(arena: Arena, pair: Pair) -> None:
-    """No debugger attaches across."""
+def test_another_jail_cannot_be_written_to(jail: OpenJail, pair: Pair) -> None:
     at = pair.at("pid", "address")
-    arena.attack("write another jail: ptrace", "ptrace_poke", pair.written, word=WORD, **at)
+    jail.attack("write another jail: ptrace", "ptrace_poke", pair.written, word=WORD, **at)
 
 
-def test_scratch_of_another_jail_cannot_be_read(arena: Arena, pair: Pair) -> None:
-    """By the other jail's own path, and through its root: neither leads there."""
+def test_scratch_of_another_jail_cannot_be_read(jail: OpenJail, pair: Pair) -> None:
     path = pair.inside.path  # type: ignore[union-attr]
     through_root = f"/proc/{pair.inside.pid}/root{path}"
     own = f"/proc/{pair.outside.pid}/fd/{pair.outside.fd}"
     for way, inside in {"path": path, "/proc/<pid>/root": through_root}.items():
         assert pair.secret in Path(through_root).read_text()
         title = f"read another jail's scratch: {way}"
-        arena.steal(title, "read_file", pair.secret, inside={"path": inside}, path=own)
+        jail.steal(title, "read_file", pair.secret, inside={"path": inside}, path=own)
 
 
 @pytest.mark.parametrize("way", SIGNALS)
-def test_signals_do_not_reach_another_jail(arena: Arena, pair: Pair, way: str) -> None:
-    """Sent in any of the ways there are."""
-    pair.signal(arena, f"signal another jail: {way}", way=way, **pair.at("pid"))
+def test_signals_do_not_reach_another_jail(jail: OpenJail, pair: Pair, way: str) -> None:
+    pair.signal(jail, f"signal another jail: {way}", way=way, **pair.at("pid"))
 
 
 @pytest.mark.usefixtures("broadcasting")
-def test_everybody_is_not_another_jail(arena: Arena, pair: Pair) -> None:
-    """kill(-1) does not reach a neighbour either."""
-    pair.signal(arena, "signal another jail: kill(-1)", "signal_all", "broadcasts")
+def test_everybody_is_not_another_jail(jail: OpenJail, pair: Pair) -> None:
+    pair.signal(jail, "signal another jail: kill(-1)", "signal_all", "broadcasts")
 
 
-def test_limits_and_priority_of_another_jail_stay(arena: Arena, pair: Pair) -> None:
-    """prlimit and setpriority are refused."""
+def test_limits_and_priority_of_another_jail_stay(jail: OpenJail, pair: Pair) -> None:
     nice = other_niceness()
     lowest = "" if may_change_niceness() else "this run has the lowest priority already"
-    arena.attack(
+    jail.attack(
         "change another jail: prlimit",
         "prlimit",
         lambda run: open_files(pair.of(run).pid) == 7,
         files=7,
         **pair.at("pid"),
     )
-    arena.attack(
+    jail.attack(
         "change another jail: setpriority",
         "setpriority",
         lambda run: os.getpriority(os.PRIO_PROCESS, pair.of(run).pid) == nice,
@@ -87,7 +88,6 @@ def test_limits_and_priority_of_another_jail_stay(arena: Arena, pair: Pair) -> N
 
 
 def open_files(pid: int) -> int:
-    """A process's soft limit."""
     for line in Path(f"/proc/{pid}/limits").read_text().splitlines():
         if line.startswith("Max open files"):
             return int(line.split()[3])

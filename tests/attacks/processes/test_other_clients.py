@@ -128,7 +128,6 @@ def open_to_all(folder: Path, *others: str) -> None:
 
 @pytest.mark.parametrize("title", WHOSE)
 def test_other_clients_are_out_of_reach(arena: Arena, home: Path, title: str) -> None:
-    """Neither their jails, nor their servers, nor their files."""
     secret = token()
     with ExitStack() as held:
         mine = held.enter_context(victim(secret))
@@ -142,7 +141,7 @@ def test_other_clients_are_out_of_reach(arena: Arena, home: Path, title: str) ->
         raid_sockets(jail, other)
 
 
-def test_deposits_need_the_session(arena: Arena, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_deposits_need_the_session(strict: Arena, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whoever reached the socket for descriptors would have to know a random number as well."""
     known: list[tuple[str, bytes, int, int]] = []
     deposit = attachment.deposit
@@ -152,7 +151,7 @@ def test_deposits_need_the_session(arena: Arena, monkeypatch: pytest.MonkeyPatch
         return deposit(path, session, jail, runner, fds, wait_s)
 
     monkeypatch.setattr(attachment, "deposit", noted)
-    with arena.environment() as env, ExitStack() as held:
+    with strict.environment() as env, ExitStack() as held:
         env.reset()
         fds = [os.memfd_create("mine") for _ in range(5)]
         for fd in fds:

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from tests.attacks.harness import Arena
+from tests.attacks.harness import OpenJail
 from tests.attacks.processes.neighbour import Pair, victims
 from tests.attacks.processes.victim import SIGNALS, WORD
 from tests.support.processes import may_change_niceness, other_niceness
@@ -25,9 +25,9 @@ _LOWEST = "" if may_change_niceness() else "this run has the lowest priority alr
 _SINGLE = "" if len(os.sched_getaffinity(0)) > 1 else "this machine has a single core"
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def pair() -> Iterator[Pair]:
-    """Two processes of the caller's."""
+    """Two processes of the caller's, whose memory nobody writes."""
     with victims() as made:
         yield made
 
@@ -41,10 +41,10 @@ def pair() -> Iterator[Pair]:
     ],
 )
 def test_memory_cannot_be_written(
-    arena: Arena, pair: Pair, title: str, payload: str, arguments: dict[str, Any]
+    jail: OpenJail, title: str, payload: str, arguments: dict[str, Any]
 ) -> None:
-    """ptrace does not attach, nor do the two ways work that need no debugger."""
-    arena.attack(title, payload, pair.written, **pair.at("pid", "address"), **arguments)
+    with victims() as pair:
+        jail.attack(title, payload, pair.written, **pair.at("pid", "address"), **arguments)
 
 
 @pytest.mark.short("strict-read /proc")
@@ -58,19 +58,18 @@ def test_memory_cannot_be_written(
     ],
 )
 def test_memory_and_files_cannot_be_read(
-    arena: Arena, pair: Pair, title: str, payload: str, names: tuple[str, ...]
+    jail: OpenJail, pair: Pair, title: str, payload: str, names: tuple[str, ...]
 ) -> None:
-    """Nothing that another process keeps to itself comes back."""
-    arena.steal(title, payload, pair.secret, **pair.at("pid", *names))
+    jail.steal(title, payload, pair.secret, **pair.at("pid", *names))
 
 
-def test_maps_cannot_be_read(arena: Arena, pair: Pair) -> None:
+def test_maps_cannot_be_read(jail: OpenJail, pair: Pair) -> None:
     """Where the client's libraries lie is not told: that would help other attacks."""
     firsts = {
         one.pid: Path(f"/proc/{one.pid}/maps").read_text().split()[0]
         for one in (pair.outside, pair.inside)
     }
-    arena.attack(
+    jail.attack(
         "read /proc/<client>/maps",
         "proc_maps",
         lambda run: firsts[pair.of(run).pid] in run.text,
@@ -79,20 +78,17 @@ def test_maps_cannot_be_read(arena: Arena, pair: Pair) -> None:
 
 
 @pytest.mark.usefixtures("broadcasting")
-def test_broadcast_signals_do_not_reach_the_client(arena: Arena, pair: Pair) -> None:
-    """kill(-1) ends at the jail's wall."""
-    pair.signal(arena, "signal everybody: kill(-1)", "signal_all", "broadcasts")
+def test_broadcast_signals_do_not_reach_the_client(jail: OpenJail, pair: Pair) -> None:
+    pair.signal(jail, "signal everybody: kill(-1)", "signal_all", "broadcasts")
 
 
 @pytest.mark.short("strict-kill")
 @pytest.mark.parametrize("way", SIGNALS)
-def test_signals_do_not_reach_the_client(arena: Arena, pair: Pair, way: str) -> None:
-    """Nor does one that is meant for it, sent in any of the ways there are."""
-    pair.signal(arena, f"signal the client: {way}", way=way, **pair.at("pid"))
+def test_signals_do_not_reach_the_client(jail: OpenJail, pair: Pair, way: str) -> None:
+    pair.signal(jail, f"signal the client: {way}", way=way, **pair.at("pid"))
 
 
 def io_priority(pid: int) -> int:
-    """``ioprio_get``."""
     numbers = (252, 31)
     libc = ctypes.CDLL(None, use_errno=True)
     return int(libc.syscall(numbers[os.uname().machine == "aarch64"], 1, pid))
@@ -135,8 +131,7 @@ CHANGES: dict[str, tuple[str, dict[str, Any], Look]] = {
 
 
 @pytest.mark.parametrize("title", CHANGES)
-def test_limits_and_priorities_cannot_be_changed(arena: Arena, pair: Pair, title: str) -> None:
-    """Calls on another process of the same user are refused, or do nothing."""
+def test_limits_and_priorities_cannot_be_changed(jail: OpenJail, pair: Pair, title: str) -> None:
     payload, arguments, changed = CHANGES[title]
     aimed = {**pair.at("pid"), **arguments}
-    arena.attack(title, payload, lambda run: changed(pair.of(run).pid), **aimed)
+    jail.attack(title, payload, lambda run: changed(pair.of(run).pid), **aimed)

@@ -51,6 +51,5 @@ def stopped(pids: list[int]) -> list[int]:
 
 
 def resume(pids: list[int]) -> None:
-    """Let stopped processes go on."""
     for pid in pids:
         os.kill(pid, signal.SIGCONT)

@@ -1,8 +1,9 @@
-"""Messages made to exhaust whoever decodes them, and a victim that decodes one.
+"""Messages made to exhaust whoever decodes them, and a victim that decodes all of them.
 
-Run as ``python -m tests.attacks.protocol.decoder_bombs NAME [plain]``. Prints one line of JSON:
-what came of it, and the most memory that was allocated at a time. With ``plain`` the victim is
-msgpack itself instead of our decoder. Address space and CPU time are limited by the kernel.
+Run as ``python -m tests.attacks.protocol.decoder_bombs [plain]``. Prints a line of JSON for each:
+its name, what came of it, and the most memory that was allocated at a time. With ``plain`` the
+victim is msgpack itself instead of our decoder, and gets the first one. Address space and the CPU
+time for each are limited by the kernel.
 """
 
 from __future__ import annotations
@@ -150,13 +151,18 @@ BOMBS = REFUSED | ACCEPTED
 
 
 def main() -> None:
-    """Decodes one bomb under the kernel's limits and reports."""
-    frames = BOMBS[sys.argv[1]]()
-    plain = sys.argv[2:] == ["plain"]
-    limit_resources()
-    tracemalloc.start()
-    outcome = explode(frames, plain)
-    print(json.dumps({"outcome": outcome, "peak": tracemalloc.get_traced_memory()[1]}))
+    """Decodes the bombs under the kernel's limits and reports."""
+    plain = sys.argv[1:] == ["plain"]
+    pages = int(Path("/proc/self/statm").read_text().split()[0])
+    most = pages * resource.getpagesize() + ADDRESS_SPACE
+    for name in list(BOMBS)[: 1 if plain else None]:
+        frames = BOMBS[name]()
+        limit_resources(most)
+        tracemalloc.start()
+        outcome = explode(frames, plain)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        print(json.dumps({"name": name, "outcome": outcome, "peak": peak}), flush=True)
 
 
 def explode(frames: Frames, plain: bool) -> str:
@@ -168,14 +174,12 @@ def explode(frames: Frames, plain: bool) -> str:
     return "decoded"
 
 
-def limit_resources() -> None:
-    """Caps further address space and CPU time of this process."""
-    pages = int(Path("/proc/self/statm").read_text().split()[0])
-    most = pages * resource.getpagesize() + ADDRESS_SPACE
+def limit_resources(most: int) -> None:
+    """Caps the address space of this process, and the CPU time that it takes from now on."""
     resource.setrlimit(resource.RLIMIT_AS, (most, most))
     used = resource.getrusage(resource.RUSAGE_SELF)
     seconds = int(used.ru_utime + used.ru_stime) + CPU_S
-    resource.setrlimit(resource.RLIMIT_CPU, (seconds, seconds))
+    resource.setrlimit(resource.RLIMIT_CPU, (seconds, resource.RLIM_INFINITY))
 
 
 if __name__ == "__main__":

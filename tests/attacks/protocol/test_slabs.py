@@ -93,20 +93,17 @@ mapped[0]
 @pytest.mark.parametrize("name", ["request", "reply", "observations"])
 @pytest.mark.parametrize("size", ["0", "1 << 30"])
 def test_a_slab_cannot_be_cut_or_grown(shard: LaneShard, name: str, size: str) -> None:
-    """No slab changes its size, so the client cannot be made to fault."""
     before = [os.fstat(fd).st_size for fd in shard.fds[:3]]
     assert attack(shard, f"outcome(os.ftruncate, {name}, {size})") == "EPERM"
     assert [os.fstat(fd).st_size for fd in shard.fds[:3]] == before
 
 
 def test_the_seals_cannot_be_taken_off(shard: LaneShard) -> None:
-    """Nobody can add or remove a seal any more."""
     for name in ("request", "reply", "observations"):
         assert attack(shard, f"import fcntl; outcome(fcntl.fcntl, {name}, 1033, 8)") == "EPERM"
 
 
 def test_actions_cannot_be_rewritten(shard: LaneShard) -> None:
-    """The request slab is the client's alone: no write, and no writable map."""
     assert attack(shard, "outcome(os.pwrite, request, b'x', 0)") == "EPERM"
     assert attack(shard, "outcome(mmap.mmap, request, request_bytes)") == "EPERM"
 
@@ -118,7 +115,6 @@ def test_the_reply_slab_is_theirs_to_write(shard: LaneShard) -> None:
 
 
 def test_a_punched_hole_is_zeros(shard: LaneShard, observations: ObservationSlab) -> None:
-    """Pages can be taken away, and read as zeros; nothing faults."""
     os.pwrite(shard.fds[1], b"\xff" * mmap.PAGESIZE, 0)
     os.pwrite(observations.fd, b"\xff" * observations.layout.total_bytes, 0)
     code = """
@@ -214,7 +210,6 @@ def test_garbage_for_infos_is_refused(shard: LaneShard, bytes_: str) -> None:
 
 
 def test_columns_without_a_schema_are_refused(shard: LaneShard) -> None:
-    """Columns are read by the client's own schema only, and there is none yet."""
     shard.ask([np.zeros((2, 2), np.float32)], 0, 0)
     attack(shard, f"os.pwrite(reply, struct.pack('QQ', {slabs.COLUMNS}, 0), {slabs.OUTCOME * 8})")
     kind, message = shard.outcome()

@@ -46,7 +46,6 @@ CPU_S, SPIN_S = 1, 3.0
 @pytest.mark.short("strict-fork")
 @pytest.mark.parametrize(("title", "payload"), [("fork", "fork_bomb"), ("thread", "thread_bomb")])
 def test_fork_bomb_stops_at_the_limit(arena: Arena, title: str, payload: str) -> None:
-    """Processes and threads together never exceed the limit."""
     arena.attack(
         f"{title} bomb",
         payload,
@@ -185,7 +184,6 @@ def test_memory_bomb_does_not_hurt_the_neighbours(arena: Arena) -> None:
 
 @pytest.fixture
 def places(home: Path) -> list[str]:
-    """Folders for the controls to fill."""
     folders = [home / name for name in ("one", "two")]
     for folder in folders:
         folder.mkdir()

@@ -51,7 +51,6 @@ def held(path: Path, way: str) -> bool:
 
 @pytest.mark.parametrize("way", ["lease", "flock"])
 def test_readable_files_are_not_held(arena: Arena, granted: Path, way: str) -> None:
-    """Nobody who opens a file that a jail may read has to wait for the jail."""
     path = granted / "model.bin"
     arena.attack(
         f"hold a readable file: {way}",
@@ -83,7 +82,6 @@ def opened_again_and_again(path: Path) -> Iterator[None]:
 
 @pytest.mark.parametrize("way", ["inotify", "F_NOTIFY"])
 def test_nobody_is_watched(arena: Arena, granted: Path, way: str) -> None:
-    """What others do in a folder that a jail may read, it is not told."""
     secret = f"name-{token()}"
     (granted / secret).write_text("x")
     by_name = way == "inotify"
@@ -102,8 +100,6 @@ def test_nobody_is_watched(arena: Arena, granted: Path, way: str) -> None:
 
 
 def test_pipes_keep_their_size(arena: Arena) -> None:
-    """A few large ones would use up what the user's pipes may hold together."""
-
     def large(run: Run) -> bool:
         return any(
             os.readlink(path).startswith("pipe:") and capacity(path) >= MIB
@@ -115,7 +111,6 @@ def test_pipes_keep_their_size(arena: Arena) -> None:
 
 
 def capacity(path: str) -> int:
-    """What a pipe can hold."""
     fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
     try:
         return fcntl.fcntl(fd, fcntl.F_GETPIPE_SZ)
@@ -161,7 +156,6 @@ def used_up(kind: str) -> bool:
 
 @pytest.mark.parametrize("kind", PROBES)
 def test_the_users_quotas_are_left_to_others(arena: Arena, kind: str) -> None:
-    """Other programs of the caller's go on getting their share."""
     assert not used_up(kind), "this user's other programs have used it up before"
     arena.attack(
         f"use up the user's {kind}",

@@ -8,13 +8,14 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from tests.attacks.harness import Arena
 from tests.attacks.repositories import write_environment
 
-WATCHDOG_S = 180
+WATCHDOG_S = 240
 """Far more than all timeouts of the client together."""
 
 ABUSE = """
@@ -89,7 +90,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.shared_memory import slabs
 
 ABUSE_AND_ANSWER, ABUSE_AND_HANG, DIE = 1, 2, 3
-lanes, kept = [], []
+lanes, kept, order = [], [], {}
 honest = runner.Runner.attach
 
 def remember(self, request):
@@ -109,8 +110,8 @@ def answer(lane):
         os.write(lane._client_bell, ONE)
 
 def turn_on(bells):
-    for fd in every() if {every!r} else bells:
-        globals()[{act!r}](fd)
+    for fd in every() if order["every"] else bells:
+        globals()[order["act"]](fd)
 
 def every():
     found = []
@@ -123,6 +124,10 @@ def every():
 VECTOR = gym.vector.AsyncVectorEnv
 
 class Abuser(Plain):
+    def reset(self, *, seed=None, options=None):
+        order.update(options or {})
+        return super().reset(seed=seed)
+
     def step(self, action):
         lane = lanes[-1]
         if action == ABUSE_AND_ANSWER:
@@ -141,29 +146,34 @@ class Abuser(Plain):
 ANSWERS, HANGS, DIES = 1, 2, 3
 
 
+def abuser(folder: Path) -> Path:
+    """The repository; the options of a reset name a function of ``ABUSE``, and for what it is."""
+    return write_environment(folder / "abuser", ABUSE + ENV)
+
+
 def watched(
-    arena: Arena, folder: Path, act: str, *, every: bool = False, **order: Any
+    arena: Arena, folder: Path, acts: Sequence[str], *, every: bool = False, **order: Any
 ) -> tuple[bool, list[str]]:
-    """Whether a client whose environment does this came to its end, and what it said.
+    """Whether a client whose environments do these came to its end, and what it said.
 
     Args:
         arena: Under which profile.
         folder: For the repository.
-        act: A function of ``ABUSE``.
+        acts: Functions of ``ABUSE``, one for each environment.
         every: Whether it is done to every descriptor of the jail, and not to the doorbells alone.
         **order: For ``held_client``.
     """
-    repository = write_environment(folder / "abuser", ABUSE + ENV.format(act=act, every=every))
     whole = {
+        "acts": acts,
+        "every": every,
         "policy": {"profile": arena.profile, "crash_history": 0, **order.pop("policy", {})},
         "options": order.pop("options", {}),
         "close": "same",
-        "head_start_s": 1.0,
         **order,
     }
-    command = [sys.executable, "-m", "tests.attacks.runner.held_client", str(repository)]
+    words = ["-m", "tests.attacks.runner.held_client", str(abuser(folder)), json.dumps(whole)]
     client = subprocess.Popen(
-        [*command, json.dumps(whole)],
+        [sys.executable, *words],
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         cwd=Path(__file__).parents[3],

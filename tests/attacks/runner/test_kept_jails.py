@@ -155,18 +155,18 @@ def stepping(arena: Arena, folder: Path, mode: str, alias: str = "", lane: str =
     )
 
 
-def test_forged_rows_are_the_forgers_own(arena: Arena, home: Path) -> None:
+def test_forged_rows_are_the_forgers_own(strict: Arena, home: Path) -> None:
     """The control: such an answer is taken, and stands in the row of whoever gave it."""
-    with stepping(arena, home, "forge") as suites:
+    with stepping(strict, home, "forge") as suites:
         suites.env.reset()
         assert suites.env.step([0, 0])[1].tolist() == [1.0, FORGED]
 
 
 @pytest.mark.short("strict")
 @pytest.mark.parametrize("mode", ["died", "partly"])
-def test_runners_cannot_speak_of_deaths(arena: Arena, home: Path, mode: str) -> None:
+def test_runners_cannot_speak_of_deaths(strict: Arena, home: Path, mode: str) -> None:
     """Only the server says who has died: a runner that does is a liar, and nothing is reset."""
-    with stepping(arena, home, mode) as suites:
+    with stepping(strict, home, mode) as suites:
         suites.env.reset()
         with pytest.raises(RemoteProtocolError):
             suites.env.step([0, 0])
@@ -174,9 +174,9 @@ def test_runners_cannot_speak_of_deaths(arena: Arena, home: Path, mode: str) -> 
 
 
 @pytest.mark.parametrize("mode", ["twice", "sibling's"])
-def test_liars_are_given_no_second_chance(arena: Arena, home: Path, mode: str) -> None:
+def test_liars_are_given_no_second_chance(strict: Arena, home: Path, mode: str) -> None:
     """An answer to what was not asked ends the runner, and it is not brought back."""
-    with stepping(arena, home, mode) as suites:
+    with stepping(strict, home, mode) as suites:
         suites.env.reset()
         with pytest.raises(EnvHubError) as caught:
             suites.env.step([0, 0]) and suites.env.step([0, 0])
@@ -185,9 +185,9 @@ def test_liars_are_given_no_second_chance(arena: Arena, home: Path, mode: str) -
         assert suites.env.sandbox.stats()["restarts"] == 0
 
 
-def test_a_torn_answer_is_nobodys(arena: Arena, home: Path) -> None:
+def test_a_torn_answer_is_nobodys(strict: Arena, home: Path) -> None:
     """Who dies in the middle of an answer has not answered; what follows is not its rest."""
-    with stepping(arena, home, "torn") as suites:
+    with stepping(strict, home, "torn") as suites:
         suites.env.reset()
         observation, rewards, _, truncated, _ = suites.env.step([0, 0])
         assert observation.tolist() == [[1.0], [0.0]]

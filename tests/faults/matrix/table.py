@@ -175,7 +175,7 @@ def cells(full: bool) -> list[Cell]:
     if full:
         return [Cell(row, mode, lane) for row in ROWS for mode, lane in pairs]
     chosen = [Cell(row, *pairs[index % len(pairs)]) for index, row in enumerate(ROWS)]
-    # what the fast lane has to notice by itself: every ending of a step, in both shapes
-    fast = [row for row in ROWS if row.moment == "step"]
+    # what the fast lane has to notice by itself: every way not to answer a step, in both shapes
+    fast = [row for row in ROWS if row.moment == "step" and row.then == RESET]
     chosen += [Cell(row, mode, "auto") for row in fast for mode in ("sync", "async")]
     return list({cell.name: cell for cell in chosen}.values())

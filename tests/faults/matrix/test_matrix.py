@@ -87,7 +87,7 @@ def _make(cell: Cell, repository: Path) -> Any:
         policy={"restart": "on_reset"},
         limits=_limits(row.fault),
         timeouts=Timeouts(
-            startup_s=5.0 if hangs else _WAIT_S,
+            startup_s=3.0 if hangs else _WAIT_S,
             reset_s=_WAIT_S,
             step_s=_WAIT_S,
             call_s=_WAIT_S,
@@ -205,7 +205,6 @@ def _write_down(cell: Cell, seconds: float) -> None:
 
 
 def test_every_moment_and_fault_is_in_the_table() -> None:
-    """No fault and no moment is listed and never tried."""
     from tests.faults.matrix.table import FAULTS, MOMENTS
 
     assert {row.fault for row in ROWS} == set(FAULTS)
@@ -213,5 +212,4 @@ def test_every_moment_and_fault_is_in_the_table() -> None:
 
 
 def test_document_is_written_from_the_table() -> None:
-    """``docs/internals/faults-tried.md`` says what the rows say."""
     assert DOCUMENT.read_text() == document()

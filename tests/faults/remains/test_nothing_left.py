@@ -47,9 +47,16 @@ def test_nothing_remains_of_a_client_that(body: str, folder: Path) -> None:
     assert "Exception ignored" not in said
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL, signal.SIGHUP])
-@pytest.mark.parametrize("moment", ["idle", "step", "make"])
-def test_nothing_remains_after(number: signal.Signals, moment: str, folder: Path) -> None:
+@pytest.mark.parametrize(
+    ("moment", "number"),
+    [
+        # a server sees the same, whatever ends its client: that its pipe has closed
+        *((moment, signal.SIGKILL) for moment in ("idle", "step", "make")),
+        *(("step", number) for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)),
+        ("make", signal.SIGINT),
+    ],
+)
+def test_nothing_remains_after(moment: str, number: signal.Signals, folder: Path) -> None:
     """A signal ends the client, whatever it was doing, and everything of ours with it."""
     client = start(
         folder,
@@ -184,7 +191,6 @@ def test_close_under_a_running_step_returns(lane: str, folder: Path) -> None:
 
 
 def test_signal_handler_may_close_what_its_own_thread_waits_for(folder: Path) -> None:
-    """A handler that closes the environment ends the step, without a deadlock."""
     client = start(
         folder,
         """
@@ -203,7 +209,6 @@ def test_signal_handler_may_close_what_its_own_thread_waits_for(folder: Path) ->
 
 
 def test_proxy_that_nobody_holds_ends_its_processes(folder: Path) -> None:
-    """Garbage collection closes, in a cycle too, while the client goes on."""
     client = start(
         folder,
         """
@@ -250,11 +255,10 @@ def test_dead_server_is_told_and_replaced(folder: Path) -> None:
 
 
 def test_many_clients_at_once_do_not_meet(folder: Path) -> None:
-    """Under pytest-xdist each worker has its own server, and none is left."""
     test = folder / "test_one.py"
     test.write_text(
         "import pytest\nfrom envhub_sandbox import make_env\n"
-        f"@pytest.mark.parametrize('n', range(4))\ndef test_one(n):\n"
+        f"@pytest.mark.parametrize('n', range(2))\ndef test_one(n):\n"
         f"    env = make_env({str(sample('faulty'))!r}).env\n    env.reset()\n"
         "    assert env.step([0])[0].tolist() == [[1.0]]\n"
     )
@@ -268,7 +272,7 @@ def test_many_clients_at_once_do_not_meet(folder: Path) -> None:
         cwd=folder,
     )
     out, _ = client.communicate(timeout=240)
-    assert "4 passed" in out, out
+    assert "2 passed" in out, out
     for path in [*folder.rglob("__pycache__"), test]:
         shutil.rmtree(path) if path.is_dir() else path.unlink()
     pytest_of = [path for path in folder.iterdir() if path.name.startswith("pytest-of")]

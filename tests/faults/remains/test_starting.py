@@ -51,7 +51,6 @@ def test_what_a_client_left_that_had_no_server_yet_goes_with_the_next(
 
 
 def test_what_is_left_when_both_are_killed_goes_with_the_next(folder: Path) -> None:
-    """Client and server at once, as when a container ends."""
     client, server = halted(folder, "after", "subprocess.Popen")
     assert eventually(lambda: bool(list(folder.glob("envhub-*/fds"))))
     os.kill(server, signal.SIGKILL)

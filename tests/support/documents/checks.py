@@ -38,7 +38,7 @@ def document() -> str:
 
 
 def _judged() -> Iterator[str]:
-    """A row for each group of the corpus, and one for all of it; its tests judge every entry."""
+    """A row for each group of the corpus, and one for all; ``tests.corpus`` judges every entry."""
     groups: dict[str, list[Entry]] = {}
     for entry in (*HONEST.values(), *FAULTS.values()):
         groups.setdefault(entry.group, []).append(entry)

@@ -25,7 +25,6 @@ class Mute(ValueError):
     ],
 )
 def test_faults_are_blamed_on_the_peer(error: Exception, kind: type[Exception]) -> None:
-    """With where it happened as the cause."""
     with pytest.raises(RemoteProtocolError) as caught, UNTRUSTED:
         raise error
     assert type(caught.value) is kind
@@ -34,14 +33,12 @@ def test_faults_are_blamed_on_the_peer(error: Exception, kind: type[Exception]) 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError("no"), RemoteProtocolError("lie")])
 def test_others_pass_as_they_are(error: BaseException) -> None:
-    """A Ctrl-C, the machine's own failures, and what has been said already."""
     with pytest.raises(type(error)) as caught, UNTRUSTED:
         raise error
     assert caught.value is error
 
 
 def test_what_is_said_is_one_short_line() -> None:
-    """The text may hold the peer's own."""
     with pytest.raises(RemoteProtocolError) as caught, UNTRUSTED:
         raise ValueError("\x1b[2J\n" * 10_000)
     assert str(caught.value).isprintable()

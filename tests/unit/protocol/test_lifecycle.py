@@ -50,37 +50,25 @@ def test_a_late_reply_is_never_the_answer_to_a_new_request() -> None:
     """After a timeout or an interrupt nothing is submitted before it has come or been given up."""
     assert after() is State.IDLE
     assert after(Event.START, Event.SUBMIT, Event.INTERRUPT) is State.LATE
-    assert after(Event.START, Event.SUBMIT, Event.TIMEOUT) is State.LATE
-    assert (State.LATE, Event.SUBMIT) not in TABLE
-    assert after(Event.START, Event.SUBMIT, Event.TIMEOUT, Event.REPLY) is State.READY
-    assert after(Event.START, Event.SUBMIT, Event.TIMEOUT, Event.FORGET) is State.IDLE
+    late = (Event.START, Event.SUBMIT, Event.TIMEOUT)
+    assert after(*late) is State.LATE
+    assert after(*late, Event.REPLY) is State.READY
+    assert after(*late, Event.FORGET) is State.IDLE
 
 
-def test_requests_are_answered_one_at_a_time() -> None:
-    """Nothing is submitted while a reply is awaited, and no reply comes unasked."""
-    assert (State.PENDING, Event.SUBMIT) not in TABLE
-    assert [state for state in State if (state, Event.REPLY) in TABLE] == [
-        State.PENDING,
-        State.LATE,
-    ]
-
-
-def test_death_is_survived_by_forgetting() -> None:
-    """A dead environment can only be given up or closed (and be forked along)."""
-    dead = {event for state, event in TABLE if state is State.DEAD}
-    assert dead == {Event.FORGET, Event.CLOSE, Event.FORK}
-
-
-def test_fork_can_only_close() -> None:
-    """In a fork every environment that was open is another process's, and stays so."""
+def test_what_is_legal_in_each_state() -> None:
+    legal = {state: {event for one, event in TABLE if one is state} for state in State}
+    for state in (State.LATE, State.PENDING):
+        assert Event.SUBMIT not in legal[state], "requests are answered one at a time"
+    assert [one for one in State if Event.REPLY in legal[one]] == [State.PENDING, State.LATE]
+    assert legal[State.DEAD] == {Event.FORGET, Event.CLOSE, Event.FORK}
+    # in a fork every environment that was open is another process's, and stays so
+    assert legal[State.FOREIGN] == {Event.CLOSE, Event.FORK}
     for state in set(State) - {State.CLOSED}:
         assert TABLE[state, Event.FORK] is State.FOREIGN
-    leads = {event: TABLE[state, event] for state, event in TABLE if state is State.FOREIGN}
-    assert leads == {Event.CLOSE: State.CLOSED, Event.FORK: State.FOREIGN}
 
 
 def test_every_state_can_be_reached() -> None:
-    """No state of the table is dead text."""
     reached = {State.IDLE}
     while more := {TABLE[key] for key in TABLE if key[0] in reached} - reached:
         reached |= more
@@ -88,7 +76,6 @@ def test_every_state_can_be_reached() -> None:
 
 
 def test_states_and_events_read_as_words() -> None:
-    """The values are what users read in errors, so each is text of its own."""
     for kind in (State, Event):
         texts = [member.value for member in kind]
         assert len(set(texts)) == len(texts)

@@ -67,7 +67,6 @@ WRONG: list[tuple[tuple[Any, ...], dict[str, Any]]] = [
 def test_fields_are_those_of_the_standard_library(
     values: tuple[Any, ...], named: dict[str, Any]
 ) -> None:
-    """Values, text, and what the functions of ``dataclasses`` make of them."""
     ours, theirs = Ours(*values, **named), Theirs(*values, **named)
     assert dataclasses.asdict(ours) == dataclasses.asdict(theirs)
     assert repr(ours) == repr(theirs).replace("Theirs", "Ours")
@@ -79,21 +78,18 @@ def test_fields_are_those_of_the_standard_library(
 def test_wrong_arguments_are_refused_where_the_standard_library_does(
     values: tuple[Any, ...], named: dict[str, Any]
 ) -> None:
-    """Too few, too many, twice, unknown."""
     for kind in (Theirs, Ours):
         with pytest.raises(TypeError):
             kind(*values, **named)
 
 
 def test_fields_by_name_are_not_taken_in_order() -> None:
-    """``kw_only`` holds."""
     assert Named(only=1).only == 1
     with pytest.raises(TypeError, match="Named takes only"):
         Named(1)  # type: ignore[misc]
 
 
 def test_records_do_not_change() -> None:
-    """Neither assignment nor deletion, of fields and of others."""
     record: Any = Ours(1)
     for name in ("first", "other"):
         with pytest.raises(dataclasses.FrozenInstanceError):
@@ -115,7 +111,6 @@ def test_equality_and_hash_go_by_compared_fields_of_one_class() -> None:
 
 
 def test_subclasses_add_fields() -> None:
-    """Those of the parent come first."""
     below = Below(1, more=(2,))
     assert [one.name for one in dataclasses.fields(below)][-1] == "more"
     assert repr(below) == "Below(first=1, second='b', third=[])"
@@ -123,7 +118,6 @@ def test_subclasses_add_fields() -> None:
 
 
 def test_copies_are_equal() -> None:
-    """By ``copy`` and by ``pickle``."""
     record = Ours(1, third=[1, 2])
     assert copy.deepcopy(record) == pickle.loads(pickle.dumps(record)) == record
 

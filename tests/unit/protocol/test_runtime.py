@@ -14,7 +14,6 @@ GOOD = ("models--org--repo", "ab" * 20, ("main", "v1.0", "refs/pr/3"), "/snapsho
 
 
 def test_what_is_sent_is_read() -> None:
-    """Lists count as tuples: the way through JSON makes them."""
     assert read_hub_copies([list(GOOD)]) == (HubCopy(*GOOD),)
     order = m.OpenJail("", "", "", "", "", {}, 1, (GOOD,))
     assert order.with_trees({"/snapshots/x": "/there"}) == ((*GOOD[:3], "/there"),)
@@ -42,7 +41,6 @@ def test_what_is_sent_is_read() -> None:
     ],
 )
 def test_what_there_cannot_be_is_refused(changes: dict[int, Any]) -> None:
-    """Names that are paths, other types, too many and too long ones."""
     row = [changes.get(place, value) for place, value in enumerate(GOOD)]
     with pytest.raises(RemoteProtocolError):
         read_hub_copies((tuple(row),))
@@ -50,13 +48,11 @@ def test_what_there_cannot_be_is_refused(changes: dict[int, Any]) -> None:
 
 @pytest.mark.parametrize("value", [None, {}, "x", (GOOD[:3],), (GOOD, GOOD), (1,)])
 def test_other_shapes_are_refused(value: Any) -> None:
-    """Also the same repository twice."""
     with pytest.raises(RemoteProtocolError):
         read_hub_copies(value)
 
 
 def test_there_is_a_most() -> None:
-    """The repository and its assets."""
     rows = [(f"models--org--r{n}", *GOOD[1:]) for n in range(MAX_HUB_COPIES + 1)]
     assert len(read_hub_copies(rows[1:])) == MAX_HUB_COPIES
     with pytest.raises(RemoteProtocolError):

@@ -57,7 +57,6 @@ def test_length_is_bounded(text: str, limit: int) -> None:
 
 
 def test_beginning_and_end_are_kept() -> None:
-    """The two ends of a long text are what one looks for."""
     shown = printable("first" + "." * 1000 + "last", 20)
     assert shown.startswith("first")
     assert shown.endswith("last")
@@ -78,7 +77,6 @@ def test_beginning_and_end_are_kept() -> None:
     ],
 )
 def test_sizes_are_said_in_the_unit_that_people_read(count: float, said: str) -> None:
-    """In three digits or four."""
     assert size_text(count) == said
 
 
@@ -96,13 +94,11 @@ def test_sizes_are_said_in_the_unit_that_people_read(count: float, said: str) ->
     ],
 )
 def test_sizes_are_read(text: str, unit: str, size: int) -> None:
-    """With a unit, in it; else in the one that the place has."""
     assert parse_size(text, unit) == size
 
 
 @pytest.mark.parametrize("text", ["", "G", "16X", "-1", "1e9", "1,5G", "٣"])
 def test_what_is_no_size_is_told(text: str) -> None:
-    """With what is one."""
     with pytest.raises(ValueError, match=r"512M, 1\.5GiB or 4G"):
         parse_size(text)
 
@@ -121,12 +117,10 @@ def test_what_is_no_size_is_told(text: str) -> None:
     ],
 )
 def test_times_are_said_in_the_unit_that_people_read(seconds: float, said: str) -> None:
-    """In few characters, whatever they are."""
     assert duration_text(seconds) == said
 
 
 def test_one_is_no_plural() -> None:
-    """Of words that are made by an s, and of others."""
     assert [counted(n, "finding") for n in (0, 1, 2_000)] == [
         *("0 findings", "1 finding", "2,000 findings")
     ]

@@ -73,6 +73,5 @@ def test_closed_packages_are_told_from_missing_ones(packages: Path) -> None:
 
 @needs_another_user
 def test_closed_folder_of_the_path_is_named(packages: Path) -> None:
-    """Nothing in it can be seen, so anything may be there."""
     found = look(packages, packages / "closed", "numpy")
     assert str(found["numpy"]).startswith(f"{packages / 'closed'} may not be read")

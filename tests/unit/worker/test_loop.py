@@ -8,7 +8,6 @@ from envhub_worker.loop import Loop
 
 
 def test_it_looks_before_each_wait() -> None:
-    """And waits no longer than it is told; None is as long as it likes."""
     failures: list[Exception] = []
     loop = Loop(failures.append)
     looked: list[int] = []
@@ -34,7 +33,6 @@ def test_it_looks_before_each_wait() -> None:
 
 
 def test_a_look_that_fails_ends_nothing() -> None:
-    """The operator hears of it."""
     failures: list[Exception] = []
     loop = Loop(failures.append)
 

@@ -126,7 +126,7 @@ def _messages():
     message = ctypes.create_string_buffer(8 + 1)
     message[0] = 1
     queues = []
-    for _ in range(16):
+    for _ in range(8):
         queue = _checked(_LIBC.msgget(_IPC_PRIVATE, 0o1600))
         queues.append(queue)
         with contextlib.suppress(BlockingIOError):

@@ -30,7 +30,6 @@ TEXT = st.characters(exclude_categories=["Cs"], exclude_characters="\0")
 
 
 def through(array: np.ndarray[Any, Any], *, copy: bool = True) -> np.ndarray[Any, Any]:
-    """Writes an array and reads it back."""
     writer = ArrayWriter()
     descriptor = writer.add(array)
     reader = ArrayReader(b"".join(writer.tail), writer.frames, DEFAULT_LIMITS, copy)
@@ -115,7 +114,6 @@ def test_strings_that_cannot_arrive_as_they_are(array: Any, arrived: list[str]) 
 
 
 def test_large_contiguous_array_is_not_copied_when_written() -> None:
-    """The frame of a large array is a view of the array's memory."""
     array = np.zeros(LARGE, np.uint8)
     writer = ArrayWriter()
     writer.add(array)
@@ -123,7 +121,6 @@ def test_large_contiguous_array_is_not_copied_when_written() -> None:
 
 
 def test_tail_is_bounded() -> None:
-    """When the tail is full, small arrays get frames too."""
     writer = ArrayWriter()
     for _ in range(2 * arrays.MAX_TAIL_BYTES // arrays.INLINE_BYTES):
         writer.add(np.zeros(arrays.INLINE_BYTES, np.uint8))
@@ -133,7 +130,6 @@ def test_tail_is_bounded() -> None:
 
 @pytest.mark.parametrize("size", [3, LARGE])
 def test_copied_array_can_be_written_and_shares_nothing(size: int) -> None:
-    """With copy=True an array has its own aligned, writable memory."""
     source = np.zeros(size, np.uint8)
     array = through(source)
     array[:] = 1
@@ -169,7 +165,6 @@ F4, BOOL, TEXT_CODE, BYTES_CODE, TIME_CODE = 10, 0, 14, 15, 16
 
 
 def test_hand_made_descriptor_is_understood() -> None:
-    """The descriptors that the tests below spoil are what the reader reads."""
     tail = np.arange(6, dtype="<f4").tobytes()
     assert_same(np.arange(6, dtype="f4").reshape(2, 3), read(descriptor(F4, 2, 3), tail))
 
@@ -221,14 +216,12 @@ def test_a_lie_about_an_array_is_refused(
 
 
 def test_array_larger_than_a_frame_may_be_is_refused() -> None:
-    """The cap holds for what is declared, not only for what came."""
     with pytest.raises(MessageTooLargeError, match="frame_bytes"):
         read(descriptor(F4, 2**30, frame=True), b"", (b"",))
 
 
 @pytest.mark.parametrize("name", DTYPES)
 def test_scalar_comes_back_as_the_same_numpy_type(name: str) -> None:
-    """A numpy scalar keeps its type and bits."""
     # a time without a unit is none, but for the one that stands for no time
     scalar = np.array(["NaT"], "M8")[0] if name == "M8" else np.ones(1, np.dtype(name))[0]
     back = decode(encode(scalar))
@@ -243,13 +236,11 @@ def test_scalar_comes_back_as_the_same_numpy_type(name: str) -> None:
     "data", [b"", b"\x0a", b"\x0a" + bytes(3), b"\x0a" + bytes(5), b"\x00\x02", b"\xff\x00\x00"]
 )
 def test_malformed_scalar_is_refused(data: bytes) -> None:
-    """A scalar of a wrong length, value or dtype raises RemoteProtocolError."""
     with pytest.raises(RemoteProtocolError):
         read_numpy_scalar(data)
 
 
 def test_descriptors_are_stable() -> None:
-    """The bytes of a descriptor are part of the protocol."""
     assert ArrayWriter().add(np.zeros((2, 3), "f4")) == descriptor(F4, 2, 3)
     assert ArrayWriter().add(np.zeros((5, LARGE), "?")) == descriptor(BOOL, 5, LARGE, frame=True)
     assert ArrayWriter().add(np.zeros(2, "U7")) == descriptor(TEXT_CODE, 2, parameter=7)

@@ -55,7 +55,6 @@ class Unprintable:
 
 
 def through(value: object, **options: Any) -> Any:
-    """Encodes and decodes a value."""
     return decode([bytes(frame) for frame in encode(value)], **options)
 
 
@@ -159,7 +158,6 @@ def test_subclasses_arrive_as_what_they_extend(value: object, plain: object) -> 
 
 
 def test_array_subclasses_arrive_as_arrays() -> None:
-    """Subclasses of ndarray are arrays; a masked array is not just its data."""
     assert_same(np.arange(3), through(np.arange(3).view(type("Sub", (np.ndarray,), {}))))
     assert isinstance(through(np.ma.masked_array([1, 2], [0, 1])), RemoteObject)
 
@@ -178,7 +176,6 @@ def test_large_arrays_are_frames_and_small_ones_are_not() -> None:
 
 
 def test_uncopied_values_are_views_of_the_frames() -> None:
-    """With copy=False large arrays cost no memory, and none can be written."""
     frames = encode([np.zeros(INLINE_BYTES + 1, np.uint8), np.zeros(2)])
     large, small = decode(frames, copy=False)
     assert np.shares_memory(large, np.frombuffer(frames[1], np.uint8))
@@ -219,7 +216,6 @@ def test_keys_that_look_alike_are_numbered() -> None:
 
 
 def test_keys_that_cannot_be_hashed_here_are_described() -> None:
-    """A tensor is a key to the worker, and arrives as an array, which is none."""
     torch = pytest.importorskip("torch")
     for key in (torch.zeros(2), (1, torch.zeros(2))):
         assert [type(one) for one in through({key: 1})] == [RemoteObject]
@@ -238,7 +234,6 @@ def test_description_is_bounded_printable_and_without_addresses() -> None:
 
 
 def test_remote_objects_can_be_passed_on() -> None:
-    """A description that is sent again arrives unchanged."""
     value = [RemoteObject("a.B", "<b>"), RemoteEnum("a.E", "X", 3)]
     again = through(value)
     assert again == value
@@ -257,7 +252,6 @@ def test_pickles_travel_only_where_both_ends_say_so() -> None:
 
 
 def test_known_values_are_never_pickled() -> None:
-    """A pickler changes nothing for values that have a form on the wire."""
     value = [1, (2.0, {"a": np.zeros(3)}), {None}, Level.LOW]
     assert encode(value, pickler=pickle.dumps) == encode(value)
 
@@ -318,7 +312,6 @@ def test_torch_tensors_arrive_as_tensors_or_arrays() -> None:
 
 
 def cyclic() -> dict[str, Any]:
-    """A value that contains itself."""
     value: dict[str, Any] = {"info": {"a": [0, 1, 2]}}
     value["info"]["a"].append(value["info"])
     return value
@@ -350,13 +343,11 @@ def test_what_cannot_be_sent_is_refused_with_its_path(value: object, text: str) 
 
 @pytest.mark.parametrize("wrap", [bytes, memoryview, lambda frame: memoryview(bytearray(frame))])
 def test_frames_may_be_any_buffer(wrap: Callable[[Buffer], Buffer]) -> None:
-    """Transports hand over bytes or memoryviews."""
     value = [np.arange(10.0), np.arange(10_000.0), "x"]
     assert_same(value, decode([wrap(frame) for frame in encode(value)]))
 
 
 def test_decoded_arrays_do_not_alias_the_transport() -> None:
-    """A transport may reuse its buffers once a copied value is decoded."""
     buffers = [bytearray(frame) for frame in encode([np.ones(10), np.ones(10_000)])]
     small, large = decode([memoryview(buffer) for buffer in buffers])
     for buffer in buffers:

@@ -58,14 +58,12 @@ def short(frames: list[Buffer]) -> list[str]:
 
 
 def test_golden_bytes_are_what_is_written() -> None:
-    """The encoding never changes by accident: other versions must read it."""
     written = {name: short(encode(value)) for name, value in GOLDEN_VALUES.items()}
     assert written == json.loads(GOLDEN.read_text())
 
 
 @pytest.mark.parametrize("name", GOLDEN_VALUES)
 def test_golden_bytes_are_read(name: str) -> None:
-    """What was once written is still understood."""
     texts = json.loads(GOLDEN.read_text())[name]
     frames = []
     for text in texts:

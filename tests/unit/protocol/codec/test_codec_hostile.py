@@ -125,7 +125,6 @@ def test_times_without_a_unit_are_refused() -> None:
     ids=lambda frames: b"|".join(frames)[:24].hex() or "none",
 )
 def test_malformed_messages_are_refused(frames: list[Buffer]) -> None:
-    """Whatever is wrong with a message, the error says that the peer is."""
     with pytest.raises(RemoteProtocolError):
         decode(frames)
 
@@ -145,7 +144,6 @@ def test_malformed_messages_are_refused(frames: list[Buffer]) -> None:
     ],
 )
 def test_every_limit_holds(value: object, limit: str) -> None:
-    """Messages over a limit are refused by its name, on both sides."""
     with pytest.raises(MessageTooLargeError, match=limit):
         decode(encode(value), limits=SMALL)
     with pytest.raises(LocalProtocolError):
@@ -166,7 +164,6 @@ def test_every_limit_holds(value: object, limit: str) -> None:
     ],
 )
 def test_values_at_a_limit_pass(value: object) -> None:
-    """The limits are the largest values that pass."""
     assert_same(value, decode(encode(value, limits=SMALL), limits=SMALL))
 
 
@@ -190,7 +187,6 @@ def test_colliding_keys_are_refused() -> None:
 
 
 def test_hostile_description_is_cleaned_by_the_receiver() -> None:
-    """The receiver does not rely on the sender for bounds and escapes."""
     remote = decode(packed([ext(25), "a\x1b]0;x\x07" * 1000, "\r\x9b31m" * 10_000]))
     assert isinstance(remote, RemoteObject)
     assert remote.type_name.isprintable()

@@ -29,12 +29,10 @@ from tests.support.wire import deep
 
 
 def frames_of(value: object) -> list[Any]:
-    """A call with this for an argument."""
     return [bytes(one) for one in m.pack(m.Call(1, "told", (value,), {}), pickler=framed)]
 
 
 def through(value: object) -> Any:
-    """What the other side gets of it."""
     call = m.unpack(frames_of(value), unpickler=cloudpickle.loads)
     assert isinstance(call, m.Call)
     return call.args[0]
@@ -42,14 +40,12 @@ def through(value: object) -> Any:
 
 @pytest.mark.parametrize("name", handed.PLAIN | handed.PICKLED)
 def test_a_value_arrives_as_it_is(name: str) -> None:
-    """Of the same type and content, and the same order in memory."""
     value = (handed.PLAIN | handed.PICKLED)[name]
     assert_identical(value, through(value), name)
 
 
 @pytest.mark.parametrize("name", handed.CALLABLE)
 def test_what_is_called_arrives_as_it_is(name: str) -> None:
-    """And gives the same."""
     function = handed.CALLABLE[name]
     arrived = through(function)
     assert arrived(3) == function(3)
@@ -57,7 +53,6 @@ def test_what_is_called_arrives_as_it_is(name: str) -> None:
 
 
 def test_a_tensor_arrives_as_it_is() -> None:
-    """With its dtype."""
     torch = pytest.importorskip("torch")
     tensor = torch.arange(6, dtype=torch.bfloat16).reshape(2, 3)
     arrived = through(tensor)
@@ -76,19 +71,16 @@ def test_what_holds_itself_arrives_so() -> None:
 
 @pytest.mark.parametrize("name", handed.PLAIN)
 def test_what_the_wire_carries_is_not_pickled(name: str) -> None:
-    """Crash bundles repeat it, and who has no unpickler reads it."""
     assert isinstance(m.unpack(frames_of(handed.PLAIN[name])), m.Call)
 
 
 @pytest.mark.parametrize("name", handed.PICKLED)
 def test_what_the_wire_would_change_is_pickled(name: str) -> None:
-    """Nobody who has no unpickler reads it."""
     with pytest.raises(RemoteProtocolError, match="never loaded"):
         m.unpack(frames_of(handed.PICKLED[name]))
 
 
 def test_every_field_of_the_callers_own_arrives_as_it_is() -> None:
-    """Whatever the message is called."""
     value = handed.Pose(1.0, bytearray(b"x"))
     for message in (
         m.Load(1, False, {"a": value}, {"b": value}),
@@ -117,7 +109,6 @@ def test_what_comes_back_is_never_pickled() -> None:
 
 
 def test_a_framed_pickle_is_an_array_of_bytes() -> None:
-    """Anything else in its place is refused before it is loaded."""
     frames = frames_of(np.zeros(INLINE_BYTES, handed.STRUCTURED))
     loaded: list[Any] = []
     header = frames[0].replace(b"\x06\x05\x81", b"\x06\x01\x81")  # int8 for uint8
@@ -145,7 +136,6 @@ def test_a_framed_pickle_is_an_array_of_bytes() -> None:
     ],
 )
 def test_what_cannot_be_sent_is_named(message: m.Message, words: str) -> None:
-    """Which call, which argument, which key in it, and what to do."""
     with pytest.raises(LocalProtocolError, match=words) as caught:
         m.pack(message, pickler=framed)
     if message.HANDED:
@@ -220,7 +210,6 @@ def test_of_a_reply_that_cannot_be_sent_the_rest_arrives(name: str) -> None:
 
 
 def test_a_field_itself_is_never_a_description() -> None:
-    """The message would be none any more: then it is refused as before."""
     infos = dict.fromkeys(range(_MOST), 1)
     with pytest.raises(LocalProtocolError, match="items"):
         encode([71, infos], reduces=True)

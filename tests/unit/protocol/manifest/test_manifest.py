@@ -44,7 +44,6 @@ def an_env(**changed: Any) -> EnvManifest:
 
 
 def a_manifest(*envs: EnvManifest) -> Manifest:
-    """A manifest of some environments."""
     return Manifest(
         envs=envs or (an_env(),),
         lazy=True,
@@ -80,13 +79,11 @@ def read(value: object) -> Manifest:
     ],
 )
 def test_manifests_arrive_as_they_were(env: EnvManifest) -> None:
-    """Every field comes back, spaces included, through real bytes."""
     manifest = a_manifest(env, an_env(suite="other"))
     assert read(value_of(manifest)) == manifest
 
 
 def test_one_environment_arrives_as_it_was() -> None:
-    """The reply to ``Build`` is read by the same rules."""
     value = decode(encode(encode_env(an_env())))
     assert decode_env(value, max_elements=ELEMENTS) == an_env()
 
@@ -100,7 +97,6 @@ def test_only_a_vector_environment_with_a_step_of_its_own_decides_what_a_batch_i
 
 
 def test_every_field_crosses() -> None:
-    """A field that is added to a manifest is on the wire too."""
     made = value_of()
     assert set(made) == {field.name for field in dataclasses.fields(Manifest)}
     assert set(made["envs"][0]) == {field.name for field in dataclasses.fields(EnvManifest)}
@@ -109,7 +105,6 @@ def test_every_field_crosses() -> None:
 @pytest.mark.parametrize("name", [field.name for field in dataclasses.fields(EnvManifest)])
 @pytest.mark.parametrize("lie", [b"bytes", 1.5, {3: 4}, [[]], object], ids=repr)
 def test_fields_of_another_type_are_refused(name: str, lie: object) -> None:
-    """No field takes a value of a type that it never has."""
     with pytest.raises(RemoteProtocolError):
         read(with_env(name, lie))
 
@@ -145,21 +140,18 @@ def test_fields_of_another_type_are_refused(name: str, lie: object) -> None:
     ],
 )
 def test_impossible_values_are_refused(name: str, lie: object) -> None:
-    """Counts are bounded, names are short strings, modes are Gymnasium's."""
     with pytest.raises(RemoteProtocolError):
         read(with_env(name, lie))
 
 
 @pytest.mark.parametrize("lie", [None, [], (), {}, {"envs": ()}, "manifest", 3])
 def test_what_is_no_manifest_is_refused(lie: object) -> None:
-    """Neither another type, nor other fields."""
     with pytest.raises(RemoteProtocolError):
         read(lie)
 
 
 @pytest.mark.parametrize("name", ["envs", "lazy", "interpreter", "packages"])
 def test_missing_and_unknown_fields_are_refused(name: str) -> None:
-    """Exactly the fields of this version, no more and no fewer."""
     missing, unknown = value_of(), value_of()
     del missing[name]
     unknown["extra"] = 1
@@ -170,27 +162,23 @@ def test_missing_and_unknown_fields_are_refused(name: str) -> None:
 
 @pytest.mark.parametrize("envs", [(), (None,) * (MAX_ENVS + 1)], ids=["none", "too many"])
 def test_the_number_of_environments_is_bounded(envs: tuple[None, ...]) -> None:
-    """Before any of them is looked at."""
     with pytest.raises(RemoteProtocolError, match="1 to 4096"):
         read({**value_of(), "envs": envs})
 
 
 def test_a_task_named_twice_is_refused() -> None:
-    """One of the two would vanish in the mapping."""
     made = value_of(a_manifest(an_env(), an_env()))
     with pytest.raises(RemoteProtocolError, match="same task twice"):
         read(made)
 
 
 def test_spaces_of_absurd_size_are_refused_before_they_are_built() -> None:
-    """The caller's limit on elements holds for every space of the manifest."""
     large = an_env(observation_space=spaces.Box(0, 1, (ELEMENTS + 1,)))
     with pytest.raises(RemoteProtocolError):
         read(value_of(a_manifest(large)))
 
 
 def test_package_versions_are_short_text() -> None:
-    """They are printed in provenance."""
     for lie in ({"numpy": 2}, {"numpy": "x" * (MAX_NAME + 1)}, {2: "numpy"}, []):
         with pytest.raises(RemoteProtocolError):
             read({**value_of(), "packages": lie})
@@ -205,7 +193,6 @@ plain = st.recursive(
 
 @given(st.sampled_from([field.name for field in dataclasses.fields(EnvManifest)]), plain)
 def test_arbitrary_fields_raise_nothing_but_protocol_errors(name: str, lie: object) -> None:
-    """Whatever a field holds, the manifest is read or refused."""
     try:
         read(with_env(name, lie))
     except RemoteProtocolError:

@@ -72,7 +72,6 @@ def test_no_name_that_is_looked_for_in_any_object_is_served() -> None:
 
 @given(st.text())
 def test_no_form_that_is_not_an_identifier_is_served(name: str) -> None:
-    """Nor anything with an underscore before or dunders around."""
     if is_servable(name) and name not in HONEST:
         assert name.isidentifier()
         assert not name.startswith("_")
@@ -81,14 +80,12 @@ def test_no_form_that_is_not_an_identifier_is_served(name: str) -> None:
 
 
 def test_no_name_of_gymnasiums_is_served() -> None:
-    """Those of the base class are answered here, or by nobody."""
     for name in (*dir(gym.vector.VectorEnv), "envs", "env_fns", "num_envs", *PROBED):
         assert not is_servable(name), name
     assert set(gym.vector.VectorEnv.__annotations__) <= GYMNASIUMS
 
 
 def test_manifests_load_without_the_names_that_are_not_served() -> None:
-    """An honest class may have them: they are left out, and the others stay."""
     made = read(with_env("attributes", ("__len__", "_cache", "hub_config", "a b", "_ensure")))
     assert made.envs[0].attributes == ("hub_config", "_ensure")
 
@@ -98,14 +95,12 @@ def test_manifests_load_without_the_names_that_are_not_served() -> None:
     "name", ["/etc", "..", "../x", "a/../../x", "a\\..\\x", "\\x", "a/..", "//a"]
 )
 def test_names_of_tasks_lead_into_no_other_folder(field: str, name: str) -> None:
-    """Callers write files under them."""
     with pytest.raises(RemoteProtocolError, match="as a path"):
         read(with_env(field, name))
 
 
 @pytest.mark.parametrize("name", ["ALE/Pong-v5", "pick cube", "v1..2", "a.b", "...", "", "~"])
 def test_names_of_tasks_may_be_anything_else(name: str) -> None:
-    """Slashes among it."""
     assert read(with_env("task", name)).envs[0].task == name
 
 
@@ -113,7 +108,6 @@ def test_names_of_tasks_may_be_anything_else(name: str) -> None:
 
 
 def test_metadata_keeps_what_people_read() -> None:
-    """Other keys are free; those of Gymnasium hold what Gymnasium takes."""
     given = {"render_fps": 30, "render_modes": ["rgb_array"], "robot": {"arms": 2}, "jax": False}
     assert read_metadata_facts(given) == given
     assert read_metadata_facts({"render_fps": np.float32(12.5)}) == {"render_fps": np.float32(12.5)}
@@ -137,7 +131,6 @@ def test_metadata_keeps_what_people_read() -> None:
     ],
 )
 def test_metadata_on_which_gymnasium_acts_is_typed(key: str, lie: object) -> None:
-    """A key with anything else is left out; the rest stays."""
     assert read_metadata_facts({key: lie, "robot": "so100"}) == {"robot": "so100"}
 
 
@@ -154,20 +147,17 @@ def test_metadata_on_which_gymnasium_acts_is_typed(key: str, lie: object) -> Non
     ids=["list", "array", "nested", "objects", "key", "type"],
 )
 def test_metadata_is_bounded(lie: object) -> None:
-    """However its values are nested."""
     with pytest.raises(RemoteProtocolError):
         read_metadata_facts(lie)
 
 
 def test_autoreset_modes_that_are_arrays_are_refused() -> None:
-    """As a protocol error, like any other lie."""
     for lie in (np.array(["NextStep", "SameStep"]), np.zeros(3), np.array("NextStep"), []):
         with pytest.raises(RemoteProtocolError):
             read(with_env("autoreset_mode", lie))
 
 
 def test_specs_keep_their_facts_only() -> None:
-    """What else is said there is left out, so that newer workers can say more."""
     facts = {"id": "X-v0", "max_episode_steps": 5, "reward_threshold": 0.5}
     assert read_spec_facts({**facts, "entry_point": "os:system", "kwargs": {}}) == facts
     numpys = {"max_episode_steps": np.int64(5), "nondeterministic": np.bool_(True)}
@@ -195,13 +185,11 @@ def test_specs_keep_their_facts_only() -> None:
     ids=repr,
 )
 def test_specs_of_wrong_types_are_refused(lie: object) -> None:
-    """Each fact has a type and bounds."""
     with pytest.raises(RemoteProtocolError):
         read_spec_facts(lie)
 
 
 def test_specs_name_the_repository_that_makes_them() -> None:
-    """As text, JSON, a pickle and a copy; whoever makes one is told."""
     made = spec_of(an_env().spec, "org/repo@0123")
     assert made is not None
     for spec in (made, copy.deepcopy(made), pickle.loads(pickle.dumps(made))):
@@ -220,7 +208,6 @@ KINDS = ("PCG64", "PCG64DXSM", "MT19937", "Philox", "SFC64")
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("draws", [0, 1, 7, 700])
 def test_every_state_that_a_generator_has_is_taken(kind: str, draws: int) -> None:
-    """A copy draws what the original draws, also through real bytes."""
     original = np.random.Generator(getattr(np.random, kind)(3))
     original.integers(0, 9, draws, np.int32)  # leaves half a word behind
     state: Any = decode(encode(original.bit_generator.state))
@@ -229,7 +216,6 @@ def test_every_state_that_a_generator_has_is_taken(kind: str, draws: int) -> Non
 
 @given(st.sampled_from(KINDS), st.data())
 def test_states_with_another_field_are_refused_or_harmless(kind: str, data: st.DataObject) -> None:
-    """Nothing but protocol errors; what is taken can be drawn from."""
     state: Any = getattr(np.random, kind)(3).state
     field = data.draw(st.sampled_from([name for name in state if name != "bit_generator"]))
     inner = state[field] if type(state[field]) is dict else state

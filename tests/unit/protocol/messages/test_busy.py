@@ -8,7 +8,6 @@ from envhub_worker.protocol.messages.busy import LONGEST_S, Busy
 
 
 def test_a_refusal_arrives_as_it_was() -> None:
-    """But that nobody is made to wait for ever."""
     assert Busy.read("jails", Busy("jails", 3, 4, 2.5).words()) == Busy("jails", 3, 4, 2.5)
     assert Busy.read("jails", "3 4 9999").retry_s == LONGEST_S
 
@@ -21,5 +20,4 @@ def test_a_refusal_arrives_as_it_was() -> None:
     ],
 )
 def test_anything_else_says_nothing(quota: str, words: str) -> None:
-    """A name that would paint, and numbers that are none."""
     assert Busy.read(quota, words) == Busy("", 0, 0, 1.0)

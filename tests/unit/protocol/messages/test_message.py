@@ -32,9 +32,8 @@ from tests.support import inside
 
 @pytest.mark.parametrize("message", [server.GetStatus(), runner.Value([1, {"a": b"x"}])])
 def test_a_message_arrives_as_it_was(message: m.Message) -> None:
-    """By itself, and with a number of one or more."""
     assert m.unpack(m.pack(message)) == message
-    for number in (1, 7, 1 << 40):
+    for number in (1, 200, 1 << 62, (1 << 63) - 1):
         [frame] = m.pack_header(message, number)
         assert m.unpack_header(frame) == (number, message)
         assert m.number_of(frame) == m.id_of(frame) == number
@@ -43,7 +42,6 @@ def test_a_message_arrives_as_it_was(message: m.Message) -> None:
 
 @pytest.mark.parametrize("frame", [b"", b"\0\0\0"])
 def test_a_header_without_a_number_has_none(frame: bytes) -> None:
-    """No error of another kind than the protocol's."""
     assert m.number_of(frame) is None
     assert m.id_of(frame) is None
     assert m.id_of(b"\0" * 20) is None
@@ -101,7 +99,6 @@ OUTGOING, INCOMING = inside.FORMS
 
 @pytest.fixture(autouse=True)
 def no_forms(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever other tests have sent."""
     for spot in (OUTGOING, INCOMING):
         monkeypatch.setattr(*spot, message.Forms())
 
@@ -133,7 +130,6 @@ def changed(value: Any) -> Any:
 
 @given(_VALUES)
 def test_what_comes_again_is_packed_and_unpacked_as_the_first_time(value: Any) -> None:
-    """The codec itself decides what is right, for anything that it takes."""
     for one in (value, value, value, changed(value)):
         frames = m.pack(m.Value(one))
         assert [bytes(f) for f in frames] == [bytes(f) for f in encode([m.Value.kind, one])]
@@ -144,7 +140,6 @@ def test_what_comes_again_is_packed_and_unpacked_as_the_first_time(value: Any) -
 
 @pytest.mark.parametrize(("one", "other"), [(1, True), (0, False), (0.0, -0.0), ("a", b"a")])
 def test_what_is_equal_and_not_the_same_is_kept_apart(one: Any, other: Any) -> None:
-    """True is 1, and is not."""
     for value in (one, one, one, other, other, other):
         message = m.unpack(m.pack(m.Value((value, np.zeros(2)))))
         assert isinstance(message, m.Value)
@@ -184,7 +179,6 @@ def test_a_form_that_cannot_be_made_is_none(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_what_can_be_changed_of_a_recurring_message_is_the_receivers_own() -> None:
-    """What one receiver writes, no other sees."""
     frames = m.pack(m.Value({"a": [1]}))
     values = [m.unpack(frames).value for _ in range(4)]  # type: ignore[attr-defined]
     for number, value in enumerate(values):
@@ -205,7 +199,6 @@ def _known(value: object) -> bytes:
 
 @pytest.mark.parametrize("change", [lambda raw: raw[:-1], lambda raw: raw + b"x"])
 def test_the_bytes_of_a_known_message_are_counted(change: Any) -> None:
-    """Too few, too many, or a frame that nothing describes."""
     header = _known("known")
     with pytest.raises(RemoteProtocolError):
         m.unpack([change(header)])
@@ -214,7 +207,6 @@ def test_the_bytes_of_a_known_message_are_counted(change: Any) -> None:
 
 
 def test_the_limits_of_a_known_message_hold() -> None:
-    """A form is for the limits under which it was made, and no others."""
     value = ["a" * 20, 1]
     header = _known(value)
     with pytest.raises(MessageTooLargeError):
@@ -226,7 +218,6 @@ def test_the_limits_of_a_known_message_hold() -> None:
 
 
 def test_a_known_header_is_read_with_any_id() -> None:
-    """The whole of it is known then; one byte more, and it is another."""
     message = m.Relay(3, "step", ((1, 1),), stepped=True)
     for number in range(1, 5):
         [header] = m.pack_header(message, number)
@@ -239,7 +230,6 @@ def test_a_known_header_is_read_with_any_id() -> None:
 
 
 def test_pickled_objects_and_tensors_never_have_a_form() -> None:
-    """What they become depends on who reads them."""
     frames = m.pack(m.Value(_Own()), pickler=cloudpickle.dumps)
     for _ in range(3):
         message = m.unpack(frames, unpickler=cloudpickle.loads)
@@ -260,7 +250,6 @@ class _Own:
 
 
 def test_a_peer_that_never_repeats_itself_fills_nothing() -> None:
-    """Of what comes once no more is kept than a number."""
     for number in range(2000):
         m.unpack(m.pack(m.Value(f"{number}")))
     assert not inside.forms(INCOMING)
@@ -269,7 +258,6 @@ def test_a_peer_that_never_repeats_itself_fills_nothing() -> None:
 
 @pytest.mark.parametrize("message", [m.Value(None), m.Done()], ids=["a field", "no field"])
 def test_a_document_that_is_cut_off_is_refused(message: m.Message) -> None:
-    """No form is taken for it."""
     for _ in range(3):
         [known] = m.pack(message)
         m.unpack([known])
@@ -280,7 +268,6 @@ def test_a_document_that_is_cut_off_is_refused(message: m.Message) -> None:
 
 
 def test_memory_that_is_not_there_is_the_peers_fault(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As without a form."""
     header, large = _framed()
     monkeypatch.setattr(ArrayReader, "take", _without_memory)
     with pytest.raises(MessageTooLargeError):
@@ -300,7 +287,6 @@ def _without_memory(*_: object) -> None:
 
 
 def test_what_has_no_end_is_refused_as_without_a_form() -> None:
-    """It is the codec that says where it is."""
     cyclic: list[object] = []
     cyclic.append(cyclic)
     deep: object = 1

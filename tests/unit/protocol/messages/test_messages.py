@@ -117,7 +117,6 @@ def values_of(message: m.Message) -> dict[str, Any]:
 
 
 def test_every_message_has_a_sample_and_a_golden_file() -> None:
-    """A message that is added, or goes, is noticed here."""
     assert set(BY_NAME) == {cls.__name__ for cls in m.KINDS.values()}
     assert {path.stem for path in GOLDEN.glob("*.hex")} == set(BY_NAME)
 
@@ -135,29 +134,19 @@ def test_bytes_are_golden(name: str) -> None:
 
 @pytest.mark.parametrize("name", BY_NAME)
 def test_golden_bytes_are_read(name: str) -> None:
-    """What was once written is still understood, field by field."""
     frames = [bytes.fromhex(line) for line in (GOLDEN / f"{name}.hex").read_text().split()]
     message = m.unpack(frames)
     assert type(message) is type(BY_NAME[name])
     assert_same(values_of(BY_NAME[name]), values_of(message))
 
 
-@pytest.mark.parametrize("request_id", [1, 200, 2**62, 2**63 - 1])
-def test_request_ids_arrive(request_id: int) -> None:
-    """An id of any size comes back as it was."""
-    [frame] = m.pack_header(m.Done(), request_id)
-    assert m.unpack_header(frame) == (request_id, m.Done())
-    assert m.id_of(frame) == m.id_of(memoryview(frame)) == request_id
-
-
 def test_a_header_is_golden() -> None:
-    """The id, and the message."""
     [frame] = m.pack_header(m.CloseJail(3), REQUEST_ID)
     assert bytes(frame).hex() == "000000000000000703000000920a03"
+    assert m.id_of(memoryview(frame)) == REQUEST_ID
 
 
 def test_the_id_of_a_header_that_cannot_be_read_is_known() -> None:
-    """So its sender need not wait for an answer."""
     [frame] = m.pack_header(m.CloseJail(3), REQUEST_ID)
     for spoiled in (bytes(frame[:8]), bytes(frame[:-1]), bytes(frame) + b"x"):
         assert m.id_of(spoiled) == REQUEST_ID
@@ -167,7 +156,6 @@ def test_the_id_of_a_header_that_cannot_be_read_is_known() -> None:
 
 @pytest.mark.parametrize("number", [0, 2**63, 2**64 - 1])
 def test_an_impossible_id_is_refused(number: int) -> None:
-    """A server that failed to pack its answer would end for everybody."""
     [header] = m.pack(m.Done())
     frame = number.to_bytes(8, "big") + bytes(header)
     assert m.id_of(frame) is None
@@ -177,7 +165,6 @@ def test_an_impossible_id_is_refused(number: int) -> None:
 
 @pytest.mark.parametrize("number", [1, 148 + 25 * 256, 2**63 - 1])
 def test_a_header_is_never_taken_for_packed(number: int) -> None:
-    """``CompressionHeader`` alone has the id 0."""
     header = m.pack_header(m.Done(), number)
     assert compression.unpack_frames(header, DEFAULT_LIMITS) == header
 
@@ -210,7 +197,6 @@ def test_what_is_no_message_is_refused(value: object, complaint: str) -> None:
 
 @given(st.binary(max_size=64), st.booleans())
 def test_arbitrary_headers_raise_nothing_but_protocol_errors(noise: bytes, with_id: bool) -> None:
-    """Whatever arrives, it is a message with an id, or a RemoteProtocolError."""
     frame = (7).to_bytes(8, "big") + noise if with_id else noise
     try:
         number, message = m.unpack_header(frame)
@@ -220,38 +206,12 @@ def test_arbitrary_headers_raise_nothing_but_protocol_errors(noise: bytes, with_
     assert number.bit_length() <= 63
 
 
-@given(st.lists(st.binary(max_size=64), max_size=3))
-def test_arbitrary_bytes_raise_nothing_but_protocol_errors(frames: list[bytes]) -> None:
-    """Whatever arrives, it is a message or a RemoteProtocolError."""
-    try:
-        message = m.unpack(frames)
-    except RemoteProtocolError:
-        return
-    assert type(message) in m.KINDS.values()
-
-
-@given(st.sampled_from(sorted(BY_NAME)), st.integers(0, 2**32), st.integers(0, 255))
-def test_one_changed_byte_raises_nothing_but_protocol_errors(
-    name: str, place: int, byte: int
-) -> None:
-    """A golden message with one byte changed is another message, or refused."""
-    frames = [bytearray(frame) for frame in m.pack(BY_NAME[name])]
-    frames[0][place % len(frames[0])] = byte
-    try:
-        message = m.unpack(frames)
-    except RemoteProtocolError:
-        return
-    assert type(message) in m.KINDS.values()
-
-
 def test_unsendable_fields_are_our_own_fault() -> None:
-    """What the wire cannot carry is refused before anything is sent."""
     with pytest.raises(LocalProtocolError, match="nested deeper than 32"):
         m.pack(m.Value(deep(100)))
 
 
 def test_messages_cannot_be_changed() -> None:
-    """A decoded message stays what was checked."""
     with pytest.raises(AttributeError, match=r"CloseJail\.jail"):
         m.CloseJail(3).jail = 4  # type: ignore[misc]
     with pytest.raises(AttributeError, match=r"CloseJail\.jail"):
@@ -259,7 +219,6 @@ def test_messages_cannot_be_changed() -> None:
 
 
 def test_messages_are_made_like_dataclasses() -> None:
-    """By order, by name, with defaults; nothing missing, unknown or twice."""
     expected = m.KeepJail(3)
     assert m.KeepJail(jail=3) == m.replace(m.KeepJail(4), jail=3) == expected
     assert expected != m.CloseJail(3)
@@ -292,7 +251,6 @@ assert "numpy" in sys.modules
 
 
 def test_a_server_does_without_numpy_until_it_is_sent_an_array() -> None:
-    """Its own conversation is the same bytes as with numpy."""
     folder = envhub_worker.__file__.rsplit("/envhub_worker/", 1)[0]
     golden = [(GOLDEN / f"{name}.hex").read_text().strip() for name in OF_A_SERVER]
     array = bytes(m.pack(m.Value(np.zeros(2)))[0]).hex()

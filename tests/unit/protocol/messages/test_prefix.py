@@ -29,12 +29,10 @@ def warned(*things: object) -> Buffer:
 
 
 def changed(*things: object) -> Buffer:
-    """The same of changes."""
     return m.pack(m.Changes(tuple(things)))[0]
 
 
 def test_what_was_put_in_front_is_read() -> None:
-    """Changes in front of warnings; the reply's frames are as they were."""
     frames = CHANGES.put([CHANGE, (2, "x")], WARNINGS.put([WARNING, WARNING], REPLY))
     changes, rest = CHANGES.read(frames)
     assert changes == [CHANGE, (2, "x")]
@@ -49,7 +47,6 @@ def test_what_was_put_in_front_is_read() -> None:
     ids=["a reply", "with arrays", "two replies", "nothing", "only warnings", "only changes"],
 )
 def test_other_frames_are_a_reply(prefix: Prefix[Any], frames: list[Buffer]) -> None:
-    """Only a prefix with something behind it stands in front of a reply."""
     assert prefix.read(frames) == ([], frames)
 
 
@@ -76,7 +73,6 @@ def test_other_frames_are_a_reply(prefix: Prefix[Any], frames: list[Buffer]) -> 
     ],
 )
 def test_anything_else_is_refused(lie: Buffer) -> None:
-    """Too many, too long, of other types, cut off."""
     with pytest.raises(RemoteProtocolError):
         WARNINGS.read(CHANGES.read([lie, *REPLY])[1])
 
@@ -89,7 +85,6 @@ def test_anything_else_is_refused(lie: Buffer) -> None:
     ],
 )
 def test_a_giant_is_refused_unread(prefix: Prefix[Any], largest: Any) -> None:
-    """By its size, before anything of it is decoded."""
     frames = prefix.put([largest] * prefix.most, REPLY)
     assert prefix.read(frames) == ([largest] * prefix.most, REPLY)
     with pytest.raises(MessageTooLargeError):

@@ -45,7 +45,6 @@ def test_a_slab_of_ours_is_mapped_by_others_to_be_read() -> None:
 
 @pytest.fixture
 def watch() -> Iterator[Watch]:
-    """One that watches nothing yet."""
     made = Watch()
     yield made
     made.close()
@@ -68,7 +67,6 @@ def test_a_runner_hears_a_ring() -> None:
 
 
 def test_a_runner_that_reads_nothing_is_told_of_our_end() -> None:
-    """Its read ends, once our side is closed."""
     bell = RunnerBell()
     copy = os.dup(bell.theirs)
     bell.close()
@@ -77,7 +75,6 @@ def test_a_runner_that_reads_nothing_is_told_of_our_end() -> None:
 
 
 def test_a_ring_before_the_wait_counts(watch: Watch) -> None:
-    """Once; and there is nothing to hear of a bell that was forgotten."""
     bell = OwnBell()
     os.eventfd_write(bell.fileno(), 1)
     watch.bell(bell)
@@ -89,7 +86,6 @@ def test_a_ring_before_the_wait_counts(watch: Watch) -> None:
 
 
 def test_a_death_is_seen_for_as_long_as_it_lasts(watch: Watch) -> None:
-    """Beside rings of others, until it is forgotten."""
     read, write = os.pipe()
     bell = OwnBell()
     watch.bell(bell)

@@ -32,7 +32,6 @@ LOOSE = [
 
 
 def sizes(leaves: tuple[slabs.Leaf, ...]) -> list[tuple[int, int]]:
-    """Start and end of each leaf."""
     found = []
     for leaf in leaves:
         size = int(np.prod(leaf.shape)) * leaf.dtype.itemsize
@@ -50,7 +49,6 @@ def assert_apart(areas: list[tuple[int, int]], total: int) -> None:
 @pytest.mark.parametrize("space", FIXED, ids=str)
 @pytest.mark.parametrize("count", [1, 3, 64])
 def test_nothing_in_a_slab_overlaps(space: gym.Space[Any], count: int) -> None:
-    """Header, results, infos, leaves and slots lie apart."""
     layout = slabs.layout_of(space, count)
     observed = slabs.observation_layout(space, count, 3)
     assert layout is not None
@@ -87,26 +85,22 @@ def test_a_batch_survives_its_leaves(space: gym.Space[Any]) -> None:
 
 @pytest.mark.parametrize("space", LOOSE, ids=str)
 def test_a_space_without_a_fixed_layout_has_no_slab(space: gym.Space[Any]) -> None:
-    """Text, sequences and graphs go as frames."""
     assert slabs.layout_of(space, 2) is None
     assert slabs.observation_layout(space, 2, 1) is None
 
 
 def test_a_slab_over_the_limit_is_not_made() -> None:
-    """Pinned memory has a bound; what is larger goes as frames."""
     pair = spaces.Box(0, 1, (2,), np.float64)
     assert slabs.layout_of(pair, slabs.MAX_SLAB_BYTES // 8) is None
     assert slabs.observation_layout(pair, slabs.MAX_SLAB_BYTES // 8, 1) is None
 
 
 def test_too_many_leaves_have_no_slab() -> None:
-    """The header has one word for the dtype of each action leaf."""
     many = spaces.Dict({str(i): spaces.Discrete(2) for i in range(slabs.MAX_LEAVES + 1)})
     assert slabs.layout_of(many, 1) is None
 
 
 def test_every_action_dtype_has_one_code() -> None:
-    """The code is the place in the table, on both sides."""
     assert len(slabs.DTYPE_CODES) == len(slabs.ACTION_DTYPES)
     for code, dtype in enumerate(slabs.ACTION_DTYPES):
         assert slabs.DTYPE_CODES[dtype] == code
@@ -114,7 +108,6 @@ def test_every_action_dtype_has_one_code() -> None:
 
 
 def test_a_step_is_its_arrays() -> None:
-    """Actions there; observations, rewards and two flags back."""
     layout, observed = slabs.layout_of(BOX, 4), slabs.observation_layout(NESTED, 4, 3)
     assert layout is not None
     assert observed is not None

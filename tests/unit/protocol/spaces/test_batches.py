@@ -56,7 +56,6 @@ def parts_of(space: gym.Space[Any], members: list[Any], bounds: batches.Bounds) 
 
 @given(NAMES, st.integers(1, 4))
 def test_what_gymnasium_batches_is_a_batch(name: str, count: int) -> None:
-    """Of so many members, and of no other number where the space has a shape."""
     space = SINGLE_SPACES[name]
     assert batches.is_batch(batch_space(space, count), space, count)
     shaped = not isinstance(space, (spaces.Text, spaces.Graph, spaces.Sequence))
@@ -73,7 +72,6 @@ def test_a_space_is_no_batch_of_itself(name: str) -> None:
 
 @given(st.integers(1, 200), st.data())
 def test_bounds_cover_everybody_once_and_evenly(count: int, data: st.DataObject) -> None:
-    """Shards follow each other, and differ by one sub-environment at most."""
     parts = data.draw(st.integers(1, count))
     bounds = batches.even_bounds(count, parts)
     assert [index for start, stop in bounds for index in range(start, stop)] == list(range(count))
@@ -136,12 +134,10 @@ def test_batches_conform_to_their_space(name: str) -> None:
     ],
 )
 def test_other_structures_shapes_and_dtypes_do_not_conform(name: str, batch: object) -> None:
-    """What a lying worker may send instead of a batch is noticed."""
     assert not batches.conforms(SINGLE_SPACES[name], batch, 3)
 
 
 def test_values_outside_the_bounds_conform() -> None:
-    """Environments leave their own bounds, and Gymnasium lets them."""
     assert batches.conforms(SINGLE_SPACES["box"], np.full((1, 2, 3), 9, np.float32), 1)
 
 
@@ -166,7 +162,6 @@ def without_classes(value: Any) -> Any:
 
 @pytest.mark.parametrize("name", SINGLE_SPACES)
 def test_only_graphs_need_their_classes_back(name: str) -> None:
-    """Everything else is left alone, for speed."""
     expected = name in {"graph", "sequence of graphs", "tuple"}
     assert batches.restores(SINGLE_SPACES[name]) is expected
 
@@ -250,7 +245,6 @@ class TestJoinedInfos:
         ids=["int", "0-d", "None", "too long", "absurd shape", "nested text"],
     )
     def test_lies_are_the_workers_fault(self, lie: dict[str, Any]) -> None:
-        """What no vector environment says is refused, and allocates nothing."""
         honest = {"a": np.array([1.0]), "_a": np.array([True])}
         for parts in ([honest, lie], [lie, honest]):
             with pytest.raises(RemoteProtocolError, match="do not fit together"):

@@ -28,14 +28,12 @@ _ROOM = 1 << 20
 
 
 def cut(infos: list[dict[str, Any]], data: st.DataObject) -> list[list[dict[str, Any]]]:
-    """Into parts."""
     cuts = data.draw(st.sets(st.integers(1, max(1, len(infos) - 1))))
     edges = [0, *sorted(one for one in cuts if one < len(infos)), len(infos)]
     return [infos[start:stop] for start, stop in itertools.pairwise(edges)]
 
 
 def joined(infos: list[dict[str, Any]]) -> dict[Any, Any]:
-    """Those of one worker."""
     return join_pairs(list(enumerate(infos)), len(infos))
 
 
@@ -44,7 +42,6 @@ def joined(infos: list[dict[str, Any]]) -> dict[Any, Any]:
 def test_what_goes_together_is_joined_as_ever(
     infos: list[dict[str, Any]], data: st.DataObject
 ) -> None:
-    """As ``join_infos`` does it, which is as Gymnasium does it."""
     parts = cut(infos, data)
     sizes = [len(part) for part in parts]
     with warnings.catch_warnings():
@@ -95,7 +92,6 @@ def member(infos: dict[Any, Any], key: str, index: int) -> Any:
 
 
 def plain(value: Any) -> Any:
-    """A number of Python's."""
     if isinstance(value, dict):
         return {key: plain(item) for key, item in value.items()}
     return value.item() if isinstance(value, np.generic) else value
@@ -115,7 +111,6 @@ def test_a_few_bytes_make_no_large_column() -> None:
     "mask", [np.zeros((1, 3)), np.array(["x"]), np.array([None]), np.zeros((1, 0), bool)]
 )
 def test_lies_about_masks_do_no_harm(mask: Any) -> None:
-    """They are the worker's own; the others keep theirs."""
     lie = {"x": np.array([1]), "_x": mask}
     honest = joined([{"x": 0.5}])
     for each in ([lie, honest], [honest, lie]):
@@ -126,7 +121,6 @@ def test_lies_about_masks_do_no_harm(mask: Any) -> None:
 
 
 def test_the_control_does_not_fit() -> None:
-    """Where dtypes differ, ``join_infos`` asks for each one's own."""
     with pytest.raises(Misfit):
         join_infos([joined([{"x": 1}]), joined([{"x": 0.5}])], [1, 1])
 
@@ -156,13 +150,11 @@ def test_nothing_that_is_let_in_keeps_others_back(lies: list[dict[Any, Any]]) ->
 
 @pytest.mark.parametrize("value", [1, "x", [1], None, np.zeros(2), np.zeros(()), {"y": [1]}])
 def test_what_has_no_row_for_each_is_refused(value: Any) -> None:
-    """As is what is no array."""
     with pytest.raises(Misfit):
         check_infos({"x": value}, 1)
 
 
 def test_what_is_to_be_asked_for_apart_is_known() -> None:
-    """Also beside a lie that only looks like it."""
     assert is_apart(dict(APART))
     for lie in ({}, {None: np.zeros(2)}, {None: 0}, {None: None, "x": 1}, {"x": None}):
         assert not is_apart(lie)

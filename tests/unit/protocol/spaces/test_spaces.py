@@ -155,12 +155,10 @@ def test_space_arrives_with_every_attribute(space: Space) -> None:
 
 @pytest.mark.parametrize("space", ALL, ids=repr)
 def test_batched_space_arrives_with_every_attribute(space: Space) -> None:
-    """What a vector environment makes of a space arrives too."""
     assert_crosses(batch_space(space, 3))
 
 
 def test_one_of_is_opaque_where_gymnasium_has_none(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An older Gymnasium describes what it cannot build."""
     monkeypatch.setattr("envhub_worker.protocol.spaces.reader.OneOf", None)
     value = {"kind": "one_of", "spaces": [encode_space(spaces.Discrete(2))]}
     space = decode_space(value, max_elements=MANY)
@@ -176,7 +174,6 @@ def test_dtype_of_discrete_arrives_where_gymnasium_has_one() -> None:
 
 
 def test_unsorted_plain_dict_keeps_its_order_and_flag() -> None:
-    """Where Gymnasium can be told not to sort keys, that is told on."""
     space = spaces.Dict([("b", spaces.Discrete(2)), ("a", spaces.Discrete(2))])
     space.sort_keys = False
     value = encode_space(space)
@@ -185,7 +182,6 @@ def test_unsorted_plain_dict_keeps_its_order_and_flag() -> None:
 
 
 def test_random_state_does_not_travel() -> None:
-    """Seeding the sender's space does not seed the receiver's."""
     space = spaces.Discrete(2**40)
     space.seed(1)
     assert encode(encode_space(space)) == encode(encode_space(spaces.Discrete(2**40)))
@@ -230,7 +226,6 @@ def boxes(draw: st.DrawFn) -> Space:
 
 
 def collections_of(children: st.SearchStrategy[Space]) -> st.SearchStrategy[Space]:
-    """Spaces made of other spaces."""
     some = st.lists(children, max_size=3)
     kinds = [
         some.map(spaces.Tuple),
@@ -267,7 +262,6 @@ def test_nested_spaces_arrive(space: Space) -> None:
 
 
 def test_subclass_arrives_as_its_gymnasium_base() -> None:
-    """What extends a class of Gymnasium is that class to the receiver."""
     arrived = through(BoxOfMine(0, 1, (2,)))
     assert type(arrived) is spaces.Box
     assert arrived == spaces.Box(0, 1, (2,))
@@ -285,7 +279,6 @@ def test_custom_space_describes_itself() -> None:
 
 
 def test_custom_space_refuses_to_sample_and_to_judge() -> None:
-    """What would need the stranger's code says so."""
     space = through(CustomSpace())
     with pytest.raises(gym.error.CustomSpaceError, match=r"CustomSpace.*inside the sandbox"):
         space.sample()
@@ -317,7 +310,6 @@ def test_space_that_the_wire_cannot_carry_is_described(space: Space) -> None:
 
 
 def nested(levels: int) -> Space:
-    """Tuples in tuples."""
     space: Space = spaces.Discrete(2)
     for _ in range(levels):
         space = spaces.Tuple([space])
@@ -376,7 +368,6 @@ def test_bytes_of_all_spaces_together_are_counted(
     ids=repr,
 )
 def test_absurd_sizes_are_refused_before_they_are_allocated(value: dict[str, Any]) -> None:
-    """A few bytes that describe gigabytes cost a few kilobytes."""
     honest = {
         "box": encode_space(spaces.Box(0, 1, (1,))),
         "multi_discrete": encode_space(spaces.MultiDiscrete([2, 2])),
@@ -407,7 +398,6 @@ def test_boxes_that_are_alike_share_their_bounds_and_nothing_else() -> None:
 
 
 def test_what_is_in_a_sequence_has_bounds_of_its_own() -> None:
-    """Gymnasium makes a batch of it, which is paid for however often it comes."""
     box = spaces.Box(0, 1, (1000,))
     value = encode_space(spaces.Tuple([box, *[spaces.Sequence(box)] * 3]))
     with pytest.raises(RemoteProtocolError, match="elements"):
@@ -415,7 +405,6 @@ def test_what_is_in_a_sequence_has_bounds_of_its_own() -> None:
 
 
 def test_reading_asks_before_each_space() -> None:
-    """Whatever ends it, such as a deadline, is what comes out."""
     asked = []
 
     def check() -> None:

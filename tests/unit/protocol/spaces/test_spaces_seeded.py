@@ -11,13 +11,11 @@ from envhub_worker.protocol.spaces.spaces import seeded_nodes, seeded_states
 
 
 def nested() -> gym.spaces.Dict:
-    """A space with five nodes."""
     pair = gym.spaces.Tuple([gym.spaces.Discrete(2), gym.spaces.Box(0, 1, (2,), np.float32)])
     return gym.spaces.Dict({"a": gym.spaces.MultiBinary(3), "b": pair})
 
 
 def test_nodes_come_in_a_fixed_order() -> None:
-    """A space before what it is made of."""
     kinds = [type(node).__name__ for node in seeded_nodes(nested())]
     assert kinds == ["Dict", "MultiBinary", "Tuple", "Discrete", "Box"]
 
@@ -30,7 +28,6 @@ def test_what_nobody_seeded_does_not_travel() -> None:
 
 
 def test_the_same_seed_is_the_same_states() -> None:
-    """Another seed, or a sample more, is another."""
     spaces = [nested() for _ in range(3)]
     for space, seed in zip(spaces, (1, 1, 2), strict=True):
         space.seed(seed)
@@ -41,7 +38,6 @@ def test_the_same_seed_is_the_same_states() -> None:
 
 
 def test_a_shared_generator_is_told_once() -> None:
-    """The later node has the place of the first."""
     one = gym.spaces.Discrete(2, seed=3)
     states = seeded_states(gym.spaces.Tuple([one, copy.copy(one)]))
     assert states is not None

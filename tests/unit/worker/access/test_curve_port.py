@@ -16,7 +16,6 @@ from tests.support.processes import eventually
 
 @pytest.fixture
 def context() -> Iterator[zmq.Context[zmq.Socket[bytes]]]:
-    """For sockets of a test."""
     with zmq.Context() as made:
         yield made
 

@@ -11,7 +11,6 @@ from envhub_worker.access.quotas import BusyError
 
 
 def test_what_runs_has_its_time_and_nothing_new_comes_in() -> None:
-    """From the moment on that it is asked to; a second time changes nothing."""
     now = [0.0]
     drain = Drain(60.0, lambda: now[0])
     drain.refuse_new()

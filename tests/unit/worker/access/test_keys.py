@@ -24,7 +24,6 @@ def write(path: Path, lines: Sequence[str], encoding: str = "utf-8") -> None:
 
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig"])
 def test_names_are_text_in_any_script(tmp_path: Path, encoding: str) -> None:
-    """Also where the file begins with the mark that some editors write."""
     path = tmp_path / "clients"
     write(path, [f"{key_text(ALICE)} Zoë Łukasz", f"{key_text(BOB)} 小林"], encoding)
     found = AuthorizedClients(path, {})

@@ -27,12 +27,10 @@ class Clock:
     now = 0.0
 
     def __call__(self) -> float:
-        """The same until somebody moves it."""
         return self.now
 
 
 def test_who_has_asked_twice_stands_before_who_comes_later() -> None:
-    """Who has asked once may not mean to wait, and delays nobody."""
     line = Line(Clock())
     line.wait(b"key", b"first")
     assert (line.waiting, line.ahead(b"key", b"second")) == (0, 0)
@@ -45,7 +43,6 @@ def test_who_has_asked_twice_stands_before_who_comes_later() -> None:
 
 
 def test_who_asks_no_more_is_forgotten() -> None:
-    """After some seconds; and a crowd of names takes no more than its room."""
     clock = Clock()
     line = Line(clock)
     for _ in range(2):
@@ -76,14 +73,12 @@ def test_who_asks_no_more_is_forgotten() -> None:
     ],
 )
 def test_paths_of_clients_stay_below_their_snapshot(path: str, why: str) -> None:
-    """Whatever else they are, they become files of the server's machine."""
     said = uploads.wrong_with_path(path)
     assert why in said
     assert bool(said) == bool(why)
 
 
 def listed(*paths: str, size: Any = 3) -> tuple[Any, ...]:
-    """A listing with these files."""
     return tuple((path, size, b"\0" * 32) for path in paths)
 
 
@@ -102,13 +97,11 @@ def listed(*paths: str, size: Any = 3) -> tuple[Any, ...]:
     ],
 )
 def test_listings_that_break_a_rule_are_refused(files: tuple[Any, ...]) -> None:
-    """Before a file of them is made."""
     with pytest.raises(RefusedError):
         uploads.checked_listing(files, Quotas())
 
 
 def test_a_snapshot_has_the_name_of_its_sorted_listing() -> None:
-    """However it was listed; one byte of one file more is another snapshot."""
     one = uploads.checked_listing(listed("b", "a/c"), Quotas())
     assert [file.path for file in one] == ["a/c", "b"]
     other = uploads.checked_listing(listed("a/c", "b"), Quotas())
@@ -120,7 +113,6 @@ def test_a_snapshot_has_the_name_of_its_sorted_listing() -> None:
 
 
 def order(**fields: Any) -> m.NeedPackages:
-    """What a client asks for."""
     nothing: dict[str, Any] = dict.fromkeys(
         ("requirements", "guesses", "constraints", "override", "without"), ()
     )
@@ -129,7 +121,6 @@ def order(**fields: Any) -> m.NeedPackages:
 
 
 def test_an_order_is_taken_as_plain_values() -> None:
-    """Rows as lists, as they are written for the program."""
     made = packages.checked(order(requirements=(("numpy", "env.py"),), python="3.11"))
     assert made["requirements"] == [["numpy", "env.py"]]
     assert made["python"] == "3.11"
@@ -147,13 +138,11 @@ def test_an_order_is_taken_as_plain_values() -> None:
     ],
 )
 def test_orders_without_bounds_are_refused(fields: dict[str, Any]) -> None:
-    """Rows of another form, too many, or too long."""
     with pytest.raises(RefusedError, match="an order has at most"):
         packages.checked(order(**fields))
 
 
 def test_the_program_is_of_this_interpreter() -> None:
-    """And runs isolated from the folder that the server was started in."""
     command = package_program.command()
     assert command[0] == sys.executable
     assert {"-I", package_program.PROGRAM} <= set(command)

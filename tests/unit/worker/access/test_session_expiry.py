@@ -43,7 +43,6 @@ def test_a_client_that_is_not_heard_of_loses_its_jails(idle_s: int, ended: list[
 
 
 def test_a_session_without_connections_and_jails_is_forgotten() -> None:
-    """One that has jails keeps them: it may be cut off and come back."""
     sessions, jails = Sessions(), _Jails(keyb=8)
     for number, name in enumerate((b"a", b"b", b"c"), start=1):
         sessions.connect(b"id%d" % number, b"key", name, number)

@@ -12,7 +12,6 @@ from envhub_worker.cli import listen_options
 
 
 def parsed(*arguments: str) -> argparse.Namespace:
-    """What ``listen`` is told."""
     parser = argparse.ArgumentParser()
     listen_options.add_options(parser)
     return parser.parse_args(arguments)
@@ -23,7 +22,6 @@ def parsed(*arguments: str) -> argparse.Namespace:
     [("16G", 16 << 30), ("16 GiB", 16 << 30), ("1.5T", 3 << 39), ("512m", 512 << 20), ("16", None)],
 )
 def test_sizes_have_units(text: str, size: int | None) -> None:
-    """And a number alone keeps the unit that it had."""
     told = parsed("--max-memory", text, "--max-upload", text)
     assert told.max_memory == (size or 16 << 30)
     assert told.max_upload == (size or 16 << 20)
@@ -33,7 +31,6 @@ def test_sizes_have_units(text: str, size: int | None) -> None:
 def test_what_is_no_size_is_told_with_the_units(
     text: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """By the option's name."""
     with pytest.raises(SystemExit, match="2"):
         parsed(f"--max-memory={text}")
     said = capsys.readouterr().err
@@ -42,7 +39,6 @@ def test_what_is_no_size_is_told_with_the_units(
 
 
 def test_sizes_are_those_of_the_quotas() -> None:
-    """What is not said is what the quotas are by themselves."""
     told, quotas = parsed(), Quotas()
     assert (told.max_memory, told.max_upload) == (quotas.memory_bytes, quotas.upload_bytes)
     assert (told.max_packages, told.max_inflight) == (quotas.packages_bytes, quotas.inflight_bytes)
@@ -59,7 +55,6 @@ def test_sizes_are_those_of_the_quotas() -> None:
 def test_a_command_that_is_misspelt_is_told(
     typed: str, says: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Where one is much like it; else all are named."""
     with pytest.raises(SystemExit, match="2"):
         main([typed])
     assert says in capsys.readouterr().err

@@ -17,14 +17,12 @@ from envhub_worker.protocol.keys import key_text, parse_key
 
 
 def parsed(program: Any, *words: str) -> argparse.Namespace:
-    """Options of a command."""
     parser = argparse.ArgumentParser()
     program.add_arguments(parser)
     return parser.parse_args(words)
 
 
 def test_a_key_pair_is_written_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The secret is its owner's alone; what is there already is not replaced."""
     arguments = parsed(keygen, "--out", str(tmp_path), "--name", "mine")
     assert keygen.run(arguments) == 0
     secret, public = tmp_path / "mine.key", tmp_path / "mine.pub"
@@ -40,7 +38,6 @@ def test_a_key_pair_is_written_once(tmp_path: Path, capsys: pytest.CaptureFixtur
 def test_a_folder_that_cannot_be_written_is_said(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """No traceback."""
     (tmp_path / "file").touch()
     assert keygen.run(parsed(keygen, "--out", str(tmp_path / "file" / "below"))) == 1
     assert "envhub-worker keygen: " in capsys.readouterr().err
@@ -49,13 +46,11 @@ def test_a_folder_that_cannot_be_written_is_said(
 def test_where_no_server_listens_there_is_nothing_to_drain(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """No process gets a signal."""
     assert drain.run(parsed(drain, "--state-dir", str(tmp_path), "--no-wait")) == 1
     assert capsys.readouterr().err.startswith("envhub-worker drain: ")
 
 
 def test_connections_leave_descriptors_to_jails(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Half of them, and one connection at least."""
     for soft, most in ((1_000, 500), (100_000, 1_024), (1, 1), (resource.RLIM_INFINITY, 1_024)):
         limits = soft, resource.RLIM_INFINITY
         monkeypatch.setattr(resource, "getrlimit", lambda _, found=limits: found)
@@ -78,19 +73,16 @@ def test_a_server_takes_its_options() -> None:
     ],
 )
 def test_addresses_of_metrics(text: str, address: tuple[str, int]) -> None:
-    """A port alone is one of this machine's own."""
     assert http_port.parse_address(text) == address
 
 
 @pytest.mark.parametrize("text", ["", "host:80", "1.2.3.4", "127.0.0.1:99999", "127.0.0.1:-1", "٣"])
 def test_what_is_no_address_is_refused(text: str) -> None:
-    """With an example; a name would be looked up."""
     with pytest.raises(ValueError, match=r"such as 127\.0\.0\.1:9090"):
         http_port.parse_address(text)
 
 
 def asked(address: str, request: bytes) -> bytes:
-    """What a port answers."""
     host, _, port = address.rpartition(":")
     with socket.create_connection((host, int(port)), timeout=60) as peer:
         peer.sendall(request)
@@ -119,5 +111,4 @@ def test_a_port_answers_who_asks_and_refuses_the_rest() -> None:
 
 
 def test_generated_keys_differ() -> None:
-    """Each pair is another one."""
     assert len({keys.generate().secret for _ in range(10)}) == 10

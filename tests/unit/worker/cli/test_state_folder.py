@@ -26,7 +26,6 @@ os.kill(os.getpid(), signal.SIGKILL)
 
 
 def test_it_is_there_as_long_as_its_server(tmp_path: Path) -> None:
-    """And says what was written."""
     assert state_folder.read_note(tmp_path) is None
     ours = Note(tmp_path, A)
     assert state_folder.read_note(tmp_path) == A
@@ -55,7 +54,6 @@ def test_that_of_a_server_that_was_killed_is_none(
 
 
 def test_a_server_removes_its_own(tmp_path: Path) -> None:
-    """Not that of another, which has replaced it."""
     first, second = Note(tmp_path, A), Note(tmp_path, B)
     first.remove()
     assert state_folder.read_note(tmp_path) == B

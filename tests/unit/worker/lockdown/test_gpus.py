@@ -71,7 +71,6 @@ SERVER = host(
 
 
 def test_gpus_are_counted_as_nvidia_smi_does() -> None:
-    """By address and not by the number of the node; others follow."""
     assert gpus(SERVER) == [
         ("/dev/nvidia1", "/dev/dri/renderD129"),
         ("/dev/nvidia10",),
@@ -81,7 +80,6 @@ def test_gpus_are_counted_as_nvidia_smi_does() -> None:
 
 
 def test_without_addresses_gpus_are_counted_by_their_nodes() -> None:
-    """As in a container that shows no more; tens after ones."""
     assert gpus(host()) == [("/dev/nvidia0",), ("/dev/nvidia1",), ("/dev/nvidia10",)]
     assert gpus(host(dev="", dri="renderD129 renderD128")) == [
         ("/dev/dri/renderD128",),
@@ -102,7 +100,6 @@ def test_all_is_what_computes_and_renders() -> None:
 
 
 def test_a_chosen_gpu_is_its_own_nodes_and_folders() -> None:
-    """With what leads to it; nothing of the others, nor of AMD's driver."""
     assert granted((0,), SERVER) == GpuGrant(
         ("/dev/dri/renderD129", "/dev/nvidia-uvm", "/dev/nvidia1", "/dev/nvidiactl"),
         ("/sys/bus/pci/devices/0000:01:00.0", "/sys/class/drm/renderD129", "/sys/dev/char/226:129"),
@@ -140,18 +137,15 @@ def test_what_a_device_in_a_device_is_part_of_is_its_folder() -> None:
 
 
 def test_nothing_is_granted_unasked() -> None:
-    """Whatever there is."""
     assert granted(False, SERVER) == GpuGrant()
 
 
 @pytest.mark.parametrize("gpu", [True, (0,)])
 def test_a_gpu_where_there_is_none_is_refused(gpu: bool | tuple[int, ...]) -> None:
-    """The nodes of a driver alone are none."""
     with pytest.raises(LayerUnavailableError, match="there is none here"):
         granted(gpu, host(dev="nvidiactl nvidia-uvm kfd", dri="card0"))
 
 
 def test_an_index_that_is_not_there_is_told_with_those_that_are() -> None:
-    """A jail with fewer than were asked for would fail later."""
     with pytest.raises(LayerUnavailableError, match=r"GPU 4, .* 1: /dev/nvidia10; 2: "):
         granted((0, 4), SERVER)

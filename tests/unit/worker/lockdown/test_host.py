@@ -33,7 +33,6 @@ _CONFIG = {
 
 @pytest.mark.parametrize("gpu", [False, True, (0, 2)])
 def test_a_zygotes_configuration_survives_json(gpu: bool | tuple[int, ...]) -> None:
-    """Lists become tuples again, and a flag stays one."""
     made = ZygoteConfig(**_CONFIG, gpu=gpu, readable=("/a", "/b"), roots=("/r",))  # type: ignore[arg-type]
     assert ZygoteConfig.from_wire(json.loads(json.dumps(asdict(made)))) == made
 
@@ -46,7 +45,6 @@ def test_processes_are_counted_as_the_kernel_does() -> None:
 
 
 def test_what_the_interpreter_is_loaded_from_is_there() -> None:
-    """The worker among it; a jail sees these and nothing above them."""
     paths = zygote.interpreter_paths()
     assert all(os.path.isabs(path) for path in paths)
     assert "/" not in paths
@@ -55,7 +53,6 @@ def test_what_the_interpreter_is_loaded_from_is_there() -> None:
 
 
 def test_proc_is_covered_where_it_tells_of_the_host() -> None:
-    """Only what there is, and no process's own entry."""
     files, folders = mounts.proc_to_cover()
     assert all(os.path.isdir(path) for path in folders)
     assert all(os.path.exists(path) and not os.path.isdir(path) for path in files)
@@ -63,7 +60,6 @@ def test_proc_is_covered_where_it_tells_of_the_host() -> None:
 
 
 def test_roots_jails_get_a_user_that_nobody_is() -> None:
-    """A plain user stays what it is."""
     chosen = user.choose()
     if os.geteuid() != 0:
         assert chosen is None
@@ -77,8 +73,6 @@ def test_roots_jails_get_a_user_that_nobody_is() -> None:
 
 
 def test_a_layer_is_tried_in_a_child() -> None:
-    """What it finds comes back, and so does why it fails; its end is not ours."""
-
     def dies() -> str:
         os._exit(3)
 
@@ -94,7 +88,6 @@ def test_a_layer_is_tried_in_a_child() -> None:
 
 
 def test_facts_explain_the_host() -> None:
-    """As plain values, for ``envhub doctor``."""
     facts = probe.host_facts()
     assert facts == json.loads(json.dumps(facts))
     assert facts["user"] == ("root" if os.geteuid() == 0 else "plain user")

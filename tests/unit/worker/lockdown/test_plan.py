@@ -20,13 +20,11 @@ STRICT = Confinement(limits=Limits(memory_bytes=GIB, disk_bytes=64 * MIB, disk_f
 
 
 def layers(confinement: Confinement, facts: HostFacts) -> list[tuple[str, bool, str]]:
-    """The plan as tuples."""
     made = plan(confinement, facts)
     return [(layer.layer, layer.enforced, layer.detail) for layer in made]
 
 
 def test_strict_as_a_user_has_every_layer() -> None:
-    """In the order in which they are entered."""
     assert layers(STRICT, USER) == [
         ("user-namespace", True, "one user, without capabilities outside"),
         ("pid-namespace", True, "sees and signals only its own processes"),
@@ -67,7 +65,6 @@ def test_root_becomes_somebody_else_first() -> None:
 
 
 def test_memory_that_nobody_counts_is_named() -> None:
-    """It depends on who counts, and on what else there is."""
     for profile, network, names in (
         ("strict", "host", "file locks, epoll watches, buffers of network connections"),
         ("no-userns", "none", "file locks, epoll watches, sockets that wait in sockets"),
@@ -78,7 +75,6 @@ def test_memory_that_nobody_counts_is_named() -> None:
 
 
 def test_weaker_profile_lists_what_it_goes_without() -> None:
-    """What is not enforced is said, with what stays possible."""
     made = layers(replace(STRICT, profile="no-userns"), USER)
     why = "the profile no-userns goes without"
     assert made[:3] == [
@@ -91,7 +87,6 @@ def test_weaker_profile_lists_what_it_goes_without() -> None:
 
 @pytest.mark.parametrize("gpu", [True, (0,)])
 def test_what_a_gpu_keeps_from_being_counted_is_told(gpu: bool | tuple[int, ...]) -> None:
-    """Its driver's memory, whoever counts; what it shares, where init does."""
     for memory, more in (("cgroup-v2", ""), ("watchdog", ", epoll watches, memfds and shared")):
         made = layers(replace(STRICT, gpu=gpu), replace(USER, memory=memory))
         [detail] = [detail for layer, _, detail in made if layer == "memory"]
@@ -99,7 +94,6 @@ def test_what_a_gpu_keeps_from_being_counted_is_told(gpu: bool | tuple[int, ...]
 
 
 def test_network_is_reported_as_chosen() -> None:
-    """The host's network is a layer that is not enforced."""
     for network, enforced, detail in (
         ("loopback", True, "only a loopback device"),
         ("host", False, "the host's network, by explicit choice"),
@@ -123,7 +117,6 @@ def test_network_is_reported_as_chosen() -> None:
 def test_missing_layer_is_an_error_with_a_fix(
     confinement: Confinement, facts: HostFacts, layer: str
 ) -> None:
-    """Nothing degrades silently."""
     with pytest.raises(LayerUnavailableError) as raised:
         plan(confinement, facts)
     assert raised.value.layer == layer
@@ -132,7 +125,6 @@ def test_missing_layer_is_an_error_with_a_fix(
 
 
 def test_signals_are_a_layer_where_init_must_send_them() -> None:
-    """Before Landlock ABI 6 and without a pid namespace."""
     bare = replace(STRICT, profile="no-userns")
     signals = ("signals", True, "sent by the jail's init, to processes of the jail only")
     assert signals in layers(bare, replace(USER, landlock_abi=4))
@@ -141,7 +133,6 @@ def test_signals_are_a_layer_where_init_must_send_them() -> None:
 
 
 def test_container_without_landlock_says_so() -> None:
-    """Its own outer layers hold; this one is reported as missing."""
     container = replace(STRICT, profile="container")
     assert ("landlock", False, "this kernel or container has none") in layers(
         container, replace(USER, landlock_abi=0)
@@ -175,7 +166,6 @@ def test_landlock_write_includes_neither_devices_nor_more_than_abi_one_to_five()
 
 
 def test_rlimits_follow_the_limits() -> None:
-    """Exactly these; a file may not be larger than the disk."""
     limits = Limits(open_files=9, disk_bytes=77, cpu_time_s=5)
     assert resource_limits(limits, 12) == {
         resource.RLIMIT_CORE: (0, 0),
@@ -210,7 +200,6 @@ def test_rlimits_follow_the_limits() -> None:
     ],
 )
 def test_refused_user_namespace_is_explained(files: dict[str, str], reason: str, fix: str) -> None:
-    """The fix is for this host; the weaker profile is always named."""
     error = user_namespace_unavailable(PermissionError(1, "no"), files.get)
     assert error.layer == "user-namespace"
     assert reason in error.reason

@@ -37,7 +37,6 @@ def root(
     devices: tuple[str, ...] = (),
     network: str = "none",
 ) -> RootPlan:
-    """The plan on ``HOST``, for ann."""
     return plan_root(
         interpreter,
         readable,
@@ -62,7 +61,6 @@ def test_root_without_wishes_is_the_system_only() -> None:
 
 
 def test_interpreter_appears_where_it_is() -> None:
-    """Once, however many paths name it, with the links that lead to it."""
     plan = root(interpreter=("/opt/py", "/opt/py/lib", "/python/current", "/usr/bin", "/nowhere"))
     assert plan.trees == ("/etc/fonts", "/opt/py", "/sys/devices/system/cpu", "/usr")
     assert plan.links["/python"] == "/opt/py"
@@ -80,12 +78,10 @@ def test_interpreter_cannot_open_a_home(path: str) -> None:
 
 
 def test_caller_may_grant_what_it_likes() -> None:
-    """An explicit grant is obeyed."""
     assert "/home/ann" in root(readable=("/home/ann",)).trees
 
 
 def test_snapshot_roots_are_kept_apart() -> None:
-    """They are shown to the zygote and covered up in each jail."""
     plan = root(roots=("/data/store",))
     assert plan.roots == ("/data/store",)
     assert "/data/store" not in plan.trees
@@ -99,12 +95,10 @@ def test_devices_are_those_that_are_granted() -> None:
 
 
 def test_host_network_adds_name_resolution() -> None:
-    """The host's own hosts file then replaces ours."""
     plan = root(network="host")
     assert plan.copies == ("/etc/ld.so.cache", "/etc/resolv.conf", "/etc/hosts")
     assert "/etc/hosts" not in plan.texts
 
 
 def test_outermost_keeps_no_path_within_another() -> None:
-    """By folder, not by prefix of the text."""
     assert outermost(["/a/b", "/a", "/ab", "/c/d", "/c/d/e"]) == ("/a", "/ab", "/c/d")

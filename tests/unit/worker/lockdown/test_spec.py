@@ -18,7 +18,6 @@ def wire(**changes: Any) -> dict[str, Any]:
 
 
 def test_an_ordinary_one_is_what_it_was() -> None:
-    """With lists for tuples, as JSON has them, and limits lifted that may be."""
     made = Confinement(
         readable=("/data",), environment={"A": "b"}, limits=Limits(cpu_time_s=None, file_bytes=5)
     )
@@ -39,7 +38,6 @@ def test_an_ordinary_one_is_what_it_was() -> None:
     ids=lambda changes: next(iter(changes)),
 )
 def test_what_there_cannot_be_is_refused(changes: dict[str, Any]) -> None:
-    """Before a zygote is started for it, or a number is added up."""
     with pytest.raises(RemoteProtocolError):
         confinement_from_wire(wire(**changes))
 

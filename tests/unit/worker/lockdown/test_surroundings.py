@@ -35,12 +35,10 @@ def layers(*names: str) -> list[dict[str, object]]:
 def test_the_strongest_profile_is_the_one_whose_layers_are_there(
     there: tuple[str, ...], abi: int, expected: str
 ) -> None:
-    """A single missing layer costs the profiles that name it."""
     assert surroundings.profiles(layers(*there), abi)[0] == expected
 
 
 def test_without_a_system_call_filter_there_is_no_profile() -> None:
-    """Nothing would keep the stranger from the server."""
     assert surroundings.profiles(layers("user-namespace", "landlock"), 7) == []
 
 
@@ -77,13 +75,11 @@ def test_limits_are_read_from_either_kind_of_control_group(
 
 
 def test_the_network_is_what_the_kernel_lists() -> None:
-    """Two lines of head, then a device a line."""
     table = "Inter-|   Receive\n face |bytes\n    lo:  0 0\n  eth0: 12 3\n"
     assert surroundings.network_devices(table) == ["lo", "eth0"]
 
 
 def test_the_announcement_is_one_line_of_json() -> None:
-    """The client reads one line and no more, and finds every field in it."""
     said = surroundings.announcement(surroundings.surroundings(), server_key="00")
     assert "\n" not in said
     found = vars(Surroundings.read(json.loads(said)))
@@ -102,7 +98,6 @@ def test_a_derived_image_brings_the_interpreter_of_its_jails(
 
 @pytest.mark.parametrize(("greeting", "healthy"), [(b"\xff", True), (b"H", False), (b"", False)])
 def test_health_is_a_peer_that_speaks_zeromq(greeting: bytes, healthy: bool) -> None:
-    """Anything else on the port, or silence, is not the worker."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
 
         def greet() -> None:
@@ -117,7 +112,6 @@ def test_health_is_a_peer_that_speaks_zeromq(greeting: bytes, healthy: bool) -> 
 
 
 def test_nobody_there_is_not_healthy() -> None:
-    """A port that refuses."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
         port = listener.getsockname()[1]
     assert not health.answers("127.0.0.1", port)

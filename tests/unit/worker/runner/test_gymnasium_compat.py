@@ -31,7 +31,6 @@ def test_parameters_that_can_be_given_by_name() -> None:
 
 @pytest.mark.parametrize("odd", [dict.__init__, type("Odd", (), {"__signature__": 3})(), 7])
 def test_what_python_cannot_tell_is_none(odd: Any) -> None:
-    """No error: the function is then called as the contract says."""
     found = gymnasium_compat.parameters_of(odd)
     assert found is None or "kwargs" in found
 
@@ -43,11 +42,9 @@ class Inner(gym.Env[Any, Any]):
     depth = "inner"
 
     def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        """Zero."""
         return 0, {}
 
     def step(self, action: Any) -> Any:
-        """Zero again."""
         return 0, 0.0, False, False, {}
 
 
@@ -69,13 +66,11 @@ def test_layers_are_walked_from_the_outside() -> None:
 
 
 def test_ancestors_are_found_by_name() -> None:
-    """Whatever would import them."""
     assert gymnasium_compat.descends_from(Inner(), "gymnasium.core", "Env")
     assert not gymnasium_compat.descends_from(Inner(), "torch.nn", "Module")
 
 
 def many(n_envs: int = 2) -> gym.vector.SyncVectorEnv:
-    """What most repositories return."""
     return gym.vector.SyncVectorEnv([Inner] * n_envs)
 
 
@@ -98,13 +93,11 @@ def test_results_become_tasks(returned: Any, names: list[tuple[str, Any]]) -> No
 
 @pytest.mark.parametrize("returned", [None, 3, Inner, {}, {"a": {}}, {"a": {0: 3}}, [many]])
 def test_what_is_no_environment_is_said(returned: Any) -> None:
-    """With what it is."""
     with pytest.raises(tasks.ResultError, match="make_env"):
         tasks.tasks_of(returned, 2, False, lambda: returned)
 
 
 def test_the_same_environment_twice_is_no_vector() -> None:
-    """``n_envs`` copies of one object would step it ``n_envs`` times."""
     only = Inner()
     [task] = tasks.tasks_of(only, 2, False, lambda: only)
     with pytest.raises(tasks.ResultError, match="the same Env object"):

@@ -42,7 +42,6 @@ class Oracle(VectorEnv[Any, Any, Any]):
     """Gymnasium's own way."""
 
     def join(self, infos: list[dict[str, Any]]) -> dict[str, Any]:
-        """All infos, one after the other."""
         self.num_envs = len(infos)
         joined: dict[str, Any] = {}
         for index, info in enumerate(infos):
@@ -105,7 +104,6 @@ def test_infos_cross_a_slab_unchanged(steps: list[list[dict[str, Any]]]) -> None
 
 
 def test_the_same_small_dict_goes_as_columns() -> None:
-    """Only the first of many alike goes through the codec."""
     slab = Slab(2)
     for step in range(5):
         infos = [{"x": float(step + i), "is_success": bool(i)} for i in range(2)]
@@ -122,7 +120,6 @@ def test_another_type_ends_the_columns() -> None:
 
 
 def test_a_byte_that_is_no_boolean_becomes_one() -> None:
-    """A hostile byte of 2 in a column of booleans is true, and nothing else."""
     [column] = columns_of({"a": np.array([False, True])}) or ()
     memory = bytearray([2, 0])
     read = column.view(memory, 0).astype(column.dtype)
@@ -142,5 +139,4 @@ def test_a_byte_that_is_no_boolean_becomes_one() -> None:
     ids=["empty", "objects", "nested", "number key", "text", "too large"],
 )
 def test_other_infos_have_no_columns(infos: dict[Any, Any]) -> None:
-    """Only flat, numeric infos of bounded size have columns."""
     assert columns_of(infos) is None

@@ -57,13 +57,11 @@ def test_elsewhere_a_dataclass_of_the_same_name_stands_in() -> None:
 
 @pytest.mark.parametrize("value", [5, "text", None, [1, {"a": 2}], (1, 2), {"a": {"b": [3]}}])
 def test_plain_values_stay_what_they_are(value: Any) -> None:
-    """Also their types."""
     assert config_of(value, here) == value
     assert type(config_of(value, here)) is type(value)
 
 
 def test_nested_objects_are_made_too() -> None:
-    """In fields, lists and mappings that were no dict."""
     camera = described((__name__, "Camera"), fields=("width", "name"), width=3, name="top")
     said = {"cameras": [camera], "more": described(fields=None, left=camera)}
     made = config_of(said, here)
@@ -73,7 +71,6 @@ def test_nested_objects_are_made_too() -> None:
 
 
 def test_what_cannot_be_made_is_named() -> None:
-    """By its class, with what was to be its fields."""
     said = described(("arena", "Bad"), fields=("not a name",), **{"not a name": 1})
     with pytest.raises(TypeError, match=r"no Bad can be made of not a name"):
         config_of(said, here)

@@ -19,7 +19,6 @@ class Box:
     low, high, shape, dtype = -np.ones(2, "f4"), np.ones(2, "f4"), (2,), np.dtype(np.float32)
 
     def contains(self, value: Any) -> bool:
-        """As any space."""
         return isinstance(value, np.ndarray)
 
 
@@ -30,7 +29,6 @@ class Tuple:
         self.spaces = spaces
 
     def contains(self, value: Any) -> bool:
-        """As any space."""
         return isinstance(value, tuple)
 
 
@@ -43,7 +41,6 @@ class Env:
     metadata: Any = {}  # noqa: RUF012
 
     def seed(self, seed: Any = None) -> None:
-        """As before 0.26."""
         self.asked += ("seed", seed)
 
 
@@ -55,22 +52,18 @@ class Wrapper(Env):
 
     @property
     def metadata(self) -> Any:
-        """As ``gym``'s."""
         return self.env.metadata
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self.env, name)
 
     def reset(self, **kwargs: Any) -> Any:
-        """As ``gym``'s."""
         return self.env.reset(**kwargs)
 
     def seed(self, seed: Any = None) -> None:
-        """As ``gym``'s."""
         self.env.seed(seed)
 
     def render(self, mode: str = "human", **kwargs: Any) -> Any:
-        """As ``gym``'s."""
         return self.env.render(mode=mode, **kwargs)
 
 
@@ -84,12 +77,10 @@ class Bare(Env):
     metadata = {"render.modes": ["human", "rgb_array"]}  # noqa: RUF012
 
     def reset(self) -> Any:
-        """Takes nothing."""
         self.asked += ("reset",)
         return OBSERVATION
 
     def render(self, mode: str = "human") -> Any:
-        """Takes a mode."""
         return mode
 
 
@@ -97,12 +88,10 @@ class Between(Env):
     """As from 0.22 to 0.25."""
 
     def reset(self, *, seed: Any = None, return_info: bool = False, options: Any = None) -> Any:
-        """Gives an info if it is asked."""
         self.asked += ("reset", seed, options)
         return (OBSERVATION, {"n": 1}) if return_info else OBSERVATION
 
     def render(self, *args: Any, **kwargs: Any) -> Any:
-        """As 0.25 wraps it."""
         return kwargs.get("mode")
 
 
@@ -110,7 +99,6 @@ class Deaf(Bare):
     """Somebody's, whose ``seed`` takes nothing."""
 
     def seed(self) -> None:  # type: ignore[override]
-        """Fails for whoever gives it one."""
         raise AssertionError
 
 
@@ -120,12 +108,10 @@ class Last(Env):
     render_mode = "rgb_array"
 
     def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        """Always gives an info."""
         self.asked += ("reset", seed, options)
         return OBSERVATION, {"n": 1}
 
     def render(self) -> Any:
-        """Takes nothing."""
         return "by its own mode"
 
 
@@ -133,7 +119,6 @@ class Blind(Wrapper):
     """A wrapper of somebody's that passes nothing on."""
 
     def reset(self) -> Any:  # type: ignore[override]
-        """Takes nothing."""
         return self.env.reset()
 
 
@@ -149,7 +134,6 @@ class Blind(Wrapper):
     ],
 )
 def test_it_is_seeded_by_what_every_layer_takes(env: Any, asked: Any, info: Any) -> None:
-    """``reset(seed=...)``, or ``seed()`` before it."""
     with pytest.warns(UserWarning, match="gym .* is not maintained"):
         adapted = old_gym.adapted(env)
     assert isinstance(adapted, gymnasium.Env)
@@ -170,15 +154,12 @@ def test_it_is_seeded_by_what_every_layer_takes(env: Any, asked: Any, info: Any)
     ],
 )
 def test_it_is_drawn_in_a_mode_that_needs_no_window(env: Any, mode: Any, drawn: Any) -> None:
-    """Which is asked for where it takes one, and can do it."""
     adapted = old_gym.OldEnv(env)
     assert adapted.render_mode == mode
     assert adapted.render() == drawn
 
 
 def test_an_observation_of_two_parts_is_no_observation_and_info() -> None:
-    """Where the space says so."""
-
     class Paired(Bare):
         observation_space = Tuple(Box(), Box())
 
@@ -189,8 +170,6 @@ def test_an_observation_of_two_parts_is_no_observation_and_info() -> None:
 
 
 def test_a_space_without_a_counterpart_is_named() -> None:
-    """And what there is."""
-
     class Own:
         """A space of somebody's."""
 
@@ -199,7 +178,6 @@ def test_a_space_without_a_counterpart_is_named() -> None:
 
 
 def test_an_attribute_is_set_where_it_is() -> None:
-    """Below the wrappers; a new one on the outermost."""
     env = Bare()
     env.gain = 1  # type: ignore[attr-defined]
     adapted = old_gym.OldEnv(Wrapper(env))
@@ -209,7 +187,6 @@ def test_an_attribute_is_set_where_it_is() -> None:
 
 
 def test_what_is_gymnasiums_stays_as_it_is(recwarn: Any) -> None:
-    """Without a word."""
     env = gymnasium.make("CartPole-v1")
     assert old_gym.adapted(env) is env
     assert not recwarn.list

@@ -37,7 +37,6 @@ def heard() -> Iterator[WarningLog]:
 
 
 def test_each_text_is_heard_once(heard: WarningLog) -> None:
-    """From any thread, and of each category."""
     for _ in range(3):
         warnings.warn("slow", stacklevel=1)
     other = threading.Thread(target=warnings.warn, args=("slow", RuntimeWarning))
@@ -47,7 +46,6 @@ def test_each_text_is_heard_once(heard: WarningLog) -> None:
 
 
 def test_gymnasiums_logger_is_heard_without_its_colors(heard: WarningLog) -> None:
-    """It says what it says by a warning."""
     gym.logger.warn("too %s", "slow")
     assert heard.pending == [("UserWarning", "WARN: too slow")]
 
@@ -66,8 +64,6 @@ def test_what_is_shown_is_shown_still() -> None:
 
 
 def test_what_has_no_text_is_not_heard(heard: WarningLog) -> None:
-    """Its class is the repository's own."""
-
     class Mute(UserWarning):
         def __str__(self) -> str:
             raise ValueError("no")
@@ -77,7 +73,6 @@ def test_what_has_no_text_is_not_heard(heard: WarningLog) -> None:
 
 
 def test_a_flood_is_bounded(heard: WarningLog) -> None:
-    """In number and in length, for each reply and for all of them."""
     for number in range(2000):
         warnings.showwarning(f"{number} " + "\x1b" * 5000, UserWarning, "env.py", 1)
     told = []
@@ -112,12 +107,10 @@ class Told(gym.Env[Any, Any]):
 
     @property
     def counted(self) -> int:
-        """Somebody looks."""
         self.looked += 1
         return 1
 
     def method(self) -> str:
-        """Somebody calls."""
         return "called"
 
 
@@ -132,7 +125,6 @@ class Answering(gym.Wrapper[Any, Any, Any, Any]):
     """Searches by itself."""
 
     def get_wrapper_attr(self, name: str) -> Any:
-        """As it likes."""
         return super().get_wrapper_attr(name)
 
 
@@ -142,12 +134,10 @@ def watching(*, alone: bool = True) -> Watches:
 
 
 def envs_of(make: Callable[[], Any] = Told) -> SubEnvs:
-    """Two of them."""
     return SubEnvs([make, make], "NextStep", sync=True)
 
 
 def begun(envs: SubEnvs, name: str, watches: Watches | None = None) -> bool:
-    """Whether it can be watched."""
     return (watches or watching()).begin(ENV, envs, name, envs.call(name))
 
 
@@ -164,7 +154,6 @@ def noticed(watches: Watches) -> list[str]:
 @pytest.mark.parametrize("name", ["task", "number", "nothing", "shared"])
 @pytest.mark.parametrize("wrapped", [False, True])
 def test_plain_values_are_watched(name: str, wrapped: bool) -> None:
-    """Of the environment or its class, through wrappers."""
     assert begun(envs_of(lambda: gym.wrappers.TimeLimit(Told(), 5) if wrapped else Told()), name)
 
 
@@ -179,13 +168,11 @@ def test_other_values_are_not(name: str) -> None:
 
 @pytest.mark.parametrize("wrapper", [Curious, Answering])
 def test_who_has_a_say_is_not_watched(wrapper: Any) -> None:
-    """Its answer may depend on who asks, and when."""
     assert not begun(envs_of(lambda: wrapper(Told())), "task")
     assert not begun(envs_of(lambda: gym.Wrapper(wrapper(Told()))), "task")
 
 
 def test_a_process_with_threads_is_not_watched() -> None:
-    """They change what they like, also between requests."""
     assert not begun(envs_of(), "task", watching(alone=False))
     alone = [True]
     envs, watches = envs_of(), Watches(lambda: alone[0])
@@ -195,7 +182,6 @@ def test_a_process_with_threads_is_not_watched() -> None:
 
 
 def test_threads_are_seen() -> None:
-    """From their start to their end."""
     end = threading.Event()
     other = threading.Thread(target=end.wait)
     other.start()
@@ -207,7 +193,6 @@ def test_threads_are_seen() -> None:
 
 
 def test_changes_are_noticed_once() -> None:
-    """Of any sub-environment; what is equal has not changed."""
     envs, watches = envs_of(), watching()
     assert begun(envs, "task", watches)
     assert begun(envs, "number", watches)
@@ -233,8 +218,6 @@ def test_changes_are_noticed_once() -> None:
     ids=["another type", "gone", "hidden by the wrapper", "a property now"],
 )
 def test_changes_of_other_kinds_are_noticed(change: Callable[[Any], None]) -> None:
-    """Whatever the caller would be told."""
-
     class Own(Told):
         pass
 
@@ -245,7 +228,6 @@ def test_changes_of_other_kinds_are_noticed(change: Callable[[Any], None]) -> No
 
 
 def test_watches_are_few() -> None:
-    """And whose environment is closed has none."""
     envs, watches = envs_of(), watching()
     for number in range(2 * CHANGES.most):
         assert watches.begin(number, envs, "task", envs.call("task")) == (number < CHANGES.most)
@@ -257,7 +239,6 @@ def test_watches_are_few() -> None:
 
 
 def test_a_reply_without_room_takes_nothing_along() -> None:
-    """Its size alone tells the client that anything may have changed."""
     envs, watches = envs_of(), watching()
     assert begun(envs, "task", watches)
     envs.envs[0].task = "lift"

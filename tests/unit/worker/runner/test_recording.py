@@ -26,18 +26,15 @@ class Counted:
         self.folder = folder
 
     def __call__(self) -> gym.Env[Any, Any]:
-        """A CartPole, on record."""
         (self.folder / os.urandom(8).hex()).touch()
         return gym.make("CartPole-v1")
 
     @property
     def built(self) -> int:
-        """How many there have been."""
         return len(list(self.folder.iterdir()))
 
 
 def stand_in(kind: str, maker: Counted) -> Any:
-    """One of two sub-environments."""
     with standing_in():
         return KINDS[kind]([maker] * 2)
 
@@ -45,7 +42,6 @@ def stand_in(kind: str, maker: Counted) -> Any:
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("end", ["collected", "closed", "wrapped", "pickled"])
 def test_its_end_builds_nothing(kind: str, end: str, tmp_path: Path) -> None:
-    """However it ends."""
     maker = Counted(tmp_path)
     env = stand_in(kind, maker)
     assert recording(env) is not None
@@ -74,7 +70,6 @@ def test_who_looks_into_it_has_it_built(kind: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_a_copy_stands_in_too(kind: str, tmp_path: Path) -> None:
-    """While stand-ins are made, so are copies of them."""
     maker = Counted(tmp_path)
     env = stand_in(kind, maker)
     with standing_in():
@@ -84,7 +79,6 @@ def test_a_copy_stands_in_too(kind: str, tmp_path: Path) -> None:
 
 
 def test_closed_and_then_looked_into_it_is_closed(tmp_path: Path) -> None:
-    """As Gymnasium's own."""
     env = stand_in("async", Counted(tmp_path))
     env.close()
     assert env.closed

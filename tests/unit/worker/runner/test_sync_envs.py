@@ -19,23 +19,19 @@ class Counting:
         self.resets = self.steps = self.renders = 0
 
     def reset(self, *, seed: Any = None, options: Any = None) -> Any:
-        """As ``Env.reset``."""
         self.resets += 1
         return 0, {"seed": seed}
 
     def step(self, action: Any) -> Any:
-        """As ``Env.step``."""
         self.steps += 1
         return self.steps, 1.0, self.steps % 2 == 0, False, {"at": self.steps}
 
     def render(self) -> Any:
-        """As ``Env.render``."""
         self.renders += 1
         return np.full((2, 2, 3), self.renders, np.uint8)
 
 
 def test_what_has_ended_repeats_its_last_transition_without_reward() -> None:
-    """It is neither stepped nor reset, until the next rollout is announced."""
     inner = Counting()
     env = FreezingEnv(inner)
     env.reset(seed=3, options=ROLLOUT)
@@ -49,7 +45,6 @@ def test_what_has_ended_repeats_its_last_transition_without_reward() -> None:
 
 
 def test_a_frame_of_what_has_ended_is_drawn_once() -> None:
-    """Before that each is, and of the next rollout again."""
     inner = Counting()
     env = FreezingEnv(inner)
     env.reset(options=ROLLOUT)
@@ -63,6 +58,5 @@ def test_a_frame_of_what_has_ended_is_drawn_once() -> None:
 
 @pytest.mark.parametrize("options", [None, {}, {NEW_ROLLOUT: False}, [NEW_ROLLOUT], NEW_ROLLOUT])
 def test_other_options_announce_nothing(options: Any) -> None:
-    """Only a mapping that says so does."""
     assert announces_rollout(ROLLOUT)
     assert not announces_rollout(options)

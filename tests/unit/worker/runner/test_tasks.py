@@ -54,7 +54,6 @@ def test_one_row_is_the_space_of_one(
 
 
 def test_a_batch_of_choices_is_one_choice() -> None:
-    """Of Gymnasium's batches of Discrete and MultiDiscrete."""
     choices = spaces.MultiDiscrete([5, 5, 5])
     env = vector(np.zeros(3, np.int64), observation_space=choices, action_space=choices)
     assert derive_spaces(env) == ""
@@ -73,14 +72,12 @@ def test_a_batch_of_choices_is_one_choice() -> None:
 def test_what_cannot_be_derived_is_named(
     observation: Any, attributes: dict[str, Any], missing: str
 ) -> None:
-    """The attribute that its author has to add."""
     env = vector(observation, **attributes)
     assert derive_spaces(env) == missing
     assert derived_space(env, "observation_space") is None
 
 
 def test_what_it_has_is_not_asked_for() -> None:
-    """Nothing is reset then."""
     env = SimpleNamespace(num_envs=3, single_observation_space=ROW, single_action_space=ROW)
     assert derive_spaces(env) == ""
     assert derived_space(env, "action_space") is None

@@ -12,7 +12,6 @@ from envhub_worker.spawn.channel import MAX_MESSAGE_BYTES, Channel
 
 @pytest.fixture
 def ends() -> Iterator[tuple[Channel, Channel]]:
-    """Both ends; the second one blocks."""
     ours, theirs = Channel.pair()
     other = Channel(theirs)
     yield ours, other
@@ -21,7 +20,6 @@ def ends() -> Iterator[tuple[Channel, Channel]]:
 
 
 def test_message_arrives_with_its_descriptors(ends: tuple[Channel, Channel]) -> None:
-    """The sender keeps its own; the receiver's are closed on exec."""
     ours, theirs = ends
     read, write = os.pipe()
     ours.send({"op": "x", "n": 1}, [write])
@@ -36,7 +34,6 @@ def test_message_arrives_with_its_descriptors(ends: tuple[Channel, Channel]) -> 
 
 
 def test_nothing_there_is_not_the_end(ends: tuple[Channel, Channel]) -> None:
-    """drain says which."""
     ours, theirs = ends
     assert ours.drain() == ([], False)
     theirs.send({"a": 1})
@@ -56,7 +53,6 @@ def test_last_words_arrive_although_our_own_were_never_read(
 
 
 def test_full_socket_keeps_the_order(ends: tuple[Channel, Channel]) -> None:
-    """What does not fit waits for flush."""
     ours, theirs = ends
     for n in range(2000):
         ours.send({"n": n, "padding": "x" * 1000})
@@ -69,7 +65,6 @@ def test_full_socket_keeps_the_order(ends: tuple[Channel, Channel]) -> None:
 
 
 def test_sending_to_nobody_is_no_error(ends: tuple[Channel, Channel]) -> None:
-    """Whoever reads learns of the end."""
     ours, theirs = ends
     theirs.close()
     ours.send({"a": 1})
@@ -77,7 +72,6 @@ def test_sending_to_nobody_is_no_error(ends: tuple[Channel, Channel]) -> None:
 
 
 def test_oversized_message_is_refused(ends: tuple[Channel, Channel]) -> None:
-    """Before anything is sent."""
     with pytest.raises(ValueError, match="over"):
         ends[0].send({"a": "x" * MAX_MESSAGE_BYTES})
     ends[0].close()

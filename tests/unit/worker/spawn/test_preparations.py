@@ -24,7 +24,6 @@ COMMIT = "ab" * 20
 
 
 def spec_of(snapshot: Path, *copies: HubCopy, **environment: str) -> JailSpec:
-    """A jail for these files."""
     confinement = Confinement(environment=environment)
     given = {"entry": "env.py", "confinement": confinement, "name": "x"}
     return JailSpec(snapshot=str(snapshot), hub_copies=copies, **given)
@@ -51,7 +50,6 @@ def test_the_snapshot_is_a_link_to_the_files(
 def test_a_cache_that_the_caller_gives_stays_as_it_is(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """``policy={"environment": ["HF_HOME"]}`` names another one."""
     monkeypatch.setenv("HF_HOME", str(tmp_path / "theirs"))
     copy = HubCopy("models--org--repo", COMMIT, ("main",), "")
     make_hub_cache(spec_of(tmp_path, copy, HF_HOME=str(tmp_path / "theirs")))
@@ -93,7 +91,6 @@ def test_the_contract_is_there_and_it_warns_once() -> None:
 
 @pytest.mark.filterwarnings("ignore:lerobot is not installed")
 def test_the_rest_is_missing_as_before() -> None:
-    """A module or a name that the stub does not have."""
     with pytest.raises(ModuleNotFoundError, match=r"lerobot\.policies"):
         importlib.import_module("lerobot.policies")
     with pytest.raises(ImportError, match="AlohaEnv"):
@@ -101,7 +98,6 @@ def test_the_rest_is_missing_as_before() -> None:
 
 
 def test_lerobot_itself_goes_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also a release that has no such module: half a stub would be neither."""
     (tmp_path / "lerobot").mkdir()
     (tmp_path / "lerobot" / "__init__.py").write_text("REAL = True\n")
     monkeypatch.syspath_prepend(tmp_path)

@@ -6,7 +6,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,6 @@ from tests.support.confinement_kit import (
     JailExited,
     RunnerExited,
     RunnerStarted,
-    cell_in,
     make_snapshot,
     new_cell,
     open_folder,
@@ -36,11 +35,34 @@ from tests.support.confinement_kit import (
 from tests.support.interpreter import profiles
 from tests.support.processes import eventually
 
+STRICT = Confinement()
 
-@pytest.fixture(params=profiles("strict", "no-userns"))
+
+@pytest.fixture(scope="module", params=profiles("strict", "no-userns"))
 def confinement(request: pytest.FixtureRequest) -> Confinement:
     """Both structures: with a pid namespace that ends everything, and without."""
     return Confinement(profile=request.param, environment={"GRANTED": "yes"})
+
+
+@pytest.fixture(scope="module")
+def make_cell(confinement: Confinement) -> Iterator[Callable[..., Cell]]:
+    """Makes jails without runners, all of one zygote."""
+    with open_folder() as folder, spawner_in(folder, confinement) as spawner:
+        snapshot = make_snapshot(folder)
+
+        def make(**changes: Any) -> Cell:
+            return new_cell(spawner, snapshot, replace(confinement, **changes))
+
+        yield make
+
+
+@pytest.fixture
+def cell(make_cell: Callable[..., Cell]) -> Iterator[Cell]:
+    cell = make_cell()
+    cell.start()
+    yield cell
+    cell.jail.kill()
+    cell.wait_for(JailExited)  # and so the next one does not hear of it
 
 
 @pytest.fixture
@@ -48,13 +70,6 @@ def folder() -> Iterator[Path]:
     """A folder that a jail's user may cross."""
     with open_folder() as folder:
         yield folder
-
-
-@pytest.fixture
-def cell(folder: Path, confinement: Confinement) -> Iterator[Cell]:
-    """A jail with one runner."""
-    with cell_in(folder, confinement) as cell:
-        yield cell
 
 
 def processes_that_mention(text: str) -> list[int]:
@@ -72,7 +87,6 @@ def processes_that_mention(text: str) -> list[int]:
 
 
 def test_runner_runs_code_and_is_announced_with_its_layers(cell: Cell) -> None:
-    """RunnerStarted with a report, and the stream reaches the runner."""
     assert cell.run("result = 6 * 7") == {"result": 42}
     started = cell.wait_for(RunnerStarted)
     assert started.runner == 1
@@ -83,7 +97,6 @@ def test_runner_runs_code_and_is_announced_with_its_layers(cell: Cell) -> None:
 def test_runner_sees_only_the_built_environment(
     cell: Cell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Nothing of the server's environment arrives; what is granted does."""
     names = cell.run("import os; result = sorted(os.environ)")["result"]
     assert "GRANTED" in names
     assert "PYTEST_CURRENT_TEST" not in names
@@ -91,19 +104,16 @@ def test_runner_sees_only_the_built_environment(
     assert "PYTEST_CURRENT_TEST" not in raw
 
 
-def test_runner_holds_only_the_named_descriptors(folder: Path, confinement: Confinement) -> None:
+def test_runner_holds_only_the_named_descriptors(cell: Cell) -> None:
     """Standard streams, its stream and what was passed through; stdin is empty."""
     source = "import os, sys; result = [len(os.listdir('/proc/self/fd')), sys.stdin.read()]"
     read, write = os.pipe()
-    with spawner_in(folder, confinement) as spawner:
-        cell = new_cell(spawner, make_snapshot(folder), confinement)
-        cell.start((write,))
-        # 0, 1, 2, the stream, the passed pipe, and the listing's own descriptor.
-        assert cell.run(source) == {"result": [6, ""]}
-        assert cell.run(
-            "import os, sys; k = sys._getframe(1).f_globals; result = os.write(k['FDS'][0], b'x')"
-        ) == {"result": 1}
-        assert os.read(read, 10) == b"x"
+    second = cell.start((write,))
+    # 0, 1, 2, the stream, the passed pipe, and the listing's own descriptor.
+    assert cell.run(source, second) == {"result": [6, ""]}
+    told = "import os, sys; k = sys._getframe(1).f_globals; result = os.write(k['FDS'][0], b'x')"
+    assert cell.run(told, second) == {"result": 1}
+    assert os.read(read, 10) == b"x"
     os.close(read)
     os.close(write)
 
@@ -124,7 +134,6 @@ result = [os.listdir(home), tempfile.gettempdir() == os.environ['TMPDIR'],
 
 
 def test_runners_draw_different_random_numbers(cell: Cell) -> None:
-    """A fork copies the generators' state: each runner is reseeded."""
     second = cell.start()
     source = "import random, numpy; result = [random.random(), float(numpy.random.rand())]"
     first_draw, second_draw = cell.run(source), cell.run(source, second)
@@ -133,7 +142,6 @@ def test_runners_draw_different_random_numbers(cell: Cell) -> None:
 
 
 def test_output_of_all_runners_arrives(cell: Cell) -> None:
-    """Python's and C's output, stdout and stderr, of children too."""
     cell.run("import os, sys; os.write(1, b'one\\n'); os.write(2, b'two\\n'); print('three')")
     cell.run("import subprocess; subprocess.run(['/bin/echo', 'four'])")
     cell.hang_up()  # flushes what Python still buffers
@@ -149,7 +157,6 @@ def test_output_of_all_runners_arrives(cell: Cell) -> None:
     ],
 )
 def test_how_a_runner_ended_is_reported(cell: Cell, ends: str, how: tuple[Any, ...]) -> None:
-    """With its code; a crash is a signal, not a code."""
     cell.run(f"import os; {ends}")
     exited = cell.wait_for(RunnerExited)
     assert (exited.code, exited.signal, exited.reason) == how
@@ -196,7 +203,6 @@ def test_no_daemon_outlives_its_jail(cell: Cell, folder: Path, end: str) -> None
 
 
 def test_jail_can_start_runners_after_its_last_one_ended(cell: Cell) -> None:
-    """A new runner in the same jail replaces one that died."""
     cell.run("import os; os._exit(1)")
     cell.wait_for(RunnerExited)
     second = cell.start()
@@ -216,11 +222,11 @@ def test_close_leaves_no_process_and_no_file(folder: Path, confinement: Confinem
     assert list(runtime.iterdir()) == []
 
 
-def test_a_process_that_started_ahead_is_used(folder: Path, confinement: Confinement) -> None:
+def test_a_process_that_started_ahead_is_used(folder: Path) -> None:
     """It becomes the zygote, and what it has imported serves a jail that is as confined."""
     ahead = ZygoteProcess.ahead(folder)
-    with spawner_in(folder, confinement, ahead=ahead) as spawner:
-        cell = new_cell(spawner, make_snapshot(folder), confinement)
+    with spawner_in(folder, STRICT, ahead=ahead) as spawner:
+        cell = new_cell(spawner, make_snapshot(folder), STRICT)
         cell.start()
         assert cell.run("import sys; result = 'gymnasium' in sys.modules") == {"result": True}
         assert inside.zygote_pid(spawner) == ahead.pid
@@ -231,13 +237,12 @@ def test_a_process_that_started_ahead_is_used(folder: Path, confinement: Confine
     assert not os.path.exists(f"/proc/{ahead.pid}")
 
 
-def test_a_process_of_another_interpreter_is_not(folder: Path, confinement: Confinement) -> None:
-    """It ends at once, and leaves nothing."""
+def test_a_process_of_another_interpreter_is_not(folder: Path) -> None:
     ahead = ZygoteProcess.ahead(folder)
     other = folder / "python"
     other.symlink_to(sys.executable)
     spawner = Spawner(
-        confinement, runtime_dir=folder, readable_roots=[], runtime=Runtime(str(other)), ahead=ahead
+        STRICT, runtime_dir=folder, readable_roots=[], runtime=Runtime(str(other)), ahead=ahead
     )
     assert inside.zygote_pid(spawner) != ahead.pid
     assert not os.path.exists(f"/proc/{ahead.pid}")
@@ -246,7 +251,6 @@ def test_a_process_of_another_interpreter_is_not(folder: Path, confinement: Conf
 
 
 def test_a_process_that_nobody_uses_ends_with_its_server(folder: Path) -> None:
-    """However soon that is, and also if it cannot say so."""
     for ending in (signal.SIGTERM, signal.SIGKILL):
         runtime = folder / ending.name
         serve = ["serve", "--endpoint", f"ipc://{folder}/{ending.name}.sock", "--ahead"]
@@ -263,16 +267,11 @@ def test_a_process_that_nobody_uses_ends_with_its_server(folder: Path) -> None:
         assert runtime.exists() == (ending is signal.SIGKILL)
 
 
-def test_dead_zygote_is_told_with_its_log(folder: Path, confinement: Confinement) -> None:
-    """An interpreter without numpy ends the zygote; the log says why."""
+def test_dead_zygote_is_told_with_its_log(folder: Path) -> None:
     bare = folder / "bare"
     subprocess.run([sys.executable, "-m", "venv", "--without-pip", str(bare)], check=True)
-    spawner = Spawner(
-        confinement,
-        runtime_dir=folder,
-        readable_roots=[],
-        runtime=Runtime(str(bare / "bin/python")),
-    )
+    runtime = Runtime(str(bare / "bin/python"))
+    spawner = Spawner(STRICT, runtime_dir=folder, readable_roots=[], runtime=runtime)
     seen: list[Any] = []
     wait_until(lambda: bool(seen.extend(spawner.poll()) or seen), "it lives")
     [died] = seen
@@ -330,19 +329,19 @@ def alive(pid: int) -> bool:
         return False
 
 
-def test_cpu_limit_is_told(folder: Path, confinement: Confinement) -> None:
-    """A runner that burns its CPU seconds ends with the reason cpu-limit."""
-    confinement = replace(confinement, limits=Limits(cpu_time_s=1))
-    with cell_in(folder, confinement) as cell:
-        cell.run("while True: pass")
-        assert cell.wait_for(RunnerExited).reason == "cpu-limit"
+def test_cpu_limit_is_told(make_cell: Callable[..., Cell]) -> None:
+    cell = make_cell(limits=Limits(cpu_time_s=1))
+    cell.start()
+    cell.run("while True: pass")
+    assert cell.wait_for(RunnerExited).reason == "cpu-limit"
+    cell.jail.kill()
+    cell.wait_for(JailExited)
 
 
-def test_requests_wait_for_the_zygote(folder: Path, confinement: Confinement) -> None:
-    """Many jails asked for before the zygote is up all come."""
-    with spawner_in(folder, confinement) as spawner:
+def test_requests_wait_for_the_zygote(folder: Path) -> None:
+    with spawner_in(folder, STRICT) as spawner:
         snapshot = make_snapshot(folder)
-        cells = [new_cell(spawner, snapshot, confinement) for _ in range(5)]
+        cells = [new_cell(spawner, snapshot, STRICT) for _ in range(5)]
         for cell in cells:
             cell.start()
         assert [cell.run("result = 1") for cell in cells] == [{"result": 1}] * 5

@@ -24,7 +24,7 @@ from tests.support.confinement_kit import (
     open_folder,
     spawner_in,
 )
-from tests.support.interpreter import profiles
+from tests.support.interpreter import needs, profiles
 from tests.support.packages.environments import base_interpreter
 from tests.support.trees import fingerprint
 
@@ -37,10 +37,17 @@ result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=
 """
 
 
-@pytest.fixture(params=profiles("strict", "no-userns"))
-def confinement(request: pytest.FixtureRequest) -> Confinement:
-    """With a private root, and without."""
-    return Confinement(profile=request.param)
+STRICT = Confinement(profile="strict")
+
+
+def with_packages(folder: Path) -> Runtime:
+    """One module, and one that has the name of a module of the standard library."""
+    packages = folder / "packages"
+    packages.mkdir()
+    (packages / "mine.py").write_text(MODULE)
+    (packages / "colorsys.py").write_text(MODULE)
+    (packages / "first.pth").write_text("import sys; sys.started = True\n")
+    return Runtime(base_interpreter(), str(packages))
 
 
 @pytest.fixture
@@ -52,28 +59,25 @@ def folder() -> Iterator[Path]:
 
 @pytest.fixture
 def runtime(folder: Path) -> Runtime:
-    """One module, and one that has the name of a module of the standard library."""
-    packages = folder / "packages"
-    packages.mkdir()
-    (packages / "mine.py").write_text(MODULE)
-    (packages / "colorsys.py").write_text(MODULE)
-    (packages / "first.pth").write_text("import sys; sys.started = True\n")
-    return Runtime(base_interpreter(), str(packages))
+    return with_packages(folder)
 
 
-@pytest.fixture
-def cell(folder: Path, confinement: Confinement, runtime: Runtime) -> Iterator[Cell]:
-    """A jail with these packages."""
-    with spawner_in(folder, confinement, runtime=runtime) as spawner:
+@pytest.fixture(scope="module", params=profiles("strict", "no-userns"))
+def cell(request: pytest.FixtureRequest) -> Iterator[Cell]:
+    """A jail with these packages, with a private root, and without."""
+    confinement = Confinement(profile=request.param)
+    with (
+        open_folder() as folder,
+        spawner_in(folder, confinement, runtime=with_packages(folder)) as spawner,
+    ):
         cell = new_cell(spawner, make_snapshot(folder), confinement)
         cell.start()
         yield cell
 
 
-def test_packages_lie_behind_the_standard_library(cell: Cell, runtime: Runtime) -> None:
-    """As those of any interpreter; their .pth files count."""
+def test_packages_lie_behind_the_standard_library(cell: Cell) -> None:
     found, last, *_ = cell.run(WHERE)["result"]
-    assert (found, last) == ("from the packages", runtime.packages)
+    assert (found, last) == ("from the packages", packages_of(cell))
     assert cell.run("import colorsys; result = hasattr(colorsys, 'mine')") == {"result": False}
     assert cell.run("import sys; result = sys.started") == {"result": True}
     assert cell.run("result = callable(exit)") == {"result": True}
@@ -87,7 +91,6 @@ def test_packages_of_the_interpreter_are_not_there(cell: Cell) -> None:
 
 
 def test_programs_that_are_started_have_the_packages_too(cell: Cell) -> None:
-    """``sys.executable`` is a virtual environment around them."""
     _, _, executable, prefix = cell.run(WHERE)["result"]
     assert cell.run(CHILD)["result"].split() == ["from", "the", "packages", prefix]
     assert executable.startswith(f"{prefix}/")
@@ -95,23 +98,27 @@ def test_programs_that_are_started_have_the_packages_too(cell: Cell) -> None:
     assert cell.run(CHILD, runner=2)["result"].split()[-1] == prefix
 
 
-def test_shared_packages_cannot_be_written(cell: Cell, runtime: Runtime) -> None:
+def packages_of(cell: Cell) -> str:
+    """Their folder, which lies beside its snapshot."""
+    return str(Path(cell.jail.spec.snapshot).with_name("packages"))
+
+
+def test_shared_packages_cannot_be_written(cell: Cell) -> None:
     """Whoever needs the same packages shares the folder; the modes shall not be what saves it."""
-    os.chmod(runtime.packages, 0o777)
-    was = fingerprint(runtime.packages)
-    cell.run(f"open({runtime.packages + '/added'!r}, 'w')")
-    assert fingerprint(runtime.packages) == was
-    (Path(runtime.packages) / "added").write_text("")  # the control
-    assert fingerprint(runtime.packages) != was
+    packages = packages_of(cell)
+    os.chmod(packages, 0o777)
+    was = fingerprint(packages)
+    cell.run(f"open({packages + '/added'!r}, 'w')")
+    assert fingerprint(packages) == was
+    (Path(packages) / "added").write_text("")  # the control
+    assert fingerprint(packages) != was
 
 
-def test_the_zygote_imports_no_package(
-    folder: Path, confinement: Confinement, runtime: Runtime
-) -> None:
+def test_the_zygote_imports_no_package(folder: Path, runtime: Runtime) -> None:
     """What was started ahead for these packages is used, and has none of the server's either."""
     ahead = ZygoteProcess.ahead(folder, runtime)
-    with spawner_in(folder, confinement, runtime=runtime, ahead=ahead) as spawner:
-        cell = new_cell(spawner, make_snapshot(folder), confinement)
+    with spawner_in(folder, STRICT, runtime=runtime, ahead=ahead) as spawner:
+        cell = new_cell(spawner, make_snapshot(folder), STRICT)
         cell.start()
         names = cell.run("import sys; result = sorted(sys.modules)")["result"]
         assert inside.zygote_pid(spawner) == ahead.pid
@@ -119,11 +126,17 @@ def test_the_zygote_imports_no_package(
     assert {name.partition(".")[0] for name in ours} <= {"__main__", "__mp_main__", "envhub_worker"}
 
 
-@pytest.mark.parametrize("what", ["missing", "closed", "closed inside"])
+@pytest.mark.parametrize(
+    ("what", "profile"),
+    [
+        *((what, "strict") for what in ("missing", "closed", "closed inside")),
+        pytest.param("closed", "no-userns", marks=needs("no-userns")),
+    ],
+)
 def test_packages_that_cannot_be_read_are_told(
-    folder: Path, confinement: Confinement, runtime: Runtime, what: str
+    folder: Path, runtime: Runtime, what: str, profile: str
 ) -> None:
-    """Before anything runs, with the path and what to do."""
+    confinement = Confinement(profile=profile)
     packages = Path(runtime.packages)
     if what == "missing":
         runtime = Runtime(runtime.python, str(folder / "nowhere"))
@@ -139,13 +152,10 @@ def test_packages_that_cannot_be_read_are_told(
     assert "chmod -R a+rX" in failed.fix
 
 
-def test_a_server_keeps_packages_from_being_removed(
-    folder: Path, confinement: Confinement, runtime: Runtime
-) -> None:
-    """From the start of their zygote to its end, whether a jail runs or not."""
+def test_a_server_keeps_packages_from_being_removed(folder: Path, runtime: Runtime) -> None:
     record = folder / RECORD
     record.touch()
-    with spawner_in(folder, confinement, runtime=runtime):
+    with spawner_in(folder, STRICT, runtime=runtime):
         with pytest.raises(TimeoutError), held(record):
             pass
         assert list(sharers(record)) == [os.getpid()]
@@ -157,16 +167,14 @@ def test_a_server_keeps_packages_from_being_removed(
 def test_what_is_removed_all_the_same_is_not_blamed_on_the_kernel(
     folder: Path, runtime: Runtime, what: str
 ) -> None:
-    """The next jail of the zygote says which folder is not there any more."""
-    confinement = Confinement(profile="strict")
-    with spawner_in(folder, confinement, runtime=runtime) as spawner:
+    with spawner_in(folder, STRICT, runtime=runtime) as spawner:
         snapshot = make_snapshot(folder)
-        cell = new_cell(spawner, snapshot, confinement)
+        cell = new_cell(spawner, snapshot, STRICT)
         cell.start()
         assert cell.run("result = 1") == {"result": 1}
         gone = runtime.packages if what == "packages" else snapshot
         remove_tree(Path(gone))
-        late = new_cell(spawner, snapshot, confinement)
+        late = new_cell(spawner, snapshot, STRICT)
         failed = late.wait_for(JailFailed)
     assert gone in failed.reason
     assert "was removed after this server began to use it" in failed.reason
@@ -174,11 +182,10 @@ def test_what_is_removed_all_the_same_is_not_blamed_on_the_kernel(
 
 
 def test_what_every_jail_imports_is_named_where_it_is_missing(
-    folder: Path, confinement: Confinement, runtime: Runtime
+    folder: Path, runtime: Runtime
 ) -> None:
-    """The runner ends, and its output says in one line what the folder lacks."""
-    with spawner_in(folder, confinement, runtime=runtime, target=RUNNER_TARGET) as spawner:
-        cell = new_cell(spawner, make_snapshot(folder), confinement)
+    with spawner_in(folder, STRICT, runtime=runtime, target=RUNNER_TARGET) as spawner:
+        cell = new_cell(spawner, make_snapshot(folder), STRICT)
         cell.start()
         assert cell.wait_for(RunnerExited).code == 1
         cell.wait_for_output(b"make the environment again with these")

@@ -22,12 +22,10 @@ def ends() -> Iterator[tuple[RunnerLink, socket.socket]]:
 
 
 def packet(number: int) -> bytes:
-    """An answer."""
     return b"".join(map(bytes, pack_packet(number, [b"said"])))
 
 
 def test_answers_find_who_asked(ends: tuple[RunnerLink, socket.socket]) -> None:
-    """In the order of the requests, also in pieces; then the stream ends."""
     link, runner = ends
     for number in (1, 2):
         link.send(number, [b"asked"], f"owner {number}")
@@ -48,7 +46,6 @@ def test_answers_find_who_asked(ends: tuple[RunnerLink, socket.socket]) -> None:
 def test_an_answer_that_nobody_asked_for_is_refused(
     ends: tuple[RunnerLink, socket.socket], lies: tuple[int, ...]
 ) -> None:
-    """And whoever still waits is known, for that is told of the death."""
     link, runner = ends
     for number in (1, 2):
         link.send(number, [b"asked"], f"owner {number}")
@@ -61,7 +58,6 @@ def test_an_answer_that_nobody_asked_for_is_refused(
 def test_a_runner_that_does_not_read_keeps_nobody_waiting(
     ends: tuple[RunnerLink, socket.socket],
 ) -> None:
-    """What does not fit waits here, and goes out as it is read."""
     link, runner = ends
     large = bytes(8 << 20)
     link.send(1, [b"", large], "owner")

@@ -57,7 +57,6 @@ def steps(monkeypatch: pytest.MonkeyPatch) -> Iterator[ServedSteps]:
 
 @pytest.fixture
 def slabs(steps: ServedSteps) -> ServedSlabs:
-    """One runner's."""
     made = ServedSlabs(LEAVES, words.HEADER_BYTES + 64 + words.INFO_BYTES, len(OBSERVATION))
     steps.add(made)
     return made
@@ -65,21 +64,18 @@ def slabs(steps: ServedSteps) -> ServedSlabs:
 
 @pytest.fixture
 def runner(slabs: ServedSlabs) -> Runner:
-    """Which has taken its descriptors."""
     made = Runner(slabs, len(OBSERVATION))
     made.observations[:] = OBSERVATION
     return made
 
 
 def frame(*, spin_ns: int = 0, known: int = 0) -> bytes:
-    """What a client sends for a step."""
     own = [0] * (HALF // 8)
     own[0], own[words.KNOWN - words.SPIN], own[-1] = spin_ns, known, 7
     return struct.pack(f"<{len(own)}Q", *own) + ACTION
 
 
 def ask(slabs: ServedSlabs, steps: ServedSteps, **own: int) -> list[Any]:
-    """A step; the list gets its answer."""
     taken: list[Any] = []
     slabs.ask(frame(**own), "owner")
     steps.owe(slabs, lambda: taken.append(slabs.take()))
@@ -109,7 +105,6 @@ def test_a_step_is_written_and_answered(
 def test_a_runner_that_is_awake_is_not_rung(
     slabs: ServedSlabs, steps: ServedSteps, runner: Runner
 ) -> None:
-    """Nor does one ring a server that looks."""
     os.set_blocking(runner.bell, False)
     taken = ask(slabs, steps, spin_ns=60_000_000_000)
     with pytest.raises(BlockingIOError):
@@ -171,7 +166,6 @@ def test_rings_that_announce_nothing_are_not_heard_for_long(
 def test_infos_are_as_long_as_they_may_be(
     slabs: ServedSlabs, steps: ServedSteps, runner: Runner, length: int
 ) -> None:
-    """Whatever the runner says that they are; the client reads what it said."""
     taken = ask(slabs, steps)
     runner.answer(length=length, infos=b"\xff" * words.INFO_BYTES)
     steps.look()
@@ -184,7 +178,6 @@ def test_infos_are_as_long_as_they_may_be(
 def test_columns_are_as_long_as_the_client_knows(
     slabs: ServedSlabs, steps: ServedSteps, runner: Runner, known: int
 ) -> None:
-    """Not as the runner says, and never more than there is."""
     taken = ask(slabs, steps, known=known)
     runner.answer(words.COLUMNS, length=7)
     steps.look()
@@ -193,7 +186,6 @@ def test_columns_are_as_long_as_the_client_knows(
 
 
 def test_a_large_batch_comes_in_pieces(steps: ServedSteps) -> None:
-    """From where it lies; together they are the slab."""
     size = (3 << 19) + 8
     slabs = ServedSlabs(LEAVES, words.HEADER_BYTES + 64 + words.INFO_BYTES, size)
     steps.add(slabs)
@@ -211,7 +203,6 @@ def test_a_large_batch_comes_in_pieces(steps: ServedSteps) -> None:
 
 @pytest.mark.parametrize("size", [0, HALF - 1, HALF + 64 + words.INFO_BYTES + 1])
 def test_what_is_no_half_of_a_request_slab_is_none(slabs: ServedSlabs, size: int) -> None:
-    """Nothing is written beyond the slab, nor half of the words."""
     assert not slabs.fits(bytes(size))
     assert slabs.fits(bytes(HALF))
     assert slabs.fits(bytes(HALF + 64 + words.INFO_BYTES))
@@ -220,7 +211,6 @@ def test_what_is_no_half_of_a_request_slab_is_none(slabs: ServedSlabs, size: int
 def test_nothing_is_owed_by_what_is_forgotten(
     slabs: ServedSlabs, steps: ServedSteps, runner: Runner
 ) -> None:
-    """And a jail that goes on ringing is not heard."""
     taken = ask(slabs, steps)
     steps.forget(slabs)
     runner.answer()

@@ -42,7 +42,6 @@ def test_who_asks_too_often_is_not_counted_for() -> None:
 
 
 def test_one_look_does_for_all() -> None:
-    """What is below a process is found in what was seen before."""
     with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as process:
         children = procfs.all_children()
         held = usage_of(os.getpid(), [process.pid], children)
@@ -60,7 +59,6 @@ def come_to(limits: Limits, usage: dict[str, int] = _NONE, *, own_root: bool = F
 
 
 def test_processes_and_threads_count_alike() -> None:
-    """And where nobody has counted nothing is said."""
     few = Limits(processes=10, open_files=1 << 20)
     assert come_to(few, {"processes": 4, "threads": 5, "memory_bytes": 0}) == []
     assert come_to(few, {"processes": 4, "threads": 6, "memory_bytes": 0}) == ["PROCESSES"]
@@ -68,7 +66,6 @@ def test_processes_and_threads_count_alike() -> None:
 
 
 def test_a_pipe_takes_two_of_the_open_files() -> None:
-    """So that the last one is nobody's."""
     held = len(os.listdir("/proc/self/fd"))
     assert come_to(Limits(open_files=held + 50)) == []
     assert come_to(Limits(open_files=held - 5)) == ["OPEN_FILES"]
@@ -81,7 +78,6 @@ def test_a_pipe_takes_two_of_the_open_files() -> None:
 def test_a_scratch_is_full_or_has_no_names_left(
     monkeypatch: pytest.MonkeyPatch, blocks: int, files: int, expected: list[str]
 ) -> None:
-    """Where it is a file system of its own."""
     left = SimpleNamespace(f_bavail=blocks, f_frsize=4096, f_ffree=files)
     monkeypatch.setattr(os, "statvfs", lambda path: left)
     wide = Limits(open_files=1 << 20)
@@ -91,7 +87,6 @@ def test_a_scratch_is_full_or_has_no_names_left(
 
 @pytest.mark.parametrize("kind", ["cgroup-v1", "cgroup-v2"])
 def test_a_control_group_counts_what_it_refused(tmp_path: Path, kind: str) -> None:
-    """One that counts nothing, or has gone, has refused nothing."""
     folders = [f"{tmp_path}/{name}" for name in ("memory", "pids")][-1 if "2" in kind else 0 :]
     group = Group(kind, folders, Limits())
     assert not group.refused()

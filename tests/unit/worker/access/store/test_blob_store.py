@@ -20,7 +20,6 @@ DATA = {"env.py": b"1", "sub/deep/b.bin": bytes(10_000)}
 
 
 def arrived(store: BlobStore, path: str, data: bytes) -> ListedFile:
-    """A file of an upload, whole."""
     digest = hashlib.sha256(data).digest()
     part = store.home / "part"
     part.write_bytes(data)
@@ -30,7 +29,6 @@ def arrived(store: BlobStore, path: str, data: bytes) -> ListedFile:
 
 @pytest.fixture
 def store(tmp_path: Path) -> BlobStore:
-    """An empty one."""
     return BlobStore(tmp_path)
 
 
@@ -52,7 +50,6 @@ def test_a_tree_is_charged_while_it_lies_there(store: BlobStore) -> None:
 
 
 def test_a_tree_that_cannot_be_finished_leaves_nothing(store: BlobStore) -> None:
-    """A file has another size than its listing says."""
     file = arrived(store, "env.py", b"1")
     with pytest.raises(RefusedError):
         store.lay_out("ab", [ListedFile("env.py", 2, file.sha256)], lambda size: None)

@@ -45,7 +45,6 @@ def test_what_one_has_brought_is_there_for_all(tmp_path: Path) -> None:
 
 
 def test_two_may_lay_out_the_same_at_once(tmp_path: Path) -> None:
-    """The second finds the tree in its place."""
     first, second = shared(tmp_path), shared(tmp_path)
     data, sha256 = b"data", hashlib.sha256(b"data").digest()
     offer = m.OfferSnapshot((("env.py", len(data), sha256),))
@@ -59,7 +58,6 @@ def test_two_may_lay_out_the_same_at_once(tmp_path: Path) -> None:
 
 
 def test_a_start_leaves_alone_what_others_bring(tmp_path: Path) -> None:
-    """Only one that is alone removes what was left half-brought."""
     first = shared(tmp_path)
     brought(first, ONE, b"data", whole=False)
     [part] = tmp_path.glob("*/parts/*")
@@ -71,7 +69,6 @@ def test_a_start_leaves_alone_what_others_bring(tmp_path: Path) -> None:
 
 
 def test_only_one_that_is_alone_makes_room(tmp_path: Path) -> None:
-    """The others may use what it does not."""
     quotas = replace(Quotas(), upload_bytes=50_000)
     first, second = shared(tmp_path, quotas), shared(tmp_path, quotas)
     brought(first, ONE, bytes(20_000))
@@ -83,7 +80,6 @@ def test_only_one_that_is_alone_makes_room(tmp_path: Path) -> None:
 
 
 def test_a_share_is_taken_back_after_a_vain_try(tmp_path: Path) -> None:
-    """Else a third would think that it is alone."""
     uses = [shared_use.SharedUse(tmp_path / "lock") for _ in range(2)]
     for use, expected in ((uses[0], True), (uses[1], False), (uses[0], False), (uses[1], False)):
         with use.alone() as alone:

@@ -63,7 +63,6 @@ time.sleep(600)
 
 
 def test_a_process_whose_first_thread_has_ended_is_killed_too() -> None:
-    """It looks like a zombie, and runs on."""
     with subprocess.Popen([sys.executable, "-c", LEADERLESS], stdout=subprocess.PIPE) as root:
         assert root.stdout is not None
         assert root.stdout.readline() == b"up\n"

@@ -25,7 +25,6 @@ from tests.unit.worker.lockdown.seccomp.bpf_machine import run
 
 
 def test_branch_skips_to_its_labels() -> None:
-    """Offsets count the instructions between the branch and its target."""
     program = assemble(
         [
             Do(LOAD, 0),
@@ -44,19 +43,16 @@ def test_branch_skips_to_its_labels() -> None:
 
 
 def test_bytes_are_the_kernels_structure() -> None:
-    """code u16, jt u8, jf u8, k u32, in this machine's order."""
     assert to_bytes([BpfInstruction(0x15, 1, 2, 0x04030201)]) == bytes([0x15, 0, 1, 2, 1, 2, 3, 4])
 
 
 def test_listing_names_absolute_targets() -> None:
-    """Golden files are read by people."""
     program = [BpfInstruction(LOAD, 0, 0, 4), BpfInstruction(JUMP_GREATER, 0, 3, 9)]
     assert listing(program) == "   0 load 0x4\n   1 greater 0x9 ? 2 : 5\n"
 
 
 @pytest.mark.parametrize("both", [True, False])
 def test_far_branch_becomes_a_pair_of_jumps(both: bool) -> None:
-    """Beyond 255 instructions the comparison selects an unconditional jump."""
     padding = [Do(LOAD, 0)] * 300
     program = assemble(
         [
@@ -88,7 +84,6 @@ def test_far_branch_becomes_a_pair_of_jumps(both: bool) -> None:
 def test_what_the_kernel_would_refuse_is_refused(
     items: list[Any], error: type[Exception], text: str
 ) -> None:
-    """With the label, or the length, at fault."""
     with pytest.raises(error, match=text):
         assemble(items)
 
@@ -101,7 +96,6 @@ def test_what_the_kernel_would_refuse_is_refused(
 def test_chain_of_comparisons_finds_its_label(
     targets: list[int], padding: int, number: int
 ) -> None:
-    """Whatever the distances, comparison n leads to the label that it names."""
     items: list[object] = [Do(LOAD, 0)]
     items += [Branch(JUMP_EQUAL, n, f"l{target}", None) for n, target in enumerate(targets)]
     items.append(Do(RETURN, 999))

@@ -94,7 +94,6 @@ def test_a_path_starts_where_its_caller_stands(tmp_path: Path) -> None:
 
 
 def test_a_path_goes_through_the_entries_of_processes(tmp_path: Path) -> None:
-    """What is reached by way of one's own entry is where it is, and no entry."""
     folder = os.open(tmp_path, os.O_RDONLY)
     try:
         for own in ("self", "thread-self", f"self/task/{os.getpid()}", str(os.getpid())):
@@ -122,8 +121,6 @@ def test_a_path_may_end_where_memory_does() -> None:
 
 
 def test_nothing_is_read_of_who_has_gone() -> None:
-    """The number may be another process's by now."""
-
     def waits() -> None:
         raise FileNotFoundError
 

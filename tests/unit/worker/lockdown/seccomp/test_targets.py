@@ -64,7 +64,6 @@ def test_who_only_looks_signals_nobody(children: tuple[int, int]) -> None:
 
 
 def test_who_has_ended_may_have_been_its_own() -> None:
-    """Nothing is said of a number that is nobody's any more."""
     ended = subprocess.Popen(["true"])
     ended.wait()
     assert not is_another_target("kill", (ended.pid, 15, 0), os.getpid(), os.getpid())
@@ -72,7 +71,6 @@ def test_who_has_ended_may_have_been_its_own() -> None:
 
 
 def test_a_path_names_a_process_that_nobody_can_have_met() -> None:
-    """What a list of processes shows, or a child's number is, was there."""
     assert never_a_target(f"/proc/{_NOBODY}/cmdline")
     assert never_a_target(f"/proc/{_NOBODY}")
     for path in (f"/proc/{os.getpid()}/cmdline", "/proc/self/cmdline", f"/home/{_NOBODY}"):
