@@ -11,12 +11,9 @@ import pytest
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import RemoteEnvError
 from envhub_sandbox.transport.deadline import Deadline, StepDeadline
-from envhub_sandbox.transport.jail import JailHandle
 from envhub_worker.protocol.shared_memory import slabs
-from tests.support import inside
 from tests.support.compare import assert_same
 from tests.support.repositories import STILL, write_repository
-from tests.support.samples import sample
 
 pytestmark = pytest.mark.same_for("users")
 
@@ -95,8 +92,7 @@ def test_large_and_small_answers_are_not_mixed_up(talker: Path, num_workers: int
     assert_same(conversation(talker, "frames", num_workers), by_lane)
 
 
-@pytest.mark.parametrize("lane", ["auto", "frames"])
-@pytest.mark.parametrize("restart", ["on_reset", "transparent"])
+@pytest.mark.parametrize(("lane", "restart"), [("auto", "on_reset"), ("frames", "transparent")])
 def test_an_operation_has_one_deadline(
     talker: Path, lane: str, restart: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -161,21 +157,6 @@ def test_a_masked_reset_after_a_failed_step_shows_the_last_observations(
         assert observation[1].tolist() == [4, 4]
 
 
-class Unknown:
-    """Of a module that is not to be had in a jail."""
-
-
-@pytest.mark.parametrize("lane", ["auto", "frames"])
-def test_an_argument_that_cannot_be_read_there_is_told(talker: Path, lane: str) -> None:
-    """The environment goes on."""
-    with make_env(talker, lane=lane) as suites:
-        env = suites.env
-        env.reset()
-        with pytest.raises(RemoteEnvError, match="tests"):
-            env.call("tell", False, ignored=Unknown())
-        assert env.get_attr("small") == ("small",)
-
-
 def test_a_signal_without_a_name_is_told(talker: Path) -> None:
     """And ends nothing but its jail."""
     with make_env(talker) as suites, make_env(talker) as others:
@@ -184,17 +165,3 @@ def test_a_signal_without_a_name_is_told(talker: Path) -> None:
         with pytest.raises(Exception, match="signal 40"):
             suites.env.call("signal")
         others.env.step([0])
-
-
-def test_what_a_request_is_called_decides_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Descriptors go with the request that says so, whatever its label for people says."""
-    exchange = JailHandle.exchange
-
-    def renamed(jail: JailHandle, _: str, *rest: Any, **options: Any) -> Any:
-        return exchange(jail, "beginning", *rest, **options)
-
-    monkeypatch.setattr(JailHandle, "exchange", renamed)
-    with make_env(sample("counter"), n_envs=2, num_workers=2) as suites:
-        suites.env.reset(seed=0)
-        assert inside.lane(suites.env) is not None
-        suites.env.step(suites.env.action_space.sample())
