@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
 from functools import partial
 from typing import Any
 
@@ -15,16 +14,14 @@ from gymnasium.vector import SyncVectorEnv
 
 from envhub_worker.protocol.codec.inert import RemoteObject
 from tests.compliance.theirs.through_sandbox import vector
-from tests.remote.listening import listening
+from tests.remote.listening import Listening, listening
 from tests.support.compare import assert_same, assert_same_space
 
 WAYS: dict[str, dict[str, Any]] = {
     "plain": {},
     "subclass": {"options": {"env_kwargs": {"subclass": True}}},
-    "frames": {"options": {"lane": "frames"}},
-    "tcp": {},
+    "tcp": {},  # by messages, as with ``lane="frames"``
 }
-STEPS = 4
 
 
 class Told(gym.Env[Any, Any]):
@@ -68,25 +65,28 @@ def told(count: int) -> list[Callable[[], gym.Env[Any, Any]]]:
     return [lambda number=i: gym.wrappers.TimeLimit(Told(number), 9) for i in range(count)]
 
 
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Listening]:
+    """A server on loopback, with keys."""
+    with listening(tmp_path_factory.mktemp("server")) as found:
+        yield found
+
+
 @pytest.fixture(params=WAYS)
-def make(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[Callable[..., Any]]:
-    """Makes it in a sandbox; what is made is closed, before the server that it is on ends."""
+def make(request: pytest.FixtureRequest) -> Iterator[Callable[..., Any]]:
+    """Makes it in a sandbox; what is made is closed."""
     made: list[Any] = []
+    options: dict[str, Any] = {}
+    if request.param == "tcp":
+        options = {"options": {"sandbox": request.getfixturevalue("server").sandbox()}}
 
     def build(env_fns: Any, **kwargs: Any) -> Any:
         made.append(vector(env_fns, **{**WAYS[request.param], **kwargs}))
         return made[-1]
 
-    with ExitStack() as held:
-        options: dict[str, Any] = {}
-        if request.param == "tcp":
-            place = held.enter_context(listening(tmp_path_factory.mktemp("server")))
-            options = {"options": {"sandbox": place.sandbox()}}
-        yield partial(build, **options)
-        for env in made:
-            env.close()
+    yield partial(build, **options)
+    for env in made:
+        env.close()
 
 
 def facts(spec: Any) -> tuple[Any, ...]:

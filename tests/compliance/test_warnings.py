@@ -19,14 +19,9 @@ from tests.compliance.theirs.through_sandbox import vector
 
 WAYS: dict[str, dict[str, Any]] = {
     "sync": {},
-    "async": {"use_async_envs": True},
     "subclass": {"options": {"env_kwargs": {"subclass": True}}},
     "frames": {"options": {"lane": "frames"}},
     "workers": {"use_async_envs": True, "options": {"num_workers": 2}},
-    "workers by frames": {
-        "use_async_envs": True,
-        "options": {"num_workers": 2, "lane": "frames"},
-    },
 }
 _COLORS = re.compile("\x1b\\[[0-9;]*m")
 

@@ -56,6 +56,14 @@ def cases(
     ]
 
 
+def each_mode(n_envs: int) -> list[Case]:
+    """Each mode once: in one process, in one, and in two."""
+    return [
+        *cases((n_envs,), (False,), MODES[1:]),
+        *cases((n_envs,), (True,), MODES[:1]),
+    ]
+
+
 @contextlib.contextmanager
 def paired(name: str, case: Case, **options: Any) -> Iterator[Pair]:
     """A sample's reference and its sandboxed environment, which live as long as the context.
@@ -87,12 +95,14 @@ class VectorEnvCompliance:
         cases: How to build it.
         steps: Steps of the long rollout.
         ends: Whether episodes end within these steps.
+        over_frames: How many of the cases, from the last one, are run as messages, too.
     """
 
     sample: ClassVar[str]
     cases: ClassVar[list[Case]] = [Case()]
     steps: ClassVar[int] = 200
     ends: ClassVar[bool] = True
+    over_frames: ClassVar[int] = 1
 
     def test_is_an_ordinary_vector_env(self, pair: Pair) -> None:
         """The proxy is a VectorEnv with the reference's size, render mode and metadata."""

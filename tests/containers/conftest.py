@@ -20,10 +20,10 @@ from envhub_sandbox.sandboxes.docker.engines import Engine, find_engine, find_im
 from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
 from tests.attacks import table
 from tests.attacks.harness import USER
-from tests.compliance.conftest import lane, pytest_generate_tests
+from tests.compliance.conftest import pytest_generate_tests
 from tests.containers.kit import IMAGE, Walls
 
-__all__ = ["lane", "pytest_generate_tests"]
+__all__ = ["pytest_generate_tests"]
 
 PLACES = ("strict-jail", "bare-jail", "walls")
 _COLUMNS = ("control, root", *(f"{place}, root" for place in PLACES))
