@@ -7,9 +7,6 @@ from pathlib import Path
 import pytest
 
 from envhub_sandbox import make_env
-from envhub_sandbox.errors import PolicyError, SandboxUnavailableError
-from envhub_worker.lockdown.gpus import gpu_devices
-from envhub_worker.lockdown.root_plan import real_host
 from tests.support.repositories import STILL, write_repository
 
 
@@ -28,22 +25,3 @@ def test_a_granted_home_does_not_break_loading(
     env = make_env(folder, policy={"environment": (name,)}).env
     env.reset(seed=1)
     env.close()
-
-
-def test_a_path_that_is_not_there_is_refused(folder: Path) -> None:
-    """Before anything is started; one that is there is not."""
-    missing = str(folder / "missing")
-    with pytest.raises(PolicyError, match="there is no such file or folder"):
-        make_env(folder, policy={"readable": (missing,)})
-    make_env(folder, policy={"readable": (str(folder),)}).close()
-
-
-def test_a_gpu_that_is_not_there_is_told(folder: Path) -> None:
-    """With what to do; where there is one it is handed in."""
-    make_env(folder).close()  # the control
-    if gpu_devices(real_host()):
-        with make_env(folder, policy={"gpu": True}) as suites:
-            suites.env.reset(seed=1)
-        return
-    with pytest.raises(SandboxUnavailableError, match=r"there is none here.*\n.*grant no GPU"):
-        make_env(folder, policy={"gpu": True})
