@@ -93,9 +93,15 @@ def test_the_line_in_a_repository_of_the_hub(stub_hub: StubHub, hub_cache: Path)
     assert str(hub_cache) not in str(error) + vars(error)["__notes__"][0]
 
 
-@pytest.mark.parametrize("lane", ["auto", "frames"])
-@pytest.mark.parametrize("at", ["step", "single", "make_env"])
-@pytest.mark.parametrize("shown", ["folded", "full"])
+@pytest.mark.parametrize(
+    ("at", "lane", "shown"),
+    [
+        ("step", "frames", "folded"),
+        ("single", "auto", "folded"),
+        ("make_env", "auto", "folded"),
+        ("step", "auto", "full"),
+    ],
+)
 def test_a_traceback_has_one_frame_of_ours(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: str, lane: str, shown: str
 ) -> None:

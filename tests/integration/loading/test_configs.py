@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 import sys
 import types
 from dataclasses import dataclass, field
@@ -171,18 +170,6 @@ def test_classes_that_exist_in_the_jail_are_used(
     cfg = OfTheCaller(fps=20, hub_path=str(folder))  # type: ignore[call-arg]
     found = seen(cfg)
     assert (found["name"], found["base"], found["same arm"]) == ("OfTheCaller", 40, True)
-
-
-def test_a_pickled_environment_has_the_same_config(tmp_path: Path) -> None:
-    """The recipe keeps what crossed, with its class, and pickles nothing of the caller's."""
-    folder = write_repository(tmp_path / "repo", _READS)
-    with (
-        make_env(ArmEnvConfig(hub_path=str(folder))) as suites,
-        pickle.loads(pickle.dumps(suites)) as again,
-    ):
-        first, second = (one.env.get_attr("seen")[0] for one in (suites, again))
-        assert second["name"] == "ArmEnvConfig"
-        assert {**first, "dict": ""} == {**second, "dict": ""}
 
 
 def test_what_has_no_plain_form_is_no_field(tmp_path: Path) -> None:

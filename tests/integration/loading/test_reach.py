@@ -9,7 +9,6 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import (
-    EnvHubError,
     LoadError,
     RemoteEnvError,
     RemoteEnvWarning,
@@ -117,15 +116,6 @@ def test_a_window_that_cannot_be_opened_is_no_mere_abort(env: Any) -> None:
     with pytest.raises(WorkerDiedError, match="It tried to open a window") as caught:
         env.call("run", f"sys.stderr.write({said!r} + chr(10)); sys.stderr.flush(); os.abort()")
     assert caught.value.signal == "SIGABRT"
-
-
-def test_a_loopback_device_of_its_own(tmp_path: Path) -> None:
-    """What the advice names works."""
-    folder = write_repository(tmp_path / "repo", RUNS)
-    with make_env(str(folder), policy={"network": "loopback"}) as suites:
-        suites.env.call("run", "socket.create_server(('127.0.0.1', 0))")
-        with pytest.raises(EnvHubError, match="A jail has no network"):
-            suites.env.call("run", f"urllib.request.urlopen({URL!r})")
 
 
 @pytest.mark.filterwarnings("default")
