@@ -93,7 +93,6 @@ def packages(folder: Path) -> Path:
 
 @pytest.fixture
 def cell(folder: Path, packages: Path) -> Iterator[Cell]:
-    """A jail with these packages."""
     runtime = Runtime(base_interpreter(), str(packages))
     with spawner_in(folder, STRICT, runtime=runtime) as spawner:
         cell = new_cell(spawner, make_snapshot(folder), STRICT)
@@ -185,7 +184,6 @@ result = failed
 
 
 def is_confined(cell: Cell, runner: int) -> bool:
-    """Whether a runner was confined."""
     cell.pump()
     return any(isinstance(event, RunnerStarted) and event.runner == runner for event in cell.events)
 

@@ -51,7 +51,6 @@ def cells() -> Iterator[dict[str, Cell]]:
 
 @pytest.fixture(params=profiles("strict", "no-userns", "container"))
 def cell(request: pytest.FixtureRequest, cells: dict[str, Cell]) -> Cell:
-    """Every profile."""
     return cells[request.param]
 
 
@@ -154,7 +153,6 @@ def test_snapshot_stays_as_it_is(cell: Cell, outside: Path) -> None:
 
 @pytest.mark.parametrize("profile", profiles("strict", "no-userns"))
 def test_link_in_a_snapshot_leads_nowhere(outside: Path, profile: str) -> None:
-    """A symbolic link to a file outside shows nothing."""
     (outside / "secret").write_text("s3cret")
     with open_folder() as folder, spawner_in(folder, Confinement(profile=profile)) as spawner:
         snapshot = make_snapshot(folder, str(outside / "secret"))
@@ -247,7 +245,6 @@ def test_listener_outside_is_not_reached(cell: Cell, outside: Path) -> None:
 
 
 def reached(listener: socket.socket) -> bool:
-    """Whether somebody connected or sent."""
     try:
         if listener.type == socket.SOCK_DGRAM:
             return listener.recv(10) == b"hello"
@@ -259,7 +256,6 @@ def reached(listener: socket.socket) -> bool:
 
 
 def test_processes_outside_get_no_signal(cell: Cell) -> None:
-    """By pid, by everything (-1), by descriptor."""
     with victim() as process:
         for attempt in (
             f"os.kill({process.pid}, signal.SIGTERM)",
@@ -282,7 +278,6 @@ def call(number, *args):
 
 
 def test_processes_outside_cannot_be_traced_or_read(cell: Cell) -> None:
-    """ptrace, process_vm_readv, /proc/<pid>/mem."""
     with victim() as process:
         pid = process.pid
         attach = CALL + f"call({{}}, 16, {pid}, 0, 0); call({{}}, 17, {pid}, 0, 0)"
@@ -411,7 +406,6 @@ def test_command_line_of_a_runner_tells_nothing(cell: Cell) -> None:
 
 
 def test_snapshot_may_be_named_through_a_link() -> None:
-    """A home may be a symbolic link to another disk."""
     with open_folder() as folder, spawner_in(folder, Confinement()) as spawner:
         make_snapshot(folder)
         (folder / "alias").symlink_to(folder, target_is_directory=True)

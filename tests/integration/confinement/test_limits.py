@@ -69,13 +69,11 @@ def limited(profile: str, **limits: int) -> Iterator[Cell]:
 
 @pytest.fixture(params=profiles("strict", "no-userns"))
 def profile(request: pytest.FixtureRequest) -> str:
-    """Both ways to hold a jail."""
     return str(request.param)
 
 
 @pytest.fixture(params=["cgroup", "watchdog"])
 def counted(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Who counts memory."""
     if request.param == "watchdog":
         monkeypatch.setattr(cgroups, "discover", lambda: None)
     elif cgroups.discover() is None:
@@ -171,7 +169,6 @@ HOME = "os.path.expanduser('~')"
 
 
 def test_scratch_folders_share_one_quota() -> None:
-    """What home took, temporary files have not."""
     with limited("strict", disk_bytes=20 * MIB, file_bytes=12 * MIB) as cell:
         cell.run(FILL.format(folder=HOME, mib=12))
         written, errno = cell.run(FILL.format(folder="'/tmp'", mib=12))["result"]

@@ -107,7 +107,6 @@ class ArmEnvConfig(Base):
         return "arms"
 
     def validate(self) -> bool:
-        """A method, which stays here."""
         return True
 
 
@@ -129,7 +128,6 @@ for _one in (Mode, Arm, Base, ArmEnvConfig, Left):
 
 
 def seen(cfg: Any) -> Any:
-    """What the repository found of it."""
     with make_env(cfg) as suites:
         return suites.env.get_attr("seen")[0]
 

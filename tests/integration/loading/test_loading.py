@@ -253,7 +253,6 @@ class TestWhatMakeEnvReturns:
             assert_same(roll(reference("cartpole", 2)), roll(env))
 
     def test_vector_wrapper(self) -> None:
-        """A VectorWrapper is called, not looked through."""
         with make_env(sample("vector_wrapper"), n_envs=2, use_async_envs=True) as suites:
             assert suites.env.factor == 0.5
             assert_same(roll(reference("vector_wrapper", 2)), roll(suites.env))
@@ -350,7 +349,6 @@ class TestWhatGoesWrong:
         assert not crashes.exists()
 
     def test_input_gets_end_of_file(self) -> None:
-        """A repository that asks a question does not hang."""
         with pytest.raises(LoadError, match="EOFError"):
             make_env(sample("prompts"))
 

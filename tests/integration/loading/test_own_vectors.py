@@ -145,7 +145,6 @@ class TestSpacesThatAreMissing:
             assert env.get_attr("seen").shape == (3, 2)
 
     def test_without_an_action_space_the_error_says_what_to_add(self, tmp_path: Path) -> None:
-        """No observation shows what an action is."""
         folder = own(tmp_path, "observation_space = Box(-1, 1, (3, 4))", base="")
         with pytest.raises(LoadError, match=r"Own.*add single_action_space"):
             make_env(folder, n_envs=3)

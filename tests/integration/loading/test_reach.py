@@ -1,4 +1,4 @@
-"""What an environment wants when it starts: its command line, sockets, downloads and windows."""
+"""What an environment wants when it starts: command line, home, sockets, downloads and windows."""
 
 from __future__ import annotations
 
@@ -110,7 +110,6 @@ def test_other_errors_get_no_advice(env: Any) -> None:
 
 
 def test_a_window_that_cannot_be_opened_is_no_mere_abort(env: Any) -> None:
-    """Qt ends the process; the error says why."""
     env.reset()
     said = 'qt.qpa.plugin: Could not load the Qt platform plugin "xcb" in ""'
     with pytest.raises(WorkerDiedError, match="It tried to open a window") as caught:
@@ -133,3 +132,20 @@ def make_env(n_envs: int = 1, use_async_envs: bool = False, cfg: EnvConfig | Non
         suites = make_env(str(folder))
     with suites:
         assert suites.provenance["installed"] is None
+
+
+@pytest.fixture
+def at_home(tmp_path: Path) -> Path:
+    """A repository that looks at its home."""
+    return write_repository(tmp_path, f"import os\nprint(os.environ['HOME'])\n{STILL}")
+
+
+@pytest.mark.parametrize("name", ["HOME", "TMPDIR"])
+def test_a_granted_home_does_not_break_loading(
+    at_home: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The variable has the caller's value; what we write lies in a folder of the jail's own."""
+    monkeypatch.setenv(name, "/nowhere/at/all")
+    env = make_env(at_home, policy={"environment": (name,)}).env
+    env.reset(seed=1)
+    env.close()

@@ -109,7 +109,6 @@ class TestManyTasks:
 
     @pytest.fixture
     def suites(self) -> Any:
-        """The benchmark, opened and closed."""
         with make_env(sample("many_tasks"), n_envs=4, use_async_envs=True) as made:
             yield made
 
@@ -140,7 +139,6 @@ class TestManyTasks:
         assert infos["pid"].tolist() == list(pids)
 
     def test_closing_one_task_leaves_the_others(self, suites: EnvSuites) -> None:
-        """A closed task says so; its neighbour goes on."""
         first, second = suites["rooms"][0], suites["rooms"][1]
         first.reset(seed=0)
         second.reset(seed=0)

@@ -104,7 +104,6 @@ def test_two_threads_that_step_are_warned_of(env: Any, monkeypatch: pytest.Monke
 
 
 def test_the_second_thread_is_refused_after_an_async_call(env: Any) -> None:
-    """No thread has the lock between the two calls."""
     env.step_async(ACTIONS)
     refused: list[type] = []
 

@@ -150,7 +150,6 @@ def test_a_step_may_take_too_long(gates: Gates) -> None:
 
 @lanes
 def test_close_ends_a_wait(gates: Gates) -> None:
-    """From another thread; whoever waits hears that it was closed."""
     env = gates.env(3)
     send(env, 1, 2, ids=[0, 2])
     heard: list[BaseException] = []
@@ -206,13 +205,11 @@ class Loop:
         self.got: dict[int, list[int]] = {0: [], 1: []}
 
     def receive(self) -> None:
-        """Whatever comes next."""
         received = self.env.recv(1)
         for index, reward in zip(ids(received), received.rewards, strict=True):
             self.got[index].append(int(reward))
 
     def run(self) -> None:
-        """Send all, and receive all."""
         for step in range(self._ahead):
             for index in (0, 1):
                 number = self._first + step

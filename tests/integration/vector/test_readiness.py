@@ -24,13 +24,11 @@ pytestmark = [pytest.mark.same_for("users"), pytest.mark.parametrize("lane", ["a
 
 @pytest.fixture
 def gates(tmp_path: Path, lane: str) -> Iterator[Gates]:
-    """Over one of the lanes."""
     with ExitStack() as stack:
         yield Gates(tmp_path, stack, lane=lane)
 
 
 def send(env: Any, *gates: int, large: int = 0) -> None:
-    """A step that waits for these."""
     env.step_async(np.array([[gate, large] for gate in gates]))
 
 
@@ -85,7 +83,6 @@ def test_large_infos_belong_to_the_answer(gates: Gates) -> None:
 
 
 def test_a_reset_is_answered_as_well(gates: Gates) -> None:
-    """With whatever else goes another way than a step."""
     for policy in ({}, {"restart": "transparent"}):
         env = gates.env(policy=policy)
         env.reset_async(seed=1)

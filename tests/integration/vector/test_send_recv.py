@@ -170,7 +170,6 @@ def test_other_requests_are_refused_meanwhile(gates: Gates) -> None:
 
 
 def test_what_cannot_be_meant_is_refused(gates: Gates) -> None:
-    """Nothing was sent then."""
     env = gates.env(3, num_workers=2)
     wrong = {
         "sub-environments 0 to 1 are stepped together, .* lacks 1": [0],
@@ -232,7 +231,6 @@ def test_a_fork_neither_sends_nor_receives(gates: Gates) -> None:
 
 
 def test_what_comes_is_checked_where_that_is_wanted(tmp_path: Path, lane: str) -> None:
-    """Actions and observations, by the number of their sub-environment."""
     text = STILL.replace("return 0, 0.0", "return 1 + int(action), 0.0")
     folder = write_repository(tmp_path, text)
     with started(folder, 3, lane=lane, min_ready=1, validate=True) as env:

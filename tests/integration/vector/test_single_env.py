@@ -31,7 +31,6 @@ def test_gymnasiums_own_check_passes() -> None:
 
 
 def test_gymnasium_makes_it_by_its_id() -> None:
-    """One and several, with what make_env takes."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         env = gym.make(_ID, ref=str(EXAMPLES / "cartpole"), limits={"processes": 32})

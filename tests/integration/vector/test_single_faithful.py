@@ -75,20 +75,17 @@ def make_env(n_envs=1, use_async_envs=False, mode="NextStep"):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A repository with the environment."""
     return write_repository(tmp_path_factory.mktemp("told"), _ENV)
 
 
 @pytest.fixture
 def here(folder: Path) -> gym.Env[Any, Any]:
-    """The same environment in this process."""
     env: gym.Env[Any, Any] = make_env_of(folder)().envs[0]
     return env
 
 
 @pytest.fixture(params=["auto", "frames"])
 def env(folder: Path, request: pytest.FixtureRequest) -> Iterator[Any]:
-    """The environment in a sandbox."""
     made = SandboxEnv(folder, lane=request.param)
     yield made
     made.close()
@@ -169,7 +166,6 @@ class _Derived(SandboxEnv):
 
 
 def test_a_derived_class_keeps_its_own_attributes(folder: Path) -> None:
-    """They are not sent."""
     env = _Derived(folder)
     try:
         assert (vars(env)["_mine"], env.calls) == (1, 2)
@@ -193,7 +189,6 @@ def test_its_actions_and_the_vector_environment_below(env: Any, folder: Path) ->
 
 
 def test_its_spec_has_the_plain_fields(tmp_path: Path) -> None:
-    """Where the repository used gym.make; Gymnasium's wrappers read it."""
     text = """
 import gymnasium as gym
 def make_env(n_envs=1, use_async_envs=False):

@@ -95,7 +95,6 @@ def play(env: Any) -> None:
 
 
 def test_an_action_outside_of_its_space_is_not_sent(leaver: Path) -> None:
-    """By its value; a float64 is taken as ever."""
     with make_env(str(leaver), 2, validate=True) as suites:
         env = suites.env
         env.reset(seed=0)
@@ -121,7 +120,6 @@ def test_what_keeps_to_its_spaces_passes(name: str) -> None:
 
 
 def test_who_drops_it_has_closed_it() -> None:
-    """At once, and not when the garbage collector comes by."""
     gc.disable()
     try:
         suites = make_env(sample("pendulum"), 2, validate=True)
@@ -136,7 +134,6 @@ def test_who_drops_it_has_closed_it() -> None:
 
 
 def test_envhub_run_validates(leaver: Path) -> None:
-    """The environment broke the rules: exit code 1."""
     kwargs = ("--env-kwargs", "value=2.0", "--env-kwargs", "moment=step")
     for validate, code in ((), 0), (("--validate",), 1):
         done = envhub("run", leaver, *kwargs, "--episodes", "1", *validate)
@@ -167,7 +164,6 @@ def make_env(n_envs=1, use_async_envs=False):
 
 
 def test_what_is_no_batch_at_all_is_told(tmp_path: Path) -> None:
-    """A vector environment of the repository's own may give anything."""
     with make_env(str(write_repository(tmp_path, _SHAPELESS)), 2, validate=True) as suites:
         with pytest.raises(ObservationError, match="no batch of observations"):
             suites.env.reset()

@@ -107,14 +107,12 @@ WAYS = [
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The repository."""
     found = tmp_path_factory.mktemp("told")
     (found / "env.py").write_text(REPOSITORY)
     return found
 
 
 def in_this_process() -> Any:
-    """The same, unsandboxed."""
     names: dict[str, Any] = {"__name__": "told"}
     exec(compile(REPOSITORY, "told", "exec"), names)
     return names["make_env"](ENVS)
@@ -138,7 +136,6 @@ def done(env: gym.vector.VectorEnv[Any, Any, Any], what: str, number: int) -> An
 
 @pytest.mark.parametrize("way", WAYS, ids=str)
 def test_every_value_is_the_one_that_is_there(folder: Path, way: dict[str, Any]) -> None:
-    """In any order of requests: as in this process."""
     dice = random.Random(3)
     requests = ["reset"]
     for _ in range(60):  # rounds of an evaluation, with something else in between
