@@ -37,7 +37,6 @@ WAYS: dict[str, dict[str, Any]] = {
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Listening]:
-    """A server on loopback, with keys."""
     with listening(tmp_path_factory.mktemp("server")) as found:
         yield found
 
@@ -95,12 +94,10 @@ class Shown(gym.Env[Any, Any]):
 
 
 def shown(space: gym.Space[Any], *infos: dict[str, Any], slow: float = 0.0) -> Callable[[], Shown]:
-    """A function that makes one."""
     return partial(Shown, space, infos, slow)
 
 
 def carts(count: int) -> list[Callable[[], gym.Env[Any, Any]]]:
-    """CartPole, often."""
     return [partial(gym.make, "CartPole-v1")] * count
 
 
@@ -207,7 +204,6 @@ def test_what_is_refused_in_gymnasiums_words(make: Make) -> None:
 @pytest.mark.parametrize("make", ALL, indirect=True)
 @pytest.mark.parametrize("mode", AutoresetMode)
 def test_facts(make: Make, mode: AutoresetMode) -> None:
-    """Attributes that wrappers read."""
     env = make(carts(2), autoreset_mode=mode)
     assert env.metadata["autoreset_mode"] is mode
     assert "autoreset_mode" not in env.envs[0].metadata
@@ -225,7 +221,6 @@ def test_the_arguments_can_be_read() -> None:
 
 @pytest.mark.parametrize(("asked", "other"), [("step", "reset"), ("reset", "step")])
 def test_halves_out_of_order(halves: Make, asked: str, other: str) -> None:
-    """Gymnasium's errors, and its warning if one closes meanwhile."""
     env = halves(carts(3))
     env.reset(seed=0)
     arguments = {"step": (np.zeros(3, np.int64),), "reset": ()}
@@ -250,7 +245,6 @@ def test_a_late_reply(halves: Make) -> None:
 
 @pytest.mark.parametrize("name", ["reset", "step", "close"])
 def test_what_is_not_called_by_name(halves: Make, name: str) -> None:
-    """It would take one sub-environment from under the others."""
     env = halves(carts(2))
     env.reset(seed=0)
     with pytest.raises(ValueError, match=f"Trying to call function `{name}` with `call`"):

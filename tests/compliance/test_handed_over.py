@@ -86,7 +86,6 @@ def env(folder: Path) -> Iterator[SandboxVectorEnv]:
 
 
 def made_of(folder: Path, **kwargs: Any) -> SandboxVectorEnv:
-    """The repository's only environment."""
     env = make_env(folder, **kwargs).env
     assert isinstance(env, SandboxVectorEnv)
     return env

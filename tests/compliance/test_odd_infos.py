@@ -57,7 +57,6 @@ ODD = ("structured", "record", "void", "long", "longs", "deep", "many", "text", 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A repository whose infos are odd."""
     return write_repository(tmp_path_factory.mktemp("odd"), _ENV)
 
 
@@ -88,7 +87,6 @@ def test_the_rest_of_a_step_arrives(folder: Path, options: dict[str, Any]) -> No
 
 
 def test_one_environment_has_plain_values_of_them(folder: Path) -> None:
-    """Of numpy's own, without a vector environment's columns."""
     expected = [[(1, 2.5)], (1, 2.5), b"abc", np.float64(1.5), [1.5, 2.5]]
     with contextlib.closing(SandboxEnv(folder)) as env:
         for odd, value in zip(ODD, expected, strict=False):

@@ -51,13 +51,11 @@ class OlderCase(Case):
 
     @property
     def label(self) -> str:
-        """A readable test id."""
         return f"{super().label}-{self.requirements[0]}"
 
 
 @contextmanager
 def opened(name: str, case: Case, runtime: Runtime, **options: Any) -> Iterator[Any]:
-    """The sandboxed environment of a case."""
     arguments = {"n_envs": case.n_envs, "use_async_envs": case.use_async_envs}
     with running_on(runtime):
         suites = make_env(

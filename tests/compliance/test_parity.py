@@ -80,7 +80,6 @@ class TestCounter(VectorEnvCompliance):
         pair.drive(seed=6, steps=5)
 
     def test_actions_of_every_kind(self, pair: Pair) -> None:
-        """Lists, tuples and other integer arrays are actions too."""
         pair.reset(seed=7)
         numbers = [i % 3 for i in range(pair.num_envs)]
         kinds = [numbers, tuple(numbers), np.array(numbers), np.array(numbers, np.int32)]

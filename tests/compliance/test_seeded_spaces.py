@@ -61,7 +61,6 @@ SPACES = ("single_action_space", "action_space", "single_observation_space", "ob
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """The same repository as a folder."""
     (tmp_path / "env.py").write_text(REPOSITORY)
     return tmp_path
 

@@ -36,7 +36,6 @@ class Told(gym.Env[Any, Any]):
         self.ran: list[str] = []
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        """Seeds its space too."""
         super().reset(seed=seed)
         if seed is not None:
             self.observation_space.seed(seed)
@@ -44,30 +43,25 @@ class Told(gym.Env[Any, Any]):
         return self.observation_space.sample(), {"space": self.action_space, "rng": self.np_random}
 
     def step(self, action: Any) -> Any:
-        """Ends at the last action."""
         assert action in self.action_space
         self.ran.append("step")
         observation, end = self.observation_space.sample(), bool(action == 1)
         return observation, float(self.np_random.random()), end, False, {"number": self.number}
 
     def add(self, count: int, *, twice: bool = False) -> int:
-        """A method with arguments."""
         self.number += count * (1 + twice)
         return self.number
 
     def close(self) -> None:
-        """Remembers it."""
         self.ran.append("close")
 
 
 def told(count: int) -> list[Callable[[], gym.Env[Any, Any]]]:
-    """As many, one wrapper around each."""
     return [lambda number=i: gym.wrappers.TimeLimit(Told(number), 9) for i in range(count)]
 
 
 @pytest.fixture(scope="module")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Listening]:
-    """A server on loopback, with keys."""
     with listening(tmp_path_factory.mktemp("server")) as found:
         yield found
 
@@ -144,7 +138,6 @@ def test_attributes_and_methods_of_one(make: Callable[..., Any]) -> None:
 
 
 def test_looking_at_a_method_runs_nothing(make: Callable[..., Any]) -> None:
-    """It is asked whether it is one."""
     env = make(told(2))
     env.reset(seed=0)
     for one in env.envs:
@@ -175,7 +168,6 @@ def test_spaces_specs_and_generators_are_themselves(make: Callable[..., Any]) ->
 
 
 def test_one_is_not_closed_under_the_others(make: Callable[..., Any]) -> None:
-    """The only one may be."""
     env = make(told(2))
     env.reset(seed=0)
     with pytest.raises(ValueError, match="close the vector environment"):

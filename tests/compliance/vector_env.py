@@ -37,7 +37,6 @@ class Case:
 
     @property
     def label(self) -> str:
-        """A readable test id."""
         words = [f"n{self.n_envs}", "async" if self.use_async_envs else "sync"]
         words += [] if self.num_workers is None else [f"{self.num_workers}workers"]
         return "-".join([*words, *map(str, self.env_kwargs.values())])
@@ -58,10 +57,7 @@ def cases(
 
 def each_mode(n_envs: int) -> list[Case]:
     """Each mode once: in one process, in one, and in two."""
-    return [
-        *cases((n_envs,), (False,), MODES[1:]),
-        *cases((n_envs,), (True,), MODES[:1]),
-    ]
+    return [*cases((n_envs,), (False,), MODES[1:]), *cases((n_envs,), (True,), MODES[:1])]
 
 
 @contextlib.contextmanager
@@ -115,7 +111,6 @@ class VectorEnvCompliance:
         assert_same(dict(pair.reference.metadata), dict(pair.sandboxed.metadata), "metadata")
 
     def test_spaces_are_equal(self, pair: Pair) -> None:
-        """The four spaces are equal and sample the same."""
         for kind in ("single_observation_space", "single_action_space"):
             assert_same_space(getattr(pair.reference, kind), getattr(pair.sandboxed, kind), kind)
         for kind in ("observation_space", "action_space"):

@@ -42,7 +42,6 @@ _TABLE = table.Collected("container attack", "ENVHUB_CONTAINER_TABLE", _COLUMNS,
 
 @pytest.fixture(scope="session", autouse=True)
 def engine() -> Engine:
-    """The engine, which has the image."""
     try:
         found = find_engine(os.environ.get("ENVHUB_TEST_ENGINE"))
         find_image(found, IMAGE)
@@ -53,7 +52,6 @@ def engine() -> Engine:
 
 @pytest.fixture(scope="session")
 def docker(engine: Engine) -> DockerSandbox:
-    """Containers of the image under test."""
     return DockerSandbox(image=IMAGE, engine=engine.kind)
 
 
@@ -68,14 +66,12 @@ def open_ground() -> Iterator[Path]:
 
 @pytest.fixture(params=PLACES)
 def walls(request: pytest.FixtureRequest, engine: Engine) -> Iterator[Walls]:
-    """Where an attack is tried."""
     made = Walls(request.param, engine)
     yield made
     _TABLE.found(request.node, made.rows)
 
 
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:
-    """Collect the rows."""
     _TABLE.read(report)
 
 

@@ -24,8 +24,6 @@ def test_random_cases_do_not_differ(first: int) -> None:
 
 
 def test_what_differs_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Sub-environments in another order are a difference."""
-
     def turned(env_fns: Any, **kwargs: Any) -> Any:
         return vector(env_fns[::-1], **kwargs)
 

@@ -70,11 +70,7 @@ _PARTS = (
     ("Values", ("envhub_worker/protocol",), "values.md"),
     (
         "The command line",
-        (
-            "envhub_sandbox/cli",
-            "envhub_sandbox/check",
-            "envhub_sandbox/session/crash",
-        ),
+        ("envhub_sandbox/cli", "envhub_sandbox/check", "envhub_sandbox/session/crash"),
         "cli.md",
     ),
     ("Other libraries", ("envhub_sandbox/integrations",), "integrations.md"),
@@ -155,7 +151,6 @@ class Message:
 
 
 def document() -> str:
-    """What the file has to hold."""
     parts, found = list[str](), list(messages())
     texts = {one.text for one in found}
     whole = [one for one in found if not any(one.text in text != one.text for text in texts)]
@@ -188,7 +183,6 @@ def messages() -> Iterator[Message]:
 
 
 def of_source(source: str, place: str) -> Iterator[Message]:
-    """Those of one module."""
     reader, module = _Reader(), ast.parse(source)
     reader.note_functions(module)
     reader.visit(module)
