@@ -83,9 +83,7 @@ def counted(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
 
 @pytest.mark.parametrize("counted", ["watchdog"], indirect=True)  # else tests/attacks has them
 @pytest.mark.parametrize(
-    "bomb",
-    [HEAP, SHARED, MEMFD, SYSTEM_V],
-    ids=["heap", "shared-anonymous", "memfd", "system-v"],
+    "bomb", [HEAP, SHARED, MEMFD, SYSTEM_V], ids=["heap", "shared-anonymous", "memfd", "system-v"]
 )
 def test_memory_bomb_ends_the_runner(bomb: str, profile: str, counted: str) -> None:
     """Every kind of memory counts, or cannot be had: the runner ends as out of memory and knows."""

@@ -18,11 +18,7 @@ from gymnasium.vector import VectorEnv
 
 from envhub_sandbox import make_env
 from envhub_sandbox.cli.shared.exits import Exit, code_for
-from envhub_sandbox.errors import (
-    DependencyError,
-    EnvHubError,
-    LoadError,
-)
+from envhub_sandbox.errors import DependencyError, EnvHubError, LoadError
 from tests.support.compare import assert_same
 from tests.support.repositories import CARTPOLE, CARTPOLES, STILL, write_repository
 from tests.support.samples import make_env_of, reference, sample

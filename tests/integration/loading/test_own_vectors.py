@@ -123,10 +123,7 @@ class TestSpacesThatAreMissing:
 
     @pytest.mark.parametrize(
         ("spaces", "observation"),
-        [
-            (_BATCHED, _SEEN),
-            ("action_space = Box(-1, 1, (2,))", _SEEN),
-        ],
+        [(_BATCHED, _SEEN), ("action_space = Box(-1, 1, (2,))", _SEEN)],
         ids=["batched", "no observation space"],
     )
     def test_they_are_derived_from_the_first_reset(

@@ -8,12 +8,7 @@ from typing import Any
 import pytest
 
 from envhub_sandbox import make_env
-from envhub_sandbox.errors import (
-    LoadError,
-    RemoteEnvError,
-    RemoteEnvWarning,
-    WorkerDiedError,
-)
+from envhub_sandbox.errors import LoadError, RemoteEnvError, RemoteEnvWarning, WorkerDiedError
 from tests.support.repositories import STILL, write_repository
 
 pytestmark = pytest.mark.short
@@ -79,10 +74,7 @@ PIP = "[sys.executable, '-m', 'pip', 'install', 'no-such-one']"
         (f"urllib.request.urlopen({URL!r})", "assets=['org/repo@COMMIT'] names"),
         (f"subprocess.run(['git', 'clone', {URL!r}, '/tmp/x'], check=True)", "] names"),
         (f"subprocess.run({PIP}, check=True)", "dependencies={'extra': ['PACKAGE']}"),
-        (
-            "subprocess.check_call('pip install -q no-such-one', shell=True)",
-            "requirements.txt",
-        ),
+        ("subprocess.check_call('pip install -q no-such-one', shell=True)", "requirements.txt"),
         ("socket.create_server(('127.0.0.1', 0))", "policy={'network': 'loopback'}"),
         ("socket.create_connection(('localhost', 1))", "policy={'network': 'loopback'}"),
         ("raise RuntimeError('could not connect to display')", "render to arrays"),

@@ -13,12 +13,7 @@ import numpy as np
 import pytest
 from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError
 
-from envhub_sandbox.errors import (
-    ActionError,
-    ObservationError,
-    RemoteEnvError,
-    WorkerError,
-)
+from envhub_sandbox.errors import ActionError, ObservationError, RemoteEnvError, WorkerError
 from tests.support.objects.gates import LARGE, RAISE, Gates, ids, send
 from tests.support.repositories import STILL, write_repository
 from tests.support.started import started

@@ -10,7 +10,7 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -159,7 +159,7 @@ def test_a_second_start_keeps_the_keys_and_does_not_print_the_secret(tmp_path: P
 
 
 def test_a_server_for_one_client_has_its_keys_in_memory_alone(
-    tmp_path: Path, repository: Path
+    tmp_path: Path, repository: Path, wait_no_more: Callable[[], None]
 ) -> None:
     """Who starts it reads its endpoint and its key; another client is refused; nothing is left."""
     ours, stranger = keys.generate(), keys.generate()
@@ -178,6 +178,7 @@ def test_a_server_for_one_client_has_its_keys_in_memory_alone(
             # an own process stands for the one that started it: its end is the server's
             process.parents()[0].kill()
             assert eventually(lambda: gone([process, *jails]))
+            wait_no_more()
 
 
 @contextlib.contextmanager
