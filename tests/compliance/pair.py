@@ -27,7 +27,6 @@ class Pair:
 
     @property
     def num_envs(self) -> int:
-        """The number of sub-environments."""
         return int(self.reference.num_envs)
 
     def sample_actions(self, seed: int, steps: int) -> list[Any]:
@@ -70,7 +69,6 @@ class Pair:
 
     @property
     def autoreset_mode(self) -> AutoresetMode:
-        """The reference's autoreset mode."""
         mode = self.reference.metadata["autoreset_mode"]
         assert isinstance(mode, AutoresetMode)
         return mode

@@ -48,7 +48,7 @@ def added(infos: list[dict[str, Any]]) -> dict[str, Any]:
     return joined
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(st.lists(INFO, min_size=1, max_size=6), st.data())
 def test_shards_join_as_one_batch(infos: list[dict[str, Any]], data: st.DataObject) -> None:
     """However the sub-environments are cut into shards, the joined infos are Gymnasium's."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 from typing import Any
 
@@ -36,11 +37,8 @@ class Odd(gym.Env):
     observation_space = gym.spaces.Box(0, 100, (2,))
     action_space = gym.spaces.Discrete(2)
 
-    def __init__(self, odd):
-        self.odd = ODD[odd]
-
     def reset(self, *, seed=None, options=None):
-        self.n = 0
+        self.n, self.odd = 0, ODD[options["odd"]]
         return np.zeros(2, np.float32), {"before": 1, "odd": self.odd, "after": "text"}
 
     def step(self, action):
@@ -51,15 +49,14 @@ class Odd(gym.Env):
     def tell(self):
         return self.odd
 
-def make_env(n_envs=1, use_async_envs=False, odd="deep"):
-    return gym.vector.SyncVectorEnv([lambda: Odd(odd)] * n_envs)
+def make_env(n_envs=1, use_async_envs=False):
+    return gym.vector.SyncVectorEnv([Odd] * n_envs)
 """
 ODD = ("structured", "record", "void", "long", "longs", "deep", "many", "text", "integer")
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A repository whose infos are odd."""
     return write_repository(tmp_path_factory.mktemp("odd"), _ENV)
 
 
@@ -69,37 +66,33 @@ def _is_inert(value: Any) -> bool:
     return isinstance(value, RemoteObject)
 
 
-@pytest.mark.parametrize("odd", ODD)
 @pytest.mark.parametrize("options", [{}, {"lane": "frames"}, {"num_workers": 2}], ids=str)
-def test_the_rest_of_a_step_arrives(folder: Path, odd: str, options: dict[str, Any]) -> None:
+def test_the_rest_of_a_step_arrives(folder: Path, options: dict[str, Any]) -> None:
     """Observations, rewards, flags, other infos; and of what is odd its value or a description."""
-    with make_env(folder, n_envs=2, env_kwargs={"odd": odd}, **options) as suites:
+    with make_env(folder, n_envs=2, **options) as suites:
         env = suites.env
-        infos = env.reset()[1]
-        for step in range(1, 4):
-            assert infos["before"].tolist() == [max(1, step - 1)] * 2
-            assert infos["after"].tolist() == ["text"] * 2
-            assert infos["_odd"].all()
-            observation, rewards, _, _, infos = env.step(np.zeros(2, int))
-            assert observation.tolist() == [[step, step]] * 2
-            assert rewards.tolist() == [step, step]
-        if odd in ODD[5:]:
-            assert _is_inert(infos["odd"])
-            with pytest.raises(RemoteEnvError, match="cannot be sent"):
-                env.call("tell")
+        for odd in ODD:
+            infos = env.reset(options={"odd": odd})[1]
+            for step in range(1, 4):
+                assert infos["before"].tolist() == [max(1, step - 1)] * 2, odd
+                assert infos["after"].tolist() == ["text"] * 2, odd
+                assert infos["_odd"].all(), odd
+                observation, rewards, _, _, infos = env.step(np.zeros(2, int))
+                assert observation.tolist() == [[step, step]] * 2, odd
+                assert rewards.tolist() == [step, step], odd
+            if odd in ODD[5:]:
+                assert _is_inert(infos["odd"]), odd
+                with pytest.raises(RemoteEnvError, match="cannot be sent"):
+                    env.call("tell")
 
 
 def test_one_environment_has_plain_values_of_them(folder: Path) -> None:
-    """Of numpy's own, without a vector environment's columns."""
-    expected = [np.array([(1, 2.5)], object), (1, 2.5), b"abc", np.float64(1.5), [1.5, 2.5]]
-    for odd, value in zip(ODD, expected, strict=False):
-        env = SandboxEnv(folder, env_kwargs={"odd": odd})
-        env.reset()
-        found = env.step(0)[4]["odd"]
-        if odd == "structured":
-            assert found.tolist() == [(1, 2.5)]
-        elif odd == "longs":
-            assert found.tolist() == value
-        else:
-            assert (type(found), found) == (type(value), value)
-        env.close()
+    expected = [[(1, 2.5)], (1, 2.5), b"abc", np.float64(1.5), [1.5, 2.5]]
+    with contextlib.closing(SandboxEnv(folder)) as env:
+        for odd, value in zip(ODD, expected, strict=False):
+            env.reset(options={"odd": odd})
+            found = env.step(0)[4]["odd"]
+            if isinstance(value, list):
+                assert found.tolist() == value
+            else:
+                assert (type(found), found) == (type(value), value)

@@ -8,7 +8,7 @@ from gymnasium.error import CustomSpaceError
 from gymnasium.vector import AutoresetMode
 
 from tests.compliance.pair import Pair
-from tests.compliance.vector_env import Case, VectorEnvCompliance, cases
+from tests.compliance.vector_env import Case, VectorEnvCompliance, cases, each_mode
 from tests.support import inside
 from tests.support.compare import assert_same
 
@@ -17,8 +17,9 @@ class TestCounter(VectorEnvCompliance):
     """Every kind of value in the infos, episodes of two to six steps."""
 
     sample = "counter"
-    cases = cases(n_envs=(1, 3), use_async_envs=(False,)) + cases(use_async_envs=(True,))
+    cases = [Case(1, False, {"autoreset_mode": "NextStep"}), *cases()]  # noqa: RUF012
     steps = 150
+    over_frames = 3
 
     def test_options_reach_the_sub_environments(self, pair: Pair) -> None:
         """Options arrive as they were given; this sample repeats them in its info."""
@@ -79,7 +80,6 @@ class TestCounter(VectorEnvCompliance):
         pair.drive(seed=6, steps=5)
 
     def test_actions_of_every_kind(self, pair: Pair) -> None:
-        """Lists, tuples and other integer arrays are actions too."""
         pair.reset(seed=7)
         numbers = [i % 3 for i in range(pair.num_envs)]
         kinds = [numbers, tuple(numbers), np.array(numbers), np.array(numbers, np.int32)]
@@ -100,11 +100,11 @@ class TestCounterInUnevenShards(VectorEnvCompliance):
 
 @pytest.mark.short
 class TestCartPole(VectorEnvCompliance):
-    """Discrete actions, float32 observations, thousands of steps."""
+    """Discrete actions, float32 observations, a thousand steps."""
 
     sample = "cartpole"
-    cases = cases(n_envs=(4,))
-    steps = 3000
+    cases = each_mode(4)
+    steps = 1000
 
     def test_lane_is_the_one_that_was_asked_for(self, pair: Pair, lane: str) -> None:
         """Spaces with a fixed layout go over shared memory unless that is forbidden."""
@@ -117,7 +117,7 @@ class TestPendulum(VectorEnvCompliance):
     """Continuous actions, truncation."""
 
     sample = "pendulum"
-    cases = cases(n_envs=(1, 3), modes=("NextStep",)) + cases(modes=("SameStep",))
+    cases = cases((1,), (False,), ("NextStep",)) + cases((3,), (True,), ("SameStep",))
     steps = 200
 
     def test_actions_keep_their_precision(self, pair: Pair) -> None:
@@ -134,14 +134,14 @@ class TestLeRobotPendulum(VectorEnvCompliance):
     """Dict observations and ``is_success`` in every info."""
 
     sample = "lerobot_pendulum"
-    cases = cases(n_envs=(2,))
+    cases = each_mode(2)
 
 
 class TestExoticSpaces(VectorEnvCompliance):
     """Spaces that have no fixed layout, for observations and actions."""
 
     sample = "exotic_spaces"
-    cases = cases(n_envs=(1,), modes=("NextStep",)) + cases(n_envs=(3,))
+    cases = [*cases((1,), (False,), ("NextStep",)), *each_mode(3)]  # noqa: RUF012
     steps = 60
 
 
@@ -149,7 +149,7 @@ class TestMiniGrid(VectorEnvCompliance):
     """A custom space in the observation."""
 
     sample = "minigrid"
-    cases = cases(n_envs=(2,), modes=("NextStep", "SameStep"))
+    cases = each_mode(2)[::2]
     steps = 60
 
     def test_spaces_are_equal(self, pair: Pair) -> None:
@@ -169,14 +169,14 @@ class TestLunarLander(VectorEnvCompliance):
     """A native physics engine."""
 
     sample = "lunar_lander"
-    cases = cases(n_envs=(2,), modes=("NextStep",))
+    cases = cases((2,), (True,), ("NextStep",))
 
 
 class TestHalfCheetah(VectorEnvCompliance):
     """MuJoCo, float64 observations, flat infos in every step."""
 
     sample = "half_cheetah"
-    cases = cases(n_envs=(2,), modes=("NextStep", "SameStep"))
+    cases = each_mode(2)[::2]
     steps = 100
 
 
@@ -184,7 +184,7 @@ class TestPushT(VectorEnvCompliance):
     """Pixels and a state in a dict."""
 
     sample = "pusht"
-    cases = cases(n_envs=(2,), modes=("NextStep", "SameStep"))
+    cases = each_mode(2)[::2]
     steps = 45
 
 

@@ -120,13 +120,16 @@ def _own(infos: dict[str, Any], place: int) -> dict[str, Any]:
 
 
 # who resets by itself sends no actions ahead, and has a worker for each
-_WAYS = [
-    *((mode, None, 1) for mode in MODES),
-    *((mode, workers, ahead) for mode in MODES[:2] for workers, ahead in [(None, 4), (3, 1)]),
+_WAYS: list[tuple[str, int | None, int, str]] = [
+    ("Disabled", None, 1, "auto"),
+    ("Disabled", None, 1, "frames"),
+    ("NextStep", None, 4, "frames"),
+    ("SameStep", None, 4, "auto"),
+    ("SameStep", 3, 1, "auto"),
 ]
 
 
-@pytest.mark.parametrize(("mode", "workers", "ahead"), _WAYS)
+@pytest.mark.parametrize(("mode", "workers", "ahead", "lane"), _WAYS)
 def test_results_do_not_depend_on_who_is_ready_first(
     tmp_path: Path, lane: str, mode: str, workers: int | None, ahead: int
 ) -> None:

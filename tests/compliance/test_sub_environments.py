@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
 from functools import partial
 from typing import Any
 
@@ -15,16 +14,14 @@ from gymnasium.vector import SyncVectorEnv
 
 from envhub_worker.protocol.codec.inert import RemoteObject
 from tests.compliance.theirs.through_sandbox import vector
-from tests.remote.listening import listening
+from tests.remote.listening import Listening, listening
 from tests.support.compare import assert_same, assert_same_space
 
 WAYS: dict[str, dict[str, Any]] = {
     "plain": {},
     "subclass": {"options": {"env_kwargs": {"subclass": True}}},
-    "frames": {"options": {"lane": "frames"}},
-    "tcp": {},
+    "tcp": {},  # by messages, as with ``lane="frames"``
 }
-STEPS = 4
 
 
 class Told(gym.Env[Any, Any]):
@@ -39,7 +36,6 @@ class Told(gym.Env[Any, Any]):
         self.ran: list[str] = []
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        """Seeds its space too."""
         super().reset(seed=seed)
         if seed is not None:
             self.observation_space.seed(seed)
@@ -47,46 +43,44 @@ class Told(gym.Env[Any, Any]):
         return self.observation_space.sample(), {"space": self.action_space, "rng": self.np_random}
 
     def step(self, action: Any) -> Any:
-        """Ends at the last action."""
         assert action in self.action_space
         self.ran.append("step")
         observation, end = self.observation_space.sample(), bool(action == 1)
         return observation, float(self.np_random.random()), end, False, {"number": self.number}
 
     def add(self, count: int, *, twice: bool = False) -> int:
-        """A method with arguments."""
         self.number += count * (1 + twice)
         return self.number
 
     def close(self) -> None:
-        """Remembers it."""
         self.ran.append("close")
 
 
 def told(count: int) -> list[Callable[[], gym.Env[Any, Any]]]:
-    """As many, one wrapper around each."""
     return [lambda number=i: gym.wrappers.TimeLimit(Told(number), 9) for i in range(count)]
 
 
+@pytest.fixture(scope="module")
+def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Listening]:
+    with listening(tmp_path_factory.mktemp("server")) as found:
+        yield found
+
+
 @pytest.fixture(params=WAYS)
-def make(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[Callable[..., Any]]:
-    """Makes it in a sandbox; what is made is closed, before the server that it is on ends."""
+def make(request: pytest.FixtureRequest) -> Iterator[Callable[..., Any]]:
+    """Makes it in a sandbox; what is made is closed."""
     made: list[Any] = []
+    options: dict[str, Any] = {}
+    if request.param == "tcp":
+        options = {"options": {"sandbox": request.getfixturevalue("server").sandbox()}}
 
     def build(env_fns: Any, **kwargs: Any) -> Any:
         made.append(vector(env_fns, **{**WAYS[request.param], **kwargs}))
         return made[-1]
 
-    with ExitStack() as held:
-        options: dict[str, Any] = {}
-        if request.param == "tcp":
-            place = held.enter_context(listening(tmp_path_factory.mktemp("server")))
-            options = {"options": {"sandbox": place.sandbox()}}
-        yield partial(build, **options)
-        for env in made:
-            env.close()
+    yield partial(build, **options)
+    for env in made:
+        env.close()
 
 
 def facts(spec: Any) -> tuple[Any, ...]:
@@ -144,7 +138,6 @@ def test_attributes_and_methods_of_one(make: Callable[..., Any]) -> None:
 
 
 def test_looking_at_a_method_runs_nothing(make: Callable[..., Any]) -> None:
-    """It is asked whether it is one."""
     env = make(told(2))
     env.reset(seed=0)
     for one in env.envs:
@@ -175,7 +168,6 @@ def test_spaces_specs_and_generators_are_themselves(make: Callable[..., Any]) ->
 
 
 def test_one_is_not_closed_under_the_others(make: Callable[..., Any]) -> None:
-    """The only one may be."""
     env = make(told(2))
     env.reset(seed=0)
     with pytest.raises(ValueError, match="close the vector environment"):

@@ -19,14 +19,9 @@ from tests.compliance.theirs.through_sandbox import vector
 
 WAYS: dict[str, dict[str, Any]] = {
     "sync": {},
-    "async": {"use_async_envs": True},
     "subclass": {"options": {"env_kwargs": {"subclass": True}}},
     "frames": {"options": {"lane": "frames"}},
     "workers": {"use_async_envs": True, "options": {"num_workers": 2}},
-    "workers by frames": {
-        "use_async_envs": True,
-        "options": {"num_workers": 2, "lane": "frames"},
-    },
 }
 _COLORS = re.compile("\x1b\\[[0-9;]*m")
 
@@ -45,12 +40,10 @@ class Warner(gym.Env[Any, Any]):
         warnings.warn("built", stacklevel=1)
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
-        """By Gymnasium's logger."""
         gym.logger.warn("reset %s", options)
         return np.zeros(2, np.float32), {"n": 1}
 
     def step(self, action: Any) -> Any:
-        """Of the action's number."""
         if action == 1:
             warnings.warn("one", Own, stacklevel=1)
         if action == 2:
@@ -64,7 +57,6 @@ class Warner(gym.Env[Any, Any]):
         return np.full(2, action, np.float32), float(action), False, False, info
 
     def told(self) -> int:
-        """In a method."""
         warnings.warn("called", stacklevel=1)
         return 1
 
@@ -121,7 +113,6 @@ def test_warnings_arrive_with_what_they_came_with(way: str) -> None:
 
 @pytest.mark.parametrize("way", ["sync", "frames", "workers"])
 def test_what_warns_before_it_fails_says_both(way: str) -> None:
-    """The error comes out, and the environment goes on."""
     env = vector([Warner] * 2, **WAYS[way])
     with listening() as told:
         env.reset()

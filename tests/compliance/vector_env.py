@@ -37,7 +37,6 @@ class Case:
 
     @property
     def label(self) -> str:
-        """A readable test id."""
         words = [f"n{self.n_envs}", "async" if self.use_async_envs else "sync"]
         words += [] if self.num_workers is None else [f"{self.num_workers}workers"]
         return "-".join([*words, *map(str, self.env_kwargs.values())])
@@ -54,6 +53,11 @@ def cases(
         Case(n, is_async, {"autoreset_mode": mode}, async_workers if is_async else None)
         for n, is_async, mode in itertools.product(n_envs, use_async_envs, modes)
     ]
+
+
+def each_mode(n_envs: int) -> list[Case]:
+    """Each mode once: in one process, in one, and in two."""
+    return [*cases((n_envs,), (False,), MODES[1:]), *cases((n_envs,), (True,), MODES[:1])]
 
 
 @contextlib.contextmanager
@@ -87,12 +91,14 @@ class VectorEnvCompliance:
         cases: How to build it.
         steps: Steps of the long rollout.
         ends: Whether episodes end within these steps.
+        over_frames: How many of the cases, from the last one, are run as messages, too.
     """
 
     sample: ClassVar[str]
     cases: ClassVar[list[Case]] = [Case()]
     steps: ClassVar[int] = 200
     ends: ClassVar[bool] = True
+    over_frames: ClassVar[int] = 1
 
     def test_is_an_ordinary_vector_env(self, pair: Pair) -> None:
         """The proxy is a VectorEnv with the reference's size, render mode and metadata."""
@@ -105,7 +111,6 @@ class VectorEnvCompliance:
         assert_same(dict(pair.reference.metadata), dict(pair.sandboxed.metadata), "metadata")
 
     def test_spaces_are_equal(self, pair: Pair) -> None:
-        """The four spaces are equal and sample the same."""
         for kind in ("single_observation_space", "single_action_space"):
             assert_same_space(getattr(pair.reference, kind), getattr(pair.sandboxed, kind), kind)
         for kind in ("observation_space", "action_space"):

@@ -20,10 +20,10 @@ from envhub_sandbox.sandboxes.docker.engines import Engine, find_engine, find_im
 from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
 from tests.attacks import table
 from tests.attacks.harness import USER
-from tests.compliance.conftest import lane, pytest_generate_tests
+from tests.compliance.conftest import pytest_generate_tests
 from tests.containers.kit import IMAGE, Walls
 
-__all__ = ["lane", "pytest_generate_tests"]
+__all__ = ["pytest_generate_tests"]
 
 PLACES = ("strict-jail", "bare-jail", "walls")
 _COLUMNS = ("control, root", *(f"{place}, root" for place in PLACES))
@@ -42,7 +42,6 @@ _TABLE = table.Collected("container attack", "ENVHUB_CONTAINER_TABLE", _COLUMNS,
 
 @pytest.fixture(scope="session", autouse=True)
 def engine() -> Engine:
-    """The engine, which has the image."""
     try:
         found = find_engine(os.environ.get("ENVHUB_TEST_ENGINE"))
         find_image(found, IMAGE)
@@ -53,7 +52,6 @@ def engine() -> Engine:
 
 @pytest.fixture(scope="session")
 def docker(engine: Engine) -> DockerSandbox:
-    """Containers of the image under test."""
     return DockerSandbox(image=IMAGE, engine=engine.kind)
 
 
@@ -68,14 +66,12 @@ def open_ground() -> Iterator[Path]:
 
 @pytest.fixture(params=PLACES)
 def walls(request: pytest.FixtureRequest, engine: Engine) -> Iterator[Walls]:
-    """Where an attack is tried."""
     made = Walls(request.param, engine)
     yield made
     _TABLE.found(request.node, made.rows)
 
 
 def pytest_runtest_logreport(report: pytest.TestReport) -> None:
-    """Collect the rows."""
     _TABLE.read(report)
 
 

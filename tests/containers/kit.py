@@ -117,7 +117,6 @@ class Walls(Arena):
             yield
 
     def place(self, policy: Mapping[str, Any]) -> dict[str, Any]:
-        """In a container of its own."""
         profile = "container" if self.profile == "bare-jail" else "strict"
         sandbox = DockerSandbox(image=IMAGE, engine=self.engine.kind, **self.options)
         return {"policy": {"profile": profile, **policy}, "sandbox": sandbox}

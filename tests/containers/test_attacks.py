@@ -52,14 +52,12 @@ def test_nothing_reaches_the_network(walls: Walls, payload: str, kind: int) -> N
 
 
 def test_abstract_sockets_of_this_machine_are_out_of_reach(walls: Walls) -> None:
-    """They belong to the network, though they look like files."""
     name = f"@{token()}"
     with listening(socket.AF_UNIX, socket.SOCK_STREAM, "\0" + name[1:]) as listener:
         sends(walls, "abstract socket", "unix_stream", listener, path=name)
 
 
 def test_socket_files_of_this_machine_are_out_of_reach(walls: Walls, open_ground: Path) -> None:
-    """A folder that everybody may enter is not there."""
     path = str(open_ground / "socket")
     with listening(socket.AF_UNIX, socket.SOCK_STREAM, path) as listener:
         os.chmod(path, 0o777)
@@ -68,7 +66,6 @@ def test_socket_files_of_this_machine_are_out_of_reach(walls: Walls, open_ground
 
 @pytest.mark.skipif(not os.access(_SOCKET, os.W_OK), reason=f"{_SOCKET} is not ours to use")
 def test_the_engine_is_out_of_reach(walls: Walls, engine: Engine) -> None:
-    """Whoever reaches its socket is root on this machine."""
     if engine.kind != "docker":
         pytest.skip(f"{engine.kind} has no server whose socket could be reached")
     secret = json.loads(engine.run("info", "--format", "{{json .ID}}"))
@@ -76,7 +73,6 @@ def test_the_engine_is_out_of_reach(walls: Walls, engine: Engine) -> None:
 
 
 def test_files_of_this_machine_cannot_be_read(walls: Walls, open_ground: Path) -> None:
-    """Not even those that everybody may read."""
     secret = token()
     (open_ground / "canary").write_text(secret)
     path = str(open_ground / "canary")
@@ -84,7 +80,6 @@ def test_files_of_this_machine_cannot_be_read(walls: Walls, open_ground: Path) -
 
 
 def test_files_of_this_machine_cannot_be_written(walls: Walls, open_ground: Path) -> None:
-    """Nothing appears in a folder that everybody may write."""
     path = open_ground / "planted"
     walls.attack(
         "write a file",
@@ -131,7 +126,6 @@ def test_environments_of_other_processes_cannot_be_read(walls: Walls) -> None:
 
 
 def test_memory_stops_at_the_containers_limit(walls: Walls) -> None:
-    """Even where the jail's own limit would permit more."""
     walls.options = {"memory": MEMORY}
     walls.attack(
         "memory bomb",
@@ -144,7 +138,6 @@ def test_memory_stops_at_the_containers_limit(walls: Walls) -> None:
 
 
 def test_processes_stop_at_the_containers_limit(walls: Walls) -> None:
-    """Likewise."""
     walls.options = {"pids": PIDS}
     walls.attack(
         "fork bomb",

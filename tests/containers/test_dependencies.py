@@ -73,7 +73,6 @@ def test_packages_are_mounted_and_stay_as_they_are(
 def test_what_the_image_has_is_not_made_again(
     docker: DockerSandbox, real_index: Index, tmp_path: Path
 ) -> None:
-    """By the metadata of what is installed there."""
     folder = write_repository(tmp_path / "repo", ENV.replace("import wanted\n", ""))
     (folder / "requirements.txt").write_text("gymnasium>=0.29\nmsgpack\n")
     asked = len(real_index.asked)

@@ -30,7 +30,6 @@ def inspected(engine: Engine, image: str) -> dict[str, Any]:
 
 
 def test_the_image_holds_the_worker_and_nothing_of_the_client(engine: Engine) -> None:
-    """Neither the client's package nor the Hub's is in it."""
     code = "import importlib.util as u, sys; sys.exit(any(map(u.find_spec, sys.argv[1:])))"
     python = ("--entrypoint", "/opt/envhub-worker/bin/python", IMAGE, "-I", "-c", code)
     engine.run("run", "--rm", *python, "envhub_sandbox", "huggingface_hub", "typer", "torch")
@@ -107,7 +106,6 @@ def derived(engine: Engine) -> Iterator[dict[str, Any]]:
 
 
 def built(engine: Engine, repository: Path, *options: str) -> dict[str, Any]:
-    """Build by the command line."""
     words = ("image", "build", str(repository), "--base", IMAGE, "--engine", engine.kind)
     done = subprocess.run(
         [sys.executable, "-I", "-m", "envhub_sandbox", *words, "--build-network", "host", "--json"],
@@ -147,7 +145,6 @@ def test_every_package_is_pinned_and_the_image_bears_the_lock(
 def test_nothing_runs_at_the_start_of_a_derived_interpreter(
     derived: dict[str, Any], engine: Engine
 ) -> None:
-    """A package cannot have code run before it is imported."""
     named = ("-name", "*.pth", "-o", "-name", "sitecustomize*", "-o", "-name", "usercustomize*")
     words = ("--entrypoint", "find", derived["image"], "/opt/environment/lib", *named)
     assert engine.run("run", "--rm", *words).strip() == ""

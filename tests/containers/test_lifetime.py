@@ -71,7 +71,6 @@ class Client:
     container: str
 
     def monitor(self) -> psutil.Process:
-        """The process that keeps its container."""
         [found] = [
             child
             for child in psutil.Process(self.process.pid).children(recursive=True)
@@ -106,7 +105,6 @@ def client(engine: Engine, then: str = "wait") -> Iterator[Client]:
 
 
 def test_closing_leaves_nothing(docker: DockerSandbox, engine: Engine) -> None:
-    """No container, no process, no folder."""
     assert nothing_left(engine)  # of others that linger
     with started(sample("counter"), sandbox=docker, seed=0):
         assert len(containers_of(engine, os.getpid())) == 1
@@ -180,7 +178,6 @@ def test_a_killed_container_is_a_dead_worker(docker: DockerSandbox, engine: Engi
 
 
 def test_tasks_of_a_repository_share_a_container(docker: DockerSandbox, engine: Engine) -> None:
-    """And two repositories do not."""
     with make_env(sample("many_tasks"), sandbox=docker) as many:
         envs = [env for tasks in many.values() for env in tasks.values()][:3]
         for env in envs:
@@ -191,7 +188,6 @@ def test_tasks_of_a_repository_share_a_container(docker: DockerSandbox, engine: 
 
 
 def test_environments_are_made_in_threads_at_once(docker: DockerSandbox) -> None:
-    """Each thread's container is its own to close."""
     done = []
 
     def drive() -> None:
@@ -219,7 +215,6 @@ def idle_container(engine: Engine, labels: dict[str, str]) -> Iterator[str]:
 
 
 def test_gc_removes_what_is_ours_and_dead_and_nothing_else(engine: Engine) -> None:
-    """A running client's, another machine's and a stranger's stay."""
     me = str(os.geteuid())
     with contextlib.ExitStack() as stack:
         kept = [runtime_folder.RuntimeFolder(runtime_folder.CONTAINER) for _ in range(2)]
@@ -255,7 +250,6 @@ def test_a_containers_own_limit_is_said_to_be_one(engine: Engine, tmp_path: Path
 
 
 def test_too_little_memory_for_the_server_is_said_to_be_so(engine: Engine) -> None:
-    """No image to build again, which would not help."""
     sandbox = DockerSandbox(image=IMAGE, engine=engine.kind, memory=16 << 20)
     with pytest.raises(WorkerStartupError, match=r"has 16 MiB.*DockerSandbox\(memory="):
         make_env(sample("cartpole"), sandbox=sandbox)

@@ -280,6 +280,5 @@ def test_packages_are_in_an_image_of_their_own(
 
 
 def test_paths_of_this_machine_are_refused(published: DockerSandbox) -> None:
-    """They are not in the virtual machine."""
     with pytest.raises(PolicyError, match="put what is needed into the repository"):
         make_env(sample("counter"), sandbox=published, policy={"readable": ("/usr/share",)})

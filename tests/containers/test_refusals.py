@@ -17,7 +17,6 @@ from tests.support.started import started
 
 
 def test_a_missing_image_says_how_to_build_it(engine: Engine) -> None:
-    """Nothing is pulled behind the caller's back."""
     with pytest.raises(SandboxUnavailableError, match="build -t no-such-image"):
         make_env(sample("counter"), sandbox=DockerSandbox(image="no-such-image"))
 
@@ -32,7 +31,6 @@ def test_a_missing_runtime_says_what_to_install(engine: Engine) -> None:
 
 
 def test_an_interpreter_of_this_machine_makes_no_sense(docker: DockerSandbox) -> None:
-    """A container has its own; another one is another image."""
     with pytest.raises(PolicyError, match="image"):
         make_env(sample("counter"), sandbox=docker, python="/usr/bin/python3")
 
@@ -40,7 +38,6 @@ def test_an_interpreter_of_this_machine_makes_no_sense(docker: DockerSandbox) ->
 def test_an_image_of_something_else_is_no_worker(
     engine: Engine, docker: DockerSandbox, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A program that announces nothing is not connected to."""
     real = docker_module.run_arguments.run_arguments
 
     def other(engine: Engine, wanted: docker_module.Container) -> list[str]:

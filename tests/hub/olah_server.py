@@ -120,7 +120,6 @@ class OlahServer:
         self._wait_until_ready(port)
 
     def repository(self, repo_id: str, repo_type: str = "model") -> GitRepository:
-        """A new, empty repository."""
         return GitRepository(self.home / "mirrors" / f"{repo_type}s" / repo_id)
 
     def requests(self) -> list[str]:
@@ -129,7 +128,6 @@ class OlahServer:
         return [" ".join(found) for found in re.findall(r'"(GET|HEAD|POST) (\S+) HTTP', lines)]
 
     def stop(self) -> None:
-        """End the process."""
         self._process.terminate()
         try:
             self._process.wait(timeout=30)

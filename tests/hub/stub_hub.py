@@ -50,13 +50,11 @@ class StubRepository:
     head_headers: dict[str, str] = field(default_factory=dict)
 
     def at(self, revision: str) -> StubRepository:
-        """As it was at a commit."""
         if revision not in self.earlier:
             return self
         return replace(self, commit=revision, files=self.earlier[revision])
 
     def tree(self) -> list[dict[str, Any]]:
-        """The listing, lies included."""
         parents = (PurePosixPath(path).parents for path in self.files)
         folders = {str(parent) for above in parents for parent in above} - {".", "/"}
         rows: list[dict[str, Any]] = [
@@ -121,7 +119,6 @@ class StubHub:
         self.stop()
 
     def stop(self) -> None:
-        """Refuse connections from now on."""
         if not self.stopped.is_set():
             self.stopped.set()
             self._server.shutdown()
@@ -131,7 +128,6 @@ class StubHub:
     def add(
         self, repo_id: str, files: Mapping[str, bytes | str], repo_type: str = "model"
     ) -> StubRepository:
-        """A new repository."""
         content = {p: c.encode() if isinstance(c, str) else c for p, c in files.items()}
         repository = StubRepository(content)
         self.repositories[repo_type, repo_id] = repository
@@ -144,7 +140,6 @@ class StubHub:
         return fault
 
     def fault_for(self, request: str) -> Fault | None:
-        """The first fault that still applies."""
         for fault in self.faults:
             if fault.times != 0 and re.search(fault.pattern, request):
                 fault.times -= 1

@@ -26,24 +26,20 @@ SHORT = {
 
 
 def benchmark(checkout: Path, *words: str, code: int = 0) -> subprocess.CompletedProcess[str]:
-    """Run one."""
     return python("-m", *words, cwd=checkout, code=code, PYTHONDONTWRITEBYTECODE="1")
 
 
 @pytest.mark.parametrize("words", SHORT)
 def test_a_benchmark_runs(words: str, checkout: Path) -> None:
-    """And prints its table."""
     done = benchmark(checkout, *f"benchmarks.{words}".split())
     assert SHORT[words] in done.stdout
 
 
 def test_the_comparison_runs(checkout: Path, tmp_path: Path) -> None:
-    """Every part of it, with a complete report."""
     benchmark(checkout, "benchmarks", "--quick", "--out", str(tmp_path))
     assert {path.suffix for path in tmp_path.iterdir()} == {".json", ".md"}
 
 
 def test_a_benchmark_that_lacks_its_environment_says_how_to_make_it(checkout: Path) -> None:
-    """Before it does anything."""
     done = benchmark(checkout, "benchmarks.suites", "--lerobot", "/none/bin/python", code=2)
     assert "first: python -m benchmarks.venvs lerobot" in done.stderr

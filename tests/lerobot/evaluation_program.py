@@ -62,7 +62,6 @@ class Opened(logging.Handler):
         logging.getLogger("envhub_sandbox.worker").setLevel(logging.DEBUG)
 
     def emit(self, record: logging.LogRecord) -> None:
-        """One more."""
         self.count += "opened" in record.getMessage()
 
 
@@ -86,7 +85,6 @@ def evaluated(main: Any, name: str, *arguments: str) -> dict[str, Any]:
 
 
 def refused(cfg: Any) -> str:
-    """How LeRobot's training makes environments."""
     try:
         lerobot_train.make_env(cfg, n_envs=1, use_async_envs=False)["hub_env"][0].close()
     except RuntimeError as error:

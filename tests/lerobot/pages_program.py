@@ -46,7 +46,6 @@ def refused(*arguments: Any, **options: Any) -> list[str]:
 
 
 def shape(envs: Any) -> dict[str, list[Any]]:
-    """The suites and tasks; closes them."""
     found = {suite: list(tasks) for suite, tasks in envs.items()}
     envs.close()
     return found
@@ -130,7 +129,6 @@ def described() -> None:
 
 
 def fails() -> None:
-    """What the page's troubleshooting is about."""
     for name in ("nothing", "missing", "wrong"):
         FOUND[name] = refused(f"robots/{name}", trust_remote_code=True)
     FOUND["no repository"] = refused("robots/nowhere")
@@ -288,7 +286,6 @@ def waits() -> None:
 
 
 def eventually(holds: Any) -> bool:
-    """Whether it comes to hold."""
     deadline = time.monotonic() + 60
     while not holds() and time.monotonic() < deadline:
         time.sleep(0.01)

@@ -38,7 +38,6 @@ class OfThisProcess(EnvConfig):
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
-        """None."""
         return {}
 
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> dict[str, Any]:
@@ -82,8 +81,6 @@ def trained(name: str, *arguments: str) -> dict[str, Any]:
 
 
 def found_in(folder: Path) -> dict[str, Any]:
-    """What the training told and wrote."""
-
     def hashes(pattern: str) -> dict[str, str]:
         return {
             str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()

@@ -18,7 +18,6 @@ def make_env(n_envs=1, use_async_envs=False):
 
 
 def folder() -> str:
-    """A new repository."""
     made = Path(tempfile.mkdtemp(prefix="compared-"))
     made.chmod(0o755)  # jails of root run as another user
     (made / "env.py").write_text(ENV)

@@ -23,7 +23,6 @@ REPOSITORY = folder()
 
 
 def played(sandboxed: bool) -> list[Any]:
-    """A reset and steps."""
     with initialize(version_base=None):
         options = compose(overrides=OPTIONS)
     assert isinstance(options.policy.environment, ListConfig)

@@ -18,7 +18,6 @@ REPOSITORY = folder()
 
 
 def make(sandboxed: bool) -> Any:
-    """One environment, emulated."""
     creator = partial(SandboxEnv, REPOSITORY) if sandboxed else partial(gym.make, "CartPole-v1")
     return pufferlib.emulation.GymnasiumPufferEnv(env_creator=creator)
 

@@ -16,7 +16,6 @@ REPOSITORY = folder()
 
 
 def make(sandboxed: bool) -> Any:
-    """One environment."""
     return SandboxEnv(REPOSITORY) if sandboxed else gym.make("CartPole-v1")
 
 

@@ -36,7 +36,6 @@ class OtherHost:
         self._drop("-I")
 
     def plug(self) -> None:
-        """The cable is in again."""
         self._drop("-D")
 
     def _drop(self, how: str) -> None:

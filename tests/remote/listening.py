@@ -78,7 +78,6 @@ class Listening:
 
     @property
     def port(self) -> int:
-        """Its port."""
         return int(self.endpoint.rpartition(":")[2])
 
     def sandbox(self, **changes: Any) -> RemoteSandbox:
@@ -87,7 +86,6 @@ class Listening:
         return RemoteSandbox(options.pop("endpoint", self.endpoint), **options)
 
     def said(self) -> str:
-        """Everything that it has printed."""
         return self.log.read_text("utf-8", "replace")
 
     def noted(self) -> str:
@@ -96,7 +94,6 @@ class Listening:
         return note.read_text() if note.exists() else ""
 
     def memory(self) -> int:
-        """Bytes that are its own."""
         return int(psutil.Process(self.process.pid).memory_info().rss)
 
     def sessions(self) -> list[dict[str, Any]]:
@@ -117,7 +114,6 @@ class Listening:
         return "--endpoint", self.endpoint, "--server-key", self.public, "--key", key
 
     def jails(self) -> int:
-        """How many are open, of whomever."""
         return sum(len(one["jails"]) for one in self.sessions())
 
     def open_jails(self) -> set[tuple[str, int]]:
@@ -127,10 +123,7 @@ class Listening:
 
 @contextmanager
 def listening(
-    folder: Path,
-    *options: str,
-    bind: str = "tcp://127.0.0.1:*",
-    prefix: Sequence[str] = (),
+    folder: Path, *options: str, bind: str = "tcp://127.0.0.1:*", prefix: Sequence[str] = ()
 ) -> Iterator[Listening]:
     """Start a server and end it; ``prefix`` runs it elsewhere."""
     folder.mkdir(parents=True, exist_ok=True)

@@ -21,18 +21,15 @@ class Peer:
         self.number = 0
 
     def tell(self, message: m.Message, *payload: bytes) -> None:
-        """Send a request."""
         self.number += 1
         self.socket.send_multipart([*m.pack_header(message, self.number), *payload])
 
     def ask(self, message: m.Message, *payload: bytes) -> m.Message:
-        """Send a request; its reply."""
         self.tell(message, *payload)
         assert self.socket.poll(30_000)
         return m.unpack_header(self.socket.recv_multipart()[0])[1]
 
     def refused(self, message: m.Message, *payload: bytes) -> m.Refusal:
-        """The refusal of a request."""
         reply = self.ask(message, *payload)
         assert isinstance(reply, m.Refusal), reply
         return reply

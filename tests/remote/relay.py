@@ -34,7 +34,6 @@ class Relay:
 
     @property
     def endpoint(self) -> str:
-        """Where clients connect."""
         return f"tcp://127.0.0.1:{self.port}"
 
     def _accept(self) -> None:
@@ -68,7 +67,6 @@ class Relay:
                 one.shutdown(socket.SHUT_RDWR)
 
     def close(self) -> None:
-        """Break everything."""
         self._listener.shutdown(socket.SHUT_RDWR)
         self._listener.close()
         self.cut()
@@ -78,7 +76,6 @@ class Relay:
 
 @contextmanager
 def relay(port: int, delay_s: float = 0.0) -> Iterator[Relay]:
-    """A wire that goes again."""
     made = Relay(port, delay_s)
     try:
         yield made

@@ -11,7 +11,6 @@ _PATIENCE_S = 120.0
 
 
 def greeting(mechanism: bytes) -> bytes:
-    """A whole one, of a client."""
     return GREETING + mechanism.ljust(20, b"\0") + b"\0" + bytes(31)
 
 

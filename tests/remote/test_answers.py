@@ -31,16 +31,13 @@ def raw(client: Peer, number: int, *fields: object) -> list[bytes]:
     return [number.to_bytes(8, "big") + len(document).to_bytes(4, "little") + document]
 
 
-@pytest.mark.parametrize("size", [0, 31, 33, 255, 3 * MIB])
-def test_a_hash_of_another_length_is_refused(client: Peer, good: Any, size: int) -> None:
-    """It would become the name of a file."""
-    refused = client.refused(m.PutBlob(b"h" * size, 0), b"data")
-    assert refused.error == "LocalProtocolError"
-    assert len(refused.message) < 10_000
-
-
-def test_a_long_text_is_not_sent_back_whole(client: Peer, good: Any) -> None:
-    """What is refused is named in a few words."""
+def test_what_is_refused_is_named_in_a_few_words(client: Peer, good: Any) -> None:
+    """A hash of another length, which would become the name of a file; and no long text is sent
+    back whole."""
+    for size in (0, 31, 3 * MIB):
+        refused = client.refused(m.PutBlob(b"h" * size, 0), b"data")
+        assert refused.error == "LocalProtocolError"
+        assert len(refused.message) < 10_000
     for request in (
         m.OpenJail("x" * MIB, "", "", "y" * MIB, "env.py", {"profile": "z" * MIB}, 1),
         m.OpenJail("x", "", "", "sha256:" + "y" * MIB, "e/" * MIB, {}, 1),
@@ -68,19 +65,18 @@ def malformed() -> dict[str, list[object]]:
     }
 
 
-@pytest.mark.parametrize("what", malformed())
-def test_a_malformed_request_is_refused(client: Peer, good: Any, what: str) -> None:
+def test_a_malformed_request_is_refused(client: Peer, good: Any) -> None:
     """As long as its id can be read there is somebody to tell."""
-    client.number += 1
-    client.socket.send_multipart(raw(client, client.number, *malformed()[what]))
-    assert client.socket.poll(30_000), "no answer"
-    number, reply = m.unpack_header(client.socket.recv_multipart()[0])
-    assert number == client.number
-    assert isinstance(reply, m.Refusal)
+    for what, fields in malformed().items():
+        client.number += 1
+        client.socket.send_multipart(raw(client, client.number, *fields))
+        assert client.socket.poll(30_000), f"{what}: no answer"
+        number, reply = m.unpack_header(client.socket.recv_multipart()[0])
+        assert number == client.number, what
+        assert isinstance(reply, m.Refusal), what
 
 
 def test_many_in_a_row_do_not_end_the_server(client: Peer, good: Any, server: Listening) -> None:
-    """Failures of the server itself, again and again, would."""
     for number in range(120):
         # a few large ones: a server that only decrypts hears of nobody's life
         client.tell(m.PutBlob(b"h" * (2 * MIB + 1 if number < 8 else 3), 0), b"data")

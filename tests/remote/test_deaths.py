@@ -72,7 +72,6 @@ def test_output_and_bundle_of_a_death_on_another_host(server: Listening, tmp_pat
 
 
 def test_idle_jails_end_over_there(server: Listening) -> None:
-    """Their memory is another's; a reset has another jail."""
     with started(sample("mortal"), timeouts={"idle_s": 0.5}, sandbox=server.sandbox()) as env:
         assert eventually(lambda: server.jails() == 0)
         with pytest.raises(WorkerDiedError, match="idle"):

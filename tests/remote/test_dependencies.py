@@ -9,7 +9,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import psutil
@@ -63,14 +63,20 @@ def permitting(real_index: Index, tmp_path_factory: pytest.TempPathFactory) -> I
 def test_a_server_makes_what_the_repository_declares(
     permitting: Listening, real_index: Index, tmp_path: Path
 ) -> None:
-    """On its side, once; the client is told what there is, and has none of it."""
-    folder = write_repository(tmp_path / "repo", ENV, requirements__txt="wanted==1.0\n")
+    """On its side, once; the client is told what there is, and has none of it. What it imports and
+    does not declare is made by the client's table, as the provenance says."""
+    make_wheel(real_index.folder, "chess")
+    source = f"import chess\n{ENV}"
+    folder = write_repository(tmp_path / "repo", source, requirements__txt="wanted==1.0\n")
     asked = []
     for _ in range(2):
         with make_env(folder, sandbox=permitting.sandbox()) as suites:
             suites.env.reset(seed=0)
             assert suites.env.call("version") == ("1.0",)
-            assert "wanted==1.0" in suites.provenance["installed"]["packages"]
+            installed = suites.provenance["installed"]
+            assert {"wanted==1.0", "chess==1.0"} <= set(installed["packages"])
+            [guess] = installed["inferred"]
+            assert guess["where"] == "env.py, line 1, which needs chess"
         asked.append(len(real_index.asked))
     assert 0 < asked[0] == asked[1]
     assert not (Path(os.environ["ENVHUB_CACHE"]) / "environments").exists()
@@ -78,22 +84,6 @@ def test_a_server_makes_what_the_repository_declares(
     assert (made / "wanted").is_dir()
     assert eventually(lambda: f"name={made.parent.name}" in permitting.said())
     assert server_facts.ask(permitting.sandbox()).dependencies
-
-
-def test_what_it_imports_and_does_not_declare_is_made_there(
-    permitting: Listening, real_index: Index, tmp_path: Path
-) -> None:
-    """By the client's table; the provenance says so in the client's words."""
-    make_wheel(real_index.folder, "chess")
-    folder = write_repository(tmp_path / "repo", f"import chess\n{ENV}")
-    (folder / "requirements.txt").write_text("wanted==1.0\n")
-    with make_env(folder, sandbox=permitting.sandbox()) as suites:
-        suites.env.reset(seed=0)
-        installed = suites.provenance["installed"]
-    assert {"wanted==1.0", "chess==1.0"} <= set(installed["packages"])
-    assert installed["inferred"] == [
-        {"module": "chess", "requirement": "chess", "where": "env.py, line 1, which needs chess"}
-    ]
 
 
 def test_an_environment_of_a_package_needs_no_repository(
@@ -338,28 +328,7 @@ def test_a_program_that_cannot_be_started_is_not_tried_for_ever(
     assert len(tried) == 1
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        lambda: order(*["p"] * (server_side.MAX_REQUIREMENTS + 1)),
-        lambda: order("p" * (server_side.MAX_TEXT + 1)),
-        lambda: m.NeedPackages(("p",), "", "", "", True),
-        lambda: m.NeedPackages((("p", 1),), "", "", "", True),
-        lambda: m.NeedPackages((), "", "", "", True, guesses=(("p", "line 1", "p"),)),
-        lambda: m.NeedPackages((), "", "", "", True, without=(1,)),
-        lambda: m.NeedPackages((), "", "", "", True, override=(("p", "l"),) * 1001),
-        lambda: m.NeedPackages((), "", "3" * (server_side.MAX_TEXT + 1), "", True),
-    ],
-)
-def test_an_order_has_bounds(idle: Packages, wrong: Callable[[], m.NeedPackages]) -> None:
-    """Before anything is begun for it."""
-    with pytest.raises(RefusedError) as caught:
-        idle.need(b"a", wrong(), ())
-    assert caught.value.error == "LocalProtocolError"
-
-
 def test_packages_have_names_that_were_given(idle: Packages) -> None:
-    """Neither a guess nor a path is one."""
     for name in ("0" * 40, "/usr", "../..", ""):
         with pytest.raises(RefusedError):
             idle.runtime(b"a", name)

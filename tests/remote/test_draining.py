@@ -15,9 +15,6 @@ import pytest
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import ServerBusyError, WorkerDiedError
 from envhub_worker.access import keys
-from envhub_worker.access.audit.log import Log
-from envhub_worker.access.drain import Drain
-from envhub_worker.access.quotas import BusyError
 from envhub_worker.protocol import messages as m
 from tests.remote.listening import Listening, listening, worker
 from tests.remote.peers import peer
@@ -78,11 +75,7 @@ def test_whose_time_is_up_is_told_why(tmp_path: Path, repository: Path) -> None:
 
 @pytest.mark.parametrize(
     ("options", "numbers"),
-    [
-        ((), [signal.SIGTERM]),
-        (_LONG, [signal.SIGTERM, signal.SIGTERM]),
-        (_LONG, [signal.SIGINT]),
-    ],
+    [((), [signal.SIGTERM]), (_LONG, [signal.SIGTERM, signal.SIGTERM]), (_LONG, [signal.SIGINT])],
 )
 def test_a_second_signal_ends_at_once(
     tmp_path: Path, repository: Path, options: tuple[str, ...], numbers: list[signal.Signals]
@@ -118,7 +111,6 @@ def test_drain_is_told_to_the_server_of_the_state_folder(tmp_path: Path) -> None
 
 
 def test_a_second_drain_only_waits(tmp_path: Path, repository: Path) -> None:
-    """It is no second signal, which would end what runs."""
     with listening(tmp_path / "server", *_LONG) as server:
         with started(repository, sandbox=server.sandbox()) as env:
             for _ in range(2):
@@ -128,28 +120,6 @@ def test_a_second_drain_only_waits(tmp_path: Path, repository: Path) -> None:
             assert env.step(np.array([0]))[0].tolist() == [[1.0]]
             assert server.process.poll() is None
         assert ends(server)
-
-
-def test_the_time_of_a_drain() -> None:
-    """It begins once, and is over for the server when nothing has run for a moment."""
-    now, said = [0.0], list[str]()
-    drain, log = Drain(10.0, lambda: now[0]), Log(said.append)
-    drain.refuse_new()
-    assert not drain.over
-    assert drain.left_s is None
-    assert drain.begin(log)
-    assert not drain.begin(log)
-    assert len(said) == 1
-    with pytest.raises(BusyError):
-        drain.refuse_new()
-    assert [drain.quiet(True), drain.quiet(False)] == [False, False]
-    now[0] = 5.0
-    assert drain.quiet(False)
-    assert drain.left_s == 5.0
-    assert not drain.over
-    now[0] = 10.0
-    assert drain.over
-    assert not Drain(0).begin(log)
 
 
 # --- two servers, restarted one after the other -----------------------------------------------

@@ -30,7 +30,6 @@ HEARTBEAT_S = 1.0
 
 @pytest.fixture
 def far() -> Iterator[OtherHost]:
-    """Another host."""
     with other_host() as host:
         yield host
 
@@ -112,17 +111,6 @@ def test_a_connection_that_breaks_between_steps_is_made_anew(
             assert eventually(lambda: link.drain() or inside.link_losses(link) > before)  # noqa: B023
 
 
-def test_a_slow_wire_changes_no_result(server: Listening, repository: Path) -> None:
-    """Each piece is delayed; a step is one round trip, and step_async waits for nothing."""
-    with (
-        relay(server.port, delay_s=0.02) as wire,
-        started(repository, sandbox=server.sandbox(endpoint=wire.endpoint)) as env,
-    ):
-        for count in range(1, 5):
-            env.step_async(np.array([0]))
-            assert env.step_wait()[0].tolist() == [[count]]
-
-
 def test_a_long_step_is_no_lost_connection(server: Listening, repository: Path) -> None:
     """Heartbeats are answered while the environment computes for several of them."""
 
@@ -179,7 +167,6 @@ sys.stdin.read()
 
 
 def test_a_killed_clients_jails_end(impatient: Listening, repository: Path) -> None:
-    """SIGKILL leaves nobody who says that he lives."""
     client = subprocess.Popen(
         [
             *(sys.executable, "-c", _CLIENT, impatient.endpoint),

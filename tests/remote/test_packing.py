@@ -33,7 +33,6 @@ def test_what_is_packed_is_the_same_again() -> None:
 
 @pytest.mark.parametrize("frames", [[b"small"], [NOISE], [bytes(compression.SMALLEST - 1)]])
 def test_what_does_not_pay_is_left_alone(frames: list[bytes]) -> None:
-    """Not even a header is added."""
     assert compression.pack_frames(frames, "lz4") == frames
     assert compression.pack_frames(frames, "") == frames
 
@@ -64,7 +63,6 @@ def test_a_lie_about_a_size_is_refused(frames: list[bytes], error: type[Exceptio
 
 
 def test_images_take_less_of_a_wire_than_they_hold(server: Listening, tmp_path: Path) -> None:
-    """The same observations, over a wire that counts."""
     with (
         relay(server.port) as wire,
         make_env(

@@ -22,7 +22,6 @@ ANOTHER = m.VERSION + 1
 
 @pytest.mark.parametrize("version", [ANOTHER, 0])
 def test_a_server_refuses_a_client_of_another_version(tmp_path: Path, version: int) -> None:
-    """The refusal names both versions."""
     use = PROCESS.acquire(tmp_path)
     server = use.server
     client = WorkerConnection(server.endpoint, server.process_fd)
@@ -66,7 +65,6 @@ def worker_of_another_version(tmp_path: Path) -> Iterator[tuple[str, int]]:
 
 
 def test_a_client_refuses_a_worker_of_another_version(tmp_path: Path) -> None:
-    """The error names both versions, and what to do."""
     with worker_of_another_version(tmp_path) as (endpoint, never):
         client = WorkerConnection(endpoint, never)
         try:

@@ -74,7 +74,6 @@ class Cell:
         self.streams: dict[int, Any] = {}
 
     def start(self, fds: tuple[int, ...] = ()) -> int:
-        """Start a runner; its id."""
         runner, stream = self.jail.start_runner(fds)
         stream.settimeout(DEADLINE_S)
         self.streams[runner] = stream.makefile("rw")
@@ -97,7 +96,6 @@ class Cell:
         self.streams.pop(runner).close()
 
     def pump(self, timeout_s: float = 0.05) -> None:
-        """Collect events and output."""
         poller = select.poll()
         for fd in (self.spawner.fileno(), self.jail.fileno(), self.jail.output):
             if fd >= 0:

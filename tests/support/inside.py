@@ -78,7 +78,6 @@ def leases(env: Any) -> list[Lease]:
 
 
 def state(env: Any) -> State:
-    """Where it is in its life."""
     return session(env).lifecycle.state
 
 
@@ -119,7 +118,6 @@ def clean_up(env: Any) -> None:
 
 
 def live_by(env: Any, lifecycle: Lifecycle) -> None:
-    """Have another table of its states."""
     found = session(env)
     for owner in (found, found.lease, found.prewarm, found.requests):
         owner.lifecycle = lifecycle
@@ -152,7 +150,6 @@ def hurried(env: Any, **timeouts: float) -> Iterator[None]:
 
 
 def launcher(env: Any) -> Launcher:
-    """What opens its jails."""
     return session(env).lease._launcher
 
 
@@ -213,12 +210,10 @@ def loaded(env: Any) -> LoadedJail | None:
 
 
 def jail(env: Any) -> JailHandle:
-    """The jail that it runs in."""
     return _running(env).jail
 
 
 def client(env: Any) -> WorkerConnection:
-    """The connection to its server."""
     return jail(env).client
 
 
@@ -306,7 +301,6 @@ def can_send(found: Any) -> bool:
 
 
 def link_losses(found: Any) -> int:
-    """How often it was lost."""
     return int(found._lost)
 
 
@@ -354,7 +348,6 @@ def building(env: Any) -> Spot:
 
 
 def taking(env: Any) -> Spot:
-    """Where it takes a jail."""
     return session(env).lease._jails, "take"
 
 
@@ -364,7 +357,6 @@ def started(env: Any) -> Spot:
 
 
 def ending(env: Any) -> Spot:
-    """Where its jail is ended."""
     return session(env).lease._jails, "end"
 
 
@@ -414,7 +406,6 @@ def is_own_group(path: Path) -> bool:
 
 
 def zygote_pid(spawner: Spawner) -> int:
-    """The zygote's process."""
     assert spawner._process is not None
     return spawner._process.pid
 
@@ -465,7 +456,6 @@ def imports_in_memory() -> Spot:
 
 
 def finding_interpreters() -> Spot:
-    """Gives the interpreters of this machine."""
     return interpreters, "_others"
 
 

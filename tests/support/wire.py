@@ -19,7 +19,6 @@ from envhub_worker.protocol.spaces.reader import Space, SpaceReader
 
 
 def message(document: bytes, tail: bytes = b"", *frames: bytes) -> list[Buffer]:
-    """Frames around a hand-made msgpack document."""
     return [struct.pack("<I", len(document)) + document + tail, *frames]
 
 
@@ -56,7 +55,6 @@ def env_manifest(observation: Space, action: Space, count: int, /, **changes: An
 
 
 def ext(code: int, payload: bytes = b"") -> msgpack.ExtType:
-    """An extension, for hand-made documents."""
     return msgpack.ExtType(code, payload)
 
 
@@ -66,7 +64,6 @@ def packed(value: object) -> list[Buffer]:
 
 
 def deep(levels: int) -> list[Any]:
-    """Lists in lists."""
     value: list[Any] = []
     for _ in range(levels - 1):
         value = [value]

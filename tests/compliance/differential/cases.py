@@ -69,7 +69,6 @@ def case(number: int) -> Case:
 
 
 def made(*args: Any) -> gym.Env[Any, Any]:
-    """A sub-environment; spaces are its own."""
     return Scripted(*deepcopy(args))
 
 

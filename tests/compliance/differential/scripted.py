@@ -75,7 +75,6 @@ class Scripted(gym.Env[Any, Any]):
         return self.observation_space.sample(), reward, ends < 0.1, 0.1 < ends < 0.2, info
 
     def render(self) -> Any:
-        """Noise."""
         return np.full((2, 3, 3), self.draw.randrange(256), np.uint8)
 
     def told(self, *args: Any, **kwargs: Any) -> Any:
@@ -92,7 +91,6 @@ class Scripted(gym.Env[Any, Any]):
         return said(self.held)
 
     def fails(self, kind: str) -> None:
-        """Raises one of Python's own exceptions."""
         raise {"value": ValueError, "key": KeyError, "zero": ZeroDivisionError}[kind](self.number)
 
     def info(self) -> dict[Any, Any]:
@@ -106,7 +104,6 @@ class Scripted(gym.Env[Any, Any]):
         return found
 
     def value(self, kind: str, depth: int) -> Any:
-        """A value of a kind."""
         draw = self.draw
         if kind == "scalar":
             return draw.choice(DTYPES)(draw.randrange(100))

@@ -44,7 +44,6 @@ def main() -> int:
 
 
 def run(paths: list[Path], variant: str, further: list[str]) -> int:
-    """pytest's exit code for one variant."""
     print(f"--- {variant}", flush=True)
     root = root_of(paths[0])
     with tempfile.TemporaryDirectory(prefix="envhub-theirs-") as folder, server(variant) as told:

@@ -39,7 +39,6 @@ def stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def test_list_shows_what_is_stored(stored: list[str]) -> None:
-    """The latest used first, with sizes."""
     done = RUNNER.invoke(app, ["cache", "list", "--json"])
     found = json.loads(done.stdout)
     assert [one["commit"] for one in found["snapshots"]] == stored
@@ -68,15 +67,9 @@ def test_hub_repositories_are_named_as_they_are_written(
     broken = host / "model--org--d" / ("e" * 40)
     broken.mkdir(parents=True)
     (broken / "record.json").write_text("[")
-    found = {one.repository: one for one in stored_snapshots()}
-    assert set(found) == {
+    assert {one.repository for one in stored_snapshots()} == {
         *("org/a", "spaces/org/b", "datasets/org/c", "git+https://h/org/d", "pypi:x@1.0#Y-v0")
     }
-    assert found["org/a"].answers_to("org/a")
-    assert found["org/a"].answers_to("org/a@ffff")
-    assert found["org/a"].answers_to("f" * 7)
-    assert not found["org/a"].answers_to("f" * 6)
-    assert not found["org/a"].answers_to("org/b@ffff")
 
 
 @pytest.mark.parametrize(("what", "left"), [("its commit", [0, 2]), ("its age", [0, 1])])
@@ -89,32 +82,24 @@ def test_remove_takes_only_what_is_meant(stored: list[str], what: str, left: lis
     assert [one.commit for one in stored_snapshots()] == [stored[index] for index in left]
 
 
-def test_remove_all_forgets_descriptions_too(stored: list[str]) -> None:
-    """Snapshots and remembered manifests."""
-    manifests = cache_root() / "manifests"
-    manifests.mkdir()
-    (manifests / "one").write_text("x")
-    assert RUNNER.invoke(app, ["cache", "remove", "--all"]).exit_code == 0
-    assert stored_snapshots() == []
-    assert not manifests.exists()
-
-
 def test_a_snapshot_that_is_used_is_kept(stored: list[str], tmp_path: Path) -> None:
     """It is named with its user, and what its code imports later is still there."""
     env = "import gymnasium\n\ndef make_env(n_envs=1, use_async_envs=False):\n"
     env += "    import later\n    return gymnasium.make_vec('CartPole-v1', num_envs=n_envs)\n"
     folder = write_repository(tmp_path / "used", env, later__py="")
+    assert (cache_root() / "manifests").is_dir() is False
     with make_env(folder) as suites:
+        assert (cache_root() / "manifests").is_dir()
         done = RUNNER.invoke(app, ["cache", "remove", "--all"])
         assert done.exit_code == 0
         assert "Removed 3 snapshots" in done.stderr
         assert f"process {os.getpid()} (" in done.stderr
+        assert not (cache_root() / "manifests").exists(), "descriptions are forgotten, too"
         suites.env.reset(seed=0)
     assert [one.commit for one in stored_snapshots()] == [suites.provenance["commit"]]
 
 
 def test_remove_of_an_unknown_name_is_usage(stored: list[str]) -> None:
-    """And nothing is removed, whatever else was named."""
     done = RUNNER.invoke(app, ["cache", "remove", stored[0], "nobody/knows"])
     assert done.exit_code == 2
     assert "nobody/knows" in done.stderr
@@ -122,7 +107,6 @@ def test_remove_of_an_unknown_name_is_usage(stored: list[str]) -> None:
 
 
 def test_version_names_everything_that_matters() -> None:
-    """A line each."""
     printed = RUNNER.invoke(app, ["--version"]).stdout
     found = {line.split()[0]: line.split()[1] for line in printed.splitlines()}
     assert found["envhub-sandbox"] == __version__
@@ -143,7 +127,6 @@ def environment(index: Index, tmp_path: Path) -> str:
 
 
 def test_environments_are_listed(environment: str) -> None:
-    """Beside the snapshots, with their packages and sizes."""
     [found] = json.loads(RUNNER.invoke(app, ["cache", "list", "--json"]).stdout)["environments"]
     assert found["name"] == environment
     assert "wanted==1.0" in found["packages"]
@@ -153,17 +136,16 @@ def test_environments_are_listed(environment: str) -> None:
     assert "1 snapshot, 1 environment" in done.stderr
 
 
-@pytest.mark.parametrize("named", [True, False])
-def test_environments_are_removed(environment: str, named: bool) -> None:
-    """By name, or since nobody used them; what was left half-made goes as well."""
+def test_environments_are_removed(environment: str) -> None:
+    """By name, and not those that were used; what was left half-made goes as well."""
     half = environments.root() / ".building-0-x"
     half.mkdir()
     used = time.time() - 86400 * 3
     os.utime(environments.root() / environment / "environment.json", (used, used))
     kept = RUNNER.invoke(app, ["cache", "remove", "--unused-for", "4"])
     assert "0 environments" in kept.stderr
-    words = [environment[:9]] if named else ["--unused-for", "2"]
-    assert "1 environment" in RUNNER.invoke(app, ["cache", "remove", *words]).stderr
+    named = RUNNER.invoke(app, ["cache", "remove", environment[:9]])
+    assert "1 environment" in named.stderr
     assert environments.every() == []
     assert not half.exists()
 
@@ -196,18 +178,9 @@ def test_newer_versions_are_chosen_when_asked_for(
 
 
 def test_a_repository_that_needs_nothing_is_only_downloaded(tmp_path: Path) -> None:
-    """It says where it runs."""
     folder = write_repository(tmp_path / "repo", "X = 1\n", requirements__txt="numpy\n")
     done = RUNNER.invoke(app, ["prefetch", str(folder)])
     assert done.exit_code == 0
     assert str(folder) in done.stdout
     assert "this interpreter" in done.stderr
     assert RUNNER.invoke(app, ["prefetch", str(folder), "--dependencies", "{"]).exit_code == 2
-
-
-def test_a_package_that_is_nowhere_is_an_error_of_loading(index: Index, tmp_path: Path) -> None:
-    """With the exit code of what did not load, and the line."""
-    folder = write_repository(tmp_path / "repo", "X = 1\n", requirements__txt="not-there\n")
-    done = RUNNER.invoke(app, ["prefetch", str(folder)])
-    assert done.exit_code == 4
-    assert "line 1 of requirements.txt" in done.stderr

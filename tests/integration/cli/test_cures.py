@@ -22,7 +22,6 @@ EXTRA = """--dependencies '{"extra": ["NAME-OF-THE-PACKAGE"]}'"""
 
 
 def options_of(command: str) -> set[str]:
-    """Those that a command has."""
     return {option for one in whole_command(command).params for option in one.opts}
 
 
@@ -35,7 +34,7 @@ def said(command: str, *arguments: str | Path) -> str:
     return text
 
 
-@pytest.mark.parametrize("command", ["run", "inspect", "lock"])
+@pytest.mark.parametrize("command", ["run", "lock"])
 def test_a_missing_module(command: str, tmp_path: Path) -> None:
     """The package joins it by an option; in Python by an argument."""
     folder = write_repository(tmp_path / "wants", _WANTS)
@@ -57,28 +56,3 @@ def test_a_make_env_that_takes_too_long(tmp_path: Path) -> None:
     assert not _IN_PYTHON.search(text)
     with pytest.raises(EnvHubError, match=r"raise timeouts=\{'startup_s': 2"):
         make_env(folder, timeouts={"startup_s": 1})
-
-
-@pytest.mark.parametrize(
-    ("arguments", "says"),
-    [
-        (["--profile", "lax"], "--profile is 'lax'; it is one of strict"),
-        (["--memory", "0"], "--memory is 0; it takes a whole number above 0"),
-        (["--memory", "much"], "--memory is 'much'; it takes a size such as 512M"),
-        (["--python", "/nowhere"], "--python is '/nowhere', which is not a program"),
-        (["--readable", "/nowhere"], "--readable has '/nowhere'"),
-        (["--server-key", "k"], "--server-key is for --sandbox tcp://HOST:PORT"),
-        (
-            ["--python", "/usr/bin/python3", "--dependencies", '{"extra": []}'],
-            """or --dependencies '{"python": "3.12"}' for the repository's own""",
-        ),
-    ],
-)
-def test_what_is_wrong_with_an_option_is_told_by_its_name(
-    arguments: list[str], says: str, tmp_path: Path
-) -> None:
-    """And nothing of it in Python's words."""
-    folder = write_repository(tmp_path / "wants", _WANTS)
-    text = said("run", folder, *arguments)
-    assert says in text
-    assert not _IN_PYTHON.search(text)

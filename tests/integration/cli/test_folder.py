@@ -41,7 +41,6 @@ def test_python_m_is_refused(folder: Path) -> None:
 
 
 def test_the_workers_program_is_refused_too(folder: Path) -> None:
-    """An operator may stand in any folder."""
     code, said, _ = ran(folder, "-m", "envhub_worker", "status")
     assert code == 1
     assert "-I -m envhub_worker" in said

@@ -19,7 +19,6 @@ pytestmark = pytest.mark.same_for("users")
 
 @pytest.fixture
 def hub(olah: OlahServer, hub_cache: Path) -> list[str]:
-    """The options that lead to it."""
     return ["--endpoint", olah.endpoint, "--hub-cache-dir", str(hub_cache)]
 
 
@@ -40,7 +39,6 @@ def test_a_repository_of_the_hub_runs(
 
 
 def test_ctrl_c_ends_a_download_that_hangs(hub_cache: Path) -> None:
-    """A Hub that accepts connections and never answers keeps nobody."""
     with socket.create_server(("127.0.0.1", 0)) as silent:
         endpoint = f"http://127.0.0.1:{silent.getsockname()[1]}"
         arguments = ["run", "org/repo", "--endpoint", endpoint, "--hub-cache-dir", str(hub_cache)]

@@ -12,7 +12,6 @@ import pytest
 
 from envhub_sandbox.check.judge import judge
 from envhub_sandbox.check.settings import JudgeOptions
-from envhub_sandbox.cli.app import app
 from envhub_sandbox.cli.starter import starter
 from envhub_sandbox.hub.local import LocalFolder
 from tests.support.command_line import COMMAND
@@ -53,6 +52,9 @@ def test_a_new_repository_passes_its_own_tests(tmp_path: Path) -> None:
     assert {str(path) for path in paths if path.parts[0] != ".git"} == set(starter("my-env", 2026))
     assert ((folder / ".git").is_dir()) == (shutil.which("git") is not None)
     (folder / "test_more.py").write_text(_MORE)
+    lacking = pytest_run(folder, "test_more.py")
+    assert lacking.returncode == 1
+    assert "needs --envhub-ref REF" in lacking.stdout
     done = pytest_run(folder, "--strict-markers", "--envhub-ref", ".")
     assert done.returncode == 0, done.stdout
     assert "3 passed" in done.stdout
@@ -97,25 +99,6 @@ def test_within_a_checkout_none_is_made(tmp_path: Path) -> None:
     (tmp_path / "my-env/__pycache__/env.pyc").write_text("")
     here = LocalFolder.at(tmp_path / "my-env")
     assert {one.path for one in here.files()} == set(starter("my-env", 2026))
-
-
-def test_a_fixture_without_a_reference_says_what_is_missing(tmp_path: Path) -> None:
-    """And nothing is made."""
-    (tmp_path / "test_it.py").write_text("def test_it(envhub_env):\n    pass\n")
-    done = pytest_run(tmp_path)
-    assert done.returncode == 1
-    assert "needs --envhub-ref REF" in done.stdout
-
-
-def test_what_is_there_already_stays(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A folder with anything in it is not touched."""
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "mine" / "env.py").write_text("precious")
-    with pytest.raises(SystemExit) as ended:
-        app(["init", str(tmp_path / "mine")], prog_name="envhub")
-    assert ended.value.code == 2
-    assert "exists and is not empty" in capsys.readouterr().err
-    assert [path.read_text() for path in (tmp_path / "mine").iterdir()] == ["precious"]
 
 
 def test_the_shell_completes_commands_and_options(tmp_path: Path) -> None:

@@ -14,7 +14,6 @@ from envhub_sandbox import make_env
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.cli.starter import starter
 from tests.hub.stub_hub import StubHub
-from tests.support.command_line import envhub
 
 pytestmark = pytest.mark.same_for("users")
 
@@ -71,9 +70,15 @@ def writes(hub: StubHub) -> list[str]:
 def test_what_was_checked_is_published_and_runs(
     push: Push, stub_hub: StubHub, mine: Path, hub_cache: Path
 ) -> None:
-    """Every file, as it is, and none that no repository has; then by the pin that was printed."""
-    (mine / ".git").mkdir()
-    (mine / ".git" / "config").write_text("secret")
+    """Every file, as it is, that git would commit; then by the pin that was printed. A dry run says
+    what it would upload."""
+    subprocess.run(["git", "init", "--quiet", str(mine)], check=True)
+    (mine / "__pycache__").mkdir()
+    (mine / "__pycache__/env.pyc").write_text("which git ignores")
+    done = push("--dry-run")
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.split() == sorted(starter("my-env", 2026))
+    assert stub_hub.requests == []
     done = push("--private", "--json")
     assert done.returncode == 0, done.stderr
     [made] = stub_hub.created
@@ -123,19 +128,6 @@ def test_what_fails_is_not_published(
     assert stub_hub.requests == []
 
 
-def test_from_a_checkout_what_git_would_commit_is_published(
-    push: Push, stub_hub: StubHub, mine: Path
-) -> None:
-    """And what it ignores stays here."""
-    subprocess.run(["git", "init", "--quiet", str(mine)], check=True)
-    (mine / "__pycache__").mkdir()
-    (mine / "__pycache__/env.pyc").write_text("x")
-    done = push()
-    assert done.returncode == 0, done.stderr
-    files = stub_hub.repositories["model", "org/my-env"].files
-    assert set(files) == set(starter("my-env", 2026))
-
-
 def test_files_that_the_repository_has_beside_are_named(push: Push, stub_hub: StubHub) -> None:
     """The pin that is printed has them, and nothing of them was checked."""
     stub_hub.add("org/my-env", {"old.py": "import os", "LICENSE": "MIT"})
@@ -144,17 +136,6 @@ def test_files_that_the_repository_has_beside_are_named(push: Push, stub_hub: St
     assert "1 more of the repository, which were not checked: old.py" in done.stderr
     beside = json.loads(push("--json").stdout)["not_checked"]
     assert beside == ["old.py"]
-
-
-def test_two_pushed_commits_are_compared(push: Push, stub_hub: StubHub, mine: Path) -> None:
-    """By the references that were printed."""
-    first = push().stdout.strip()
-    (mine / "env.py").write_text((mine / "env.py").read_text() + "\nimport subprocess\n")
-    second = push().stdout.strip()
-    done = envhub("diff", first, second, "--endpoint", stub_hub.endpoint)
-    assert done.returncode == 7, done.stderr
-    assert "source-process: env.py:" in done.stdout
-    assert "2 changes" in done.stderr
 
 
 def test_a_hub_that_refuses_is_a_message(push: Push, stub_hub: StubHub) -> None:
@@ -175,11 +156,3 @@ def test_what_has_not_arrived_is_said(push: Push, stub_hub: StubHub) -> None:
     done = push()
     assert (done.returncode, done.stdout) == (3, "")
     assert "does not have requirements.txt as the folder has it" in done.stderr
-
-
-def test_a_dry_run_uploads_nothing(push: Push, stub_hub: StubHub) -> None:
-    """It is checked all the same, and says what it would upload."""
-    done = push("--dry-run")
-    assert done.returncode == 0, done.stderr
-    assert done.stdout.split() == sorted(starter("my-env", 2026))
-    assert stub_hub.requests == []

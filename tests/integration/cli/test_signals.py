@@ -33,10 +33,10 @@ def make_env(n_envs=1, use_async_envs=False):
 
 
 @pytest.mark.parametrize(
-    ("number", "code", "says"),
-    [(signal.SIGINT, 130, "Interrupted.\n"), (signal.SIGTERM, 143, "")],
+    ("number", "code", "says", "step_s"),
+    [(signal.SIGINT, 130, "Interrupted.\n", 3600), (signal.SIGTERM, 143, "", 0.001)],
+    ids=["stuck in a step", "stepping"],
 )
-@pytest.mark.parametrize("step_s", [0.001, 3600], ids=["stepping", "stuck in a step"])
 def test_an_interrupted_run_ends_and_leaves_nothing(
     tmp_path: Path, number: signal.Signals, code: int, says: str, step_s: float
 ) -> None:
@@ -67,8 +67,6 @@ def test_an_interrupted_run_ends_and_leaves_nothing(
     "arguments",
     [
         ("run", str(EXAMPLES / "cartpole"), "--episodes", "1"),
-        ("run", str(EXAMPLES / "cartpole"), "--episodes", "1", "--json"),
-        ("inspect", str(EXAMPLES / "cartpole")),
         ("cache", "list", "--json"),
         ("--version",),
     ],

@@ -93,7 +93,6 @@ def packages(folder: Path) -> Path:
 
 @pytest.fixture
 def cell(folder: Path, packages: Path) -> Iterator[Cell]:
-    """A jail with these packages."""
     runtime = Runtime(base_interpreter(), str(packages))
     with spawner_in(folder, STRICT, runtime=runtime) as spawner:
         cell = new_cell(spawner, make_snapshot(folder), STRICT)
@@ -127,6 +126,8 @@ def test_runners_of_a_jail_share_what_they_write(cell: Cell, packages: Path) -> 
     """One view for a jail, also of a module that is imported later."""
     path = f"{packages}/robot/late.py"
     outcome(cell, f"open({path!r}, 'w').write('here = __file__')")
+    [view] = [one for one in cell.wait_for(RunnerStarted).report if one["layer"] == "working-view"]
+    assert "copy on write" in view["detail"]
     second = cell.start()
     answer = cell.run("import robot, robot.late; result = [robot.here, robot.late.here]", second)
     assert answer == {"result": [f"{packages}/robot/__init__.py", path]}
@@ -183,16 +184,8 @@ result = failed
 
 
 def is_confined(cell: Cell, runner: int) -> bool:
-    """Whether a runner was confined."""
     cell.pump()
     return any(isinstance(event, RunnerStarted) and event.runner == runner for event in cell.events)
-
-
-def test_report_says_how_files_are_seen(cell: Cell) -> None:
-    """As one layer more."""
-    report = cell.wait_for(RunnerStarted).report
-    [view] = [layer for layer in report if layer["layer"] == "working-view"]
-    assert "copy on write" in view["detail"]
 
 
 ADVICE = """

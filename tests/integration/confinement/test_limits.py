@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -70,13 +69,11 @@ def limited(profile: str, **limits: int) -> Iterator[Cell]:
 
 @pytest.fixture(params=profiles("strict", "no-userns"))
 def profile(request: pytest.FixtureRequest) -> str:
-    """Both ways to hold a jail."""
     return str(request.param)
 
 
 @pytest.fixture(params=["cgroup", "watchdog"])
 def counted(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Who counts memory."""
     if request.param == "watchdog":
         monkeypatch.setattr(cgroups, "discover", lambda: None)
     elif cgroups.discover() is None:
@@ -84,15 +81,14 @@ def counted(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> 
     return str(request.param)
 
 
+@pytest.mark.parametrize("counted", ["watchdog"], indirect=True)  # else tests/attacks has them
 @pytest.mark.parametrize(
-    "bomb",
-    [HEAP, SHARED, MEMFD, SYSTEM_V],
-    ids=["heap", "shared-anonymous", "memfd", "system-v"],
+    "bomb", [HEAP, SHARED, MEMFD, SYSTEM_V], ids=["heap", "shared-anonymous", "memfd", "system-v"]
 )
 def test_memory_bomb_ends_the_runner(bomb: str, profile: str, counted: str) -> None:
     """Every kind of memory counts, or cannot be had: the runner ends as out of memory and knows."""
     assert unconfined(bomb) == {"result": "filled"}
-    refused = ABSENT | (UNMEASURABLE if counted == "watchdog" else {})
+    refused = ABSENT | UNMEASURABLE
     with limited(profile, memory_bytes=MEMORY) as cell:
         answer = cell.run(bomb)
         if bomb in refused:
@@ -143,17 +139,6 @@ else:
 """
 
 
-def test_fork_bomb_stops_at_the_limit(profile: str) -> None:
-    """A jail has as many processes as it may, and not one more.
-
-    Without a user namespace the kernel counts the user's other processes too.
-    """
-    with limited(profile, processes=60) as cell:
-        children, errno = cell.run(FORKS)["result"]
-        assert errno
-        assert children == 59 if profile == "strict" else children < 200  # and the runner
-
-
 def test_jails_of_one_zygote_do_not_share_the_process_limit() -> None:
     """Another jail forks on while the first is at its limit."""
     confinement = Confinement(limits=Limits(processes=60))
@@ -179,44 +164,9 @@ else:
     result = [written, 0]
 """
 HOME = "os.path.expanduser('~')"
-SCRATCH = [HOME, "os.environ['TMPDIR']", "os.getcwd()", "'/dev/shm'"]
-
-
-INODES = """
-import os
-written = 0
-try:
-    while written < 3000:
-        open(os.path.expanduser(f"~/{written}"), "w").close(); written += 1
-except OSError as error:
-    result = [written, error.errno]
-else:
-    result = [written, 0]
-"""
-ONE_FILE = FILL.format(folder=HOME, mib=5)
-QUOTAS = [
-    *(({"disk_bytes": 20 * MIB}, FILL.format(folder=one, mib=40), 10, 20) for one in SCRATCH),
-    ({"disk_files": 1000}, INODES, 801, 999),
-    ({"file_bytes": 3 * MIB}, ONE_FILE, 3, 3),
-]
-
-
-@pytest.mark.short
-@pytest.mark.parametrize(
-    ("limits", "source", "least", "most"), QUOTAS, ids=[*SCRATCH, "empty files", "one file"]
-)
-def test_disk_fill_stops_at_the_quota(
-    limits: dict[str, int], source: str, least: int, most: int
-) -> None:
-    """Home, temporary files, work and shared memory have one; empty files count, and the size."""
-    with limited("strict", **limits) as cell:
-        written, errno = cell.run(source)["result"]
-        assert least <= written <= most
-        assert errno
 
 
 def test_scratch_folders_share_one_quota() -> None:
-    """What home took, temporary files have not."""
     with limited("strict", disk_bytes=20 * MIB, file_bytes=12 * MIB) as cell:
         cell.run(FILL.format(folder=HOME, mib=12))
         written, errno = cell.run(FILL.format(folder="'/tmp'", mib=12))["result"]
@@ -235,53 +185,23 @@ def test_disk_fill_ends_the_runner_without_a_mount_namespace() -> None:
         assert cell.wait_for(RunnerExited).reason == "disk-limit"
 
 
-def test_open_files_stop_at_the_limit(profile: str) -> None:
-    """One process holds as many descriptors as it may."""
+def test_open_files_stop_at_a_limit_that_cannot_be_raised_again(profile: str) -> None:
+    """A runner is no more able to than any other process without privilege."""
     source = """
+import resource
 files = []
 try:
     while len(files) < 500:
         files.append(open("/dev/null"))
 except OSError as error:
     result = len(files)
+files.clear()
 """
-    with limited(profile, open_files=100) as cell:
-        assert 80 < cell.run(source)["result"] < 100
-
-
-def test_cpu_time_of_children_does_not_outlast_the_limit(profile: str) -> None:
-    """A child has the limit too: a spinning one is ended by the kernel."""
-    source = """
-import os, signal
-pid = os.fork()
-if not pid:
-    signal.signal(signal.SIGXCPU, signal.SIG_IGN)
-    while True: pass
-_, status = os.waitpid(pid, 0)
-result = os.WTERMSIG(status)
-"""
-    with limited(profile, cpu_time_s=1) as cell:
-        assert cell.run(source) == {"result": 9}
-
-
-def test_limits_cannot_be_raised_again(profile: str) -> None:
-    """A runner is no more able to than any other process without privilege."""
-    source = """
+    raising = """
 import resource
 soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
 resource.setrlimit(resource.RLIMIT_NOFILE, (hard + 1, hard + 1))
 """
-    with limited(profile) as cell:
-        assert cell.run(source)["error"] == "ValueError"
-
-
-def test_output_flood_does_not_block_the_runner(profile: str) -> None:
-    """Whoever reads the pipe keeps what it wants; the runner writes on."""
-    with limited(profile) as cell:
-        flood = "import os\nfor _ in range(64): os.write(1, b'x' * 65536)\nresult = 'done'"
-        stream = cell.streams[1]
-        stream.write(json.dumps(flood) + "\n")
-        stream.flush()
-        while len(cell.output) < 64 * 65536:
-            cell.pump()
-        assert json.loads(stream.readline()) == {"result": "done"}
+    with limited(profile, open_files=100) as cell:
+        assert 80 < cell.run(source)["result"] < 100
+        assert cell.run(raising)["error"] == "ValueError"

@@ -16,14 +16,12 @@ STRICT = Confinement(limits=Limits(processes=256))
 
 @pytest.fixture(scope="module")
 def strict() -> Iterator[Cell]:
-    """A jail under the strict profile."""
     with open_folder() as folder, cell_in(folder, STRICT) as cell:
         yield cell
 
 
 @pytest.fixture(scope="module")
 def bare() -> Iterator[Cell]:
-    """A jail without namespaces."""
     confinement = Confinement(profile="no-userns")
     with open_folder() as folder, cell_in(folder, confinement) as cell:
         yield cell
@@ -31,7 +29,6 @@ def bare() -> Iterator[Cell]:
 
 @pytest.fixture(params=profiles("strict", "no-userns"))
 def cell(request: pytest.FixtureRequest) -> Cell:
-    """Both."""
     name = "strict" if request.param == "strict" else "bare"
     return request.getfixturevalue(name)
 
@@ -67,14 +64,12 @@ result = [float(numpy.abs(a @ numpy.linalg.inv(a) - numpy.eye(400)).max()) < 1e-
 
 
 def test_only_runner_of_a_jail_has_all_blas_threads() -> None:
-    """As many as a fresh interpreter would have."""
     with open_folder() as folder, cell_in(folder, STRICT) as cell:
         threads = outcome(cell, "import os; result = len(os.listdir('/proc/self/task'))")
         assert threads == min(len(os.sched_getaffinity(0)), 16)
 
 
 def test_threads_and_asyncio(cell: Cell) -> None:
-    """Threads, executors, timers, subprocesses of asyncio."""
     source = """
 import asyncio, concurrent.futures as futures, threading
 async def main():
@@ -92,7 +87,6 @@ result = [squares, event.wait(20), asyncio.run(main())]
 
 
 def test_subprocesses(cell: Cell) -> None:
-    """Programs, shells, pipelines, another Python, time-outs and kills."""
     source = """
 import subprocess, sys
 result = [
@@ -176,13 +170,10 @@ result = [got, child.exitcode]
     assert in_fresh_runner(bare, source) == ["hello", 0]
 
 
-@pytest.mark.parametrize("shared", [True, False])
-def test_gymnasium_async_vector_env(strict: Cell, shared: bool) -> None:
-    """The repository's own worker processes, inside the jail."""
-    source = f"""
+def test_gymnasium_async_vector_env(strict: Cell) -> None:
+    source = """
 import gymnasium
-envs = gymnasium.make_vec("CartPole-v1", num_envs=3, vectorization_mode="async",
-                          vector_kwargs=dict(shared_memory={shared}))
+envs = gymnasium.make_vec("CartPole-v1", num_envs=3, vectorization_mode="async")
 observations, _ = envs.reset(seed=1)
 for _ in range(20):
     observations, *_ = envs.step(envs.action_space.sample())
@@ -222,23 +213,7 @@ result = [names, (home / ".cache/deep/file").read_text(), pathlib.Path("copy/a.t
     assert outcome(cell, source) == [["a", "b", "c", "d", "e", "f"], "cached", "asset"]
 
 
-def test_working_directory_takes_files_beside_the_snapshots(strict: Cell) -> None:
-    """In sub-folders too, and a snapshot's file may be replaced in the view only."""
-    source = """
-import os
-open("assets/new.txt", "w").write("new")
-os.unlink("env.py"); open("env.py", "w").write("VALUE = 8\\n")
-result = [sorted(os.listdir("assets")), open("env.py").read()]
-"""
-    assert outcome(strict, source) == [["a.txt", "new.txt"], "VALUE = 8\n"]
-    snapshot = strict.jail.spec.snapshot
-    assert sorted(os.listdir(f"{snapshot}/assets")) == ["a.txt"]
-    with open(f"{snapshot}/env.py") as file:
-        assert file.read() == "VALUE = 7\n"
-
-
 def test_programs_built_in_scratch_run(strict: Cell) -> None:
-    """Just-in-time compilers write shared objects and load them."""
     source = """
 import os, subprocess, tempfile
 path = os.path.join(tempfile.mkdtemp(), "script")
@@ -263,7 +238,6 @@ result = [getpass.getuser(), multiprocessing.cpu_count() >= 1, psutil.virtual_me
 
 
 def test_pygame_draws_without_a_display(cell: Cell) -> None:
-    """The dummy drivers are set for it."""
     pytest.importorskip("pygame")
     source = """
 import pygame
@@ -277,7 +251,6 @@ pygame.quit()
 
 
 def test_torch_computes_and_trains(strict: Cell) -> None:
-    """Threads, autograd, a data loader with worker processes, shared tensors."""
     pytest.importorskip("torch")
     source = """
 import torch
@@ -296,7 +269,6 @@ result = [bool(layer.weight.grad.abs().sum() > 0), batches]
 
 
 def test_imageio_writes_a_video_with_ffmpeg(strict: Cell) -> None:
-    """A bundled program, fed through a pipe."""
     pytest.importorskip("imageio_ffmpeg")
     source = """
 import imageio, numpy, os

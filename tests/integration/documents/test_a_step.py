@@ -68,7 +68,6 @@ def test_the_page_lists_the_files_of_a_step(checkout: Path) -> None:
     ],
 )
 def test_a_trace_names_each_message(lane: str, step: str) -> None:
-    """On stderr, in their order; and without the variable nothing."""
     program = ("-c", f"LANE = {lane!r}{PLAY}")
     traced = python(*program, ENVHUB_TRACE="1")
     lines = [re.sub(r"^\+\d+\.\d{6} MainThread ", "", line) for line in traced.stderr.splitlines()]

@@ -56,7 +56,6 @@ def python_of(document: str) -> list[str]:
     ],
 )
 def test_the_python_of_a_document_runs(document: str, tmp_path: Path) -> None:
-    """All of its blocks, one after the other."""
     text = _IMPORTED + "\n".join(python_of(document))
     if "prometheus_client" in text:
         pytest.importorskip("prometheus_client")

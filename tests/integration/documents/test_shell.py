@@ -41,7 +41,6 @@ def test_the_shell_of_a_document_runs(document: str, stub_hub: StubHub, tmp_path
     "wrong", ["false && true", "envhub-worker listen --frobnicate", "docker rm --force it"]
 )
 def test_a_block_that_fails_is_found(wrong: str, stub_hub: StubHub, tmp_path: Path) -> None:
-    """Also where more follows."""
     with pytest.raises(AssertionError):
         execute([Block("README.md", "sh", f"{wrong}\ntrue\n")], stub_hub, tmp_path)
 
@@ -61,7 +60,6 @@ def long_ones() -> list[list[str]]:
 def test_what_is_too_long_takes_its_arguments(
     words: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """By its own parser, after which it is stopped."""
     module, *arguments = words
     if module in _WITHOUT_PARSER:
         assert importlib.util.find_spec(module) is not None

@@ -65,7 +65,6 @@ def client_key(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @contextmanager
 def serving(folder: Path, client: Path, *options: str, **more: Any) -> Iterator[Listening]:
-    """A server for that client."""
     known = ("--authorized-clients", str(client.with_suffix(".pub")))
     with listening(folder, *known, *options, **more) as server:
         server.client_key = str(client)
@@ -76,7 +75,6 @@ def serving(folder: Path, client: Path, *options: str, **more: Any) -> Iterator[
 def servers(
     tmp_path_factory: pytest.TempPathFactory, client_key: Path
 ) -> Iterator[list[Listening]]:
-    """Three that no test ends."""
     with ExitStack() as stack:
         folders = [tmp_path_factory.mktemp(f"server{number}") for number in range(3)]
         yield [stack.enter_context(serving(folder, client_key)) for folder in folders]
@@ -94,5 +92,4 @@ def serve(tmp_path: Path, client_key: Path) -> Iterator[Callable[..., Listening]
 
 
 def places(env: Any) -> list[str]:
-    """Where each of its workers is."""
     return [worker["place"] for worker in env.sandbox.stats()["workers"]]

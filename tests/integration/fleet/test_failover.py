@@ -27,7 +27,6 @@ def _two(serve: Callable[..., Listening], **more: Any) -> tuple[Listening, Liste
 
 
 def _is_at(env: Any, server: Listening) -> np.ndarray:
-    """Which rows are on a server."""
     found = np.zeros(env.num_envs, bool)
     for worker in env.sandbox.stats()["workers"]:
         found[slice(*worker["rows"])] = worker["place"] == server.endpoint
@@ -63,24 +62,6 @@ def test_its_rows_come_back_elsewhere(rows: Path, serve: Callable[..., Listening
     assert eventually(lambda: stays.jails() == 0)
 
 
-def test_what_follows_a_loss_can_be_had_again(rows: Path, serve: Callable[..., Listening]) -> None:
-    """The same seeds, actions and losses give the same observations, on whichever server."""
-    stays = serve("stays")
-    found = []
-    for name in ("first", "second"):
-        goes = serve(name)
-        sandbox = [stays.sandbox(), goes.sandbox()][:: 1 if name == "first" else -1]
-        with started(
-            rows, n_envs=2, sandbox=sandbox, seed=3, policy={"restart": "transparent"}
-        ) as env:
-            row = 0 if name == "first" else 1
-            assert _is_at(env, goes)[1 - row]
-            goes.process.kill()
-            env.step(STILL[:2])
-            found.append(env.step(STILL[:2])[0][1 - row, 2])
-    assert found[0] != found[1], "another row has another seed"
-
-
 def test_reset_has_them_elsewhere(rows: Path, serve: Callable[..., Listening]) -> None:
     """``restart="on_reset"``: an error first, which names place and rows; then they are back."""
     stays, goes = _two(serve)
@@ -109,22 +90,6 @@ def test_without_restarts_it_stays_dead(rows: Path, serve: Callable[..., Listeni
             env.reset()
         assert inside.state(env).name == "DEAD"
     assert eventually(lambda: stays.jails() == 0)
-
-
-def test_one_process_that_ends_takes_no_other_along(rows: Path, servers: list[Listening]) -> None:
-    """A row's process dies; its worker comes back on the same server, and no other begins anew."""
-    sandbox = [server.sandbox() for server in servers]
-    options: dict[str, Any] = {"n_envs": 6, "policy": {"restart": "transparent"}}
-    with started(rows, sandbox=sandbox, **options) as env:
-        before = places(env)
-        actions = STILL.copy()
-        actions[3] = DIES
-        *_, truncations, infos = env.step(actions)
-        assert truncations.tolist() == [False, False, True, True, False, False]
-        assert infos["worker_restarted"].tolist() == truncations.tolist()
-        assert places(env) == before
-        assert [one["restarts"] for one in env.sandbox.stats()["workers"]] == [0, 1, 0]
-        assert env.step(STILL)[0][:, 1].tolist() == [2, 2, 0, 0, 2, 2]
 
 
 def test_every_worker_is_waited_for_where_one_fails(rows: Path, servers: list[Listening]) -> None:
@@ -210,7 +175,6 @@ def test_a_server_that_comes_back_gets_workers_again(
 
 @pytest.fixture
 def far() -> Iterator[OtherHost]:
-    """Another host."""
     with other_host() as host:
         yield host
 

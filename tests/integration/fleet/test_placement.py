@@ -1,4 +1,4 @@
-"""Which worker goes where, and to the next place where one has no room."""
+"""Which worker goes where, to the next place where one has no room; and with which packages."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ import numpy as np
 import pytest
 
 from envhub_sandbox import Fleet, make_env
-from envhub_sandbox.errors import PolicyError, ServerBusyError, WorkerDiedError
-from tests.integration.fleet.conftest import places
+from envhub_sandbox.errors import MissingModuleError, PolicyError, ServerBusyError, WorkerDiedError
+from tests.integration.fleet.conftest import places, serving
 from tests.remote.listening import Listening
 from tests.support import inside
-from tests.support.compare import assert_same
+from tests.support.packages.wheels import Index, make_wheel
 from tests.support.ports import lasting_port
 from tests.support.processes import eventually
+from tests.support.repositories import write_repository
 from tests.support.samples import sample
 from tests.support.started import started
 
@@ -31,6 +32,11 @@ def test_workers_are_spread_over_all_places(rows: Path, servers: list[Listening]
         assert Counter(places(env)) == {a.endpoint: 4, b.endpoint: 2, c.endpoint: 2}
         assert env.step(np.zeros(9, int))[0][:, 0].tolist() == list(range(9))
         assert [server.jails() for server in servers] == [4, 2, 2]
+    # a vector environment that steps by a class of its own is somewhere, as a whole
+    with make_env(sample("custom_vector"), n_envs=4, sandbox=[a, b, c]) as suites:
+        suites.env.reset(seed=3)
+        assert "workers" not in suites.env.sandbox.stats()
+        assert sum(server.jails() for server in servers) == 1
     assert all(eventually(lambda s=server: s.jails() == 0) for server in servers)
 
 
@@ -57,17 +63,6 @@ def test_no_room_anywhere_is_an_error_that_names_all(
         assert "The other places of the fleet" in str(caught.value)
         assert "of 3, on tcp://" in str(caught.value)
     assert all(eventually(lambda s=server: s.jails() == 0) for server in small)
-
-
-def test_one_waits_for_room_where_asked_to(rows: Path, serve: Callable[..., Listening]) -> None:
-    """``retry_s`` holds for the fleet as for one server."""
-    small = serve("small", "--max-jails", "2")
-    sandboxes = [small.sandbox(retry_s=120)]
-    with make_env(rows, n_envs=2, sandbox=sandboxes, num_workers=2) as suites:
-        suites.env.reset()
-        inside.parts(suites.env)[0].lease.end()  # makes room while the other one waits
-        with started(rows, n_envs=2, sandbox=[*sandboxes, *sandboxes], num_workers=1) as other:
-            other.step(np.zeros(2, int))
 
 
 def test_a_server_that_is_not_there_gets_no_worker(rows: Path, servers: list[Listening]) -> None:
@@ -109,46 +104,67 @@ def test_a_list_in_a_file_is_looked_at_again(
         assert places(env) == [second.endpoint] * 2
 
 
-def test_the_provenance_says_where_they_run(rows: Path, servers: list[Listening]) -> None:
-    """With the environment's own results the same: it is said beside them."""
-    sandboxes = [servers[0].sandbox(), "process"]
-    with make_env(rows, n_envs=2, sandbox=sandboxes) as suites:
-        suites.env.reset()
-        assert sorted(suites.provenance["places"]) == ["process", servers[0].endpoint]
-        json.dumps(suites.provenance)
-
-
-def test_what_cannot_be_cut_has_one_worker(servers: list[Listening]) -> None:
-    """A vector environment that steps by a class of its own is somewhere, as a whole."""
-    sandbox = [server.sandbox() for server in servers]
-    with make_env(sample("custom_vector"), n_envs=4, sandbox=sandbox) as suites:
-        with make_env(sample("custom_vector"), n_envs=4) as alone:
-            assert_same(alone.env.reset(seed=3), suites.env.reset(seed=3), "reset")
-            actions = alone.env.action_space.sample()
-            assert_same(alone.env.step(actions), suites.env.step(actions), "step")
-        assert "workers" not in suites.env.sandbox.stats()
-        assert sum(server.jails() for server in servers) == 1
-
-
 def test_a_fleet_can_be_handed_on(rows: Path) -> None:
-    """A pickle of its environments makes them again, over places of the same names."""
+    """The provenance names the places; a pickle of its environments makes them again, over places
+    of the same names."""
     with make_env(rows, n_envs=3, sandbox=Fleet(["process"] * 3)) as suites:
         expected = suites.env.reset(seed=4)[0]
+        assert set(suites.provenance["places"]) == {"process"}
+        json.dumps(suites.provenance)
         with pickle.loads(pickle.dumps(suites)) as again:
             assert len(inside.parts(again.env)) == 3
             assert np.array_equal(expected, again.env.reset(seed=4)[0])
 
 
-def test_no_secret_key_is_in_a_pickle() -> None:
-    """Neither the fleet's own nor one of its places'."""
-    secret = "0123456789abcdef" * 4
-    fleet = Fleet(["tcp://a:1", "tcp://b:1"], remote={"client_key": secret, "server_key": "f" * 64})
-    assert secret.encode() not in pickle.dumps(fleet)
-    assert secret not in repr(fleet)
-
-
 @pytest.mark.parametrize("places", [[], "file:/there/is/none", "dns://nohost", ["process", "vm"]])
 def test_a_list_that_is_none_is_refused(rows: Path, places: Any) -> None:
-    """Before anything is started."""
     with pytest.raises(PolicyError):
         make_env(rows, sandbox=Fleet(places) if places != "file:/there/is/none" else places)
+
+
+ENV = """
+import gymnasium as gym
+import listed
+
+class Told(gym.Wrapper):
+    def where(self):
+        return listed.__file__
+
+def make_env(n_envs=1, use_async_envs=False):
+    return gym.vector.SyncVectorEnv([lambda: Told(gym.make("CartPole-v1"))] * n_envs)
+"""
+
+
+@pytest.fixture(scope="module")
+def packages(real_index: Index) -> Index:
+    """An index with a package that is installed nowhere."""
+    make_wheel(real_index.folder, "listed", "1.0")
+    return real_index
+
+
+def test_here_and_on_a_server(packages: Index, client_key: Path, tmp_path: Path) -> None:
+    """Each place makes them itself; the results are those of one."""
+    folder = write_repository(tmp_path / "repository", ENV, requirements__txt="listed\n")
+    with make_env(folder, n_envs=4) as suites:
+        expected = suites.env.reset(seed=3)[0]
+    with (
+        serving(tmp_path / "server", client_key, "--dependencies") as server,
+        make_env(folder, n_envs=4, sandbox=["process", server.sandbox()]) as suites,
+    ):
+        assert np.array_equal(suites.env.reset(seed=3)[0], expected)
+        assert sorted(places(suites.env)) == sorted(["process", server.endpoint])
+        where = suites.env.call("where")
+        assert len(set(where)) == 2
+        assert "listed==1.0" in suites.provenance["installed"]["packages"]
+
+
+def test_a_place_that_lacks_one(packages: Index, client_key: Path, tmp_path: Path) -> None:
+    """A server that makes none has its own packages: the error says which rows and which place."""
+    folder = write_repository(tmp_path / "repository", ENV, requirements__txt="listed\n")
+    with (
+        serving(tmp_path / "server", client_key) as server,
+        make_env(folder, n_envs=4, sandbox=["process", server.sandbox()]) as suites,
+        pytest.raises(MissingModuleError, match="No module named 'listed'") as caught,
+    ):
+        suites.env.reset()
+    assert f"of 4, on {server.endpoint}" in str(caught.value)

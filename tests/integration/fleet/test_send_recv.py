@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 from envhub_sandbox.errors import WorkerDiedError, WorkerTimeoutError
-from tests.integration.fleet.conftest import DIES
 from tests.remote.listening import Listening
 from tests.remote.relay import relay
 from tests.support import inside
@@ -92,19 +91,6 @@ def test_a_lost_server_is_its_own(rows: Path, serve: Callable[..., Listening]) -
         assert errors == set(lost)
 
 
-def test_what_dies_far_away_comes_back_alone(rows: Path, servers: list[Listening]) -> None:
-    """With ``restart="transparent"``: its row is cut off; nothing waits here for the others."""
-    places = [server.sandbox() for server in servers]
-    policy = {"restart": "transparent"}
-    with started(rows, 3, sandbox=places, num_workers=3, min_ready=1, policy=policy) as env:
-        env.send(np.array([0, DIES, 0]))
-        taken = [env.recv() for _ in range(3)]
-        cut = {int(one.env_ids[0]): bool(one.truncations[0]) for one in taken}
-        assert cut == {0: False, 1: True, 2: False}
-        env.send(np.zeros(3, np.int64))
-        assert env.recv(3).observations[:, 1].tolist() == [2, 0, 2]
-
-
 def test_a_silent_server_keeps_nobody_waiting(rows: Path, serve: Callable[..., Listening]) -> None:
     """It takes what it is sent, and says nothing; its row alone is late."""
     places = [serve("speaks").sandbox(), (silent := serve("silent")).sandbox()]
@@ -128,7 +114,6 @@ def test_a_silent_server_keeps_nobody_waiting(rows: Path, serve: Callable[..., L
 def test_a_learner_may_think_for_longer_than_a_heartbeat(
     rows: Path, servers: list[Listening]
 ) -> None:
-    """What is in flight meanwhile is received as ever."""
     place = servers[0].sandbox(heartbeat_s=1.0)
     with started(rows, 2, sandbox=place, min_ready=2) as env:
         env.send(np.zeros(2, np.int64))

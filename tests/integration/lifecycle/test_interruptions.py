@@ -20,9 +20,14 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
 ]
 
-_STARTS, _CLOSES = 41, 13
+_STARTS, _CLOSES = 61, 17
 """Calls between two moments: of some 500 in a start, and of some 120 in a close."""
-lanes = pytest.mark.parametrize("lane", ["auto", "frames"])
+_WAYS: dict[str, dict[str, Any]] = {
+    "auto": {"use_async_envs": True},
+    "frames": {"use_async_envs": True, "lane": "frames"},
+    "fleet": {"n_envs": 6, "sandbox": ["process"] * 3},
+}
+ways = pytest.mark.parametrize("way", _WAYS)
 
 
 @pytest.fixture
@@ -32,35 +37,35 @@ def nothing_more() -> Iterator[Callable[[], bool]]:
         yield question
 
 
-def _made(lane: str) -> Any:
-    return make_env(sample("echo"), n_envs=2, use_async_envs=True, lane=lane)
+def _made(way: str) -> Any:
+    return make_env(sample("echo"), **{"n_envs": 2, **_WAYS[way]})
 
 
-@lanes
+@ways
 def test_an_interrupted_start_leaves_nothing_behind(
-    nothing_more: Callable[[], bool], lane: str
+    nothing_more: Callable[[], bool], way: str
 ) -> None:
     """No use of the server, no jail, no descriptor; and what the next reset says is its own."""
     options = {"token": 5.0, "delay": 0.0}
     moment, came = 0, True
     while came:
-        with _made(lane) as suites:
+        with _made(way) as suites:
             came = at_call(moment, suites.env.reset)
             observations, _ = suites.env.reset(options=options)
-            assert observations.tolist() == [[5.0, 0.0]] * 2
+            assert observations.tolist() == [[5.0, 0.0]] * suites.env.num_envs
         assert nothing_more(), moment
         moment += _STARTS
-    assert moment > 5 * _STARTS
+    assert moment > 3 * _STARTS
 
 
-@lanes
+@ways
 def test_an_interrupted_close_leaves_nothing_behind(
-    nothing_more: Callable[[], bool], lane: str
+    nothing_more: Callable[[], bool], way: str
 ) -> None:
     """No use of the server, no jail, no descriptor, once it is closed again, or nobody has it."""
     moment, came = 0, True
     while came:
-        suites = _made(lane)
+        suites = _made(way)
         suites.env.reset()
         came = at_call(moment, suites.close)
         if moment % 2:
@@ -69,4 +74,4 @@ def test_an_interrupted_close_leaves_nothing_behind(
         del suites
         assert nothing_more(), moment
         moment += _CLOSES
-    assert moment > 5 * _CLOSES
+    assert moment > 3 * _CLOSES

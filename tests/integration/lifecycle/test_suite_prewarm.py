@@ -87,7 +87,6 @@ def tasks(repository: Path) -> Iterator[Callable[..., Tasks]]:
 
 
 def states(tasks: Tasks) -> list[str]:
-    """Where each is in its life."""
     return [env.sandbox.stats()["state"] for env in tasks]
 
 
@@ -109,7 +108,6 @@ def settled(tasks: Tasks, expected: list[int]) -> bool:
 
 
 def test_the_next_task_is_up_and_built_before_anybody_asks(tasks: Callable[..., Tasks]) -> None:
-    """Its constructors have run; its first reset starts no process."""
     first, second = envs = tasks(2, prewarm=1)
     first.reset()
     assert eventually(lambda: ahead(envs) == [1])
@@ -145,7 +143,7 @@ def test_by_default_who_closes_each_task_finds_the_next_one_up(
         assert settled(envs, [index + 1] if closes else [])
 
 
-@pytest.mark.parametrize("count", [1, 2, 3])
+@pytest.mark.parametrize("count", [1, 3])
 def test_no_more_are_up_unused_than_was_said(tasks: Callable[..., Tasks], count: int) -> None:
     """Whichever task is used next; what is not among the following is given up, and can return."""
     envs = tasks(8, prewarm=count)
@@ -284,7 +282,7 @@ def test_closed_in_the_midst_it_leaves_nothing(repository: Path) -> None:
     """Whenever that comes: no process, and no bundle of a crash that was none."""
     stop_idle()
     before, bundles = descendants(), set(_bundles())
-    for pause_s in (0.0, 0.02, 0.05, 0.1, 0.2, 0.4):
+    for pause_s in (0.0, 0.05, 0.2):
         suites = make_env(repository, prewarm=2, timeouts={"server_idle_s": 0})
         envs = _of(suites)
         envs[0].reset()
@@ -308,7 +306,6 @@ def test_the_last_close_waits_for_all(tasks: Callable[..., Tasks]) -> None:
 
 
 def test_a_suite_that_nobody_holds_gives_up_what_it_started_ahead(repository: Path) -> None:
-    """Nothing of ours keeps it alive."""
     stop_idle()
     before = descendants()
     suites = make_env(repository, prewarm=1, timeouts={"server_idle_s": 0})
@@ -321,37 +318,21 @@ def test_a_suite_that_nobody_holds_gives_up_what_it_started_ahead(repository: Pa
 
 
 def test_suites_do_not_start_each_others_tasks(tasks: Callable[..., Tasks]) -> None:
-    """The last task of one is followed by none."""
     envs = tasks(2, prewarm=2, env_kwargs={"suites": 2})
     envs[1].reset()
     assert settled(envs, [])
 
 
 def played(env: Any) -> list[Any]:
-    """A short, seeded episode."""
     found = [env.reset(seed=7)[0].tolist()]
     for _ in range(5):
         found.append([part.tolist() for part in env.step(np.ones(1, int))[:4]])
     return found
 
 
-@pytest.mark.parametrize("prewarm", [None, 1, 3])
-def test_results_do_not_depend_on_it(tasks: Callable[..., Tasks], prewarm: int | None) -> None:
-    """Task after task, as an evaluation plays them."""
-    results = []
-    for ahead_of in (0, prewarm):
-        found = []
-        for env in tasks(5, prewarm=ahead_of):
-            found.append(played(env))
-            env.close()
-        results.append(found)
-    assert results[0] == results[1]
-
-
-@pytest.mark.parametrize("prewarm", [0, 1, 2])
-def test_threads_may_play_tasks_at_once(tasks: Callable[..., Tasks], prewarm: int) -> None:
+def test_threads_may_play_tasks_at_once(tasks: Callable[..., Tasks]) -> None:
     """A pool of threads, as ``max_parallel_tasks`` has; closed from the main one."""
-    envs = tasks(8, prewarm=prewarm)
+    envs = tasks(8, prewarm=2)
     with concurrent.futures.ThreadPoolExecutor(3) as pool:
         futures = {pool.submit(played, env): index for index, env in enumerate(envs)}
         for future in concurrent.futures.as_completed(futures):
@@ -362,7 +343,6 @@ def test_threads_may_play_tasks_at_once(tasks: Callable[..., Tasks], prewarm: in
 
 
 def test_it_takes_a_whole_number_or_none() -> None:
-    """And means nothing without a sandbox."""
     with pytest.raises(ValueError, match="`prewarm` is -1, and must be at least 0"):
         make_env(sample("counter"), prewarm=-1)
     with pytest.raises(TypeError, match="`prewarm` is 'one'"):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import stat
 import subprocess
@@ -12,11 +11,10 @@ from pathlib import Path
 import pytest
 
 from envhub_sandbox import make_env
-from envhub_sandbox.errors import EnvHubError
 from tests.remote.listening import WORKER, counting, listening
 from tests.support.samples import sample
 
-UMASKS = ["000", "027", "077"]
+UMASKS = ["000", "077"]
 _RUN = """
 import sys
 from envhub_sandbox import make_env
@@ -28,7 +26,6 @@ with make_env(sys.argv[1]) as suites:
 
 
 def under(umask: str, *command: object, **environment: str) -> subprocess.CompletedProcess[str]:
-    """Run a command under an umask."""
     return subprocess.run(
         ["sh", "-c", f'umask {umask} && exec "$@"', "sh", *map(str, command)],
         capture_output=True,
@@ -62,7 +59,6 @@ def test_an_environment_runs(tmp_path: Path, umask: str) -> None:
 
 @pytest.mark.parametrize("umask", UMASKS)
 def test_a_bundle_is_its_owners(tmp_path: Path, umask: str) -> None:
-    """What led to a crash may hold secrets."""
     (tmp_path / "env.py").write_text("import os\nos._exit(3)\n")
     cache = tmp_path / "cache"
     done = under(umask, sys.executable, "-c", _RUN, tmp_path, ENVHUB_CACHE=str(cache))
@@ -71,16 +67,6 @@ def test_a_bundle_is_its_owners(tmp_path: Path, umask: str) -> None:
     assert {path.name for path in bundle.iterdir()} >= {"bundle.json", "README.txt"}
     assert stat.S_IMODE(bundle.stat().st_mode) == 0o700
     assert open_to_others(cache) == []
-
-
-@pytest.mark.parametrize("umask", UMASKS)
-def test_doctor_finds_the_same(umask: str) -> None:
-    """What a host can enforce does not depend on the umask."""
-    doctor = (sys.executable, "-I", "-m", "envhub_sandbox", "doctor", "--json")
-    usual, other = (under(mask, *doctor) for mask in ("022", umask))
-    assert other.returncode == usual.returncode, other.stdout + other.stderr
-    found, expected = (json.loads(done.stdout)["profiles"] for done in (other, usual))
-    assert [one["available"] for one in found] == [one["available"] for one in expected]
 
 
 @pytest.mark.parametrize("umask", UMASKS)
@@ -96,9 +82,8 @@ def test_a_listening_server_serves(tmp_path: Path, umask: str) -> None:
         assert all(folder.stat().st_mode & 0o066 == 0 for folder in folders)
 
 
-@pytest.mark.parametrize("mode", [0o770, 0o777])
-def test_a_state_folder_that_others_can_write_is_refused(tmp_path: Path, mode: int) -> None:
-    """They could put keys of their own there."""
+def test_a_state_folder_that_others_can_write_is_refused(tmp_path: Path) -> None:
+    mode = 0o770
     (tmp_path / "state").mkdir()
     (tmp_path / "state").chmod(mode)
     command = [*WORKER, "listen", "--bind", "tcp://127.0.0.1:*", "--state-dir", tmp_path / "state"]
@@ -106,23 +91,3 @@ def test_a_state_folder_that_others_can_write_is_refused(tmp_path: Path, mode: i
     assert done.returncode == 2
     assert f"{mode:04o}" in done.stderr
     assert list((tmp_path / "state").iterdir()) == []
-
-
-def test_packages_that_may_not_be_read_are_not_called_missing(tmp_path: Path) -> None:
-    """An interpreter whose packages are closed to the jail's user: the error names the folder."""
-    made = tmp_path / "python"
-    subprocess.run([sys.executable, "-m", "venv", "--without-pip", made], check=True)
-    packages = next(made.glob("lib/python3*/site-packages"))
-    closed = packages / "closed"
-    closed.mkdir()
-    (packages / "more.pth").write_text(f"{closed}\n")
-    for folder in (path for path in sys.path if path.endswith("site-packages")):
-        for name in Path(folder).iterdir():
-            if name.name != "cloudpickle" and not (closed / name.name).exists():
-                (packages / name.name).symlink_to(name)
-    closed.chmod(0)
-    with pytest.raises(EnvHubError) as caught:
-        make_env(sample("cartpole"), python=str(made / "bin" / "python"))
-    closed.chmod(0o700)
-    assert f"{closed} may not be read by uid" in str(caught.value)
-    assert "pip install" not in str(caught.value)

@@ -55,7 +55,6 @@ def failure(reference: str, *, at: str, **options: Any) -> EnvHubError:
 
 
 def play(reference: str, **options: Any) -> None:
-    """One step."""
     with make_env(reference, **options) as suites:
         suites.env.reset(seed=0)
         suites.env.step([0])
@@ -72,7 +71,6 @@ def play_one(reference: str, **options: Any) -> None:
     ("at", "lane"), [("step", "auto"), ("step", "frames"), ("make_env", "auto")]
 )
 def test_the_line_in_the_authors_own_folder(tmp_path: Path, at: str, lane: str) -> None:
-    """And not the one in the copy that was run."""
     folder = repository(tmp_path)
     error = failure(str(folder), at=at, lane=lane)
     where = f'  File "{folder}/parts/motor.py", line 2, in turn\n'
@@ -84,7 +82,6 @@ def test_the_line_in_the_authors_own_folder(tmp_path: Path, at: str, lane: str) 
 
 
 def test_the_line_in_a_repository_of_the_hub(stub_hub: StubHub, hub_cache: Path) -> None:
-    """Its name there, and the commit."""
     made = stub_hub.add("org/motor", {"env.py": ENV, "parts/motor.py": MOTOR})
     options = {"endpoint": stub_hub.endpoint, "hub_cache_dir": hub_cache}
     error = failure("org/motor", at="step", **options)
@@ -93,9 +90,15 @@ def test_the_line_in_a_repository_of_the_hub(stub_hub: StubHub, hub_cache: Path)
     assert str(hub_cache) not in str(error) + vars(error)["__notes__"][0]
 
 
-@pytest.mark.parametrize("lane", ["auto", "frames"])
-@pytest.mark.parametrize("at", ["step", "single", "make_env"])
-@pytest.mark.parametrize("shown", ["folded", "full"])
+@pytest.mark.parametrize(
+    ("at", "lane", "shown"),
+    [
+        ("step", "frames", "folded"),
+        ("single", "auto", "folded"),
+        ("make_env", "auto", "folded"),
+        ("step", "auto", "full"),
+    ],
+)
 def test_a_traceback_has_one_frame_of_ours(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, at: str, lane: str, shown: str
 ) -> None:

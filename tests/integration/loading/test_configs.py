@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 import sys
 import types
 from dataclasses import dataclass, field
@@ -108,7 +107,6 @@ class ArmEnvConfig(Base):
         return "arms"
 
     def validate(self) -> bool:
-        """A method, which stays here."""
         return True
 
 
@@ -130,7 +128,6 @@ for _one in (Mode, Arm, Base, ArmEnvConfig, Left):
 
 
 def seen(cfg: Any) -> Any:
-    """What the repository found of it."""
     with make_env(cfg) as suites:
         return suites.env.get_attr("seen")[0]
 
@@ -171,18 +168,6 @@ def test_classes_that_exist_in_the_jail_are_used(
     cfg = OfTheCaller(fps=20, hub_path=str(folder))  # type: ignore[call-arg]
     found = seen(cfg)
     assert (found["name"], found["base"], found["same arm"]) == ("OfTheCaller", 40, True)
-
-
-def test_a_pickled_environment_has_the_same_config(tmp_path: Path) -> None:
-    """The recipe keeps what crossed, with its class, and pickles nothing of the caller's."""
-    folder = write_repository(tmp_path / "repo", _READS)
-    with (
-        make_env(ArmEnvConfig(hub_path=str(folder))) as suites,
-        pickle.loads(pickle.dumps(suites)) as again,
-    ):
-        first, second = (one.env.get_attr("seen")[0] for one in (suites, again))
-        assert second["name"] == "ArmEnvConfig"
-        assert {**first, "dict": ""} == {**second, "dict": ""}
 
 
 def test_what_has_no_plain_form_is_no_field(tmp_path: Path) -> None:

@@ -18,12 +18,7 @@ from gymnasium.vector import VectorEnv
 
 from envhub_sandbox import make_env
 from envhub_sandbox.cli.shared.exits import Exit, code_for
-from envhub_sandbox.errors import (
-    DependencyError,
-    EnvHubError,
-    HubReferenceError,
-    LoadError,
-)
+from envhub_sandbox.errors import DependencyError, EnvHubError, LoadError
 from tests.support.compare import assert_same
 from tests.support.repositories import CARTPOLE, CARTPOLES, STILL, write_repository
 from tests.support.samples import make_env_of, reference, sample
@@ -149,8 +144,9 @@ class TestLayouts:
             observations, *_ = roll(suites.env)
             assert observations.shape == (2,)
 
-    @pytest.mark.parametrize("use_async_envs", [False, True])
-    @pytest.mark.parametrize("name", ["partial_entry", "async_import"])
+    @pytest.mark.parametrize(
+        ("name", "use_async_envs"), [("partial_entry", False), ("async_import", True)]
+    )
     def test_entry_points(self, name: str, use_async_envs: bool) -> None:
         """A ``functools.partial``; vector classes that are imported by name at the top."""
         with make_env(sample(name), n_envs=2, use_async_envs=use_async_envs) as suites:
@@ -161,7 +157,6 @@ class TestLayouts:
         [
             ("make_env()", {}),
             ("make_env(n_envs)", {}),
-            ("make_env(n_envs, use_async_envs)", {}),
             ("make_env(**kwargs)", {}),
             ("make_env(n_envs=1, use_async_envs=False, difficulty='easy', *, seed=None)", {}),
             ("make_env(n_envs=1, *, difficulty)", {"difficulty": "hard"}),
@@ -174,11 +169,6 @@ class TestLayouts:
         folder = write_repository(tmp_path / "repo", body)
         with make_env(folder, n_envs=2, env_kwargs=kwargs) as suites:
             assert roll(suites.env)[0].shape == (2, 4)
-
-    def test_env_kwargs_reach_make_env(self) -> None:
-        """``env_kwargs`` are ``make_env``'s own arguments, plain values and nested."""
-        with make_env(sample("lerobot_pendulum"), env_kwargs={"task": "stay_up"}) as suites:
-            assert suites.env.get_attr("task") == ("stay_up",)
 
     def test_config_object(self) -> None:
         """A config's attributes cross, also those that are no fields; dicts stay dicts."""
@@ -205,15 +195,7 @@ class TestLayouts:
 class TestWhatMakeEnvReturns:
     """Everything becomes ``{suite: {task_id: VectorEnv}}``."""
 
-    def test_vector_env_without_spec(self) -> None:
-        """A VectorEnv without a spec is task 0 of the suite ``hub_env``, as in LeRobot."""
-        with make_env(sample("cartpole"), n_envs=2) as suites:
-            assert {suite: list(tasks) for suite, tasks in suites.items()} == {"hub_env": [0]}
-            assert isinstance(suites, dict)
-            assert suites.env is suites["hub_env"][0]
-
-    @pytest.mark.parametrize("use_async_envs", [False, True])
-    @pytest.mark.parametrize("n_envs", [1, 3])
+    @pytest.mark.parametrize(("n_envs", "use_async_envs"), [(1, False), (3, True)])
     def test_single_env(self, n_envs: int, use_async_envs: bool) -> None:
         """A single Env is wrapped ``n_envs`` times; its spec names the suite."""
         with make_env(sample("single_env"), n_envs, use_async_envs) as suites:
@@ -222,7 +204,8 @@ class TestWhatMakeEnvReturns:
             assert_same(roll(reference("cartpole", n_envs)), roll(suites.env))
 
     def test_loose_suites(self) -> None:
-        """A bare VectorEnv is task 0, a list counts from 0, single environments are wrapped."""
+        """A bare VectorEnv is task 0, a list counts from 0, single environments are wrapped; task
+        ids may be text, with any characters."""
         with make_env(sample("loose_suites"), n_envs=2) as suites:
             tasks = {suite: list(group) for suite, group in suites.items()}
             assert tasks == {"bare": [0], "list": [0, 1], "singles": [3]}
@@ -231,9 +214,6 @@ class TestWhatMakeEnvReturns:
             assert roll(suites["bare"][0])[0].shape == (2, 4)
             assert roll(suites["list"][1])[0].shape == (2, 2)
             assert roll(suites["singles"][3])[0].shape == (2, 3)
-
-    def test_string_tasks(self) -> None:
-        """Task ids may be text, with any characters."""
         with make_env(sample("string_tasks"), n_envs=2) as suites:
             assert list(suites["classics"]) == ["balance the pole", "climb/the-hill"]
             assert roll(suites["classics"]["climb/the-hill"])[0].shape == (2, 2)
@@ -268,16 +248,14 @@ class TestWhatMakeEnvReturns:
             assert env.nickname == "duck"
             assert_same(roll(reference("cartpole", 2)), roll(env))
 
-    @pytest.mark.parametrize("use_async_envs", [False, True])
-    def test_vector_wrapper(self, use_async_envs: bool) -> None:
-        """A VectorWrapper is called, not looked through."""
-        made = make_env(sample("vector_wrapper"), n_envs=2, use_async_envs=use_async_envs)
-        with made as suites:
+    def test_vector_wrapper(self) -> None:
+        with make_env(sample("vector_wrapper"), n_envs=2, use_async_envs=True) as suites:
             assert suites.env.factor == 0.5
             assert_same(roll(reference("vector_wrapper", 2)), roll(suites.env))
 
     def test_custom_vector_env(self) -> None:
-        """A VectorEnv with its own step is compared bit for bit, infos included."""
+        """One with its own step is compared bit for bit, infos included; its attributes are served,
+        and its methods are called there."""
         expected = reference("custom_vector", 3)
         with make_env(sample("custom_vector"), n_envs=3) as suites:
             env = suites.env
@@ -287,13 +265,8 @@ class TestWhatMakeEnvReturns:
                 assert_same(expected.step(actions), env.step(actions))
             assert_same(expected.render(), env.render())
             assert_same(dict(expected.metadata), dict(env.metadata))
-
-    def test_own_attributes_of_the_vector_env(self) -> None:
-        """``env.hub_config`` is a value, ``env.initialize()`` a method of the remote env."""
-        with make_env(sample("custom_vector"), n_envs=2) as suites:
-            env = suites.env
-            expected = {"name": "swarm", "gains": [0.5, 2.0], "limits": {"speed": 1}}
-            assert_same(expected, env.hub_config)
+            config = {"name": "swarm", "gains": [0.5, 2.0], "limits": {"speed": 1}}
+            assert_same(config, env.hub_config)
             assert env.initialized is False
             assert env.initialize(friction=0.25) == 0.25
             assert (env.initialized, env.friction) == (True, 0.25)
@@ -316,13 +289,8 @@ class TestWhatMakeEnvReturns:
         ("mistake", "named"),
         [
             ("none", "None"),
-            ("int", "42"),
-            ("text", "CartPole-v1"),
-            ("module", "module"),
-            ("class", "type"),
             ("list of ints", "list"),
             ("empty", "empty"),
-            ("suite of None", "None"),
             ("task of int", "42"),
             ("empty suite", "without an environment"),
             ("tuple key", "tuple"),
@@ -361,14 +329,6 @@ class TestWhatGoesWrong:
             make_env(folder)
         assert "broken" in str(caught.value)
 
-    def test_remote_traceback_is_text(self, tmp_path: Path) -> None:
-        """What the repository raised comes with its line and its traceback, as text."""
-        body = "def make_env(**k):\n    return deep()\ndef deep():\n    raise KeyError('oh')\n"
-        with pytest.raises(LoadError, match=r"(?s)KeyError.*line 4, in deep\n.*oh") as caught:
-            make_env(write_repository(tmp_path / "repo", body))
-        assert isinstance(caught.value.__cause__, KeyError)
-        assert "line 2, in make_env" in vars(caught.value)["__notes__"][0]
-
     def test_an_interpreter_without_our_packages_is_a_missing_dependency(
         self, tmp_path: Path
     ) -> None:
@@ -385,14 +345,8 @@ class TestWhatGoesWrong:
         assert not crashes.exists()
 
     def test_input_gets_end_of_file(self) -> None:
-        """A repository that asks a question does not hang."""
         with pytest.raises(LoadError, match="EOFError"):
             make_env(sample("prompts"))
-
-    def test_printing_repository_works(self) -> None:
-        """Output on both streams disturbs nothing."""
-        with make_env(sample("noisy"), env_kwargs={"fail": False, "lines": 5000}) as suites:
-            assert roll(suites.env)[0].shape == (1, 4)
 
 
 SUITE = f"""{STILL}
@@ -457,7 +411,7 @@ def test_a_result_that_changes_is_refused(tmp_path: Path, what: str) -> None:
 class TestAFile:
     """``make_env("env.py")``, as whoever stands in the folder would write it."""
 
-    @pytest.mark.parametrize("name", ["env.py", "nets/env.py", "./env.py"])
+    @pytest.mark.parametrize("name", ["env.py", "nets/env.py"])
     def test_a_file_that_is_here_is_taken(
         self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str
     ) -> None:
@@ -467,15 +421,3 @@ class TestAFile:
         with make_env(name) as suites:
             assert suites.provenance["repository"] == str((tmp_path / name).parent)
             assert suites.provenance["path"] == "env.py"
-
-    @pytest.mark.parametrize(
-        ("name", "why"), [("env.py", "does not exist here"), ("env.txt", "owner is missing")]
-    )
-    def test_what_is_no_python_file_here_is_a_hub_reference(
-        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, why: str
-    ) -> None:
-        """A name alone is none."""
-        (tmp_path / "env.txt").write_text("")
-        monkeypatch.chdir(tmp_path)
-        with pytest.raises(HubReferenceError, match=why):
-            make_env(name)

@@ -24,7 +24,7 @@ ACTIONS = np.zeros(2, np.int64)
 DEADLINE_S = 60.0
 
 
-@pytest.fixture(params=["auto", "frames"])
+@pytest.fixture(params=["auto"])
 def env(request: pytest.FixtureRequest) -> Iterator[Any]:
     """A vector environment that has been reset."""
     with make_env(str(SAMPLES / "cartpole"), n_envs=2, lane=request.param) as suites:
@@ -56,20 +56,27 @@ def held_between_the_halves(env: Any, monkeypatch: pytest.MonkeyPatch) -> Callab
     return finish
 
 
-@pytest.mark.parametrize("asks", ["step", "reset", "get_attr"])
-def test_the_second_thread_waits(env: Any, monkeypatch: pytest.MonkeyPatch, asks: str) -> None:
+over_both_lanes = pytest.mark.parametrize("env", ["auto", "frames"], indirect=True)
+
+
+@over_both_lanes
+def test_the_second_thread_waits(env: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Nothing of it is sent before the first has its results; then both have theirs."""
-    finish = held_between_the_halves(env, monkeypatch)
-    arguments = {"step": (ACTIONS,), "get_attr": ("gravity",)}.get(asks, ())
-    sent, results = env.sandbox.stats()["requests"], []
-    second = threading.Thread(target=lambda: results.append(getattr(env, asks)(*arguments)))
-    second.start()
-    assert not getattr(*inside.use_lock(env)).acquire(blocking=False)
-    assert (env.sandbox.stats()["requests"], results) == (sent, [])
-    assert finish()[0].shape == (2, 4)
-    second.join(DEADLINE_S)
-    assert len(results) == 1
-    assert env.step(ACTIONS)[0].shape == (2, 4)
+    for asks, arguments in (("step", (ACTIONS,)), ("reset", ()), ("get_attr", ("gravity",))):
+        finish = held_between_the_halves(env, monkeypatch)
+        sent, results = env.sandbox.stats()["requests"], list[Any]()
+
+        def ask(into: list[Any] = results, name: str = asks, given: Any = arguments) -> None:
+            into.append(getattr(env, name)(*given))
+
+        second = threading.Thread(target=ask)
+        second.start()
+        assert not getattr(*inside.use_lock(env)).acquire(blocking=False)
+        assert (env.sandbox.stats()["requests"], results) == (sent, [])
+        assert finish()[0].shape == (2, 4)
+        second.join(DEADLINE_S)
+        assert len(results) == 1
+        assert env.step(ACTIONS)[0].shape == (2, 4)
 
 
 def test_two_threads_that_step_are_warned_of(env: Any, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -97,7 +104,6 @@ def test_two_threads_that_step_are_warned_of(env: Any, monkeypatch: pytest.Monke
 
 
 def test_the_second_thread_is_refused_after_an_async_call(env: Any) -> None:
-    """No thread has the lock between the two calls."""
     env.step_async(ACTIONS)
     refused: list[type] = []
 
@@ -114,6 +120,7 @@ def test_the_second_thread_is_refused_after_an_async_call(env: Any) -> None:
     assert env.step_wait()[0].shape == (2, 4)
 
 
+@over_both_lanes
 @pytest.mark.parametrize("asks", ["recv", "send", "reset"])
 def test_a_second_thread_waits_for_a_send(
     env: Any, monkeypatch: pytest.MonkeyPatch, asks: str

@@ -1,4 +1,4 @@
-"""Requests that go straight to the runners, and answers too large for that: nothing is mixed up."""
+"""What a lane carries: requests, several steps at once, what is too large; nothing is mixed up."""
 
 from __future__ import annotations
 
@@ -9,14 +9,16 @@ import numpy as np
 import pytest
 
 from envhub_sandbox import make_env
-from envhub_sandbox.errors import RemoteEnvError
+from envhub_sandbox.errors import RemoteEnvError, RemoteProtocolError
 from envhub_sandbox.transport.deadline import Deadline, StepDeadline
-from envhub_sandbox.transport.jail import JailHandle
+from envhub_sandbox.transport.shared_memory.served_lane import ServedLane
+from envhub_worker.protocol.limits import DEFAULT_LIMITS, limits_for
 from envhub_worker.protocol.shared_memory import slabs
 from tests.support import inside
 from tests.support.compare import assert_same
+from tests.support.objects.pipelines import changing, one_by_one, several_at_once
 from tests.support.repositories import STILL, write_repository
-from tests.support.samples import sample
+from tests.support.started import started
 
 pytestmark = pytest.mark.same_for("users")
 
@@ -71,7 +73,6 @@ assert slabs.INFO_BYTES == 65536, "what is large has changed"
 
 @pytest.fixture(scope="module")
 def talker(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The repository."""
     return write_repository(tmp_path_factory.mktemp("talker"), STILL + REPOSITORY)
 
 
@@ -95,8 +96,7 @@ def test_large_and_small_answers_are_not_mixed_up(talker: Path, num_workers: int
     assert_same(conversation(talker, "frames", num_workers), by_lane)
 
 
-@pytest.mark.parametrize("lane", ["auto", "frames"])
-@pytest.mark.parametrize("restart", ["on_reset", "transparent"])
+@pytest.mark.parametrize(("lane", "restart"), [("auto", "on_reset"), ("frames", "transparent")])
 def test_an_operation_has_one_deadline(
     talker: Path, lane: str, restart: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -150,7 +150,6 @@ def test_a_reset_by_the_server_leaves_lent_batches_alone(talker: Path) -> None:
 def test_a_masked_reset_after_a_failed_step_shows_the_last_observations(
     talker: Path, copy: bool
 ) -> None:
-    """Of those that the failed step did not reach, too."""
     with make_env(talker, 2, copy=copy) as suites:
         env = suites.env
         held = [env.reset()[0]]
@@ -161,23 +160,7 @@ def test_a_masked_reset_after_a_failed_step_shows_the_last_observations(
         assert observation[1].tolist() == [4, 4]
 
 
-class Unknown:
-    """Of a module that is not to be had in a jail."""
-
-
-@pytest.mark.parametrize("lane", ["auto", "frames"])
-def test_an_argument_that_cannot_be_read_there_is_told(talker: Path, lane: str) -> None:
-    """The environment goes on."""
-    with make_env(talker, lane=lane) as suites:
-        env = suites.env
-        env.reset()
-        with pytest.raises(RemoteEnvError, match="tests"):
-            env.call("tell", False, ignored=Unknown())
-        assert env.get_attr("small") == ("small",)
-
-
 def test_a_signal_without_a_name_is_told(talker: Path) -> None:
-    """And ends nothing but its jail."""
     with make_env(talker) as suites, make_env(talker) as others:
         suites.env.reset()
         others.env.reset()
@@ -186,15 +169,80 @@ def test_a_signal_without_a_name_is_told(talker: Path) -> None:
         others.env.step([0])
 
 
-def test_what_a_request_is_called_decides_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Descriptors go with the request that says so, whatever its label for people says."""
-    exchange = JailHandle.exchange
+@pytest.mark.parametrize("lane", ["auto", "frames"])
+@pytest.mark.parametrize(("count", "workers", "size"), [(2, 1, 3), (1, 1, 100_000), (3, 2, 3)])
+def test_what_comes_is_what_a_step_gives(
+    tmp_path: Path, lane: str, count: int, workers: int, size: int
+) -> None:
+    """Also where infos do not fit, change their columns or are not there, and where one raises;
+    back and forth between steps through slabs and steps as messages."""
+    folder = changing(tmp_path, size)
+    with started(folder, count, lane="auto", num_workers=workers) as env:
+        expected = one_by_one(env)
+    took: list[bool] = []
+    with started(folder, count, lane=lane, num_workers=workers) as env:
+        found = inside.session(env).lease.lane
+        assert found is not None
+        assert isinstance(found, ServedLane) == (lane == "frames")
+        results = several_at_once(env, lambda: took.append(found.takes_more))
+    assert set(took) == ({True, False} if lane == "frames" and workers == 1 else {False})
+    for number, (wanted, came) in enumerate(zip(expected, results, strict=True)):
+        assert_same(wanted[0], came[0], f"step {number}")
+    # of one worker that has warned where another has raised, with this step's answer or the next
+    warned = [sorted(text for _, texts in some for text in texts) for some in (expected, results)]
+    assert warned[0] == warned[1]
+    assert len(warned[0]) > 10
 
-    def renamed(jail: JailHandle, _: str, *rest: Any, **options: Any) -> Any:
-        return exchange(jail, "beginning", *rest, **options)
 
-    monkeypatch.setattr(JailHandle, "exchange", renamed)
-    with make_env(sample("counter"), n_envs=2, num_workers=2) as suites:
-        suites.env.reset(seed=0)
-        assert inside.lane(suites.env) is not None
-        suites.env.step(suites.env.action_space.sample())
+_ENV = """
+import gymnasium as gym
+import numpy as np
+
+class Large(gym.Env):
+    observation_space = gym.spaces.Box(0, 255, (SIZE,), np.uint8)
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(SIZE, np.uint8), {}
+
+    def step(self, action):
+        return np.zeros(SIZE, np.uint8), 0.0, False, False, {"large": [np.zeros(3 << 20, np.uint8)]}
+
+    def large(self, size):
+        return np.zeros(size, np.uint8)
+
+def make_env(n_envs=1, use_async_envs=False):
+    return gym.vector.SyncVectorEnv([Large] * n_envs)
+"""
+
+
+def _repository(folder: Path, size: int) -> Path:
+    return write_repository(folder, _ENV.replace("SIZE", str(size)))
+
+
+@pytest.mark.parametrize("lane", ["auto", "frames"])
+def test_a_smaller_limit_is_the_jails_own(tmp_path: Path, lane: str) -> None:
+    """What is larger is an error of that call; the environment goes on."""
+    folder = _repository(tmp_path, 4)
+    with make_env(folder, lane=lane, limits={"message_bytes": 1 << 20}) as suites:
+        env = suites.env
+        env.reset()
+        with pytest.raises(RemoteEnvError, match=r"1048576 \(message_bytes\)"):
+            env.call("large", 2 << 20)
+        assert "RemoteObject" in repr(type(env.step(np.array([0]))[4]["large"][0][0]))
+        assert len(env.call("large", 1 << 19)[0]) == 1 << 19
+
+
+def test_a_larger_limit_lets_more_through(tmp_path: Path) -> None:
+    """More than the default, which the server's own reader has as well."""
+    size = DEFAULT_LIMITS.message_bytes + 1
+    assert limits_for(2 * size) is limits_for(2 * size)
+    with make_env(_repository(tmp_path, 4), limits={"message_bytes": 2 * size}) as suites:
+        assert len(suites.env.call("large", size)[0]) == size
+
+
+def test_a_large_space_names_the_limit(tmp_path: Path) -> None:
+    folder = _repository(tmp_path, 100 << 10)
+    with pytest.raises(RemoteProtocolError, match=r"raise the limit.*elements"):
+        make_env(folder, limits={"elements": 10_000}).close()
+    make_env(folder, limits={"elements": 1_000_000}).close()

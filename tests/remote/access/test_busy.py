@@ -14,12 +14,9 @@ import pytest
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import PolicyError, ServerBusyError, WorkerError
 from envhub_sandbox.sandboxes.remote import RemoteSandbox
-from envhub_sandbox.session.jails.launcher import retry_while_busy
-from envhub_sandbox.transport.deadline import StartupDeadline
 from envhub_worker.access import keys
-from envhub_worker.access.places import Line
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.messages.busy import LONGEST_S, Busy
+from envhub_worker.protocol.messages.busy import Busy
 from tests.remote.listening import Listening, listening
 from tests.remote.peers import peer
 from tests.support.processes import eventually
@@ -33,42 +30,18 @@ def narrow(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Listening]:
         yield server
 
 
-def test_the_first_who_came_is_the_first_who_is_let_in() -> None:
-    """Among those who go on asking; who asked once, or has given up, stands in nobody's way."""
-    now = [0.0]
-    line = Line(lambda: now[0])
-    for _ in range(2):
-        line.wait(b"key", b"one")
-        line.wait(b"key", b"two")
-    line.wait(b"key", b"once")
-    assert [line.ahead(b"key", name) for name in (b"one", b"two", b"once", b"new")] == [0, 1, 2, 2]
-    assert line.ahead(b"another", b"new") == 0
-    line.leave(b"key", b"one")
-    assert line.ahead(b"key", b"two") == 0
-    now[0] = 60.0
-    assert line.ahead(b"key", b"new") == 0
-
-
-@pytest.mark.parametrize(
-    ("quota", "words"),
-    [("", ""), ("jails", "1 2"), ("jails", "-1 2 3"), ("\x1b[2J", "1 2 3"), ("jails", "9" * 99)],
-)
-def test_what_is_no_answer_of_ours_says_nothing(quota: str, words: str) -> None:
-    """It is a server's, and is looked at before anybody sleeps for it."""
-    assert Busy.read(quota, words) == Busy("", 0, 0, 1.0)
-    assert Busy.read("jails", "1 2 9999.0").retry_s == LONGEST_S
-    busy = Busy("jails", 3, 4, 1.5)
-    assert Busy.read(busy.quota, busy.words()) == busy
-
-
 def test_a_full_server_says_which_quota_and_how_much(narrow: Listening, repository: Path) -> None:
-    """As attributes; what would never fit is another error, for which no waiting helps."""
-    with started(repository, sandbox=narrow.sandbox()):
+    """As attributes, also after ``retry_s``; what would never fit is another error, for which no
+    waiting helps."""
+    with started(repository, sandbox=narrow.sandbox()) as first:
         with pytest.raises(ServerBusyError, match=r"2 jails .* \(--max-jails\)") as caught:
             make_env(repository, n_envs=2, sandbox=narrow.sandbox())
         said = caught.value
         assert (said.quota, said.used, said.limit) == ("jails", 1, 1)
         assert said.retry_s > 0
+        with pytest.raises(ServerBusyError):
+            make_env(repository, n_envs=4, sandbox=narrow.sandbox(retry_s=1.5))
+        assert first.step(np.array([0]))[0].tolist() == [[1.0]]
     policy = {"limits": {"memory_bytes": 1 << 50}}
     with pytest.raises(WorkerError) as never:
         make_env(repository, n_envs=3, sandbox=narrow.sandbox(retry_s=60.0), policy=policy)
@@ -103,37 +76,6 @@ def test_who_waits_gets_the_place_once_it_is_free(
         made[0].close()
 
 
-def test_who_waits_in_vain_is_told_so(narrow: Listening, repository: Path) -> None:
-    """After ``retry_s``; the other one goes on."""
-    with started(repository, sandbox=narrow.sandbox()) as first:
-        with pytest.raises(ServerBusyError):
-            make_env(repository, n_envs=4, sandbox=narrow.sandbox(retry_s=1.5))
-        assert first.step(np.array([0]))[0].tolist() == [[1.0]]
-
-
-def test_a_wait_counts_neither_against_the_start_nor_after_a_close() -> None:
-    """The deadline moves along; who gives it up is not asked for any more."""
-    deadline, asked = StartupDeadline(1000.0), list[float]()
-
-    def ask() -> str:
-        asked.append(deadline.left_s() or 0.0)
-        if len(asked) < 3:
-            raise ServerBusyError("full", retry_s=0.2)
-        return "in"
-
-    assert retry_while_busy(ask, 600.0, deadline, "it") == "in"
-    assert len(asked) == 3
-    deadline.postpone(5000.0)
-    assert (deadline.left_s() or 0.0) > 5000.0
-    asked.clear()
-    deadline.give_up()
-    deadline.postpone(5000.0)
-    assert deadline.passed
-    with pytest.raises(ServerBusyError):
-        retry_while_busy(ask, 600.0, deadline, "it")
-    assert len(asked) == 1
-
-
 def test_a_session_is_waited_for_like_a_jail(tmp_path: Path) -> None:
     """The refusal names that quota; who asks again is let in once the other has gone."""
     with listening(tmp_path / "server", "--max-sessions", "1") as server:
@@ -150,6 +92,5 @@ def test_a_session_is_waited_for_like_a_jail(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("retry_s", [-1.0, float("inf"), float("nan")])
 def test_a_wait_without_end_is_refused(retry_s: float) -> None:
-    """As any other number that cannot be."""
     with pytest.raises(PolicyError, match="retry_s"):
         RemoteSandbox("tcp://127.0.0.1:5555", retry_s=retry_s)

@@ -35,7 +35,6 @@ def captured(server: Listening, repository: Path) -> bytes:
 
 @contextlib.contextmanager
 def peers(server: Listening, count: int) -> Iterator[list[socket.socket]]:
-    """Connections to the server."""
     with contextlib.ExitStack() as stack:
         yield [stack.enter_context(knock(server.port)) for _ in range(count)]
 
@@ -74,7 +73,13 @@ def test_replayed_beginnings_open_no_session(server: Listening, good: Any, captu
 
 
 def test_dripping_strangers_are_shown_the_door(server: Listening, good: Any) -> None:
-    """Who sends a byte now and then is never silent, and still has to be done in time."""
+    """Who does not finish a handshake in a few seconds; who sends a byte now and then is never
+    silent, and still has to be done in time."""
+    with peers(server, 100) as silent:  # in the middle of a handshake
+        for connection in silent:
+            say(connection, _CURVE_GREETING[:3])
+        good.call("count")
+        assert all(map(ends, silent))
     with peers(server, 30) as connections:
         gone: set[int] = set()
         # never a whole greeting, which would be judged

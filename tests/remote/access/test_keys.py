@@ -8,10 +8,9 @@ import dataclasses
 import os
 import signal
 import socket
-import stat
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +38,6 @@ pytestmark = pytest.mark.short
 
 
 def test_keys_are_read_in_both_forms() -> None:
-    """Ours, and ZeroMQ's own."""
     for _ in range(20):
         public, secret = zmq.curve_keypair()
         assert parse_key(public.decode()) == z85.decode(public)
@@ -49,33 +47,9 @@ def test_keys_are_read_in_both_forms() -> None:
 
 @pytest.mark.parametrize("text", ["", "00", "g" * 64, "0" * 63, " " * 40, "~" * 40, "#" * 40])
 def test_what_is_no_key_is_refused_without_being_repeated(text: str) -> None:
-    """It may be a secret with a typing error."""
     with pytest.raises(ValueError, match="64 hexadecimal digits") as caught:
         parse_key(text)
     assert not text.strip() or text not in str(caught.value)
-
-
-def test_keygen_writes_a_secret_that_nobody_else_reads(tmp_path: Path) -> None:
-    """0600 from the start, the public key printed, the secret not; nothing is overwritten."""
-    command = ("keygen", "--out", tmp_path / "new")
-    done = worker(*command)
-    assert done.returncode == 0, done.stderr
-    secret = tmp_path / "new" / "client.key"
-    pair = keys.load(secret)
-    assert stat.S_IMODE(secret.stat().st_mode) == 0o600
-    assert key_text(pair.public) in done.stdout
-    assert key_text(pair.secret) not in done.stdout
-    assert (tmp_path / "new" / "client.pub").read_text().strip() == key_text(pair.public)
-    assert "secret" not in repr(pair).replace("KeyPair", "")
-    again = worker(*command)
-    assert again.returncode == 1
-    assert "client.key exists" in again.stderr
-    assert "Errno" not in again.stderr
-    assert keys.load(secret) == pair
-    secret.unlink()
-    again = worker(*command)
-    assert "client.pub exists" in again.stderr
-    assert not secret.exists()
 
 
 def test_the_list_of_clients_knows_names_and_comments(tmp_path: Path) -> None:
@@ -136,17 +110,11 @@ def test_without_landlock_a_weak_profile_is_for_one_client(
     inside.gate_of(options, tmp_path, identity)
 
 
-@pytest.mark.parametrize(
-    "bind", ["tcp://", "5555", "ipc:///tmp/x", "udp://127.0.0.1:1", "tcp://127.0.0.1:http"]
-)
+@pytest.mark.parametrize("bind", ["tcp://", "5555", "ipc:///tmp/x", "tcp://127.0.0.1:http"])
 def test_only_tcp_addresses_are_bound(bind: str) -> None:
-    """Anything else is a mistake."""
+    """Anything else is a mistake; nobody listens on all interfaces without saying so."""
     with pytest.raises(identities.UsageError, match="--bind takes"):
         identities.check_bind(bind, False)
-
-
-def test_the_default_is_loopback() -> None:
-    """Nobody listens on all interfaces without saying so."""
     parser = argparse.ArgumentParser()
     listen_options.add_options(parser)
     assert parser.parse_args([]).bind.startswith("tcp://127.0.0.1:")
@@ -183,7 +151,6 @@ def test_the_line_names_the_profile_where_the_default_cannot_be_had() -> None:
 
 
 def test_a_second_start_keeps_the_keys_and_does_not_print_the_secret(tmp_path: Path) -> None:
-    """Clients go on working; logs hold the secret once."""
     with listening(tmp_path / "same") as first:
         assert first.client_key in first.said()
     with listening(tmp_path / "same") as second:
@@ -192,7 +159,7 @@ def test_a_second_start_keeps_the_keys_and_does_not_print_the_secret(tmp_path: P
 
 
 def test_a_server_for_one_client_has_its_keys_in_memory_alone(
-    tmp_path: Path, repository: Path
+    tmp_path: Path, repository: Path, wait_no_more: Callable[[], None]
 ) -> None:
     """Who starts it reads its endpoint and its key; another client is refused; nothing is left."""
     ours, stranger = keys.generate(), keys.generate()
@@ -211,6 +178,7 @@ def test_a_server_for_one_client_has_its_keys_in_memory_alone(
             # an own process stands for the one that started it: its end is the server's
             process.parents()[0].kill()
             assert eventually(lambda: gone([process, *jails]))
+            wait_no_more()
 
 
 @contextlib.contextmanager
@@ -267,13 +235,15 @@ def test_keys_are_found_in_the_configuration_folder(
 def test_what_cannot_be_reached_is_refused_at_once(
     repository: Path, options: dict[str, str]
 ) -> None:
-    """Before anything is downloaded or sent."""
     with pytest.raises(PolicyError):
         make_env(repository, **options)
 
 
-def test_status_says_what_jails_do(server: Listening, repository: Path) -> None:
-    """For people, as its operator; a client sees itself."""
+def test_status_says_what_jails_do(server: Listening, repository: Path, tmp_path: Path) -> None:
+    """For people, as its operator; a client sees itself. Without a server it fails, for scripts."""
+    absent = worker("status", "--state-dir", tmp_path)
+    assert absent.returncode == 1
+    assert "no 'envhub-worker listen'" in absent.stderr
     with started(repository, sandbox=server.sandbox()):
 
         def told() -> str:
@@ -306,15 +276,9 @@ def test_health_asks_the_server_and_not_only_its_port(tmp_path: Path) -> None:
         server.process.send_signal(signal.SIGCONT)
 
 
-def test_status_without_a_server_says_so(tmp_path: Path) -> None:
-    """It fails, for scripts, and at once."""
-    done = worker("status", "--state-dir", tmp_path)
-    assert done.returncode == 1
-    assert "no 'envhub-worker listen'" in done.stderr
-
-
-def test_a_log_cannot_be_filled_by_strangers() -> None:
-    """A few lines of a kind in a minute, then how many more there were."""
+def test_a_log_cannot_be_filled() -> None:
+    """A few lines of a kind in a minute, then how many more there were. A client has many of its
+    own; what it wastes is neither another's nor a stranger's."""
     now, lines = [0.0], list[str]()
     log = Log(lines.append, lambda: now[0])
     for _ in range(1000):
@@ -324,19 +288,14 @@ def test_a_log_cannot_be_filled_by_strangers() -> None:
     now[0] = 61
     log.tick()
     assert lines[-1].endswith(f"left_out of=unknown_key lines={1000 - LINES}")
-
-
-def test_a_log_cannot_be_filled_by_a_client_and_is_not_by_its_work() -> None:
-    """Many lines of its own; what it wastes is neither another's nor a stranger's."""
-    now, lines = [0.0], list[str]()
-    log = Log(lines.append, lambda: now[0])
+    lines.clear()
     for _ in range(CLIENT_LINES + 5):
         log.say("refused", whose="a" * 64, client="mallory")
     assert len(lines) == CLIENT_LINES
     log.say("refused", whose="b" * 64, client="alice")
     log.say("refused", why="a stranger")
     assert len(lines) == CLIENT_LINES + 2
-    now[0] = 61
+    now[0] = 122
     log.tick()
     assert lines[-1].endswith(f"left_out of=refused lines=5 key={'a' * 16}")
 
@@ -356,26 +315,20 @@ def test_a_log_that_nobody_reads_ends_nothing(monkeypatch: pytest.MonkeyPatch) -
 def test_a_state_folder_of_somebody_else_is_not_used(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The temporary folder is everybody's: what others may write there is none of ours."""
+    """The temporary folder is everybody's: what others may write there is none of ours. Jails are
+    made elsewhere: a relative folder is where one stands."""
     monkeypatch.setenv("XDG_STATE_HOME", "/proc/nowhere")
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     folder = tmp_path / f"envhub-worker-{os.getuid()}"
     assert state_folder.state_dir(None, create=True) == folder
     folder.chmod(0o777)
     assert state_folder.state_dir(None, create=True) is None
-
-
-def test_a_relative_state_folder_is_where_one_stands(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Jails are made elsewhere, and are told where snapshots lie."""
     monkeypatch.chdir(tmp_path)
     assert state_folder.state_dir(Path("here"), create=True) == tmp_path / "here"
 
 
-@pytest.mark.parametrize("bind", ["a taken port", "tcp://192.0.2.1:5555", "tcp://no.invalid:5555"])
+@pytest.mark.parametrize("bind", ["a taken port", "tcp://192.0.2.1:5555"])
 def test_an_address_that_cannot_be_had_is_said_in_a_line(bind: str, tmp_path: Path) -> None:
-    """And no traceback; nothing is left."""
     with contextlib.closing(socket.create_server(("127.0.0.1", 0))) as taken:
         if bind == "a taken port":
             bind = f"tcp://127.0.0.1:{taken.getsockname()[1]}"
@@ -387,7 +340,6 @@ def test_an_address_that_cannot_be_had_is_said_in_a_line(bind: str, tmp_path: Pa
 
 
 def test_a_name_is_no_line_of_the_status() -> None:
-    """Nor does it crowd out what others have."""
     jail = {"name": "evil\n0 sessions", "states": ["idle"], "operation": "", "busy_s": 0.0}
     one = {"client": "a", "session": "1", "heard_s": 0.0, "connections": 1, "upload_bytes": 0}
     many = [{**jail, "name": "x" * 512} for _ in range(40)]

@@ -25,7 +25,6 @@ pytestmark = pytest.mark.same_for("versions")
 
 @pytest.fixture
 def keys() -> tuple[str, str]:
-    """A client's keys, public and secret."""
     public, secret = new_keys()
     return key_text(public), key_text(secret)
 
@@ -53,7 +52,6 @@ def announcing(public: str, state: Path) -> Iterator[tuple[subprocess.Popen[str]
 def announced(
     keys: tuple[str, str], tmp_path: Path
 ) -> Iterator[tuple[subprocess.Popen[str], dict[str, Any]]]:
-    """One for these keys."""
     with announcing(keys[0], tmp_path / "state") as found:
         yield found
 
@@ -110,7 +108,6 @@ def test_it_ends_with_its_stdin(
 def test_what_contradicts_itself_is_refused(
     tmp_path: Path, words: tuple[str, ...], text: str
 ) -> None:
-    """With what to leave out."""
     done = worker(
         "listen", "--bind", "tcp://127.0.0.1:*", "--state-dir", tmp_path / "state", *words
     )

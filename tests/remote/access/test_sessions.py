@@ -58,7 +58,7 @@ def test_the_place_of_a_program_that_ends_is_free_at_once(
     end: str, narrow: Listening, repository: Path
 ) -> None:
     """Of one that closes, and of one that leaves that to its end: one after the other come in."""
-    for _ in range(3):
+    for _ in range(2):
         client = program(narrow, repository, end)
         said, _ = client.communicate(timeout=120)
         assert client.returncode == 0, said

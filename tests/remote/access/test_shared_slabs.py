@@ -26,7 +26,6 @@ MANY = 200
 
 @contextmanager
 def opened(server: Listening) -> Iterator[Any]:
-    """An environment there, of six runners."""
     options: dict[str, Any] = {"n_envs": 6, "num_workers": 6}
     limits = {"limits": {"memory_bytes": LIMIT_BYTES}}
     with make_env(sample("counter"), sandbox=server.sandbox(), **limits, **options) as suites:
@@ -36,7 +35,6 @@ def opened(server: Listening) -> Iterator[Any]:
 
 @pytest.fixture
 def env(server: Listening) -> Iterator[Any]:
-    """One for a test."""
     with opened(server) as found:
         yield found
 
@@ -49,7 +47,6 @@ def share(env: Any, slabs: list[tuple[int, int]]) -> m.Message:
 
 
 def files(server: Listening) -> int:
-    """How many descriptors the server has."""
     return len(os.listdir(f"/proc/{server.process.pid}/fd"))
 
 
@@ -73,7 +70,6 @@ def test_slabs_are_no_memory_beside_the_limit(env: Any) -> None:
 
 
 def test_slabs_that_are_made_again_leave_nothing(env: Any, server: Listening) -> None:
-    """Nor do those that no runner has taken."""
     share(env, [(0, 64)])
     before = files(server)
     for _ in range(MANY):

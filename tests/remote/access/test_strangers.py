@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import errno
-import resource
 import socket
 import struct
 import time
@@ -30,14 +29,12 @@ from envhub_worker.access.quotas import Permissions, Quotas
 from envhub_worker.access.remote_gate import RemoteGate, Rules
 from envhub_worker.access.sessions import Sessions
 from envhub_worker.access.store.uploads import Uploads
-from envhub_worker.cli import listen
 from envhub_worker.loop import Loop
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.keys import key_text
 from envhub_worker.supervisor.records import Asker, RefusedError, Witness
 from tests.remote.listening import Listening, listening
-from tests.remote.relay import relay
-from tests.remote.strangers import ends, greeting, knock, say
+from tests.remote.strangers import greeting, knock
 from tests.support import inside
 from tests.support.processes import eventually
 from tests.support.started import started
@@ -89,18 +86,12 @@ def test_a_refusal_between_looking_and_sending_is_no_wait(
 
 
 def test_another_servers_key_is_refused_at_once(server: Listening, repository: Path) -> None:
-    """Nobody but the server that was meant can answer."""
     other = key_text(keys.generate().public)
     with pytest.raises(
         SandboxUnavailableError, match=r"another public key than the given\s+server_key"
     ):
         make_env(repository, sandbox=server.sandbox(server_key=other))
     assert eventually(lambda: "handshake_failed" in server.said())
-
-
-@pytest.mark.short
-def test_no_key_is_refused_at_once(server: Listening, repository: Path) -> None:
-    """A client without keys does not get to say anything."""
     with pytest.raises(SandboxUnavailableError, match="does not speak ZeroMQ with CURVE"):
         make_env(repository, sandbox=server.sandbox(insecure_loopback=True))
 
@@ -170,22 +161,6 @@ def test_a_message_without_a_proved_key_is_refused(tmp_path: Path) -> None:
         gate.authorize(ClientRequest(asker, m.GetSessions(), (), sessions, None))  # type: ignore[arg-type]
 
 
-def test_captured_bytes_are_worth_nothing(server: Listening, repository: Path, good: Any) -> None:
-    """What a client once sent, sent again: the server's keys of the connection are others."""
-    with relay(server.port) as wire:
-        with started(repository, sandbox=server.sandbox(endpoint=wire.endpoint)):
-            pass
-        captured = [bytes(kept) for kept in wire.captured if len(kept) > len(_GREETING)]
-    assert captured
-    jails = server.open_jails()
-    for data in captured:
-        with knock(server.port) as connection:
-            say(connection, data)
-            assert ends(connection)
-    assert eventually(lambda: "handshake_failed" in server.said())
-    assert server.open_jails() <= jails
-
-
 def test_a_flood_of_frames_without_keys_costs_no_memory(
     server: Listening, good: Any, tmp_path: Path
 ) -> None:
@@ -208,7 +183,6 @@ def flood(server: Listening) -> int:
 
 
 def test_a_port_scan_is_a_few_lines_in_the_log(server: Listening, good: Any) -> None:
-    """Hundreds of connections that say nothing, or noise, and go."""
     before = server.memory()
     for number in range(300):
         with knock(server.port) as connection, contextlib.suppress(ConnectionError):
@@ -217,19 +191,6 @@ def test_a_port_scan_is_a_few_lines_in_the_log(server: Listening, good: Any) -> 
     assert server.memory() - before < 64 * _MIB
     periods = 1 + int((time.time() - psutil.Process(server.process.pid).create_time()) / PERIOD_S)
     assert server.said().count("warning handshake_failed") <= LINES * periods < 300
-
-
-def test_slow_strangers_are_shown_the_door(server: Listening, good: Any) -> None:
-    """Whoever does not finish a handshake in a few seconds is disconnected."""
-    connections = [knock(server.port) for _ in range(100)]
-    try:
-        for connection in connections:
-            connection.sendall(_GREETING[:3])
-        good.call("count")
-        assert all(map(ends, connections))
-    finally:
-        for connection in connections:
-            connection.close()
 
 
 def may_filter() -> bool:
@@ -301,13 +262,6 @@ def test_a_door_that_cannot_be_shut_ends_nothing(monkeypatch: pytest.MonkeyPatch
 
 def _no_descriptors(*_: object) -> None:
     raise OSError(errno.EMFILE, "Too many open files")
-
-
-def test_connections_leave_half_of_the_descriptors(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever was asked for: jails need the others."""
-    for limit, most in ((100, 50), (1, 1), (resource.RLIM_INFINITY, 1024), (65_536, 1024)):
-        monkeypatch.setattr("resource.getrlimit", lambda _, soft=limit: (soft, soft))
-        assert listen.most_connections(1024) == most
 
 
 def test_without_keys_it_listens_on_loopback_only(tmp_path: Path, repository: Path) -> None:

@@ -4,20 +4,15 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
 
-import pytest
 from typer.testing import CliRunner
 
 from envhub_sandbox.cli.app import app
-from envhub_sandbox.sandboxes import server_facts
-from envhub_sandbox.sandboxes.server_facts import ServerFacts
 from envhub_worker.access import keys
 from envhub_worker.access.quotas import Quotas
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.keys import key_text
 from tests.remote.listening import Listening, listening
-from tests.support.processes import eventually
 from tests.support.started import started
 
 RUNNER = CliRunner()
@@ -33,7 +28,6 @@ def doctor(server: Listening, *options: str, key: str | None = None) -> tuple[in
 def test_a_server_says_what_it_can_and_what_we_may_take(
     server: Listening, repository: Path
 ) -> None:
-    """Versions, profiles and quotas; to look takes no place."""
     with started(repository, sandbox=server.sandbox()):
         code, out, _ = doctor(server, "--profile", "container", "--json")
         told = json.loads(out)["server"]
@@ -49,16 +43,7 @@ def test_a_server_says_what_it_can_and_what_we_may_take(
         assert jails.split()[1:] == [str(told["used"]["jails"]), str(Quotas().jails)]
 
 
-def test_a_profile_that_is_not_permitted_is_the_exit_code(tmp_path: Path) -> None:
-    """With why; what is to be had there is 0."""
-    with listening(tmp_path / "server", "--weakest-profile", "strict") as server:
-        code, out, _ = doctor(server, "--profile", "container")
-        assert code == 6
-        assert "no jail with the profile 'container'" in out
-
-
 def test_who_is_not_let_in_is_told_why(server: Listening) -> None:
-    """An unknown key, another server's, no address, nobody there."""
     code, _, err = doctor(server, key=key_text(keys.generate().secret))
     assert code == 6
     assert "does not know our key" in err
@@ -79,37 +64,3 @@ def test_a_server_without_keys_can_be_asked(tmp_path: Path) -> None:
         assert "it asks for no key" in RUNNER.invoke(app, words).stdout
         assert RUNNER.invoke(app, [*words, "--server-key", "x"]).exit_code == 2
         assert RUNNER.invoke(app, ["doctor", "--insecure-loopback"]).exit_code == 2
-
-
-def test_a_server_that_drains_is_no_place_to_go(tmp_path: Path, repository: Path) -> None:
-    """It still answers whoever asks."""
-    with (
-        listening(tmp_path / "server", "--drain-s", "600") as server,
-        started(repository, sandbox=server.sandbox()),
-    ):
-        server.process.terminate()
-        assert eventually(lambda: doctor(server)[0] == 5)
-        assert "it drains" in doctor(server)[1]
-
-
-@pytest.mark.parametrize(
-    "told",
-    [
-        {},
-        {"profile": 5, "weakest_profile": ["strict"], "quotas": "many", "clients": 7},
-        {
-            "python": "\x1b[2J" * 1000,
-            "quotas": {"\x1b[2J": 1, "jails": -1, "x": 1 << 70, "y": True},
-        },
-        {"quotas": {str(number): number for number in range(5000)}, "clients": {"a": None}},
-    ],
-)
-def test_what_a_server_says_is_looked_at(told: dict[str, Any]) -> None:
-    """Types and lengths, before it is printed."""
-    facts: ServerFacts = server_facts.facts_of(m.Welcome(9, "\x1b[2J" * 100, 1), 0.1, told)
-    assert not facts.enforces("strict")
-    assert len(facts.quotas) <= 32
-    assert set(facts.quotas) <= {str(number) for number in range(32)} | {"\\x1b[2J"}
-    for text in (facts.version, facts.python, facts.profile):
-        assert text.isprintable()
-        assert len(text) < 400

@@ -45,7 +45,6 @@ class Prometheus:
         self._log = log
 
     def said(self) -> str:
-        """Everything that it has printed."""
         return self._log.read_text("utf-8", "replace")
 
     @property
@@ -116,10 +115,7 @@ def test_every_panel_of_the_dashboard_shows_something(tmp_path: Path, repository
             assert eventually(lambda: bool(prometheus.query("envhub_server_requests_total > 0")))
             for _ in range(5):
                 env.step(np.array([0]))
-            with (
-                pytest.raises(ServerBusyError),
-                started(repository, sandbox=one.server.sandbox()),
-            ):
+            with pytest.raises(ServerBusyError), started(repository, sandbox=one.server.sandbox()):
                 pass
             empty = [
                 expression
@@ -136,11 +132,7 @@ def test_every_panel_of_the_dashboard_shows_something(tmp_path: Path, repository
 
 
 def test_promtool_finds_no_fault_with_the_page(tmp_path: Path, repository: Path) -> None:
-    """Names, types, units and helps are as Prometheus wants them."""
-    with (
-        watched(tmp_path / "server") as one,
-        started(repository, sandbox=one.server.sandbox()),
-    ):
+    with watched(tmp_path / "server") as one, started(repository, sandbox=one.server.sandbox()):
         assert eventually(lambda: "envhub_server_sessions{" in _page_of(one))  # each second anew
         command = ["promtool", "check", "metrics"]
         done = subprocess.run(

@@ -39,7 +39,6 @@ def cluster_of(*nodes: dict[str, Any]) -> Iterator[Any]:
 
 
 def add_node(cluster: Any, num_cpus: float = 2, **resources: float) -> Any:
-    """A further node."""
     own = {"resources": resources} if resources else {}
     return _started(cluster, num_cpus=num_cpus, **own)
 

@@ -62,7 +62,6 @@ if __name__ == "__main__":
 
 @pytest.fixture
 def repository(tmp_path: Path, cluster: Any) -> Path:
-    """It knows where everything is."""
     folder = cluster.head_node.get_temp_dir_path()
     return write_repository(tmp_path / "repo", ENV.format(address=cluster.address, folder=folder))
 

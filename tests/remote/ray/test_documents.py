@@ -18,7 +18,6 @@ EXAMPLE = str(blocks.CHECKOUT / "examples" / "cartpole")
 
 
 def test_the_blocks_run(cluster: Any, tmp_path: Path) -> None:
-    """With the example for the repository that they name."""
     here = Path(__file__).relative_to(blocks.CHECKOUT).as_posix()
     ours = [one for one in blocks.tested(blocks.OWN) if one.listed(blocks.APART) == here]
     assert [one.language for one in ours] == ["sh", "python"]

@@ -130,7 +130,6 @@ def test_another_address_than_that_of_this_process_is_refused(
 
 
 def test_a_suite_keeps_its_server_between_its_tasks(cluster: Any) -> None:
-    """An evaluation closes each task before it opens the next."""
     with make_env(sample("many_tasks"), sandbox="ray", timeouts={"server_idle_s": 0.1}) as suites:
         seen = set()
         for env in list(next(iter(suites.values())).values())[:2]:

@@ -89,7 +89,6 @@ class Block:
 
     @property
     def way(self) -> str | None:
-        """How it is tested."""
         if self.listed(APART):
             return OWN
         if self.listed(NOT_EXECUTED):
@@ -97,7 +96,6 @@ class Block:
         return _EVERYWHERE.get(self.language) or TABLE.get((self.document, self.language))
 
     def listed(self, table: Mapping[tuple[str, str], str]) -> str | None:
-        """What a table says of it."""
         for (document, beginning), said in table.items():
             if document == self.document and self.text.startswith(beginning):
                 return said
@@ -105,7 +103,6 @@ class Block:
 
 
 def blocks() -> Iterator[Block]:
-    """Every block of every document."""
     for document in DOCUMENTS:
         text = (CHECKOUT / document).read_text()
         for language, code in re.findall(r"^```(\S*)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL):

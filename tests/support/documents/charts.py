@@ -54,13 +54,11 @@ class Plot:
 
 
 def document() -> str:
-    """What the page has to hold."""
     shown = {name: f"![{_told(plot)}](assets/{name}.svg)" for name, plot in plots().items()}
     return filled(DOCUMENT, **shown)
 
 
 def pictures() -> dict[Path, str]:
-    """What each picture has to hold."""
     return {ASSETS / f"{name}.svg": drawn(plot) for name, plot in plots().items()}
 
 

@@ -23,7 +23,6 @@ _CORPUS = "| Repositories | Number | Right | Missed | False |\n| --- | --- | ---
 
 
 def document() -> str:
-    """What the file has to hold."""
     rows = [
         f"| `{check.id}` | {check.severity.value} | {check.sentence} | {check.cure} |"
         for check in CHECKS.values()

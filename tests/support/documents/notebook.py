@@ -53,12 +53,10 @@ def _displayed(output: Any) -> dict[str, Any]:
 
 
 def _named(text: str) -> str:
-    """Without the machine's own path."""
     return text.replace(f"{CHECKOUT}/", "")
 
 
 def main() -> None:
-    """Execute it, and write it."""
     with tempfile.TemporaryDirectory() as folder:
         os.environ["IPYTHONDIR"] = folder
         notebook = executed()

@@ -30,7 +30,6 @@ _TITLE = "Shared options"
 
 
 def document() -> str:
-    """What the file has to hold."""
     commands = [*_commands()]
     counted = Counter(row for *_, rows in commands for row in rows)
     often = [row for row, count in counted.items() if count >= _SHARED and row[0][:2] == "--"]
@@ -123,7 +122,6 @@ class _Arguments:
         self.rows: list[Row] = []
 
     def add_argument(self, *names: str, **of: Any) -> None:
-        """As a parser has it."""
         if of["help"] == argparse.SUPPRESS:
             return
         # defaults that depend on the host are explained elsewhere

@@ -226,16 +226,12 @@ def _plain(line: str) -> str:
 
 
 def main() -> None:
-    """Run the commands, and draw."""
     said = command()
     with tempfile.TemporaryDirectory() as folder:
         shown, film = played(shlex.split(said), Path(folder))
         frames, fps = sheet(film)
     doctor = re.sub(r"Linux \S+", "Linux", printed(["doctor"]), count=1)
-    pictures = {
-        DOCUMENT: drawn(said, shown, frames, fps),
-        DOCTOR: still("envhub doctor", doctor),
-    }
+    pictures = {DOCUMENT: drawn(said, shown, frames, fps), DOCTOR: still("envhub doctor", doctor)}
     for document, text in pictures.items():
         assert len(text) < MAX_BYTES, len(text)
         document.write_text(text)

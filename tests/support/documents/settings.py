@@ -19,7 +19,6 @@ _UNITS = ((1 << 30, "GiB"), (1 << 20, "MiB"), (1 << 10, "KiB"))
 
 
 def document() -> str:
-    """What the file has to hold."""
     parts = ["## `make_env`\n", *_table(make_env, "Args", _arguments())]
     for kind in (Policy, Limits, Timeouts):
         summary = (inspect.getdoc(kind) or "").partition("\n\n")[0]

@@ -104,11 +104,7 @@ def executed(document: str) -> list[Block]:
 
 
 def execute(
-    blocks: Iterable[Block],
-    hub: StubHub,
-    folder: Path,
-    within: str = "",
-    docker: str = _DOCKER,
+    blocks: Iterable[Block], hub: StubHub, folder: Path, within: str = "", docker: str = _DOCKER
 ) -> str:
     """Execute blocks of shell and Python; returns what they print.
 

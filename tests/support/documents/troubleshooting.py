@@ -71,11 +71,7 @@ _PARTS = (
     ("Values", ("envhub_worker/protocol",), "values.md"),
     (
         "The command line",
-        (
-            "envhub_sandbox/cli",
-            "envhub_sandbox/check",
-            "envhub_sandbox/session/crash",
-        ),
+        ("envhub_sandbox/cli", "envhub_sandbox/check", "envhub_sandbox/session/crash"),
         "cli.md",
     ),
     ("Other libraries", ("envhub_sandbox/integrations",), "integrations.md"),
@@ -192,7 +188,6 @@ def messages() -> list[Message]:
 
 
 def of_source(source: str, place: str) -> Iterator[Message]:
-    """Those of one module."""
     reader, module = _Reader(), ast.parse(source)
     reader.note_functions(module)
     reader.visit(module)

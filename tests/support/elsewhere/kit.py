@@ -34,5 +34,4 @@ def ran(
 
 
 def elsewhere(system: str, program: str, *arguments: str | Path, **variables: str) -> str:
-    """What a program prints there."""
     return ran(system, "-c", program, *arguments, **variables).stdout

@@ -64,36 +64,30 @@ class FakeLane:
         self._bell: list[int] = []
 
     def answered(self) -> bool:
-        """Unless it is silent."""
         self.on_look()
         return not self.silent
 
     def sources(self) -> list[int]:
-        """A pipe."""
         self._bell = self._bell or list(os.pipe())
         self.listened = True
         self.on_listen()
         return [self._bell[0]]
 
     def ring(self) -> None:
-        """Make it readable, for ever."""
         self.sources()
         os.write(self._bell[1], b"!")
 
     def request(self, operation: str, messages: Sequence[m.Message]) -> Request:
-        """Ready to be sent."""
         frames = [m.pack(message) for message in messages]
         return Request(operation, messages, frames, [(0, NUM_ENVS)], plain=True)
 
     def send(self, request: Request) -> None:
-        """Owe an answer."""
         self._owe(request.messages[0])
 
     def expect_more(self) -> None:
         """It takes no more."""
 
     def send_step(self, actions: Any, *, ahead: bool = False) -> None:
-        """Owe a step."""
         self._owe(m.Step(self.number, np.array(actions)))
 
     def _owe(self, message: m.Message) -> None:
@@ -102,19 +96,16 @@ class FakeLane:
         self.owed = message
 
     def wait(self, deadline: Deadline) -> None:
-        """It is there."""
         if self.fails is not None:
             error, self.fails = self.fails, None
             raise error
         self.owed = None
 
     def result(self, infos: dict[Any, Any] | None = None) -> StepResult:
-        """Of one step."""
         no = np.zeros(self._count, np.bool_)
         return _observation(self._count), np.zeros(self._count), no, no, self.infos
 
     def replies(self, deadline: Deadline) -> list[m.Message]:
-        """The answer that is owed."""
         asked = self.owed
         self.wait(deadline)
         if isinstance(asked, m.Reset):
@@ -122,17 +113,14 @@ class FakeLane:
         return [self.answer]
 
     def catch_up(self, deadline: Deadline) -> None:
-        """Drop what is owed."""
         if isinstance(self.fails, WorkerTimeoutError):
             raise self.fails
         self.owed = None
 
     def traffic(self) -> tuple[int, int, int]:
-        """None."""
         return 0, 0, 0
 
     def close(self) -> None:
-        """Nothing is used any more."""
         self.closed = True
         while self._bell:
             os.close(self._bell.pop())

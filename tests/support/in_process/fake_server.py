@@ -31,7 +31,6 @@ class FakeServer:
         self._replies: dict[int, tuple[m.Message, list[Any]]] = {}
 
     def request(self, message: m.Message, *, deadline: Deadline) -> tuple[m.Message, list[Any]]:
-        """It agrees to everything."""
         return m.Done(), []
 
     def send(self, message: m.Message, payload: Frames = ()) -> int:
@@ -62,19 +61,15 @@ class FakeServer:
         return len(self._replies)
 
     def arrived(self, request_id: int) -> bool:
-        """Whether there is a reply."""
         return request_id in self._replies
 
     def peek(self, request_id: int) -> tuple[m.Message | None, list[Any]]:
-        """The reply, which stays."""
         return self._replies.get(request_id, (None, []))
 
     def forget(self, request_id: int) -> None:
-        """Drop it."""
         self._replies.pop(request_id, None)
 
     def receive(self, request_id: int, deadline: Deadline) -> tuple[m.Message, list[Any]]:
-        """The reply."""
         if request_id not in self._replies:
             raise WorkerTimeoutError("the worker did not answer in time")
         return self._replies.pop(request_id)

@@ -43,7 +43,6 @@ class RunnerHere:
 
 
 def main(folder: str) -> None:
-    """Play ten steps."""
     runner = RunnerHere(Path(folder))
     runner.manifest.action_space.seed(0)
     print(runner.ask(m.Reset(1, None, None, None)))

@@ -123,9 +123,7 @@ ATTACKS = {
     "raw_icmp": Attack(_NETWORK, "tried socket AF_INET", {"host": "127.0.0.1", **_WORD}),
     "reach_below": Attack(_FILES, "/proc/", {"folder": "/tmp", "name": "x"}),
     "reach_devices": Attack(
-        _FILES,
-        "write /dev/nvidia0",
-        {"nodes": ["/dev/nvidia0"], "folders": ["/sys/class/net"]},
+        _FILES, "write /dev/nvidia0", {"nodes": ["/dev/nvidia0"], "folders": ["/sys/class/net"]}
     ),
     "read_by_handle": Attack(
         _KERNEL, "tried open_by_handle_at", {"handle": "00" * 8, "kind": 1, "mounts": ["."]}
@@ -226,7 +224,6 @@ ENTRIES = {"sub_folder": ":envs-v1/pick-cube.py"}
 
 
 def failing(name: str) -> list[Finding]:
-    """What fails of a sample."""
     arguments = {"n_envs": 2, "timeouts": _TIMEOUTS}
     reference = f"{sample(name)}{ENTRIES.get(name, '')}"
     report = judge(JudgeOptions(reference=reference, arguments=arguments, steps=10, resets=2))

@@ -178,7 +178,6 @@ def _inspector(module: Any) -> Any:
 
 
 def _console() -> Any:
-    """Where rich prints."""
     return importlib.import_module("rich.console").Console(file=io.StringIO(), width=100)
 
 

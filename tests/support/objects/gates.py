@@ -71,7 +71,6 @@ class Gates:
         self.repository = write_repository(folder / "repository", text)
 
     def env(self, count: int = 1, **options: Any) -> Any:
-        """One more environment, after its reset."""
         policy = {"readable": [str(self._folder / "gates")], **options.pop("policy", {})}
         made = started(self.repository, count, policy=policy, **{**self._options, **options})
         return self._stack.enter_context(made)
@@ -83,11 +82,9 @@ class Gates:
 
 
 def send(env: Any, *gates: int, ids: Any = None, what: int = 0) -> None:
-    """Steps that wait for these."""
     env.send(np.array([[gate, what] for gate in gates]), ids)
 
 
 def ids(received: Any) -> list[int]:
-    """Whose results these are."""
     found: list[int] = received.env_ids.tolist()
     return found

@@ -87,7 +87,6 @@ class OwnArray(np.ndarray):
 
 
 def half(value: float) -> float:
-    """Half of it."""
     return value / 2
 
 

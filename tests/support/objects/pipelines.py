@@ -64,7 +64,6 @@ def changing(folder: Path, size: int) -> str:
 
 
 def one_by_one(env: Any) -> list[Any]:
-    """What each step gives, or raises."""
     return [_came(partial(env.step, some)) for part in _actions(env) for some in part]
 
 

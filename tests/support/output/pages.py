@@ -47,22 +47,18 @@ class Page(HTMLParser):
         self.close()
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        """As the parser calls it."""
         self.tags.append((tag, tuple(attrs)))
 
     def handle_data(self, data: str) -> None:
-        """As the parser calls it."""
         self.text += data
 
     def handle_comment(self, data: str) -> None:
-        """As the parser calls it."""
         self.tags.append(("!", ((data, None),)))
 
     handle_pi = handle_comment
 
     @property
     def names(self) -> set[str]:
-        """Which tags there are."""
         return {name for name, _ in self.tags}
 
 

@@ -29,7 +29,6 @@ def git(folder: Path, *arguments: str, given: str | None = None) -> str:
 
 
 def make_repository(folder: Path, files: Mapping[str, str]) -> str:
-    """Commit files, and return the commit."""
     for name, text in files.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text(text)

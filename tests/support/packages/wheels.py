@@ -121,11 +121,9 @@ class Index:
         return self._waiting.is_set()
 
     def let_go(self) -> None:
-        """Answer all again."""
         self._free.set()
 
     def page(self, name: str) -> bytes | None:
-        """The list of a package's files."""
         rows = []
         for path in sorted(self.folder.iterdir()):
             if path.name.split("-")[0].lower().replace("_", "-") == name:

@@ -43,9 +43,7 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
         terminalreporter.write_line(f"{number} skipped: {reason}")
 
 
-def by_reason(
-    reports: Iterable[pytest.TestReport | pytest.CollectReport],
-) -> dict[str, set[str]]:
+def by_reason(reports: Iterable[pytest.TestReport | pytest.CollectReport]) -> dict[str, set[str]]:
     """The skipped tests (or modules) of each reason; processes that say the same count once."""
     found: dict[str, set[str]] = defaultdict(set)
     for report in reports:
