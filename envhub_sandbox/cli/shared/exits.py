@@ -49,6 +49,7 @@ class Exit(IntEnum):
 
 EXIT_CODES = f"Exit codes: {'; '.join(f'{int(one)} {one.meaning}' for one in Exit)}."
 
+
 class UsageError(EnvHubError):
     """What was asked for cannot be; the text says what to ask for instead."""
 
