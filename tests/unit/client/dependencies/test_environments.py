@@ -172,7 +172,7 @@ def test_several_processes_make_it_once(index: Index, tmp_path: Path) -> None:
     make_wheel(index.folder, "wanted")
     folder = repository(tmp_path / "repo", "wanted")
     asked = []
-    for count in (1, 1, 3):  # the first one chooses versions as well
+    for count in (1, 1, 3):  # the first one chooses versions as well; three download what one does
         for env in environments.every():
             environments.remove(env)
             subprocess.run(["rm", "-r", str(tmp_path / "uv")], check=True)
