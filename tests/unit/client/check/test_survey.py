@@ -54,60 +54,72 @@ def found(folder: Path, data: bytes | str, name: str = "odd.py") -> list[tuple[s
     return [(one.id, one.line) for one in surveyed(local(folder)).findings if one.file == name]
 
 
-@pytest.mark.parametrize(
-    ("text", "check"),
-    [
-        ("from urllib import request", "source-network"),
-        ("import asyncio as a; a.open_connection('x', 1)", "source-network"),
-        ("import subprocess", "source-process"),
-        ("import os as harmless; harmless.system('x')", "source-process"),
-        ("from os import system as s; s('x')", "source-process"),
-        ("import os; run = os.popen", "source-process"),
-        ("import os; getattr(os, 'system')('x')", "source-process"),
-        ("import os; getattr(os, 'sys' + 'tem')('x')", "source-dynamic"),
-        ("\uff45\uff56\uff41\uff4c('1')", "source-dynamic"),
-        ("import importlib; importlib.import_module(x)", "source-dynamic"),
-        ("import builtins", "source-dynamic"),
-        ("import zipimport", "source-dynamic"),
-        ("import importlib.machinery as m; m.SourceFileLoader('x', 'x.txt')", "source-dynamic"),
-        ("import codecs; codecs.register(x)", "source-dynamic"),
-        ("import torch; torch.load('x')", "source-pickle"),
-        ("import numpy as np; np.load('x', allow_pickle=True)", "source-pickle"),
-        ("import ctypes", "source-native"),
-        ("open('/etc/passwd')", "source-outside"),
-        ("open('~/.ssh/id_rsa')", "source-outside"),
-        ("x['HF_TOKEN']", "source-outside"),
-        ("from pathlib import Path; Path.home()", "source-outside"),
-        ("x = '" + "QUJD" * 300 + "'", "source-obscure"),
-        ("x = 1" + " " * 3_000 + "; y = 2", "source-obscure"),
-        ("x = 'a\u202eb'", "source-hidden"),
-        ("# \u200b", "source-hidden"),
-        ("\u3164 = 1", "source-hidden"),
-        ("s\u0443stem = 1", "source-hidden"),
-        ("x = 1\ry = 2", "source-hidden"),
-        ("# \x1b[8m", "source-hidden"),
-    ],
-)
-def test_what_is_worth_a_look_is_found(text: str, check: str, tmp_path: Path) -> None:
+def of_each(folder: Path, texts: list[str]) -> dict[str, set[tuple[str, int]]]:
+    """The checks, with lines, of what is found in a file of each text."""
+    for number, text in enumerate(texts):
+        repository(folder, f"odd{number}.py", text)
+    told = surveyed(local(folder)).findings
+    return {
+        text: {(one.id, one.line) for one in told if one.file == f"odd{number}.py"}
+        for number, text in enumerate(texts)
+    }
+
+
+_WORTH_A_LOOK = [
+    ("from urllib import request", "source-network"),
+    ("import asyncio as a; a.open_connection('x', 1)", "source-network"),
+    ("import subprocess", "source-process"),
+    ("import os as harmless; harmless.system('x')", "source-process"),
+    ("from os import system as s; s('x')", "source-process"),
+    ("import os; run = os.popen", "source-process"),
+    ("import os; getattr(os, 'system')('x')", "source-process"),
+    ("import os; getattr(os, 'sys' + 'tem')('x')", "source-dynamic"),
+    ("\uff45\uff56\uff41\uff4c('1')", "source-dynamic"),
+    ("import importlib; importlib.import_module(x)", "source-dynamic"),
+    ("import builtins", "source-dynamic"),
+    ("import zipimport", "source-dynamic"),
+    ("import importlib.machinery as m; m.SourceFileLoader('x', 'x.txt')", "source-dynamic"),
+    ("import codecs; codecs.register(x)", "source-dynamic"),
+    ("import torch; torch.load('x')", "source-pickle"),
+    ("import numpy as np; np.load('x', allow_pickle=True)", "source-pickle"),
+    ("import ctypes", "source-native"),
+    ("open('/etc/passwd')", "source-outside"),
+    ("open('~/.ssh/id_rsa')", "source-outside"),
+    ("x['HF_TOKEN']", "source-outside"),
+    ("from pathlib import Path; Path.home()", "source-outside"),
+    ("x = '" + "QUJD" * 300 + "'", "source-obscure"),
+    ("x = 1" + " " * 3_000 + "; y = 2", "source-obscure"),
+    ("x = 'a\u202eb'", "source-hidden"),
+    ("# \u200b", "source-hidden"),
+    ("\u3164 = 1", "source-hidden"),
+    ("s\u0443stem = 1", "source-hidden"),
+    ("x = 1\ry = 2", "source-hidden"),
+    ("# \x1b[8m", "source-hidden"),
+]
+
+
+def test_what_is_worth_a_look_is_found(tmp_path: Path) -> None:
     """Each by its check alone, in its line; the line before is the control."""
-    assert set(found(tmp_path / "r", f"x = None\n{text}")) == {(check, 2)}
+    told = of_each(tmp_path / "r", [f"x = None\n{text}" for text, _ in _WORTH_A_LOOK])
+    assert told == {f"x = None\n{text}": {(check, 2)} for text, check in _WORTH_A_LOOK}
 
 
-@pytest.mark.parametrize(
-    "text",
-    [
-        "import os, re, math; re.compile('x'); model.compile(); os.path.join('a', 'b')",
-        "def f(eval=False, exec=None): return eval if exec else None",
-        "import numpy as np; np.load('x'); np.load('y', allow_pickle=False)",
-        "import torch; getattr(torch, name); getattr(self, 'system')",
-        "from . import subprocess",
-        '"""Reads /etc, and ~/.ssh, and so on."""',
-        "x = 'na\u00efve \u0441\u043b\u043e\u0432\u043e \u5f3a\u5316'\r\ny = 1\r\n",
-        "import os; getattr(os, 0x" + "f" * 900 + ")",  # which Python refuses to write out
-    ],
-)
-def test_honest_code_is_not_named(text: str, tmp_path: Path) -> None:
-    assert found(tmp_path / "r", text) == []
+_HONEST = [
+    "import os, re, math; re.compile('x'); model.compile(); os.path.join('a', 'b')",
+    "def f(eval=False, exec=None): return eval if exec else None",
+    "import numpy as np; np.load('x'); np.load('y', allow_pickle=False)",
+    "import torch; getattr(torch, name); getattr(self, 'system')",
+    "from . import subprocess",
+    '"""Reads /etc, and ~/.ssh, and so on."""',
+    "x = 'na\u00efve \u0441\u043b\u043e\u0432\u043e \u5f3a\u5316'\r\ny = 1\r\n",
+    "import os; getattr(os, 0x" + "f" * 900 + ")",  # which Python refuses to write out
+]
+
+
+def test_honest_code_is_not_named(tmp_path: Path) -> None:
+    """Names that look alike, and letters of other languages."""
+    named = {text: told for text, told in of_each(tmp_path / "r", _HONEST).items() if told}
+    assert named == {}
 
 
 @pytest.mark.parametrize(

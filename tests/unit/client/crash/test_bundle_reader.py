@@ -105,6 +105,7 @@ def test_a_bundle_comes_back(tmp_path: Path) -> None:
         (("label",), 5),
         (("task", "num_envs"), "2"),
         (("history", "requests", 1, "steps"), [0, 4]),
+        (("history", "requests", 1, "of"), "actions-float32.npy"),
         (("history", "requests"), []),
         (("history", "dropped"), True),
     ],

@@ -172,7 +172,7 @@ def test_several_processes_make_it_once(index: Index, tmp_path: Path) -> None:
     make_wheel(index.folder, "wanted")
     folder = repository(tmp_path / "repo", "wanted")
     asked = []
-    for count in (1, 1, 4):  # the first one chooses versions as well
+    for count in (1, 1, 3):  # the first one chooses versions as well; three download what one does
         for env in environments.every():
             environments.remove(env)
             subprocess.run(["rm", "-r", str(tmp_path / "uv")], check=True)
@@ -202,7 +202,7 @@ made(Path(sys.argv[1]))
 """
 
 
-@pytest.mark.parametrize("step", ["install", "compile", "publish"])
+@pytest.mark.parametrize("step", ["install", "publish"])
 def test_a_maker_that_is_killed_leaves_nothing_that_is_used(
     index: Index, tmp_path: Path, step: str
 ) -> None:

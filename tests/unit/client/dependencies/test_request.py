@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import datetime
 import json
+import os
 import platform
 import zipfile
 from importlib import metadata
@@ -184,6 +185,7 @@ def test_no_interpreter_is_an_error_that_says_what_to_do(
     (tmp_path / "versions/3.99.0/bin").mkdir(parents=True)
     (tmp_path / "versions/3.99.0/bin/python3").write_text("")
     monkeypatch.setenv("PYENV_ROOT", pyenv.format(tmp_path))
+    monkeypatch.setenv("PATH", os.path.dirname(interpreters.own().path))  # each there is asked
     with pytest.raises(InterpreterUnavailableError, match=r"uv python install"):
         interpreters.find(asked, declared)
 

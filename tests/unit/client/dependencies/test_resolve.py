@@ -89,6 +89,7 @@ def test_no_interpreter_of_somebody_elses_is_asked(
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     for target in (HERE, Target(version="3.12", machine="x86_64")):
         assert resolve("numpy", target=target).packages
+    monkeypatch.setenv("PATH", "/nowhere")  # each interpreter there would be asked
     with contextlib.suppress(DependencyError):
         interpreters.find("3.9.1")
     assert not (tmp_path / "asked").exists()

@@ -116,22 +116,24 @@ def writable(change: Damage) -> Damage:
     return lambda slot: (slot.tree.chmod(0o755), change(slot))
 
 
-EDIT: Damage = lambda slot: edit(slot.tree / "env.py", b"print(2)\n")  # noqa: E731
-REMOVE = writable(lambda slot: (slot.tree / "empty").unlink())
-LOSE_RECORD: Damage = lambda slot: slot.record.unlink()  # noqa: E731
+DAMAGE: dict[str, Damage] = {
+    "edit": lambda slot: edit(slot.tree / "env.py", b"print(2)\n"),
+    "remove": writable(lambda slot: (slot.tree / "empty").unlink()),
+    "lose the record": lambda slot: slot.record.unlink(),
+}
 
 
 @pytest.mark.parametrize(
     ("damage", "said"),
     [
-        (EDIT, r"'env\.py' was changed"),
-        (lambda slot: (EDIT(slot), REMOVE(slot)), r"'env\.py' was changed"),
+        (DAMAGE["edit"], r"'env\.py' was changed"),
+        (lambda slot: (DAMAGE["edit"](slot), DAMAGE["remove"](slot)), r"'env\.py' was changed"),
         (lambda slot: edit(slot.tree / "env.py", b"print(1)\n#"), r"'env\.py' was changed"),
         (
             writable(lambda slot: (slot.tree / "sitecustomize.py").write_bytes(b"")),
             r"'sitecustomize\.py' is extra",
         ),
-        (REMOVE, "'empty' is missing"),
+        (DAMAGE["remove"], "'empty' is missing"),
         (
             writable(
                 lambda slot: (
@@ -141,7 +143,7 @@ LOSE_RECORD: Damage = lambda slot: slot.record.unlink()  # noqa: E731
             ),
             r"'env\.py' is not a regular file",
         ),
-        (LOSE_RECORD, r"record\.json is missing"),
+        (DAMAGE["lose the record"], r"record\.json is missing"),
         (lambda slot: slot.record.write_text('{"format": 1, "files": [[1]]}'), "cannot be read"),
         (lambda slot: slot.record.write_text('{"format": 99, "files": []}'), "cannot be read"),
     ],
@@ -171,7 +173,7 @@ def test_damage_is_refused_with_the_command_that_repairs(
 @pytest.mark.parametrize(
     "damage",
     [
-        *(REMOVE, LOSE_RECORD, lambda slot: remove_tree(slot.tree)),
+        *(DAMAGE["remove"], DAMAGE["lose the record"], lambda slot: remove_tree(slot.tree)),
         lambda slot: (remove_tree(slot.home), slot.home.mkdir()),
     ],
     ids=["a file", "the record", "the tree", "all but the name"],

@@ -75,8 +75,11 @@ def test_an_interpreter_of_its_kind_fits() -> None:
         (replace(NEWER, version="3.99.0"), "which does not have it"),
     ],
 )
-def test_one_of_another_kind_does_not(theirs: interpreters.Interpreter, said: str) -> None:
+def test_one_of_another_kind_does_not(
+    theirs: interpreters.Interpreter, said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A wheel that was chosen for the one may crash in the other; the text has the other way."""
+    monkeypatch.setenv("PATH", "/nowhere")  # each interpreter there would be asked
     with pytest.raises(InterpreterUnavailableError, match=said) as caught:
         interpreter_fitting(theirs, declares())
     assert "envhub image build" in str(caught.value)
