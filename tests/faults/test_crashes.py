@@ -40,14 +40,15 @@ def play(env: Any, steps: int = 2000) -> errors.WorkerDiedError:
     pytest.fail("it does not die")
 
 
-SHARDS: list[tuple[int, int, Any]] = [
-    *((1, 1, "process"), (3, 1, "process"), (3, 2, "process")),
-    (3, 2, ["process", "process"]),
-]
-
-
-@pytest.mark.parametrize("lane", ["auto", "frames"])
-@pytest.mark.parametrize(("n_envs", "shards", "sandbox"), SHARDS)
+@pytest.mark.parametrize(
+    ("lane", "n_envs", "shards", "sandbox"),
+    [
+        ("auto", 1, 1, "process"),
+        ("auto", 3, 2, "process"),
+        ("frames", 3, 1, "process"),
+        ("frames", 3, 2, ["process", "process"]),
+    ],
+)
 def test_a_replay_dies_at_the_same_step(
     tmp_path: Path, lane: str, n_envs: int, shards: int, sandbox: Any
 ) -> None:
@@ -72,8 +73,7 @@ def test_a_replay_dies_at_the_same_step(
     assert error.log_tail in found["replayed"]["death"]["message"]
 
 
-@pytest.mark.parametrize("actions", ["dict", "text"])
-@pytest.mark.parametrize("ending", ["segfault", "memory"])
+@pytest.mark.parametrize(("actions", "ending"), [("dict", "memory"), ("text", "segfault")])
 def test_every_ending_and_every_action_comes_again(
     tmp_path: Path, actions: str, ending: str
 ) -> None:

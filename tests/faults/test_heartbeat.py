@@ -16,13 +16,12 @@ from tests.support.started import started
 
 
 @pytest.mark.usefixtures("neighbour")
-@pytest.mark.parametrize("lane", ["auto", "frames"])
 @pytest.mark.parametrize(
-    ("fault", "state", "there"),
+    ("fault", "state", "there", "lane"),
     [
-        ("cpu", "running", {psutil.STATUS_RUNNING}),
-        ("hang", "waiting", {psutil.STATUS_SLEEPING}),
-        ("stop", "stopped", {psutil.STATUS_STOPPED}),
+        ("cpu", "running", {psutil.STATUS_RUNNING}, "auto"),
+        ("hang", "waiting", {psutil.STATUS_SLEEPING}, "frames"),
+        ("stop", "stopped", {psutil.STATUS_STOPPED}, "auto"),
     ],
 )
 def test_timeout_tells_what_the_worker_does(

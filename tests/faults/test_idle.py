@@ -22,7 +22,9 @@ WORKING_S = 2.0
 
 pytestmark = pytest.mark.usefixtures("neighbour")
 lanes = pytest.mark.parametrize("lane", ["auto", "frames"])
-policies = pytest.mark.parametrize("restart", ["never", "transparent"])
+policies = pytest.mark.parametrize(
+    ("lane", "restart"), [("auto", "transparent"), ("frames", "never")]
+)
 
 
 @contextmanager
@@ -81,7 +83,6 @@ def works(env: Any, action: Any, enough: Callable[[], bool]) -> bool:
     return True
 
 
-@lanes
 @policies
 def test_idle_processes_end_and_a_reset_starts_others(lane: str, restart: str) -> None:
     """It is no death: no policy and no budget is asked, and the same seeds give the same."""
@@ -94,7 +95,6 @@ def test_idle_processes_end_and_a_reset_starts_others(lane: str, restart: str) -
         assert env.sandbox.stats()["deaths"] == env.sandbox.stats()["restarts"] == 0
 
 
-@lanes
 @policies
 def test_a_step_after_that_says_that_a_reset_is_needed(lane: str, restart: str) -> None:
     with made(lane, restart) as env:

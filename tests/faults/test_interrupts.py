@@ -316,10 +316,12 @@ OPERATIONS: dict[str, tuple[Event, Callable[[Any], object]]] = {
 }
 
 
-@lanes
 @pytest.mark.parametrize("before", [True, False], ids=["before", "after"])
-@pytest.mark.parametrize("operation", OPERATIONS)
-def test_closed_in_the_midst_says_closed(lane: str, before: bool, operation: str) -> None:
+@pytest.mark.parametrize(
+    ("operation", "lane"),
+    [*((one, "auto") for one in OPERATIONS), ("step", "frames"), ("late", "frames")],
+)
+def test_closed_in_the_midst_says_closed(operation: str, lane: str, before: bool) -> None:
     """A signal handler that closes while a request is on its way out, or looked after."""
     event, ask = OPERATIONS[operation]
     with begun(lane) as env:

@@ -90,15 +90,18 @@ def begun(lane: str = "auto", **options: Any) -> Iterator[Any]:
         yield suites.env
 
 
-@pytest.fixture(params=["auto", "frames"])
+@pytest.fixture
 def env(request: pytest.FixtureRequest) -> Iterator[Any]:
-    with begun(request.param) as found:
+    """The same, over either lane."""
+    with begun(getattr(request, "param", "auto")) as found:
         yield found
 
 
+both = pytest.mark.parametrize("env", ["auto", "frames"], indirect=True)
 lanes = pytest.mark.parametrize("lane", ["auto", "frames"])
 
 
+@both
 @pytest.mark.parametrize("how", [EXIT, KILL, CRASH])
 def test_the_dead_come_back_and_the_others_go_on(env: Any, how: int) -> None:
     """The rows of the dead are fresh and truncated, all others are what they would have been."""
@@ -119,6 +122,7 @@ def test_the_dead_come_back_and_the_others_go_on(env: Any, how: int) -> None:
     assert env.sandbox.stats()["deaths"] == env.sandbox.stats()["restarts"] == 1
 
 
+@both
 def test_next_step_resets_what_came_back_truncated(env: Any) -> None:
     """As after any truncation in this mode: the action after it resets, the next one counts."""
     beside = oracle()
@@ -145,10 +149,9 @@ def test_same_step_has_begun_the_next_episode(lane: str) -> None:
         assert np.array_equal(after[DEAD, 0], observation[DEAD, 0])
 
 
-@lanes
-def test_disabled_wants_a_reset_of_what_came_back(lane: str) -> None:
+def test_disabled_wants_a_reset_of_what_came_back() -> None:
     """A step is refused as after any episode's end, and a masked reset goes on with the others."""
-    with begun(lane, env_kwargs={"mode": "Disabled"}) as env:
+    with begun(env_kwargs={"mode": "Disabled"}) as env:
         assert env.step(LAST_DIES)[3].tolist() == [False, False, True, True]
         with pytest.raises(errors.RemoteEnvError):
             env.step(ALL_LIVE)
@@ -263,10 +266,9 @@ def test_a_masked_reset_brings_back_whom_it_does_not_name(env: Any) -> None:
     assert env.step(ALL_LIVE)[0][:, 1].tolist() == [2, 2, 1, 1]
 
 
-@lanes
-def test_who_dies_again_in_coming_back_is_dead(lane: str) -> None:
+def test_who_dies_again_in_coming_back_is_dead() -> None:
     """There is one attempt; afterwards it is dead as without it, and a reset starts afresh."""
-    with made(lane) as suites:
+    with made() as suites:
         env = suites.env
         with pytest.raises(errors.WorkerDiedError) as caught:
             env.reset(options={"exit": True})
@@ -343,9 +345,8 @@ def test_a_death_that_is_mended_is_logged(env: Any, caplog: pytest.LogCaptureFix
     assert "sub-environments [2, 3]" in told[0]
 
 
-@lanes
-def test_a_fresh_jail_has_no_attributes_of_the_last(lane: str) -> None:
-    with begun(lane, timeouts={"step_s": 0.05}) as env:
+def test_a_fresh_jail_has_no_attributes_of_the_last() -> None:
+    with begun(timeouts={"step_s": 0.05}) as env:
         env.set_attr("weight", 7)
         with pytest.raises(errors.WorkerTimeoutError):
             env.step([SPIN, LIVE, LIVE, LIVE])
@@ -358,6 +359,7 @@ def test_a_fresh_jail_has_no_attributes_of_the_last(lane: str) -> None:
             env.get_attr("weight")
 
 
+@both
 def test_a_death_between_requests_is_met_by_the_next(env: Any) -> None:
     """Killed from outside while nothing is asked: a call says so, a step brings it back."""
     victim = inside.pids(env)[1]
@@ -378,6 +380,7 @@ def test_a_reset_brings_back_who_died_between_requests(env: Any) -> None:
     assert restarted(info)
 
 
+@both
 def test_the_end_of_the_jail_takes_all_rows(env: Any) -> None:
     jail = inside.jail(env).number
     runners = inside.pids(env)
@@ -413,6 +416,7 @@ def test_the_cpu_limit_takes_one_process() -> None:
         assert restarted(info)
 
 
+@both
 def test_one_that_raises_beside_a_death_is_told_first(env: Any) -> None:
     with pytest.raises(errors.RemoteEnvError, match="as told"):
         env.step([LIVE, RAISE, LIVE, EXIT])
@@ -420,6 +424,7 @@ def test_one_that_raises_beside_a_death_is_told_first(env: Any) -> None:
     assert restarted(env.step(ALL_LIVE)[4])
 
 
+@both
 def test_a_late_sibling_is_a_timeout_all_the_same(env: Any) -> None:
     with halted(inside.pids(env)[:1]):
         env.step_async([LIVE, LIVE, LIVE, EXIT])
@@ -437,10 +442,9 @@ def test_a_slow_sibling_is_waited_for(env: Any) -> None:
     assert truncated.tolist() == [False, False, True, True]
 
 
-@lanes
-def test_budget_ends_in_the_death_itself(lane: str) -> None:
+def test_budget_ends_in_the_death_itself() -> None:
     """When all restarts are used up a death is told as it is, with the reason for staying dead."""
-    with made(lane, policy={"restart_budget": 1}) as suites:
+    with made(policy={"restart_budget": 1}) as suites:
         env = suites.env
         env.reset()
         env.step(LAST_DIES)

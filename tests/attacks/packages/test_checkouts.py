@@ -32,6 +32,7 @@ def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> GitRepository:
 
 
 def watched(repository: GitRepository, program: Path) -> list[str]:
+    """Git asks it what has changed."""
     repository.git("config", "core.fsmonitor", str(program))
     return ["ls-files", "--modified"]
 

@@ -36,19 +36,19 @@ def test_nothing_of_ours_has_the_token(arena: Arena, hub_token: str) -> None:
 
     A worker is executed afresh, and never forked off the client.
     """
+    assert hub_token in os.environ.values()
+    read = 0
+    for process in psutil.Process().children(recursive=True):
+        with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # it has ended meanwhile
+            assert hub_token not in Path(f"/proc/{process.pid}/environ").read_text()
+            read += 1
+    assert read >= 2  # of the fresh server and its zygote, at least
     with arena.environment() as env:
         env.reset()
         jail = OpenJail(arena, env)
         jail.steal("find the token in the environment", "environment", hub_token)
         more = {"prefix": "hf_canary_", "secret": hub_token}
         jail.steal("find the token in memory", "own_memory", hub_token, **more)
-        assert hub_token in os.environ.values()
-        read = 0
-        for process in psutil.Process().children(recursive=True):
-            with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # it has ended
-                assert hub_token not in Path(f"/proc/{process.pid}/environ").read_text()
-                read += 1
-        assert read >= 2  # of the fresh server and its zygote, at least
 
 
 @pytest.mark.parametrize(

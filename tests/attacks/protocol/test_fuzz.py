@@ -29,7 +29,7 @@ from tests.support import inside
 ROOT = Path(__file__).parents[3]
 EXAMPLES = 100
 SEED = 1
-MANY = 2000
+MANY = 600
 KINDS = {
     "LoadDone",
     "BuildDone",

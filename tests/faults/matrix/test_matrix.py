@@ -87,7 +87,7 @@ def _make(cell: Cell, repository: Path) -> Any:
         policy={"restart": "on_reset"},
         limits=_limits(row.fault),
         timeouts=Timeouts(
-            startup_s=3.0 if hangs else _WAIT_S,
+            startup_s=5.0 if hangs else _WAIT_S,
             reset_s=_WAIT_S,
             step_s=_WAIT_S,
             call_s=_WAIT_S,
