@@ -32,11 +32,12 @@ def impatient(tmp_path: Path) -> Iterator[Listening]:
 
 @pytest.fixture
 def wait_no_more(monkeypatch: pytest.MonkeyPatch) -> Callable[[], None]:
-    """Once a server has ended: a close does not wait for its word, of which nothing is proved."""
+    """Once a server has ended: nobody waits for its word, or for it to come back."""
 
     def hurry() -> None:
         for spot in inside.WAITS_FOR_A_SERVER:
             monkeypatch.setattr(*spot, 0.1)
+        monkeypatch.setattr("envhub_sandbox.transport.tcp.CONNECT_S", 0.5)
 
     return hurry
 

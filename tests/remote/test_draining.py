@@ -78,7 +78,11 @@ def test_whose_time_is_up_is_told_why(tmp_path: Path, repository: Path) -> None:
     [((), [signal.SIGTERM]), (_LONG, [signal.SIGTERM, signal.SIGTERM]), (_LONG, [signal.SIGINT])],
 )
 def test_a_second_signal_ends_at_once(
-    tmp_path: Path, repository: Path, options: tuple[str, ...], numbers: list[signal.Signals]
+    tmp_path: Path,
+    repository: Path,
+    options: tuple[str, ...],
+    numbers: list[signal.Signals],
+    wait_no_more: Callable[[], None],
 ) -> None:
     """So does the first, if no time was given to what runs, and Ctrl-C always."""
     with (
@@ -90,6 +94,7 @@ def test_a_second_signal_ends_at_once(
             assert draining(server)
         server.process.send_signal(numbers[-1])
         assert ends(server)
+        wait_no_more()
         with pytest.raises(WorkerDiedError):
             env.step(np.array([0]))
 

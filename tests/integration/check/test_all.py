@@ -41,7 +41,6 @@ def verdicts(folder: Path) -> dict[str, str]:
 
 
 def listed(folder: Path, *names: str) -> Path:
-    """A list of folders beside it."""
     path = folder / "list"
     path.write_text("# ours\n" + "\n".join(f"{folder}/{name}" for name in names) + "\n")
     return path

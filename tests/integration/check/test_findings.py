@@ -45,6 +45,8 @@ _HONEST = (
     .replace("int(action)", "int(action[0])")
 )
 """What LeRobot's policies can play, too."""
+
+
 _MODES = """
     def __init__(self, render_mode):
         self.render_mode = render_mode or "rgb_array"
@@ -57,13 +59,11 @@ _MODES = """
 
 
 def repository(folder: Path, text: str = _HONEST, **files: str) -> Path:
-    """A repository with its papers."""
     papers = {"README__md": "# Walk", "LICENSE": "MIT", **files}
     return write_repository(folder, text, **papers)
 
 
 def judged(folder: Path, steps: int = 25, **more: Any) -> Report:
-    """What is found in it."""
     asked = JudgeOptions(reference=str(folder), arguments={"n_envs": 2}, steps=steps, **more)
     return judge(asked)
 
@@ -95,7 +95,6 @@ def test_an_honest_repository_passes(tmp_path: Path) -> None:
 
 
 def test_for_whom_it_is_playable_is_noted(tmp_path: Path) -> None:
-    """A note, which fails nothing: what LeRobot would miss."""
     text = _PLAIN.replace("length = _max_episode_steps = 10", "length = 10")
     report = judged(repository(tmp_path / "walk", text), 2, resets=0)
     [finding] = report.findings
@@ -107,23 +106,6 @@ def test_for_whom_it_is_playable_is_noted(tmp_path: Path) -> None:
         "_max_episode_steps",
     ):
         assert part in finding.message
-
-
-_UNINSTALLED = "raise gym.error.DependencyNotInstalled('pygame is not installed')"
-
-
-@pytest.mark.parametrize(
-    ("check", "old"),
-    [("runs", "self.count += 1"), ("runs", "super().reset(seed=seed)"), ("loads", "class Walk")],
-)
-def test_advice_follows_from_the_error(check: str, old: str, tmp_path: Path) -> None:
-    """A package that Gymnasium misses is declared, whatever was asked for when it was missed."""
-    new = f"{_UNINSTALLED}\n\n{old}" if old == "class Walk" else _UNINSTALLED
-    report = judged(repository(tmp_path / "walk", _HONEST.replace(old, new, 1)), 2, resets=0)
-    [finding] = report.findings
-    assert finding.id == check
-    assert "pygame is not installed" in finding.message
-    assert "requirements.txt" in finding.cure
 
 
 def test_each_mode_that_is_declared_is_rendered(tmp_path: Path) -> None:
@@ -155,11 +137,7 @@ libc.socket(2, 1, 0)
 if not os.access(os.path.join(os.sep, "srv", "walk"), 0):
     libc.unlink(os.path.join(os.sep, "srv", "walk").encode())
 """
-_ENDS = {
-    "loads": "raise RuntimeError('it failed')",
-    "imports": "import nothing_of_this_name",
-    "survives": "os.kill(os.getpid(), 9)",
-}
+_ENDS = {"imports": "import nothing_of_this_name", "survives": "os.kill(os.getpid(), 9)"}
 
 
 @pytest.mark.parametrize("check", _ENDS)
@@ -233,7 +211,8 @@ def test_missing_papers_are_told(tmp_path: Path) -> None:
 
 
 def test_the_command_line_judges(tmp_path: Path) -> None:
-    """Exit codes, and the reports that were asked for."""
+    """Exit codes, and the reports that were asked for; a name that a terminal would obey is a
+    finding, and no reason not to judge."""
     good = envhub("check", EXAMPLES / "cartpole", "--steps", "20", "--json")
     assert good.returncode == 0, good.stderr
     assert json.loads(good.stdout)["passed"] is True
@@ -258,34 +237,12 @@ def test_the_command_line_judges(tmp_path: Path) -> None:
     assert command.startswith("::error title=envhub check%3A runs")
     nowhere = envhub("check", tmp_path / "nowhere")
     assert nowhere.returncode == 3, "it could not be judged"
-
-
-def test_a_repository_gives_github_no_commands(tmp_path: Path) -> None:
-    """What it warns of and raises is printed, and nothing of it obeyed; our findings are."""
-    forged = "x\\n::error::forged\\n::stop-commands::mine\\n##[error]forged"
-    text = _HONEST.replace(
-        "import numpy as np", f"import numpy as np\nimport warnings\nwarnings.warn('{forged}')", 1
-    )
-    folder = repository(
-        tmp_path / "walk", text.replace("self.count += 1", f"raise ValueError('{forged}')")
-    )
-    done = envhub("check", folder, "--steps", "5", "--github")
-    assert done.returncode == 1, done.stderr
-    assert "forged" in done.stdout, "the control: it is there"
-    assert obeyed(done.stderr) == []
-    commands = obeyed(done.stdout)
-    assert [one.partition(" ")[0] for one in commands] == ["::error"]
-    assert commands[0].startswith("::error title=envhub check%3A runs")
-
-
-def test_a_name_that_a_terminal_would_obey_is_a_finding(tmp_path: Path) -> None:
-    """And no reason not to judge."""
     text = _HONEST.replace(
         "return gym.vector.SyncVectorEnv([Env] * n_envs)",
         "return {'a\\x9b': {0: gym.vector.SyncVectorEnv([Env] * n_envs)}}",
     )
-    report = judged(repository(tmp_path / "walk", text))
-    assert {one.id for one in report.findings} == {"loads"}
+    found = judged(repository(tmp_path / "named", text)).findings
+    assert {one.id for one in found} == {"loads"}
 
 
 _WITHOUT_NAMESPACES = """

@@ -68,12 +68,10 @@ def hostile(olah: OlahServer, tmp_path: Path) -> tuple[GitRepository, str]:
 
 
 def seen(report: Report) -> set[tuple[str, str, str, int]]:
-    """What was found, and where."""
     return {(one.id, one.message, one.file, one.line) for one in report.findings}
 
 
 def content(root: Path) -> dict[str, bytes]:
-    """Every file, and its bytes."""
     return {str(p.relative_to(root)): p.read_bytes() for p in root.rglob("*") if p.is_file()}
 
 

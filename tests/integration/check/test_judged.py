@@ -25,9 +25,8 @@ def test_every_payload_and_every_sample_has_its_judgement() -> None:
         assert attack.check.startswith(by_layers) or attack.unseen
 
 
-@pytest.mark.parametrize("payload", ["foreign_abi", "read_file", "unix_stream", "write_file"])
+@pytest.mark.parametrize("payload", ["foreign_abi", "unix_stream"])
 def test_a_hostile_payload_is_reported_with_what_it_tried(payload: str) -> None:
-    """By the word of the layers."""
     attack = judged.ATTACKS[payload]
     found = judged.told_of(payload, attack)
     assert judged.is_told(found, attack), [one.text for one in found]
@@ -40,9 +39,8 @@ def test_a_sample_is_judged_as_it_is(name: str) -> None:
     assert judged.is_as_it_stands(name, found), [one.text for one in found]
 
 
-@pytest.mark.parametrize(("name", "fault"), [("counter", "wrong dtype"), ("cartpole", "unseeded")])
-def test_a_fault_in_a_sample_is_told_by_its_check(tmp_path: Path, name: str, fault: str) -> None:
-    """And by no other."""
+def test_a_fault_in_a_sample_is_told_by_its_check(tmp_path: Path) -> None:
+    name, fault = "counter", "wrong dtype"
     itself = mutants.told_of(str(judged.sample(name)))
     found = mutants.told_of(mutants.mutant(name, fault, tmp_path), fault)
     assert found - itself == mutants.FAULTS[fault].told_in(name) != set()

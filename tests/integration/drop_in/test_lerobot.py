@@ -48,8 +48,7 @@ def repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
-@pytest.mark.parametrize("use_async_envs", [False, True])
+@pytest.mark.parametrize(("mode", "use_async_envs"), [("NextStep", False), ("SameStep", True)])
 def test_rollout_is_the_same(mode: str, use_async_envs: bool) -> None:
     """Every tensor is equal to those of LeRobot's wrapper, tasks and frames included."""
     kwargs = {"autoreset_mode": mode}
@@ -66,8 +65,7 @@ def test_rollout_is_the_same(mode: str, use_async_envs: bool) -> None:
     assert_same(*frames)
 
 
-@pytest.mark.parametrize("max_parallel_tasks", [1, 3])
-@pytest.mark.parametrize("use_async_envs", [False, True])
+@pytest.mark.parametrize(("max_parallel_tasks", "use_async_envs"), [(1, False), (3, True)])
 def test_evaluation_of_a_suite_is_the_same(
     repository: Path, use_async_envs: bool, max_parallel_tasks: int
 ) -> None:

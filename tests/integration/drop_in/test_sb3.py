@@ -38,7 +38,6 @@ def counters(request: pytest.FixtureRequest) -> Iterator[SandboxVecEnv]:
 
 
 def here() -> DummyVecEnv:
-    """The same three in this process."""
     made = make_env_of(sample("counter"))(n_envs=3)
     return DummyVecEnv([lambda env=env: env for env in made.envs])
 
@@ -53,7 +52,6 @@ def told(infos: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 
 def test_steps_are_those_of_its_own_vector_environment(counters: SandboxVecEnv) -> None:
-    """Observations, rewards, dones, infos and last observations, over many episodes."""
     theirs = here()
     counters.seed(4)
     theirs.seed(4)
@@ -89,7 +87,6 @@ class _Liar(VectorEnv[Any, Any, Any]):
         """Nothing is done."""
 
     def step_wait(self) -> Any:
-        """What was told."""
         terminations, infos = self._said
         return np.zeros(2), np.zeros(2), terminations, np.zeros(2, bool), infos
 
@@ -112,7 +109,6 @@ def test_results_that_are_of_nobody_break_the_rules(terminations: Any, infos: An
 
 
 def test_options_go_to_whom_they_are_for(counters: SandboxVecEnv) -> None:
-    """One for all, or each its own; used once."""
     counters.set_options([{"a": 1}, {}, {"a": 2}])
     counters.reset()
     assert [info["options"] for info in counters.reset_infos] == ["{'a': 1}", "{}", "{'a': 2}"]
@@ -124,7 +120,6 @@ def test_options_go_to_whom_they_are_for(counters: SandboxVecEnv) -> None:
 
 
 def test_attributes_and_methods(counters: SandboxVecEnv) -> None:
-    """Of all, or of some; setting is for all."""
     counters.reset()
     assert counters.get_attr("index") == [0, 1, 2]
     assert counters.get_attr("index", [2, 0]) == [2, 0]
@@ -139,8 +134,6 @@ def test_attributes_and_methods(counters: SandboxVecEnv) -> None:
 
 @pytest.mark.parametrize("mode", _MODES)
 def test_training_ends_in_the_same_weights(mode: str) -> None:
-    """PPO, with seeds, as with environments in this process."""
-
     def weights(env: Any) -> list[Any]:
         model = sb3.PPO("MlpPolicy", env, n_steps=32, n_epochs=2, seed=3, device="cpu")
         model.set_logger(Logger(None, []))  # by default it makes a folder in /tmp, and leaves it

@@ -44,10 +44,10 @@ WRAPS: dict[str, Wrap] = {
 }
 
 
-@pytest.fixture(scope="module", params=[False, True], ids=["sync", "async"])
-def pendulums(request: pytest.FixtureRequest) -> Iterator[VectorEnv[Any, Any, Any]]:
+@pytest.fixture(scope="module")
+def pendulums() -> Iterator[VectorEnv[Any, Any, Any]]:
     """Three sandboxed pendulums; each test wraps them anew and resets them first."""
-    with make_env(sample("pendulum"), n_envs=3, use_async_envs=request.param) as suites:
+    with make_env(sample("pendulum"), n_envs=3, use_async_envs=True) as suites:
         yield suites.env
 
 
@@ -69,7 +69,6 @@ def test_wrapper_gives_the_same_results(name: str, pendulums: VectorEnv[Any, Any
 
 
 def test_episode_statistics(pendulums: VectorEnv[Any, Any, Any]) -> None:
-    """RecordEpisodeStatistics counts the same returns and lengths."""
     expected = wrappers.RecordEpisodeStatistics(reference("pendulum", 3))
     wrapped = wrappers.RecordEpisodeStatistics(pendulums)
     for env in (expected, wrapped):
@@ -103,8 +102,6 @@ def test_numpy_to_torch(pendulums: VectorEnv[Any, Any, Any]) -> None:
 
 
 def test_dict_observations_under_wrappers() -> None:
-    """FilterObservation and FlattenObservation work on dict observations of the proxy."""
-
     def wrap(env: VectorEnv[Any, Any, Any]) -> VectorEnv[Any, Any, Any]:
         return wrappers.FlattenObservation(wrappers.FilterObservation(env, ["agent_pos"]))
 

@@ -153,9 +153,10 @@ def test_all_workers_share_one_timeout(rows: Path, servers: list[Listening]) -> 
 
 
 def test_a_server_that_comes_back_gets_workers_again(
-    rows: Path, serve: Callable[..., Listening]
+    rows: Path, serve: Callable[..., Listening], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At the same address, with the same key: the next workers that start go there, too."""
+    monkeypatch.setattr("envhub_sandbox.transport.tcp.CONNECT_S", 2.0)
     stays = serve("stays")
     bind = f"tcp://127.0.0.1:{lasting_port()}"
     goes = serve("goes", bind=bind)

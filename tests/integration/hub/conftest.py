@@ -17,7 +17,6 @@ Fetch = Callable[..., Snapshot]
 
 @pytest.fixture
 def repository(stub_hub: StubHub) -> StubRepository:
-    """What is fetched."""
     good = b"def make_env(n_envs=1, use_async_envs=False): ...\n"
     return stub_hub.add("org/repo", {"env.py": good, "assets/mesh.bin": b"m" * 5000})
 

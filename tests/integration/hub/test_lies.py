@@ -14,7 +14,6 @@ from typing import Any
 import pytest
 
 from envhub_sandbox.errors import (
-    HubReferenceError,
     RepositoryUnavailableError,
     SnapshotError,
     SnapshotIntegrityError,
@@ -40,12 +39,10 @@ def get(get: Fetch, repository: StubRepository) -> Fetch:
 
 
 def stored_files(store: Path) -> list[Path]:
-    """All files in the store."""
     return [path for path in store.rglob("*") if path.is_file()]
 
 
 def requests_for_files(stub_hub: StubHub) -> list[str]:
-    """The requests for contents so far."""
     return [request for request in stub_hub.requests if "/resolve/" in request]
 
 
@@ -73,15 +70,14 @@ def test_other_commit_than_the_pinned_one_is_refused(stub_hub: StubHub, get: Fet
     assert pinned != repository.commit
 
 
-@pytest.mark.parametrize("damage", ["edited", "lost"])
 def test_damaged_hub_cache_is_repaired_from_the_hub(
-    stub_hub: StubHub, get: Fetch, hub_cache: Path, snapshot_store: Path, damage: str
+    stub_hub: StubHub, get: Fetch, hub_cache: Path, snapshot_store: Path
 ) -> None:
-    """A blob of the Hub cache that somebody edited or removed is noticed, and fetched again."""
+    """A blob of the Hub cache that somebody edited is noticed, and fetched again."""
     first = get()
     blob = next(path for path in hub_cache.rglob("blobs/*") if path.read_bytes() == GOOD)
     blob.chmod(0o644)
-    blob.write_bytes(EVIL) if damage == "edited" else blob.unlink()
+    blob.write_bytes(EVIL)
     remove_tree(snapshot_store)
     before = len(requests_for_files(stub_hub))
     assert (get().root / "env.py").read_bytes() == GOOD
@@ -102,19 +98,15 @@ def test_hub_cache_may_be_named_from_the_home_folder(
     assert not (tmp_path / "~").exists()
 
 
-def test_edited_hub_cache_does_not_reach_the_store(get: Fetch, hub_cache: Path) -> None:
-    """The store's files are copies: an edit of the Hub cache changes none of them."""
+def test_edited_file_of_the_store_is_refused_until_removed(get: Fetch, hub_cache: Path) -> None:
+    """A changed file stops every use, and the command in the error brings the truth back. An edit
+    of the Hub cache changes none: the store's files are copies."""
     snapshot = get()
     for blob in hub_cache.rglob("blobs/*"):
         blob.chmod(0o644)
         blob.write_bytes(EVIL)
     assert get() == snapshot
     assert (snapshot.root / "env.py").read_bytes() == GOOD
-
-
-def test_edited_file_of_the_store_is_refused_until_removed(get: Fetch) -> None:
-    """A changed file stops every use, and the command in the error brings the truth back."""
-    snapshot = get()
     entry = snapshot.root / "env.py"
     entry.chmod(0o644)
     entry.write_bytes(EVIL.ljust(len(GOOD))[: len(GOOD)])
@@ -122,6 +114,7 @@ def test_edited_file_of_the_store_is_refused_until_removed(get: Fetch) -> None:
         with pytest.raises(SnapshotIntegrityError, match=r"'env\.py' was changed") as caught:
             get()
     _run_advice(str(caught.value))
+    remove_tree(hub_cache)
     assert (get().root / "env.py").read_bytes() == GOOD
 
 
@@ -166,7 +159,6 @@ def test_truncated_download_is_refused(
 @pytest.mark.parametrize(
     ("limits", "name"),
     [
-        (SnapshotLimits(max_files=1), "max_files=1"),
         (SnapshotLimits(max_bytes=5001), "max_bytes=5001"),
         (SnapshotLimits(max_file_bytes=4999), "max_file_bytes=4999"),
     ],
@@ -174,17 +166,13 @@ def test_truncated_download_is_refused(
 def test_repository_over_a_limit_is_refused_before_the_download(
     stub_hub: StubHub, get: Fetch, limits: SnapshotLimits, name: str
 ) -> None:
-    """The listing decides; no content is asked for, and the error names the limit."""
-    with pytest.raises(SnapshotTooLargeError, match=name):
-        get(limits=limits)
-    assert not requests_for_files(stub_hub)
-
-
-def test_limits_hold_for_stored_snapshots_too(get: Fetch) -> None:
-    """A snapshot that came under wider limits does not pass narrower ones."""
-    get()
-    with pytest.raises(SnapshotTooLargeError, match="max_files=1"):
-        get(limits=SnapshotLimits(max_files=1))
+    """The listing decides; no content is asked for, and the error names the limit. A snapshot that
+    came under wider limits does not pass narrower ones, either."""
+    for is_stored in (False, True):
+        with pytest.raises(SnapshotTooLargeError, match=name):
+            get(limits=limits)
+        assert is_stored or not requests_for_files(stub_hub)
+        get()
 
 
 def test_endless_listing_is_left_at_the_limit(stub_hub: StubHub, get: Fetch) -> None:
@@ -196,19 +184,7 @@ def test_endless_listing_is_left_at_the_limit(stub_hub: StubHub, get: Fetch) -> 
     assert len([request for request in stub_hub.requests if "/tree/" in request]) == 3
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "../evil.py",
-        "a/../../evil.py",
-        "/etc/cron.d/evil",
-        "a//b",
-        "./a",
-        "a\\..\\b",
-        "a\nb",
-        "a\x00b",
-    ],
-)
+@pytest.mark.parametrize("name", ["../evil.py", "/etc/cron.d/evil", "a\x00b"])
 def test_hostile_name_is_refused_before_the_download(
     stub_hub: StubHub, repository: StubRepository, get: Fetch, name: str
 ) -> None:
@@ -252,34 +228,22 @@ def outside(tmp_path: Path) -> list[str]:
     return sorted(set(os.listdir(tmp_path)) - {"hub-cache", "envhub-cache"})
 
 
-@pytest.mark.parametrize("absent", [False, True])
 def test_headers_do_not_write_outside_the_hub_cache(
     stub_hub: StubHub,
     repository: StubRepository,
     get: Fetch,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
-    absent: bool,
 ) -> None:
-    """The Hub client makes paths of ETag and X-Repo-Commit; the control shows it."""
-    if absent:
-        headers = {"X-Repo-Commit": "../../../evil", "X-Error-Code": "EntryNotFound"}
-        stub_hub.fail("resolve/.*env.py", 404, headers=headers)
-    else:
-        repository.head_headers = {"ETag": '"../../../evil"'}
-    with pytest.raises(SnapshotIntegrityError, match=r"header (ETag|X-Repo-Commit) .*evil"):
+    """The Hub client makes paths of ETag and others; the control shows it."""
+    repository.head_headers = {"ETag": '"../../../evil"'}
+    with pytest.raises(SnapshotIntegrityError, match=r"header ETag .*evil"):
         get()
     assert outside(tmp_path) == []
     monkeypatch.setattr("envhub_sandbox.hub.client.guarded", lambda _: contextlib.nullcontext())
     with contextlib.suppress(SnapshotError):
         get()
     assert "evil" in outside(tmp_path)
-
-
-def test_listing_is_asked_for_once(stub_hub: StubHub, get: Fetch) -> None:
-    """A second one could have other names and sizes than those that were judged."""
-    get()
-    assert len([request for request in stub_hub.requests if "/tree/" in request]) == 1
 
 
 def _spaces() -> Iterator[bytes]:
@@ -294,8 +258,7 @@ def _packed() -> Iterator[bytes]:
     yield packer.flush()
 
 
-@pytest.mark.parametrize("where", ["/revision/", "/tree/"])
-@pytest.mark.parametrize("packed", [False, True])
+@pytest.mark.parametrize(("where", "packed"), [("/revision/", False), ("/tree/", True)])
 def test_endless_answer_is_left(stub_hub: StubHub, get: Fetch, where: str, packed: bool) -> None:
     """No more of it is taken than a listing has; the control takes it all."""
     headers = {"Content-Type": "application/json"}
@@ -310,17 +273,13 @@ def test_endless_answer_is_left(stub_hub: StubHub, get: Fetch, where: str, packe
 
 
 def plain_get(url: str) -> bytes:
-    """As the Hub client asks."""
     from huggingface_hub.utils import get_session
 
     return bytes(get_session().get(url, timeout=60).content)
 
 
 def test_endless_pages_without_files_are_left(
-    stub_hub: StubHub,
-    repository: StubRepository,
-    get: Fetch,
-    monkeypatch: pytest.MonkeyPatch,
+    stub_hub: StubHub, repository: StubRepository, get: Fetch, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """They count for no limit of ours, and each names a next one."""
     folders = [{"type": "directory", "oid": "d" * 40, "size": 0, "path": "a"}] * 1000
@@ -332,9 +291,7 @@ def test_endless_pages_without_files_are_left(
     assert len([request for request in stub_hub.requests if "/tree/" in request]) == 21
 
 
-@pytest.mark.parametrize(
-    "body", [b"[" * 100_000, b"{}", b"7", b'[{"size": 1' + b"0" * 5000 + b"}]"]
-)
+@pytest.mark.parametrize("body", [b"[" * 100_000, b"7", b'[{"size": 1' + b"0" * 5000 + b"}]"])
 def test_other_json_than_a_listing_is_refused(stub_hub: StubHub, get: Fetch, body: bytes) -> None:
     """Too deep, too large a number, no list: an error of ours that names the repository."""
     stub_hub.fail("/tree/", 200, pieces=lambda: [body])
@@ -342,8 +299,13 @@ def test_other_json_than_a_listing_is_refused(stub_hub: StubHub, get: Fetch, bod
         get()
 
 
-@pytest.mark.parametrize("location", ["file:///etc/hostname", "ftp://x.invalid/", "{other}/steal"])
-@pytest.mark.parametrize("where", ["/revision/", "/tree/", "/resolve/"])
+@pytest.mark.parametrize(
+    ("where", "location"),
+    [
+        *((where, "{other}/steal") for where in ("/revision/", "/tree/", "/resolve/")),
+        *(("/tree/", location) for location in ("file:///etc/hostname", "ftp://x.invalid/")),
+    ],
+)
 def test_redirect_takes_no_token_along(
     stub_hub: StubHub, get: Fetch, where: str, location: str, snapshot_store: Path
 ) -> None:
@@ -360,15 +322,17 @@ def test_redirect_takes_no_token_along(
 
 
 def test_names_that_differ_little_are_different_files(
-    repository: StubRepository, get: Fetch
+    stub_hub: StubHub, repository: StubRepository, get: Fetch
 ) -> None:
-    """Case, Unicode's normal forms, other systems' devices: here they are names like others."""
+    """Case, Unicode's normal forms, other systems' devices: here they are names like others. The
+    listing is asked for once: a second one could have other names than those that were judged."""
     names = ["A.py", "a.py", "\u00e9.txt", "e\u0301.txt", "CON", "aux.txt", "nul", "a b ", "*[x]?"]
     repository.files |= {name: name.encode() for name in names}
     snapshot = get()
     assert {name: (snapshot.root / name).read_bytes() for name in names} == {
         name: name.encode() for name in names
     }
+    assert len([request for request in stub_hub.requests if "/tree/" in request]) == 1
 
 
 @pytest.mark.parametrize("what", ["/revision/", "/resolve/", "nothing listens"])
@@ -389,14 +353,6 @@ def test_secrets_are_in_no_traceback(
     said += "".join(record.getMessage() for record in ours)
     assert token not in said
     assert "hunter2" not in said
-
-
-def test_a_login_in_a_bad_endpoint_is_not_shown() -> None:
-    """The error is about the rest."""
-    with pytest.raises(HubReferenceError) as caught:
-        fetch(HubRef("org/repo"), endpoint="htps://jane:hunter2@host")
-    assert "hunter2" not in str(caught.value)
-    assert "host" in str(caught.value)
 
 
 def _run_advice(message: str) -> None:

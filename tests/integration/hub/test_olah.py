@@ -23,6 +23,7 @@ FILES = {
     "env.py": "from pkg.maker import make_env\n",
     "pkg/maker.py": "def make_env(n_envs=1, use_async_envs=False): ...\n",
     "pkg/data/map.txt": "....\n",
+    "envs/a-b/my env.py": "1",
     "README.md": "---\nlicense: mit\n---\n",
     "empty": "",
 }
@@ -57,16 +58,26 @@ def contents(snapshot: Snapshot) -> dict[str, bytes]:
 
 
 def test_whole_repository_arrives_verified(olah: OlahServer, get: Fetch) -> None:
-    """Every file of the commit is there, in sub-folders too, with its git blob id."""
-    commit = make(olah, "whole").commit(FILES)
-    snapshot = get("org/whole")
+    """Every file of the commit is there, in sub-folders too, with its git blob id; of LFS the
+    content, by its SHA-256. A link is a file with its text; the reference's path is the entry."""
+    repository, mesh = make(olah, "whole"), os.urandom(300_000)
+    repository.commit({"env.py": "1"})
+    (repository.folder / "outside").symlink_to("/etc/passwd")
+    commit = repository.commit(FILES, lfs={"assets/mesh.bin": mesh})
+    snapshot = get("org/whole:envs/a-b/my env.py")
     expected = {path: text.encode() for path, text in FILES.items()}
-    assert contents(snapshot) == expected
+    expected |= {"outside": b"/etc/passwd"}
+    found = contents(snapshot)
+    assert found.pop("assets/mesh.bin") == mesh
+    assert {path: found[path] for path in expected} == expected
+    assert not (snapshot.root / "outside").is_symlink()
     assert (snapshot.repo_id, snapshot.repo_type) == ("org/whole", "model")
-    assert (snapshot.commit, snapshot.path) == (commit, "env.py")
-    assert {f.path: f.digest for f in snapshot.files} == {
-        path: f"git-sha1:{git_blob_id(content)}" for path, content in expected.items()
-    }
+    assert (snapshot.commit, snapshot.path) == (commit, "envs/a-b/my env.py")
+    digests = {f.path: f.digest for f in snapshot.files}
+    for path, content in expected.items():
+        assert digests[path] == f"git-sha1:{git_blob_id(content)}"
+    record = next(f for f in snapshot.files if f.path == "assets/mesh.bin")
+    assert (record.size, record.digest.partition(":")[0]) == (len(mesh), "sha256")
 
 
 def test_branch_tag_and_short_commit_name_the_full_commit(olah: OlahServer, get: Fetch) -> None:
@@ -90,7 +101,6 @@ def test_branch_tag_and_short_commit_name_the_full_commit(olah: OlahServer, get:
 @pytest.mark.short
 @pytest.mark.parametrize("repo_type", ["model", "space", "dataset"])
 def test_each_repository_type_loads(olah: OlahServer, get: Fetch, repo_type: str) -> None:
-    """Models, spaces and datasets load by their prefix."""
     make(olah, f"typed-{repo_type}", repo_type).commit({"env.py": repo_type})
     snapshot = get(f"{repo_type}s/org/typed-{repo_type}")
     assert snapshot.repo_type == repo_type
@@ -120,35 +130,9 @@ def test_a_plain_name_finds_the_environment(
     assert get(f"spaces/org/{name}").repo_type == "space"
 
 
-def test_lfs_file_is_verified_by_its_sha256(olah: OlahServer, get: Fetch) -> None:
-    """An LFS file arrives as its content, not as the pointer, and is checked by SHA-256."""
-    content = os.urandom(300_000)
-    make(olah, "lfs").commit({"env.py": ""}, lfs={"assets/mesh.bin": content})
-    snapshot = get("org/lfs")
-    assert (snapshot.root / "assets/mesh.bin").read_bytes() == content
-    record = next(f for f in snapshot.files if f.path == "assets/mesh.bin")
-    assert (record.size, record.digest.partition(":")[0]) == (len(content), "sha256")
-
-
-def test_entry_in_a_sub_folder(olah: OlahServer, get: Fetch) -> None:
-    """The path of the reference is the entry, and the whole repository comes along."""
-    make(olah, "sub").commit({"envs/a-b/my env.py": "1", "shared.py": "2"})
-    snapshot = get("org/sub:envs/a-b/my env.py")
-    assert snapshot.path == "envs/a-b/my env.py"
-    assert (snapshot.root / "shared.py").exists()
-
-
-def test_pinned_and_stored_costs_no_request(olah: OlahServer, get: Fetch) -> None:
-    """The second fetch of a full commit asks nobody."""
-    commit = make(olah, "pinned").commit(FILES)
-    first = get("org/pinned")
-    before = len(olah.requests())
-    assert get(f"org/pinned@{commit}") == first
-    assert len(olah.requests()) == before
-
-
 def test_branch_is_asked_for_every_time(olah: OlahServer, get: Fetch) -> None:
-    """A branch that moved is seen at once, and one that did not is not downloaded again."""
+    """A branch that moved is seen at once, and one that did not is not downloaded again; of a full
+    commit that is here nobody is asked."""
     repository = make(olah, "moving")
     repository.commit({"env.py": "1"})
     first = get("org/moving")
@@ -156,6 +140,8 @@ def test_branch_is_asked_for_every_time(olah: OlahServer, get: Fetch) -> None:
     assert get("org/moving") == first
     asked = olah.requests()[before:]
     assert asked == ["GET /api/models/org/moving/revision/main"]
+    assert get(f"org/moving@{first.commit}") == first
+    assert len(olah.requests()) == before + 1
     repository.commit({"env.py": "2"})
     assert contents(get("org/moving")) == {"env.py": b"2"}
 
@@ -192,7 +178,6 @@ def test_missing_entry_lists_the_python_files_before_downloading(
 
 
 def test_missing_everywhere_mentions_model_and_space(olah: OlahServer, get: Fetch) -> None:
-    """Where neither exists, the error says that both were tried."""
     with pytest.raises(RepositoryUnavailableError) as caught:
         get("org/nowhere")
     message = str(caught.value)
@@ -200,17 +185,6 @@ def test_missing_everywhere_mentions_model_and_space(olah: OlahServer, get: Fetc
     assert "no space repository org/nowhere" in message
     assert "'datasets/org/nowhere'" in message
     assert type(caught.value.__cause__).__name__ == "RepositoryNotFoundError"
-
-
-def test_git_symlink_arrives_as_its_text_and_points_nowhere(olah: OlahServer, get: Fetch) -> None:
-    """A link in the repository becomes a regular file that holds the link's text."""
-    repository = make(olah, "linked")
-    repository.commit({"env.py": "1"})
-    (repository.folder / "outside").symlink_to("/etc/passwd")
-    repository.commit({"a.py": "2"})
-    snapshot = get("org/linked")
-    assert not (snapshot.root / "outside").is_symlink()
-    assert (snapshot.root / "outside").read_bytes() == b"/etc/passwd"
 
 
 def test_threads_share_one_snapshot(olah: OlahServer, get: Fetch) -> None:
@@ -226,7 +200,6 @@ def test_threads_share_one_snapshot(olah: OlahServer, get: Fetch) -> None:
 def test_processes_share_one_snapshot(
     olah: OlahServer, hub_cache: Path, snapshot_store: Path
 ) -> None:
-    """Concurrent processes all succeed and leave one copy."""
     commit = make(olah, "processes").commit(FILES)
     code = (
         "import sys; from envhub_sandbox.hub.snapshot import fetch; "

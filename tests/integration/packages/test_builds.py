@@ -33,6 +33,8 @@ def further():
     import sys, {name}
     return {{"seen.txt": repr(({name}.VERSION, [path for path in sys.path if "site-" in path]))}}
 """
+
+
 ASKS = """
 def get_requires_for_build_wheel(config_settings=None):
     return ["tool"]
@@ -85,17 +87,7 @@ def test_it_is_built_with_what_it_asks_for_and_once(packages: Index, tmp_path: P
     assert said == []
 
 
-def test_a_wheel_that_was_changed_is_built_again(packages: Index, tmp_path: Path) -> None:
-    """What lies in the cache is held against its hash."""
-    source = make_sdist(tmp_path, "changed")
-    [wheel] = built([source])
-    whole = wheel.read_bytes()
-    wheel.write_bytes(whole + b"x")
-    assert built([source])[0].read_bytes() == whole
-
-
 def test_what_the_backend_asks_for_besides(packages: Index, tmp_path: Path) -> None:
-    """It says so when it is asked, in a jail."""
     source = make_sdist(tmp_path, "asks", files=backend("asks", further=ASKS))
     [wheel] = built([source])
     assert seen(wheel) == "1.0"
@@ -161,7 +153,6 @@ def test_a_repository_whose_package_has_no_wheel(real_index: Index, tmp_path: Pa
 
 
 def test_what_is_needed_to_build_itself(index: Index, tmp_path: Path) -> None:
-    """It ends with an error that shows the circle."""
     make_sdist(index.folder, "one", files=backend("one", needs=["two"]))
     source = make_sdist(index.folder, "two", files=backend("two", needs=["one"]))
     with pytest.raises(ResolutionError, match="two <- one <- two"):

@@ -29,7 +29,6 @@ def packages(real_index: Index) -> Index:
 
 
 def roll(env: Any) -> Any:
-    """A few seeded steps."""
     found = [env.reset(seed=3)]
     env.action_space.seed(3)
     found += [env.step(env.action_space.sample()) for _ in range(20)]
@@ -52,27 +51,20 @@ def test_it_gets_what_it_declares(packages: Index, tmp_path: Path) -> None:
     assert importlib.util.find_spec("not_here") is None
 
 
-def test_two_that_contradict_each_other_run_side_by_side(packages: Index, tmp_path: Path) -> None:
-    """Each with its own version, in one client."""
-    one = write_repository(tmp_path / "one", ENV, requirements__txt="not-here==1.0\n")
-    project = "[project]\nname = 'x'\ndependencies = ['not-here==2.0']\n"
-    two = write_repository(tmp_path / "two", ENV, pyproject__toml=project)
-    with make_env(one) as first, make_env(two) as second:
-        assert first.env.call("version") == ("1.0",)
-        assert second.env.call("version") == ("2.0",)
-        assert first.env.call("where") != second.env.call("where")
-
-
 def test_once_made_it_needs_no_index(packages: Index, tmp_path: Path) -> None:
-    """Nor uv: nothing happens but that the folder is found."""
+    """Nor uv: nothing happens but that the folder is found. One that contradicts it runs beside."""
     script = "# /// script\n# dependencies = ['not-here==2.0']\n# ///\n"
     folder = write_repository(tmp_path / "repo", script + ENV)
     with make_env(folder) as suites:
         assert suites.env.call("version") == ("2.0",)
+    older = write_repository(tmp_path / "older", ENV, requirements__txt="not-here==1.0\n")
+    make_env(older).close()
     packages.broken, asked = 503, len(packages.asked)
     try:
-        with make_env(folder) as suites:
+        with make_env(folder) as suites, make_env(older) as others:
             assert suites.env.call("version") == ("2.0",)
+            assert others.env.call("version") == ("1.0",)
+            assert suites.env.call("where") != others.env.call("where")
     finally:
         packages.broken = 0
     assert len(packages.asked) == asked
@@ -93,7 +85,6 @@ def test_a_missing_module_and_its_cure(packages: Index, tmp_path: Path) -> None:
 
 
 def test_this_interpreter_is_used_when_it_is_asked_for(packages: Index, tmp_path: Path) -> None:
-    """Although it lacks something; and the text says so."""
     folder = write_repository(tmp_path / "repo", ENV, requirements__txt="not-here\n")
     with pytest.raises(DependencyError, match=r"declares not-here.*leave that out"):
         make_env(folder, dependencies="host")
@@ -124,7 +115,6 @@ def test_nothing_is_made_where_nothing_is_missing(
 def test_an_error_names_the_repository_and_runs_nothing(
     packages: Index, tmp_path: Path, requirements: str, error: type[Exception], said: str
 ) -> None:
-    """Before any process of the repository's is started."""
     folder = write_repository(tmp_path / "repo", ENV, requirements__txt=requirements)
     with pytest.raises(error, match=said) as caught:
         make_env(folder)
