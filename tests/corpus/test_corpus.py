@@ -1,7 +1,6 @@
 """``envhub check`` finds the one fault of each repository, and nothing in the honest ones.
 
-What stands with an entry is in the table of ``docs/checks.md``. Here at least one fault of
-each kind is judged, and half of the honest ones; ``python -m tests.corpus`` judges all.
+What stands with an entry is in the table of ``docs/checks.md``; here each is judged.
 """
 
 from __future__ import annotations
@@ -30,23 +29,8 @@ _ELSEWHERE = {
 """Checks that need more than a folder, and what tests them."""
 
 
-def _kind(entry: Entry) -> object:
-    """What finds its fault, and in which way it is judged."""
-    return entry.told, entry.group, entry.also, entry.found, *entry.settings, *entry.arguments
-
-
-_ONE_OF_EACH = {_kind(entry): name for name, entry in reversed(FAULTS.items())}
-_MORE = (
-    *("several modes of rendering", "Blackjack, a tuple", "reset by its user"),
-    *("a cache that grows", "a rendering that is not there", "no Python", "a class returned"),
-    *("an end in an array", "infos that are None", "no last observation"),
-)
-"""They come to code of the checks to which no other of their kind comes."""
-_JUDGED = dict.fromkeys((*list(HONEST)[::2], *reversed(_ONE_OF_EACH.values()), *_MORE))
-
-
 @pytest.mark.filterwarnings("ignore::envhub_sandbox.errors.RemoteEnvWarning")
-@pytest.mark.parametrize("name", _JUDGED)
+@pytest.mark.parametrize("name", _ENTRIES)
 def test_it_is_judged_as_it_stands(name: str, tmp_path: Path) -> None:
     entry = _ENTRIES[name]
     found = entry.judged(tmp_path)
