@@ -10,6 +10,7 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from envhub_sandbox import SandboxEnv
+from envhub_sandbox.errors import LoadError
 from tests.support.samples import EXAMPLES
 
 pytestmark = pytest.mark.same_for("users")
@@ -38,6 +39,8 @@ def test_gymnasium_makes_it_by_its_id() -> None:
         assert env.reset(seed=1)[0] in env.observation_space
         env.close()
         env.close()
+        with pytest.raises(LoadError, match="make_env takes no render_mode"):  # it is handed on
+            gym.make(_ID, ref=str(EXAMPLES / "cartpole"), render_mode="rgb_array")
         envs = gym.make_vec(_ID, num_envs=3, ref=str(EXAMPLES / "cartpole"))
         assert envs.reset(seed=1)[0].shape == (3, 4)
         envs.close()
