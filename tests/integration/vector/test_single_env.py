@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import warnings
 
 import gymnasium as gym
+import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
@@ -24,11 +26,15 @@ def _quiet() -> None:
 
 
 def test_gymnasiums_own_check_passes() -> None:
-    """As for an environment that its author wrote here; a notebook shows its spaces."""
+    """As for an environment that its author wrote here; a notebook shows its spaces, and its
+    copy plays the same."""
     html = "_repr_html_"
     with contextlib.closing(SandboxEnv(EXAMPLES / "cartpole")) as env:
         check_env(env)
         assert "Discrete(2)" in getattr(env, html)()
+        with contextlib.closing(copy.deepcopy(env)) as twin:
+            assert np.array_equal(env.reset(seed=3)[0], twin.reset(seed=3)[0])
+            assert env.step(1)[1:] == twin.step(1)[1:]
 
 
 def test_gymnasium_makes_it_by_its_id() -> None:
