@@ -120,6 +120,15 @@ def test_failures_have_a_code_and_a_message(
     assert "Traceback" not in done.stderr
 
 
+def test_stopping_early_is_said(tmp_path: Path) -> None:
+    """An environment that never ends can be tried with ``--steps``."""
+    folder = one_env(tmp_path / "one", "return 0, 1.0, False, False, {}")
+    done = envhub("run", folder, "--steps", "20")
+    assert done.returncode == 0
+    assert "0 (stopped)" in done.stdout
+    assert "stopped by --steps" in done.stderr
+
+
 def test_a_repository_that_does_not_load(tmp_path: Path) -> None:
     folder = write_repository(tmp_path / "bad", "import this_is_not_installed\n")
     done = envhub("run", folder)
