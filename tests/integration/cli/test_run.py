@@ -189,6 +189,18 @@ def test_prints_stay_off_stdout_without_a_sandbox(tmp_path: Path) -> None:
     assert "printed by a child" in done.stderr
 
 
+def test_output_and_life_of_a_jail_go_where_they_are_wanted(tmp_path: Path) -> None:
+    """Its output to a file, ``--verbose`` to stderr; the bundle of a death is for programs, too."""
+    dies = ("--env-kwargs", "moment=step", "--env-kwargs", "fault=exit")
+    kept = ("--worker-output", tmp_path / "worker.log", "--verbose", "--json")
+    done = envhub("run", sample("faulty"), *dies, *kept)
+    assert done.returncode == 5
+    assert (tmp_path / "worker.log").read_text() == "about to exit\n"
+    assert "opened" in done.stderr
+    assert "closes" in done.stderr
+    assert (Path(json.loads(done.stdout)["error"]["bundle"]) / "bundle.json").exists()
+
+
 def test_diff_compares_spaces_where_that_is_asked_for(tmp_path: Path) -> None:
     """Without ``--run`` nothing is known of them."""
     old = write_repository(tmp_path / "old", CARTPOLE)
