@@ -329,6 +329,14 @@ class TestWhatGoesWrong:
             make_env(folder)
         assert "broken" in str(caught.value)
 
+    def test_remote_traceback_is_text(self, tmp_path: Path) -> None:
+        """What the repository raised comes with its line and its traceback, as text."""
+        body = "def make_env(**k):\n    return deep()\ndef deep():\n    raise KeyError('oh')\n"
+        with pytest.raises(LoadError, match=r"(?s)KeyError.*line 4, in deep\n.*oh") as caught:
+            make_env(write_repository(tmp_path / "repo", body))
+        assert isinstance(caught.value.__cause__, KeyError)
+        assert "line 2, in make_env" in vars(caught.value)["__notes__"][0]
+
     def test_an_interpreter_without_our_packages_is_a_missing_dependency(
         self, tmp_path: Path
     ) -> None:
