@@ -42,9 +42,13 @@ def stub_hub() -> Iterator[StubHub]:
 
 @pytest.fixture
 def snapshot_store(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty store of snapshots (``$ENVHUB_CACHE``), and no token of the developer's."""
+    """An empty store of snapshots (``$ENVHUB_CACHE``), and no token of the developer's.
+
+    Nor is the developer's Hub cache a command's: two runs would wait for each other's locks there.
+    """
     store = tmp_path / "envhub-cache"
     monkeypatch.setenv("ENVHUB_CACHE", str(store))
+    monkeypatch.setenv("HF_HUB_CACHE", str(tmp_path / "hub-of-commands"))
     for name in ("HF_TOKEN", "HUGGING_FACE_HUB_TOKEN", "HF_ENDPOINT", "HF_HUB_OFFLINE"):
         monkeypatch.delenv(name, raising=False)
     return store

@@ -120,6 +120,15 @@ def test_failures_have_a_code_and_a_message(
     assert "Traceback" not in done.stderr
 
 
+def test_stopping_early_is_said(tmp_path: Path) -> None:
+    """An environment that never ends can be tried with ``--steps``."""
+    folder = one_env(tmp_path / "one", "return 0, 1.0, False, False, {}")
+    done = envhub("run", folder, "--steps", "20")
+    assert done.returncode == 0
+    assert "0 (stopped)" in done.stdout
+    assert "stopped by --steps" in done.stderr
+
+
 def test_a_repository_that_does_not_load(tmp_path: Path) -> None:
     folder = write_repository(tmp_path / "bad", "import this_is_not_installed\n")
     done = envhub("run", folder)
@@ -178,6 +187,18 @@ def test_prints_stay_off_stdout_without_a_sandbox(tmp_path: Path) -> None:
     json.loads(done.stdout)
     assert "printed by Python" in done.stderr
     assert "printed by a child" in done.stderr
+
+
+def test_output_and_life_of_a_jail_go_where_they_are_wanted(tmp_path: Path) -> None:
+    """Its output to a file, ``--verbose`` to stderr; the bundle of a death is for programs, too."""
+    dies = ("--env-kwargs", "moment=step", "--env-kwargs", "fault=exit")
+    kept = ("--worker-output", tmp_path / "worker.log", "--verbose", "--json")
+    done = envhub("run", sample("faulty"), *dies, *kept)
+    assert done.returncode == 5
+    assert (tmp_path / "worker.log").read_text() == "about to exit\n"
+    assert "opened" in done.stderr
+    assert "closes" in done.stderr
+    assert (Path(json.loads(done.stdout)["error"]["bundle"]) / "bundle.json").exists()
 
 
 def test_diff_compares_spaces_where_that_is_asked_for(tmp_path: Path) -> None:

@@ -18,7 +18,7 @@ from gymnasium.vector import VectorEnv
 
 from envhub_sandbox import make_env
 from envhub_sandbox.cli.shared.exits import Exit, code_for
-from envhub_sandbox.errors import DependencyError, EnvHubError, LoadError
+from envhub_sandbox.errors import DependencyError, EnvHubError, LoadError, PolicyError
 from tests.support.compare import assert_same
 from tests.support.repositories import CARTPOLE, CARTPOLES, STILL, write_repository
 from tests.support.samples import make_env_of, reference, sample
@@ -329,6 +329,14 @@ class TestWhatGoesWrong:
             make_env(folder)
         assert "broken" in str(caught.value)
 
+    def test_remote_traceback_is_text(self, tmp_path: Path) -> None:
+        """What the repository raised comes with its line and its traceback, as text."""
+        body = "def make_env(**k):\n    return deep()\ndef deep():\n    raise KeyError('oh')\n"
+        with pytest.raises(LoadError, match=r"(?s)KeyError.*line 4, in deep\n.*oh") as caught:
+            make_env(write_repository(tmp_path / "repo", body))
+        assert isinstance(caught.value.__cause__, KeyError)
+        assert "line 2, in make_env" in vars(caught.value)["__notes__"][0]
+
     def test_an_interpreter_without_our_packages_is_a_missing_dependency(
         self, tmp_path: Path
     ) -> None:
@@ -343,6 +351,12 @@ class TestWhatGoesWrong:
         assert str(sample("cartpole")) in str(caught.value)
         assert code_for(caught.value) == Exit.LOAD
         assert not crashes.exists()
+
+    def test_a_granted_path_that_is_not_there_is_refused(self, tmp_path: Path) -> None:
+        """Before anything is started; one that is there is not."""
+        with pytest.raises(PolicyError, match="there is no such file or folder"):
+            make_env(sample("echo"), policy={"readable": (str(tmp_path / "missing"),)})
+        make_env(sample("echo"), policy={"readable": (str(tmp_path),)}).close()
 
     def test_input_gets_end_of_file(self) -> None:
         with pytest.raises(LoadError, match="EOFError"):

@@ -151,6 +151,9 @@ def test_an_id_that_is_not_there(packages: Index) -> None:
     assert "CartPole" not in str(caught.value)
     with pytest.raises(LoadError, match="registers no environment with Gymnasium"):
         make_env("pypi:no-envs#Walled/Maze-v2")
+    with pytest.raises(LoadError, match=r"gymnasium [\d.]+ registers no environment") as caught:
+        make_env("pypi:gymnasium#CartPole-v9")  # whose ids are there from the start
+    assert "CartPole-v1" in str(caught.value)
 
 
 def test_a_package_or_version_that_is_not_there(packages: Index) -> None:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import contextlib
+import copy
 import warnings
 
 import gymnasium as gym
+import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
 from envhub_sandbox import SandboxEnv
+from envhub_sandbox.errors import LoadError
 from tests.support.samples import EXAMPLES
 
 pytestmark = pytest.mark.same_for("users")
@@ -23,11 +26,15 @@ def _quiet() -> None:
 
 
 def test_gymnasiums_own_check_passes() -> None:
-    """As for an environment that its author wrote here; a notebook shows its spaces."""
+    """As for an environment that its author wrote here; a notebook shows its spaces, and its
+    copy plays the same."""
     html = "_repr_html_"
     with contextlib.closing(SandboxEnv(EXAMPLES / "cartpole")) as env:
         check_env(env)
         assert "Discrete(2)" in getattr(env, html)()
+        with contextlib.closing(copy.deepcopy(env)) as twin:
+            assert np.array_equal(env.reset(seed=3)[0], twin.reset(seed=3)[0])
+            assert env.step(1)[1:] == twin.step(1)[1:]
 
 
 def test_gymnasium_makes_it_by_its_id() -> None:
@@ -38,6 +45,8 @@ def test_gymnasium_makes_it_by_its_id() -> None:
         assert env.reset(seed=1)[0] in env.observation_space
         env.close()
         env.close()
+        with pytest.raises(LoadError, match="make_env takes no render_mode"):  # it is handed on
+            gym.make(_ID, ref=str(EXAMPLES / "cartpole"), render_mode="rgb_array")
         envs = gym.make_vec(_ID, num_envs=3, ref=str(EXAMPLES / "cartpole"))
         assert envs.reset(seed=1)[0].shape == (3, 4)
         envs.close()
