@@ -48,7 +48,9 @@ def make_env_of(folder: Path) -> Callable[..., Any]:
         module = types.ModuleType(package)
         module.__path__ = [str(folder)]
         sys.modules[package] = module
-    entry = importlib.import_module(f"{package}.env")
+    with pytest.MonkeyPatch.context() as patch:  # a repository in which bytecode lies is refused
+        patch.setattr(sys, "dont_write_bytecode", True)
+        entry = importlib.import_module(f"{package}.env")
     make_env: Callable[..., Any] = entry.make_env
     return make_env
 
