@@ -50,7 +50,7 @@ with_summary() {
 
 # The attacks on jails, and the tests of what confines, is confined and installed: for these it matters who
 # runs them. What the client makes of hostile answers (tests/attacks/client) is the same for everybody.
-differs_by_user=(tests/attacks/{files,kernel,network,output,packages,processes,protocol,resources,runner}
+differs_by_user=(tests/attacks/{files,kernel,network,output,packages,processes,resources,protocol,runner}
   tests/integration/{confinement,lifecycle,loading,packages})
 
 # processes: for tests that start much and wait for it: half as many again as there are cores, which
