@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from typing import Any
 
 import psutil
+import pytest
 
 _SOON = {"health_check_period_ms": 1000, "health_check_failure_threshold": 4}
 """For Ray to see that a node has gone; by itself it takes three times as long."""
@@ -26,16 +27,20 @@ def cluster_of(*nodes: dict[str, Any]) -> Iterator[Any]:
     from ray.cluster_utils import Cluster
 
     folder = tempfile.mkdtemp(prefix="ray-", dir="/tmp")  # short: it holds sockets
+    # Ray's Cluster writes its address below the default folder, which it does not make
+    os.mkdir(os.path.join(folder, "ray"))
     found = Cluster()
-    try:
-        own = {"temp_dir": folder, "include_dashboard": False, "_system_config": _SOON}
-        _started(found, num_cpus=0, **own)
-        for node in nodes:
-            add_node(found, **node)
-        yield found
-    finally:
-        found.shutdown()
-        shutil.rmtree(folder, ignore_errors=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("RAY_TMPDIR", folder)
+        try:
+            own = {"temp_dir": folder, "include_dashboard": False, "_system_config": _SOON}
+            _started(found, num_cpus=0, **own)
+            for node in nodes:
+                add_node(found, **node)
+            yield found
+        finally:
+            found.shutdown()
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def add_node(cluster: Any, num_cpus: float = 2, **resources: float) -> Any:
