@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import socket
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from time import monotonic
@@ -131,15 +131,15 @@ class Fleet(Sandbox):
     name = "fleet"
 
     def __post_init__(self) -> None:
-        if not isinstance(self.places, (str, os.PathLike, Sequence)):
+        if not isinstance(self.places, (os.PathLike, Iterable)):
             raise PolicyError(
                 f"a fleet's places are {self.places!r}; they are a list of places, a file with one "
                 "on each line, or dns://HOST:PORT"
             )
         known = {one.name for one in fields(RemoteSandbox) if one.init} - {"endpoint"}
-        if unknown := sorted(set(self.remote) - known):
+        if unknown := sorted(map(repr, set(self.remote) - known)):
             raise PolicyError(
-                f"a fleet's remote has {', '.join(map(repr, unknown))}; RemoteSandbox takes "
+                f"a fleet's remote has {', '.join(unknown)}; RemoteSandbox takes "
                 f"{', '.join(sorted(known))}"
             )
 

@@ -53,7 +53,7 @@ def test_a_fleet_is_no_place_of_another(tmp_path: Path) -> None:
         (None, {}, "places are None"),
         (3, {}, "places are 3"),
         (["tcp://a:1"], {"server": "x"}, "'server'.*server_key"),
-        (["tcp://a:1"], {"endpoint": "tcp://b:1"}, "'endpoint'"),
+        (["tcp://a:1"], {"endpoint": "tcp://b:1", 1: 2}, "'endpoint', 1;"),
     ],
 )
 def test_what_is_no_fleet_says_what_is_one(places: Any, remote: Any, said: str) -> None:
