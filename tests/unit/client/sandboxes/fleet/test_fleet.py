@@ -78,6 +78,7 @@ def test_places_stand_in_a_list_a_text_or_a_file(tmp_path: Path) -> None:
     """In their order, also twice; behind an address its key. Comments and empty lines are none."""
     given = ["tcp://a:1", PROCESS, "tcp://a:1"]
     assert PlaceList(given).read() == given
+    assert PlaceList(Fleet(dict.fromkeys(given)).places).read() == ["tcp://a:1", PROCESS]
     assert PlaceList("tcp://a:1, process,").read() == ["tcp://a:1", "process"]
     path = tmp_path / "places"
     path.write_text("# all\n\ntcp://a:1   KEY # the first\n  process\n")
