@@ -87,7 +87,11 @@ def main(order: dict[str, Any]) -> int:
     found: dict[str, Any] = {}
     with control_run("reach_devices", arguments) as run:
         found["outside"] = run.value
+    with control_run("write_proc", {}) as run:
+        found["outside"]["proc"] = run.value
     arena = Arena(order["profile"], "GPUs")
+    with arena.inside("write_proc", {}, {"gpu": order["gpu"]}) as run:
+        found["proc"] = run.value or run.error
     with arena.inside("reach_devices", arguments, {"gpu": order["gpu"]}) as run:
         found |= {"inside": run.value, "error": run.error, "report": arena.report}
     try:

@@ -71,6 +71,12 @@ def test_a_jail_has_the_gpus_that_it_was_given(arena: Arena) -> None:
     arena.judge(title, "succeeds", f"vendor of {OTHER}" in json.dumps(inside), "")
     title = "with gpu=[0]: map /dev/zero, which is memory in no account"
     arena.judge(title, "succeeds", inside["zeros"] == "mapped", "", judged=ANSWER)
+    proc = found["proc"]
+    assert isinstance(proc, dict), proc
+    assert outside["proc"]["others"], "the control opens what it owns"
+    assert proc["named"], "CUDA gives up where it cannot name its threads"
+    title = "with gpu=[0]: write into a file of /proc that is the kernel's or another process's"
+    arena.judge(title, "succeeds", bool(proc["others"]), json.dumps(proc), judged=ANSWER)
     [memory] = [layer["detail"] for layer in found["report"] if layer["layer"] == "memory"]
     assert "not counted: file locks, memory of the GPU's driver" in memory
     if "measured by" in memory:

@@ -8,7 +8,15 @@ from collections.abc import Callable, Iterable, Mapping
 
 from envhub_worker.lockdown.context import JailContext
 from envhub_worker.lockdown.mechanisms import landlock, process
-from envhub_worker.lockdown.mechanisms.landlock import DEVICE, READ, READ_DIR, WRITE, LandlockRule
+from envhub_worker.lockdown.mechanisms.landlock import (
+    DEVICE,
+    READ,
+    READ_DIR,
+    TRUNCATE,
+    WRITE,
+    WRITE_FILE,
+    LandlockRule,
+)
 from envhub_worker.lockdown.seccomp import filter
 from envhub_worker.lockdown.seccomp.paths import OwnPaths
 from envhub_worker.lockdown.stages import selftest
@@ -73,9 +81,7 @@ def enter(
     # filter is last: from then on each call is judged, the self-test's own included. The self-test
     # sees what a stranger's code would see, for nothing is given up after it.
     process.set_dumpable(True)
-    # when the whole host runs out of memory, the kernel should end a jail, not its client
-    with open("/proc/self/oom_score_adj", "w") as file:
-        file.write("1000")
+    process.be_ended_first()
     _apply(resource_limits(jail.spec.confinement.limits, jail.processes))
     process.drop_capabilities()
     process.set_no_new_privileges()
@@ -100,11 +106,15 @@ def rules(jail: JailContext, pid: int) -> list[LandlockRule]:
     own_files = [f"{own}/{name}" for name in _OWN_FILES.split()]
     readable += ["/proc", "/etc", "/dev"] if common.namespaced else [*_HOST_FILES, *own_files]
     writable = _writable(jail)
+    # CUDA names its threads there, and gives up (error 304) where it cannot. Nobody else's
+    # processes are in a pid namespace's /proc; without one, children cannot name theirs.
+    threads = "/proc" if common.namespaced else f"{own}/task"
     return [
         *(LandlockRule(path, READ) for path in readable),
         *([] if common.namespaced else [LandlockRule(own, READ_DIR)]),
         *(LandlockRule(path, WRITE) for path in writable),
         *(LandlockRule(path, DEVICE) for path in common.devices),
+        *([] if common.config.gpu is False else [LandlockRule(threads, WRITE_FILE | TRUNCATE)]),
     ]
 
 
