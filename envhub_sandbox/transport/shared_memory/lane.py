@@ -11,6 +11,8 @@ from collections.abc import Sequence
 from time import perf_counter_ns
 from typing import Any
 
+import numpy as np
+
 from envhub_sandbox.errors import EnvHubError, RemoteProtocolError, WorkerDiedError
 from envhub_sandbox.transport.connection import Source
 from envhub_sandbox.transport.deadline import Deadline
@@ -20,7 +22,12 @@ from envhub_sandbox.transport.replies import typed_reply
 from envhub_sandbox.transport.results import Results, StepResult
 from envhub_sandbox.transport.shared_memory.attachment import Attachment
 from envhub_sandbox.transport.shared_memory.observations import RING, ObservationSlab
-from envhub_sandbox.transport.shared_memory.shard import LaneShard, Outcome, ShardSlabs
+from envhub_sandbox.transport.shared_memory.shard import (
+    JoinedColumns,
+    LaneShard,
+    Outcome,
+    ShardSlabs,
+)
 from envhub_sandbox.transport.shared_memory.spin import CPUS, Cores, SpinChooser
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import UNTRUSTED
@@ -83,6 +90,7 @@ class SharedMemoryLane:
         self._flat_actions = len(leaves) == 1 and not leaves[0].path
         self._owed = _BY_SERVER
         self._answers = _NOTHING
+        self._joined = JoinedColumns((), ())
         self._steps = 0
         self._step_bytes = sum(one.action_bytes for one in layouts), observed.batch_bytes
         # as many workers of the same environment are on this machine, or may be
@@ -188,10 +196,15 @@ class SharedMemoryLane:
         if len(self.shards) == 1:
             self.shards[0].ask(leaves, slot, spin_ns)
             return
-        cpus = self._cores.of_shards()
-        for index, (shard, (start, stop)) in enumerate(zip(self.shards, self._bounds, strict=True)):
-            rows = [leaf[start:stop] for leaf in leaves]
-            shard.ask(rows, slot, spin_ns if index < self._awake else 0, cpus[index])
+        # the first ones start while the last ones are still asked: with many, each moment counts
+        asked = zip(self.shards, self._bounds, self._cores.of_shards(), strict=True)
+        is_one_array = self._flat_actions and type(actions) is np.ndarray
+        for index, (shard, (start, stop), cpu) in enumerate(asked):
+            wishes = spin_ns if index < self._awake else 0, slot, cpu
+            if is_one_array:
+                shard.ask_rows(actions[start:stop], wishes)
+            else:
+                shard.ask([leaf[start:stop] for leaf in leaves], *wishes)
 
     def wait(self, deadline: Deadline) -> None:
         """See ``Lane``."""
@@ -201,12 +214,19 @@ class SharedMemoryLane:
     def result(self, infos: dict[Any, Any] | None = None) -> StepResult:
         """See ``Lane``. Trust: input from the worker."""
         if infos is None:
-            infos = self._results.infos(self._infos()) if self._answers else {}
+            infos = self._infos() if self._answers else {}
         return (self.observations.take(), *self.observations.results(), infos)
 
-    def _infos(self) -> list[dict[Any, Any]]:
+    def _infos(self) -> dict[Any, Any]:
+        if len(self.shards) > 1 and all(kind == slabs.COLUMNS for kind, _ in self._answers):
+            schemas = [shard.schema for shard in self.shards]
+            if not self._joined.is_of(schemas):
+                self._joined = JoinedColumns(schemas, self._bounds)
+            if self._joined.columns:
+                return self._joined.infos()
         shards = zip(self.shards, self._answers, strict=True)
-        return [infos_of(shard, outcome, self._results) for shard, outcome in shards]
+        parts = [infos_of(shard, outcome, self._results) for shard, outcome in shards]
+        return self._results.infos(parts)
 
     def _outcomes(self, deadline: Deadline) -> list[Outcome]:
         """Every shard's outcome; nothing at all if none says more than its results."""

@@ -9,6 +9,7 @@ would be a SIGBUS).
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 from time import perf_counter_ns
 from typing import TYPE_CHECKING, Any
@@ -32,6 +33,8 @@ Outcome = tuple[int, m.Message | None]
 """``slabs.DONE``, ``RAISED``, ``FETCH`` or ``COLUMNS``, and what came encoded."""
 _OUTCOMES = frozenset({slabs.DONE, slabs.RAISED, slabs.FETCH, slabs.COLUMNS})
 _UNKNOWN = -1
+Schema = list[tuple[Column, Any]]
+"""What columns infos have, and where each lies in a slab."""
 
 
 class ShardSlabs:
@@ -51,12 +54,24 @@ class ShardSlabs:
         self._request, self._reply = request, reply
         self._asks = slabs.words(request)
         self._tells = slabs.words(reply)
-        self._columns: list[tuple[Column, Any]] = []
+        self._columns: Schema = []
         self._own: dict[Any, Any] | None = None
         self._views: dict[tuple[int, Any], Any] = {}
         self._codes = [_UNKNOWN] * len(layout.actions)
         self._wishes: tuple[int, int, int] | None = (0, 0, 0)
         self._told = False
+        self._rows: tuple[Any, Any] = None, None
+
+    def write_rows(self, rows: Any, wishes: tuple[int, int, int]) -> None:
+        """``write`` of actions that are one array, where nothing else is new: it usually is not."""
+        dtype, view = self._rows
+        if dtype is not rows.dtype or self._told:
+            self.write([rows], *wishes)
+            self._rows = rows.dtype, self._views[0, rows.dtype][1]
+            return
+        view[...] = rows
+        if wishes != self._wishes:
+            self._wish(*wishes)
 
     def write(self, leaves: Sequence[Any], slot: int, spin_ns: int, cpu: int = 0) -> None:
         """Write a shard's actions; its observations are to go to ``slot``."""
@@ -74,6 +89,7 @@ class ShardSlabs:
             code = found[0] + slabs.LISTED if listed else found[0]
             if self._codes[index] != code:
                 self._codes[index] = _UNKNOWN
+                self._rows = None, None
                 asks[slabs.DTYPES + index] = code
                 asks[slabs.CHANGES] += 1
                 self._codes[index] = code
@@ -155,6 +171,11 @@ class ShardSlabs:
         self._own = None if own_info(infos) is None else infos
         self._asks[slabs.KNOWN] = max((c.offset + v.nbytes for c, v in self._columns), default=0)
 
+    @property
+    def schema(self) -> Schema:
+        """The columns of the infos, which another list follows with the next schema."""
+        return self._columns if self._own is None else []
+
     def columns(self) -> dict[Any, Any]:
         """Infos that came as columns: fresh arrays."""
         if not self._columns:
@@ -170,6 +191,43 @@ class ShardSlabs:
         self._asks.release()
         self._tells.release()
         # the maps go with the last array over them
+
+
+class JoinedColumns:
+    """The infos of all shards, where all of them came as the same columns: one copy each.
+
+    With many shards this is most of what is left of a step that has infos.
+
+    Args:
+        schemas: Each shard's.
+        bounds: The sub-environments of each, from and to.
+
+    Attributes:
+        columns: Name, shape, dtype and each shard's part; empty where the schemas differ, or one
+            does not have a value for each sub-environment.
+    """
+
+    def __init__(self, schemas: Sequence[Schema], bounds: Sequence[tuple[int, int]]) -> None:
+        self._schemas = schemas
+        self.columns: list[tuple[str, tuple[int, ...], Any, list[Any]]] = []
+        forms = [[(one.key, one.dtype, one.shape[1:]) for one, _ in schema] for schema in schemas]
+        rows = [{one.shape[0] if one.shape else 0 for one, _ in schema} for schema in schemas]
+        if forms and forms == [forms[0]] * len(forms) and rows == [{b - a} for a, b in bounds]:
+            for index, (key, dtype, tail) in enumerate(forms[0]):
+                parts = [schema[index][1] for schema in schemas]
+                self.columns.append((key, (bounds[-1][1], *tail), dtype, parts))
+
+    def is_of(self, schemas: Sequence[Schema]) -> bool:
+        """Whether it was made of these."""
+        known = self._schemas
+        return len(known) == len(schemas) and all(map(operator.is_, known, schemas))
+
+    def infos(self) -> dict[Any, Any]:
+        """Fresh arrays. Trust: each byte is read once; what is not 0 in a mask is true."""
+        return {
+            key: np.concatenate(parts, out=np.empty(shape, dtype), casting="unsafe")
+            for key, shape, dtype, parts in self.columns
+        }
 
 
 def _as(known: Any, value: Any) -> Any:
@@ -217,6 +275,11 @@ class LaneShard(ShardSlabs):
     def ask(self, leaves: Sequence[Any], slot: int, spin_ns: int, cpu: int = 0) -> None:
         """Write a shard's actions and announce them."""
         self.write(leaves, slot, spin_ns, cpu)
+        self._announce()
+
+    def ask_rows(self, rows: Any, wishes: tuple[int, int, int]) -> None:
+        """The same, of actions that are one array; ``wishes`` are the other arguments."""
+        self.write_rows(rows, wishes)
         self._announce()
 
     def tell(self, packet: bytes, slot: int, spin_ns: int = 0, cpu: int = 0) -> None:
