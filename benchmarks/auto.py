@@ -24,6 +24,7 @@ import gymnasium as gym
 from benchmarks.clock import Slice, run_slice
 from benchmarks.load import busy_processes, load_average, stolen
 from benchmarks.machine import machine
+from benchmarks.peers.envhub import settle
 from benchmarks.workloads import WORKLOADS, Workload, action_batches, makers
 from envhub_sandbox import make_env
 from tests.support import inside
@@ -32,7 +33,6 @@ _WORKLOADS = ("cartpole", "halfcheetah", "cameras", "busy")
 _SIZES = (1, 2, 4, 8, 16, 64)
 _MOST_PIXELS = 16
 """Sub-environments with cameras: more take gigabytes."""
-_MOST_USES = 8
 _LEAST_STEPS = 40
 _STOLEN = 0.03
 _COLUMNS = (
@@ -63,7 +63,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _row(workload: Workload, count: int, rounds: int, seconds: float) -> str:
-    uses = _try_out(workload, count, seconds)
+    given = {"use_async_envs": True, "env_kwargs": workload.arguments}
+    uses = settle(workload, count, seconds, **given)
     fixed = [1]
     while 2 * fixed[-1] <= min(count, len(os.sched_getaffinity(0))):
         fixed.append(2 * fixed[-1])
@@ -85,21 +86,6 @@ def _row(workload: Workload, count: int, rounds: int, seconds: float) -> str:
         *(sizes, uses, f"{share:.1%}", f"{load_average():.1f}"),
     )
     return "| " + " | ".join(map(str, cells)) + " |"
-
-
-def _try_out(workload: Workload, count: int, seconds: float) -> int:
-    """Use the pin until two uses follow one another alike; returns how many uses that took."""
-    before = None
-    for use in range(1, _MOST_USES + 1):
-        with _made(workload, count, None) as suites:
-            env = suites.env
-            env.reset(seed=0)
-            bounds = inside.bounds(env)
-            if bounds == before or count == 1:
-                return use - 1
-            before = bounds
-            _slice(env, itertools.cycle(action_batches(workload.name, count)), seconds)
-    return _MOST_USES
 
 
 def _turns(

@@ -144,10 +144,11 @@ def _median(costs: list[int]) -> float:
 
 
 def main() -> None:
-    """Print a table for one and two shards."""
+    """Print a table."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.breakdown")
     parser.add_argument("workload", choices=WORKLOADS)
     parser.add_argument("sizes", nargs="*", type=int)
+    parser.add_argument("--shards", nargs="+", type=int, default=[1, 2])
     parser.add_argument("--nice", type=int, default=0, help="-20: on a machine that others use")
     options = parser.parse_args()
     os.nice(options.nice)
@@ -155,7 +156,7 @@ def main() -> None:
     print("| n | shards | waits | " + " | ".join(COLUMNS) + " |")
     print("|---" * (len(COLUMNS) + 3) + "|")
     for count in options.sizes or workload.sizes:
-        for shards in (1, 2) if count > 1 else (1,):
+        for shards in options.shards if count > 1 else (1,):
             for way, row in breakdown(workload, count, shards).items():
                 cells = " | ".join(f"{value:g}" for value in row.values())
                 print(f"| {count} | {shards} | {way} | {cells} |", flush=True)

@@ -72,8 +72,9 @@ def _divisors(count: int) -> list[Setting]:
 
 
 def _threads(count: int) -> list[Setting]:
-    cores = len(os.sched_getaffinity(0))
-    return [{"threads": threads} for threads in range(1, min(cores, count) + 1)]
+    most = min(len(os.sched_getaffinity(0)), count)
+    tried = {1, 2, 4, *range(8, most, 4), most}
+    return [{"threads": threads} for threads in sorted(tried) if threads <= most]
 
 
 def _gymnasium(name: str, title: str, **given: Any) -> Peer:
