@@ -133,6 +133,9 @@ def test_each_keeps_its_own_failure() -> None:
     assert [one.value for one in calls.each] == [1, None, 3]
     with pytest.raises(ValueError, match="this one"):
         calls.each[1].result()
+    with pytest.raises(ValueError, match="this one"):
+        calls.results()
+    assert Calls([lambda: 1, lambda: 2, lambda: 3], at_once=1).results() == [1, 2, 3]
 
 
 def test_a_wait_may_end_before_the_calls() -> None:
