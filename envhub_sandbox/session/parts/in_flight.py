@@ -10,6 +10,7 @@ Followed: EnvPool's ``send`` and ``recv``, and PufferLib's, for the ids beside t
 from __future__ import annotations
 
 import copy
+import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -198,12 +199,12 @@ class InFlight:
 
     # --- and back ------------------------------------------------------------------------------
 
-    def recv(self, min_ready: int, timeout_s: float | None) -> Received:
+    def recv(self, min_ready: int, deadline: Deadline) -> Received:
         """The results of the first sub-environments that are ready, of each at most one.
 
         Raises:
             NoAsyncCallError: Nothing was sent.
-            WorkerTimeoutError: ``timeout_s`` came first, and nothing is lost; or a worker's own
+            WorkerTimeoutError: The deadline came first, and nothing is lost; or a worker's own
                 timeout did, as ``Requests.collect_step`` says.
         """
         self._order.refuse_if_closed()
@@ -212,7 +213,6 @@ class InFlight:
                 self._note()
             raise NoAsyncCallError("Calling `recv` without any prior call to `send`.", "recv")
         self._refuse_if_interrupted("recv")
-        deadline = Deadline(timeout_s)
         with _held([queue for queue in self._queues if queue.busy]):
             try:
                 while (taken := self._first(min_ready)) is None:
@@ -234,12 +234,7 @@ class InFlight:
         found = answered_first([lane for lane in lanes if lane is not None], until)
         late = [at for at, place in enumerate(busy) if self._queues[place].left_s == 0]
         if not found and not late and deadline.passed:
-            raise WorkerTimeoutError(
-                f"fewer sub-environments than `min_ready` were ready after {deadline.timeout_s} s; "
-                "nothing is lost: call `recv` again",
-                request="recv",
-                timeout_s=deadline.timeout_s,
-            )
+            raise _too_few(deadline)
         return [busy[at] for at in found or late]
 
     def _keep(self, place: int, result: StepResult) -> None:
@@ -296,6 +291,29 @@ class InFlight:
                 self._sends = False
             finally:
                 self._note()
+
+
+@contextmanager
+def held_in_time(lock: threading.RLock, deadline: Deadline) -> Iterator[None]:
+    """Hold what another thread's ``recv`` may have. Raises ``WorkerTimeoutError``, as ``recv``."""
+    left_s, taken = deadline.left_s(), False
+    try:
+        taken = lock.acquire(timeout=-1 if left_s is None else min(left_s, threading.TIMEOUT_MAX))
+        if not taken:
+            raise _too_few(deadline)
+        yield
+    finally:
+        if taken:
+            lock.release()
+
+
+def _too_few(deadline: Deadline) -> WorkerTimeoutError:
+    return WorkerTimeoutError(
+        f"fewer sub-environments than `min_ready` were ready after {deadline.timeout_s} s; "
+        "nothing is lost: call `recv` again",
+        request="recv",
+        timeout_s=deadline.timeout_s,
+    )
 
 
 def _held(queues: Sequence[WorkerQueue]) -> AbstractContextManager[None]:
