@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from envhub_sandbox.errors import LocalProtocolError, WorkerDiedError, WorkerTimeoutError
+from envhub_worker.protocol import messages as m
 from tests.integration.fleet.conftest import DIES, places
 from tests.remote.hosts import OtherHost, other_host
 from tests.remote.listening import Listening
-from envhub_worker.protocol import messages as m
 from tests.support import inside
 from tests.support.ports import lasting_port
 from tests.support.processes import eventually

@@ -188,7 +188,7 @@ def test_a_timeout_ends_the_wait_for_another_threads_recv(gates: Gates) -> None:
     thread = threading.Thread(target=lambda: heard.append(env.recv(2)))
     thread.start()
     assert eventually(lambda: is_waited_for(env, 0))
-    with pytest.raises(WorkerTimeoutError, match="ready after 0.01 s") as late:
+    with pytest.raises(WorkerTimeoutError, match=r"ready after 0\.01 s") as late:
         env.recv(2, timeout=0.01)
     assert (late.value.request, late.value.timeout_s, heard) == ("recv", 0.01, [])
     gates.open(1)
