@@ -78,7 +78,7 @@ class RequestOrder(ABC):
         self.attributes = attributes
         self.closed = False
         self.waiting: str | None = None
-        self.face = "VectorEnv"
+        self.face = "SandboxVectorEnv"
         self._repository = repository
         self._unshown = repository.warnings.unshown
         self._timeouts = repository.timeouts

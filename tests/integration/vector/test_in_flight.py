@@ -175,6 +175,7 @@ def test_close_ends_a_wait(gates: Gates) -> None:
     env.close()
     thread.join(60)
     assert [type(error) for error in heard] == [ClosedEnvironmentError]
+    assert "`SandboxVectorEnv`" in str(heard[0]), "as after it"
     assert all(part.lifecycle.state is State.CLOSED for part in inside.parts(env))
     assert all(part.lease.loaded is None for part in inside.parts(env))
 
