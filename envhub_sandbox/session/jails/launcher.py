@@ -22,6 +22,7 @@ from envhub_sandbox.sandboxes.sandbox import Sandbox, may_go_elsewhere, worst_of
 from envhub_sandbox.session.error_text import name_denied, read_denials
 from envhub_sandbox.session.jails.loaded import ExpectedManifest, LoadedJail, ServerHold
 from envhub_sandbox.session.repository import Repository
+from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.system.log import WORKER
 from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline, PartDeadline
@@ -197,8 +198,11 @@ class Launcher:
         except WorkerTimeoutError as error:
             if place is None or deadline.passed:
                 raise
-            text = f"{place.address} has not opened a jail in {part.timeout_s:.0f} s"
-            raise WorkerStartupError(text) from error
+            more = option_name("startup_s", 2 * (self.repository.timeouts.startup_s or 1))
+            raise WorkerStartupError(
+                f"{place.address} has not opened a jail in {part.timeout_s:.0f} s; read that "
+                f"server's log, or raise {more}"
+            ) from error
 
     def _client(self, server: WorkerServer) -> WorkerConnection:
         limits = self.repository.wire_limits
