@@ -26,7 +26,7 @@ from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.failures import refusal
 from envhub_sandbox.session.parts.worker_queue import WorkerQueue
 from envhub_sandbox.session.requests import MessageFor, RequestOrder
-from envhub_sandbox.session.use_lock import all_held
+from envhub_sandbox.session.use_lock import FleetUse, all_held
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.readiness import answered_first
 from envhub_sandbox.transport.results import StepResult
@@ -170,7 +170,7 @@ class InFlight:
         self, name: str, queues: Sequence[WorkerQueue], prepare: Callable[[WorkerQueue], None]
     ) -> Iterator[None]:
         """Before anything is sent, all must be able to take it."""
-        with _held(queues):
+        with self._held(queues):
             if self._order.waiting != SENT:
                 self._order.refuse_if_busy(name)
             self._order.refuse_if_closed()
@@ -181,6 +181,11 @@ class InFlight:
             yield
             self._sends = False
             self._note()
+
+    def _held(self, queues: Sequence[WorkerQueue]) -> AbstractContextManager[None]:
+        """The locks of these workers: interruption.md, rule 10."""
+        locks, use = [queue.part.use.lock for queue in queues], self._order.use
+        return use.hold(locks) if isinstance(use, FleetUse) else all_held(locks)
 
     def _refuse_if_interrupted(self, name: str) -> None:
         """Whom a send has reached, or whose results are lost, is not known then."""
@@ -213,12 +218,15 @@ class InFlight:
                 self._note()
             raise NoAsyncCallError("Calling `recv` without any prior call to `send`.", "recv")
         self._refuse_if_interrupted("recv")
-        with _held([queue for queue in self._queues if queue.busy]):
+        with self._held([queue for queue in self._queues if queue.busy]):
             try:
                 while (taken := self._first(min_ready)) is None:
                     for place in self._wait(deadline):
                         self._queues[place].take(partial(self._keep, place))
                 return self._joined(taken)
+            except Exception:
+                self._order.refuse_if_closed()  # as by a signal handler
+                raise
             finally:
                 self._note()
 
@@ -283,7 +291,7 @@ class InFlight:
 
     def drop(self) -> None:
         """Wait for what is owed, and forget it with all that was not received."""
-        with _held(self._queues):
+        with self._held(self._queues):
             try:
                 for queue in self._queues:
                     queue.drop()
@@ -314,8 +322,3 @@ def _too_few(deadline: Deadline) -> WorkerTimeoutError:
         request="recv",
         timeout_s=deadline.timeout_s,
     )
-
-
-def _held(queues: Sequence[WorkerQueue]) -> AbstractContextManager[None]:
-    """The locks of these workers: interruption.md, rule 10."""
-    return all_held([queue.part.use.lock for queue in queues])

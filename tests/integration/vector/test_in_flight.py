@@ -181,6 +181,24 @@ def test_close_ends_a_wait(gates: Gates) -> None:
 
 
 @lanes
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_signal_handler_closes_what_waits(
+    gates: Gates, monkeypatch: pytest.MonkeyPatch, count: int
+) -> None:
+    """Its own thread has the locks: it waits for nobody to release them."""
+    monkeypatch.setattr(*inside.CLOSE_PATIENCE, 3600.0)
+    env = gates.env(count)
+    send(env, *range(1, count + 1))
+    before = signal.signal(signal.SIGUSR1, lambda *_: env.close())
+    try:
+        threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGUSR1)).start()
+        with pytest.raises(ClosedEnvironmentError):
+            env.recv()
+    finally:
+        signal.signal(signal.SIGUSR1, before)
+
+
+@lanes
 def test_a_timeout_ends_the_wait_for_another_threads_recv(gates: Gates) -> None:
     """Whose own goes on."""
     env = gates.env(2)
