@@ -27,7 +27,7 @@ from envhub_sandbox.session.failures import refusal
 from envhub_sandbox.session.parts.worker_queue import WorkerQueue
 from envhub_sandbox.session.requests import MessageFor, RequestOrder
 from envhub_sandbox.session.use_lock import FleetUse, all_held
-from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.deadline import Deadline, deadline_of
 from envhub_sandbox.transport.readiness import answered_first
 from envhub_sandbox.transport.results import StepResult
 from envhub_worker.protocol.lifecycle import State
@@ -204,12 +204,12 @@ class InFlight:
 
     # --- and back ------------------------------------------------------------------------------
 
-    def recv(self, min_ready: int, deadline: Deadline) -> Received:
+    def recv(self, min_ready: int, timeout: float | Deadline | None) -> Received:
         """The results of the first sub-environments that are ready, of each at most one.
 
         Raises:
             NoAsyncCallError: Nothing was sent.
-            WorkerTimeoutError: The deadline came first, and nothing is lost; or a worker's own
+            WorkerTimeoutError: ``timeout`` came first, and nothing is lost; or a worker's own
                 timeout did, as ``Requests.collect_step`` says.
         """
         self._order.refuse_if_closed()
@@ -218,6 +218,7 @@ class InFlight:
                 self._note()
             raise NoAsyncCallError("Calling `recv` without any prior call to `send`.", "recv")
         self._refuse_if_interrupted("recv")
+        deadline = deadline_of(timeout)
         with self._held([queue for queue in self._queues if queue.busy]):
             try:
                 while (taken := self._first(min_ready)) is None:
