@@ -26,21 +26,3 @@ def main() -> None:
         app(prog_name="envhub")
     except KeyboardInterrupt:  # while still importing; later, commands report it themselves
         sys.exit(130)
-    except SystemExit as end:
-        _leave_threads(end)
-        raise
-
-
-def _leave_threads(end: SystemExit) -> None:
-    """Exit now where a download that was interrupted has threads that the interpreter waits for."""
-    import atexit
-    import os
-    import sys
-    import threading
-
-    others = set(threading.enumerate()) - {threading.main_thread()}
-    if any(not one.daemon for one in others) and isinstance(end.code, int):
-        atexit._run_exitfuncs()
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(end.code)

@@ -15,6 +15,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import field
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from traceback import walk_tb
@@ -42,6 +43,7 @@ from envhub_sandbox.hub.listing import (
     copy_verified,
 )
 from envhub_sandbox.hub.logins import authorization, login_of, without_login
+from envhub_sandbox.system.threads import Calls
 from envhub_worker.protocol.records import dataclass
 
 _DEFAULT_ENDPOINT = "https://huggingface.co"
@@ -141,18 +143,12 @@ class HubClient:
         """Download these files into the Hub cache; the folder of the commit there.
 
         One by one and not by ``snapshot_download``: that asks for a listing of its own, which may
-        be another than the one that was judged.
+        be another than the one that was judged. Where one fails, or a Ctrl-C comes, those that run
+        are not waited for: all that they write is whole files of the Hub cache.
         """
-        from concurrent.futures import ThreadPoolExecutor
-
-        with self._explained(repo, commit), ThreadPoolExecutor(_WORKERS) as pool:
-            futures = [pool.submit(self._download, repo, commit, path) for path in paths]
-            try:
-                places = [future.result() for future in futures]
-            finally:
-                for future in futures:
-                    future.cancel()
-        place = places[0]
+        with self._explained(repo, commit):
+            downloads = [partial(self._download, repo, commit, path) for path in paths]
+            place = Calls(downloads, _WORKERS).results()[0]
         return place.parents[paths[0].count("/")]
 
     def download_again(self, repo: Repository, commit: str, path: str) -> Path:

@@ -78,7 +78,7 @@ class RequestOrder(ABC):
         self.attributes = attributes
         self.closed = False
         self.waiting: str | None = None
-        self.face = "VectorEnv"
+        self.face = "SandboxVectorEnv"
         self._repository = repository
         self._unshown = repository.warnings.unshown
         self._timeouts = repository.timeouts
@@ -374,8 +374,11 @@ class Requests(RequestOrder):
 
     # --- steps ---------------------------------------------------------------------------------
 
-    def submit_step(self, actions: Any) -> None:
-        """Send a validated batch of actions, with the lock held; raises as ``submit`` does."""
+    def submit_step(self, actions: Any, packed: Packed | None = None) -> None:
+        """Send a validated batch of actions, with the lock held; raises as ``submit`` does.
+
+        ``packed``: of them, where they have no fixed layout and were packed already.
+        """
         try:
             lifecycle = self.lifecycle
             if lifecycle.state is not State.READY:
@@ -388,7 +391,10 @@ class Requests(RequestOrder):
                 assert lane is not None
                 lifecycle.request = "step"
                 lifecycle.on(Event.SUBMIT)  # interruption.md, rule 1: first
-                lane.send_step(actions)
+                if packed is None:
+                    lane.send_step(actions)
+                else:
+                    lane.send(packed.sent)
             except BaseException as error:
                 with self.use.hold("step"):
                     self._nothing_was_sent(error)

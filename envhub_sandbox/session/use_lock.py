@@ -141,7 +141,7 @@ class FleetUse:
         A fresh one for each ``with``: where a Ctrl-C comes into it, the locks are released with
         that object at the latest.
         """
-        return self._hold_all()
+        return self.hold([part.lock for part in self._parts])
 
     @property
     def flight(self) -> threading.RLock:
@@ -154,8 +154,9 @@ class FleetUse:
         return self._holder == threading.get_ident()
 
     @contextmanager
-    def _hold_all(self) -> Iterator[None]:
-        with all_held([part.lock for part in self._parts]):
+    def hold(self, locks: Sequence[threading.RLock]) -> Iterator[None]:
+        """Hold these of the parts' locks."""
+        with all_held(locks):
             before, self._holder = self._holder, threading.get_ident()
             try:
                 yield

@@ -48,17 +48,22 @@ class Call(Generic[T]):
 
 
 class Calls(Generic[T]):
-    """Runs calls at the same time, in daemon threads: 64 at once, the others after these.
+    """Runs calls at the same time, in daemon threads: so many at once, the others after these.
     ``each``: the calls, in their order.
-    Raises ``RuntimeError``: the system has no thread left; those that it had go on.
+    Raises ``RuntimeError``: the system has no thread left. Then, and after an interrupt, those that
+    have begun go on, and no other begins.
     """
 
-    def __init__(self, calls: Sequence[Callable[[], T]]) -> None:
+    def __init__(self, calls: Sequence[Callable[[], T]], at_once: int = _AT_ONCE) -> None:
         self._finished: queue.SimpleQueue[None] = queue.SimpleQueue()
         self.each = [Call(call, self._finished) for call in calls]
         self._left = deque(self.each)
-        for _ in self.each[:_AT_ONCE]:
-            threading.Thread(target=self._run, name="envhub-calls", daemon=True).start()
+        try:
+            for _ in self.each[:at_once]:
+                threading.Thread(target=self._run, name="envhub-calls", daemon=True).start()
+        except BaseException:
+            self._left.clear()
+            raise
 
     def _run(self) -> None:
         """In each thread."""
@@ -78,3 +83,16 @@ class Calls(Generic[T]):
             except queue.Empty:
                 continue
         return True
+
+    def results(self) -> list[T]:
+        """What all returned. Raises what one raised, without a wait for those that have begun."""
+        try:
+            return [self._result(one) for one in self.each]
+        finally:
+            self._left.clear()
+
+    def _result(self, call: Call[T]) -> T:
+        while not call.done:
+            with contextlib.suppress(queue.Empty):
+                self._finished.get(timeout=_LOOK_S)
+        return call.result()

@@ -46,6 +46,27 @@ class Deadline:
         return self._at is not None and monotonic() >= self._at
 
 
+class PartDeadline(Deadline):
+    """So much of what is left of another deadline, which also ends it."""
+
+    __slots__ = ("_whole",)
+
+    def __init__(self, whole: Deadline, share: float) -> None:
+        left_s = whole.left_s()
+        super().__init__(None if left_s is None else left_s * share)
+        self._whole = whole
+
+    def left_ms(self) -> int | None:
+        """As the other: its waits may be short."""
+        left = (super().left_ms(), self._whole.left_ms())
+        return min((one for one in left if one is not None), default=None)
+
+    @property
+    def passed(self) -> bool:
+        """Whether one of them has come."""
+        return super().passed or self._whole.passed
+
+
 def deadline_of(timeout: float | Deadline | None) -> Deadline:
     """A deadline so many seconds from now; one that several waits share is given as it is."""
     return timeout if isinstance(timeout, Deadline) else Deadline(timeout)

@@ -252,6 +252,7 @@ class RelayLane:
 
     def send(self, request: Request) -> None:
         """See ``Lane``."""
+        self._asked_ns = perf_counter_ns()
         self.send_some(request.operation, self.runners, request.frames)
 
     def send_some(

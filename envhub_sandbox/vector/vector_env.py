@@ -22,7 +22,7 @@ from gymnasium.vector import VectorEnv
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.parts.fleet_session import AnySession, FleetSession
-from envhub_sandbox.session.parts.in_flight import SENT, InFlight, Received, Rows
+from envhub_sandbox.session.parts.in_flight import SENT, InFlight, Received, Rows, held_in_time
 from envhub_sandbox.session.requests import Bounds, MessageFor, OneMessageFor
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.remote_warnings import level_of_the_caller
@@ -366,7 +366,8 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         Args:
             min_ready: How many sub-environments to wait for; by default the value given to
                 ``make_env``, otherwise all.
-            timeout: Seconds to wait, or None for no limit. Each step also has ``Timeouts.step_s``.
+            timeout: Seconds to wait, also for another thread's ``recv``, or None for no limit. Each
+                step also has ``Timeouts.step_s``.
 
         Returns:
             ``observations, rewards, terminations, truncations, infos, env_ids``, each with ``n``
@@ -387,8 +388,9 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         wanted = self._session.repository.min_ready if min_ready is None else min_ready
         if wanted is not None and wanted < 1:
             raise ValueError(f"`min_ready` is {wanted}, and must be at least 1")
-        with self._requests.use.flight:
-            return self._in_flight().recv(self.num_envs if wanted is None else wanted, timeout)
+        deadline = Deadline(timeout)
+        with held_in_time(self._requests.use.flight, deadline):
+            return self._in_flight().recv(self.num_envs if wanted is None else wanted, deadline)
 
     def _in_flight(self) -> InFlight:
         if self._flight is None:

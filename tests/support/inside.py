@@ -318,6 +318,8 @@ def send_half(connection: WorkerConnection, frames: Sequence[Buffer]) -> None:
 
 LATE_REPLY_GRACE: Spot = (env_session, "GRACE_S")
 """For how long ``reset`` waits for a late reply."""
+SHARE_OF_A_SERVER: Spot = (launcher_module, "_SHARE")
+"""How much of the time for a start one server of a fleet may use."""
 CLOSE_PATIENCE: Spot = (env_session, "INTERRUPT_S")
 """For how long ``close`` waits for another thread."""
 WAITS_FOR_A_SERVER: tuple[Spot, Spot] = ((launcher_module, "_CLOSE_S"), (remote, "_CLOSE_S"))

@@ -14,6 +14,7 @@ from envhub_sandbox.errors import (
     LoadError,
     ServerBusyError,
     WorkerDiedError,
+    WorkerStartupError,
     WorkerTimeoutError,
 )
 from envhub_sandbox.sandboxes.pool import ServerUse, WorkerServer
@@ -21,9 +22,10 @@ from envhub_sandbox.sandboxes.sandbox import Sandbox, may_go_elsewhere, worst_of
 from envhub_sandbox.session.error_text import name_denied, read_denials
 from envhub_sandbox.session.jails.loaded import ExpectedManifest, LoadedJail, ServerHold
 from envhub_sandbox.session.repository import Repository
+from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.system.log import WORKER
 from envhub_sandbox.transport.connection import WorkerConnection
-from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.deadline import Deadline, PartDeadline
 from envhub_sandbox.transport.jail import JailHandle, open_jail
 from envhub_sandbox.transport.output import OutputFollower, OutputSinks
 from envhub_sandbox.transport.replies import expect_reply, typed_reply
@@ -38,6 +40,8 @@ _CLOSE_S = 5.0
 _LOST_S = 1.0
 """Likewise, where the connection to the server was lost: one that lives ends by itself a jail that
 no client holds."""
+_SHARE = 0.5
+"""How much of the time that is left one server of a fleet may take to open a jail."""
 _SILENT_S = 30.0
 """For how long a server that has not answered then is not asked again for the end of a jail."""
 _STATUS_S = 1.0
@@ -152,7 +156,8 @@ class Launcher:
             # all at once, where they will load what is known: else it is asked for, and then again
             order = self._order(known.shards if known else 1)
             order = place.prepare(order, server, client, deadline)
-            jail = open_jail(client, order, self.repository.wire_limits, deadline)
+            in_turn = server.far is not None and place is not self._sandbox
+            jail = self._open_jail(client, order, deadline, place if in_turn else None)
         except BaseException:
             client.close()
             wanted.close()
@@ -178,6 +183,26 @@ class Launcher:
             finally:
                 jail.close(Deadline(_CLOSE_S))
             raise
+
+    def _open_jail(
+        self, client: WorkerConnection, order: m.OpenJail, deadline: Deadline, place: Sandbox | None
+    ) -> JailHandle:
+        """Open it.
+
+        ``place``: of several servers, which is to leave the next one some time.
+        Raises ``WorkerStartupError``: it has not.
+        """
+        part = deadline if place is None else PartDeadline(deadline, _SHARE)
+        try:
+            return open_jail(client, order, self.repository.wire_limits, part)
+        except WorkerTimeoutError as error:
+            if place is None or deadline.passed:
+                raise
+            more = option_name("startup_s", 2 * (self.repository.timeouts.startup_s or 1))
+            raise WorkerStartupError(
+                f"{place.address} has not opened a jail in {part.timeout_s:.0f} s; read that "
+                f"server's log, or raise {more}"
+            ) from error
 
     def _client(self, server: WorkerServer) -> WorkerConnection:
         limits = self.repository.wire_limits

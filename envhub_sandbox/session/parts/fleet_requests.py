@@ -154,20 +154,19 @@ class FleetRequests(RequestOrder):
                 self._make_ready("step")
                 break
         rows = batches.split(self._space, actions, self.results.bounds)
-        if self._may_not_fit:
-            self._refuse_unsendable(actions, rows)
+        packed = self._packed(actions, rows) if self._may_not_fit else [None] * len(rows)
         self._sent_ns = perf_counter_ns()
-        self._send(lambda at: self._each[at].submit_step(rows[at]))
+        self._send(lambda at: self._each[at].submit_step(rows[at], packed[at]))
         self._counters.requests += 1
         self._history.step(actions)
 
-    def _refuse_unsendable(self, actions: Any, rows: Sequence[Any]) -> None:
-        """Refuse what one worker cannot be sent before others are sent theirs.
-        Raises ``LocalProtocolError``, which names it by its place in ``actions``.
+    def _packed(self, actions: Any, rows: Sequence[Any]) -> Sequence[Packed | None]:
+        """Each worker's, before others are sent theirs.
+        Raises ``LocalProtocolError``, which names what cannot be sent by its place in ``actions``.
         """
         try:
-            for one, row in zip(self._each, rows, strict=True):
-                one.pack("step", partial(_step, row))
+            pairs = zip(self._each, rows, strict=True)
+            return [one.pack("step", partial(_step, row)) for one, row in pairs]
         except LocalProtocolError:
             count = self.results.manifest.num_envs
             self._each[0].refuse_whole("step", partial(_step, actions), count)

@@ -10,6 +10,7 @@ Followed: EnvPool's ``send`` and ``recv``, and PufferLib's, for the ids beside t
 from __future__ import annotations
 
 import copy
+import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -25,8 +26,8 @@ from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.failures import refusal
 from envhub_sandbox.session.parts.worker_queue import WorkerQueue
 from envhub_sandbox.session.requests import MessageFor, RequestOrder
-from envhub_sandbox.session.use_lock import all_held
-from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.session.use_lock import FleetUse, all_held
+from envhub_sandbox.transport.deadline import Deadline, deadline_of
 from envhub_sandbox.transport.readiness import answered_first
 from envhub_sandbox.transport.results import StepResult
 from envhub_worker.protocol.lifecycle import State
@@ -169,7 +170,7 @@ class InFlight:
         self, name: str, queues: Sequence[WorkerQueue], prepare: Callable[[WorkerQueue], None]
     ) -> Iterator[None]:
         """Before anything is sent, all must be able to take it."""
-        with _held(queues):
+        with self._held(queues):
             if self._order.waiting != SENT:
                 self._order.refuse_if_busy(name)
             self._order.refuse_if_closed()
@@ -180,6 +181,11 @@ class InFlight:
             yield
             self._sends = False
             self._note()
+
+    def _held(self, queues: Sequence[WorkerQueue]) -> AbstractContextManager[None]:
+        """The locks of these workers: interruption.md, rule 10."""
+        locks, use = [queue.part.use.lock for queue in queues], self._order.use
+        return use.hold(locks) if isinstance(use, FleetUse) else all_held(locks)
 
     def _refuse_if_interrupted(self, name: str) -> None:
         """Whom a send has reached, or whose results are lost, is not known then."""
@@ -198,12 +204,12 @@ class InFlight:
 
     # --- and back ------------------------------------------------------------------------------
 
-    def recv(self, min_ready: int, timeout_s: float | None) -> Received:
+    def recv(self, min_ready: int, timeout: float | Deadline | None) -> Received:
         """The results of the first sub-environments that are ready, of each at most one.
 
         Raises:
             NoAsyncCallError: Nothing was sent.
-            WorkerTimeoutError: ``timeout_s`` came first, and nothing is lost; or a worker's own
+            WorkerTimeoutError: ``timeout`` came first, and nothing is lost; or a worker's own
                 timeout did, as ``Requests.collect_step`` says.
         """
         self._order.refuse_if_closed()
@@ -212,13 +218,16 @@ class InFlight:
                 self._note()
             raise NoAsyncCallError("Calling `recv` without any prior call to `send`.", "recv")
         self._refuse_if_interrupted("recv")
-        deadline = Deadline(timeout_s)
-        with _held([queue for queue in self._queues if queue.busy]):
+        deadline = deadline_of(timeout)
+        with self._held([queue for queue in self._queues if queue.busy]):
             try:
                 while (taken := self._first(min_ready)) is None:
                     for place in self._wait(deadline):
                         self._queues[place].take(partial(self._keep, place))
                 return self._joined(taken)
+            except Exception:
+                self._order.refuse_if_closed()  # as by a signal handler
+                raise
             finally:
                 self._note()
 
@@ -234,12 +243,7 @@ class InFlight:
         found = answered_first([lane for lane in lanes if lane is not None], until)
         late = [at for at, place in enumerate(busy) if self._queues[place].left_s == 0]
         if not found and not late and deadline.passed:
-            raise WorkerTimeoutError(
-                f"fewer sub-environments than `min_ready` were ready after {deadline.timeout_s} s; "
-                "nothing is lost: call `recv` again",
-                request="recv",
-                timeout_s=deadline.timeout_s,
-            )
+            raise _too_few(deadline)
         return [busy[at] for at in found or late]
 
     def _keep(self, place: int, result: StepResult) -> None:
@@ -288,7 +292,7 @@ class InFlight:
 
     def drop(self) -> None:
         """Wait for what is owed, and forget it with all that was not received."""
-        with _held(self._queues):
+        with self._held(self._queues):
             try:
                 for queue in self._queues:
                     queue.drop()
@@ -298,6 +302,24 @@ class InFlight:
                 self._note()
 
 
-def _held(queues: Sequence[WorkerQueue]) -> AbstractContextManager[None]:
-    """The locks of these workers: interruption.md, rule 10."""
-    return all_held([queue.part.use.lock for queue in queues])
+@contextmanager
+def held_in_time(lock: threading.RLock, deadline: Deadline) -> Iterator[None]:
+    """Hold what another thread's ``recv`` may have. Raises ``WorkerTimeoutError``, as ``recv``."""
+    left_s, taken = deadline.left_s(), False
+    try:
+        taken = lock.acquire(timeout=-1 if left_s is None else min(left_s, threading.TIMEOUT_MAX))
+        if not taken:
+            raise _too_few(deadline)
+        yield
+    finally:
+        if taken:
+            lock.release()
+
+
+def _too_few(deadline: Deadline) -> WorkerTimeoutError:
+    return WorkerTimeoutError(
+        f"fewer sub-environments than `min_ready` were ready after {deadline.timeout_s} s; "
+        "nothing is lost: call `recv` again",
+        request="recv",
+        timeout_s=deadline.timeout_s,
+    )

@@ -114,10 +114,14 @@ def test_without_xvfb_the_error_says_so(tmp_path: Path, monkeypatch: pytest.Monk
         make_env(str(folder), policy={**DISPLAY, "environment": ["PATH"]})
 
 
-def test_a_window_without_a_display_names_the_option(tmp_path: Path) -> None:
+@needs("no-userns")
+def test_a_profile_without_socket_files_has_no_display(tmp_path: Path) -> None:
     folder = write_repository(tmp_path / "repo", WINDOWS)
     with pytest.raises(SandboxUnavailableError, match="permits no socket files"):
         make_env(str(folder), policy={**DISPLAY, "profile": "no-userns"})
+
+
+def test_a_window_without_a_display_names_the_option(tmp_path: Path) -> None:
     broken = write_repository(tmp_path / "broken", "raise OSError('cannot open display: None')\n")
     with pytest.raises(LoadError, match=r"policy=\{'display': 'virtual'\}"):
         make_env(str(broken))

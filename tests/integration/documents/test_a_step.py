@@ -85,11 +85,23 @@ def test_a_trace_names_each_message(lane: str, step: str) -> None:
 
 def test_a_runner_runs_here_for_a_debugger() -> None:
     """Without a jail, so that a breakpoint in it is met; the results are the same."""
-    runner = RunnerHere(SAMPLES / "cartpole")
-    runner.ask(m.Reset(1, [0, 1], None, None))
-    done = runner.ask(m.Step(1, ACTIONS))
+    with RunnerHere(SAMPLES / "cartpole") as runner:
+        runner.ask(m.Reset(1, [0, 1], None, None))
+        done = runner.ask(m.Step(1, ACTIONS))
     with make_env(str(SAMPLES / "cartpole"), n_envs=2) as suites:
         suites.env.reset(seed=0)
         observation, *_ = suites.env.step(ACTIONS)
     assert isinstance(done, m.StepDone)
     assert np.array_equal(np.asarray(done.observation), observation)
+
+
+def test_a_runner_here_leaves_nothing_to_the_next() -> None:
+    """Both entry files are the module ``hub_env.env``."""
+    path = list(sys.path)
+    spaces = []
+    for name in ("cartpole", "pendulum"):
+        with RunnerHere(SAMPLES / name) as runner:
+            spaces.append(type(runner.manifest.single_action_space).__name__)
+    assert spaces == ["Discrete", "Box"]
+    assert sys.path == path
+    assert "hub_env.env" not in sys.modules

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from envhub_sandbox.errors import LocalProtocolError, WorkerDiedError, WorkerTimeoutError
+from envhub_worker.protocol import messages as m
 from tests.integration.fleet.conftest import DIES, places
 from tests.remote.hosts import OtherHost, other_host
 from tests.remote.listening import Listening
@@ -134,6 +135,23 @@ def test_an_action_that_cannot_be_sent_is_sent_to_nobody(tmp_path: Path) -> None
         with pytest.raises(LocalProtocolError, match=r"actions\[1\]\[0\] cannot be sent"):
             env.step((("a",), ("x" * (5 << 20),)))
         assert env.step((("a",), ("b",)))[0].tolist() == [1, 1]
+
+
+def test_what_has_no_fixed_layout_is_packed_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = write_repository(tmp_path / "texts", _TEXTS)
+    packed, pack = [], m.pack
+
+    def noting(message: m.Message, **options: Any) -> Any:
+        packed.append(type(message))
+        return pack(message, **options)
+
+    with started(folder, n_envs=2, sandbox=["process", "process"]) as env:
+        monkeypatch.setattr(m, "pack", noting)
+        assert env.step((("a",), ("b",)))[0].tolist() == [1, 1]
+        assert env.step((("c",), ("d",)))[0].tolist() == [2, 2]
+    assert packed.count(m.Step) == 4
 
 
 def test_all_workers_share_one_timeout(rows: Path, servers: list[Listening]) -> None:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 
 from envhub_sandbox import Fleet, make_env
@@ -19,7 +20,7 @@ from tests.remote.listening import Listening
 from tests.support import inside
 from tests.support.packages.wheels import Index, make_wheel
 from tests.support.ports import lasting_port
-from tests.support.processes import eventually
+from tests.support.processes import eventually, halted
 from tests.support.repositories import write_repository
 from tests.support.samples import sample
 from tests.support.started import started
@@ -72,6 +73,24 @@ def test_a_server_that_is_not_there_gets_no_worker(rows: Path, servers: list[Lis
     stranger = servers[1].sandbox(client_key="f" * 64)
     with started(rows, n_envs=4, sandbox=[absent, stranger, here], num_workers=4) as env:
         assert set(places(env)) == {here.endpoint}
+
+
+def test_a_server_that_opens_no_jail_leaves_time_for_the_next(
+    rows: Path, serve: Callable[..., Listening], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It says that it has room, and what would make the jail does nothing."""
+    stuck, other = serve("stuck"), serve("other")
+    with started(rows, sandbox=stuck.sandbox()):
+        pass
+    assert eventually(lambda: stuck.jails() == 0)
+    server = psutil.Process(stuck.process.pid)
+    monkeypatch.setattr(*inside.SHARE_OF_A_SERVER, 0.01)
+    with (
+        halted(zygote.pid for zygote in server.children()),
+        halted(one.pid for one in server.children(recursive=True)),  # what it has prepared
+        started(rows, sandbox=[stuck.sandbox(), other.sandbox()], n_envs=2) as env,
+    ):
+        assert places(env) == [other.endpoint] * 2
 
 
 def test_a_list_in_a_file_is_looked_at_again(

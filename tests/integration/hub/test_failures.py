@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import base64
 import logging
+import os
 import re
+import signal
+import subprocess
+import sys
 import time
 import traceback
 from pathlib import Path
@@ -18,10 +22,23 @@ from envhub_sandbox.hub.listing import Repository
 from tests.hub.stub_hub import StubHub
 from tests.integration.hub.conftest import Fetch
 from tests.support.command_line import python
+from tests.support.processes import eventually
+from tests.support.repositories import STILL
 
 pytestmark = pytest.mark.same_for("users")
 
 TOKEN = "hf_SECRETSECRETSECRET"
+INTERRUPTED = """
+from envhub_sandbox import make_env
+try:
+    make_env("models/org/repo", token=False)
+except KeyboardInterrupt:
+    print("interrupted")
+if AGAIN:
+    with make_env("models/org/repo", token=False) as suites:
+        suites.env.reset(seed=0)
+        print("loaded")
+"""
 
 
 def failure(get: Fetch, text: str = "models/org/repo", **rest: Any) -> RepositoryUnavailableError:
@@ -239,3 +256,28 @@ def test_password_in_the_endpoint_is_not_shown(
             assert stub_hub.endpoint in text
             assert not {"s3cret", login} & set(re.findall(r"[\w=]+", text + caplog.text))
     assert "127.0.0.1" in caplog.text, "the control failed: nobody logs URLs"
+
+
+@pytest.mark.parametrize("again", [True, False])
+def test_an_interrupt_waits_for_no_download(
+    stub_hub: StubHub, hub_cache: Path, *, again: bool
+) -> None:
+    """Nor does the end of the process; and the next ``make_env`` can have it all."""
+    files = {f"assets/{number}": str(number) for number in range(20)}
+    stub_hub.add("org/repo", {"env.py": STILL, **files})
+    stub_hub.fail("(GET|HEAD) /org/repo/resolve/.*/assets/7$", stall=True, times=1)
+    with subprocess.Popen(
+        [sys.executable, "-c", f"AGAIN = {again}{INTERRUPTED}"],
+        stdout=subprocess.PIPE,
+        env={
+            **os.environ,
+            "HF_ENDPOINT": stub_hub.endpoint,
+            "HF_HUB_CACHE": str(hub_cache),
+            "HF_HUB_ETAG_TIMEOUT": "3600",
+            "HF_HUB_DOWNLOAD_TIMEOUT": "3600",
+        },
+    ) as process:
+        assert eventually(lambda: any("/assets/7" in one for one in stub_hub.requests), 120)
+        process.send_signal(signal.SIGINT)
+        out, _ = process.communicate(timeout=240)
+    assert (out, process.returncode) == (b"interrupted\n" + b"loaded\n" * again, 0)

@@ -48,6 +48,15 @@ def kill(env: Any, worker: int) -> None:
         os.kill(pid, signal.SIGKILL)
 
 
+def is_waited_for(env: Any, worker: int) -> bool:
+    """Whether another thread's ``recv`` waits for one of its workers."""
+    lock = inside.use_lock_of(inside.parts(env)[worker])
+    free = lock.acquire(blocking=False)
+    if free:
+        lock.release()
+    return not free
+
+
 @lanes
 def test_a_death_is_its_own(gates: Gates) -> None:
     """The others go on, without a reset; who has died takes nothing more."""
@@ -162,12 +171,48 @@ def test_close_ends_a_wait(gates: Gates) -> None:
 
     thread = threading.Thread(target=wait)
     thread.start()
-    assert eventually(lambda: not inside.use_lock_of(inside.parts(env)[2]).acquire(blocking=False))
+    assert eventually(lambda: is_waited_for(env, 2))
     env.close()
     thread.join(60)
     assert [type(error) for error in heard] == [ClosedEnvironmentError]
+    assert "`SandboxVectorEnv`" in str(heard[0]), "as after it"
     assert all(part.lifecycle.state is State.CLOSED for part in inside.parts(env))
     assert all(part.lease.loaded is None for part in inside.parts(env))
+
+
+@lanes
+@pytest.mark.parametrize("count", [1, 2])
+def test_a_signal_handler_closes_what_waits(
+    gates: Gates, monkeypatch: pytest.MonkeyPatch, count: int
+) -> None:
+    """Its own thread has the locks: it waits for nobody to release them."""
+    monkeypatch.setattr(*inside.CLOSE_PATIENCE, 3600.0)
+    env = gates.env(count)
+    send(env, *range(1, count + 1))
+    before = signal.signal(signal.SIGUSR1, lambda *_: env.close())
+    try:
+        threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGUSR1)).start()
+        with pytest.raises(ClosedEnvironmentError):
+            env.recv()
+    finally:
+        signal.signal(signal.SIGUSR1, before)
+
+
+@lanes
+def test_a_timeout_ends_the_wait_for_another_threads_recv(gates: Gates) -> None:
+    """Whose own goes on."""
+    env = gates.env(2)
+    send(env, 1, 1)
+    heard: list[Any] = []
+    thread = threading.Thread(target=lambda: heard.append(env.recv(2)))
+    thread.start()
+    assert eventually(lambda: is_waited_for(env, 0))
+    with pytest.raises(WorkerTimeoutError, match=r"ready after 0\.01 s") as late:
+        env.recv(2, timeout=0.01)
+    assert (late.value.request, late.value.timeout_s, heard) == ("recv", 0.01, [])
+    gates.open(1)
+    thread.join(60)
+    assert ids(*heard) == [0, 1]
 
 
 @lanes

@@ -14,11 +14,12 @@ from pathlib import Path
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest.manifest import EnvManifest, decode_manifest
 from envhub_worker.protocol.stream import Packet
+from envhub_worker.runner.loader import PACKAGE
 from envhub_worker.runner.runner import Runner
 
 
 class RunnerHere:
-    """A runner of one repository.
+    """A runner of one repository, whose modules can be imported until the end of a ``with``.
 
     Args:
         folder: Of the repository.
@@ -30,12 +31,23 @@ class RunnerHere:
     """
 
     def __init__(self, folder: Path, n_envs: int = 2, entry: str = "env.py") -> None:
+        self._before = set(sys.modules), list(sys.path), sys.dont_write_bytecode
         self._runner = Runner(str(folder.absolute()), entry)
         loaded = self.ask(m.Load(n_envs, False, None, {}))
         assert isinstance(loaded, m.LoadDone), loaded
         self.manifest: EnvManifest = decode_manifest(loaded.manifest, max_elements=1 << 24).envs[0]
         task = self.manifest
         self.ask(m.Build(1, task.suite, task.task, 0, task.num_envs))
+
+    def __enter__(self) -> RunnerHere:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Or the next one would be given this one's ``env.py``, which has the same name."""
+        modules, sys.path[:], sys.dont_write_bytecode = self._before
+        for name in sys.modules.keys() - modules:
+            if name.partition(".")[0] == PACKAGE:
+                del sys.modules[name]
 
     def ask(self, message: m.Message) -> m.Message:
         """What it answers; ``m.RaisedException`` has the traceback of the repository's error."""

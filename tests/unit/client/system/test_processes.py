@@ -133,6 +133,27 @@ def test_each_keeps_its_own_failure() -> None:
     assert [one.value for one in calls.each] == [1, None, 3]
     with pytest.raises(ValueError, match="this one"):
         calls.each[1].result()
+    with pytest.raises(ValueError, match="this one"):
+        calls.results()
+    assert Calls([lambda: 1, lambda: 2, lambda: 3], at_once=1).results() == [1, 2, 3]
+
+
+def test_without_a_thread_for_each_no_call_begins_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    go_on, begun, threads = threading.Event(), threading.Event(), []
+
+    def start(thread: threading.Thread) -> None:
+        if threads:
+            raise RuntimeError("can't start new thread")
+        threads.append(thread)
+        begin(thread)
+
+    begin = threading.Thread.start
+    monkeypatch.setattr(threading.Thread, "start", start)
+    with pytest.raises(RuntimeError):
+        Calls([lambda: go_on.wait(DEADLINE_S), begun.set])
+    go_on.set()
+    threads[0].join()
+    assert not begun.is_set()
 
 
 def test_a_wait_may_end_before_the_calls() -> None:
