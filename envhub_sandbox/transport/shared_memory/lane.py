@@ -194,17 +194,17 @@ class SharedMemoryLane:
         spin_ns = self._spin.budget_ns
         slot = self.observations.choose()
         if len(self.shards) == 1:
-            self.shards[0].ask(leaves, slot, spin_ns)
+            self.shards[0].ask(leaves, (slot, spin_ns, 0))
             return
         # the first ones start while the last ones are still asked: with many, each moment counts
         asked = zip(self.shards, self._bounds, self._cores.of_shards(), strict=True)
         is_one_array = self._flat_actions and type(actions) is np.ndarray
         for index, (shard, (start, stop), cpu) in enumerate(asked):
-            wishes = spin_ns if index < self._awake else 0, slot, cpu
+            wishes = slot, spin_ns if index < self._awake else 0, cpu
             if is_one_array:
                 shard.ask_rows(actions[start:stop], wishes)
             else:
-                shard.ask([leaf[start:stop] for leaf in leaves], *wishes)
+                shard.ask([leaf[start:stop] for leaf in leaves], wishes)
 
     def wait(self, deadline: Deadline) -> None:
         """See ``Lane``."""
@@ -292,7 +292,7 @@ class SharedMemoryLane:
         cpus = self._cores.of_shards() if len(self.shards) > 1 else [0]
         for index, (shard, frames) in enumerate(zip(self.shards, request.frames, strict=True)):
             spin_ns = self._spin.budget_ns if index < self._awake else 0
-            shard.tell(b"".join(pack_packet(0, frames)), slot, spin_ns, cpus[index])
+            shard.tell(b"".join(pack_packet(0, frames)), (slot, spin_ns, cpus[index]))
 
     def send_for_infos(self) -> None:
         """See ``Lane``."""

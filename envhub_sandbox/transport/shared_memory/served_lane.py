@@ -282,7 +282,7 @@ class ServedShard:
 
     def ask(self, leaves: Sequence[Any], spin_ns: int) -> bytes:
         """What the server writes into the request slab for a step."""
-        self.slabs.write(leaves, 0, spin_ns)
+        self.slabs.write(leaves, (0, spin_ns, 0))
         return b"".join((self._words, self._actions))
 
     def read(self, frames: Frames) -> Outcome:

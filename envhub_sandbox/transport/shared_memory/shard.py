@@ -33,6 +33,9 @@ Outcome = tuple[int, m.Message | None]
 """``slabs.DONE``, ``RAISED``, ``FETCH`` or ``COLUMNS``, and what came encoded."""
 _OUTCOMES = frozenset({slabs.DONE, slabs.RAISED, slabs.FETCH, slabs.COLUMNS})
 _UNKNOWN = -1
+Wishes = tuple[int, int, int]
+"""Which slot the observations go to, for how many ns to wait awake afterwards, and one more than
+the core to run on, or 0."""
 Schema = list[tuple[Column, Any]]
 """What columns infos have, and where each lies in a slab."""
 
@@ -58,23 +61,23 @@ class ShardSlabs:
         self._own: dict[Any, Any] | None = None
         self._views: dict[tuple[int, Any], Any] = {}
         self._codes = [_UNKNOWN] * len(layout.actions)
-        self._wishes: tuple[int, int, int] | None = (0, 0, 0)
+        self._wishes: Wishes | None = (0, 0, 0)
         self._told = False
         self._rows: tuple[Any, Any] = None, None
 
-    def write_rows(self, rows: Any, wishes: tuple[int, int, int]) -> None:
+    def write_rows(self, rows: Any, wishes: Wishes) -> None:
         """``write`` of actions that are one array, where nothing else is new: it usually is not."""
         dtype, view = self._rows
         if dtype is not rows.dtype or self._told:
-            self.write([rows], *wishes)
+            self.write([rows], wishes)
             self._rows = rows.dtype, self._views[0, rows.dtype][1]
             return
         view[...] = rows
         if wishes != self._wishes:
             self._wish(*wishes)
 
-    def write(self, leaves: Sequence[Any], slot: int, spin_ns: int, cpu: int = 0) -> None:
-        """Write a shard's actions; its observations are to go to ``slot``."""
+    def write(self, leaves: Sequence[Any], wishes: Wishes) -> None:
+        """Write a shard's actions."""
         asks = self._asks
         if self._told:
             asks[slabs.MESSAGE] = 0
@@ -94,28 +97,26 @@ class ShardSlabs:
                 asks[slabs.CHANGES] += 1
                 self._codes[index] = code
             found[1][...] = leaf
-        wishes = (spin_ns, slot, cpu)
         if wishes != self._wishes:
             self._wish(*wishes)
 
-    def write_message(self, packet: bytes, slot: int, spin_ns: int = 0, cpu: int = 0) -> None:
+    def write_message(self, packet: bytes, wishes: Wishes) -> None:
         """Write a message in the place of actions."""
         start = self.layout.message
         self._request[start : start + len(packet)] = packet
         self._told = True
         self._asks[slabs.MESSAGE] = len(packet)
-        wishes = (spin_ns, slot, cpu)
         if wishes != self._wishes:
             self._wish(*wishes)
 
-    def _wish(self, spin_ns: int, slot: int, cpu: int) -> None:
+    def _wish(self, slot: int, spin_ns: int, cpu: int) -> None:
         asks = self._asks
         self._wishes = None
         asks[slabs.SPIN] = spin_ns
         asks[slabs.SLOT] = slot
         asks[slabs.CPU] = cpu
         asks[slabs.CHANGES] += 1
-        self._wishes = (spin_ns, slot, cpu)
+        self._wishes = (slot, spin_ns, cpu)
 
     def _view(self, index: int, dtype: Any) -> tuple[int, Any]:
         code = slabs.DTYPE_CODES[dtype]
@@ -272,19 +273,19 @@ class LaneShard(ShardSlabs):
             self._slab_files.pop().close()
         self._runner_bell.handed_over()
 
-    def ask(self, leaves: Sequence[Any], slot: int, spin_ns: int, cpu: int = 0) -> None:
+    def ask(self, leaves: Sequence[Any], wishes: Wishes) -> None:
         """Write a shard's actions and announce them."""
-        self.write(leaves, slot, spin_ns, cpu)
+        self.write(leaves, wishes)
         self._announce()
 
-    def ask_rows(self, rows: Any, wishes: tuple[int, int, int]) -> None:
-        """The same, of actions that are one array; ``wishes`` are the other arguments."""
+    def ask_rows(self, rows: Any, wishes: Wishes) -> None:
+        """The same, of actions that are one array."""
         self.write_rows(rows, wishes)
         self._announce()
 
-    def tell(self, packet: bytes, slot: int, spin_ns: int = 0, cpu: int = 0) -> None:
+    def tell(self, packet: bytes, wishes: Wishes) -> None:
         """Write a message and announce it."""
-        self.write_message(packet, slot, spin_ns, cpu)
+        self.write_message(packet, wishes)
         self._announce()
 
     def _announce(self) -> None:

@@ -46,15 +46,6 @@ def become_subreaper() -> None:
     kernel.prctl(_PR_SET_CHILD_SUBREAPER, 1)
 
 
-def be_ended_first() -> None:
-    """When the whole host runs out of memory, the kernel should end a jail, not its client.
-
-    What root sets here, no descendant can lower.
-    """
-    with open("/proc/self/oom_score_adj", "w") as file:
-        file.write("1000")
-
-
 def set_no_new_privileges() -> None:
     """Let no later ``execve`` gain anything: set-user-id bits and file capabilities are dead."""
     kernel.prctl(_PR_SET_NO_NEW_PRIVS, 1)

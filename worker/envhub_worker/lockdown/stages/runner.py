@@ -81,7 +81,9 @@ def enter(
     # filter is last: from then on each call is judged, the self-test's own included. The self-test
     # sees what a stranger's code would see, for nothing is given up after it.
     process.set_dumpable(True)
-    process.be_ended_first()
+    # when the whole host runs out of memory, the kernel should end a jail, not its client
+    with open("/proc/self/oom_score_adj", "w") as file:
+        file.write("1000")
     _apply(resource_limits(jail.spec.confinement.limits, jail.processes))
     process.drop_capabilities()
     process.set_no_new_privileges()

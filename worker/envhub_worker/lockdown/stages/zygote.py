@@ -40,8 +40,6 @@ def enter(config: ZygoteConfig) -> Common:
     if config.refusal is not None:
         raise LayerUnavailableError(**config.refusal)
     namespaced = config.profile == "strict"
-    if config.gpu is not False:  # its jails may write into their own folders of /proc
-        process.be_ended_first()
     plan = _plan_root(config)
     if namespaced:
         _enter_namespaces(config, plan)
