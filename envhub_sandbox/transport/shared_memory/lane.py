@@ -19,8 +19,13 @@ from envhub_sandbox.transport.lane import Frames, RelayLane, Request
 from envhub_sandbox.transport.replies import typed_reply
 from envhub_sandbox.transport.results import Results, StepResult
 from envhub_sandbox.transport.shared_memory.attachment import Attachment
-from envhub_sandbox.transport.shared_memory.observations import RING, ObservationSlab
-from envhub_sandbox.transport.shared_memory.shard import LaneShard, Outcome, ShardSlabs
+from envhub_sandbox.transport.shared_memory.client_slabs import (
+    RING,
+    LaneShard,
+    ObservationSlab,
+    Outcome,
+    ShardSlabs,
+)
 from envhub_sandbox.transport.shared_memory.spin import CPUS, Cores, SpinChooser
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import UNTRUSTED

@@ -16,7 +16,7 @@ from gymnasium import spaces
 from envhub_sandbox.errors import RemoteProtocolError
 from envhub_sandbox.session import requests
 from envhub_sandbox.transport.shared_memory import shard
-from envhub_sandbox.transport.shared_memory.shard import LaneShard
+from envhub_sandbox.transport.shared_memory.client_slabs import LaneShard
 from envhub_sandbox.vector import vector_env
 from envhub_sandbox.vector.sandbox_view import SandboxView
 from envhub_sandbox.vector.sub_environment import SubEnvironment
