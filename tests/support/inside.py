@@ -41,7 +41,7 @@ from envhub_sandbox.transport.jail import JailHandle
 from envhub_sandbox.transport.shared_memory.client_slabs import LaneShard
 from envhub_sandbox.transport.shared_memory.lane import SharedMemoryLane
 from envhub_worker.access.audit.log import Log
-from envhub_worker.access.port.connection_limit import ConnectionLimiter
+from envhub_worker.access.curve_port import ConnectionLimiter
 from envhub_worker.access.remote_gate import RemoteGate
 from envhub_worker.cli import listen, listen_options
 from envhub_worker.cli.identity import Identity
