@@ -35,7 +35,6 @@ from envhub_sandbox.settings.policy import Policy, Timeouts
 from envhub_sandbox.system.folders import cache_root
 from envhub_sandbox.system.locks import SharedLock
 from envhub_sandbox.system.log import CRASHES
-from envhub_sandbox.transport import trace
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.remote_warnings import RemoteWarnings
 from envhub_worker.protocol import messages as m
@@ -163,7 +162,10 @@ class Repository:
         installed: dict[str, Any] | None,
         advice: Callable[[str], str],
     ) -> None:
-        trace.start_if_wanted()
+        if os.environ.get("ENVHUB_TRACE") == "1":
+            from envhub_sandbox.transport import trace
+
+            trace.start()
         self.snapshot = snapshot
         self.arguments = arguments
         self.policy = policy

@@ -10,7 +10,6 @@ changed, so a step costs the same.
 from __future__ import annotations
 
 import functools
-import os
 import sys
 import threading
 from collections.abc import Callable
@@ -22,13 +21,13 @@ from envhub_sandbox.transport.lane import RelayLane, Request
 from envhub_sandbox.transport.shared_memory.served_lane import ServedLane
 from envhub_worker.protocol import messages as m
 
-_VARIABLE = "ENVHUB_TRACE"
 _SENDING = ("send_step", "send", "send_for_infos")
 _WAITING = ("wait", "replies")
 
 
 @functools.cache
-def _start() -> None:
+def start() -> None:
+    """Print from now on."""
     began = perf_counter()
 
     def say(text: str) -> None:
@@ -50,12 +49,6 @@ def _start() -> None:
             setattr(cls, name, _sending(getattr(cls, name), say))
         for name in waits:
             setattr(cls, name, _waiting(getattr(cls, name), say))
-
-
-def start_if_wanted() -> None:
-    """Print from now on, where the variable says so."""
-    if os.environ.get(_VARIABLE) == "1":
-        _start()
 
 
 def _sending(method: Callable[..., Any], say: Callable[[str], None]) -> Callable[..., Any]:

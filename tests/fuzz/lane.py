@@ -8,9 +8,8 @@ import numpy as np
 from gymnasium import spaces
 
 from envhub_sandbox.transport.results import Results
+from envhub_sandbox.transport.shared_memory.client_slabs import LaneShard, ObservationSlab
 from envhub_sandbox.transport.shared_memory.lane import infos_of
-from envhub_sandbox.transport.shared_memory.observations import ObservationSlab
-from envhub_sandbox.transport.shared_memory.shard import LaneShard
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import UNTRUSTED
 from envhub_worker.protocol.shared_memory import slabs

@@ -9,11 +9,11 @@ from typing import Any
 import msgpack
 import numpy as np
 
-from envhub_worker.protocol.codec.decoder import decode
 from envhub_worker.protocol.codec.encoder import encode
 from envhub_worker.protocol.codec.inert import RemoteEnum, RemoteObject
 from envhub_worker.protocol.errors import ProtocolError
 from envhub_worker.protocol.limits import WireLimits
+from tests.support.decode import decode
 
 SMALL = WireLimits(items=20_000, header_bytes=1 << 20)
 _NUMBERS = (0, 1, -1, 2, 7, 2**31, 2**63 - 1, -(2**63), 2**64 - 1, 2**200)

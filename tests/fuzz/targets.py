@@ -30,7 +30,6 @@ from envhub_sandbox.transport.values import DescriptionReader, generator, spec_o
 from envhub_sandbox.vector.actions import action_reader
 from envhub_sandbox.vector.vector_env import metadata_of
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec.decoder import decode
 from envhub_worker.protocol.codec.encoder import encode
 from envhub_worker.protocol.codec.wire import GENERATOR, SPACE, SPEC
 from envhub_worker.protocol.errors import UNTRUSTED
@@ -46,6 +45,7 @@ from tests.attacks.client.lying_server import env_manifest
 from tests.fuzz.mutate import Spoiler, crossing
 from tests.fuzz.oracle import WrongError, alike, demand, fits, per_env, usable
 from tests.fuzz.traffic import Frames
+from tests.support.decode import decode
 from tests.unit.protocol.spaces.test_batches import SINGLE_SPACES, parts_of
 
 ELEMENTS = 2_000_000

@@ -38,10 +38,10 @@ from envhub_sandbox.transport import tcp
 from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import JailHandle
+from envhub_sandbox.transport.shared_memory.client_slabs import LaneShard
 from envhub_sandbox.transport.shared_memory.lane import SharedMemoryLane
-from envhub_sandbox.transport.shared_memory.shard import LaneShard
 from envhub_worker.access.audit.log import Log
-from envhub_worker.access.port.connection_limit import ConnectionLimiter
+from envhub_worker.access.curve_port import ConnectionLimiter
 from envhub_worker.access.remote_gate import RemoteGate
 from envhub_worker.cli import listen, listen_options
 from envhub_worker.cli.identity import Identity

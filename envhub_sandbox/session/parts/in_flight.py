@@ -28,7 +28,7 @@ from envhub_sandbox.session.parts.worker_queue import WorkerQueue
 from envhub_sandbox.session.requests import MessageFor, RequestOrder
 from envhub_sandbox.session.use_lock import FleetUse, all_held
 from envhub_sandbox.transport.deadline import Deadline, deadline_of
-from envhub_sandbox.transport.readiness import answered_first
+from envhub_sandbox.transport.lane import answered_first
 from envhub_sandbox.transport.results import StepResult
 from envhub_worker.protocol.lifecycle import State
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, LARGE_BYTES

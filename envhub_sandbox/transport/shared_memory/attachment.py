@@ -10,7 +10,7 @@ from time import monotonic, sleep
 from envhub_sandbox.errors import WorkerDiedError
 from envhub_sandbox.transport.connection import SESSION
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.shared_memory.shard import LaneShard
+from envhub_sandbox.transport.shared_memory.client_slabs import LaneShard
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.shared_memory.descriptors import Watch
 

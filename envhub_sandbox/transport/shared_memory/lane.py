@@ -21,10 +21,11 @@ from envhub_sandbox.transport.lane import Frames, RelayLane, Request
 from envhub_sandbox.transport.replies import typed_reply
 from envhub_sandbox.transport.results import Results, StepResult
 from envhub_sandbox.transport.shared_memory.attachment import Attachment
-from envhub_sandbox.transport.shared_memory.observations import RING, ObservationSlab
-from envhub_sandbox.transport.shared_memory.shard import (
+from envhub_sandbox.transport.shared_memory.client_slabs import (
+    RING,
     JoinedColumns,
     LaneShard,
+    ObservationSlab,
     Outcome,
     ShardSlabs,
 )

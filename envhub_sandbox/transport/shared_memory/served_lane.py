@@ -22,8 +22,7 @@ from envhub_sandbox.transport.jail import RunnersDiedError
 from envhub_sandbox.transport.lane import Frames, RelayLane
 from envhub_sandbox.transport.replies import expect_reply, typed_reply
 from envhub_sandbox.transport.results import Results, StepResult
-from envhub_sandbox.transport.shared_memory.observations import ObservationSlab
-from envhub_sandbox.transport.shared_memory.shard import Outcome, ShardSlabs
+from envhub_sandbox.transport.shared_memory.client_slabs import ObservationSlab, Outcome, ShardSlabs
 from envhub_sandbox.transport.shared_memory.spin import SpinChooser
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.wire import Buffer
@@ -136,7 +135,7 @@ class ServedLane(RelayLane):
         elif kind == slabs.COLUMNS:
             infos = shard.slabs.columns()
         else:
-            infos = self._results.info(message)
+            infos = {} if message is None else self._results.info(message)
         return m.StepDone(shard.observation(), *shard.observations.results(), infos)
 
     def result(self, infos: dict[Any, Any] | None = None) -> StepResult:
@@ -146,12 +145,9 @@ class ServedLane(RelayLane):
             return super().result(infos)
         # it was made here, of the spaces that are declared
         self._answers = []
-        flags = done.rewards, done.terminations, done.truncations
-        return (
-            done.observation,
-            *flags,
-            self._results.infos([done.info]) if infos is None else infos,
-        )
+        if infos is None:  # most steps have none
+            infos = self._results.infos([done.info]) if done.info else {}
+        return done.observation, done.rewards, done.terminations, done.truncations, infos
 
     def wait(self, deadline: Deadline) -> None:
         """See ``Lane``."""

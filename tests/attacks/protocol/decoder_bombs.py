@@ -18,9 +18,9 @@ from pathlib import Path
 
 import msgpack
 
-from envhub_worker.protocol.codec.decoder import decode
 from envhub_worker.protocol.codec.wire import Buffer
 from envhub_worker.protocol.errors import RemoteProtocolError
+from tests.support.decode import decode
 from tests.support.wire import ext, message, packed
 
 MIB = 1024 * 1024

@@ -23,7 +23,6 @@ from gymnasium import spaces
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from envhub_worker.protocol.codec.decoder import decode
 from envhub_worker.protocol.codec.encoder import encode
 from envhub_worker.protocol.codec.inert import RemoteObject
 from envhub_worker.protocol.codec.wire import Buffer
@@ -33,6 +32,7 @@ from tests.attacks.protocol import decoder_bombs
 from tests.attacks.protocol.decoder_bombs import ACCEPTED, MIB, REFUSED
 from tests.fuzz.mutate import Pairs, Spoiler
 from tests.fuzz.mutate import packed as packed_tree
+from tests.support.decode import decode
 from tests.support.wire import decode_space, ext, message, packed
 
 ROOT = Path(__file__).parents[3]

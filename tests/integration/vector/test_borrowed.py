@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from envhub_sandbox import make_env
-from envhub_sandbox.transport.shared_memory.observations import RING
+from envhub_sandbox.transport.shared_memory.client_slabs import RING
 from tests.support.compare import assert_same
 from tests.support.samples import sample
 

@@ -14,7 +14,7 @@ import pytest
 
 from envhub_sandbox.errors import WorkerDiedError
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.readiness import answered_first
+from envhub_sandbox.transport.lane import answered_first
 from tests.support import inside
 from tests.support.objects.gates import Gates
 from tests.support.processes import eventually

@@ -21,10 +21,10 @@ from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerEr
 from envhub_sandbox.transport.tcp import TcpLink
 from envhub_worker.access import keys
 from envhub_worker.access.audit.log import LINES, PERIOD_S, Log
+from envhub_worker.access.curve_port import ConnectionLimiter
 from envhub_worker.access.gate import ClientRequest, Incoming
 from envhub_worker.access.keys import AuthorizedClients
 from envhub_worker.access.packages import Packages
-from envhub_worker.access.port.connection_limit import ConnectionLimiter
 from envhub_worker.access.quotas import Permissions, Quotas
 from envhub_worker.access.remote_gate import RemoteGate, Rules
 from envhub_worker.access.sessions import Sessions

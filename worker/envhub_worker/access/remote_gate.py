@@ -11,13 +11,12 @@ from envhub_worker.access.audit.events import Events
 from envhub_worker.access.audit.figures import ClientFigures, ServerFigures, Tally, client_name
 from envhub_worker.access.audit.log import Log
 from envhub_worker.access.audit.usage import Usage
+from envhub_worker.access.curve_port import MAX_CONNECTIONS, CurvePort
 from envhub_worker.access.drain import Drain
 from envhub_worker.access.gate import ClientRequest, Gate, Incoming
 from envhub_worker.access.keys import AuthorizedClients, KeyPair
 from envhub_worker.access.packages import Packages
 from envhub_worker.access.places import Places
-from envhub_worker.access.port.connection_limit import MAX_CONNECTIONS
-from envhub_worker.access.port.curve_port import CurvePort
 from envhub_worker.access.quotas import InFlight, Permissions, Quotas, Use, check_policy
 from envhub_worker.access.session_expiry import SessionExpiry
 from envhub_worker.access.sessions import WATCHER, Sessions

@@ -182,26 +182,10 @@ def fresh(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 
 @pytest.mark.usefixtures("fresh")
-@pytest.mark.parametrize("value", [None, "0", "yes"])
-def test_without_the_variable_no_class_is_changed(
-    monkeypatch: pytest.MonkeyPatch, value: str | None
-) -> None:
-    monkeypatch.delenv("ENVHUB_TRACE", raising=False)
-    if value is not None:
-        monkeypatch.setenv("ENVHUB_TRACE", value)
-    before = [dict(vars(cls)) for cls in CLASSES]
-    trace.start_if_wanted()
-    assert [dict(vars(cls)) for cls in CLASSES] == before
-
-
-@pytest.mark.usefixtures("fresh")
-def test_each_message_is_a_line(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_each_message_is_a_line(capsys: pytest.CaptureFixture[str]) -> None:
     """Once, however often it is asked for; what fails is named by its error."""
-    monkeypatch.setenv("ENVHUB_TRACE", "1")
-    trace.start_if_wanted()
-    trace.start_if_wanted()
+    trace.start()
+    trace.start()
     with lying() as server:
         client = WorkerConnection(server.endpoint, server.process_fd)
         client.request(m.Hello(m.VERSION, b"a secret"), deadline=Deadline(60))

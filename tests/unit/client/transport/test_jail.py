@@ -10,11 +10,9 @@ from unittest.mock import Mock
 
 import pytest
 
-from envhub_sandbox.transport import readiness
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import JailHandle, WatchedAttributes
-from envhub_sandbox.transport.lane import RelayLane
-from envhub_sandbox.transport.readiness import answered_first
+from envhub_sandbox.transport.lane import RelayLane, answered_first
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
 from envhub_worker.protocol.messages.prefix import CHANGES
@@ -122,7 +120,7 @@ def test_a_deadline_ends_the_wait(lanes: list[FakeLane]) -> None:
 
 def test_a_ring_ends_the_sleep(lanes: list[FakeLane], monkeypatch: pytest.MonkeyPatch) -> None:
     """Whichever lane it comes from: without it, this would take an hour."""
-    monkeypatch.setattr(readiness, "LOOK_MS", 3_600_000)
+    monkeypatch.setattr("envhub_sandbox.transport.lane.LOOK_MS", 3_600_000)
 
     def answer() -> None:
         while not lanes[1].listened:

@@ -15,8 +15,8 @@ from gymnasium import spaces
 
 from envhub_sandbox.errors import RemoteProtocolError
 from envhub_sandbox.session import requests
-from envhub_sandbox.transport.shared_memory import shard
-from envhub_sandbox.transport.shared_memory.shard import LaneShard
+from envhub_sandbox.transport.shared_memory import client_slabs
+from envhub_sandbox.transport.shared_memory.client_slabs import LaneShard
 from envhub_sandbox.vector import vector_env
 from envhub_sandbox.vector.sandbox_view import SandboxView
 from envhub_sandbox.vector.sub_environment import SubEnvironment
@@ -98,7 +98,7 @@ def test_a_runner_is_told_all_after_an_interrupt(what: str, afterwards: tuple[st
             else:
                 lane.tell(b"packet", 1)
 
-        came = before_line(shard.__file__, line, act)
+        came = before_line(client_slabs.__file__, line, act)
         assert runner.asked(dtype, slot) == expected
         lane.close()
         if not came:

@@ -13,7 +13,6 @@ from hypothesis.extra import numpy as hnp
 
 from envhub_worker.protocol.codec import arrays
 from envhub_worker.protocol.codec.arrays import ArrayReader, ArrayWriter
-from envhub_worker.protocol.codec.decoder import decode
 from envhub_worker.protocol.codec.encoder import encode
 from envhub_worker.protocol.codec.numpy_forms import read_numpy_scalar
 from envhub_worker.protocol.errors import (
@@ -22,6 +21,7 @@ from envhub_worker.protocol.errors import (
     RemoteProtocolError,
 )
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
+from tests.support.decode import decode
 
 LARGE = arrays.INLINE_BYTES + 8
 NUMBERS = ["?", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4", "f8", "c8", "c16"]
@@ -29,10 +29,10 @@ DTYPES = [*NUMBERS, "U7", "S5", "M8[ns]", "m8[25s]", "M8", "m8"]
 TEXT = st.characters(exclude_categories=["Cs"], exclude_characters="\0")
 
 
-def through(array: np.ndarray[Any, Any], *, copy: bool = True) -> np.ndarray[Any, Any]:
+def through(array: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
     writer = ArrayWriter()
     descriptor = writer.add(array)
-    reader = ArrayReader(b"".join(writer.tail), writer.frames, DEFAULT_LIMITS, copy)
+    reader = ArrayReader(b"".join(writer.tail), writer.frames, DEFAULT_LIMITS)
     read = reader.take(descriptor)
     reader.finish()
     return read
@@ -45,7 +45,7 @@ def read(
     limits: WireLimits = DEFAULT_LIMITS,
 ) -> np.ndarray[Any, Any]:
     """Reads one array out of hand-made bytes, to the end."""
-    reader = ArrayReader(tail, frames, limits, copy=True)
+    reader = ArrayReader(tail, frames, limits)
     array = reader.take(descriptor)
     reader.finish()
     return array
@@ -140,10 +140,9 @@ def test_copied_array_can_be_written_and_shares_nothing(size: int) -> None:
 def test_misaligned_frames_give_aligned_arrays() -> None:
     """A transport may cut frames out of one buffer anywhere; native code needs alignment."""
     frame = memoryview(bytes(1 + 8 * LARGE))[1:]
-    reader = ArrayReader(b"", [frame], DEFAULT_LIMITS, copy=False)
+    reader = ArrayReader(b"", [frame], DEFAULT_LIMITS)
     array = reader.take(descriptor(11, LARGE, frame=True))
     assert array.flags.aligned
-    assert not array.flags.writeable
 
 
 @pytest.mark.parametrize(

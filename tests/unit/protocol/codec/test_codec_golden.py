@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from envhub_worker.protocol.codec.arrays import INLINE_BYTES
-from envhub_worker.protocol.codec.decoder import decode
 from envhub_worker.protocol.codec.encoder import encode
 from envhub_worker.protocol.codec.inert import RemoteEnum, RemoteObject
 from envhub_worker.protocol.codec.wire import Buffer
 from tests.support.compare import assert_same
+from tests.support.decode import decode
 
 GOLDEN = Path(__file__).parents[2] / "golden" / "values.json"
 

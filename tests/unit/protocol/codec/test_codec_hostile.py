@@ -9,7 +9,6 @@ import msgpack
 import numpy as np
 import pytest
 
-from envhub_worker.protocol.codec.decoder import decode
 from envhub_worker.protocol.codec.encoder import encode
 from envhub_worker.protocol.codec.inert import RemoteObject
 from envhub_worker.protocol.codec.wire import Buffer
@@ -20,6 +19,7 @@ from envhub_worker.protocol.errors import (
 )
 from envhub_worker.protocol.limits import WireLimits
 from tests.support.compare import assert_same
+from tests.support.decode import decode
 from tests.support.wire import deep, ext, message, packed
 
 SMALL = WireLimits(

@@ -18,12 +18,12 @@ from envhub_sandbox.transport.values import framed
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec import unsendable
 from envhub_worker.protocol.codec.arrays import INLINE_BYTES
-from envhub_worker.protocol.codec.decoder import decode
 from envhub_worker.protocol.codec.encoder import encode
 from envhub_worker.protocol.codec.inert import RemoteObject
 from envhub_worker.protocol.errors import LocalProtocolError, RemoteProtocolError
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
 from tests.support.compare import assert_identical, assert_same
+from tests.support.decode import decode
 from tests.support.objects import handed
 from tests.support.wire import deep
 

@@ -10,7 +10,6 @@ from gymnasium import spaces
 from hypothesis import given
 from hypothesis import strategies as st
 
-from envhub_worker.protocol.codec.decoder import decode
 from envhub_worker.protocol.codec.encoder import encode
 from envhub_worker.protocol.errors import RemoteProtocolError
 from envhub_worker.protocol.limits import MAX_NUM_ENVS
@@ -24,6 +23,7 @@ from envhub_worker.protocol.manifest.manifest import (
     encode_manifest,
 )
 from envhub_worker.protocol.manifest.names import MAX_NAME, MAX_NAMES
+from tests.support.decode import decode
 from tests.support.wire import env_manifest
 
 ELEMENTS = 40_000

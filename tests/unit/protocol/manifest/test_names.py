@@ -19,7 +19,6 @@ from envhub_sandbox.errors import RemoteEnvError, RemoteProtocolError, remote_er
 from envhub_sandbox.transport import values
 from envhub_sandbox.transport.values import spec_of
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
-from envhub_worker.protocol.codec.decoder import decode
 from envhub_worker.protocol.codec.encoder import encode
 from envhub_worker.protocol.codec.inert import RemoteEnum, RemoteObject
 from envhub_worker.protocol.manifest.manifest import (
@@ -28,6 +27,7 @@ from envhub_worker.protocol.manifest.manifest import (
     read_spec_facts,
 )
 from envhub_worker.protocol.manifest.names import GYMNASIUMS, PROBED, is_servable
+from tests.support.decode import decode
 from tests.support.objects.curious import names_asked_for
 from tests.support.objects.protocol_names import names_that_libraries_call
 from tests.unit.protocol.manifest.test_manifest import an_env, read, with_env

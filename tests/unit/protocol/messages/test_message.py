@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.arrays import ArrayReader
-from envhub_worker.protocol.codec.decoder import decode
 from envhub_worker.protocol.codec.encoder import encode
 from envhub_worker.protocol.codec.inert import RemoteEnum, RemoteObject
 from envhub_worker.protocol.errors import (
@@ -28,6 +27,7 @@ from envhub_worker.protocol.errors import (
 from envhub_worker.protocol.limits import WireLimits
 from envhub_worker.protocol.messages import message, runner, server
 from tests.support import inside
+from tests.support.decode import decode
 
 
 @pytest.mark.parametrize("message", [server.GetStatus(), runner.Value([1, {"a": b"x"}])])

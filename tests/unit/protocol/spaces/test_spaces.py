@@ -16,12 +16,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from envhub_sandbox.errors import WorkerTimeoutError
-from envhub_worker.protocol.codec.decoder import decode
 from envhub_worker.protocol.codec.encoder import encode
 from envhub_worker.protocol.errors import LocalProtocolError, RemoteProtocolError
 from envhub_worker.protocol.spaces.reader import ELEMENT_BYTES, SPACE_BYTES, SpaceReader
 from envhub_worker.protocol.spaces.spaces import MAX_SPACE_DEPTH, OpaqueSpace, encode_space
 from tests.support.compare import assert_same
+from tests.support.decode import decode
 from tests.support.wire import decode_space
 
 pytestmark = pytest.mark.same_for("users")

@@ -8,7 +8,7 @@ import pytest
 import zmq
 
 from envhub_worker.access.audit.log import Log
-from envhub_worker.access.port.curve_port import CurvePort
+from envhub_worker.access.curve_port import CurvePort
 from envhub_worker.access.sessions import Sessions
 from envhub_worker.loop import Loop
 from tests.support.processes import eventually

@@ -128,23 +128,3 @@ def _encode(item: Item, place: int, labels: dict[str, int], *, far: bool) -> lis
 def to_bytes(program: Sequence[BpfInstruction]) -> bytes:
     """As the kernel reads it: an array of ``struct sock_filter``."""
     return b"".join(struct.pack("=HBBI", i.code, i.if_true, i.if_false, i.k) for i in program)
-
-
-def listing(program: Sequence[BpfInstruction]) -> str:
-    """One line per instruction, for people and golden files."""
-    names = {
-        LOAD: "load",
-        AND: "and",
-        RETURN: "return",
-        _JUMP: "jump",
-        JUMP_EQUAL: "equal",
-        JUMP_GREATER: "greater",
-        JUMP_GREATER_OR_EQUAL: "greater-or-equal",
-    }
-    lines = []
-    for place, one in enumerate(program):
-        text = f"{place:4} {names[one.code]} {one.k:#x}"
-        if one.code in (JUMP_EQUAL, JUMP_GREATER, JUMP_GREATER_OR_EQUAL):
-            text += f" ? {place + 1 + one.if_true} : {place + 1 + one.if_false}"
-        lines.append(text)
-    return "\n".join(lines) + "\n"

@@ -87,7 +87,7 @@ class ArrayWriter:
 
 
 class ArrayReader:
-    """Hands out one message's arrays in the order of their descriptors.
+    """Hands out one message's arrays in the order of their descriptors, as copies.
 
     Trust: input from the worker.
 
@@ -95,18 +95,14 @@ class ArrayReader:
         tail: Bytes of small arrays.
         frames: Bytes of large arrays, one each.
         limits: Cap on the bytes of one array.
-        copy: Whether arrays have memory of their own and can be written. Otherwise they are
-            read-only, and the large ones are views of ``frames`` where those are aligned.
     """
 
-    __slots__ = ("_copy", "_frames", "_limits", "_next_byte", "_next_frame", "_tail")
+    __slots__ = ("_frames", "_limits", "_next_byte", "_next_frame", "_tail")
 
-    def __init__(
-        self, tail: Buffer, frames: Sequence[Buffer], limits: WireLimits, copy: bool
-    ) -> None:
+    def __init__(self, tail: Buffer, frames: Sequence[Buffer], limits: WireLimits) -> None:
         self._tail, self._next_byte = tail, 0
         self._frames, self._next_frame = frames, 0
-        self._limits, self._copy = limits, copy
+        self._limits = limits
 
     def take(self, descriptor: bytes) -> Array:
         """Returns the array of the next descriptor, native in byte order and C-contiguous.
@@ -119,12 +115,10 @@ class ArrayReader:
         if not nbytes:
             return np.empty(shape, dtype)
         array: Array
-        if not own_frame:
-            array = np.ndarray(shape, dtype, self._slice(nbytes))
-        elif self._copy:
+        if own_frame:
             array = np.ndarray(shape, dtype, self._frame(nbytes)).copy()
         else:
-            array = _read_only(np.ndarray(shape, dtype, self._frame(nbytes)))
+            array = np.ndarray(shape, dtype, self._slice(nbytes))
         if dtype.kind in "bUM":
             check_content(array)
         return array
@@ -134,14 +128,14 @@ class ArrayReader:
         if self._next_byte != len(self._tail) or self._next_frame != len(self._frames):
             raise RemoteProtocolError("The message has array bytes that nothing describes.")
 
-    def _slice(self, nbytes: int) -> bytes | bytearray:
+    def _slice(self, nbytes: int) -> bytearray:
         """Returns the next bytes of the tail; always a copy, for they are not aligned there."""
         end = self._next_byte + nbytes
         if end > len(self._tail):
             raise RemoteProtocolError("An array's bytes are missing in the header's tail.")
         raw = self._tail[self._next_byte : end]
         self._next_byte = end
-        return bytearray(raw) if self._copy else bytes(raw)
+        return bytearray(raw)
 
     def _frame(self, nbytes: int) -> Buffer:
         if nbytes > self._limits.frame_bytes:
@@ -293,14 +287,6 @@ def _sized_dtype(code: int, parameter: int) -> np.dtype[Any]:
         raise RemoteProtocolError("A time dtype has an unknown unit.")
     kind = "M8" if code == _DATETIME else "m8"
     return np.dtype(f"<{kind}[{count}{_UNITS[unit]}]" if unit else f"<{kind}")
-
-
-def _read_only(array: Array) -> Array:
-    """Returns the array protected from writing; a copy where a transport misaligned it."""
-    if not array.flags.aligned:
-        array = array.copy()
-    array.flags.writeable = False
-    return array
 
 
 def check_content(array: Array) -> None:

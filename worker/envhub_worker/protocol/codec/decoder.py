@@ -20,7 +20,7 @@ from envhub_worker.protocol.codec.inert import (
 )
 from envhub_worker.protocol.codec.wire import Buffer
 from envhub_worker.protocol.errors import MessageTooLargeError, ProtocolError, RemoteProtocolError
-from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
+from envhub_worker.protocol.limits import WireLimits
 
 if TYPE_CHECKING:
     from envhub_worker.protocol.codec.arrays import Array, ArrayReader
@@ -50,11 +50,20 @@ class _Head:
 class Decoder:
     """Rebuilds one value; msgpack calls its hooks in the order of the document.
 
-    The arguments are those of ``codec.decode``, with the parts of ``split_frames``.
+    Trust: input from the worker. Sizes are checked before anything is allocated, every byte
+    must be accounted for, and nothing is executed.
+
+    Args:
+        tail, buffers: Of ``split_frames``.
+        limits: What is accepted.
+        unpickler: Decodes pickled objects; only a worker, which trusts its client, has one.
+        tensors: Makes a tensor of an array and a dtype name (``"bfloat16"`` comes as uint16
+            bits). Without it tensors come as arrays, bfloat16 as float32.
+        things: Begins to make what is described. Decoders without it refuse descriptions.
     """
 
     __slots__ = (
-        *("_arrays", "_buffers", "_copy", "_hashed_keys", "_heads", "_make", "_tail"),
+        *("_arrays", "_buffers", "_hashed_keys", "_heads", "_make", "_tail"),
         *("limits", "tensors", "things", "unpickler"),
     )
 
@@ -66,9 +75,8 @@ class Decoder:
         unpickler: Unpickler | None,
         tensors: TensorMaker | None,
         things: ThingReader | None = None,
-        copy: bool = True,
     ) -> None:
-        self._tail, self._buffers, self.limits, self._copy = tail, buffers, limits, copy
+        self._tail, self._buffers, self.limits = tail, buffers, limits
         self.unpickler, self.tensors, self.things = unpickler, tensors, things
         self._arrays: ArrayReader | None = None
         self._make: Callable[[int, object], object] | None = None
@@ -143,7 +151,7 @@ class Decoder:
         if self._arrays is None:
             from envhub_worker.protocol.codec.arrays import ArrayReader
 
-            self._arrays = ArrayReader(self._tail, self._buffers, self.limits, self._copy)
+            self._arrays = ArrayReader(self._tail, self._buffers, self.limits)
         return self._arrays.take(descriptor)
 
     def make(self, head: _Head, items: list[Any]) -> object:
@@ -307,35 +315,3 @@ _BUILDERS: dict[int, Callable[[Decoder, _Head, list[Any]], object]] = {
     wire.REMOTE: _build_remote,
     **dict.fromkeys((wire.SPACE, wire.SPEC, wire.GENERATOR), Decoder.make),
 }
-
-
-def decode(
-    frames: Sequence[Buffer],
-    *,
-    limits: WireLimits = DEFAULT_LIMITS,
-    unpickler: Unpickler | None = None,
-    tensors: TensorMaker | None = None,
-    copy: bool = True,
-    things: ThingReader | None = None,
-) -> object:
-    """Decodes frames into the value that was encoded.
-
-    Trust: input from the worker. Sizes are checked before anything is allocated, every byte
-    must be accounted for, and nothing is executed.
-
-    Args:
-        frames: As ``encode`` returned them.
-        limits: What is accepted.
-        unpickler: Decodes pickled objects; only a worker, which trusts its client, has one.
-        tensors: Makes a tensor of an array and a dtype name (``"bfloat16"`` comes as uint16
-            bits). Without it tensors come as arrays, bfloat16 as float32.
-        copy: Arrays own their memory and can be written. Otherwise they are read-only and the
-            large ones are views of ``frames``.
-        things: Begins to make what is described. Decoders without it refuse descriptions.
-
-    Raises:
-        MessageTooLargeError: Over one of ``limits``.
-        RemoteProtocolError: Malformed in any other way.
-    """
-    document, tail, buffers = wire.split_frames(frames, limits)
-    return Decoder(tail, buffers, limits, unpickler, tensors, things, copy).value(document)

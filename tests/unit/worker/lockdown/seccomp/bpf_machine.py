@@ -1,4 +1,4 @@
-"""A classic BPF interpreter for seccomp data: what the kernel would answer."""
+"""A classic BPF interpreter for seccomp data: what the kernel would answer; and a listing."""
 
 from __future__ import annotations
 
@@ -35,3 +35,23 @@ def _holds(one: BpfInstruction, accumulator: int) -> bool:
         0x25: accumulator > one.k,
         0x35: accumulator >= one.k,
     }[one.code]
+
+
+def listing(program: Sequence[BpfInstruction]) -> str:
+    """One line per instruction, for people and golden files."""
+    names = {
+        0x20: "load",
+        0x54: "and",
+        0x06: "return",
+        0x05: "jump",
+        0x15: "equal",
+        0x25: "greater",
+        0x35: "greater-or-equal",
+    }
+    lines = []
+    for place, one in enumerate(program):
+        text = f"{place:4} {names[one.code]} {one.k:#x}"
+        if one.code in (0x15, 0x25, 0x35):
+            text += f" ? {place + 1 + one.if_true} : {place + 1 + one.if_false}"
+        lines.append(text)
+    return "\n".join(lines) + "\n"

@@ -18,10 +18,9 @@ from envhub_worker.lockdown.seccomp.bpf import (
     Do,
     Label,
     assemble,
-    listing,
     to_bytes,
 )
-from tests.unit.worker.lockdown.seccomp.bpf_machine import run
+from tests.unit.worker.lockdown.seccomp.bpf_machine import listing, run
 
 
 def test_branch_skips_to_its_labels() -> None:

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from envhub_worker.lockdown.layers import LayerUnavailableError
-from envhub_worker.lockdown.seccomp import bpf, filter
+from envhub_worker.lockdown.seccomp import filter
 from envhub_worker.lockdown.seccomp.bpf import BpfInstruction
 from envhub_worker.lockdown.seccomp.policy import (
     ALLOW,
@@ -28,7 +28,7 @@ from envhub_worker.lockdown.seccomp.policy import (
     watched_calls,
 )
 from envhub_worker.lockdown.seccomp.syscalls import NUMBERS
-from tests.unit.worker.lockdown.seccomp.bpf_machine import run
+from tests.unit.worker.lockdown.seccomp.bpf_machine import listing, run
 
 pytestmark = pytest.mark.same_for("users", "versions")
 
@@ -62,7 +62,7 @@ class Filter:
 def test_program_is_the_golden_one(machine: str, namespaced: bool, network: str) -> None:
     name = f"seccomp-{machine}-{'namespaced' if namespaced else 'bare'}-{network}.txt"
     program = filter.program(machine, policy_table(namespaced=namespaced, network=network))
-    assert bpf.listing(program) == (GOLDEN / name).read_text()
+    assert listing(program) == (GOLDEN / name).read_text()
 
 
 @machines

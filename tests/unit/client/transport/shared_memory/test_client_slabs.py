@@ -15,7 +15,7 @@ import pytest
 from gymnasium import spaces
 
 from envhub_sandbox.transport.shared_memory.attachment import deposit
-from envhub_sandbox.transport.shared_memory.observations import RING, ObservationSlab
+from envhub_sandbox.transport.shared_memory.client_slabs import RING, ObservationSlab
 from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.supervisor import fd_store
 

@@ -1,1 +1,0 @@
-"""The TCP port: keys are proved there, and connections bounded."""
