@@ -14,13 +14,17 @@ from typing import Any
 from envhub_sandbox.errors import EnvHubError, RemoteProtocolError, WorkerDiedError
 from envhub_sandbox.transport.connection import Source
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.jail import RunnersDiedError
 from envhub_sandbox.transport.lane import Frames, RelayLane, Request
-from envhub_sandbox.transport.replies import typed_reply
+from envhub_sandbox.transport.replies import RunnersDiedError, typed_reply
 from envhub_sandbox.transport.results import Results, StepResult
 from envhub_sandbox.transport.shared_memory.attachment import Attachment
 from envhub_sandbox.transport.shared_memory.observations import RING, ObservationSlab
-from envhub_sandbox.transport.shared_memory.shard import LaneShard, Outcome, ShardSlabs
+from envhub_sandbox.transport.shared_memory.shard import (
+    LaneShard,
+    Outcome,
+    ShardSlabs,
+    action_layouts,
+)
 from envhub_sandbox.transport.shared_memory.spin import CPUS, Cores, SpinChooser
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import UNTRUSTED
@@ -120,7 +124,8 @@ class SharedMemoryLane:
         """
         slots = 1 if copy else 1 + RING
         space = results.manifest.single_observation_space
-        observed, layouts = slabs.observation_layout(space, results.count, slots), results.layouts()
+        observed = slabs.observation_layout(space, results.count, slots)
+        layouts = action_layouts(results)
         if observed is None or layouts is None:
             attachment.close()
             return None
