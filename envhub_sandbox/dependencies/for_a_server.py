@@ -17,6 +17,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import resource
 import signal
 import subprocess
@@ -119,7 +120,7 @@ def _request(order: Mapping[str, Any]) -> PackageRequest:
     try:
         check_versions(python or ">=3")
         check_versions(order["supports"] or ">=3")
-        if os.sep in python + order["supports"] or (until and not DATE.fullmatch(until)):
+        if os.sep in python + order["supports"] or (until and not re.fullmatch(DATE, until)):
             raise ValueError("a path, or no date")
     except ValueError as error:
         raise RequirementError(

@@ -32,7 +32,7 @@ _FORMAT = 1
 _READ: dict[tuple[Path, str], tuple[tuple[str, str, int], ...]] = {}
 _MOST = 64
 _SHOWN = 20
-_MISSING = re.compile(r"No module named '([\w.]+)'")
+_MISSING = r"No module named '([\w.]+)'"
 _WORKERS = {"cloudpickle", "gymnasium", "msgpack", "numpy", "farama_notifications"}
 """Modules that are in every jail."""
 _GYMNASIUM = (
@@ -180,7 +180,7 @@ class MissingModule:
         """
         from envhub_sandbox.dependencies.declared import declared
 
-        module = found[1] if (found := _MISSING.search(said)) else ""
+        module = found[1] if (found := re.search(_MISSING, said)) else ""
         try:
             says = declared(self.snapshot.root, self.snapshot.path)
         except RequirementError as error:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:  # they cost time, and most repositories need none of them
     from envhub_sandbox.dependencies.declared import WantedPackage
     from envhub_sandbox.dependencies.modules import Guess
 
-DATE = re.compile(r"\d{4}-\d{2}-\d{2}(T\d{2}:\d{2}:\d{2}(Z|[+-]\d{2}:\d{2}))?")
+DATE = r"\d{4}-\d{2}-\d{2}(T\d{2}:\d{2}:\d{2}(Z|[+-]\d{2}:\d{2}))?"
 _DECLARE = ("requirements.txt", "pyproject.toml")
 _SCRIPT, _LOOKED_AT = b"# /// script", 1024 * 1024  # as ``declared.py`` has them
 _NAMES = ("extra", "only", "without", "override", "python", "fetch_python", "exclude_newer")
@@ -156,7 +156,7 @@ def _date(given: object) -> str | None:
     if given is None:
         return None
     text = given if isinstance(given, str) else getattr(given, "isoformat", lambda: "")()
-    if not DATE.fullmatch(text):
+    if not re.fullmatch(DATE, text):
         raise PolicyError(
             f"exclude_newer in dependencies is {given!r}; it takes a date such as '2026-01-31'"
         )

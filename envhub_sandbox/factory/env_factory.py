@@ -15,7 +15,7 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.hub.snapshot import Snapshot
@@ -24,14 +24,13 @@ from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.jails.builder import JailSource, SharedJail
 from envhub_sandbox.session.jails.launcher import Launcher, retry_while_busy
 from envhub_sandbox.session.jails.loaded import ExpectedManifest, LoadedJail
-from envhub_sandbox.session.parts.fleet_session import AnySession, FleetSession
 from envhub_sandbox.session.prewarm import SuitePrewarm, TaskPrewarm
 from envhub_sandbox.settings.policy import Policy
 from envhub_sandbox.system import folders
 from envhub_sandbox.system.folders import cache_root, write_whole_file
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.shard_trials import ShardTrials
-from envhub_sandbox.transport.values import generator, lasting
+from envhub_sandbox.transport.values import generator, pickled
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker import protocol
@@ -40,6 +39,9 @@ from envhub_worker.protocol.codec.encoder import encode
 from envhub_worker.protocol.manifest.manifest import EnvManifest, Manifest, decode_manifest
 from envhub_worker.protocol.runtime import Runtime
 from envhub_worker.protocol.stream import StreamReader, pack_packet
+
+if TYPE_CHECKING:
+    from envhub_sandbox.session.parts.fleet_session import AnySession
 
 _FORMAT = 1
 
@@ -97,7 +99,7 @@ def manifest_key(snapshot: Snapshot, load: m.Load, policy: Policy, runtime: Runt
     a miss, and no harm.
     """
     try:
-        arguments = b"".join(map(bytes, m.pack(load, pickler=lasting)))
+        arguments = b"".join(map(bytes, m.pack(load, pickler=partial(pickled, lasting=True))))
     except (EnvHubError, TypeError):
         return None
     facts = (
@@ -231,6 +233,8 @@ class EnvFactory:
 
         if workers == 1:
             return EnvSession(source(0, len(bounds)), env, bounds, trials)
+        from envhub_sandbox.session.parts.fleet_session import FleetSession  # which few need
+
         history, unnoted = History(env, self._repository.policy.crash_history), ShardTrials(None)
         parts = [
             EnvSession(source(worker, 1), env, [rows], unnoted, history)

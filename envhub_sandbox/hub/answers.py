@@ -25,10 +25,10 @@ MAX_BODY_BYTES = 64 << 20
 """Of a page of a listing, unpacked: those of the Hub have some 300 kB."""
 _MAX_BODY_S = 300.0
 _NAMES = {
-    "ETag": re.compile(r'(W/)?"?[A-Za-z0-9_+=:-][A-Za-z0-9_+=:.-]{0,199}"?'),
-    "X-Linked-ETag": re.compile(r'(W/)?"?[A-Za-z0-9_+=:-][A-Za-z0-9_+=:.-]{0,199}"?'),
-    "X-Repo-Commit": re.compile(r"[0-9a-f]{40}"),
-    "X-Xet-Hash": re.compile(r"[0-9a-f]{1,128}"),
+    "ETag": r'(W/)?"?[A-Za-z0-9_+=:-][A-Za-z0-9_+=:.-]{0,199}"?',
+    "X-Linked-ETag": r'(W/)?"?[A-Za-z0-9_+=:-][A-Za-z0-9_+=:.-]{0,199}"?',
+    "X-Repo-Commit": r"[0-9a-f]{40}",
+    "X-Xet-Hash": r"[0-9a-f]{1,128}",
 }
 
 
@@ -87,7 +87,7 @@ def guarded(session: Any) -> Iterator[None]:
 def _judge(response: Any, *_: object, **__: object) -> None:
     for name, form in _NAMES.items():
         value = response.headers.get(name)
-        if value is not None and not form.fullmatch(value):
+        if value is not None and not re.fullmatch(form, value):
             raise HostileAnswerError(f"the header {name} of an answer is {value[:200]!r}")
 
 

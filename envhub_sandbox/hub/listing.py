@@ -7,18 +7,20 @@ so both are judged before anything is downloaded. What comes then is hashed whil
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import stat
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass, field, fields
+from dataclasses import field, fields
 from pathlib import Path
 from typing import IO, Any, NamedTuple, Protocol, TypeVar
 
 from envhub_sandbox.errors import PolicyError, SnapshotError, SnapshotTooLargeError
 from envhub_sandbox.hub.grammar import REPO_TYPES, Parts, has_control_characters, join
 from envhub_sandbox.system.platform import wrong_here
+from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.runtime import is_cached_revision
 from envhub_worker.protocol.text import size_text
 
@@ -164,6 +166,12 @@ class Snapshot:
     def _source(self) -> str:
         by_content = self.repo_type in ("local", "pypi")
         return self.name if by_content else f"{self.name}@{self.commit[:12]}"
+
+
+def content_digest(files: tuple[FileRecord, ...]) -> str:
+    """A hash of names and contents, which is the commit of what has none."""
+    rows = [[file.path, file.size, file.digest] for file in files]
+    return hashlib.sha256(json.dumps(rows).encode()).hexdigest()
 
 
 def _cached_revisions(snapshot: Snapshot) -> tuple[str, ...]:

@@ -9,11 +9,9 @@ but the folder. ``.git`` is in no commit, and left out everywhere, as are socket
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import posixpath
 import stat
-import sysconfig
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -231,6 +229,8 @@ def _in_a_snapshot(path: str) -> str:
 def _example(text: str) -> Path:
     """The folder of an example: in the checkout that this is, or where the wheel has put it."""
     checkout = Path(__file__).resolve().parents[2]
+    import sysconfig  # rarely needed, and slow to import
+
     schemes = ("data", sysconfig.get_default_scheme()), ("data", "posix_user")
     installed = [checkout / "share"] + [Path(sysconfig.get_path(*one), "share") for one in schemes]
     roots = [checkout] if (checkout / "worker" / "envhub_worker").is_dir() else []
@@ -258,12 +258,6 @@ def _digest(file: LocalFile, title: str) -> str:
         return digest_of(file.source, SHA256, file.size)
     except (OSError, HashMismatch) as error:
         raise SnapshotError(f"{title}: {file.path!r} cannot be read: {error}") from error
-
-
-def content_digest(files: tuple[FileRecord, ...]) -> str:
-    """A hash of names and contents, which is the commit of what has none."""
-    rows = [[file.path, file.size, file.digest] for file in files]
-    return hashlib.sha256(json.dumps(rows).encode()).hexdigest()
 
 
 def copier(files: tuple[LocalFile, ...], title: str) -> Callable[[FileRecord, Path], None]:

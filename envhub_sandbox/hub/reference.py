@@ -10,12 +10,12 @@ network.
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 
 from envhub_sandbox.errors import HubReferenceError
 from envhub_sandbox.hub import grammar, registered
 from envhub_sandbox.hub.git import address
 from envhub_sandbox.hub.grammar import DEFAULT_PATH, REPO_TYPES, Parts, Wrong, is_commit, is_local
+from envhub_worker.protocol.records import dataclass
 
 __all__ = ["DEFAULT_PATH", "REPO_TYPES", "HubRef", "is_local", "pinned"]
 

@@ -19,9 +19,9 @@ GRAMMAR = (
 )
 _PREFIX = "pypi:"
 _NAME = r"[A-Za-z0-9](?:[A-Za-z0-9._-]{0,98}[A-Za-z0-9])?"
-_PACKAGE = re.compile(rf"({_NAME})(\[{_NAME}(?:,{_NAME}){{0,15}}\])?", re.ASCII)
-_VERSION = re.compile(r"[0-9][A-Za-z0-9.!+_-]{0,99}", re.ASCII)
-_ID = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.:/-]{0,199}", re.ASCII)
+_PACKAGE = rf"(?a)({_NAME})(\[{_NAME}(?:,{_NAME}){{0,15}}\])?"
+_VERSION = r"(?a)[0-9][A-Za-z0-9.!+_-]{0,99}"
+_ID = r"(?a)[A-Za-z0-9_][A-Za-z0-9_.:/-]{0,199}"
 
 
 def is_one(text: str) -> bool:
@@ -42,12 +42,12 @@ def read(text: str) -> Parts:
 def check(parts: Parts) -> None:
     """Raise ``Wrong`` unless an index and a registry could have it."""
     package, env_id = parts.repo_id.partition("#")[::2]
-    if not _PACKAGE.fullmatch(package):
+    if not re.fullmatch(_PACKAGE, package):
         raise Wrong(f"{package[:200]!r} is not the name of a package", GRAMMAR)
-    if parts.revision is not None and not _VERSION.fullmatch(parts.revision):
+    if parts.revision is not None and not re.fullmatch(_VERSION, parts.revision):
         plain = repr(join(parts._replace(revision=None)))
         raise Wrong(f"{parts.revision[:200]!r} is not a version, such as '3.0.0'", plain)
-    if not _ID.fullmatch(env_id):
+    if not re.fullmatch(_ID, env_id):
         raise Wrong(f"{env_id[:200]!r} is not the id of an environment", GRAMMAR)
 
 

@@ -35,9 +35,9 @@ from envhub_sandbox.hub.listing import (
     Snapshot,
     SnapshotLimits,
     check_listing_names,
+    content_digest,
     listing_within_limits,
 )
-from envhub_sandbox.hub.local import LocalFolder, content_digest, copier, split_local
 from envhub_sandbox.hub.reference import DEFAULT_PATH, HubRef, is_local
 from envhub_sandbox.system.log import SNAPSHOT
 from envhub_worker.protocol.records import dataclass
@@ -92,6 +92,8 @@ def commit_of(
     file is not looked at.
     """
     if is_here(reference):
+        from envhub_sandbox.hub.local import LocalFolder, split_local
+
         root, _ = split_local(reference, DEFAULT_PATH)
         return f"local-{content_digest(LocalFolder.at(root).listed(DEFAULT_LIMITS)[1])}"
     ref = HubRef.parse(reference)
@@ -233,6 +235,8 @@ def local(
         SnapshotError: A link leaves the folder, a file cannot be read, or has a name that the Hub
             cannot have.
     """
+    from envhub_sandbox.hub.local import LocalFolder, copier, split_local  # no pin needs it
+
     root, path = split_local(str(folder), path)
     here = LocalFolder.at(root)
     found, files = here.listed(limits)

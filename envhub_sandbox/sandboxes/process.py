@@ -13,6 +13,7 @@ import os
 import select
 import subprocess
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -170,12 +171,31 @@ def check_platform() -> None:
 
 
 def _start(store: Path, runtime: Runtime) -> LocalServer:
+    # The order matters. Until the server is ready there is nothing to do, so what takes time and is
+    # not needed before belongs here, where it is free: that is why nothing which `make_env` imports
+    # imports ZeroMQ, or what speaks it. `session/jails` imports that where it is used. It has a
+    # thread, which a Ctrl-C does not reach: an import of ZeroMQ that was interrupted can never be
+    # repeated. Whatever fails here, or interrupts it, ends the server.
+    importing = threading.Thread(target=_import_quietly, name="envhub-import", daemon=True)
     server = LocalServer(runtime_folder.SERVER, "", _STOP_S)
     with server.starting(partial(_execute, server, store, runtime)) as ready:
-        for path in runtime_folder.remove_stale():  # while it starts, this costs nothing
+        importing.start()
+        for path in runtime_folder.remove_stale():
             WORKER.info("removed %s, which a client that was killed had left", path)
         _wait_until_ready(ready, server)
+        importing.join()
+        _import_transport()
     return server
+
+
+def _import_quietly() -> None:
+    with contextlib.suppress(Exception):  # it is raised where it is imported again
+        _import_transport()
+
+
+def _import_transport() -> None:
+    """Import all that speaks with a server: these two import the rest."""
+    from envhub_sandbox.transport.shared_memory import attachment, lane  # noqa: F401
 
 
 def _execute(

@@ -15,7 +15,7 @@ from envhub_sandbox.errors import (
     WorkerTimeoutError,
 )
 from envhub_sandbox.sandboxes.pool import ServerUse, WorkerServer
-from envhub_sandbox.transport.tcp import UnreachableError
+from envhub_sandbox.transport.replies import UnreachableError
 from envhub_worker.protocol.runtime import OWN, Runtime
 
 if TYPE_CHECKING:

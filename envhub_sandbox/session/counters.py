@@ -10,13 +10,15 @@ import threading
 import weakref
 from array import array
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 
 from envhub_sandbox.system.platform import run_after_fork
-from envhub_sandbox.transport.lane import Lane
 from envhub_worker.protocol.lifecycle import State
+
+if TYPE_CHECKING:
+    from envhub_sandbox.transport.lane import Lane
 
 KEPT = 1024
 """Step latencies that are kept: the last ones. A power of two."""

@@ -27,14 +27,13 @@ from envhub_sandbox.session.failures import Failures, Restarts
 from envhub_sandbox.session.jails.builder import JailSource
 from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.session.prewarm import INTERRUPT_S, LOOK_S, Prewarm
-from envhub_sandbox.session.recovery import Recovery
 from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.session.requests import Requests
 from envhub_sandbox.session.use_lock import UseLock
 from envhub_sandbox.system.log import WORKER
 from envhub_sandbox.system.platform import run_after_fork
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.jail import RunnersDiedError
+from envhub_sandbox.transport.replies import RunnersDiedError
 from envhub_sandbox.transport.results import Results
 from envhub_sandbox.transport.shard_trials import ShardTrials
 from envhub_worker.protocol.lifecycle import Event, Lifecycle, State
@@ -81,8 +80,10 @@ class EnvSession:
         self._restarts = Restarts(policy, counters)
         self._failures = failures = Failures(lease, history)
         self.use = use = UseLock(lease, failures)
-        recovery: Recovery | None = None
+        recovery = None
         if policy.restart == "transparent":
+            from envhub_sandbox.session.recovery import Recovery  # which few need
+
             recovery = Recovery(lease, self._restarts, failures, history)
         self.prewarm = Prewarm(lease, use, history, recovery)
         self.requests = Requests(lease, use, self.prewarm, history, failures, recovery)

@@ -20,10 +20,9 @@ from envhub_sandbox.settings.policy import Policy
 from envhub_worker.protocol.codec.inert import one_line
 from envhub_worker.protocol.text import printable, quoted
 
-_FRAME = re.compile(
-    r'^(?P<margin>[ |+-]*)File "(?P<file>[^"\n]{1,4096})", line (?P<line>[0-9]{1,9})'
-    r"(?:, in (?P<function>[^\n]*))?(?:\n(?P<source>[ |]{4}[^\n]*)(?:\n(?P<caret>[ |\t]*\^+))?)?",
-    re.MULTILINE,
+_FRAME = (
+    r'(?m)^(?P<margin>[ |+-]*)File "(?P<file>[^"\n]{1,4096})", line (?P<line>[0-9]{1,9})'
+    r"(?:, in (?P<function>[^\n]*))?(?:\n(?P<source>[ |]{4}[^\n]*)(?:\n(?P<caret>[ |\t]*\^+))?)?"
 )
 _TRACEBACK_CHARS = 32_768
 _FUNCTION_CHARS, _SOURCE_CHARS = 100, 200
@@ -34,9 +33,9 @@ def add_author_line(error: EnvHubError, snapshot: Snapshot) -> None:
     remote = error if isinstance(error, RemoteEnvError) else error.__cause__
     if not isinstance(remote, RemoteEnvError) or "__notes__" in vars(error):
         return
-    frames = [found for found in _FRAME.finditer(remote.traceback) if _place(found, snapshot)]
+    frames = [found for found in re.finditer(_FRAME, remote.traceback) if _place(found, snapshot)]
     where = _line(frames[-1], snapshot) if frames else ""
-    named = _FRAME.sub(lambda found: _named(found, snapshot), remote.traceback)
+    named = re.sub(_FRAME, lambda found: _named(found, snapshot), remote.traceback)
     remote.traceback = printable(named, _TRACEBACK_CHARS)
     remote.where = where
     if where:
@@ -80,21 +79,21 @@ def _source(found: re.Match[str]) -> list[str]:
 
 # --- what it wanted to reach, and which option brings that ---------------------------------------
 
-_HUB = re.compile(
+_HUB = (
     r"LocalEntryNotFoundError|OfflineModeIsEnabled|HF_HUB_OFFLINE|huggingface\.co|"
     r"[Oo]utgoing traffic has been disabled"
 )
-_INSTALL = re.compile(r"\b(pip|pip3|uv|conda)\b[^\n]{0,80}\b(install|add|sync)\b")
-_NO_FAMILY = re.compile(r"\[Errno 97\]|[Aa]ddress family not supported")
-_DOWNLOAD = re.compile(
+_INSTALL = r"\b(pip|pip3|uv|conda)\b[^\n]{0,80}\b(install|add|sync)\b"
+_NO_FAMILY = r"\[Errno 97\]|[Aa]ddress family not supported"
+_DOWNLOAD = (
     r"\bgit\b[^\n]{0,80}\b(clone|fetch|pull|submodule|lfs)\b|\b(wget|curl|aria2c)\b|"
     r"URLError|gaierror|ConnectionError|ConnectError|NewConnectionError|Max retries exceeded|"
     r"[Nn]ame resolution|Name or service not known|Could not resolve host|Network is unreachable"
 )
-_DISPLAY = re.compile(
+_DISPLAY = (
     r"NoSuchDisplayException|no display name and no \$DISPLAY|DISPLAY environment variable|"
     r"(connect|open|find)[^\n]{0,20} (X server|[Xx]?[ -]?display)|Qt platform plugin|"
-    r"No available video device|Failed to (initialize GLFW|create window)",
+    r"No available video device|Failed to (initialize GLFW|create window)"
 )
 _TEXT_CHARS = 65_536
 
@@ -115,23 +114,23 @@ def add_reach_advice(error: EnvHubError, policy: Policy) -> None:
 
 def _advice(text: str, policy: Policy) -> str:
     if policy.network != "host":
-        if _HUB.search(text):
+        if re.search(_HUB, text):
             return (
                 "A jail has no network, and of the Hub it has its own repository and its assets "
                 f"only: name this one with {option_name('assets', ['org/repo@COMMIT'])}"
             )
-        if _INSTALL.search(text):
+        if re.search(_INSTALL, text):
             return (
                 "A jail has no network and cannot install packages: name the packages in the "
                 "repository's requirements.txt, or with "
                 f"{option_name('dependencies', {'extra': ['PACKAGE']})}"
             )
-        if _NO_FAMILY.search(text) and policy.network == "none":
+        if re.search(_NO_FAMILY, text) and policy.network == "none":
             return (
                 "A jail has no network: for connections between its own processes give it a "
                 f"loopback device of its own, with {option_name('network', 'loopback')}"
             )
-        if _DOWNLOAD.search(text) or _NO_FAMILY.search(text):
+        if re.search(_DOWNLOAD, text) or re.search(_NO_FAMILY, text):
             return (
                 "A jail has no network: put what it downloads into the repository, or into one on "
                 f"the Hub that {option_name('assets', ['org/repo@COMMIT'])} names"
@@ -140,7 +139,7 @@ def _advice(text: str, policy: Policy) -> str:
 
 
 def _of_display(text: str, policy: Policy) -> str:
-    if not _DISPLAY.search(text) or policy.display != "none":
+    if not re.search(_DISPLAY, text) or policy.display != "none":
         return ""
     return (
         "It tried to open a window, and a jail has no display: have it render to arrays "
@@ -151,7 +150,7 @@ def _of_display(text: str, policy: Policy) -> str:
 
 # --- what it was denied --------------------------------------------------------------------------
 
-_DENIAL = re.compile(r"[a-z0-9_]{1,40}( [A-Z0-9_]{1,40}| /.{0,400})?")
+_DENIAL = r"[a-z0-9_]{1,40}( [A-Z0-9_]{1,40}| /.{0,400})?"
 _MOST_DENIALS = 64
 _NAMED_DENIALS, _SHOWN = 8, 200
 """Denials in the text of an error, and characters of each."""
@@ -165,7 +164,7 @@ def read_denials(said: object) -> tuple[str, ...] | None:
     if not isinstance(said, tuple):
         return None
     texts = (one for one in said[:_MOST_DENIALS] if isinstance(one, str) and one.isprintable())
-    return tuple(one for one in texts if _DENIAL.fullmatch(one))
+    return tuple(one for one in texts if re.fullmatch(_DENIAL, one))
 
 
 def name_denied(error: WorkerDiedError) -> None:

@@ -10,7 +10,7 @@ import threading
 import weakref
 from collections.abc import Callable
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -26,12 +26,14 @@ from envhub_sandbox.session.jails.loaded import LoadedJail
 from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.system.processes import OwnerProcess
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
-from envhub_sandbox.transport.lane import Lane
+from envhub_sandbox.transport.replies import UnreachableError
 from envhub_sandbox.transport.results import Results
 from envhub_sandbox.transport.shard_trials import LEAST_STEPS, ShardTrials
-from envhub_sandbox.transport.tcp import UnreachableError
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.lifecycle import Lifecycle, State
+
+if TYPE_CHECKING:
+    from envhub_sandbox.transport.lane import Lane
 
 _WITHOUT_A_JAIL = frozenset({State.EXPIRED, State.DEAD, State.FOREIGN, State.CLOSED})
 """It may not have been given back yet."""

@@ -14,17 +14,19 @@ import weakref
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from itertools import chain
+from typing import TYPE_CHECKING
 
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.session.crash.history import History
 from envhub_sandbox.session.jails.loaded import LoadedJail
 from envhub_sandbox.session.lease import Lease, closed_during
-from envhub_sandbox.session.recovery import Recovery
 from envhub_sandbox.session.use_lock import UseLock
 from envhub_sandbox.system.log import WORKER
-from envhub_sandbox.system.threads import Calls
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
 from envhub_worker.protocol.lifecycle import Event, State
+
+if TYPE_CHECKING:
+    from envhub_sandbox.session.recovery import Recovery
 
 LOOK_S = 10.0
 """How long a look at a jail that may have died may take."""
@@ -187,6 +189,8 @@ class FleetPrewarm:
 
     def start(self) -> None:
         """Likewise, and wait for them."""
+        from envhub_sandbox.system.threads import Calls  # which few need
+
         Calls([part.start for part in self._parts]).wait()
 
     def cancel(self) -> bool:

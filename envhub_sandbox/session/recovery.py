@@ -7,7 +7,7 @@ others go on. Without it there is no ``Recovery``, and a death is an error.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,20 +17,21 @@ from envhub_sandbox.session.failures import Failures, Restarts
 from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.system.log import WORKER
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
-from envhub_sandbox.transport.jail import RunnersDiedError
-from envhub_sandbox.transport.lane import Lane, Request
-from envhub_sandbox.transport.replies import check_reply, typed_reply
+from envhub_sandbox.transport.replies import RunnersDiedError, check_reply, typed_reply
 from envhub_sandbox.transport.results import is_batch
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.wire import Buffer
 from envhub_worker.protocol.errors import UNTRUSTED
 from envhub_worker.protocol.lifecycle import Event
 
+if TYPE_CHECKING:
+    from envhub_sandbox.transport.lane import Lane, Request
+
 RESTARTED = "worker_restarted"
 """The key in the infos: whether a sub-environment was lost and came back reset."""
 _SETTINGS = 256
 """Attributes that are remembered, the last ones."""
-MessagesFor = Callable[[Lane, int], list[m.Message]]
+MessagesFor = Callable[["Lane", int], list[m.Message]]
 """Makes what a shard's fresh runner is asked, one after the other."""
 RowsOf = Callable[[m.Message, int], m.Message]
 """Makes the reply for a dead shard of a fresh runner's last answer and the number of rows."""

@@ -12,7 +12,7 @@ import os
 import shlex
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import field
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -42,6 +42,7 @@ from envhub_worker.protocol.confinement import LACKS_PACKAGES
 from envhub_worker.protocol.limits import WireLimits, limits_for
 from envhub_worker.protocol.manifest.manifest import Manifest
 from envhub_worker.protocol.messages import VERSION
+from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.runtime import RECORD, Runtime
 from envhub_worker.protocol.text import printable
 

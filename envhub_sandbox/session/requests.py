@@ -13,7 +13,7 @@ from __future__ import annotations
 import contextlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from typing import Any, NamedTuple, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, TypeVar
 
 from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError
 
@@ -30,24 +30,27 @@ from envhub_sandbox.session.crash.history import History
 from envhub_sandbox.session.failures import Failures, refusal
 from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.session.prewarm import Prewarm
-from envhub_sandbox.session.recovery import Recovery
 from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.session.use_lock import FleetUse, UseLock
 from envhub_sandbox.transport.deadline import Deadline, StepDeadline, deadline_of
-from envhub_sandbox.transport.jail import RunnersDiedError
-from envhub_sandbox.transport.lane import Lane, Request
-from envhub_sandbox.transport.replies import all_replies
+from envhub_sandbox.transport.replies import RunnersDiedError, all_replies
 from envhub_sandbox.transport.results import Results, StepResult
 from envhub_sandbox.transport.shard_trials import ENOUGH_STEPS
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.lifecycle import Event, State
 from envhub_worker.protocol.spaces import batches
 
+if TYPE_CHECKING:
+    from envhub_sandbox.session.recovery import Recovery
+    from envhub_sandbox.transport.lane import Lane, Request
+
 Bounds = tuple[int, int]
 MessageFor = Callable[[int, Bounds], m.Message]
 """Makes the message for a shard out of the environment's number and the shard's bounds."""
 OneMessageFor = Callable[[int, "int | None"], m.Message]
 """Makes it of the number and the sub-environment's place in the shard; None in other shards."""
+SENT = "send"
+"""What is pending between ``send`` and ``recv``, as ``RequestOrder.waiting`` calls it."""
 _SHOWN = 64
 """Characters of an attribute's name in the name of a request."""
 T = TypeVar("T")

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import field, fields, replace
 from numbers import Real
 from typing import Any, TypeVar
 
 from envhub_sandbox.errors import PolicyError
 from envhub_sandbox.settings.options import option_name
 from envhub_worker.protocol.confinement import DISPLAYS, NETWORKS, PROFILES, Confinement, Limits
+from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.text import parse_size
 
 __all__ = [

@@ -101,10 +101,10 @@ def kill_group(process: subprocess.Popen[Any]) -> None:
             return  # it has ended, and all that it had started
 
 
-_RESERVED = re.compile(
+_RESERVED = (
     r"(?i:con|prn|aux|nul|conin\$|conout\$|(?:com|lpt)[0-9\u00b9\u00b2\u00b3])[ ]*(?:[.:].*)?"
 )
-_REFUSED = re.compile(r'[<>:"|?*\\\x00-\x1f]')
+_REFUSED = r'[<>:"|?*\\\x00-\x1f]'
 
 
 def wrong_on_windows(path: str) -> str | None:
@@ -112,9 +112,9 @@ def wrong_on_windows(path: str) -> str | None:
     ``path``: relative, with ``/``.
     """
     for step in path.split("/"):
-        if found := _REFUSED.search(step):
+        if found := re.search(_REFUSED, step):
             return f"has {found[0]!r} in its name, which Windows reads as something else"
-        if _RESERVED.fullmatch(step):
+        if re.fullmatch(_RESERVED, step):
             return f"has the step {step!r}, which is a device on Windows"
         if step.endswith((".", " ")):
             return f"has the step {step!r}, of which Windows drops the end"

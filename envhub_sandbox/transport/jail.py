@@ -18,7 +18,13 @@ from envhub_sandbox.errors import (
 from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.remote_warnings import RemoteWarnings
-from envhub_sandbox.transport.replies import check_reply, death, expect_reply, typed_reply
+from envhub_sandbox.transport.replies import (
+    RunnersDiedError,
+    check_reply,
+    death,
+    expect_reply,
+    typed_reply,
+)
 from envhub_sandbox.transport.values import framed, unpacked
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.wire import Buffer
@@ -34,31 +40,6 @@ _UNSEEN_S = 5.0
 
 Unpack = Callable[[int, list[Buffer]], m.Message]
 """Makes a message of the frames that came from the runner at a place of the request."""
-
-
-class RunnersDiedError(WorkerDiedError):
-    """Runners of a kept jail have died; the others have answered.
-
-    Never seen by a user, who gets ``first``, or nothing.
-
-    Attributes:
-        replies: In the order of the request; None where a runner has died.
-        deaths: How, by its place in the request.
-        jail_gone: Whether the jail has ended, too.
-    """
-
-    def __init__(
-        self,
-        replies: Sequence[m.Message | None],
-        deaths: dict[int, WorkerDiedError],
-        *,
-        jail_gone: bool = False,
-    ) -> None:
-        self.first = next(iter(deaths.values()))
-        super().__init__(str(self.first), reason=self.first.reason)
-        self.replies = list(replies)
-        self.deaths = deaths
-        self.jail_gone = jail_gone
 
 
 class JailHandle:

@@ -15,8 +15,8 @@ from typing import Any, Protocol
 from envhub_sandbox.errors import EnvHubError, WorkerError
 from envhub_sandbox.transport.connection import Source
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.jail import JailHandle, RunnersDiedError, Unpack
-from envhub_sandbox.transport.replies import all_replies
+from envhub_sandbox.transport.jail import JailHandle, Unpack
+from envhub_sandbox.transport.replies import RunnersDiedError, all_replies
 from envhub_sandbox.transport.results import Results, StepResult
 from envhub_sandbox.transport.values import framed
 from envhub_worker.protocol import messages as m

@@ -14,15 +14,17 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TextIO
+from typing import TYPE_CHECKING, TextIO
 
 from envhub_sandbox.errors import EnvHubError, PolicyError
 from envhub_sandbox.system.log import OUTPUT
-from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.replies import expect_reply
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.text import printable
+
+if TYPE_CHECKING:
+    from envhub_sandbox.transport.connection import WorkerConnection
 
 FILE_BYTES = 64 << 20
 """What one file takes; a worker may print for ever."""
@@ -30,7 +32,7 @@ _PERIOD_S = 0.25
 _ASK_S = 5.0
 _LINE_CHARS = 4096
 _LINE_BYTES = 4 * _LINE_CHARS
-_ENDS = re.compile(rb"\r\n|\n|\r")
+_ENDS = rb"\r\n|\n|\r"
 
 Sink = Callable[[str], object]
 
@@ -44,7 +46,7 @@ class Lines:
 
     def feed(self, data: bytes) -> None:
         """Take bytes; every line that they end goes to the sinks."""
-        *lines, self._rest = _ENDS.split(self._rest + data)
+        *lines, self._rest = re.split(_ENDS, self._rest + data)
         for line in lines:
             self._emit(line)
         while len(self._rest) > _LINE_BYTES:

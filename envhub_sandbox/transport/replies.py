@@ -1,4 +1,4 @@
-"""What a reply says: the message that was asked for, or the error that it means.
+"""What a reply says: the message that was asked for, or the error that it means; or that none came.
 
 Everything that a server or a runner can say becomes an exception here, and nowhere else: out of
 fixed tables, with texts that are cut and made printable.
@@ -38,7 +38,37 @@ from envhub_worker.protocol.confinement import Reason
 from envhub_worker.protocol.messages.busy import ERROR, Busy
 from envhub_worker.protocol.text import continued, printable, quoted
 
-_PROFILE = re.compile('profile "(strict|no-userns|container)"')
+_PROFILE = 'profile "(strict|no-userns|container)"'
+
+
+class UnreachableError(SandboxUnavailableError):
+    """There is no server, or it goes just now: as far as one can tell, for it has said nothing."""
+
+
+class RunnersDiedError(WorkerDiedError):
+    """Runners of a kept jail have died; the others have answered.
+
+    Never seen by a user, who gets ``first``, or nothing.
+
+    Attributes:
+        replies: In the order of the request; None where a runner has died.
+        deaths: How, by its place in the request.
+        jail_gone: Whether the jail has ended, too.
+    """
+
+    def __init__(
+        self,
+        replies: Sequence[m.Message | None],
+        deaths: dict[int, WorkerDiedError],
+        *,
+        jail_gone: bool = False,
+    ) -> None:
+        self.first = next(iter(deaths.values()))
+        super().__init__(str(self.first), reason=self.first.reason)
+        self.replies = list(replies)
+        self.deaths = deaths
+        self.jail_gone = jail_gone
+
 
 # --- what was asked for ------------------------------------------------------------------------
 
@@ -106,7 +136,7 @@ def all_replies(replies: Sequence[m.Message], kind: type[m.M] | tuple[type[m.M],
 
 def _named(fix: str) -> str:
     """What to do, with a profile written as an option of the place that the user is at."""
-    return _PROFILE.sub(lambda found: option_name("profile", found[1]), fix)
+    return re.sub(_PROFILE, lambda found: option_name("profile", found[1]), fix)
 
 
 def refusal(reply: m.Refusal) -> Exception:

@@ -14,7 +14,6 @@ from envhub_worker.protocol.codec.inert import one_line
 from envhub_worker.protocol.errors import FAULTS, UNTRUSTED
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
 from envhub_worker.protocol.manifest.manifest import EnvManifest
-from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.spaces import batches
 
 _SHOWN = 500
@@ -49,14 +48,6 @@ class Results:
         self.slices = [(start - first, stop - first) for start, stop in bounds]
         self.count = sum(self._sizes)
         self._restores = batches.restores(self._space)
-
-    def layouts(self) -> list[slabs.Layout] | None:
-        """Where each shard's actions lie in its slab; None where spaces have no fixed layout."""
-        action_space = self.manifest.single_action_space
-        found = [slabs.layout_of(action_space, size) for size in self._sizes]
-        known = [layout for layout in found if layout is not None]
-        own = [self.manifest.own_batch(name) for name in ("action_space", "observation_space")]
-        return known if len(known) == len(found) and own == [None, None] else None
 
     def step(self, replies: list[m.StepDone], infos: dict[Any, Any] | None = None) -> StepResult:
         """What ``VectorEnv.step`` returns; with these infos, if there are other ones.

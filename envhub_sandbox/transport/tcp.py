@@ -14,6 +14,7 @@ import zmq
 from zmq.utils import z85
 
 from envhub_sandbox.errors import EnvHubError, SandboxUnavailableError, WorkerDiedError
+from envhub_sandbox.transport.replies import UnreachableError
 from envhub_worker.protocol.records import dataclass
 
 CONNECT_S = 10.0
@@ -35,10 +36,6 @@ _EVENTS = (
     | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
     | zmq.EVENT_DISCONNECTED
 )
-
-
-class UnreachableError(SandboxUnavailableError):
-    """There is no server, or it goes just now: as far as one can tell, for it has said nothing."""
 
 
 @dataclass(frozen=True)

@@ -16,9 +16,6 @@ from collections.abc import Callable
 from time import perf_counter
 from typing import Any
 
-from envhub_sandbox.transport.connection import WorkerConnection
-from envhub_sandbox.transport.lane import RelayLane, Request
-from envhub_sandbox.transport.shared_memory.served_lane import ServedLane
 from envhub_worker.protocol import messages as m
 
 _SENDING = ("send_step", "send", "send_for_infos")
@@ -28,6 +25,11 @@ _WAITING = ("wait", "replies")
 @functools.cache
 def start() -> None:
     """Print from now on."""
+    # sandboxes/process.py says why they are imported late
+    from envhub_sandbox.transport.connection import WorkerConnection
+    from envhub_sandbox.transport.lane import RelayLane
+    from envhub_sandbox.transport.shared_memory.served_lane import ServedLane
+
     began = perf_counter()
 
     def say(text: str) -> None:
@@ -78,9 +80,9 @@ def _waiting(method: Callable[..., Any], say: Callable[[str], None]) -> Callable
     return waiting
 
 
-def _named(value: object) -> str:
+def _named(value: Any) -> str:
     """The classes of messages in it, and what a request is called."""
-    if isinstance(value, Request):
+    if hasattr(value, "messages"):  # a request
         return f"{value.operation} {_named(value.messages)}"
     if isinstance(value, m.Message):
         operation = getattr(value, "operation", None)

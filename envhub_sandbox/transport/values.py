@@ -18,7 +18,6 @@ from functools import cache
 from types import FunctionType
 from typing import Any, NoReturn, Union
 
-import cloudpickle  # type: ignore[import-untyped]
 import gymnasium as gym
 import numpy as np
 import numpy.typing as npt
@@ -248,21 +247,21 @@ def not_here(*args: Any, reference: str = "", **kwargs: Any) -> NoReturn:
     )
 
 
-def pickled(value: object) -> bytes:
-    """What the jail makes the same value of; a class of ``__main__`` travels along."""
-    buffer = io.BytesIO()
-    _Pickler(buffer).dump(value)
-    return buffer.getvalue()
+def pickled(value: object, *, lasting: bool = False) -> bytes:
+    """What the jail makes the same value of; a class of ``__main__`` travels along.
 
-
-def lasting(value: object) -> bytes:
-    """The same, if it says all there is to the value: no code of the caller's own is named in it.
+    Args:
+        value: One that the wire has no form for.
+        lasting: Whether the bytes must say all there is to it: no code of the caller's own is
+            named in them.
 
     Raises:
-        TypeError: It is; who knows what that code is by the next time.
+        TypeError: Such code is named; who knows what it is by the next time.
     """
     buffer = io.BytesIO()
-    _LastingPickler(buffer).dump(value)
+    pickler = _pickler()(buffer)
+    pickler.lasting = lasting
+    pickler.dump(value)
     return buffer.getvalue()
 
 
@@ -272,23 +271,28 @@ def framed(value: object) -> bytes | memoryview:
     return data if len(data) <= INLINE_BYTES else memoryview(data)
 
 
-class _Pickler(cloudpickle.Pickler):  # type: ignore[misc]
-    def reducer_override(self, value: Any) -> Any:
-        """A view of memory, which pickle knows nothing of, is one of a copy."""
-        if type(value) is memoryview:
-            plain = value.readonly and value.format == "B" and value.ndim == 1
-            return memoryview, (bytes(value) if plain else np.array(value),)
-        return super().reducer_override(value)
+@cache
+def _pickler() -> Any:
+    import cloudpickle  # type: ignore[import-untyped]  # few callers have a value that needs it
 
+    class Pickler(cloudpickle.Pickler):  # type: ignore[misc]
+        lasting: bool
 
-class _LastingPickler(_Pickler):
-    def reducer_override(self, value: Any) -> Any:
-        """Judges classes and functions; their names are all that a pickle has of them."""
-        if isinstance(value, (type, FunctionType)):
-            package = str(value.__module__).partition(".")[0]
-            if package not in _INSTALLED and package not in sys.stdlib_module_names:
-                raise TypeError(f"{value.__qualname__} may be another one by the next time")
-        return super().reducer_override(value)
+        def reducer_override(self, value: Any) -> Any:
+            """A view of memory, which pickle knows nothing of, is one of a copy.
+
+            Of classes and functions a pickle has the names only, so these are judged.
+            """
+            if self.lasting and isinstance(value, (type, FunctionType)):
+                package = str(value.__module__).partition(".")[0]
+                if package not in _INSTALLED and package not in sys.stdlib_module_names:
+                    raise TypeError(f"{value.__qualname__} may be another one by the next time")
+            if type(value) is memoryview:
+                plain = value.readonly and value.format == "B" and value.ndim == 1
+                return memoryview, (bytes(value) if plain else np.array(value),)
+            return super().reducer_override(value)
+
+    return Pickler
 
 
 _INSTALLED = frozenset({"gymnasium", "numpy"})

@@ -18,11 +18,11 @@ from gymnasium.error import CustomSpaceError
 
 from envhub_sandbox.errors import ActionError, ActionTypeError
 from envhub_worker.protocol.manifest.manifest import EnvManifest
-from envhub_worker.protocol.shared_memory.slabs import DTYPE_CODES
-from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES, OpaqueSpace
+from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES, BOX_DTYPES, OpaqueSpace
 
 _INTEGERS = frozenset("iub")
 _NUMBERS = frozenset("fiub")
+_DTYPES = frozenset(BOX_DTYPES.values())
 _PYTHONS = {np.dtype(kind): kind for kind in (bool, int, float)}
 """What numpy makes of lists of such numbers."""
 
@@ -137,7 +137,7 @@ class ActionReader:
         if isinstance(space, ARRAY_SPACES):
             self._shape = _shape(space, count)
             kinds = _kinds_for(space)
-            self._dtypes = frozenset(dtype for dtype in DTYPE_CODES if dtype.kind in kinds)
+            self._dtypes = frozenset(dtype for dtype in _DTYPES if dtype.kind in kinds)
 
     def read(self, actions: Any) -> Any:
         """The batch; raises as ``batch_of`` does."""
@@ -166,7 +166,7 @@ def _is_listed(value: Any, array: Any) -> bool:
 
 def _native(array: Any) -> Any:
     """The same numbers in a dtype that can cross: native byte order, at most 64 bits."""
-    if array.dtype in DTYPE_CODES:
+    if array.dtype in _DTYPES:
         return array
     wide = array.dtype.itemsize > np.dtype(np.float64).itemsize
     return array.astype(np.float64 if wide else array.dtype.newbyteorder("="))

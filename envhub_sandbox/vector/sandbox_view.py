@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from envhub_sandbox.session.parts.fleet_session import AnySession
+if TYPE_CHECKING:
+    from envhub_sandbox.session.parts.fleet_session import AnySession
 
 
 class SandboxView:

@@ -14,7 +14,6 @@ from gymnasium.vector import VectorEnv
 from envhub_sandbox.session.repository import Recipe
 from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.system.log import WORKER, progress_shown
-from envhub_sandbox.system.threads import Calls
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv, leave_suite
 from envhub_worker.protocol.text import parse_size, size_text
 
@@ -247,6 +246,8 @@ class TaskMap(Generic[T]):
         with progress_shown("tasks", WORKER) as tell:
             self._tell = tell
             try:
+                from envhub_sandbox.system.threads import Calls  # which few need
+
                 Calls([self._run] * self._threads).wait()
             except BaseException as error:  # a Ctrl-C: requests in other threads end with a close
                 self._failure = error

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from copy import copy
 from functools import partial
 from threading import get_ident
-from typing import Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import gymnasium as gym
 import numpy as np
@@ -21,9 +21,7 @@ from gymnasium.vector import VectorEnv
 
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.session.env_session import EnvSession
-from envhub_sandbox.session.parts.fleet_session import AnySession, FleetSession
-from envhub_sandbox.session.parts.in_flight import SENT, InFlight, Received, Rows, held_in_time
-from envhub_sandbox.session.requests import Bounds, MessageFor, OneMessageFor
+from envhub_sandbox.session.requests import SENT, Bounds, MessageFor, OneMessageFor
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.remote_warnings import level_of_the_caller
 from envhub_sandbox.transport.replies import typed_reply
@@ -38,6 +36,10 @@ from envhub_worker.protocol.errors import UNTRUSTED
 from envhub_worker.protocol.lifecycle import State
 from envhub_worker.protocol.manifest.manifest import EnvManifest
 from envhub_worker.protocol.manifest.names import absent, is_servable
+
+if TYPE_CHECKING:
+    from envhub_sandbox.session.parts.fleet_session import AnySession
+    from envhub_sandbox.session.parts.in_flight import InFlight, Received, Rows
 
 _NOT_CALLED = frozenset({"reset", "step", "close"})
 """What ``AsyncVectorEnv.call`` refuses: it would take one sub-environment from under the others."""
@@ -388,14 +390,18 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         wanted = self._session.repository.min_ready if min_ready is None else min_ready
         if wanted is not None and wanted < 1:
             raise ValueError(f"`min_ready` is {wanted}, and must be at least 1")
+        from envhub_sandbox.session.parts.in_flight import held_in_time  # which few need
+
         deadline = Deadline(timeout)
         with held_in_time(self._requests.use.flight, deadline):
             return self._in_flight().recv(self.num_envs if wanted is None else wanted, deadline)
 
     def _in_flight(self) -> InFlight:
         if self._flight is None:
+            from envhub_sandbox.session.parts.in_flight import InFlight  # which few need
+
             session = self._session
-            parts = session.parts if isinstance(session, FleetSession) else [session]
+            parts = [session] if isinstance(session, EnvSession) else session.parts
             self._flight = InFlight(self._requests, parts)
         return self._flight
 

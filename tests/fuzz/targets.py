@@ -22,9 +22,15 @@ from envhub_sandbox.hub.listing import FileRecord, Snapshot
 from envhub_sandbox.session.error_text import add_author_line
 from envhub_sandbox.transport import values
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.jail import JailHandle, RunnersDiedError, open_jail
+from envhub_sandbox.transport.jail import JailHandle, open_jail
 from envhub_sandbox.transport.remote_warnings import MOST, RemoteWarnings
-from envhub_sandbox.transport.replies import check_reply, death, expect_reply, raised
+from envhub_sandbox.transport.replies import (
+    RunnersDiedError,
+    check_reply,
+    death,
+    expect_reply,
+    raised,
+)
 from envhub_sandbox.transport.results import Results
 from envhub_sandbox.transport.values import DescriptionReader, generator, spec_of
 from envhub_sandbox.vector.actions import action_reader

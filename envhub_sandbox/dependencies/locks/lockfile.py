@@ -151,7 +151,11 @@ class _Reader:
 
     def lock(self, packages: tuple[PylockPackage, ...]) -> LockFile:
         text = self._text
-        newer = text(self._ours, "exclude-newer", DATE) if "exclude-newer" in self._ours else None
+        newer = (
+            text(self._ours, "exclude-newer", re.compile(DATE))
+            if "exclude-newer" in self._ours
+            else None
+        )
         return LockFile(
             repository=text(self._ours, "repository"),
             commit=text(self._ours, "commit", _COMMIT),

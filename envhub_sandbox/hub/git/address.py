@@ -25,13 +25,11 @@ from envhub_sandbox.hub.grammar import (
 KIND = "git"
 GRAMMAR = "git+https://host/org/repo@commit:path.py, or github:org/repo@commit:path.py"
 PROTOCOLS = ("https",)
-REVISION = re.compile(r"(?!.*(?:\.\.|//|@\{))[A-Za-z0-9_][A-Za-z0-9_./+-]{0,200}")
+REVISION = r"(?!.*(?:\.\.|//|@\{))[A-Za-z0-9_][A-Za-z0-9_./+-]{0,200}"
 _GITHUB = "github:"
 _SCHEMES = ("git+http:", "git+https:", "git+file:", "git+ext:")
 _PAGES = ("https://github.com/", "https://www.github.com/", "github.com/")
-_URL = re.compile(
-    r"([a-z]+)://([A-Za-z0-9][A-Za-z0-9.-]*(?::\d{1,5})?)(/[A-Za-z0-9_.~/+%-]{1,200})"
-)
+_URL = r"([a-z]+)://([A-Za-z0-9][A-Za-z0-9.-]*(?::\d{1,5})?)(/[A-Za-z0-9_.~/+%-]{1,200})"
 
 
 def is_one(text: str) -> bool:
@@ -41,7 +39,7 @@ def is_one(text: str) -> bool:
 
 def is_url(text: str) -> bool:
     """Whether git may be given it: nothing in it is an option, a login or another protocol."""
-    found = _URL.fullmatch(text)
+    found = re.fullmatch(_URL, text)
     return found is not None and found[1] in PROTOCOLS
 
 
@@ -87,7 +85,7 @@ def check(parts: Parts) -> None:
     if too_few or not is_url(parts.repo_id) or {"", ".", ".."} & set(repo.split("/")):
         raise Wrong(f"{parts.repo_id[:200]!r} is not the address of a repository", GRAMMAR)
     check_revision(parts)
-    if parts.revision is not None and not REVISION.fullmatch(parts.revision):
+    if parts.revision is not None and not re.fullmatch(REVISION, parts.revision):
         example = repr(join(parts._replace(revision="main")))
         raise Wrong(
             f"{parts.revision!r} is not a commit, tag or branch of git",

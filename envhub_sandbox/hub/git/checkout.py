@@ -32,7 +32,7 @@ _KEPT = ("GIT_CONFIG_GLOBAL", "GIT_CONFIG_SYSTEM", "GIT_CONFIG_NOSYSTEM")
 _LIST = ("ls-files", "-z", "-v", "--cached", "--others", "--exclude-standard")
 _CONVERSIONS = ("filter", "ident", "working-tree-encoding")
 """Attributes by which a folder has other bytes than the commit; ends of lines aside."""
-_SHA256 = re.compile(r"^\s*objectformat\s*=\s*\"?sha256", re.IGNORECASE | re.MULTILINE)
+_SHA256 = r"(?im)^\s*objectformat\s*=\s*\"?sha256"
 """In a configuration; such an index reads as another one here, and git does not notice."""
 
 
@@ -139,7 +139,7 @@ def _repository_of(folder: Path) -> _Repository | None:
             own = top / path.strip() if kind == "gitdir" else own
         common = own / _text_of(own / "commondir").strip()
         is_one = (own / "HEAD").is_file() and (common / "objects").is_dir()
-        is_one = is_one and not _SHA256.search(_text_of(common / "config"))
+        is_one = is_one and not re.search(_SHA256, _text_of(common / "config"))
         owners = (folder.stat().st_uid, user_id(), 0)
         is_trusted = (top / ".git").lstat().st_uid in owners
     except (OSError, ValueError):  # also a path with a null byte

@@ -79,7 +79,7 @@ def resolve(url: str, revision: str, variables: Variables | None = None) -> str:
     """
     if is_commit(revision):
         return revision
-    if not address.REVISION.fullmatch(revision):
+    if not re.fullmatch(address.REVISION, revision):
         raise HubReferenceError(
             f"{revision[:200]!r} is not a commit, tag or branch of {url[:200]!r}"
         )

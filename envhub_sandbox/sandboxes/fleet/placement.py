@@ -25,7 +25,7 @@ from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.settings.policy import Policy
 from envhub_sandbox.system.log import WORKER
 from envhub_sandbox.system.threads import Call, Calls
-from envhub_sandbox.transport.tcp import UnreachableError
+from envhub_sandbox.transport.replies import UnreachableError
 from envhub_worker.protocol.runtime import OWN, Runtime
 
 _WAIT_S = 1.5

@@ -9,17 +9,19 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from envhub_sandbox.errors import EnvHubError
-from envhub_sandbox.transport.lane import Request
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.wire import Buffer
 from envhub_worker.protocol.manifest.manifest import EnvManifest
+from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES
+
+if TYPE_CHECKING:
+    from envhub_sandbox.transport.lane import Request
 
 HISTORY_BYTES = 8 << 20
 """Memory that the history of one environment takes at most."""
@@ -35,7 +37,7 @@ _SLICED = (m.Reset, m.SetAttr, m.GetOne, m.CallOne)
 """Each shard is sent another part of these."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class RecordedRequest:
     """Any request but a step whose actions are one array.
 
@@ -49,7 +51,7 @@ class RecordedRequest:
     exact: bool
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Steps:
     """Steps in a row. ``actions`` is ``(steps, num_envs, *single_action_space.shape)``."""
 

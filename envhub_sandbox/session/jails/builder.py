@@ -11,19 +11,20 @@ import itertools
 import threading
 import weakref
 from collections.abc import Callable, Sequence
-from typing import Any, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from envhub_sandbox.errors import LoadError
 from envhub_sandbox.session.jails.launcher import Launcher
 from envhub_sandbox.session.jails.loaded import ExpectedManifest, LoadedJail
 from envhub_sandbox.system.processes import OwnerProcess
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.lane import Lane, RelayLane
 from envhub_sandbox.transport.replies import typed_reply
 from envhub_sandbox.transport.results import Results
-from envhub_sandbox.transport.shared_memory.served_lane import ServedLane
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest.manifest import EnvManifest, decode_env
+
+if TYPE_CHECKING:
+    from envhub_sandbox.transport.lane import Lane, RelayLane
 
 _numbers = itertools.count(1)
 
@@ -155,7 +156,7 @@ class Builder:
             loaded.jail.expire(idle_s, deadline)
         runners = self._launcher.spread(loaded, len(self._bounds), deadline, self._manifest)
         self._check_manifest(loaded)
-        relay = RelayLane(loaded.jail, runners, self._number, self._results)
+        relay = self._relay(loaded, runners)
         self._build(relay, range(len(runners)), deadline)
         return self._fast_lane(relay, loaded, deadline)
 
@@ -171,10 +172,15 @@ class Builder:
         loaded.loaded.difference_update(gone)
         self._launcher.load(loaded, fresh, deadline, self._manifest)
         self._check_manifest(loaded)
-        relay = RelayLane(loaded.jail, lane.runners, self._number, self._results)
+        relay = self._relay(loaded, lane.runners)
         relay.renew(dead, fresh, deadline)
         self._build(relay, dead, deadline)
         lane.renew(dead, fresh, deadline)
+
+    def _relay(self, loaded: LoadedJail, runners: list[int]) -> RelayLane:
+        from envhub_sandbox.transport.lane import RelayLane  # sandboxes/process.py says why here
+
+        return RelayLane(loaded.jail, runners, self._number, self._results)
 
     def _build(self, relay: RelayLane, shards: Sequence[int], deadline: Deadline) -> None:
         wanted = self._manifest
@@ -215,6 +221,8 @@ class Builder:
         if not self._manifest.shardable or not self._own:
             return relay  # a runner has one lane, and environments of one jail share theirs
         if server.fd_path is None or self._repository.lane == "frames":
+            from envhub_sandbox.transport.shared_memory.served_lane import ServedLane
+
             return ServedLane.open(relay, self._results, deadline)
         # late, for Linux alone has what they import
         from envhub_sandbox.transport.shared_memory.attachment import Attachment

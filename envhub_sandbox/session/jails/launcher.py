@@ -7,7 +7,7 @@ from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from time import monotonic, sleep
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from envhub_sandbox.errors import (
     EnvHubError,
@@ -24,17 +24,18 @@ from envhub_sandbox.session.jails.loaded import ExpectedManifest, LoadedJail, Se
 from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.system.log import WORKER
-from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline, PartDeadline
-from envhub_sandbox.transport.jail import JailHandle, open_jail
 from envhub_sandbox.transport.output import OutputFollower, OutputSinks
-from envhub_sandbox.transport.replies import expect_reply, typed_reply
-from envhub_sandbox.transport.tcp import UnreachableError
+from envhub_sandbox.transport.replies import UnreachableError, expect_reply, typed_reply
 from envhub_sandbox.transport.values import generator
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import UNTRUSTED
 from envhub_worker.protocol.manifest.manifest import EnvManifest, decode_manifest
 from envhub_worker.protocol.messages.busy import DRAINING
+
+if TYPE_CHECKING:
+    from envhub_sandbox.transport.connection import WorkerConnection
+    from envhub_sandbox.transport.jail import JailHandle
 
 _CLOSE_S = 5.0
 _LOST_S = 1.0
@@ -192,6 +193,8 @@ class Launcher:
         ``place``: of several servers, which is to leave the next one some time.
         Raises ``WorkerStartupError``: it has not.
         """
+        from envhub_sandbox.transport.jail import open_jail  # sandboxes/process.py says why here
+
         part = deadline if place is None else PartDeadline(deadline, _SHARE)
         try:
             return open_jail(client, order, self.repository.wire_limits, part)
@@ -205,6 +208,8 @@ class Launcher:
             ) from error
 
     def _client(self, server: WorkerServer) -> WorkerConnection:
+        from envhub_sandbox.transport.connection import WorkerConnection
+
         limits = self.repository.wire_limits
         return WorkerConnection(server.endpoint, server.process_fd, limits, server.far)
 

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from envhub_sandbox.sandboxes.pool import ServerUse, WorkerServer
 from envhub_sandbox.system.processes import OwnerProcess
-from envhub_sandbox.transport.jail import JailHandle
 from envhub_worker.protocol.manifest.manifest import EnvManifest, Manifest
+from envhub_worker.protocol.records import dataclass
+
+if TYPE_CHECKING:
+    from envhub_sandbox.transport.jail import JailHandle
 
 
 @dataclass(frozen=True)
@@ -27,7 +29,6 @@ class ExpectedManifest:
     shards: int = 1
 
 
-@dataclass(eq=False)
 class LoadedJail:
     """An open jail whose first runner has called ``make_env``.
 
@@ -48,20 +49,25 @@ class LoadedJail:
         changed: Whether it returned something else in one of them than the manifest says.
     """
 
-    jail: JailHandle
-    manifest: Manifest
-    value: dict[str, object]
-    loaded: set[int]
-    use: ServerUse[WorkerServer]
-    give_back: Callable[[LoadedJail], None]
-    address: str = ""
-    ending: bool = False
-    closing: bool = False
-    ended: bool = False
-    closed: bool = False
-    lost: bool = False
-    changed: bool = False
-    owner: OwnerProcess = field(default_factory=OwnerProcess)
+    def __init__(
+        self,
+        jail: JailHandle,
+        manifest: Manifest,
+        value: dict[str, object],
+        loaded: set[int],
+        use: ServerUse[WorkerServer],
+        give_back: Callable[[LoadedJail], None],
+        address: str = "",
+    ) -> None:
+        self.jail = jail
+        self.manifest = manifest
+        self.value = value
+        self.loaded = loaded
+        self.use = use
+        self.give_back = give_back
+        self.address = address
+        self.ending = self.closing = self.ended = self.closed = self.lost = self.changed = False
+        self.owner = OwnerProcess()
 
     @property
     def server(self) -> WorkerServer:

@@ -25,7 +25,7 @@ from envhub_sandbox.errors import ActionError, WorkerTimeoutError
 from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.failures import refusal
 from envhub_sandbox.session.parts.worker_queue import WorkerQueue
-from envhub_sandbox.session.requests import MessageFor, RequestOrder
+from envhub_sandbox.session.requests import SENT, MessageFor, RequestOrder
 from envhub_sandbox.session.use_lock import FleetUse, all_held
 from envhub_sandbox.transport.deadline import Deadline, deadline_of
 from envhub_sandbox.transport.lane import answered_first
@@ -33,9 +33,6 @@ from envhub_sandbox.transport.results import StepResult
 from envhub_worker.protocol.lifecycle import State
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, LARGE_BYTES
 from envhub_worker.protocol.spaces import batches
-
-SENT = "send"
-"""What is pending then, as ``RequestOrder.waiting`` calls it."""
 
 
 class Received(NamedTuple):

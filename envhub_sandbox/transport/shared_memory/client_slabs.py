@@ -30,6 +30,7 @@ import numpy as np
 from envhub_sandbox.errors import RemoteProtocolError, WorkerTimeoutError
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.lane import RECHECK_MS
+from envhub_sandbox.transport.results import Results
 from envhub_sandbox.transport.values import unpacked
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import UNTRUSTED
@@ -52,6 +53,16 @@ Wishes = tuple[int, int, int]
 the core to run on, or 0."""
 Schema = list[tuple[Column, Any]]
 """What columns infos have, and where each lies in a slab."""
+
+
+def action_layouts(results: Results) -> list[slabs.Layout] | None:
+    """Where each shard's actions lie in its slab; None where spaces have no fixed layout."""
+    manifest = results.manifest
+    space = manifest.single_action_space
+    found = [slabs.layout_of(space, stop - start) for start, stop in results.bounds]
+    known = [layout for layout in found if layout is not None]
+    own = [manifest.own_batch(name) for name in ("action_space", "observation_space")]
+    return known if len(known) == len(found) and own == [None, None] else None
 
 
 class ShardSlabs:

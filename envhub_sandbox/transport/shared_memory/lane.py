@@ -16,9 +16,8 @@ import numpy as np
 from envhub_sandbox.errors import EnvHubError, RemoteProtocolError, WorkerDiedError
 from envhub_sandbox.transport.connection import Source
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.jail import RunnersDiedError
 from envhub_sandbox.transport.lane import Frames, RelayLane, Request
-from envhub_sandbox.transport.replies import typed_reply
+from envhub_sandbox.transport.replies import RunnersDiedError, typed_reply
 from envhub_sandbox.transport.results import Results, StepResult
 from envhub_sandbox.transport.shared_memory.attachment import Attachment
 from envhub_sandbox.transport.shared_memory.client_slabs import (
@@ -28,6 +27,7 @@ from envhub_sandbox.transport.shared_memory.client_slabs import (
     ObservationSlab,
     Outcome,
     ShardSlabs,
+    action_layouts,
 )
 from envhub_sandbox.transport.shared_memory.spin import CPUS, Cores, SpinChooser
 from envhub_worker.protocol import messages as m
@@ -129,7 +129,8 @@ class SharedMemoryLane:
         """
         slots = 1 if copy else 1 + RING
         space = results.manifest.single_observation_space
-        observed, layouts = slabs.observation_layout(space, results.count, slots), results.layouts()
+        observed = slabs.observation_layout(space, results.count, slots)
+        layouts = action_layouts(results)
         if observed is None or layouts is None:
             attachment.close()
             return None

@@ -18,11 +18,15 @@ import numpy as np
 
 from envhub_sandbox.errors import EnvHubError, RemoteProtocolError, WorkerDiedError
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.jail import RunnersDiedError
 from envhub_sandbox.transport.lane import Frames, RelayLane
-from envhub_sandbox.transport.replies import expect_reply, typed_reply
+from envhub_sandbox.transport.replies import RunnersDiedError, expect_reply, typed_reply
 from envhub_sandbox.transport.results import Results, StepResult
-from envhub_sandbox.transport.shared_memory.client_slabs import ObservationSlab, Outcome, ShardSlabs
+from envhub_sandbox.transport.shared_memory.client_slabs import (
+    ObservationSlab,
+    Outcome,
+    ShardSlabs,
+    action_layouts,
+)
 from envhub_sandbox.transport.shared_memory.spin import SpinChooser
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.wire import Buffer
@@ -63,7 +67,7 @@ class ServedLane(RelayLane):
         space = results.manifest.single_observation_space
         shards = [
             ServedShard(space, layout, observed)
-            for layout in results.layouts() or ()
+            for layout in action_layouts(results) or ()
             if (observed := slabs.observation_layout(space, layout.count, 1)) is not None
         ]
         if len(shards) < len(results.slices):

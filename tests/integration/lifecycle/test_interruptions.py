@@ -6,11 +6,13 @@ Python looks for signals where a function begins, so these are the moments that 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import pytest
 
 from envhub_sandbox import make_env
+from tests.support.command_line import python
 from tests.support.in_process.interrupts import at_call
 from tests.support.samples import sample
 from tests.support.started import nothing_more_held
@@ -75,3 +77,54 @@ def test_an_interrupted_close_leaves_nothing_behind(
         assert nothing_more(), moment
         moment += _CLOSES
     assert moment > 3 * _CLOSES
+
+
+_IMPORTS = f"""
+import os, signal, sys, time
+import psutil
+from envhub_sandbox import make_env
+
+class Finder:
+    def find_spec(self, name, path=None, target=None):
+        if name == NAME:
+            print("servers:", len(psutil.Process().children()))
+            if KIND is ImportError:
+                raise ImportError(name)
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.5)
+
+signal.signal(signal.SIGINT, signal.default_int_handler)
+env = make_env({str(sample("echo"))!r}, n_envs=2).env
+sys.meta_path.insert(0, Finder())
+try:
+    env.reset()
+except KIND:
+    print("left:", len(psutil.Process().children()))
+del sys.meta_path[0]
+print(env.reset(options={{"token": 5.0, "delay": 0.0}})[0].tolist())
+"""
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("zmq", "KeyboardInterrupt"),
+        ("zmq.sugar.frame", "KeyboardInterrupt"),
+        ("envhub_sandbox.transport.lane", "KeyboardInterrupt"),
+        ("envhub_sandbox.transport.lane", "ImportError"),
+    ],
+)
+def test_an_interrupted_import_leaves_no_server_behind(
+    tmp_path: Path, snapshot_store: Path, name: str, kind: str
+) -> None:
+    """What speaks with a server is imported while it starts. The next reset starts another."""
+    runtime = tmp_path / "t"
+    runtime.mkdir(mode=0o711)
+    with make_env(sample("echo"), n_envs=2):
+        pass  # its manifest is known from here on
+    done = python("-c", f"NAME, KIND = {name!r}, {kind}{_IMPORTS}", TMPDIR=str(runtime))
+    *servers, left, answer = done.stdout.splitlines()
+    assert set(servers) == {"servers: 1"}
+    assert (left, answer) == ("left: 0", "[[5.0, 0.0], [5.0, 0.0]]")
+    assert done.stderr == ""
+    assert list(runtime.iterdir()) == []

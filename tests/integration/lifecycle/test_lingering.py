@@ -160,7 +160,7 @@ def test_a_run_of_the_command_line_does_not_wait_for_it() -> None:
             """
             from envhub_sandbox import Timeouts
             from envhub_sandbox.cli import main
-            Timeouts.__init__.__kwdefaults__["server_idle_s"] = 600
+            Timeouts.__record__.defaults["server_idle_s"] = lambda: 600
             sys.argv = ["envhub", "run", REPOSITORY, "--steps", "3"]
             main()
             """,

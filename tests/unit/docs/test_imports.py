@@ -473,6 +473,29 @@ def test_the_command_line_helps_without_loading_anything_heavy() -> None:
     assert not loaded & {"zmq", "huggingface_hub", "gymnasium", "numpy", "torch"}
 
 
+def test_what_speaks_with_a_server_is_imported_while_that_starts(snapshot_store: Path) -> None:
+    """It costs nothing then. A known manifest, ``make_env`` and the start need none of it."""
+    made = f"""
+import subprocess, sys
+from envhub_sandbox import make_env
+suites = make_env({str(sample("marker"))!r})
+"""
+    start = """
+starts = subprocess.Popen.__init__
+def watched(*arguments, **options):
+    print(*sys.modules)
+    starts(*arguments, **options)
+subprocess.Popen.__init__ = watched
+suites.env.reset()
+sys.exit()
+"""
+    late = {"cloudpickle", "huggingface_hub", "zmq"}
+    loaded_by(made)  # from here on the manifest is known
+    assert not loaded_by(made) & late
+    assert not loaded_by(made + start) & late
+    assert "zmq" in loaded_by(f"{made}suites.env.reset()")
+
+
 def test_a_repository_leaves_no_module_in_the_client() -> None:
     """After make_env, reset and step nothing in ``sys.modules`` comes from its folder."""
     source = f"""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import inspect
 import pickle
 import subprocess
 import sys
@@ -108,6 +109,36 @@ def test_equality_and_hash_go_by_compared_fields_of_one_class() -> None:
     assert Ours(1).third is not Ours(1).third
     assert Ours(1) != Below(1)
     assert Named(only=1) != 1
+
+
+@records.dataclass(frozen=True)
+class Checked:
+    """One that looks at what it was given."""
+
+    first: int
+    second: str = "b"
+
+    def __post_init__(self) -> None:
+        if self.first < 0:
+            raise ValueError("first is negative")
+        object.__setattr__(self, "second", self.second.upper())
+
+
+def test_what_was_given_is_looked_at() -> None:
+    assert Checked(1).second == dataclasses.replace(Checked(2), first=1).second == "B"
+    for make in (lambda: Checked(-1), lambda: dataclasses.replace(Checked(1), first=-1)):
+        with pytest.raises(ValueError, match="negative"):
+            make()
+
+
+def test_a_notebook_shows_the_fields() -> None:
+    """What is shown of a class is what it takes, as the standard library has it."""
+    ours, theirs = inspect.signature(Ours).parameters, inspect.signature(Theirs).parameters
+    assert [str(one) for one in ours.values() if one.name != "third"] == [
+        str(one) for one in theirs.values() if one.name != "third"
+    ]
+    assert ours["third"].default == []
+    assert str(inspect.signature(Named)) == "(*, only: 'int')"
 
 
 def test_subclasses_add_fields() -> None:

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, NoReturn
 
 if TYPE_CHECKING:
+    import inspect
     from dataclasses import dataclass as dataclass
 else:
 
@@ -40,6 +41,26 @@ class About(NamedTuple):
     defaults: dict[str, Callable[[], Any]]
     compared: tuple[str, ...]
     shown: tuple[str, ...]
+
+
+class _Signature:
+    """What ``inspect`` and notebooks show of a class, made when it is asked for."""
+
+    def __get__(self, record: object, cls: Any) -> inspect.Signature:
+        from inspect import Parameter, Signature
+
+        defaults = cls.__record__.defaults
+        return Signature(
+            [
+                Parameter(
+                    field.name,
+                    Parameter.KEYWORD_ONLY if field.kw_only else Parameter.POSITIONAL_OR_KEYWORD,
+                    default=defaults.get(field.name, lambda: Parameter.empty)(),
+                    annotation=field.type,
+                )
+                for field in dataclasses.fields(cls)
+            ]
+        )
 
 
 class FrozenRecord:
@@ -90,7 +111,15 @@ def _recorded(cls: Any, *, kw_only: bool, shown: bool) -> Any:
     for name in ("__init__", "__setattr__", "__delattr__", "__eq__", "__hash__", "__repr__"):
         if name not in own and (shown or name != "__repr__"):
             setattr(cls, name, vars(FrozenRecord)[name])
+    if "__init__" not in own and hasattr(cls, "__post_init__"):
+        cls.__init__ = _init_and_check
+    cls.__signature__ = _Signature()
     return cls
+
+
+def _init_and_check(record: Any, *values: Any, **named: Any) -> None:
+    FrozenRecord.__init__(record, *values, **named)
+    record.__post_init__()
 
 
 def _default(field: dataclasses.Field[Any]) -> Callable[[], Any] | None:
@@ -104,21 +133,22 @@ def _default(field: dataclasses.Field[Any]) -> Callable[[], Any] | None:
 def _completed(record: Any, values: tuple[Any, ...], named: dict[str, Any]) -> dict[str, Any]:
     """All fields in order: those given in order, those given by name, and defaults."""
     about: About = record.__record__
-    given = dict(zip(about.positional, values))  # noqa: B905 - too many are refused below
-    if (
-        len(values) > len(about.positional)
-        or named.keys() & given.keys()
-        or not named.keys() <= set(about.names)
-    ):
+    names, defaults = about.names, about.defaults
+    given = dict(zip(about.positional, values)) | named  # noqa: B905 - seen below
+    found = {
+        name: given[name] if name in given else defaults[name]()
+        for name in names
+        if name in given or name in defaults
+    }
+    if len(given) < len(values) + len(named) or not given.keys() <= found.keys():
         raise TypeError(
-            f"{type(record).__name__} takes {', '.join(about.names)}; it was given "
+            f"{type(record).__name__} takes {', '.join(names)}; it was given "
             f"{len(values)} in order, and {', '.join(named) or 'none'} by name"
         )
-    given |= named
-    missing = [name for name in about.names if name not in given and name not in about.defaults]
-    if missing:
-        raise TypeError(f"{type(record).__name__} needs {', '.join(missing)}")
-    return {n: given[n] if n in given else about.defaults[n]() for n in about.names}
+    if len(found) < len(names):
+        missing = ", ".join(name for name in names if name not in found)
+        raise TypeError(f"{type(record).__name__} needs {missing}")
+    return found
 
 
 def _compared(record: Any) -> tuple[Any, ...]:

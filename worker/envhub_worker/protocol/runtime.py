@@ -12,10 +12,10 @@ from envhub_worker.protocol.errors import RemoteProtocolError
 
 MAX_HUB_COPIES = 17
 """The repository's own files, and sixteen others."""
-_FOLDER = re.compile(r"(models|datasets|spaces)(--[A-Za-z0-9_][\w.-]{0,95}){1,2}", re.ASCII)
-_COMMIT = re.compile(r"[0-9a-f]{40}")
+_FOLDER = r"(?a)(models|datasets|spaces)(--[A-Za-z0-9_][\w.-]{0,95}){1,2}"
+_COMMIT = r"[0-9a-f]{40}"
 _STEP = r"\w[\w.+#=@%,-]{0,99}"
-_REVISION = re.compile(rf"{_STEP}(/{_STEP}){{0,4}}", re.ASCII)
+_REVISION = rf"(?a){_STEP}(/{_STEP}){{0,4}}"
 _MAX_REVISIONS = 4
 _MAX_PATH = 4096
 
@@ -63,7 +63,7 @@ class HubCopy(NamedTuple):
 
 def is_cached_revision(text: str) -> bool:
     """Whether ``HubCopy.revisions`` may have it. Each is a path in the cache; git permits more."""
-    return _REVISION.fullmatch(text) is not None
+    return re.fullmatch(_REVISION, text) is not None
 
 
 def read_hub_copies(value: Any) -> tuple[HubCopy, ...]:
@@ -91,7 +91,7 @@ def _copy(value: Any) -> HubCopy:
     texts = (folder, commit, tree, *revisions)
     if not all(type(text) is str for text in texts) or len(tree) > _MAX_PATH or "\0" in tree:
         raise _wrong()
-    known = _FOLDER.fullmatch(folder) and _COMMIT.fullmatch(commit)
+    known = re.fullmatch(_FOLDER, folder) and re.fullmatch(_COMMIT, commit)
     if not known or not all(map(is_cached_revision, revisions)):
         raise _wrong()
     return HubCopy(folder, commit, tuple(revisions), tree)

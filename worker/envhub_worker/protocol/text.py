@@ -57,7 +57,7 @@ def duration_text(seconds: float) -> str:
     return f"{hours} h {minutes} min" if hours else f"{minutes} min {rest} s"
 
 
-_SIZE = re.compile(r"(\d+(?:\.\d+)?) *([kmgt]?)(i?b|bytes?)?", re.ASCII)
+_SIZE = r"(?a)(\d+(?:\.\d+)?) *([kmgt]?)(i?b|bytes?)?"
 SIZES = "a size such as 512M, 1.5GiB or 4G; units are powers of 1024"
 """What ``parse_size`` takes, for errors and help."""
 
@@ -72,7 +72,7 @@ def parse_size(text: str, unit: str = "") -> int:
     Raises:
         ValueError: It is no size; the text says what is one.
     """
-    found = _SIZE.fullmatch(text.strip().lower())
+    found = re.fullmatch(_SIZE, text.strip().lower())
     if found is None:
         raise ValueError(f"it takes {SIZES}")
     number, prefix, rest = found.groups()

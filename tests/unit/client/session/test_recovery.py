@@ -12,7 +12,8 @@ from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
 from envhub_sandbox.session.recovery import SeedBook, derived_seed, resets, revived_step
 from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.jail import JailHandle, RunnersDiedError
+from envhub_sandbox.transport.jail import JailHandle
+from envhub_sandbox.transport.replies import RunnersDiedError
 from envhub_sandbox.transport.results import Results
 from envhub_sandbox.transport.values import DescriptionReader
 from envhub_worker.protocol import messages as m

@@ -15,7 +15,8 @@ from zmq.utils import z85
 from envhub_sandbox.errors import SandboxUnavailableError
 from envhub_sandbox.transport import deadline as deadline_module
 from envhub_sandbox.transport.deadline import Deadline, StepDeadline
-from envhub_sandbox.transport.tcp import TcpLink, TcpServer, UnreachableError
+from envhub_sandbox.transport.replies import UnreachableError
+from envhub_sandbox.transport.tcp import TcpLink, TcpServer
 from tests.support import inside
 from tests.support.processes import eventually
 

@@ -14,8 +14,8 @@ ERROR = "ServerBusyError"
 DRAINING = "draining"
 """In the place of a quota: the server is about to end."""
 LONGEST_S = 60.0
-_NUMBERS = re.compile(r"(\d{1,18}) (\d{1,18}) (\d{1,4}(?:\.\d{1,3})?)")
-_NAME = re.compile(r"[a-z_]{1,32}")
+_NUMBERS = r"(\d{1,18}) (\d{1,18}) (\d{1,4}(?:\.\d{1,3})?)"
+_NAME = r"[a-z_]{1,32}"
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class Busy:
     @classmethod
     def read(cls, quota: str, words: str) -> Busy:
         """What travelled; with nothing in it where that is none. Trust: input from the worker."""
-        found = _NUMBERS.fullmatch(words)
-        if found is None or not _NAME.fullmatch(quota):
+        found = re.fullmatch(_NUMBERS, words)
+        if found is None or not re.fullmatch(_NAME, quota):
             return cls("", 0, 0, 1.0)
         return cls(quota, int(found[1]), int(found[2]), min(float(found[3]), LONGEST_S))

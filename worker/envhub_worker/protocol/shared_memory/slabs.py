@@ -45,18 +45,12 @@ from envhub_worker.protocol.shared_memory.words import (
     REPLY_BYTES,
 )
 from envhub_worker.protocol.spaces import batches
-from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES
+from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES, BOX_DTYPES
 
 MAX_SLAB_BYTES = 1 << 31
 """Above this the frames lane serves: a slab is pinned memory."""
 
-ACTION_DTYPES = tuple(
-    np.dtype(name)
-    for name in (
-        *("bool", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "uint64"),
-        *("float16", "float32", "float64"),
-    )
-)
+ACTION_DTYPES = tuple(BOX_DTYPES.values())
 """An action keeps the dtype that the caller gave it; the code is the place in this table."""
 LISTED = 32
 """Added to the code, it asks for numbers of Python in lists: the caller gave such."""

@@ -27,6 +27,7 @@ MAX_SPACE_DEPTH = 12
 
 _DTYPE_CODES = ("?", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4", "f8")
 BOX_DTYPES = {np.dtype(code).name: np.dtype(code) for code in _DTYPE_CODES}
+"""By name. Their order is that of the codes of actions in shared memory."""
 INTEGER_DTYPES = {name: dtype for name, dtype in BOX_DTYPES.items() if dtype.kind in "iu"}
 
 ARRAY_SPACES = (spaces.Box, spaces.Discrete, spaces.MultiDiscrete, spaces.MultiBinary)
@@ -234,14 +235,15 @@ def _fields(space: Any, depth: int) -> tuple[Any, ...]:
 
 
 _opaque_fields = _fields.dispatch(object)
+# each class is named: to read it off the annotations takes as long as all else here
 
 
-@_fields.register
+@_fields.register(OpaqueSpace)
 def _(space: OpaqueSpace, depth: int) -> tuple[Any, ...]:
     return "opaque", space.type_name, space.text, space.shape, space.dtype_text
 
 
-@_fields.register
+@_fields.register(spaces.Box)
 def _(space: spaces.Box, depth: int) -> tuple[Any, ...]:
     if space.dtype.name not in BOX_DTYPES:
         return _opaque_fields(space, depth)
@@ -249,24 +251,24 @@ def _(space: spaces.Box, depth: int) -> tuple[Any, ...]:
     return "box", space.dtype.name, space.shape, *map(_compact, arrays)
 
 
-@_fields.register
+@_fields.register(spaces.Discrete)
 def _(space: spaces.Discrete, depth: int) -> tuple[Any, ...]:
     return "discrete", int(space.n), int(space.start), np.dtype(space.dtype).name
 
 
-@_fields.register
+@_fields.register(spaces.MultiDiscrete)
 def _(space: spaces.MultiDiscrete, depth: int) -> tuple[Any, ...]:
     name, shape = np.dtype(space.dtype).name, space.nvec.shape
     return "multi_discrete", name, shape, _compact(space.nvec), _compact(space.start)
 
 
-@_fields.register
+@_fields.register(spaces.MultiBinary)
 def _(space: spaces.MultiBinary, depth: int) -> tuple[Any, ...]:
     n = space.n
     return "multi_binary", tuple(map(int, n)) if isinstance(n, tuple) else int(n)
 
 
-@_fields.register
+@_fields.register(spaces.Text)
 def _(space: spaces.Text, depth: int) -> tuple[Any, ...]:
     characters = "".join(dict.fromkeys(space.character_list))
     if not is_charset(characters) or len(characters) != len(space.character_set):
@@ -274,7 +276,7 @@ def _(space: spaces.Text, depth: int) -> tuple[Any, ...]:
     return "text", int(space.min_length), int(space.max_length), characters
 
 
-@_fields.register
+@_fields.register(spaces.Dict)
 def _(space: spaces.Dict, depth: int) -> tuple[Any, ...]:
     parts = _encode_all(space.spaces.values(), depth)
     return "dict", list(space.spaces), parts, bool(getattr(space, "sort_keys", True))
@@ -285,12 +287,12 @@ def _(space: spaces.Tuple[Any], depth: int) -> tuple[Any, ...]:
     return "tuple", _encode_all(space.spaces, depth)
 
 
-@_fields.register
+@_fields.register(spaces.Sequence)
 def _(space: spaces.Sequence, depth: int) -> tuple[Any, ...]:
     return "sequence", _encode_child(space.feature_space, depth), bool(space.stack)
 
 
-@_fields.register
+@_fields.register(spaces.Graph)
 def _(space: spaces.Graph, depth: int) -> tuple[Any, ...]:
     edge = space.edge_space
     node = _encode_child(space.node_space, depth)

@@ -26,7 +26,7 @@ from envhub_sandbox.sandboxes.fleet import fleet
 from envhub_sandbox.sandboxes.fleet.fleet import Fleet, PlaceList, read_dns
 from envhub_sandbox.sandboxes.process import PROCESS
 from envhub_sandbox.sandboxes.sandbox import is_list, may_go_elsewhere, worst_of
-from envhub_sandbox.transport.tcp import UnreachableError
+from envhub_sandbox.transport.replies import UnreachableError
 from envhub_worker.access import keys
 from envhub_worker.protocol.keys import key_text
 from tests.support import inside

@@ -16,7 +16,7 @@ from envhub_sandbox.sandboxes.fleet.member import FleetPackages, Member
 from envhub_sandbox.sandboxes.fleet.placement import Placement, Room
 from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.settings.policy import Policy
-from envhub_sandbox.transport.tcp import UnreachableError
+from envhub_sandbox.transport.replies import UnreachableError
 from envhub_worker.protocol.runtime import Runtime
 
 

@@ -11,10 +11,10 @@ import pytest
 
 from envhub_sandbox.errors import EnvHubError, ServerBusyError, WorkerDiedError, WorkerStartupError
 from envhub_sandbox.sandboxes.sandbox import Sandbox
-from envhub_sandbox.session.jails import launcher as launcher_module
 from envhub_sandbox.session.jails import launcher as module
 from envhub_sandbox.session.jails.launcher import Launcher, retry_while_busy
 from envhub_sandbox.session.jails.loaded import LoadedJail
+from envhub_sandbox.transport import connection
 from envhub_sandbox.transport.deadline import StartupDeadline
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.messages.busy import DRAINING
@@ -65,7 +65,7 @@ class _Place(Sandbox):
 @pytest.fixture
 def client(monkeypatch: pytest.MonkeyPatch) -> _Client:
     made = _Client()
-    monkeypatch.setattr(launcher_module, "WorkerConnection", lambda *_: made)
+    monkeypatch.setattr(connection, "WorkerConnection", lambda *_: made)
     return made
 
 

@@ -18,8 +18,9 @@ from envhub_sandbox.errors import (
     WorkerTimeoutError,
 )
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.jail import JailHandle, RunnersDiedError
+from envhub_sandbox.transport.jail import JailHandle
 from envhub_sandbox.transport.lane import RelayLane
+from envhub_sandbox.transport.replies import RunnersDiedError
 from envhub_sandbox.transport.results import Results
 from envhub_sandbox.transport.shared_memory.served_lane import ServedLane, ServedShard
 from envhub_worker.protocol import messages as m
