@@ -22,13 +22,13 @@ from envhub_sandbox.transport.results import Results, StepResult
 from envhub_sandbox.transport.shared_memory.attachment import Attachment
 from envhub_sandbox.transport.shared_memory.client_slabs import (
     RING,
-    JoinedColumns,
     LaneShard,
     ObservationSlab,
     Outcome,
     ShardSlabs,
     action_layouts,
 )
+from envhub_sandbox.transport.shared_memory.joined_columns import JoinedColumns
 from envhub_sandbox.transport.shared_memory.spin import CPUS, Cores, SpinChooser
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import UNTRUSTED
