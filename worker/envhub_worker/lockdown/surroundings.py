@@ -1,4 +1,4 @@
-"""What a container does to this process, read and tried from inside: claims are no layers.
+"""What a container does to this process, as read and tried from inside: no claim is believed.
 
 The client asks an engine for a container by its flags. An engine may ignore one with a warning
 (a limit that the host's control groups cannot give), and the flags say nothing of what works

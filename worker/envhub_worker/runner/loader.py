@@ -1,15 +1,14 @@
-"""A caller's config object, made again of the plain values that have crossed.
-
-Each object comes with the names of its class and of the classes that this inherits from. The class
-itself is used where it can be imported here; else a dataclass of the same name, which inherits
-from the nearest of them that can. Followed: ``dataclasses.make_dataclass``.
-
-The only importer of repository code: imports the entry file and calls its ``make_env``.
+"""The only importer of repository code: imports the entry file and calls its ``make_env``.
 
 The entry becomes the module ``hub_env.<path>``, a real importable name, so that dataclasses with
 postponed annotations, ``from .sibling import x``, and pickling of the repository's classes to its
 own child processes work; its folder and the repository's root are importable too (``import
 sibling``). Followed: LeRobot's ``_import_hub_module`` and ``_call_make_env``.
+
+A caller's config object is made again of the plain values that have crossed (``config_of``). Each
+object comes with the names of its class and of the classes that this inherits from. The class
+itself is used where it can be imported here; else a dataclass of the same name, which inherits
+from the nearest of them that can. Followed: ``dataclasses.make_dataclass``.
 """
 
 from __future__ import annotations

@@ -1,16 +1,14 @@
-"""Sub-environments of LeRobot's rollouts, which stand still once their episode has ended.
-
-A rollout steps all sub-environments until the last one is done, and drops what the finished ones
-give. Newer releases announce a rollout in the options of ``reset``. From then on a finished
-sub-environment repeats its last transition, with reward 0, until the next rollout is announced; a
-frame of it is drawn once. Followed: ``lerobot.envs.utils.FreezeAfterEpisodeEnd`` 0.6, around each
-sub-environment, whose results these are.
-
-The worker's own loop over plain sub-environments: ``SyncVectorEnv``, written into given memory.
+"""The worker's own loop over plain sub-environments: ``SyncVectorEnv``, written into given memory.
 
 Observations, rewards and flags go straight to where they are read: no stacking, no deep copy.
 Everything but ``reset`` and ``step`` is ``SyncVectorEnv``'s own. The parity suite compares the two
 bit by bit. Followed: ``gymnasium.vector.SyncVectorEnv`` 1.4.
+
+``FreezingEnv`` is for LeRobot's rollouts, which step all sub-environments until the last one is
+done, and drop what the finished ones give. Newer releases announce a rollout in the options of
+``reset``. From then on a finished sub-environment repeats its last transition, with reward 0, until
+the next rollout is announced; a frame of it is drawn once. Followed:
+``lerobot.envs.utils.FreezeAfterEpisodeEnd`` 0.6, whose results these are.
 """
 
 from __future__ import annotations
