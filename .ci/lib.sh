@@ -73,6 +73,10 @@ permit_what_this_machine_lacks() {
     echo "no control groups for this user: the tests that need them are skipped"
     export ENVHUB_CI_WITHOUT_CGROUPS=1
   fi
+  if ! ls /dev/nvidia0 /dev/dri/renderD* >/dev/null 2>&1; then
+    echo "no GPU: the tests of a real one are skipped"
+    export ENVHUB_CI_WITHOUT_GPU=1
+  fi
 }
 
 # make_venv PYTHON FOLDER: a virtual environment with uv in it.

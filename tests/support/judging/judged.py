@@ -21,7 +21,7 @@ from tests.support.samples import SAMPLES, sample
 
 HOSTILE = SAMPLES.parent / "attacks" / "hostile"
 PAYLOADS = HOSTILE / "payloads"
-NO_ATTACKS = {"__init__", "be_victim", "kernel", "plant", "running", "where_am_i"}
+NO_ATTACKS = {"__init__", "be_victim", "kernel", "plant", "running", "use_card", "where_am_i"}
 _TIMEOUTS = dict.fromkeys(("call_s", "reset_s", "step_s"), 30.0)
 _MIB = 1 << 20
 _CLIENT = {"pid": os.getpid()}
@@ -107,6 +107,7 @@ ATTACKS = {
     "netlink_routes": Attack("source-network", "", unseen=_LIBRARIES),
     "network_table": Attack("source-outside", "", {"name": "tcp"}, unseen="it sees its own"),
     "oom_score": Attack(_FILES, "oom_score_adj", {**_CLIENT, "score": 900}),
+    "open_nodes": Attack(_FILES, "write /dev/nvidia0", {"nodes": ["/dev/nvidia0"]}),
     "own_memory": Attack("source-outside", "", {"prefix": "x"}, unseen="it may read its own"),
     "packet": Attack(_NETWORK, "tried socket AF_PACKET", {"device": "lo", **_WORD}),
     "pidfd_getfd": Attack(_KERNEL, "tried pidfd_open of", {**_CLIENT, "fd": 0}),
@@ -172,6 +173,7 @@ ATTACKS = {
         unseen="there is no such call",
     ),
     "write_file": Attack(_FILES, "truncate /home/other/file", {**_OUTSIDE, **_TEXT}),
+    "write_proc": Attack(_FILES, "write /proc/"),
     "write_to_terminal": Attack(_FILES, "write /dev/tty", {**_TEXT, "ways": ["/dev/tty"]}),
 }
 

@@ -12,6 +12,7 @@ import pytest
 # Reasons for which a test may be skipped in CI, each with the variable that permits it there.
 _PERMITTED = {
     "needs torch": "ENVHUB_CI_WITHOUT_TORCH",
+    "no GPU": "ENVHUB_CI_WITHOUT_GPU",
     "may not make control groups": "ENVHUB_CI_WITHOUT_CGROUPS",
     "there is no prometheus": "ENVHUB_CI_WITHOUT_PROMETHEUS",
 }
