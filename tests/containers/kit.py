@@ -42,7 +42,7 @@ def folders(client: int | None = None) -> list[Path]:
     wanted, found = str(client or os.getpid()), []
     for path in Path(tempfile.gettempdir()).glob("envhub-docker-*"):
         with contextlib.suppress(OSError):
-            if (path / "alive").read_text().split()[1] == wanted:
+            if (path / "alive").read_text().split()[1:2] == [wanted]:  # empty: just being written
                 found.append(path)
     return found
 
