@@ -9,7 +9,6 @@ gymnasium[mujoco], and a GPU that both can use.
 from __future__ import annotations
 
 import argparse
-import importlib.util
 import itertools
 import os
 import signal
@@ -27,7 +26,7 @@ import numpy as np
 
 from benchmarks.clock import Slice, run_slice
 from benchmarks.machine import machine
-from benchmarks.workloads import REPOSITORIES
+from benchmarks.workloads import REPOSITORIES, module
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import EnvHubError
 
@@ -61,7 +60,7 @@ def main() -> None:
 
 
 def _compared(name: str, count: int, rounds: int, seconds: float) -> str:
-    here = _module(REPOSITORIES / name).make_env(count)
+    here = module(REPOSITORIES / name).make_env(count)
     with _in_jail(name, count) as there:
         _equal_steps(here, there)
         batches = itertools.cycle([here.action_space.sample() for _ in range(32)])
@@ -124,15 +123,6 @@ def _crash(env: Any, pids: set[int]) -> None:
 def _in_jail(name: str, count: int) -> Iterator[Any]:
     with make_env(str(REPOSITORIES / name), count, policy=_POLICY) as suites:
         yield suites.env
-
-
-def _module(folder: Path) -> Any:
-    spec = importlib.util.spec_from_file_location(f"gpu_{folder.name}", folder / "env.py")
-    assert spec is not None
-    assert spec.loader is not None
-    loaded = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(loaded)
-    return loaded
 
 
 def _card() -> str:

@@ -74,7 +74,8 @@ WORKLOADS = {
 
 
 @lru_cache
-def _module(folder: Path) -> ModuleType:
+def module(folder: Path) -> ModuleType:
+    """A repository's ``env.py``, imported in this process."""
     spec = importlib.util.spec_from_file_location(f"benchmark_{folder.name}", folder / "env.py")
     assert spec is not None
     assert spec.loader is not None
@@ -86,7 +87,7 @@ def _module(folder: Path) -> ModuleType:
 def single(name: str) -> Any:
     """One sub-environment of a workload, in this process."""
     workload = WORKLOADS[name]
-    return _module(workload.folder).single(**workload.arguments)
+    return module(workload.folder).single(**workload.arguments)
 
 
 def makers(name: str, count: int) -> list[Callable[[], Any]]:

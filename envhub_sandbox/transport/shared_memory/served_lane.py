@@ -139,7 +139,7 @@ class ServedLane(RelayLane):
         elif kind == slabs.COLUMNS:
             infos = shard.slabs.columns()
         else:
-            infos = {} if message is None else self._results.info(message)
+            infos = self._results.info(message)
         return m.StepDone(shard.observation(), *shard.observations.results(), infos)
 
     def result(self, infos: dict[Any, Any] | None = None) -> StepResult:
@@ -149,8 +149,8 @@ class ServedLane(RelayLane):
             return super().result(infos)
         # it was made here, of the spaces that are declared
         self._answers = []
-        if infos is None:  # most steps have none
-            infos = self._results.infos([done.info]) if done.info else {}
+        if infos is None:
+            infos = self._results.infos([done.info])
         return done.observation, done.rewards, done.terminations, done.truncations, infos
 
     def wait(self, deadline: Deadline) -> None:
