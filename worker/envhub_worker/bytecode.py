@@ -22,24 +22,19 @@ from envhub_worker.lockdown.mechanisms import landlock, process
 from envhub_worker.lockdown.mechanisms.landlock import READ, WRITE, LandlockRule
 from envhub_worker.lockdown.seccomp import filter
 
-_LIMITS = (
-    (resource.RLIMIT_AS, 8 << 30),
-    (resource.RLIMIT_CPU, 1800),
-    (resource.RLIMIT_FSIZE, 1 << 30),
-    (resource.RLIMIT_CORE, 0),
-)
+_LIMITS = {
+    resource.RLIMIT_AS: 8 << 30,
+    resource.RLIMIT_CPU: 1800,
+    resource.RLIMIT_FSIZE: 1 << 30,
+    resource.RLIMIT_CORE: 0,
+}
 
 
 def confine_to_bytecode_folder(folder: str) -> None:
     """Bind this single-threaded process to a folder, for good.
-
-    Raises:
-        LayerUnavailableError: A layer cannot be had.
+    Raises ``LayerUnavailableError``: a layer cannot be had.
     """
-    for limit, value in _LIMITS:
-        hard = resource.getrlimit(limit)[1]
-        value = value if hard == resource.RLIM_INFINITY else min(value, hard)
-        resource.setrlimit(limit, (value, value))
+    process.apply_limits({limit: (value, value) for limit, value in _LIMITS.items()})
     library = os.path.realpath(os.path.dirname(os.__file__))
     abi = landlock.version()
     scoped = landlock.scopes(abi)

@@ -61,7 +61,6 @@ class Common:
         covered: (files, folders) of /proc to hide.
         landlock_abi: 0 where there is none.
         brokered: Whether init sends the jails' signals.
-        asks: Whether init is asked anything: signals, or what is denied.
         watched: Calls that are permitted and ask init all the same, so that it sees them.
         programs: The compiled system call filters: where memory is counted, where it is measured.
         set_blas_threads: Sets OpenBLAS's threads, if that is what numpy uses.
@@ -76,7 +75,6 @@ class Common:
     covered: tuple[list[str], list[str]]
     landlock_abi: int
     brokered: bool
-    asks: bool
     watched: frozenset[str]
     programs: tuple[bytes, ...]
     set_blas_threads: Callable[[int], None] | None = None
@@ -89,11 +87,14 @@ class JailContext:
     Attributes:
         processes: Cap for ``RLIMIT_NPROC``.
         measured: No control group counts memory; init measures it.
+        joins: Where to join the jail's control group, if it has one.
     """
 
+    init: int
     spec: JailSpec
     common: Common
     scratch: Scratch
     view: View
     processes: int
     measured: bool
+    joins: list[int]

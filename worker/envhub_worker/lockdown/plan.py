@@ -7,6 +7,7 @@ a weaker profile goes without are listed too, with what stays possible.
 from __future__ import annotations
 
 from envhub_worker.lockdown.layers import Layer, LayerUnavailableError, no_system_calls
+from envhub_worker.lockdown.mechanisms.landlock import scopes
 from envhub_worker.lockdown.seccomp.syscalls import NUMBERS
 from envhub_worker.protocol.confinement import LEAST_LANDLOCK, MIB, NETWORKS, PROFILES, Confinement
 from envhub_worker.protocol.records import dataclass
@@ -14,14 +15,10 @@ from envhub_worker.protocol.records import dataclass
 #: What the kernel counts per user and does not bound per jail.
 SHARED_QUOTAS = "pages of pipes, descriptors in flight in sockets, epoll watches"
 
-# Without a pid namespace Landlock must itself guard signals: from this ABI on it does. Before it,
-# init sends the jail's signals.
-_LANDLOCK_FOR_SIGNALS = 6
-
 
 def needs_broker(*, namespaced: bool, landlock_abi: int) -> bool:
-    """Whether nothing but init keeps a jail's signals inside."""
-    return not namespaced and landlock_abi < _LANDLOCK_FOR_SIGNALS
+    """Whether nothing but init keeps a jail's signals inside: no pid namespace and no Landlock."""
+    return not namespaced and not scopes(landlock_abi)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,16 +42,21 @@ def plan(confinement: Confinement, facts: HostFacts) -> tuple[Layer, ...]:
     """
     _check(confinement, facts)
     limits, namespaced = confinement.limits, confinement.profile == "strict"
+    user = Layer("unprivileged-user", True, "a user id without files and processes")
+    own = Layer("user-namespace", True, "one user, without capabilities outside")
+    brokered = needs_broker(namespaced=namespaced, landlock_abi=facts.landlock_abi)
+    signals = Layer("signals", True, "sent by the jail's init, to processes of the jail only")
     ignored = "" if namespaced else "; changes of mode, owner and time are accepted and ignored"
     cpu = "" if limits.cpu_time_s is None else f", {limits.cpu_time_s} CPU seconds"
     rlimits = f"{limits.processes} processes, {limits.open_files} open files{cpu}, no core dumps"
     return (
-        *_user_layers(facts, namespaced),
+        *[user] * facts.root,
+        *[own] * namespaced,
         *(_namespace_layers(confinement) if namespaced else _without_namespaces(confinement)),
         Layer("capabilities", True, "none in any set"),
         Layer("no-new-privileges", True, "no rights from set-user-id programs"),
         _landlock_layer(facts.landlock_abi),
-        *_signal_layers(facts, namespaced),
+        *[signals] * brokered,
         Layer("seccomp", True, f"allow-list for {facts.machine}{ignored}"),
         Layer("rlimits", True, rlimits),
         *_limit_layers(confinement, facts, namespaced),
@@ -96,12 +98,6 @@ def _check(confinement: Confinement, facts: HostFacts) -> None:
         )
 
 
-def _user_layers(facts: HostFacts, namespaced: bool) -> list[Layer]:
-    user = Layer("unprivileged-user", True, "a user id without files and processes")
-    namespace = Layer("user-namespace", True, "one user, without capabilities outside")
-    return [user] * facts.root + [namespace] * namespaced
-
-
 def _namespace_layers(confinement: Confinement) -> list[Layer]:
     limits = confinement.limits
     network = {
@@ -135,14 +131,8 @@ def _without_namespaces(confinement: Confinement) -> list[Layer]:
 def _landlock_layer(abi: int) -> Layer:
     if not abi:
         return Layer("landlock", False, "this kernel or container has none")
-    scope = ", TCP" * (abi >= 4) + ", signals and abstract sockets" * (abi >= 6)
+    scope = ", TCP" * (abi >= 4) + ", signals and abstract sockets" * scopes(abi)
     return Layer("landlock", True, f"ABI {abi}: files{scope}")
-
-
-def _signal_layers(facts: HostFacts, namespaced: bool) -> list[Layer]:
-    if not needs_broker(namespaced=namespaced, landlock_abi=facts.landlock_abi):
-        return []
-    return [Layer("signals", True, "sent by the jail's init, to processes of the jail only")]
 
 
 def _uncounted(confinement: Confinement, facts: HostFacts, namespaced: bool) -> str:

@@ -38,7 +38,6 @@ from envhub_worker.lockdown.limits.watchdog import Watchdog
 from envhub_worker.lockdown.mechanisms import process, procfs, reap
 from envhub_worker.lockdown.plan import HostFacts, plan
 from envhub_worker.lockdown.seccomp import notify, paths
-from envhub_worker.lockdown.seccomp.syscalls import syscall_name
 from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.lockdown.stages import jail
 from envhub_worker.lockdown.stages.runner import runner_paths
@@ -98,7 +97,6 @@ class Init:
         self._denials: set[tuple[str, str]] = set()
         self._running = True
         self._poller = select.poll()
-        self._joins: list[int] = []
 
     def run(self) -> None:
         """Set the jail up and serve until the channel ends."""
@@ -116,7 +114,7 @@ class Init:
 
     def _set_up(self, message: dict[str, Any], fds: list[int]) -> None:
         spec = JailSpec.from_wire(message["spec"])
-        events, *self._joins = fds or [-1]
+        events, *joins = fds or [-1]
         facts = HostFacts(
             machine=os.uname().machine,
             root=self._common.config.user is not None,
@@ -126,12 +124,14 @@ class Init:
         layers = plan(spec.confinement, facts)
         scratch, view = jail.enter(spec, self._common, message["scratch"])
         self._jail = JailContext(
+            init=os.getpid(),
             spec=spec,
             common=self._common,
             scratch=scratch,
             view=view,
             processes=jail.process_limit(spec.confinement.limits, self._common.namespaced),
             measured=not message["cgroup"],
+            joins=joins,
         )
         self._watchdog = Watchdog(self._jail, events)
         report = [layer.to_wire() for layer in (*layers, jail.working_view(view))]
@@ -186,17 +186,9 @@ class Init:
 
     def _start(self, number: int, fds: list[int]) -> None:
         status, theirs = Channel.pair()
-        order = runner_entry.Order(
-            parent=os.getpid(),
-            jail=self._jail,
-            fds=fds,
-            runners=len(self._runners) + 1,
-            joins=self._joins,
-            status=theirs.fileno(),
-        )
         pid = os.fork()
         if pid == 0:
-            runner_entry.run(order)
+            runner_entry.run(self._jail, fds, theirs.fileno(), len(self._runners) + 1)
         self._watchdog.ignore(fds)
         close_fds(fds)
         theirs.close()
@@ -225,7 +217,7 @@ class Init:
         runner = self._runners.get(request.caller)
         if runner is not None and runner.status is not None:
             return
-        call = syscall_name(request.call)
+        call = request.call
         if call not in paths.NAMED or call not in self._common.watched:
             detail = notify.detail(request)
             if detail or not notify.is_own_affair(call, self._common.watched):

@@ -30,7 +30,6 @@ from envhub_worker.lockdown.mechanisms import process, reap
 from envhub_worker.lockdown.mechanisms.environment import jail_environment
 from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.lockdown.stages import runner
-from envhub_worker.protocol.records import dataclass
 from envhub_worker.spawn import blas
 from envhub_worker.spawn.channel import Channel
 from envhub_worker.spawn.preparations import (
@@ -43,30 +42,17 @@ from envhub_worker.spawn.preparations import (
 _SELF_TEST = Layer("self-test", True, "the denials above were tried and held")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Order:
-    """What init asks a new runner to be.
+def run(jail: JailContext, fds: list[int], status: int, runners: int) -> NoReturn:
+    """Confine this freshly forked process, report, and run the target. Never returns.
 
-    Attributes:
+    Args:
         fds: The stream to the server, then whatever the server passes through.
-        runners: How many the jail has, this one included.
-        joins: Where to join the jail's control group, if it has one.
         status: Socket for the report to init; closed before the target runs.
+        runners: How many the jail has, this one included.
     """
-
-    parent: int
-    jail: JailContext
-    fds: list[int]
-    runners: int
-    joins: list[int]
-    status: int
-
-
-def run(order: Order) -> NoReturn:
-    """Confine this freshly forked process, report, and run the target. Never returns."""
     code = 1
     try:
-        code = _run(order)
+        code = _run(jail, fds, Channel(socket.socket(fileno=status)), runners)
     except SystemExit as error:
         code = _exit_code(error)
     except BaseException:
@@ -77,32 +63,33 @@ def run(order: Order) -> NoReturn:
         os._exit(code & 0xFF)
 
 
-def _run(order: Order) -> int:
-    init = Channel(socket.socket(fileno=order.status))
+def _run(jail: JailContext, fds: list[int], init: Channel, runners: int) -> int:
     try:
-        confine(order, init)
+        confine(jail, fds, init)
     except LayerUnavailableError as error:
         init.send(error.to_wire())
         return 1
-    blas.restore_threads(order.jail.common.set_blas_threads, order.runners)
+    blas.restore_threads(jail.common.set_blas_threads, runners)
     init.send({"report": [_SELF_TEST.to_wire()]})
     init.close()
-    make_hub_cache(order.jail.spec)
+    make_hub_cache(jail.spec)
     install_lerobot_stub()
-    start_display(order.jail.spec)
-    main = _main(order)  # not before init is out of reach: packages may be a stranger's
-    stream = socket.socket(fileno=order.fds[0])
-    return int(main(stream, order.jail.spec, order.fds[1:]) or 0)
+    start_display(jail.spec)
+    main = _main(jail, runners)  # not before init is out of reach: packages may be a stranger's
+    stream = socket.socket(fileno=fds[0])
+    return int(main(stream, jail.spec, fds[1:]) or 0)
 
 
-def _main(order: Order) -> Callable[[socket.socket, JailSpec, list[int]], int | None]:
+def _main(
+    jail: JailContext, runners: int
+) -> Callable[[socket.socket, JailSpec, list[int]], int | None]:
     """What the runner runs, imported with the packages that it is to have."""
-    config = order.jail.common.config
+    config = jail.common.config
     if not config.packages:
         return _resolve(config.target)
-    _bring_in(config.packages, order.jail.scratch.home)
+    _bring_in(config.packages, jail.scratch.home)
     try:
-        with blas.threads_at_load(order.runners):
+        with blas.threads_at_load(runners):
             return _resolve(config.target)
     except ModuleNotFoundError as error:
         raise SystemExit(
@@ -118,23 +105,23 @@ def _resolve(target: str) -> Callable[[socket.socket, JailSpec, list[int]], int 
     return getattr(importlib.import_module(place), function)  # type: ignore[no-any-return]
 
 
-def confine(order: Order, init: Channel) -> None:
+def confine(jail: JailContext, fds: list[int], init: Channel) -> None:
     """Give up everything that the jail does not need."""
     # In this order: the end of init is our end from the first line on. A session of our own is
     # what init ends orphans by. The control group is joined before anything is allocated that it
     # should count, and while its descriptors are open: the next line but one closes them. The
     # environment is built while the zygote's can still be read. ``runner.enter`` is last; it has
     # an order of its own, and after it there is nothing left to give up.
-    process.die_with_parent(order.parent)
+    process.die_with_parent(jail.init)
     os.setsid()
-    for group in order.joins:
+    for group in jail.joins:
         os.write(group, b"0")  # this process, which has one thread
     process.reset_signals(reap.HANDLED)
-    descriptors = {0, 1, 2, order.status, *order.fds}
-    process.close_all_but({*descriptors, *order.jail.view.shared.values()})
-    _forget_the_zygote(order.jail)
-    check_display(order.jail.spec, os.environ)
-    runner.enter(order.jail, descriptors, lambda listener: init.send({"broker": True}, [listener]))
+    descriptors = {0, 1, 2, init.fileno(), *fds}
+    process.close_all_but({*descriptors, *jail.view.shared.values()})
+    _forget_the_zygote(jail)
+    check_display(jail.spec, os.environ)
+    runner.enter(jail, descriptors, lambda listener: init.send({"broker": True}, [listener]))
 
 
 def _forget_the_zygote(jail: JailContext) -> None:

@@ -36,10 +36,14 @@ _MOVE_MOUNT_F_EMPTY_PATH = 4
 _CAPABILITY_VERSION_3 = 0x20080522
 
 
-def syscall(call: int, *args: int | bytes | None) -> int:
-    """Call the kernel. Integers are passed as longs, bytes as pointers. Raises ``OSError``."""
+def syscall(
+    name: str, *args: int | bytes | ctypes.Array[ctypes.c_char] | None, path: str | None = None
+) -> int:
+    """Call the kernel. Integers are passed as longs, bytes as pointers.
+    Raises ``OSError``, which names ``path``.
+    """
     words = [ctypes.c_long(arg) if isinstance(arg, int) else arg for arg in args]
-    return _checked(_libc.syscall(ctypes.c_long(call), *words))
+    return _checked(_libc.syscall(ctypes.c_long(syscall_number(name)), *words), path)
 
 
 def prctl(option: int, *args: int) -> int:
@@ -72,62 +76,46 @@ def unmount(target: str) -> None:
 
 def pivot_root(new_root: str, put_old: str) -> None:
     """``pivot_root(2)``."""
-    syscall(syscall_number("pivot_root"), os.fsencode(new_root), os.fsencode(put_old))
+    syscall("pivot_root", os.fsencode(new_root), os.fsencode(put_old))
 
 
 def clone_tree(path: str) -> int:
     """A detached copy of the mounts at and below ``path``, as a descriptor."""
     flags = _OPEN_TREE_CLONE | _OPEN_TREE_CLOEXEC | _AT_RECURSIVE
-    try:
-        return syscall(syscall_number("open_tree"), _AT_FDCWD, os.fsencode(path), flags)
-    except OSError as error:
-        raise OSError(error.errno, error.strerror, path) from None
+    return syscall("open_tree", _AT_FDCWD, os.fsencode(path), flags, path=path)
 
 
 def restrict_tree(tree: int, attributes: int, *, userns: int = 0) -> None:
     """Add mount ``attributes`` (``ATTR_*``) to the detached ``tree``."""
     words = struct.pack("=QQQQ", attributes, 0, 0, userns)
-    syscall(
-        syscall_number("mount_setattr"),
-        tree,
-        b"",
-        _AT_EMPTY_PATH | _AT_RECURSIVE,
-        words,
-        len(words),
-    )
+    syscall("mount_setattr", tree, b"", _AT_EMPTY_PATH | _AT_RECURSIVE, words, len(words))
 
 
 def restrict_mount(path: str, attributes: int) -> None:
     """Add mount ``attributes`` to the one mount at ``path``."""
     words = struct.pack("=QQQQ", attributes, 0, 0, 0)
-    syscall(syscall_number("mount_setattr"), _AT_FDCWD, os.fsencode(path), 0, words, len(words))
+    syscall("mount_setattr", _AT_FDCWD, os.fsencode(path), 0, words, len(words))
 
 
 def attach_tree(tree: int, path: str) -> None:
     """Attach the detached ``tree`` at ``path``; the descriptor stays the caller's."""
     words = (b"", _AT_FDCWD, os.fsencode(path), _MOVE_MOUNT_F_EMPTY_PATH)
-    try:
-        syscall(syscall_number("move_mount"), tree, *words)
-    except OSError as error:
-        raise OSError(error.errno, error.strerror, path) from None
+    syscall("move_mount", tree, *words, path=path)
 
 
 def capget() -> tuple[int, int, int]:
     """This thread's (effective, permitted, inheritable) capabilities as bit masks."""
     header = struct.pack("=Ii", _CAPABILITY_VERSION_3, 0)
     data = ctypes.create_string_buffer(24)
-    _checked(_libc.syscall(ctypes.c_long(syscall_number("capget")), header, data))
+    syscall("capget", header, data)
     words = struct.unpack("=6I", data.raw)
     effective, permitted, inheritable = (words[n] | words[n + 3] << 32 for n in range(3))
     return effective, permitted, inheritable
 
 
-def capset(effective: int, permitted: int, inheritable: int) -> None:
-    """Set this thread's capabilities."""
-    header = struct.pack("=Ii", _CAPABILITY_VERSION_3, 0)
-    low = [mask & 0xFFFFFFFF for mask in (effective, permitted, inheritable)]
-    high = [mask >> 32 for mask in (effective, permitted, inheritable)]
-    syscall(syscall_number("capset"), header, struct.pack("=6I", *low, *high))
+def capset_none() -> None:
+    """Empty this thread's three sets."""
+    syscall("capset", struct.pack("=Ii", _CAPABILITY_VERSION_3, 0), bytes(24))
 
 
 def _checked(result: int, path: str | None = None) -> int:

@@ -14,7 +14,6 @@ from collections.abc import Iterable
 
 from envhub_worker.lockdown.layers import LayerUnavailableError
 from envhub_worker.lockdown.mechanisms import kernel
-from envhub_worker.lockdown.seccomp.syscalls import syscall_number
 from envhub_worker.protocol.records import dataclass
 
 _VERSION = 1
@@ -73,7 +72,7 @@ def scopes(abi: int) -> bool:
 def version() -> int:
     """The ABI that this kernel offers, or 0."""
     try:
-        return kernel.syscall(syscall_number("landlock_create_ruleset"), None, 0, _VERSION)
+        return kernel.syscall("landlock_create_ruleset", None, 0, _VERSION)
     except OSError:
         return 0
 
@@ -89,11 +88,11 @@ def restrict(wanted: Ruleset, rules: Iterable[LandlockRule]) -> None:
         # A kernel refuses a structure that is longer than its own, unless the rest is zero; the
         # first ones know the first field only.
         size = 24 if wanted.scope else 16 if wanted.tcp else 8
-        fd = kernel.syscall(syscall_number("landlock_create_ruleset"), words, size, 0)
+        fd = kernel.syscall("landlock_create_ruleset", words, size, 0)
         try:
             for rule in rules:
                 _add(fd, rule, wanted.files)
-            kernel.syscall(syscall_number("landlock_restrict_self"), fd, 0)
+            kernel.syscall("landlock_restrict_self", fd, 0)
         finally:
             os.close(fd)
     except OSError as error:
@@ -110,9 +109,7 @@ def _add(ruleset_fd: int, rule: LandlockRule, handled: int) -> None:
         if not stat.S_ISDIR(os.fstat(path).st_mode):
             access &= _ON_FILES
         words = struct.pack("=Qi", access, path)
-        kernel.syscall(
-            syscall_number("landlock_add_rule"), ruleset_fd, _RULE_PATH_BENEATH, words, 0
-        )
+        kernel.syscall("landlock_add_rule", ruleset_fd, _RULE_PATH_BENEATH, words, 0)
     finally:
         os.close(path)
 

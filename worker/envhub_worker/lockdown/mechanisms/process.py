@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import errno
 import os
+import resource
 import signal
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 from envhub_worker.lockdown.mechanisms import kernel
-from envhub_worker.lockdown.seccomp.syscalls import syscall_number
 
 _PR_SET_PDEATHSIG = 1
 _PR_SET_DUMPABLE = 4
@@ -60,7 +60,7 @@ def drop_capabilities() -> None:
     """Empty the bounding, ambient, inheritable, permitted and effective sets."""
     empty_the_bounding_set()
     kernel.prctl(_PR_CAP_AMBIENT, _PR_CAP_AMBIENT_CLEAR_ALL)
-    kernel.capset(0, 0, 0)
+    kernel.capset_none()
 
 
 def held_capabilities() -> int:
@@ -82,6 +82,15 @@ def empty_the_bounding_set() -> None:
             return  # the first that this kernel does not know
 
 
+def apply_limits(rules: Mapping[int, tuple[int, int]]) -> None:
+    """Set the (soft, hard) of each resource, never above the hard limit that already holds."""
+    for number, (soft, hard) in rules.items():
+        ceiling = resource.getrlimit(number)[1]
+        if ceiling != resource.RLIM_INFINITY:
+            soft, hard = min(soft, ceiling), min(hard, ceiling)
+        resource.setrlimit(number, (soft, hard))
+
+
 def close_all_but(keep: Iterable[int]) -> None:
     """Close every descriptor that is not in ``keep``."""
     low = 0
@@ -94,7 +103,7 @@ def close_all_but(keep: Iterable[int]) -> None:
 
 def _close_range(low: int, high: int) -> None:
     try:
-        kernel.syscall(syscall_number("close_range"), low, high, 0)
+        kernel.syscall("close_range", low, high, 0)
     except OSError as error:
         if error.errno != errno.ENOSYS:
             raise

@@ -21,7 +21,7 @@ from envhub_worker.lockdown.seccomp.policy import (
     policy_table,
     recorded_calls,
 )
-from envhub_worker.lockdown.seccomp.syscalls import NUMBERS, syscall_number
+from envhub_worker.lockdown.seccomp.syscalls import NUMBERS
 
 _AUDIT_ARCH = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}
 # The x32 ABI reaches the same calls under numbers that a table does not list.
@@ -189,13 +189,11 @@ def _listener(place: int) -> int:
     to ask anew where its handler has calls restarted.
     """
     try:
-        return kernel.syscall(
-            syscall_number("seccomp"), _SET_MODE_FILTER, _NEW_LISTENER | WAIT_KILLABLE, place
-        )
+        return kernel.syscall("seccomp", _SET_MODE_FILTER, _NEW_LISTENER | WAIT_KILLABLE, place)
     except OSError as error:
         if error.errno != errno.EINVAL:
             raise
-    return kernel.syscall(syscall_number("seccomp"), _SET_MODE_FILTER, _NEW_LISTENER, place)
+    return kernel.syscall("seccomp", _SET_MODE_FILTER, _NEW_LISTENER, place)
 
 
 def installed() -> bool:

@@ -19,12 +19,12 @@ import signal
 import socket
 import struct
 from collections.abc import Callable, Collection
-from dataclasses import dataclass
 
 from envhub_worker.lockdown.mechanisms import kernel, procfs
 from envhub_worker.lockdown.seccomp.policy import refusal
-from envhub_worker.lockdown.seccomp.syscalls import c_int, syscall_name, syscall_number
+from envhub_worker.lockdown.seccomp.syscalls import c_int, syscall_name
 from envhub_worker.lockdown.seccomp.targets import NAMING, OTHER, PRETENDED, is_another_target
+from envhub_worker.protocol.records import dataclass
 
 _RECEIVE = 0xC0502100
 _SEND = 0xC0182101
@@ -43,29 +43,25 @@ class Request:
 
     Attributes:
         thread: The calling thread.
-        caller: Its process.
-        arguments: The first three, as the C integers that the kernel reads.
-        words: All six, as the registers are.
+        caller: Its process; 0 if it has gone.
+        call: Its name.
+        words: Its six arguments, as the registers are.
         still_waits: Raises OSError where the caller has gone since.
     """
 
     thread: int
     caller: int
-    call: int
-    arguments: tuple[int, int, int]
-    words: tuple[int, ...] = ()
+    call: str
+    words: tuple[int, ...]
     still_waits: Callable[[], object] = lambda: None
 
-
-@dataclass(frozen=True)
-class Answer:
-    """``error``: an errno, or 0; ``proceed``: the kernel shall make the call itself."""
-
-    error: int = 0
-    proceed: bool = False
+    @property
+    def arguments(self) -> list[int]:
+        """The first three, as the C integers that the kernel reads."""
+        return [c_int(word) for word in self.words[:3]]
 
 
-_PROCEED = Answer(proceed=True)
+_PROCEED: int | None = None  # instead of an errno, or 0: the kernel shall make the call itself
 _Inside = Callable[[], Collection[int]]
 _SIGNALS = ("kill", "tkill", "tgkill")
 _NETLINKS = (0, 15)
@@ -90,25 +86,23 @@ def serve(
     except OSError as error:
         # Something took the caller out of its call; others may still come.
         return error.errno == errno.EINTR or _has_callers(listener)
-    identity, thread, _, call, _, _, *words = _REQUEST.unpack(buffer)
-    first, second, third = (c_int(word) for word in words[:3])
+    identity, thread, _, number, _, _, *words = _REQUEST.unpack(buffer)
 
     def still_waits() -> object:
         return fcntl.ioctl(listener, _STILL_WAITS, struct.pack("=Q", identity))
 
-    caller = procfs.process_of(thread)
-    request = Request(thread, caller, call, (first, second, third), tuple(words), still_waits)
+    call, caller = syscall_name(number), procfs.process_of(thread)
+    request = Request(thread, caller, call, tuple(words), still_waits)
     note(request)  # before the caller goes on: what it did is known when it is looked for
-    name = syscall_name(request.call)
-    if name in permitted:
+    if call in permitted:
         answer = _PROCEED
-    elif name in _SIGNALS:
+    elif call in _SIGNALS:
         answer = decide(request, lambda: procfs.descendants(os.getpid()))
     else:
-        answer = Answer(refusal(name))
-    flags = _CONTINUE if answer.proceed else 0
+        answer = refusal(call)
+    flags = _CONTINUE if answer is _PROCEED else 0
     with contextlib.suppress(OSError):
-        fcntl.ioctl(listener, _SEND, _ANSWER.pack(identity, 0, -answer.error, flags))
+        fcntl.ioctl(listener, _SEND, _ANSWER.pack(identity, 0, -(answer or 0), flags))
     return True
 
 
@@ -120,7 +114,7 @@ MOST_FILES = 32
 
 def detail(request: Request) -> str:
     """Of the arguments of a call what the kernel itself reads in a register."""
-    call = syscall_name(request.call)
+    call = request.call
     if call in NAMING and is_another_target(call, request.arguments, request.caller, os.getpid()):
         return OTHER
     if call not in ("socket", "socketpair"):
@@ -145,16 +139,17 @@ def _has_callers(listener: int) -> bool:
     return not any(events & select.POLLHUP for _, events in poller.poll(0))
 
 
-def decide(request: Request, inside: _Inside) -> Answer:
-    """Send the signal that ``request`` asks for, where that is permitted.
+def decide(request: Request, inside: _Inside) -> int | None:
+    """Send the signal that ``request`` asks for, where that is permitted; 0, an errno, or
+    ``_PROCEED``.
     ``inside``: gives the pids of the jail's processes, without init.
     """
     first, second, third = request.arguments
     if request.caller == 0:
-        return Answer(errno.ESRCH)
-    if request.call == syscall_number("kill"):
+        return errno.ESRCH
+    if request.call == "kill":
         return _kill(request.caller, first, second, inside)
-    if request.call == syscall_number("tkill"):
+    if request.call == "tkill":
         if first == request.thread:
             return _PROCEED
         return _send_to_thread(procfs.process_of(first), first, second, inside)
@@ -163,19 +158,19 @@ def decide(request: Request, inside: _Inside) -> Answer:
     return _send_to_thread(first, second, third, inside)
 
 
-def _kill(caller: int, target: int, signum: int, inside: _Inside) -> Answer:
+def _kill(caller: int, target: int, signum: int, inside: _Inside) -> int | None:
     group = _group_of(caller)
     if group < 0:
-        return Answer(errno.ESRCH)  # it has gone since: no caller waits for the answer
+        return errno.ESRCH  # it has gone since: no caller waits for the answer
     # A process is alone with the jail in its own group: the host has a session of its own.
     if target in (caller, 0, -group):
         return _PROCEED
     if target == -1:
-        return Answer(errno.EPERM)
+        return errno.EPERM
     if target > 0:
-        return Answer(_send(target, signum, inside))
+        return _send(target, signum, inside)
     members = [pid for pid in inside() if _group_of(pid) == -target]
-    return Answer(min((_send(pid, signum, inside) for pid in members), default=errno.ESRCH))
+    return min((_send(pid, signum, inside) for pid in members), default=errno.ESRCH)
 
 
 def _group_of(pid: int) -> int:
@@ -188,11 +183,10 @@ def _send(pid: int, signum: int, inside: _Inside) -> int:
     return _held(pid, inside, lambda pidfd: signal.pidfd_send_signal(pidfd, signum))
 
 
-def _send_to_thread(pid: int, thread: int, signum: int, inside: _Inside) -> Answer:
+def _send_to_thread(pid: int, thread: int, signum: int, inside: _Inside) -> int:
     if pid <= 0 or thread <= 0:
-        return Answer(errno.ESRCH)
-    tgkill = syscall_number("tgkill")
-    return Answer(_held(pid, inside, lambda _: kernel.syscall(tgkill, pid, thread, signum)))
+        return errno.ESRCH
+    return _held(pid, inside, lambda _: kernel.syscall("tgkill", pid, thread, signum))
 
 
 def _held(pid: int, inside: _Inside, act: Callable[[int], object]) -> int:

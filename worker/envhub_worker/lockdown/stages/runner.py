@@ -1,13 +1,21 @@
-"""A runner's own confinement: what the kernel binds to one process and its descendants."""
+"""A runner's own confinement: what the kernel binds to one process and its descendants.
+
+At the end it tries what it must not be able to do: the last thing before a stranger's code.
+"""
 
 from __future__ import annotations
 
+import contextlib
 import os
 import resource
-from collections.abc import Callable, Iterable, Mapping
+import secrets
+import socket
+from collections.abc import Callable, Iterable
+from functools import partial
 
 from envhub_worker.lockdown.context import JailContext
-from envhub_worker.lockdown.mechanisms import landlock, process
+from envhub_worker.lockdown.layers import LayerUnavailableError
+from envhub_worker.lockdown.mechanisms import kernel, landlock, process
 from envhub_worker.lockdown.mechanisms.landlock import (
     DEVICE,
     READ,
@@ -19,7 +27,6 @@ from envhub_worker.lockdown.mechanisms.landlock import (
 )
 from envhub_worker.lockdown.seccomp import filter
 from envhub_worker.lockdown.seccomp.paths import OwnPaths
-from envhub_worker.lockdown.stages import selftest
 from envhub_worker.protocol.confinement import Limits
 
 # What the C library and numerical libraries read; nothing here is about a person.
@@ -61,18 +68,18 @@ _SIGNALS = 512
 # lets the process print where it was.
 _CPU_GRACE_S = 1
 
+_PTRACE_ATTACH = 16
+
 
 def enter(
     jail: JailContext, descriptors: Iterable[int], give_to_init: Callable[[int], None]
 ) -> None:
     """Confine this single-threaded process for good, and test that it holds.
+    Raises ``LayerUnavailableError``: a layer cannot be had, or a denial does not hold.
 
     Args:
         descriptors: Every descriptor that may be open.
         give_to_init: Takes the broker's listener, if there is one, before the descriptor is closed.
-
-    Raises:
-        LayerUnavailableError: A layer cannot be had, or a denial does not hold.
     """
     # In this order. Dumpable comes first: init is not, but a process that is not may not even open
     # its own files in /proc, which the next line does. Limits come before the capabilities go that
@@ -84,18 +91,19 @@ def enter(
     # when the whole host runs out of memory, the kernel should end a jail, not its client
     with open("/proc/self/oom_score_adj", "w") as file:
         file.write("1000")
-    _apply(resource_limits(jail.spec.confinement.limits, jail.processes))
+    process.apply_limits(resource_limits(jail.spec.confinement.limits, jail.processes))
     process.drop_capabilities()
     process.set_no_new_privileges()
     if jail.common.landlock_abi:
         wanted = landlock.ruleset(jail.common.landlock_abi, jail.common.config.network)
         landlock.restrict(wanted, rules(jail, os.getpid()))
     program = jail.common.programs[jail.measured]
-    listener = filter.install(program, brokered=jail.common.asks)
+    asks = jail.common.brokered or jail.common.config.record
+    listener = filter.install(program, brokered=asks)
     if listener >= 0:
         give_to_init(listener)
         os.close(listener)  # its holder may permit anything
-    selftest.run(jail, descriptors)
+    _self_test(jail, descriptors)
 
 
 def rules(jail: JailContext, pid: int) -> list[LandlockRule]:
@@ -158,10 +166,92 @@ def resource_limits(limits: Limits, processes: int | None) -> dict[int, tuple[in
     return rules
 
 
-def _apply(rules: Mapping[int, tuple[int, int]]) -> None:
-    """Set each limit, never above the hard limit that already holds."""
-    for number, (soft, hard) in rules.items():
-        ceiling = resource.getrlimit(number)[1]
-        if ceiling != resource.RLIM_INFINITY:
-            soft, hard = min(soft, ceiling), min(hard, ceiling)
-        resource.setrlimit(number, (soft, hard))
+def _self_test(jail: JailContext, descriptors: Iterable[int]) -> None:
+    """Try what it must not be able to do, as far as that can be tried without harm.
+    Raises ``LayerUnavailableError``: layer ``self-test``: a denial does not hold.
+    """
+    _hold("no capability is left", process.held_capabilities() == 0)
+    _hold("no_new_privs is set", process.has_no_new_privileges())
+    _hold("a system call filter is installed", filter.installed())
+    for path, shared in jail.view.shared.items():
+        _hold(f"what is written to {path} stays in the jail", _stays_inside(path, shared))
+    listed = {fd for fd in map(int, os.listdir("/proc/self/fd")) if _is_open(fd)}
+    _hold("only named descriptors are open", listed <= set(descriptors))
+    for claim, attempt in _denials(jail).items():
+        _hold(claim, _denied(attempt))
+
+
+def _denials(jail: JailContext) -> dict[str, Callable[[], object]]:
+    init = os.getppid()
+    denials: dict[str, Callable[[], object]] = {
+        "no user namespace can be made": lambda: kernel.unshare(kernel.CLONE_NEWUSER),
+        "nothing can be mounted": lambda: kernel.mount("none", "/tmp", "tmpfs"),
+        "init cannot be traced": lambda: kernel.syscall("ptrace", _PTRACE_ATTACH, init, 0, 0),
+        "init's limits cannot be changed": lambda: kernel.syscall(
+            "prlimit64", init, resource.RLIMIT_CORE, 0, 0
+        ),
+    }
+    if jail.spec.snapshot in jail.view.refused:
+        entry = os.path.join(jail.spec.snapshot, jail.spec.entry)
+        denials["the snapshot cannot be written"] = lambda: os.open(entry, os.O_WRONLY)
+    for path in jail.view.refused:
+        denials[f"{path} cannot be written"] = partial(_make_unnamed, path)
+    if jail.common.landlock_abi or jail.common.namespaced:
+        canary = jail.common.config.canary
+        denials["files outside cannot be read"] = lambda: os.open(canary, os.O_RDONLY)
+    if landlock.scopes(jail.common.landlock_abi) or jail.common.brokered:
+        denials["init cannot be signalled"] = lambda: os.kill(init, 0)
+    if jail.common.config.network == "none":
+        denials["no internet socket can be made"] = lambda: socket.socket(socket.AF_INET)
+    return denials
+
+
+def _make_unnamed(path: str, folder: int | None = None) -> None:
+    """A file without a name: if it can be made, it is gone at once."""
+    os.open(path, os.O_TMPFILE | os.O_WRONLY, 0o600, dir_fd=folder)
+
+
+def _stays_inside(path: str, shared: int) -> bool:
+    """Make a file in a view, and look for it in the folder ``shared``; which takes none itself."""
+    name = f".{secrets.token_hex(16)}"
+    try:
+        with contextlib.suppress(OSError):  # where a runner before filled the scratch, for example
+            os.close(os.open(f"{path}/{name}", os.O_CREAT | os.O_EXCL | os.O_WRONLY, 0o600))
+        return not _is_there(name, shared) and _denied(lambda: _make_unnamed(".", shared))
+    finally:
+        with contextlib.suppress(OSError):
+            os.unlink(f"{path}/{name}")
+        os.close(shared)  # nothing but this test looks below a view
+
+
+def _is_there(name: str, folder: int) -> bool:
+    try:
+        os.lstat(name, dir_fd=folder)
+    except FileNotFoundError:
+        return False
+    return True
+
+
+def _denied(attempt: Callable[[], object]) -> bool:
+    try:
+        attempt()
+    except OSError:
+        return True
+    return False
+
+
+def _is_open(fd: int) -> bool:
+    try:
+        os.fstat(fd)
+    except OSError:
+        return False  # the listing's own
+    return True
+
+
+def _hold(claim: str, holds: bool) -> None:
+    if not holds:
+        raise LayerUnavailableError(
+            "self-test",
+            f"this is not true: {claim}",
+            "Nothing was run. Please report this with the output of `envhub doctor --json`.",
+        )

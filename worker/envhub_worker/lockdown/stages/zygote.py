@@ -84,7 +84,6 @@ def enter(config: ZygoteConfig) -> Common:
         covered=covered,
         landlock_abi=abi,
         brokered=brokered,
-        asks=brokered or config.record,
         watched=seen,
         programs=programs,
     )

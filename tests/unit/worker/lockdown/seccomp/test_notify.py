@@ -17,7 +17,6 @@ import pytest
 import envhub_worker
 from envhub_worker.lockdown.seccomp import filter, notify
 from envhub_worker.lockdown.seccomp.policy import policy_table, watched_calls
-from envhub_worker.lockdown.seccomp.syscalls import syscall_number
 from tests.support.processes import eventually
 
 _ROUNDS = 20
@@ -111,5 +110,5 @@ def test_a_caller_that_has_gone_since_ends_nobody(to: str) -> None:
     gone = subprocess.Popen([sys.executable, "-c", ""])
     gone.wait()
     target = -gone.pid if to == "its group" else 1
-    asked = notify.Request(gone.pid, gone.pid, syscall_number("kill"), (target, 15, 0))
-    assert notify.decide(asked, list) == notify.Answer(errno.ESRCH)
+    asked = notify.Request(gone.pid, gone.pid, "kill", (target, 15, 0))
+    assert notify.decide(asked, list) == errno.ESRCH
