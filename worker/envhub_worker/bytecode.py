@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import compileall
 import os
-import platform
 import py_compile
 import re
 import resource
@@ -37,9 +36,7 @@ def confine_to_bytecode_folder(folder: str) -> None:
     process.apply_limits({limit: (value, value) for limit, value in _LIMITS.items()})
     library = os.path.realpath(os.path.dirname(os.__file__))
     abi = landlock.version()
-    scoped = landlock.scopes(abi)
-    machine = platform.machine()
-    program = filter.compile_filter(machine, namespaced=False, network="none", scoped=scoped)
+    program = filter.compile_filter(namespaced=False, network="none", scoped=landlock.scopes(abi))
     process.drop_capabilities()
     process.set_no_new_privileges()
     # without an ABI it raises: no layer is left out

@@ -15,9 +15,7 @@ _REFUSALS = (errno.EACCES, errno.EPERM, errno.EROFS)
 
 def why_file_hidden(module: str) -> str:
     """Why a module that was not found may be there all the same; empty if nothing hides it.
-
-    Args:
-        module: Its dotted name, as in ``ModuleNotFoundError.name``.
+    ``module``: its dotted name, as in ``ModuleNotFoundError.name``.
     """
     parent, _, last = module.rpartition(".")
     package = sys.modules.get(parent) if parent else None

@@ -29,9 +29,7 @@ _MAX_FAILURES = 100
 
 class Loop:
     """Calls back when a descriptor or a ZeroMQ socket is ready, until ``stop``.
-
-    Args:
-        failed: Called with what a callback raised. It must not raise.
+    ``failed``: called with what a callback raised; it must not raise.
     """
 
     def __init__(self, failed: Callable[[Exception], None]) -> None:
@@ -39,8 +37,8 @@ class Loop:
         self._poller = zmq.Poller()
         self._callbacks: dict[Any, Callable[[], None]] = {}
         self._stopped = False
-        self._tick: Callable[[], None] | None = None
-        self._look: Callable[[], int | None] = _nothing
+        self._tick: Callable[[], None] = lambda: None
+        self._look: Callable[[], int | None] = lambda: None
         self._failures = 0
 
     def tick(self, callback: Callable[[], None]) -> None:
@@ -91,7 +89,7 @@ class Loop:
                 callback = self._callbacks.get(ready)
                 if callback is not None:
                     self._call(callback)
-            if self._tick is not None and monotonic() - ticked >= _POLL_MS / 1000:
+            if monotonic() - ticked >= _POLL_MS / 1000:
                 ticked = monotonic()
                 self._call(self._tick)
 
@@ -114,10 +112,6 @@ class Loop:
             self._failed(error)
         else:
             self._failures = 0
-
-
-def _nothing() -> None:
-    """There is nothing to look at."""
 
 
 def has_message(socket: zmq.Socket[bytes]) -> bool:

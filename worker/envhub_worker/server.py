@@ -119,16 +119,13 @@ class Server:
         try:
             self._loop.run()
         finally:
-            self._shut_down()
-
-    def _shut_down(self) -> None:
-        if self._gate.drained(self._jails):  # those who were refused last shall hear it
-            self._router.setsockopt(zmq.LINGER, _LAST_WORDS_MS)
-        self._jails.close()
-        self._gate.close(self._sessions)
-        self._router.close()
-        self._context.term()
-        remove_tree(str(self._runtime_dir))  # its owner may not be there any more
+            if self._gate.drained(self._jails):  # those who were refused last shall hear it
+                self._router.setsockopt(zmq.LINGER, _LAST_WORDS_MS)
+            self._jails.close()
+            self._gate.close(self._sessions)
+            self._router.close()
+            self._context.term()
+            remove_tree(str(self._runtime_dir))  # its owner may not be there any more
 
     # --- clients -------------------------------------------------------------------------------
 

@@ -45,9 +45,8 @@ class ZygoteConfig:
     @classmethod
     def from_wire(cls, data: dict[str, Any]) -> ZygoteConfig:
         """From ``dataclasses.asdict`` after a trip through JSON."""
-        paths = {name: tuple(data[name]) for name in ("readable", "roots")}
-        gpu = data["gpu"]
-        return cls(**{**data, **paths, "gpu": gpu if type(gpu) is bool else tuple(gpu)})
+        lists = {name: tuple(value) for name, value in data.items() if type(value) is list}
+        return cls(**{**data, **lists})
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -12,7 +12,7 @@ import re
 from collections.abc import Collection
 
 from envhub_worker.lockdown.layers import LayerUnavailableError
-from envhub_worker.lockdown.root_plan import HostFiles, real_path
+from envhub_worker.lockdown.root_plan import HostFiles, resolve
 from envhub_worker.protocol.records import dataclass
 
 _ADDRESS = re.compile(r"[0-9a-f]{4,8}:[0-9a-f]{2}:[0-9a-f]{2}\.[0-7]")
@@ -91,7 +91,7 @@ def _address(node: str, host: HostFiles) -> str:
     """The PCI address of what a node belongs to; empty if it has none, or none is known."""
     name = posixpath.basename(node)
     if not _is_nvidias(node):
-        folder = real_path(f"/sys/class/drm/{name}", host)
+        folder = resolve(f"/sys/class/drm/{name}", host, {})
         found: list[str] = _ADDRESS.findall(folder)
         return found[-1] if found else ""
     for address in host.listdir(_NVIDIAS):

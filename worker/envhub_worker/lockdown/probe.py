@@ -27,6 +27,7 @@ from envhub_worker.lockdown.mechanisms import (
     mounts,
     namespaces,
     process,
+    procfs,
     user,
 )
 from envhub_worker.lockdown.seccomp import filter
@@ -51,7 +52,7 @@ def main(argv: Sequence[str]) -> int:
 
 def probe() -> dict[str, Any]:
     """All of it. This process must be single-threaded."""
-    restricted = _text("/proc/sys/kernel/apparmor_restrict_unprivileged_userns") == "1"
+    restricted = procfs.text("/proc/sys/kernel/apparmor_restrict_unprivileged_userns") == "1"
     return {
         "host": host_facts(),
         "layers": [try_layer(name, attempt) for name, attempt in _LAYERS.items()],
@@ -189,12 +190,11 @@ def _landlock() -> str:
 
 def _seccomp() -> str:
     process.set_no_new_privileges()
-    machine = os.uname().machine
-    filter.install(filter.compile_filter(machine, namespaced=True, network="none"))
+    filter.install(filter.compile_filter(namespaced=True, network="none"))
     try:
         socket.socket(socket.AF_INET)
     except OSError:
-        return f"filters for {machine}"
+        return f"filters for {os.uname().machine}"
     raise LayerUnavailableError("seccomp", "the filter denies nothing", "")
 
 
@@ -230,11 +230,3 @@ _LAYERS: dict[str, Callable[[], str]] = {
     "seccomp": _seccomp,
     "cgroup": _cgroup,
 }
-
-
-def _text(path: str) -> str | None:
-    try:
-        with open(path) as file:
-            return file.read().strip()
-    except OSError:
-        return None

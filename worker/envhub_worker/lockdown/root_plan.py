@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import os
 import posixpath
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 
+from envhub_worker.lockdown.mechanisms import procfs
 from envhub_worker.lockdown.mechanisms.namespaces import INSIDE_UID
 from envhub_worker.protocol.records import dataclass
 
@@ -50,14 +51,12 @@ class RootPlan:
     """What to put into an empty root, in this order.
 
     Attributes:
-        folders: Empty folders (mount points).
         trees: Paths that appear where they are on the host, read-only, with all below them.
         roots: The same for folders that snapshots lie in; a jail covers them up again.
         links: Symbolic links: path to target.
         texts: Files of our own: path to content.
     """
 
-    folders: tuple[str, ...]
     trees: tuple[str, ...]
     roots: tuple[str, ...]
     devices: tuple[str, ...]
@@ -87,7 +86,7 @@ def plan_root(
     readable: Iterable[str],
     roots: Iterable[str],
     *,
-    private: Iterable[str],
+    private: Collection[str],
     devices: Iterable[str],
     network: str,
     host: HostFiles,
@@ -103,8 +102,7 @@ def plan_root(
         network: ``"host"`` adds what name resolution and TLS read.
     """
     links: dict[str, str] = dict(_DEV_LINKS)
-    hidden = list(private)
-    wanted = [path for path in interpreter if not any(within(one, path) for one in hidden)]
+    wanted = [path for path in interpreter if not any(within(one, path) for one in private)]
     trees = [*wanted, *readable, *_ETC_FOLDERS, *_SYS_FOLDERS, *_SYSTEM]
     copies = list(_ETC_FILES)
     texts = dict(_TEXTS)
@@ -114,11 +112,10 @@ def plan_root(
         del texts["/etc/hosts"]
 
     def real(paths: Iterable[str]) -> tuple[str, ...]:
-        resolved = [_resolve(path, links, host) for path in paths]
+        resolved = [resolve(path, host, links) for path in paths]
         return outermost(path for path in resolved if host.exists(path))
 
     return RootPlan(
-        folders=OWN_FOLDERS,
         trees=real(trees),
         roots=real(roots),
         devices=(*_DEVICES, *devices),
@@ -142,7 +139,7 @@ def within(path: str, folder: str) -> bool:
     return path == folder or path.startswith(folder.rstrip("/") + "/")
 
 
-def _resolve(path: str, links: dict[str, str], host: HostFiles) -> str:
+def resolve(path: str, host: HostFiles, links: dict[str, str]) -> str:
     """The real path; every symbolic link on the way is noted in ``links``."""
     current, pending = "/", path.strip("/").split("/")
     for _ in range(256):  # more than the kernel's own limit of 40 links can need
@@ -159,24 +156,11 @@ def _resolve(path: str, links: dict[str, str], host: HostFiles) -> str:
     return current
 
 
-def real_path(path: str, host: HostFiles) -> str:
-    """Where a path leads through the symbolic links of ``host``."""
-    return _resolve(path, {}, host)
-
-
 def real_host() -> HostFiles:
     """This host's files."""
     return HostFiles(
         exists=os.path.exists,
         readlink=lambda path: os.readlink(path) if os.path.islink(path) else None,
         listdir=lambda path: sorted(os.listdir(path)) if os.path.isdir(path) else [],
-        read=_content,
+        read=lambda path: procfs.text(path) or "",
     )
-
-
-def _content(path: str) -> str:
-    try:
-        with open(path, errors="replace") as file:
-            return file.read(4096)
-    except OSError:
-        return ""

@@ -14,7 +14,7 @@ from typing import Any
 
 from envhub_worker import __version__
 from envhub_worker.lockdown import probe
-from envhub_worker.lockdown.mechanisms import landlock
+from envhub_worker.lockdown.mechanisms import landlock, procfs
 from envhub_worker.protocol.confinement import LEAST_LANDLOCK, Surroundings
 from envhub_worker.protocol.runtime import OWN, Runtime
 
@@ -99,10 +99,7 @@ def _number(path: Path) -> int | None:
 
 
 def _words(path: Path, count: int) -> list[str]:
-    try:
-        words = path.read_text().split()
-    except OSError:
-        words = []
+    words = (procfs.text(str(path)) or "").split()
     return [*words, *[""] * count][:count]
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import ctypes
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from envhub_worker.lockdown.mechanisms.environment import THREAD_TIMEOUT
@@ -43,25 +43,20 @@ def find_setter() -> Callable[[int], None] | None:
     return None
 
 
-def thread_count(environment: Mapping[str, str], cores: int, runners: int) -> int:
-    """How many threads a runner gets.
-
-    Args:
-        environment: The runner's; the variables that OpenBLAS reads decide, where there is one.
-        runners: Of the jail, this one included: they share the cores.
-    """
+def _thread_count(runners: int) -> int:
+    """What OpenBLAS's variables say; else the ``runners`` of a jail share the cores."""
     for name in _VARIABLES:
-        value = environment.get(name, "")
+        value = os.environ.get(name, "")
         if value.isdigit() and int(value) > 0:
             return int(value)
-    return max(1, min(cores // runners, _MOST))
+    return max(1, min(len(os.sched_getaffinity(0)) // runners, _MOST))
 
 
 @contextmanager
 def threads_at_load(runners: int) -> Iterator[None]:
     """What OpenBLAS shall read, where a runner itself loads it; nothing of it stays behind."""
-    count = thread_count(os.environ, len(os.sched_getaffinity(0)), runners)
-    wanted = {"OPENBLAS_NUM_THREADS": str(count), "OPENBLAS_THREAD_TIMEOUT": THREAD_TIMEOUT}
+    count = str(_thread_count(runners))
+    wanted = {"OPENBLAS_NUM_THREADS": count, "OPENBLAS_THREAD_TIMEOUT": THREAD_TIMEOUT}
     fresh = {name: value for name, value in wanted.items() if name not in os.environ}
     os.environ.update(fresh)
     try:
@@ -73,6 +68,6 @@ def threads_at_load(runners: int) -> Iterator[None]:
 
 def restore_threads(setter: Callable[[int], None] | None, runners: int) -> None:
     """Start the threads that a fresh interpreter would have; call it when confined."""
-    count = thread_count(os.environ, len(os.sched_getaffinity(0)), runners)
+    count = _thread_count(runners)
     if setter is not None and count > 1:
         setter(count)

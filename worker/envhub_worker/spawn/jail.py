@@ -6,7 +6,7 @@ import contextlib
 import os
 import signal
 import socket
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -163,7 +163,7 @@ class Jail:
         events = [event for message, fds in messages for event in self._translate(message, fds)]
         if ended:
             self._channel.close()
-            self._close_pidfds(list(self._runner_pidfds))
+            self._close_pidfds(self._runner_pidfds)
         return events
 
     def _translate(self, message: dict[str, Any], fds: list[int]) -> list[JailEvent]:
@@ -179,19 +179,16 @@ class Jail:
             self._close_pidfds([message["runner"]])
         return [_EVENTS[kind](**message)]
 
-    def _close_pidfds(self, runners: Sequence[int]) -> None:
-        known = self._runner_pidfds
-        close_fds([known.pop(runner) for runner in runners if runner in known])
+    def _close_pidfds(self, runners: Iterable[int]) -> None:
+        for runner in list(runners):
+            if runner in self._runner_pidfds:
+                os.close(self._runner_pidfds.pop(runner))
 
     def start_runner(self, fds: Sequence[int] = ()) -> tuple[int, socket.socket]:
         """Ask for a runner in this jail; it starts once the jail is ready.
 
-        Args:
-            fds: Passed through to ``runner.main``; they stay the caller's.
-
-        Returns:
-            The runner's id and the server's end of its stream (``AF_UNIX``, ``SOCK_STREAM``).
-            When the jail or the runner dies, the stream ends.
+        Returns its id and the server's end of its stream (``AF_UNIX``, ``SOCK_STREAM``), which ends
+        when the jail or the runner dies. ``fds`` go to ``runner.main``, and stay the caller's.
         """
         self._count += 1
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_STREAM)
@@ -220,14 +217,13 @@ class Jail:
                 signal.pidfd_send_signal(self.pidfd, signum)
 
     def release(self) -> None:
-        """Everything in the jail is dead: give back its files and the handle on its init.
-
-        ``output`` and the events not yet polled stay the caller's to read to their end.
+        """Everything in the jail is dead: give back its files and the handle on its init. What it
+        said and printed stays the caller's to read.
         """
         if self.pidfd >= 0:
             os.close(self.pidfd)
             self.pidfd = -1
-        self._close_pidfds(list(self._runner_pidfds))
+        self._close_pidfds(self._runner_pidfds)
         if self._group is not None:
             self._group.remove()
         if self._folder is not None:

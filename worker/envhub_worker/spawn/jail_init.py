@@ -189,7 +189,7 @@ class Init:
         pid = os.fork()
         if pid == 0:
             runner_entry.run(self._jail, fds, theirs.fileno(), len(self._runners) + 1)
-        self._watchdog.ignore(fds)
+        self._watchdog.memory.ignore(fds)
         close_fds(fds)
         theirs.close()
         self._runners[pid] = _Runner(number, status)

@@ -68,9 +68,7 @@ _running: list[subprocess.Popen[bytes]] = []
 
 def check_display(spec: JailSpec, environment: Mapping[str, str]) -> None:
     """Look for the program that a display needs, before anything is given up.
-
-    Raises:
-        LayerUnavailableError: The policy asks for a display, and it is not there.
+    Raises ``LayerUnavailableError``: the policy asks for a display, and it is not there.
     """
     wanted = spec.confinement.display == "virtual"
     if wanted and shutil.which(_PROGRAM, path=environment.get("PATH")) is None:
@@ -86,9 +84,7 @@ def start_display(spec: JailSpec) -> None:
     """Start the display of this process, where it is to have one, and name it in its environment.
 
     Call it once confined: what is started then is as confined. It ends with this process's session.
-
-    Raises:
-        SystemExit: It did not come up; the text says so.
+    Raises ``SystemExit``: it did not come up; the text says so.
     """
     if spec.confinement.display != "virtual":
         return
@@ -175,14 +171,6 @@ class _Finder(MetaPathFinder, Loader):
             )
 
 
-def _nothing() -> dict[str, Any]:
-    return {}
-
-
-def _constants() -> dict[str, Any]:
-    return dict(_CONSTANTS)
-
-
 def _types() -> dict[str, Any]:
     from dataclasses import make_dataclass
     from enum import Enum
@@ -229,10 +217,10 @@ def _configs() -> dict[str, Any]:
 
 
 _MODULES: dict[str, Callable[[], dict[str, Any]]] = {
-    **dict.fromkeys(("lerobot", "lerobot.envs", "lerobot.utils", "lerobot.configs"), _nothing),
+    **dict.fromkeys(("lerobot", "lerobot.envs", "lerobot.utils", "lerobot.configs"), dict),
     "lerobot.envs.configs": _configs,
     "lerobot.configs.types": _types,
-    "lerobot.utils.constants": _constants,
-    "lerobot.constants": _constants,
+    "lerobot.utils.constants": lambda: _CONSTANTS,
+    "lerobot.constants": lambda: _CONSTANTS,
 }
 """What each module of the stub has."""

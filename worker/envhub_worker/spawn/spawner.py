@@ -74,8 +74,7 @@ class Spawner:
 
         Args:
             confinement: What the zygote's jails have in common.
-            target: What a runner runs once it is confined: ``"module:function"``, or
-                ``"/a/file.py:function"``.
+            target: What a confined runner runs: ``"module:function"``, or ``"/a.py:function"``.
             ahead: A process to use, if it is one of this interpreter; else it is ended.
         """
         self._jails: dict[int, Jail] = {}
@@ -96,7 +95,6 @@ class Spawner:
         self._apart: LockedFolder | None = None
         self._scratches = self._make_scratches(confinement)
         self._cgroups = self._make_cgroups()
-        self._log = self._process.log
         self._channel = self._process.channel
         self._in_use = _keep(runtime.packages)
         place = self._folder / "root"
@@ -111,7 +109,7 @@ class Spawner:
             packages=runtime.packages and os.path.realpath(runtime.packages),
             roots=tuple(readable_roots),
             place=str(place),
-            canary=str(self._log),
+            canary=str(self._process.log),
             user=self._user,
             record=confinement.record_denials,
             refusal=refusal,
@@ -164,7 +162,7 @@ class Spawner:
     def _died(self) -> list[SpawnerEvent]:
         self._exited = True
         code = self._reap_zygote()
-        log = self._log.read_bytes()[-_LOG_TAIL_BYTES:].decode(errors="replace")
+        log = self._process.log.read_bytes()[-_LOG_TAIL_BYTES:].decode(errors="replace")
         events: list[SpawnerEvent] = [ZygoteDied(code, log)]
         events += [JailExited(one, None, int(signal.SIGKILL)) for one in self._jails.values()]
         self._release_jails()

@@ -176,12 +176,11 @@ class JailEvents:
 
     def _runner_started(self, entry: JailRecord, event: RunnerStarted) -> None:
         entry.pids[event.runner] = event.pid
-        entry.report = tuple(event.report)
         for opening in list(entry.opening):
             opening.waiting.discard(event.runner)
             if not opening.waiting:
                 entry.opening.remove(opening)
-                opened = m.JailOpened(entry.number, opening.runners, entry.report)
+                opened = m.JailOpened(entry.number, opening.runners, tuple(event.report))
                 self._reply(opening.asker, opened)
                 took = monotonic() - opening.since
                 self._witness.opened(entry, len(opening.runners), took)
@@ -211,14 +210,11 @@ class JailEvents:
             return m.replace(death, reason="out-of-memory", detail=OUTER_LIMIT)
         return death
 
-    def ended_with_the_server(self) -> None:
-        """Nothing is left of any jail."""
+    def close(self) -> None:
+        """The server ends, and nothing is left of any jail."""
         for entry in self._jails.values():
             if entry.death is None and not entry.released:
                 self._witness.closed(entry)
-
-    def close(self) -> None:
-        """Nothing happens any more."""
         self._steps.close()
         self._outer_limit.close()
 

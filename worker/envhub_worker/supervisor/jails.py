@@ -52,10 +52,7 @@ MAX_LOST = 4096
 
 class Jails:
     """All jails of a server.
-
-    Args:
-        fd_path: The socket that takes descriptors.
-        ahead: A process for the first zygote.
+    ``fd_path``: the socket that takes descriptors; ``ahead``: a process for the first zygote.
     """
 
     def __init__(
@@ -84,9 +81,8 @@ class Jails:
         for entry in self._jails.values():
             self._events.kill(entry)
         self._zygotes.close()
-        self._events.ended_with_the_server()
-        self._fds.close()
         self._events.close()
+        self._fds.close()
 
     # --- requests: what is returned is the reply; None, where that comes later ------------------
 
@@ -347,20 +343,15 @@ def _targets(
     entry: JailRecord, request: m.Relay, payload: list[bytes]
 ) -> list[tuple[int, list[bytes]]] | None:
     """Which runner gets which frames; None if the request does not add up."""
-    targets: list[tuple[int, list[bytes]]] = []
-    asked: set[int] = set()
+    targets: dict[int, list[bytes]] = {}
     start = 0
     for part in request.parts:
-        if type(part) is not tuple or len(part) != 2:
+        if type(part) is not tuple or list(map(type, part)) != [int, int]:
             return None
         runner, count = part
-        if type(runner) is not int or runner in asked:
+        is_known = runner in entry.links or runner in entry.lost
+        if runner in targets or not is_known or not 1 <= count <= len(payload) - start:
             return None
-        asked.add(runner)
-        if runner not in entry.links and runner not in entry.lost:
-            return None
-        if type(count) is not int or not 1 <= count <= len(payload) - start:
-            return None
-        targets.append((runner, payload[start : start + count]))
+        targets[runner] = payload[start : start + count]
         start += count
-    return targets if targets and start == len(payload) else None
+    return list(targets.items()) if targets and start == len(payload) else None

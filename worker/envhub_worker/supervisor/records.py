@@ -203,7 +203,6 @@ class JailRecord:
     output: OutputTail
     links: dict[int, RunnerLink] = field(default_factory=dict)
     pids: dict[int, int] = field(default_factory=dict)
-    report: tuple[object, ...] = ()
     opening: list[Opening] = field(default_factory=list)
     closing: list[Asker] = field(default_factory=list)
     kept: bool = False

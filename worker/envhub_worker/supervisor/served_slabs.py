@@ -187,9 +187,7 @@ class ServedSteps:
 
     def look(self) -> int | None:
         """Take all answers that are there, and wait a moment for those that come at once.
-
-        Returns:
-            For how many milliseconds the server may sleep; None for as long as it likes.
+        Returns for how many milliseconds the server may sleep; None for as long as it likes.
         """
         turn, wait_ms = perf_counter_ns() + _TURN_NS, None
         while self._owed:

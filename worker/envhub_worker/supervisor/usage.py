@@ -41,15 +41,12 @@ class CountLimit:
 
 
 def usage_of(init: int, runners: Collection[int], children: procfs.Children) -> dict[str, int]:
-    """Processes, threads and memory of a jail; empty where it has gone, or has not begun.
+    """Processes, threads and memory of the jail of ``init``; empty where it has gone, or has not
+    begun.
 
-    Args:
-        init: The pid of its first process, which adopts whatever is orphaned in it.
-
-    Returns:
-        ``processes``: all that live or wait to be reaped, without init. ``threads``: theirs, beyond
-        one each. ``files``: descriptors that the runners have open. ``memory_bytes``: of the
-        runners, what is theirs alone and not a file's.
+    ``processes``: all that live or wait to be reaped, without init. ``threads``: theirs, beyond
+    one each. ``files``: descriptors that the runners have open. ``memory_bytes``: of the runners,
+    what is theirs alone and not a file's.
     """
     if init <= 0:
         return {}
@@ -74,10 +71,7 @@ def reached(
     limits: Limits, usage: Mapping[str, int], runners: Collection[int], *, own_root: bool
 ) -> Iterator[str]:
     """The names of limits that are used up.
-
-    Args:
-        usage: Of ``usage_of``; empty where nothing was counted.
-        own_root: Whether its scratch is a file system of its own.
+    ``usage``: of ``usage_of``; ``own_root``: whether its scratch is a file system of its own.
     """
     if usage and usage["processes"] + usage["threads"] >= limits.processes:
         yield "PROCESSES"

@@ -25,10 +25,7 @@ _PREFIX = "envhub_"
 @dataclass(frozen=True)
 class Hierarchy:
     """Where groups for jails can be made.
-
-    Attributes:
-        kind: ``"cgroup-v1"`` or ``"cgroup-v2"``.
-        folders: The folder of each controller; under v2 there is one.
+    ``kind``: ``"cgroup-v1"`` or ``"cgroup-v2"``; ``folders``: of each controller; under v2 one.
     """
 
     kind: str
@@ -36,12 +33,8 @@ class Hierarchy:
 
 
 def find(mounts: str, own: str, *, root: bool) -> Hierarchy | None:
-    """Where to make groups. Pure.
-
-    Args:
-        mounts: Content of ``/proc/self/mountinfo``.
-        own: Content of ``/proc/self/cgroup``.
-        root: Whether we are root: then a v2 group may stand at the top, whatever our own is.
+    """Where to make groups, by what ``/proc/self/mountinfo`` and ``/proc/self/cgroup`` say. Pure.
+    ``root``: whether we are root: then a v2 group may stand at the top, whatever our own is.
     """
     paths = dict(_own_paths(own))
     points = dict(_mount_points(mounts))

@@ -35,7 +35,7 @@ _SHARED = re.compile(
 
 # Of the kernel's own memory, generously: a mapping with what reverses it, and an open file.
 _MAPPING, _DESCRIPTOR = 512, 1024
-# The filter keeps pipes at the size that they are made with.
+# The filter keeps pipes, and buffers of sockets, at the size that they are made with.
 _PIPE = 64 * 1024
 # Of a socket, where the host does not say.
 _BUFFER = 212992
@@ -57,7 +57,6 @@ class Usage:
         files: memfds that some process has open, by (device, inode).
         sockets: Names of open sockets.
         pipes: Names of open pipes.
-        other: Files in the jail's tmpfs.
     """
 
     private: int = 0
@@ -66,36 +65,19 @@ class Usage:
     files: dict[tuple[int, int], int] = field(default_factory=dict)
     sockets: set[str] = field(default_factory=set)
     pipes: set[str] = field(default_factory=set)
-    other: int = 0
-
-    @property
-    def shared(self) -> int:
-        """What shared anonymous mappings may hold."""
-        return sum(self.mapped.values())
-
-    @property
-    def certain(self) -> int:
-        """All but processes' own and shared memory: what cannot be had more exactly."""
-        buffers = len(self.sockets) * socket_bytes() + len(self.pipes) * _PIPE
-        return self.kernel + sum(self.files.values()) + buffers + self.other
-
-    @property
-    def total(self) -> int:
-        """All of it. Pages that forked processes share are counted for each."""
-        return self.private + self.shared + self.certain
 
 
 class MemoryWatch:
-    """Looks at the memory of a jail's processes."""
+    """Looks at the memory of a jail's processes.
+
+    Args:
+        limit: Bytes.
+        tmpfs: A path in the jail's own, if it has one.
+        own_network: Whether all sockets of our network namespace are the jail's, those too that
+            wait in another socket, where no process has them.
+    """
 
     def __init__(self, limit: int, tmpfs: str | None, *, own_network: bool = False) -> None:
-        """A watch for ``limit`` bytes.
-
-        Args:
-            tmpfs: A path in the jail's own, if it has one.
-            own_network: Whether all sockets of our network namespace are the jail's, those too
-                that wait in another socket, where no process has them.
-        """
         self._limit = limit
         self._tmpfs = tmpfs
         self._own_network = own_network
@@ -110,18 +92,23 @@ class MemoryWatch:
     def look(self, pids: Collection[int]) -> tuple[int, list[int]]:
         """(bytes in use, pids that cannot be measured).
 
-        The cheap upper bound first; only when that is over the limit, what is really there.
-        Shared memory may have left every page table, where no process's account shows it: it is
-        what its mappings may hold, or less where the whole machine has less.
+        The cheap upper bound first, in which pages that forked processes share count for each; only
+        when that is over the limit, what is really there. Shared memory may have left every page
+        table, where no process's account shows it: it is what its mappings may hold, or less where
+        the whole machine has less.
         """
-        usage, hidden = self._bound(pids)
-        if usage.total <= self._limit:
-            return usage.total, hidden
+        usage, hidden = self._usage(pids)
+        shared = sum(usage.mapped.values())
+        buffers = len(usage.sockets) * socket_bytes() + len(usage.pipes) * _PIPE
+        others = usage.kernel + sum(usage.files.values()) + buffers + self._tmpfs_bytes()
+        bound = usage.private + shared + others
+        if bound <= self._limit:
+            return bound, hidden
         exact = sum(_proportional(pid) for pid in pids)
-        return exact + min(usage.shared, shared_of_the_machine()) + usage.certain, hidden
+        return exact + min(shared, shared_of_the_machine()) + others, hidden
 
-    def _bound(self, pids: Collection[int]) -> tuple[Usage, list[int]]:
-        usage, hidden = Usage(other=self._tmpfs_bytes()), []
+    def _usage(self, pids: Collection[int]) -> tuple[Usage, list[int]]:
+        usage, hidden = Usage(), []
         for pid in pids:
             try:
                 _add_process(usage, pid)
@@ -185,10 +172,7 @@ def _add_descriptors(usage: Usage, pid: int) -> None:
 
 @functools.cache
 def socket_bytes() -> int:
-    """The most that waits in one socket: what fills its buffer, and a message that still went in.
-
-    The filter keeps the size of the buffers.
-    """
+    """The most that waits in one socket: what fills its buffer, and a message that went in last."""
     return 2 * int(procfs.content("/proc/sys/net/core/wmem_default") or _BUFFER) + _DESCRIPTOR
 
 
@@ -251,18 +235,17 @@ _EVENTS_LOOK_S = 0.5
 
 
 class Watchdog:
-    """Memory, by its control group's account or by measuring; scratch where no quota bounds it."""
+    """Memory, by its control group's account or by measuring; scratch where no quota bounds it.
+    ``events``: where the control group counts out-of-memory; -1 to measure instead.
+    """
 
     def __init__(self, jail: JailContext, events: int) -> None:
-        """A watchdog for ``jail``.
-        ``events``: where its control group counts out-of-memory; -1 to measure instead.
-        """
         self._limits = jail.spec.confinement.limits
         tmpfs = jail.scratch.temporary if jail.common.namespaced else None
         self._events = events
         self._seen_kills = 0
         own_network = jail.common.namespaced and jail.common.config.network != "host"
-        self._memory = MemoryWatch(self._limits.memory_bytes, tmpfs, own_network=own_network)
+        self.memory = MemoryWatch(self._limits.memory_bytes, tmpfs, own_network=own_network)
         self._folder = None if jail.common.namespaced else os.path.dirname(jail.scratch.home)
         self._memory_due = time.monotonic()
         self._disk_due = time.monotonic() if self._folder else float("inf")
@@ -270,10 +253,6 @@ class Watchdog:
     def seconds_left(self) -> float:
         """Until the next look."""
         return max(0.0, min(self._memory_due, self._disk_due) - time.monotonic())
-
-    def ignore(self, fds: list[int]) -> None:
-        """Do not count these files: they are the client's."""
-        self._memory.ignore(fds)
 
     def look(self, pids: Collection[int]) -> tuple[Reason, str] | None:
         """(reason, detail) when the jail must end, else None."""
@@ -297,7 +276,7 @@ class Watchdog:
         if self._events >= 0:
             self._memory_due = time.monotonic() + _EVENTS_LOOK_S
             return self.killed_by_kernel()
-        used, hidden = self._memory.look(pids)
+        used, hidden = self.memory.look(pids)
         for pid in hidden:
             # It runs a program that may not be read, and so cannot be measured.
             with contextlib.suppress(ProcessLookupError):

@@ -33,8 +33,8 @@ _PROC_KEPT = frozenset(
 )
 
 
-def build_root(plan: RootPlan, place: str, copied: Sequence[str], user: int | None) -> None:
-    """Make ``place`` a new root with what ``plan`` says, and the host's /proc. Not yet entered.
+def enter_root(plan: RootPlan, place: str, copied: Sequence[str], user: int | None) -> None:
+    """Make ``place`` a root with what ``plan`` says and the host's /proc; enter it, detach the old.
 
     Needs a mount namespace of our own; nothing propagates out of it.
 
@@ -59,13 +59,18 @@ def build_root(plan: RootPlan, place: str, copied: Sequence[str], user: int | No
         _PLAIN,
         "size=4m,nr_inodes=4096,mode=755",
     )
-    for path in plan.folders:
+    for path in root_plan.OWN_FOLDERS:
         os.makedirs(place + path, 0o755, exist_ok=True)
     _put(trees | own, place)  # in this order: one of the latter may lie in one of the former
     for path, content in files.items():
         _write(place + path, content)
     for path, target in plan.links.items():
         _link(place + path, target)
+    os.chdir(place)
+    kernel.pivot_root(".", ".")
+    kernel.unmount(".")
+    os.chdir("/")
+    kernel.restrict_mount("/", kernel.ATTR_RDONLY)
 
 
 def _take(paths: Iterable[str], attributes: int) -> dict[str, int]:
@@ -115,16 +120,6 @@ def _link(path: str, target: str) -> None:
     with contextlib.suppress(OSError):
         # Where the parent is a read-only tree of the host, the link is already in it.
         os.symlink(target, path)
-
-
-def enter_root(plan: RootPlan, place: str, copied: Sequence[str], user: int | None) -> None:
-    """Make ``place`` a root with what ``plan`` says, enter it and detach the old one."""
-    build_root(plan, place, copied, user)
-    os.chdir(place)
-    kernel.pivot_root(".", ".")
-    kernel.unmount(".")
-    os.chdir("/")
-    kernel.restrict_mount("/", kernel.ATTR_RDONLY)
 
 
 def mount_proc() -> None:

@@ -12,7 +12,7 @@ import struct
 from collections.abc import Callable
 
 from envhub_worker.lockdown.layers import LayerUnavailableError
-from envhub_worker.lockdown.mechanisms import kernel, process
+from envhub_worker.lockdown.mechanisms import kernel, process, procfs
 from envhub_worker.protocol.text import shortage
 
 #: The user that a jail sees itself as. Not 0: programs treat that one specially.
@@ -128,12 +128,11 @@ def raise_loopback() -> None:
 
 
 def user_namespace_unavailable(
-    error: OSError, read: Callable[[str], str | None] | None = None
+    error: OSError, read: Callable[[str], str | None] = procfs.text
 ) -> LayerUnavailableError:
     """Why this host refused a user namespace, and what to do about it here.
     ``read``: gives the text of a sysctl file, or None where there is none.
     """
-    read = read or _read
     reason, fix = _diagnosis(error, read)
     return LayerUnavailableError("user-namespace", reason, f"{fix} {_WEAKER}")
 
@@ -165,9 +164,3 @@ def _diagnosis(error: OSError, read: Callable[[str], str | None]) -> tuple[str, 
             'profile "container".',
         )
     return f"the kernel answers {answer}", "Ask the administrator of this host to allow it."
-
-
-def _read(path: str) -> str | None:
-    with contextlib.suppress(OSError), open(path) as file:
-        return file.read().strip()
-    return None

@@ -31,6 +31,13 @@ def content(path: str) -> bytes:
         return b""
 
 
+def text(path: str) -> str | None:
+    """What a small file says, such as a setting; None where it cannot be read."""
+    with contextlib.suppress(OSError), open(path, errors="replace") as file:
+        return file.read(4096).strip()
+    return None
+
+
 def numbers(path: str) -> dict[bytes, int]:
     """The lines ``Name:   123 kB`` (then in bytes) and ``Name:   123``."""
     found: dict[bytes, int] = {}

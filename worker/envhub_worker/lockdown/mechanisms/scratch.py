@@ -37,10 +37,7 @@ class Scratch:
 
     def create(self, snapshot: str, owner: int | None) -> None:
         """Make the folders, readable by their owner alone, and link the snapshot into ``work``.
-
-        Args:
-            snapshot: Its top-level entries appear as symbolic links.
-            owner: The user and group to give the folders to, or None to keep them.
+        ``owner``: the user and group to give the folders to, or None to keep them.
         """
         parent = os.path.dirname(self.home)
         runtime = f"{self.temporary}/runtime"

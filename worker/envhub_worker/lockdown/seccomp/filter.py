@@ -39,7 +39,6 @@ _NUMBER, _ARCHITECTURE, _ARGUMENTS = 0, 4, 16
 
 
 def compile_filter(
-    machine: str,
     *,
     namespaced: bool,
     network: str,
@@ -48,9 +47,10 @@ def compile_filter(
     scoped: bool = True,
     record: bool = False,
 ) -> bytes:
-    """The program for ``machine`` as bytes; see ``policy_table``; ``recorded_calls`` if ``record``.
+    """This machine's program as bytes; see ``policy_table``; ``recorded_calls`` if ``record``.
     Raises ``LayerUnavailableError``: no table for this machine.
     """
+    machine = os.uname().machine
     conditions = {"brokered": brokered, "measured": measured, "scoped": scoped}
     verdicts = policy_table(namespaced=namespaced, network=network, **conditions)
     if record:
@@ -160,11 +160,8 @@ class _Program(ctypes.Structure):
 def install(compiled: bytes, *, brokered: bool = False) -> int:
     """Filter this thread and its descendants for good. ``no_new_privs`` must be set.
 
-    Returns:
-        Where the calls that ask arrive if ``brokered``, else -1. Its holder decides.
-
-    Raises:
-        LayerUnavailableError: The kernel refuses.
+    Returns where the calls that ask arrive if ``brokered``, else -1. Its holder decides.
+    Raises ``LayerUnavailableError``: the kernel refuses.
     """
     code = ctypes.create_string_buffer(compiled, len(compiled))
     header = _Program(len(compiled) // 8, ctypes.addressof(code))

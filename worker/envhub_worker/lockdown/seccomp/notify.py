@@ -68,17 +68,11 @@ _NETLINKS = (0, 15)
 """Of addresses and of devices: what the C library and what looks for devices asks."""
 
 
-def serve(
-    listener: int,
-    permitted: Collection[str],
-    note: Callable[[Request], None],
-) -> bool:
+def serve(listener: int, permitted: Collection[str], note: Callable[[Request], None]) -> bool:
     """Answer one request that waits at ``listener``; False when no caller is left.
 
-    Args:
-        permitted: Calls that the policy allows whatever their arguments, and that only ask so that
-            they are seen: the kernel goes on with them. What is neither one of these nor a signal
-            is denied.
+    The kernel goes on with the calls of ``permitted``, which the policy allows whatever their
+    arguments: they only ask to be seen. What is neither one of these nor a signal is denied.
     """
     buffer = bytearray(_REQUEST.size)
     try:

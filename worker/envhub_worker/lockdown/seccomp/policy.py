@@ -41,10 +41,11 @@ class Check:
 class ByArguments:
     """The first rule whose checks all hold decides; else ``otherwise``."""
 
-    rules: tuple[tuple[tuple[Check, ...], int], ...]
+    rules: Rules
     otherwise: int
 
 
+Rules = tuple[tuple[tuple[Check, ...], int], ...]
 Verdict = int | ByArguments
 
 _MEMORY = """
@@ -80,11 +81,11 @@ _CONNECTED_SOCKETS = """
 """
 _OTHER_SOCKETS = "bind listen accept accept4 connect"
 # These reach beyond what Landlock guards, so they need a mount and an IPC namespace.
-_NAMESPACED = """
-    chmod fchmod fchmodat fchmodat2 chown fchown lchown fchownat utimensat setxattr lsetxattr
-    fsetxattr removexattr lremovexattr fremovexattr sched_setaffinity
-"""
 _MODES_AND_TIMES = "chmod fchmod fchmodat fchmodat2 chown fchown lchown fchownat utimensat"
+_NAMESPACED = f"""
+    {_MODES_AND_TIMES} sched_setaffinity
+    setxattr lsetxattr fsetxattr removexattr lremovexattr fremovexattr
+"""
 # These succeed and do nothing: a jail has one user, libzmq aborts if it cannot set the scheduler,
 # and syncing stalls the host's disks. The last three are what there was before utimensat.
 _WITHOUT_EFFECT = """
@@ -222,7 +223,7 @@ def _filtered() -> dict[str, Verdict]:
         # A fifo; in this way libraries make no other file.
         "mknod": ByArguments((((Check(1, _S_IFIFO, _S_IFMT),), ALLOW),), EPERM),
         "mknodat": ByArguments((((Check(2, _S_IFIFO, _S_IFMT),), ALLOW),), EPERM),
-        "ioctl": ByArguments(_ioctls(), ALLOW),
+        "ioctl": _ioctls(),
         "fcntl": _fcntls(),
         "setsockopt": _socket_options(),
         "mmap": ByArguments(_HUGE, ALLOW),
@@ -251,7 +252,7 @@ def _by_option(arg: int, allowed: Iterable[int], denied: Iterable[int] = ()) -> 
 def _socket_options() -> ByArguments:
     """Buffers keep the size that init counts them with; filters take the kernel's own memory."""
 
-    def rules(verdict: int, *options: int) -> tuple[tuple[tuple[Check, ...], int], ...]:
+    def rules(verdict: int, *options: int) -> Rules:
         return tuple(((Check(1, _SOL_SOCKET), Check(2, one)), verdict) for one in options)
 
     sizes = rules(PRETEND, _SO_SNDBUF, _SO_RCVBUF, _SO_SNDBUFFORCE, _SO_RCVBUFFORCE)
@@ -271,21 +272,20 @@ def _unmeasurable() -> dict[str, Verdict]:
     return {"memfd_create": ENOSYS, "mmap": ByArguments(rules, ALLOW)}
 
 
-def _ioctls() -> tuple[tuple[tuple[Check, ...], int], ...]:
+def _ioctls() -> ByArguments:
     # File systems' own calls, which Landlock does not see: 'f', 'v' and 'X' change flags,
     # versions, encryption and verity of a file that is open for reading, 0x94 (btrfs) and 0xf5
     # (f2fs) also volumes.
     kinds = (ord("f"), ord("v"), ord("X"), 0x94, 0xF5)
     families = tuple(((Check(1, kind << 8, 0xFF00),), _ENOTTY) for kind in kinds)
     denied = (_TIOCSTI, _TIOCLINUX, _TIOCCONS, _TIOCSETD, _FIOSETOWN, _SIOCSPGRP)
-    return families + tuple(((Check(1, request),), EPERM) for request in denied)
+    rules = families + tuple(((Check(1, request),), EPERM) for request in denied)
+    return ByArguments(rules, ALLOW)
 
 
 def _sockets(local: bool, network: str, *, own: bool) -> dict[str, Verdict]:
     """Local sockets by name only where no other process has such names (``local``).
-
-    Args:
-        own: The network namespace is the jail's own, and its user namespace's.
+    ``own``: the network namespace is the jail's own, and its user namespace's.
     """
     internet = network != "none"
     verdicts: dict[str, Verdict] = {
@@ -298,7 +298,7 @@ def _sockets(local: bool, network: str, *, own: bool) -> dict[str, Verdict]:
     return verdicts
 
 
-def _families(local: bool, internet: bool, own: bool) -> tuple[tuple[tuple[Check, ...], int], ...]:
+def _families(local: bool, internet: bool, own: bool) -> Rules:
     rules: list[tuple[tuple[Check, ...], int]] = []
     if own:
         # Programs list their network devices, and SDL's games die where they cannot wait for new
@@ -320,21 +320,17 @@ def _families(local: bool, internet: bool, own: bool) -> tuple[tuple[tuple[Check
     return tuple(rules)
 
 
-def _pairs(local: bool) -> tuple[tuple[tuple[Check, ...], int], ...]:
+def _pairs(local: bool) -> Rules:
     # Without a mount namespace a datagram pair would send to any socket file of the host.
     kinds = [_SOCK_STREAM, _SOCK_SEQPACKET, *([_SOCK_DGRAM] if local else [])]
     return tuple(((Check(0, _AF_UNIX), Check(1, kind, _SOCK_TYPE)), ALLOW) for kind in kinds)
 
 
-def _utimensat() -> ByArguments:
+def _without_namespaces() -> dict[str, Verdict]:
     # What touches a path takes a success for a file that is there, and does not create it.
     touched = ((Check(1, 0, wide=True),), PRETEND), ((Check(2, 0, wide=True),), EPERM)
-    return ByArguments(touched, PRETEND)
-
-
-def _without_namespaces() -> dict[str, Verdict]:
     return {
         **dict.fromkeys(_MODES_AND_TIMES.split(), PRETEND),
-        "utimensat": _utimensat(),
+        "utimensat": ByArguments(touched, PRETEND),
         "sched_setaffinity": ByArguments((((Check(0, 0),), ALLOW),), PRETEND),
     }

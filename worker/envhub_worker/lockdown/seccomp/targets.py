@@ -27,11 +27,8 @@ _ENTRY = re.compile(r"/proc/(\d{1,18})(/.*)?", re.DOTALL)
 
 
 def is_another_target(call: str, arguments: Sequence[int], caller: int, init: int) -> bool:
-    """Whether a call is about a process outside of its jail, init among these.
-
-    Args:
-        call: Its name, one of ``NAMING``.
-        arguments: Its first three, as C integers.
+    """Whether a call, one of ``NAMING``, is about a process outside of its jail, as its init is.
+    ``arguments``: the first three, as C integers.
     """
     if call in _WHICH and arguments[0] != _WHICH[call]:
         return False
@@ -42,7 +39,10 @@ def is_another_target(call: str, arguments: Sequence[int], caller: int, init: in
         return number == -1 or _never_was(-number)
     if number <= 0 or (call == "pidfd_open" and number == init):
         return False
-    return _is_outside(number, caller, init)
+    process = procfs.process_of(number)
+    if process == 0:
+        return _never_was(number)  # else it may have been a child's: then nothing is said of it
+    return process == init or (process != caller and not procfs.is_below(process, init))
 
 
 def never_a_target(path: str) -> bool:
@@ -51,22 +51,11 @@ def never_a_target(path: str) -> bool:
     return entry is not None and _never_was(int(entry[1]))
 
 
-def _is_outside(number: int, caller: int, init: int) -> bool:
-    """A number without a process may have been a child's: then nothing is said of it."""
-    process = procfs.process_of(number)
-    if process == 0:
-        return _never_was(number)
-    return process == init or (process != caller and not procfs.is_below(process, init))
-
-
 def _never_was(number: int) -> bool:
     """Whether a jail's own namespace has not yet come to that number, or no other can.
 
     A host begins again at low numbers, and a jail hardly ever lives that long.
     """
     is_ours = os.getpid() == _FIRST
-    try:
-        with open("/proc/loadavg" if is_ours else "/proc/sys/kernel/pid_max") as file:
-            return number > int(file.read().split()[-1])
-    except (OSError, ValueError):
-        return False
+    most = procfs.text("/proc/loadavg" if is_ours else "/proc/sys/kernel/pid_max")
+    return most is not None and number > int(most.split()[-1])

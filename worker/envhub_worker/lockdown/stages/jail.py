@@ -18,16 +18,9 @@ from envhub_worker.protocol.confinement import Limits
 
 
 def enter(spec: JailSpec, common: Common, folder: str) -> tuple[Scratch, View]:
-    """Confine this init as far as all of its runners are.
-
-    Args:
-        folder: A private folder of the host for a jail without a mount namespace.
-
-    Returns:
-        The jail's writable folders, and how it sees its snapshot and its packages.
-
-    Raises:
-        LayerUnavailableError: The host lacks a layer that the profile names.
+    """Confine this init as far as all of its runners are; the jail's writable folders and its view.
+    Raises ``LayerUnavailableError``: the host lacks a layer that the profile names.
+    ``folder``: a private folder of the host for a jail without a mount namespace.
     """
     # In this order. Without namespaces there is little to do here: this process gives up what it
     # could regain, looks at the entry with the rights that are left, and cannot be traced from then

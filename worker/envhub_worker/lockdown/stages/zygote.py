@@ -59,7 +59,6 @@ def enter(config: ZygoteConfig) -> Common:
     # A driver keeps more out of sight than a filter could deny.
     programs = tuple(
         compile_filter(
-            os.uname().machine,
             namespaced=namespaced,
             network=config.network,
             brokered=brokered,
@@ -167,23 +166,21 @@ def _check_interpreter() -> None:
 
 def _check_packages(folder: str) -> None:
     """Of the top level; of what lies deeper the import says that it is there, and closed."""
+    why = ""
     try:
-        names = os.listdir(folder)
+        for name in os.listdir(folder):
+            path = os.path.join(folder, name)
+            if not os.access(path, os.R_OK | os.X_OK if os.path.isdir(path) else os.R_OK):
+                why = f"holds {name}, which the jails may not read"
     except OSError as error:
-        raise _unreadable_packages(folder, f"cannot be read: {error.strerror}") from error
-    for name in names:
-        path = os.path.join(folder, name)
-        if not os.access(path, os.R_OK | os.X_OK if os.path.isdir(path) else os.R_OK):
-            raise _unreadable_packages(folder, f"holds {name}, which the jails may not read")
-
-
-def _unreadable_packages(folder: str, why: str) -> LayerUnavailableError:
-    return LayerUnavailableError(
-        "packages",
-        f"the folder of packages {folder} {why}",
-        f"The jails run as uid {os.getuid()} here. Make it again, or readable for all users: "
-        f"chmod -R a+rX {folder}",
-    )
+        why = f"cannot be read: {error.strerror}"
+    if why:
+        raise LayerUnavailableError(
+            "packages",
+            f"the folder of packages {folder} {why}",
+            f"The jails run as uid {os.getuid()} here. Make it again, or readable for all users: "
+            f"chmod -R a+rX {folder}",
+        )
 
 
 def _be_the_first_process() -> None:
