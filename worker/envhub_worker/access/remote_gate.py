@@ -21,8 +21,8 @@ from envhub_worker.access.quotas import InFlight, Permissions, Quotas, Use, chec
 from envhub_worker.access.session_expiry import SessionExpiry
 from envhub_worker.access.sessions import WATCHER, Sessions
 from envhub_worker.access.store.uploads import PREFIX, Uploads, wrong_with_path
+from envhub_worker.lockdown.probe import own_runtime
 from envhub_worker.lockdown.spec import confinement_from_wire
-from envhub_worker.lockdown.surroundings import own_runtime
 from envhub_worker.loop import Loop
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import ProtocolError

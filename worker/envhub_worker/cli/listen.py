@@ -41,7 +41,7 @@ from envhub_worker.cli.identity import (
 )
 from envhub_worker.cli.listen_options import add_options, quotas_of
 from envhub_worker.cli.state_folder import Note, ServerNote, state_folder
-from envhub_worker.lockdown import probe, surroundings
+from envhub_worker.lockdown import probe
 from envhub_worker.lockdown.mechanisms import landlock, locked_folder
 from envhub_worker.lockdown.mechanisms.locked_folder import LockedFolder
 from envhub_worker.protocol.confinement import Surroundings
@@ -65,10 +65,10 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _listen(arguments: argparse.Namespace, state: Path) -> int:
     check_bind(arguments.bind, arguments.insecure_loopback)
-    around = surroundings.surroundings() if arguments.announce else None
+    around = probe.surroundings() if arguments.announce else None
     if arguments.dependencies and (why := why_impossible()):
         raise UsageError(f"--dependencies: {why}")
-    strongest = surroundings.profiles(probe.probe()["layers"], landlock.version())
+    strongest = probe.profiles(probe.probe()["layers"], landlock.version())
     identity = replace(identity_of(arguments, state), profile=(*strongest, "strict")[0])
     log = Log(form=FORMS[arguments.log_format], level=arguments.log_level)
     why = unusable(identity.profile, arguments.weakest_profile)
@@ -117,7 +117,7 @@ def _serve(
                 os.write(arguments.ready_fd, f"{server.endpoint} {identity.public}\n".encode())
             os.close(arguments.ready_fd)
         elif around is not None:
-            print(surroundings.announcement(around, server_key=identity.public), flush=True)
+            print(probe.announcement(around, server_key=identity.public), flush=True)
         elif arguments.log_format == "text" or identity.authorized is None:  # a client needs it
             print(announcement(server.endpoint, identity), flush=True)
         log.say(

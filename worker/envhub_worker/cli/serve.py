@@ -98,6 +98,6 @@ def _ahead(arguments: argparse.Namespace) -> ZygoteProcess | None:
 
 
 def _announced() -> str:
-    from envhub_worker.lockdown import surroundings
+    from envhub_worker.lockdown import probe
 
-    return surroundings.announcement(surroundings.surroundings())
+    return probe.announcement(probe.surroundings())

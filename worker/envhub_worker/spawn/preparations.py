@@ -143,9 +143,6 @@ def install_lerobot_stub() -> None:
 class _Finder(MetaPathFinder, Loader):
     """Finds and loads the modules of ``_MODULES``."""
 
-    def __init__(self) -> None:
-        self._said = False
-
     def find_spec(
         self, name: str, path: Sequence[str] | None, target: object = None
     ) -> ModuleSpec | None:
@@ -160,10 +157,9 @@ class _Finder(MetaPathFinder, Loader):
         """An ordinary one."""
 
     def exec_module(self, module: types.ModuleType) -> None:
-        """Fill it, and warn of it once."""
+        """Fill it, and warn with the first: that is of all."""
         vars(module).update(_MODULES[module.__name__]())
-        if not self._said:
-            self._said = True
+        if module.__name__ == "lerobot":
             warnings.warn(
                 "lerobot is not installed in the jail: a stub replaces it, with EnvConfig, "
                 "HubEnvConfig, PolicyFeature, FeatureType and the constants of observations",

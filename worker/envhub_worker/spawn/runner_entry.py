@@ -30,14 +30,8 @@ from envhub_worker.lockdown.mechanisms import process, reap
 from envhub_worker.lockdown.mechanisms.environment import jail_environment
 from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.lockdown.stages import runner
-from envhub_worker.spawn import blas
+from envhub_worker.spawn import blas, preparations
 from envhub_worker.spawn.channel import Channel
-from envhub_worker.spawn.preparations import (
-    check_display,
-    install_lerobot_stub,
-    make_hub_cache,
-    start_display,
-)
 
 _SELF_TEST = Layer("self-test", True, "the denials above were tried and held")
 
@@ -72,9 +66,9 @@ def _run(jail: JailContext, fds: list[int], init: Channel, runners: int) -> int:
     blas.restore_threads(jail.common.set_blas_threads, runners)
     init.send({"report": [_SELF_TEST.to_wire()]})
     init.close()
-    make_hub_cache(jail.spec)
-    install_lerobot_stub()
-    start_display(jail.spec)
+    preparations.make_hub_cache(jail.spec)
+    preparations.install_lerobot_stub()
+    preparations.start_display(jail.spec)
     main = _main(jail, runners)  # not before init is out of reach: packages may be a stranger's
     stream = socket.socket(fileno=fds[0])
     return int(main(stream, jail.spec, fds[1:]) or 0)
@@ -120,7 +114,7 @@ def confine(jail: JailContext, fds: list[int], init: Channel) -> None:
     descriptors = {0, 1, 2, init.fileno(), *fds}
     process.close_all_but({*descriptors, *jail.view.shared.values()})
     _forget_the_zygote(jail)
-    check_display(jail.spec, os.environ)
+    preparations.check_display(jail.spec, os.environ)
     runner.enter(jail, descriptors, lambda listener: init.send({"broker": True}, [listener]))
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from envhub_worker.cli import health
-from envhub_worker.lockdown import surroundings
+from envhub_worker.lockdown import probe
 from envhub_worker.protocol.confinement import Surroundings
 from envhub_worker.protocol.runtime import OWN, Runtime
 
@@ -35,11 +35,11 @@ def layers(*names: str) -> list[dict[str, object]]:
 def test_the_strongest_profile_is_the_one_whose_layers_are_there(
     there: tuple[str, ...], abi: int, expected: str
 ) -> None:
-    assert surroundings.profiles(layers(*there), abi)[0] == expected
+    assert probe.profiles(layers(*there), abi)[0] == expected
 
 
 def test_without_a_system_call_filter_there_is_no_profile() -> None:
-    assert surroundings.profiles(layers("user-namespace", "landlock"), 7) == []
+    assert probe.profiles(layers("user-namespace", "landlock"), 7) == []
 
 
 @pytest.mark.parametrize(
@@ -70,17 +70,17 @@ def test_limits_are_read_from_either_kind_of_control_group(
         for name, text in files[root].items():
             (folder / name).parent.mkdir(exist_ok=True)
             (folder / name).write_text(f"{text}\n")
-        readers = surroundings.memory_limit, surroundings.pids_limit, surroundings.cpus_limit
+        readers = probe.memory_limit, probe.pids_limit, probe.cpus_limit
         assert tuple(read(folder) for read in readers) == expected
 
 
 def test_the_network_is_what_the_kernel_lists() -> None:
     table = "Inter-|   Receive\n face |bytes\n    lo:  0 0\n  eth0: 12 3\n"
-    assert surroundings.network_devices(table) == ["lo", "eth0"]
+    assert probe.network_devices(table) == ["lo", "eth0"]
 
 
 def test_the_announcement_is_one_line_of_json() -> None:
-    said = surroundings.announcement(surroundings.surroundings(), server_key="00")
+    said = probe.announcement(probe.surroundings(), server_key="00")
     assert "\n" not in said
     found = vars(Surroundings.read(json.loads(said)))
     assert set(json.loads(said)) == {"envhub-worker", "server_key", *found}
@@ -90,10 +90,10 @@ def test_a_derived_image_brings_the_interpreter_of_its_jails(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of servers for clients on other hosts, too, who cannot name one; else it is the server's."""
-    monkeypatch.setattr(surroundings, "ENVIRONMENT", tmp_path / "python")
-    assert surroundings.own_runtime() == OWN
+    monkeypatch.setattr(probe, "ENVIRONMENT", tmp_path / "python")
+    assert probe.own_runtime() == OWN
     (tmp_path / "python").touch()
-    assert surroundings.own_runtime() == Runtime(str(tmp_path / "python"))
+    assert probe.own_runtime() == Runtime(str(tmp_path / "python"))
 
 
 @pytest.mark.parametrize(("greeting", "healthy"), [(b"\xff", True), (b"H", False), (b"", False)])

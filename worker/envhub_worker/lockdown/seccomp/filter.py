@@ -9,18 +9,9 @@ from collections.abc import Mapping
 
 from envhub_worker.lockdown.layers import LayerUnavailableError, no_system_calls
 from envhub_worker.lockdown.mechanisms import kernel
-from envhub_worker.lockdown.seccomp import bpf
+from envhub_worker.lockdown.seccomp import bpf, policy
 from envhub_worker.lockdown.seccomp.bpf import Branch, Do, Item, Label
-from envhub_worker.lockdown.seccomp.policy import (
-    ENOSYS,
-    EPERM,
-    KILL_PROCESS,
-    ByArguments,
-    Check,
-    Verdict,
-    policy_table,
-    recorded_calls,
-)
+from envhub_worker.lockdown.seccomp.policy import ByArguments, Check, Verdict
 from envhub_worker.lockdown.seccomp.syscalls import NUMBERS
 
 _AUDIT_ARCH = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}
@@ -52,9 +43,9 @@ def compile_filter(
     """
     machine = os.uname().machine
     conditions = {"brokered": brokered, "measured": measured, "scoped": scoped}
-    verdicts = policy_table(namespaced=namespaced, network=network, **conditions)
+    verdicts = policy.policy_table(namespaced=namespaced, network=network, **conditions)
     if record:
-        verdicts = recorded_calls(verdicts, NUMBERS.get(machine, ()))
+        verdicts = policy.recorded_calls(verdicts, NUMBERS.get(machine, ()))
     return bpf.to_bytes(program(machine, verdicts))
 
 
@@ -68,14 +59,15 @@ def program(machine: str, verdicts: Mapping[str, Verdict]) -> list[bpf.BpfInstru
     known = set(numbers.values())
     items: list[Item] = [
         Do(bpf.LOAD, _ARCHITECTURE),
-        Branch(bpf.JUMP_EQUAL, _AUDIT_ARCH[machine], None, _returning(KILL_PROCESS)),
+        Branch(bpf.JUMP_EQUAL, _AUDIT_ARCH[machine], None, _returning(policy.KILL_PROCESS)),
         Do(bpf.LOAD, _NUMBER),
     ]
     if machine == "x86_64":
-        items.append(Branch(bpf.JUMP_GREATER_OR_EQUAL, _X32, _returning(KILL_PROCESS), None))
-    items.append(Branch(bpf.JUMP_GREATER, highest, _returning(ENOSYS), None))
+        items.append(Branch(bpf.JUMP_GREATER_OR_EQUAL, _X32, _returning(policy.KILL_PROCESS), None))
+    items.append(Branch(bpf.JUMP_GREATER, highest, _returning(policy.ENOSYS), None))
     labels = [
-        _label(n, by_number.get(n, EPERM if n in known else ENOSYS)) for n in range(highest + 1)
+        _label(n, by_number.get(n, policy.EPERM if n in known else policy.ENOSYS))
+        for n in range(highest + 1)
     ]
     # (first number, label) of each run of equal labels
     starts = [n for n, label in enumerate(labels) if n == 0 or labels[n - 1] != label]

@@ -16,15 +16,7 @@ from functools import partial
 from envhub_worker.lockdown.context import JailContext
 from envhub_worker.lockdown.layers import LayerUnavailableError
 from envhub_worker.lockdown.mechanisms import kernel, landlock, process
-from envhub_worker.lockdown.mechanisms.landlock import (
-    DEVICE,
-    READ,
-    READ_DIR,
-    TRUNCATE,
-    WRITE,
-    WRITE_FILE,
-    LandlockRule,
-)
+from envhub_worker.lockdown.mechanisms.landlock import LandlockRule
 from envhub_worker.lockdown.seccomp import filter
 from envhub_worker.lockdown.seccomp.paths import OwnPaths
 from envhub_worker.protocol.confinement import Limits
@@ -120,11 +112,15 @@ def rules(jail: JailContext, pid: int) -> list[LandlockRule]:
     # processes are in a pid namespace's /proc; without one, children cannot name theirs.
     threads = "/proc" if common.namespaced else f"{own}/task"
     return [
-        *(LandlockRule(path, READ) for path in readable),
-        *([] if common.namespaced else [LandlockRule(own, READ_DIR)]),
-        *(LandlockRule(path, WRITE) for path in writable),
-        *(LandlockRule(path, DEVICE) for path in common.devices),
-        *([] if common.config.gpu is False else [LandlockRule(threads, WRITE_FILE | TRUNCATE)]),
+        *(LandlockRule(path, landlock.READ) for path in readable),
+        *([] if common.namespaced else [LandlockRule(own, landlock.READ_DIR)]),
+        *(LandlockRule(path, landlock.WRITE) for path in writable),
+        *(LandlockRule(path, landlock.DEVICE) for path in common.devices),
+        *(
+            []
+            if common.config.gpu is False
+            else [LandlockRule(threads, landlock.WRITE_FILE | landlock.TRUNCATE)]
+        ),
     ]
 
 
