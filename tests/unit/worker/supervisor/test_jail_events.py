@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import pytest
@@ -19,16 +21,19 @@ from envhub_worker.supervisor.served_slabs import ServedSlabs
 
 
 class _Jail:
-    """One that has told something which nobody has read yet."""
+    """One that has told something which nobody has read yet; or that cannot be heard."""
 
-    def __init__(self, *events: Any) -> None:
+    def __init__(self, *events: Any, fails: bool = False) -> None:
         self.events = list(events)
+        self.fails = fails
         self.killed = False
 
     def fileno(self) -> int:
         return -1 if self.killed else 99
 
     def poll(self) -> list[Any]:
+        if self.fails:
+            raise AssertionError("no room for a descriptor")
         told, self.events = self.events, []
         return [] if self.killed else told
 
@@ -43,61 +48,58 @@ class _Silent:
         return lambda *arguments: ""
 
 
-def test_what_a_jail_was_denied_is_known_when_it_is_ended() -> None:
-    """Also if what ends it is heard of first, on another descriptor; and it dies of that."""
-    tried = CallDenied("socket", "AF_INET")
-    jail: Any = _Jail(tried, RunnerExited(1, None, 9, "signal"))
+class _Told(Witness):
+    """Writes down what the server itself has met."""
+
+    def __init__(self) -> None:
+        self.failures: list[str] = []
+
+    def failed(self, error: Exception) -> None:
+        self.failures.append(str(error))
+
+
+@contextmanager
+def told_of(jail: Any) -> Iterator[tuple[JailEvents, JailRecord, _Told, list[Any]]]:
+    """The events of one jail, its record, what went wrong, and what is replied to whom."""
     silent: Any = _Silent()
-    entry = JailRecord(7, "one", b"", jail, (), silent)
-    events = JailEvents(silent, silent, {7: entry}, silent, Witness())
+    said: list[tuple[Any, m.Message]] = []
+    entry, witness = JailRecord(7, "one", b"", jail, (), silent), _Told()
+
+    def reply(asker: Any, message: m.Message, *_: object) -> None:
+        said.append((asker, message))
+
+    events = JailEvents(silent, reply, {7: entry}, silent, witness)
     try:
+        yield events, entry, witness, said
+    finally:
+        events.close()
+
+
+@pytest.mark.parametrize("fails", [False, True])
+def test_what_a_jail_was_denied_is_known_when_it_is_ended(fails: bool) -> None:
+    """Also if what ends it is heard of first, on another descriptor; and it dies of that.
+
+    Its last words may be lost, as where its server has no descriptors left; that goes on.
+    """
+    tried = CallDenied("socket", "AF_INET")
+    jail = _Jail(tried, RunnerExited(1, None, 9, "signal"), fails=fails)
+    with told_of(jail) as (events, entry, witness, _):
         events.end(entry, whole_jail("protocol"))
-        assert entry.denied == ["socket AF_INET"]
+        assert entry.denied == ([] if fails else ["socket AF_INET"])
+        assert witness.failures == (["no room for a descriptor"] if fails else [])
         assert entry.death is not None
         assert entry.death.reason == "protocol"
         assert jail.killed
-    finally:
-        events.close()
-
-
-def test_a_jail_that_cannot_be_heard_any_more_ends_alone() -> None:
-    """Its last words may be lost, as where its server has no descriptors left; that goes on."""
-
-    class Unheard(_Jail):
-        def poll(self) -> list[Any]:
-            raise AssertionError("no room for a descriptor")
-
-    class Told(Witness):
-        def failed(self, error: Exception) -> None:
-            failures.append(str(error))
-
-    failures: list[str] = []
-    jail: Any = Unheard()
-    silent: Any = _Silent()
-    entry = JailRecord(7, "one", b"", jail, (), silent)
-    events = JailEvents(silent, silent, {7: entry}, silent, Told())
-    try:
-        events.end(entry, whole_jail("protocol"))
-        assert (jail.killed, failures) == (True, ["no room for a descriptor"])
-        assert entry.death is not None
-    finally:
-        events.close()
 
 
 @pytest.mark.parametrize("stepped", [True, False])
 def test_who_waits_for_a_jail_that_another_closes_hears_of_it(stepped: bool) -> None:
     """A thread that waits for a step, which the server takes or the runner's stream does."""
     jail: Any = _Jail()
-    silent: Any = _Silent()
-    entry = JailRecord(7, "one", b"", jail, (), silent)
-    said: list[tuple[Any, m.Message]] = []
-    events = JailEvents(
-        silent, lambda asker, reply, *_: said.append((asker, reply)), {7: entry}, silent, Witness()
-    )
     ours, theirs = socket.socketpair()
-    link = entry.links[1] = RunnerLink(ours, DEFAULT_LIMITS)
     pending: Any = Pending("who steps", "step", [None])  # type: ignore[arg-type]
-    try:
+    with theirs, told_of(jail) as (events, entry, _, said):
+        link = entry.links[1] = RunnerLink(ours, DEFAULT_LIMITS)
         if stepped:
             size = words.HEADER_BYTES + words.INFO_BYTES
             events.share(link, ServedSlabs(0, size, 64))
@@ -110,6 +112,3 @@ def test_who_waits_for_a_jail_that_another_closes_hears_of_it(stepped: bool) -> 
         death = said[0][1]
         assert isinstance(death, m.Death)
         assert (death.operation, death.detail) == ("step", "the jail was closed")
-    finally:
-        events.close()
-        theirs.close()

@@ -8,7 +8,7 @@ import os
 import select
 import struct
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 
@@ -55,18 +55,36 @@ def steps(monkeypatch: pytest.MonkeyPatch) -> Iterator[ServedSteps]:
     made.close()
 
 
-@pytest.fixture
-def slabs(steps: ServedSteps) -> ServedSlabs:
-    made = ServedSlabs(LEAVES, words.HEADER_BYTES + 64 + words.INFO_BYTES, len(OBSERVATION))
-    steps.add(made)
-    return made
+def make(observation_bytes: int = len(OBSERVATION)) -> ServedSlabs:
+    return ServedSlabs(LEAVES, words.HEADER_BYTES + 64 + words.INFO_BYTES, observation_bytes)
+
+
+class Served(NamedTuple):
+    """A runner that takes steps of the server."""
+
+    slabs: ServedSlabs
+    steps: ServedSteps
+    runner: Runner
+
+    def ask(self, **own: int) -> list[Any]:
+        """Ask a step; what is taken of the answer."""
+        taken: list[Any] = []
+        self.slabs.ask(frame(**own), "owner")
+        self.steps.owe(self.slabs, lambda: taken.append(self.slabs.take()))
+        return taken
+
+
+def serve(steps: ServedSteps, observation: bytes = OBSERVATION) -> Served:
+    slabs = make(len(observation))
+    steps.add(slabs)
+    runner = Runner(slabs, len(observation))
+    runner.observations[:] = observation
+    return Served(slabs, steps, runner)
 
 
 @pytest.fixture
-def runner(slabs: ServedSlabs) -> Runner:
-    made = Runner(slabs, len(OBSERVATION))
-    made.observations[:] = OBSERVATION
-    return made
+def served(steps: ServedSteps) -> Served:
+    return serve(steps)
 
 
 def frame(*, spin_ns: int = 0, known: int = 0) -> bytes:
@@ -75,153 +93,130 @@ def frame(*, spin_ns: int = 0, known: int = 0) -> bytes:
     return struct.pack(f"<{len(own)}Q", *own) + ACTION
 
 
-def ask(slabs: ServedSlabs, steps: ServedSteps, **own: int) -> list[Any]:
-    taken: list[Any] = []
-    slabs.ask(frame(**own), "owner")
-    steps.owe(slabs, lambda: taken.append(slabs.take()))
-    return taken
-
-
-def test_a_step_is_written_and_answered(
-    slabs: ServedSlabs, steps: ServedSteps, runner: Runner
-) -> None:
+def test_a_step_is_written_and_answered(served: Served) -> None:
     """The client's words and actions arrive; what comes back is the outcome and the batch."""
-    runner.tells[words.PARKED] = 1
-    taken = ask(slabs, steps)
-    assert os.read(runner.bell, 8) == (1).to_bytes(8, "little")
-    assert (runner.asked[words.SEQUENCE], runner.asked[words.DTYPES]) == (1, 7)
+    served.runner.tells[words.PARKED] = 1
+    taken = served.ask()
+    assert os.read(served.runner.bell, 8) == (1).to_bytes(8, "little")
+    assert (served.runner.asked[words.SEQUENCE], served.runner.asked[words.DTYPES]) == (1, 7)
     start = words.HEADER_BYTES
-    assert runner.request[start : start + len(ACTION)] == ACTION
-    assert steps.look() is None
+    assert served.runner.request[start : start + len(ACTION)] == ACTION
+    assert served.steps.look() is None
     assert taken == []
-    runner.answer()
-    steps.look()
+    served.runner.answer()
+    served.steps.look()
     assert taken == [("owner", [struct.pack("<QQ", words.DONE, 0) + OBSERVATION])]
-    assert slabs.owner is None
-    steps.look()
+    assert served.slabs.owner is None
+    served.steps.look()
     assert len(taken) == 1
 
 
-def test_a_runner_that_is_awake_is_not_rung(
-    slabs: ServedSlabs, steps: ServedSteps, runner: Runner
-) -> None:
-    os.set_blocking(runner.bell, False)
-    taken = ask(slabs, steps, spin_ns=60_000_000_000)
+def test_a_runner_that_is_awake_is_not_rung(served: Served) -> None:
+    os.set_blocking(served.runner.bell, False)
+    taken = served.ask(spin_ns=60_000_000_000)
     with pytest.raises(BlockingIOError):
-        os.read(runner.bell, 8)
-    assert steps.look() == 0, "a server that is awake sleeps"
-    assert runner.asked[words.PARKED] == 0
-    runner.answer()
-    steps.look()
+        os.read(served.runner.bell, 8)
+    assert served.steps.look() == 0, "a server that is awake sleeps"
+    assert served.runner.asked[words.PARKED] == 0
+    served.runner.answer()
+    served.steps.look()
     assert len(taken) == 1
-    assert not select.select([steps.fileno()], [], [], 0)[0]
+    assert not select.select([served.steps.fileno()], [], [], 0)[0]
 
 
-def test_a_server_sleeps_when_an_answer_takes_long(
-    slabs: ServedSlabs, steps: ServedSteps, runner: Runner
-) -> None:
+def test_a_server_sleeps_when_an_answer_takes_long(served: Served) -> None:
     """It looks once more soon, for the ring may cross with that; then it is rung."""
-    taken = ask(slabs, steps, spin_ns=1)
-    assert steps.look() == 2
-    assert runner.asked[words.PARKED] == 1
-    assert steps.look() is None
-    runner.answer()
-    assert select.select([steps.fileno()], [], [], 60)[0]
-    steps.rung()
-    steps.look()
+    taken = served.ask(spin_ns=1)
+    assert served.steps.look() == 2
+    assert served.runner.asked[words.PARKED] == 1
+    assert served.steps.look() is None
+    served.runner.answer()
+    assert select.select([served.steps.fileno()], [], [], 60)[0]
+    served.steps.rung()
+    served.steps.look()
     assert len(taken) == 1
 
 
 def test_both_sides_sleep_where_waiting_awake_is_not_permitted(
-    slabs: ServedSlabs, steps: ServedSteps, runner: Runner, monkeypatch: pytest.MonkeyPatch
+    served: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """On one core, or on one that may see the announcement before what is announced."""
     monkeypatch.setattr(*inside.MAY_SPIN, False)
-    ask(slabs, steps, spin_ns=60_000_000_000)
-    assert (runner.asked[words.SPIN], runner.asked[words.PARKED]) == (0, 1)
-    assert steps.look() is None
+    served.ask(spin_ns=60_000_000_000)
+    assert (served.runner.asked[words.SPIN], served.runner.asked[words.PARKED]) == (0, 1)
+    assert served.steps.look() is None
 
 
 @pytest.mark.parametrize("rings", [0, 1, 1000])
-def test_rings_that_announce_nothing_are_not_heard_for_long(
-    slabs: ServedSlabs, steps: ServedSteps, runner: Runner, rings: int
-) -> None:
+def test_rings_that_announce_nothing_are_not_heard_for_long(served: Served, rings: int) -> None:
     """A server that woke at each of them would be the jail's; its answer is found without."""
-    taken = ask(slabs, steps)
+    taken = served.ask()
     heard = 0
     for _ in range(rings):
-        runner.ring()
-        if select.select([steps.fileno()], [], [], 0)[0]:
+        served.runner.ring()
+        if select.select([served.steps.fileno()], [], [], 0)[0]:
             heard += 1
-            steps.rung()
-            steps.look()
+            served.steps.rung()
+            served.steps.look()
     assert heard == min(rings, 17)
     assert taken == []
-    runner.answer()
-    steps.look()
+    served.runner.answer()
+    served.steps.look()
     assert len(taken) == 1
 
 
 @pytest.mark.parametrize("length", [1, words.INFO_BYTES, words.INFO_BYTES + 1, 2**64 - 1])
-def test_infos_are_as_long_as_they_may_be(
-    slabs: ServedSlabs, steps: ServedSteps, runner: Runner, length: int
-) -> None:
-    taken = ask(slabs, steps)
-    runner.answer(length=length, infos=b"\xff" * words.INFO_BYTES)
-    steps.look()
+def test_infos_are_as_long_as_they_may_be(served: Served, length: int) -> None:
+    taken = served.ask()
+    served.runner.answer(length=length, infos=b"\xff" * words.INFO_BYTES)
+    served.steps.look()
     [(_, [first])] = taken
     infos = b"\xff" * min(length, words.INFO_BYTES)
     assert first == struct.pack("<QQ", words.DONE, length) + infos + OBSERVATION
 
 
 @pytest.mark.parametrize("known", [0, 24, words.INFO_BYTES, 2**64 - 1])
-def test_columns_are_as_long_as_the_client_knows(
-    slabs: ServedSlabs, steps: ServedSteps, runner: Runner, known: int
-) -> None:
-    taken = ask(slabs, steps, known=known)
-    runner.answer(words.COLUMNS, length=7)
-    steps.look()
+def test_columns_are_as_long_as_the_client_knows(served: Served, known: int) -> None:
+    taken = served.ask(known=known)
+    served.runner.answer(words.COLUMNS, length=7)
+    served.steps.look()
     [(_, [first])] = taken
     assert len(first) == 16 + min(known, words.INFO_BYTES) + len(OBSERVATION)
 
 
 def test_a_large_batch_comes_in_pieces(steps: ServedSteps) -> None:
-    size = (3 << 19) + 8
-    slabs = ServedSlabs(LEAVES, words.HEADER_BYTES + 64 + words.INFO_BYTES, size)
-    steps.add(slabs)
-    runner = Runner(slabs, size)
-    runner.observations[:] = os.urandom(size)
-    taken = ask(slabs, steps)
-    runner.answer()
+    observation = os.urandom((3 << 19) + 8)
+    served = serve(steps, observation)
+    taken = served.ask()
+    served.runner.answer()
     steps.look()
     [(_, [head, *pieces])] = taken
     assert (len(head), [len(piece) for piece in pieces]) == (16, [1 << 19] * 3 + [8])
-    assert b"".join(pieces) == runner.observations[:]
-    steps.forget(slabs)
-    assert bytes(pieces[0]) == runner.observations[: 1 << 19], "they are sent after the end, too"
+    assert b"".join(pieces) == observation
+    steps.forget(served.slabs)
+    assert bytes(pieces[0]) == observation[: 1 << 19], "they are sent after the end, too"
 
 
 @pytest.mark.parametrize("size", [0, HALF - 1, HALF + 64 + words.INFO_BYTES + 1])
-def test_what_is_no_half_of_a_request_slab_is_none(slabs: ServedSlabs, size: int) -> None:
+def test_what_is_no_half_of_a_request_slab_is_none(size: int) -> None:
+    slabs = make()
     assert not slabs.fits(bytes(size))
     assert slabs.fits(bytes(HALF))
     assert slabs.fits(bytes(HALF + 64 + words.INFO_BYTES))
 
 
-def test_nothing_is_owed_by_what_is_forgotten(
-    slabs: ServedSlabs, steps: ServedSteps, runner: Runner
-) -> None:
-    taken = ask(slabs, steps)
-    steps.forget(slabs)
-    runner.answer()
-    assert steps.look() is None
+def test_nothing_is_owed_by_what_is_forgotten(served: Served) -> None:
+    taken = served.ask()
+    served.steps.forget(served.slabs)
+    served.runner.answer()
+    assert served.steps.look() is None
     assert taken == []
-    assert not select.select([steps.fileno()], [], [], 0)[0]
+    assert not select.select([served.steps.fileno()], [], [], 0)[0]
 
 
 def test_an_answer_may_be_the_end_of_others(steps: ServedSteps) -> None:
     """As where what one runner said ends its jail: the answers of the others are not taken."""
-    made = [ServedSlabs(LEAVES, words.HEADER_BYTES + 64 + words.INFO_BYTES, 8) for _ in range(2)]
+    made = [make(8) for _ in range(2)]
     ended: list[ServedSlabs] = []
 
     def end() -> None:
@@ -251,7 +246,7 @@ def test_a_server_without_descriptors_loses_none(monkeypatch: pytest.MonkeyPatch
 
     monkeypatch.setattr(os, "dup", scarce)
     with pytest.raises(OSError, match="Too many"):
-        ServedSlabs(LEAVES, words.HEADER_BYTES + 64 + words.INFO_BYTES, 8)
+        make()
     assert len(made) == 3
     for fd in made:
         with pytest.raises(OSError, match="Bad file descriptor"):
