@@ -63,64 +63,36 @@ Item = Label | Do | Branch
 
 def assemble(items: Sequence[Item]) -> list[BpfInstruction]:
     """Resolve the labels. A jump over more than 255 instructions becomes a pair.
-    Raises ``KeyError``: a label is missing; ``ValueError``: a label lies behind its branch, or the
-    program is too long.
+    Raises ``KeyError``: a label is missing, or lies behind its branch; ``ValueError``: the program
+    is too long.
     """
-    branches = {index: item for index, item in enumerate(items) if isinstance(item, Branch)}
-    far: set[int] = set()  # branches that are written long; which moves what follows them
-    while True:
-        places, labels = _lay_out(items, far)
-        skips = {
-            i: [labels[to] - places[i] - 1 for to in one.targets] for i, one in branches.items()
-        }
-        more = {index for index, skip in skips.items() if max(skip, default=0) > 255} - far
-        if not more:
-            break
-        far |= more
-    for index, branch in branches.items():
-        for target, skip in zip(branch.targets, skips[index], strict=True):
-            if skip < 0:
-                raise ValueError(f"label {target!r} lies behind its branch")
-    program: list[BpfInstruction] = []
-    for index, item in enumerate(items):
-        program += _encode(item, places[index], labels, far=index in far)
+    program: list[BpfInstruction] = []  # backwards: so it is known how far each branch leads
+    labels: dict[str, int] = {}  # how many instructions follow
+    for item in reversed(items):
+        if isinstance(item, Label):
+            labels[item.name] = len(program)
+        elif isinstance(item, Do):
+            program.append(BpfInstruction(item.code, 0, 0, item.k))
+        else:
+            program += reversed(_branch(item, len(program), labels))
     if len(program) > _MAX_INSTRUCTIONS:
         raise ValueError(f"{len(program)} instructions are over {_MAX_INSTRUCTIONS}")
-    return program
+    return program[::-1]
 
 
-def _lay_out(items: Sequence[Item], far: set[int]) -> tuple[list[int], dict[str, int]]:
-    """Where each item starts, and where each label is."""
-    places: list[int] = []
-    labels: dict[str, int] = {}
-    position = 0
-    for index, item in enumerate(items):
-        places.append(position)
-        if isinstance(item, Label):
-            labels[item.name] = position
-        else:
-            position += 1
-        if isinstance(item, Branch) and index in far:
-            position += len(item.targets)
-    return places, labels
-
-
-def _encode(item: Item, place: int, labels: dict[str, int], *, far: bool) -> list[BpfInstruction]:
-    if isinstance(item, Label):
-        return []
-    if isinstance(item, Do):
-        return [BpfInstruction(item.code, 0, 0, item.k)]
-    if not far:
-        ends = (item.if_true, item.if_false)
-        if_true, if_false = (0 if end is None else labels[end] - place - 1 for end in ends)
+def _branch(item: Branch, following: int, labels: dict[str, int]) -> list[BpfInstruction]:
+    """``following``: the number of instructions behind it."""
+    skips = {end: following - labels[end] for end in item.targets}
+    if max(skips.values(), default=0) <= 255:
+        if_true, if_false = (skips.get(end or "", 0) for end in (item.if_true, item.if_false))
         return [BpfInstruction(item.code, if_true, if_false, item.k)]
     # the comparison skips to one of up to two unconditional jumps, or over them
-    targets = item.targets
-    skip_true = len(targets) if item.if_true is None else 0
-    skip_false = len(targets) if item.if_false is None else len(targets) - 1
+    ends = item.targets
+    skip_true = len(ends) if item.if_true is None else 0
+    skip_false = len(ends) if item.if_false is None else len(ends) - 1
     jumps = [
-        BpfInstruction(_JUMP, 0, 0, labels[target] - place - 2 - slot)
-        for slot, target in enumerate(targets)
+        BpfInstruction(_JUMP, 0, 0, skips[end] + len(ends) - 1 - slot)
+        for slot, end in enumerate(ends)
     ]
     return [BpfInstruction(item.code, skip_true, skip_false, item.k), *jumps]
 

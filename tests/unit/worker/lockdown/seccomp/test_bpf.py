@@ -68,7 +68,7 @@ def test_far_branch_becomes_a_pair_of_jumps(both: bool) -> None:
 @pytest.mark.parametrize(
     ("items", "error", "text"),
     [
-        ([Label("back"), Do(LOAD, 0), Branch(JUMP_EQUAL, 1, "back", None)], ValueError, "behind"),
+        ([Label("back"), Do(LOAD, 0), Branch(JUMP_EQUAL, 1, "back", None)], KeyError, "back"),
         ([Branch(JUMP_EQUAL, 1, "nowhere", None), Do(RETURN, 0)], KeyError, "nowhere"),
         ([Do(LOAD, 0)] * 4097, ValueError, "4097"),
     ],
