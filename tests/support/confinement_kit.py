@@ -179,9 +179,7 @@ def cell_in(folder: Path, confinement: Confinement, **options: Any) -> Iterator[
 
 def new_cell(spawner: Spawner, snapshot: str, confinement: Confinement) -> Cell:
     """A further jail of ``spawner``, without runners."""
-    spec = JailSpec(
-        snapshot=snapshot, entry="env.py", confinement=with_kit(confinement), name="test"
-    )
+    spec = JailSpec(snapshot=snapshot, entry="env.py", confinement=with_kit(confinement))
     return Cell(spawner, spawner.spawn(spec))
 
 

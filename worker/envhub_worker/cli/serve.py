@@ -92,7 +92,7 @@ def _ahead(arguments: argparse.Namespace) -> ZygoteProcess | None:
         return None
     runtime = Runtime(arguments.python, arguments.packages)
     try:
-        return ZygoteProcess.ahead(arguments.runtime_dir, runtime)
+        return ZygoteProcess(runtime, arguments.runtime_dir, ahead=True)
     except OSError:  # opening a jail in that interpreter says why
         return None
 

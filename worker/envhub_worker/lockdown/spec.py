@@ -34,7 +34,6 @@ class JailSpec:
     snapshot: str
     entry: str
     confinement: Confinement
-    name: str
     hub_copies: tuple[HubCopy, ...] = ()
 
     def to_wire(self) -> dict[str, Any]:

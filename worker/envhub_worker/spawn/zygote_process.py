@@ -63,11 +63,6 @@ class ZygoteProcess:
             )
         self.pid = self._process.pid
 
-    @classmethod
-    def ahead(cls, runtime_dir: Path, runtime: Runtime = OWN) -> ZygoteProcess:
-        """One that imports at once, as far as it may."""
-        return cls(runtime, runtime_dir, ahead=True)
-
     def wait(self) -> int:
         """Its exit code; it is killed if it does not end by itself soon."""
         try:

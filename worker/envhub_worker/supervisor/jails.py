@@ -100,7 +100,6 @@ class Jails:
             snapshot=request.snapshot,
             entry=request.entry,
             confinement=confinement,
-            name=request.name,
             hub_copies=copies,
         )
         zygote, jail = self._zygotes.fork(request.runtime, spec)

@@ -136,8 +136,7 @@ class ServedSlabs:
     def close(self) -> None:
         """Give everything back. Idempotent."""
         deposit, self.deposit = self.deposit, []
-        for fd in deposit:
-            os.close(fd)
+        close_fds(deposit)
         self._runner_bell.close()
         self.bell.close()
         self._observed.release()

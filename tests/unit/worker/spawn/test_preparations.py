@@ -25,8 +25,9 @@ COMMIT = "ab" * 20
 
 def spec_of(snapshot: Path, *copies: HubCopy, **environment: str) -> JailSpec:
     confinement = Confinement(environment=environment)
-    given = {"entry": "env.py", "confinement": confinement, "name": "x"}
-    return JailSpec(snapshot=str(snapshot), hub_copies=copies, **given)
+    return JailSpec(
+        snapshot=str(snapshot), entry="env.py", confinement=confinement, hub_copies=copies
+    )
 
 
 def test_the_snapshot_is_a_link_to_the_files(

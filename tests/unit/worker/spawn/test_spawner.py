@@ -16,7 +16,7 @@ import pytest
 from envhub_worker import bootstrap
 from envhub_worker.lockdown.mechanisms import procfs
 from envhub_worker.protocol.confinement import LACKS_PACKAGES, Confinement
-from envhub_worker.protocol.runtime import Runtime
+from envhub_worker.protocol.runtime import OWN, Runtime
 from envhub_worker.spawn.spawner import Spawner, ZygoteDied
 from envhub_worker.spawn.zygote_process import ZygoteProcess
 from tests.support import inside
@@ -194,7 +194,7 @@ def test_close_leaves_no_process_and_no_file(folder: Path, confinement: Confinem
 
 def test_a_process_that_started_ahead_is_used(folder: Path) -> None:
     """It becomes the zygote, and what it has imported serves a jail that is as confined."""
-    ahead = ZygoteProcess.ahead(folder)
+    ahead = ZygoteProcess(OWN, folder, ahead=True)
     with spawner_in(folder, STRICT, ahead=ahead) as spawner:
         cell = new_cell(spawner, make_snapshot(folder), STRICT)
         cell.start()
@@ -208,7 +208,7 @@ def test_a_process_that_started_ahead_is_used(folder: Path) -> None:
 
 
 def test_a_process_of_another_interpreter_is_not(folder: Path) -> None:
-    ahead = ZygoteProcess.ahead(folder)
+    ahead = ZygoteProcess(OWN, folder, ahead=True)
     other = folder / "python"
     other.symlink_to(sys.executable)
     spawner = Spawner(

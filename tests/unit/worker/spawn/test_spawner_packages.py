@@ -116,7 +116,7 @@ def test_shared_packages_cannot_be_written(cell: Cell) -> None:
 
 def test_the_zygote_imports_no_package(folder: Path, runtime: Runtime) -> None:
     """What was started ahead for these packages is used, and has none of the server's either."""
-    ahead = ZygoteProcess.ahead(folder, runtime)
+    ahead = ZygoteProcess(runtime, folder, ahead=True)
     with spawner_in(folder, STRICT, runtime=runtime, ahead=ahead) as spawner:
         cell = new_cell(spawner, make_snapshot(folder), STRICT)
         cell.start()
