@@ -37,7 +37,7 @@ from envhub_worker.lockdown.layers import LayerUnavailableError
 from envhub_worker.lockdown.limits.watchdog import Watchdog
 from envhub_worker.lockdown.mechanisms import process, procfs, reap
 from envhub_worker.lockdown.plan import HostFacts, plan
-from envhub_worker.lockdown.seccomp import notify, paths
+from envhub_worker.lockdown.seccomp import evidence, notify
 from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.lockdown.stages import jail
 from envhub_worker.lockdown.stages.runner import runner_paths
@@ -218,14 +218,14 @@ class Init:
         if runner is not None and runner.status is not None:
             return
         call = request.call
-        if call not in paths.NAMED or call not in self._common.watched:
+        if call not in evidence.NAMED or call not in self._common.watched:
             detail = notify.detail(request)
             if detail or not notify.is_own_affair(call, self._common.watched):
                 self._report_denied(call, detail)
             return
         mine = runner_paths(self._jail, request.caller, request.thread)
         waits = request.still_waits
-        for deed, path in paths.asked(call, request.words, request.thread, mine, waits):
+        for deed, path in evidence.asked(call, request.words, request.thread, mine, waits):
             known = sum(text.startswith("/") for _, text in self._denials)
             if known < notify.MOST_FILES:
                 self._report_denied(deed, path)

@@ -11,8 +11,7 @@ from __future__ import annotations
 import errno
 from collections.abc import Iterable, Mapping
 
-from envhub_worker.lockdown.seccomp.paths import NAMED
-from envhub_worker.lockdown.seccomp.targets import NAMING, PRETENDED
+from envhub_worker.lockdown.seccomp.evidence import NAMED, NAMING, PRETENDED
 from envhub_worker.protocol.records import dataclass
 
 _ERRNO = 0x00050000

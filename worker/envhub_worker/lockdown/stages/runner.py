@@ -18,7 +18,7 @@ from envhub_worker.lockdown.layers import LayerUnavailableError
 from envhub_worker.lockdown.mechanisms import kernel, landlock, process
 from envhub_worker.lockdown.mechanisms.landlock import LandlockRule
 from envhub_worker.lockdown.seccomp import filter
-from envhub_worker.lockdown.seccomp.paths import OwnPaths
+from envhub_worker.lockdown.seccomp.evidence import OwnPaths
 from envhub_worker.protocol.confinement import Limits
 
 # What the C library and numerical libraries read; nothing here is about a person.
