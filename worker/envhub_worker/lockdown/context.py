@@ -7,6 +7,7 @@ from typing import Any
 
 from envhub_worker.lockdown.mechanisms.mounts import View
 from envhub_worker.lockdown.mechanisms.scratch import Scratch
+from envhub_worker.lockdown.root_plan import RootPlan
 from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.protocol.records import dataclass
 
@@ -55,8 +56,7 @@ class Common:
 
     Attributes:
         pid: The zygote's pid as an init sees it as its parent.
-        trees: Read-only trees of the private root.
-        roots: The snapshot folders, symbolic links resolved.
+        root: What a jail sees of the host's files, symbolic links resolved.
         covered: (files, folders) of /proc to hide.
         landlock_abi: 0 where there is none.
         brokered: Whether init sends the jails' signals.
@@ -68,9 +68,7 @@ class Common:
     config: ZygoteConfig
     pid: int
     namespaced: bool
-    trees: tuple[str, ...]
-    roots: tuple[str, ...]
-    devices: tuple[str, ...]
+    root: RootPlan
     covered: tuple[list[str], list[str]]
     landlock_abi: int
     brokered: bool

@@ -53,6 +53,7 @@ MAX_LOST = 4096
 class Jails:
     """All jails of a server.
     ``fd_path``: the socket that takes descriptors; ``ahead``: a process for the first zygote.
+    ``deaths``: how many have ended unasked since the start, by reason.
     """
 
     def __init__(
@@ -74,6 +75,7 @@ class Jails:
         self._fds = FdStore(str(fd_path), self._pidfd_for)
         loop.watch(self._fds.fileno(), self._fds.accept)
         self._events = JailEvents(loop, reply, self._jails, self._fds, witness)
+        self.deaths: Mapping[str, int] = self._events.deaths
         self._zygotes = Zygotes(loop, runtime_dir, readable_roots, self._jails, self._events, ahead)
 
     def close(self) -> None:
@@ -290,11 +292,6 @@ class Jails:
     def statuses(self, owner: bytes) -> list[dict[str, object]]:
         """What the jails of a session are doing."""
         return [status_of(entry) for entry in self.open_ones(owner)]
-
-    @property
-    def deaths(self) -> Mapping[str, int]:
-        """How many have ended unasked since the start, by reason."""
-        return self._events.deaths
 
     def end(self, entry: JailRecord, why: str) -> None:
         """End a jail that no client closes; its client reads why if it comes back."""

@@ -56,8 +56,8 @@ def _mount(spec: JailSpec, common: Common) -> View:
     view = mounts.mount_jail(
         spec.snapshot,
         common.config.packages,
-        common.roots,
-        common.trees,
+        common.root.roots,
+        common.root.trees,
         size=limits.disk_bytes,
         inodes=limits.disk_files,
     )
@@ -109,7 +109,7 @@ def working_view(view: View) -> Layer:
 
 
 def _check_snapshot(spec: JailSpec, common: Common) -> None:
-    if not any(within(spec.snapshot, path) for path in (*common.roots, *common.trees)):
+    if not any(within(spec.snapshot, path) for path in (*common.root.roots, *common.root.trees)):
         raise LayerUnavailableError(
             "mount-namespace",
             f"the snapshot {spec.snapshot} is in none of the readable roots",

@@ -103,7 +103,7 @@ def rules(jail: JailContext, pid: int) -> list[LandlockRule]:
     ``pid``: the runner's own: without a pid namespace it may read only its own ``/proc`` folder.
     """
     common = jail.common
-    readable = [*common.trees, jail.spec.snapshot]
+    readable = [*common.root.trees, jail.spec.snapshot]
     own = f"/proc/{pid}"
     own_files = [f"{own}/{name}" for name in _OWN_FILES.split()]
     readable += ["/proc", "/etc", "/dev"] if common.namespaced else [*_HOST_FILES, *own_files]
@@ -115,7 +115,7 @@ def rules(jail: JailContext, pid: int) -> list[LandlockRule]:
         *(LandlockRule(path, landlock.READ) for path in readable),
         *([] if common.namespaced else [LandlockRule(own, landlock.READ_DIR)]),
         *(LandlockRule(path, landlock.WRITE) for path in writable),
-        *(LandlockRule(path, landlock.DEVICE) for path in common.devices),
+        *(LandlockRule(path, landlock.DEVICE) for path in common.root.devices),
         *(
             []
             if common.config.gpu is False
@@ -135,8 +135,8 @@ def runner_paths(jail: JailContext, pid: int, thread: int) -> OwnPaths:
     streams = ("/dev/fd", "/dev/stdin", "/dev/stdout", "/dev/stderr")
     itself = ("/proc/self", "/proc/thread-self", f"/proc/{pid}", f"/proc/{thread}")
     scratch = tuple(_writable(jail))
-    changed = (*scratch, *jail.common.devices, *streams, *itself)
-    read = (*jail.common.trees, jail.spec.snapshot, *changed)
+    changed = (*scratch, *jail.common.root.devices, *streams, *itself)
+    read = (*jail.common.root.trees, jail.spec.snapshot, *changed)
     return OwnPaths(changed=changed, read=read, scratch=scratch)
 
 
