@@ -132,11 +132,11 @@ def proc_to_cover() -> tuple[list[str], list[str]]:
     files: list[str] = []
     folders: list[str] = []
     for name in sorted(os.listdir("/proc")):
-        path = f"/proc/{name}"
-        mode = os.lstat(path).st_mode
-        if name.isdigit() or name in _PROC_KEPT or not mode & 0o004:
-            continue
-        (folders if stat.S_ISDIR(mode) else files).append(path)
+        if not name.isdigit() and name not in _PROC_KEPT:  # processes come and go
+            path = f"/proc/{name}"
+            mode = os.lstat(path).st_mode
+            if mode & 0o004:
+                (folders if stat.S_ISDIR(mode) else files).append(path)
     return files, folders
 
 
