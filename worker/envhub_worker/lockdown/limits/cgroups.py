@@ -36,8 +36,10 @@ def find(mounts: str, own: str, *, root: bool) -> Hierarchy | None:
     """Where to make groups, by what ``/proc/self/mountinfo`` and ``/proc/self/cgroup`` say. Pure.
     ``root``: whether we are root: then a v2 group may stand at the top, whatever our own is.
     """
-    paths = dict(_own_paths(own))
-    points = dict(_mount_points(mounts))
+    entries = [line.split(":", 2) for line in own.splitlines()]
+    # by controller; the v2 hierarchy is the controller ''
+    paths = {name: path for _, names, path in entries for name in names.split(",")}
+    points = _mount_points(mounts)
     if root and "memory" in points and "pids" in points:
         folders = [points[name] + paths.get(name, "/") for name in ("memory", "pids")]
         return Hierarchy("cgroup-v1", tuple(folder.rstrip("/") for folder in folders))
@@ -47,22 +49,14 @@ def find(mounts: str, own: str, *, root: bool) -> Hierarchy | None:
     return None
 
 
-def _own_paths(own: str) -> list[tuple[str, str]]:
-    """(controller, path); the v2 hierarchy is the controller ''."""
-    entries = [line.split(":", 2) for line in own.splitlines()]
-    return [(name, path) for _, names, path in entries for name in names.split(",")]
-
-
-def _mount_points(mounts: str) -> list[tuple[str, str]]:
-    points = []
+def _mount_points(mounts: str) -> dict[str, str]:
+    points: dict[str, str] = {}
     for line in mounts.splitlines():
         left, _, right = line.partition(" - ")
         kind, _, options = right.split(" ", 2)
-        place = left.split()[4]
-        if kind == "cgroup":
-            points += [(name, place) for name in options.rpartition(" ")[2].split(",")]
-        elif kind == "cgroup2":
-            points.append(("", place))
+        controllers = options.rpartition(" ")[2].split(",") if kind == "cgroup" else [""]
+        if kind in ("cgroup", "cgroup2"):
+            points |= dict.fromkeys(controllers, left.split()[4])
     return points
 
 
