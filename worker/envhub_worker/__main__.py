@@ -20,11 +20,9 @@
 - environment: nothing is read from it but what Python itself needs.
 - exit code: 0 after a stop, 2 for wrong arguments.
 
-``envhub-worker listen [--bind tcp://127.0.0.1:5555] [--key FILE] [--authorized-clients FILE]
-[--insecure-loopback] [--state-dir D] [quotas]`` serves clients on other hosts. It keeps keys and
-snapshots in ``D``, by default below ``$XDG_STATE_HOME``. ``envhub-worker keygen [--out DIR]``
-makes a key pair, ``envhub-worker status`` says who uses a listening server, ``envhub-worker drain``
-ends it gently.
+``envhub-worker listen`` serves clients on other hosts. It keeps keys and snapshots in
+``--state-dir D``, by default below ``$XDG_STATE_HOME``. Its options, and the commands about such a
+server, are in the help.
 
 A program that starts such a server for one client of its own adds ``--only-client KEY``, the public
 key of that client: the server's own pair is made for this one life and is on no disk, there is no
@@ -32,9 +30,6 @@ note for the other commands. Such a server ends with that program by ``--client-
 what lies in ``D`` is shared with other such servers, or by ``--until-eof``. It says its public key
 once the endpoint is bound: after the endpoint, in the one line that ``--ready-fd N`` gets, or in
 that of ``--announce``.
-
-``envhub-worker health [--port 5555] [--state-dir D]`` exits with 0 if a server of this container
-answers, else 1.
 """
 
 from __future__ import annotations
