@@ -10,7 +10,6 @@ from envhub_worker.lockdown.layers import Layer, LayerUnavailableError, no_syste
 from envhub_worker.lockdown.mechanisms.landlock import scopes
 from envhub_worker.lockdown.seccomp.syscalls import NUMBERS
 from envhub_worker.protocol.confinement import LEAST_LANDLOCK, MIB, NETWORKS, PROFILES, Confinement
-from envhub_worker.protocol.records import dataclass
 
 #: What the kernel counts per user and does not bound per jail.
 SHARED_QUOTAS = "pages of pipes, descriptors in flight in sockets, epoll watches"
@@ -21,49 +20,40 @@ def needs_broker(*, namespaced: bool, landlock_abi: int) -> bool:
     return not namespaced and not scopes(landlock_abi)
 
 
-@dataclass(frozen=True, kw_only=True)
-class HostFacts:
-    """What decides, of this host.
+def plan(
+    confinement: Confinement, *, machine: str, root: bool, landlock_abi: int, memory: str
+) -> tuple[Layer, ...]:
+    """The layers for ``confinement`` on a host like this, in their order.
+    Raises ``LayerUnavailableError``: the profile names a layer that the host lacks.
 
-    Attributes:
+    Args:
         landlock_abi: 0 where there is none.
         memory: What caps memory: ``"cgroup-v2"``, ``"cgroup-v1"`` or ``"watchdog"``.
     """
-
-    machine: str
-    root: bool
-    landlock_abi: int
-    memory: str
-
-
-def plan(confinement: Confinement, facts: HostFacts) -> tuple[Layer, ...]:
-    """The layers for ``confinement`` on a host like ``facts``, in their order.
-    Raises ``LayerUnavailableError``: the profile names a layer that the host lacks.
-    """
-    _check(confinement, facts)
+    _check(confinement, machine, landlock_abi)
     limits, namespaced = confinement.limits, confinement.profile == "strict"
     user = Layer("unprivileged-user", True, "a user id without files and processes")
     own = Layer("user-namespace", True, "one user, without capabilities outside")
-    brokered = needs_broker(namespaced=namespaced, landlock_abi=facts.landlock_abi)
+    brokered = needs_broker(namespaced=namespaced, landlock_abi=landlock_abi)
     signals = Layer("signals", True, "sent by the jail's init, to processes of the jail only")
     ignored = "" if namespaced else "; changes of mode, owner and time are accepted and ignored"
     cpu = "" if limits.cpu_time_s is None else f", {limits.cpu_time_s} CPU seconds"
     rlimits = f"{limits.processes} processes, {limits.open_files} open files{cpu}, no core dumps"
     return (
-        *[user] * facts.root,
+        *[user] * root,
         *[own] * namespaced,
         *(_namespace_layers(confinement) if namespaced else _without_namespaces(confinement)),
         Layer("capabilities", True, "none in any set"),
         Layer("no-new-privileges", True, "no rights from set-user-id programs"),
-        _landlock_layer(facts.landlock_abi),
+        _landlock_layer(landlock_abi),
         *[signals] * brokered,
-        Layer("seccomp", True, f"allow-list for {facts.machine}{ignored}"),
+        Layer("seccomp", True, f"allow-list for {machine}{ignored}"),
         Layer("rlimits", True, rlimits),
-        *_limit_layers(confinement, facts, namespaced),
+        *_limit_layers(confinement, root, memory, namespaced),
     )
 
 
-def _check(confinement: Confinement, facts: HostFacts) -> None:
+def _check(confinement: Confinement, machine: str, landlock_abi: int) -> None:
     """Refuse what there cannot be."""
     for name, value, known in (
         ("profile", confinement.profile, PROFILES),
@@ -73,11 +63,11 @@ def _check(confinement: Confinement, facts: HostFacts) -> None:
             raise LayerUnavailableError(
                 name, f"there is no {name} {value!r}", f"Choose one of {', '.join(known)}."
             )
-    if facts.machine not in NUMBERS:
-        raise no_system_calls(facts.machine)
+    if machine not in NUMBERS:
+        raise no_system_calls(machine)
     least = LEAST_LANDLOCK[confinement.profile]
-    if facts.landlock_abi < least:
-        have = f"ABI {facts.landlock_abi}" if facts.landlock_abi else "none"
+    if landlock_abi < least:
+        have = f"ABI {landlock_abi}" if landlock_abi else "none"
         raise LayerUnavailableError(
             "landlock",
             f"the profile {confinement.profile} needs Landlock ABI {least}, this kernel has {have}",
@@ -135,12 +125,12 @@ def _landlock_layer(abi: int) -> Layer:
     return Layer("landlock", True, f"ABI {abi}: files{scope}")
 
 
-def _uncounted(confinement: Confinement, facts: HostFacts, namespaced: bool) -> str:
+def _uncounted(confinement: Confinement, memory: str, namespaced: bool) -> str:
     """What of a jail's memory nothing counts here, named for the report."""
     names = ["file locks"]
     if confinement.gpu is not False:
         names.append("memory of the GPU's driver")
-    if facts.memory == "watchdog":
+    if memory == "watchdog":
         names.append("epoll watches")
         if confinement.gpu is not False:  # drivers need them, so that the filter permits them
             names.append("memfds and shared memory that are mapped nowhere, or in part")
@@ -151,8 +141,10 @@ def _uncounted(confinement: Confinement, facts: HostFacts, namespaced: bool) -> 
     return ", ".join(names)
 
 
-def _limit_layers(confinement: Confinement, facts: HostFacts, namespaced: bool) -> list[Layer]:
-    uncounted = f"; not counted: {_uncounted(confinement, facts, namespaced)}"
+def _limit_layers(
+    confinement: Confinement, root: bool, memory: str, namespaced: bool
+) -> list[Layer]:
+    uncounted = f"; not counted: {_uncounted(confinement, memory, namespaced)}"
     amount = f"{confinement.limits.memory_bytes // MIB} MiB"
     detail = {
         "cgroup-v2": f"{amount}, counted by the kernel (cgroup v2)",
@@ -161,9 +153,9 @@ def _limit_layers(confinement: Confinement, facts: HostFacts, namespaced: bool) 
     }
     # what the kernel counts per user, and a jail therefore takes from others' share
     quotas = Layer("user-quotas", False, f"shared with this user's programs: {SHARED_QUOTAS}")
-    if facts.root:
+    if root:
         quotas = Layer("user-quotas", True, "its own: no other program runs as this user")
-    layers = [Layer("memory", True, detail[facts.memory] + uncounted), quotas]
+    layers = [Layer("memory", True, detail[memory] + uncounted), quotas]
     if not namespaced:
         disk = f"{confinement.limits.disk_bytes // MIB} MiB, measured by the jail's init"
         layers.append(Layer("scratch", True, disk))

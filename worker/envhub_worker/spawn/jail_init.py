@@ -36,7 +36,7 @@ from envhub_worker.lockdown.context import Common, JailContext
 from envhub_worker.lockdown.layers import LayerUnavailableError
 from envhub_worker.lockdown.limits.watchdog import Watchdog
 from envhub_worker.lockdown.mechanisms import process, procfs, reap
-from envhub_worker.lockdown.plan import HostFacts, plan
+from envhub_worker.lockdown.plan import plan
 from envhub_worker.lockdown.seccomp import evidence, notify
 from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.lockdown.stages import jail
@@ -115,13 +115,13 @@ class Init:
     def _set_up(self, message: dict[str, Any], fds: list[int]) -> None:
         spec = JailSpec.from_wire(message["spec"])
         events, *joins = fds or [-1]
-        facts = HostFacts(
+        layers = plan(
+            spec.confinement,
             machine=os.uname().machine,
             root=self._common.config.user is not None,
             landlock_abi=self._common.landlock_abi,
             memory=message["cgroup"] or "watchdog",
         )
-        layers = plan(spec.confinement, facts)
         scratch, view = jail.enter(spec, self._common, message["scratch"])
         self._jail = JailContext(
             init=os.getpid(),

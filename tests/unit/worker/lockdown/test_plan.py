@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import resource
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -11,16 +12,16 @@ from envhub_worker.lockdown.layers import LayerUnavailableError
 from envhub_worker.lockdown.mechanisms import landlock
 from envhub_worker.lockdown.mechanisms.landlock import Ruleset
 from envhub_worker.lockdown.mechanisms.namespaces import user_namespace_unavailable
-from envhub_worker.lockdown.plan import HostFacts, plan
+from envhub_worker.lockdown.plan import plan
 from envhub_worker.lockdown.stages.runner import resource_limits
 from envhub_worker.protocol.confinement import GIB, MIB, Confinement, Limits
 
-USER = HostFacts(machine="x86_64", root=False, landlock_abi=7, memory="watchdog")
+USER = {"machine": "x86_64", "root": False, "landlock_abi": 7, "memory": "watchdog"}
 STRICT = Confinement(limits=Limits(memory_bytes=GIB, disk_bytes=64 * MIB, disk_files=10))
 
 
-def layers(confinement: Confinement, facts: HostFacts) -> list[tuple[str, bool, str]]:
-    made = plan(confinement, facts)
+def layers(confinement: Confinement, facts: dict[str, Any]) -> list[tuple[str, bool, str]]:
+    made = plan(confinement, **facts)
     return [(layer.layer, layer.enforced, layer.detail) for layer in made]
 
 
@@ -56,7 +57,7 @@ def test_strict_as_a_user_has_every_layer() -> None:
 
 def test_root_becomes_somebody_else_first() -> None:
     """The first layer as root; memory by control group where there is one."""
-    made = layers(STRICT, replace(USER, root=True, memory="cgroup-v1"))
+    made = layers(STRICT, {**USER, "root": True, "memory": "cgroup-v1"})
     assert made[0] == ("unprivileged-user", True, "a user id without files and processes")
     assert made[-2:] == [
         ("memory", True, "1024 MiB, counted by the kernel (cgroup v1); not counted: file locks"),
@@ -88,7 +89,7 @@ def test_weaker_profile_lists_what_it_goes_without() -> None:
 @pytest.mark.parametrize("gpu", [True, (0,)])
 def test_what_a_gpu_keeps_from_being_counted_is_told(gpu: bool | tuple[int, ...]) -> None:
     for memory, more in (("cgroup-v2", ""), ("watchdog", ", epoll watches, memfds and shared")):
-        made = layers(replace(STRICT, gpu=gpu), replace(USER, memory=memory))
+        made = layers(replace(STRICT, gpu=gpu), {**USER, "memory": memory})
         [detail] = [detail for layer, _, detail in made if layer == "memory"]
         assert f"; not counted: file locks, memory of the GPU's driver{more}" in detail
 
@@ -105,20 +106,20 @@ def test_network_is_reported_as_chosen() -> None:
 @pytest.mark.parametrize(
     ("confinement", "facts", "layer"),
     [
-        (STRICT, replace(USER, landlock_abi=0), "landlock"),
-        (replace(STRICT, profile="no-userns"), replace(USER, landlock_abi=2), "landlock"),
+        (STRICT, {**USER, "landlock_abi": 0}, "landlock"),
+        (replace(STRICT, profile="no-userns"), {**USER, "landlock_abi": 2}, "landlock"),
         (replace(STRICT, profile="no-userns", network="loopback"), USER, "network-namespace"),
         (replace(STRICT, profile="container", network="loopback"), USER, "network-namespace"),
-        (STRICT, replace(USER, machine="riscv64"), "seccomp"),
+        (STRICT, {**USER, "machine": "riscv64"}, "seccomp"),
         (replace(STRICT, profile="lax"), USER, "profile"),
         (replace(STRICT, network="lan"), USER, "network"),
     ],
 )
 def test_missing_layer_is_an_error_with_a_fix(
-    confinement: Confinement, facts: HostFacts, layer: str
+    confinement: Confinement, facts: dict[str, Any], layer: str
 ) -> None:
     with pytest.raises(LayerUnavailableError) as raised:
-        plan(confinement, facts)
+        plan(confinement, **facts)
     assert raised.value.layer == layer
     assert raised.value.reason
     assert raised.value.fix
@@ -127,15 +128,15 @@ def test_missing_layer_is_an_error_with_a_fix(
 def test_signals_are_a_layer_where_init_must_send_them() -> None:
     bare = replace(STRICT, profile="no-userns")
     signals = ("signals", True, "sent by the jail's init, to processes of the jail only")
-    assert signals in layers(bare, replace(USER, landlock_abi=4))
-    assert signals not in layers(bare, replace(USER, landlock_abi=6))
-    assert signals not in layers(STRICT, replace(USER, landlock_abi=4))
+    assert signals in layers(bare, {**USER, "landlock_abi": 4})
+    assert signals not in layers(bare, {**USER, "landlock_abi": 6})
+    assert signals not in layers(STRICT, {**USER, "landlock_abi": 4})
 
 
 def test_container_without_landlock_says_so() -> None:
     container = replace(STRICT, profile="container")
     assert ("landlock", False, "this kernel or container has none") in layers(
-        container, replace(USER, landlock_abi=0)
+        container, {**USER, "landlock_abi": 0}
     )
 
 
