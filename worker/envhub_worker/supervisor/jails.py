@@ -1,5 +1,8 @@
 """The jails of a worker server, as its clients ask for them: opened, asked, read and closed.
 
+And their zygotes: one for each runtime, and each part of a policy that it needs; started when a
+jail needs one, ended when they are too many.
+
 Trusted code. What happens to a jail without being asked for is in ``jail_events.py``.
 """
 
@@ -11,14 +14,18 @@ import secrets
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from envhub_worker.lockdown.mechanisms.procfs import Children
 from envhub_worker.lockdown.spec import JailSpec, confinement_from_wire
 from envhub_worker.loop import Loop
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.confinement import Confinement
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, MAX_IN_FLIGHT, WireLimits, limits_for
+from envhub_worker.protocol.runtime import Runtime
 from envhub_worker.protocol.shared_memory import words
 from envhub_worker.spawn.channel import close_fds
+from envhub_worker.spawn.spawner import JailExited, Spawner
 from envhub_worker.spawn.zygote_process import ZygoteProcess
 from envhub_worker.supervisor.fd_store import FdStore
 from envhub_worker.supervisor.jail_events import JailEvents
@@ -40,7 +47,6 @@ from envhub_worker.supervisor.records import (
 from envhub_worker.supervisor.runner_stream import RunnerLink
 from envhub_worker.supervisor.served_slabs import ServedSlabs
 from envhub_worker.supervisor.usage import CountLimit, reached, usage_of
-from envhub_worker.supervisor.zygotes import Zygotes
 
 MAX_RUNNERS = 64
 """Runners of one jail: one per useful core, not one per sub-environment."""
@@ -48,6 +54,11 @@ MAX_JAILS = 256
 """Open jails of one server."""
 MAX_LOST = 4096
 """Runners of a kept jail that may die: their deaths are remembered."""
+MAX_IDLE_ZYGOTES = 2
+"""Without a jail, when another is started. A client mostly has one policy, or two in turns."""
+_OF_POLICY = ("profile", "network", "readable", "gpu", "record_denials")
+
+_Zygote = tuple[Any, ...]  # its name: a runtime, and these parts of a policy
 
 
 class Jails:
@@ -76,13 +87,20 @@ class Jails:
         loop.watch(self._fds.fileno(), self._fds.accept)
         self._events = JailEvents(loop, reply, self._jails, self._fds, witness)
         self.deaths: Mapping[str, int] = self._events.deaths
-        self._zygotes = Zygotes(loop, runtime_dir, readable_roots, self._jails, self._events, ahead)
+        self._loop = loop
+        self._runtime_dir = runtime_dir
+        self._readable_roots = readable_roots
+        self._ahead = ahead
+        self._spawners: dict[_Zygote, Spawner] = {}
 
     def close(self) -> None:
         """End every jail and zygote."""
         for entry in self._jails.values():
             self._events.kill(entry)
-        self._zygotes.close()
+        for spawner in self._spawners.values():
+            spawner.close()
+        if self._ahead is not None:
+            self._ahead.discard()
         self._events.close()
         self._fds.close()
 
@@ -104,7 +122,9 @@ class Jails:
             confinement=confinement,
             hub_copies=copies,
         )
-        zygote, jail = self._zygotes.fork(request.runtime, spec)
+        # a zygote is one environment's: not even what it has not imported is shared with another
+        zygote = (request.runtime, *(getattr(confinement, name) for name in _OF_POLICY))
+        jail = self._spawner(zygote, request.runtime, confinement).spawn(spec)
         entry = JailRecord(
             number=secrets.randbits(62),
             name=request.name,
@@ -274,6 +294,43 @@ class Jails:
         children = self._counting.children() if mine else None
         return m.Status(tuple({**status_of(one), **_held(one, children)} for one in mine))
 
+    # --- zygotes -------------------------------------------------------------------------------
+
+    def _spawner(self, zygote: _Zygote, runtime: Runtime, confinement: Confinement) -> Spawner:
+        spawner = self._spawners.pop(zygote, None)
+        if spawner is None:
+            self._end_idle()
+            ahead, self._ahead = self._ahead, None
+            spawner = Spawner(
+                confinement,
+                runtime_dir=self._runtime_dir,
+                readable_roots=self._readable_roots,
+                runtime=runtime,
+                ahead=ahead,
+            )
+            self._loop.watch(spawner.fileno(), lambda: self._poll(zygote))
+        self._spawners[zygote] = spawner  # the one that was used last is the last
+        return spawner
+
+    def _end_idle(self) -> None:
+        """A client with ever new policies does not fill the machine with warm interpreters."""
+        used = {entry.zygote for entry in self._jails.values() if not entry.released}
+        idle = [zygote for zygote in self._spawners if zygote not in used]
+        for zygote in idle[: max(0, len(idle) - MAX_IDLE_ZYGOTES)]:
+            spawner = self._spawners.pop(zygote)
+            self._loop.unwatch(spawner.fileno())
+            spawner.close()
+
+    def _poll(self, zygote: _Zygote) -> None:
+        for event in self._spawners[zygote].poll():
+            if isinstance(event, JailExited):
+                self._events.jail_gone(event)
+            else:
+                spawner = self._spawners.pop(zygote)
+                self._loop.unwatch(spawner.fileno())
+                self._events.zygote_died(zygote, event)
+                spawner.close()
+
     # --- for the gate --------------------------------------------------------------------------
 
     def open_ones(self, owner: bytes = b"") -> list[JailRecord]:
@@ -287,7 +344,7 @@ class Jails:
     @property
     def packages(self) -> frozenset[str]:
         """Folders of packages that a jail, or a zygote that waits for one, has mounted."""
-        return self._zygotes.packages
+        return frozenset(runtime.packages for runtime, *_ in self._spawners)
 
     def statuses(self, owner: bytes) -> list[dict[str, object]]:
         """What the jails of a session are doing."""
