@@ -18,7 +18,7 @@ from envhub_worker.protocol.confinement import Limits
 
 
 def enter(spec: JailSpec, common: Common, folder: str) -> tuple[Scratch, View]:
-    """Confine this init as far as all of its runners are; the jail's writable folders and its view.
+    """Confine this init as far as all of its runners are. Gives the jail's folders and its view.
     Raises ``LayerUnavailableError``: the host lacks a layer that the profile names.
     ``folder``: a private folder of the host for a jail without a mount namespace.
     """

@@ -110,17 +110,15 @@ def rules(jail: JailContext, pid: int) -> list[LandlockRule]:
     writable = _writable(jail)
     # CUDA names its threads there, and gives up (error 304) where it cannot. Nobody else's
     # processes are in a pid namespace's /proc; without one, children cannot name theirs.
-    threads = "/proc" if common.namespaced else f"{own}/task"
+    threads = (
+        [] if common.config.gpu is False else ["/proc" if common.namespaced else f"{own}/task"]
+    )
     return [
         *(LandlockRule(path, landlock.READ) for path in readable),
         *([] if common.namespaced else [LandlockRule(own, landlock.READ_DIR)]),
         *(LandlockRule(path, landlock.WRITE) for path in writable),
         *(LandlockRule(path, landlock.DEVICE) for path in common.root.devices),
-        *(
-            []
-            if common.config.gpu is False
-            else [LandlockRule(threads, landlock.WRITE_FILE | landlock.TRUNCATE)]
-        ),
+        *(LandlockRule(path, landlock.WRITE_FILE | landlock.TRUNCATE) for path in threads),
     ]
 
 
