@@ -25,9 +25,8 @@ from gymnasium.envs.registration import EnvSpec
 
 from envhub_sandbox.errors import RemoteProtocolError
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec.arrays import INLINE_BYTES
+from envhub_worker.protocol.codec.arrays import INLINE_BYTES, widened_numpy
 from envhub_worker.protocol.codec.inert import RemoteObject, one_line
-from envhub_worker.protocol.codec.numpy_forms import widened_numpy
 from envhub_worker.protocol.codec.wire import GENERATOR, SPACE, SPEC, Buffer
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 from envhub_worker.protocol.manifest.manifest import read_spec_facts

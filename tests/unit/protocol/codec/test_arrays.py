@@ -12,9 +12,8 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from envhub_worker.protocol.codec import arrays
-from envhub_worker.protocol.codec.arrays import ArrayReader, ArrayWriter
+from envhub_worker.protocol.codec.arrays import ArrayReader, ArrayWriter, read_numpy_scalar
 from envhub_worker.protocol.codec.encoder import encode
-from envhub_worker.protocol.codec.numpy_forms import read_numpy_scalar
 from envhub_worker.protocol.errors import (
     LocalProtocolError,
     MessageTooLargeError,

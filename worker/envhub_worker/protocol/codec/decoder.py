@@ -205,7 +205,7 @@ def _is_hashable(key: object) -> bool:
 
 
 def _read_scalar(decoder: Decoder, payload: bytes) -> object:
-    from envhub_worker.protocol.codec.numpy_forms import read_numpy_scalar
+    from envhub_worker.protocol.codec.arrays import read_numpy_scalar
 
     return read_numpy_scalar(payload)
 
@@ -275,9 +275,9 @@ def _build_slice(decoder: Decoder, head: _Head, items: list[Any]) -> object:
 
 
 def _build_of_numpy(decoder: Decoder, head: _Head, items: list[Any]) -> object:
-    from envhub_worker.protocol.codec import numpy_forms
+    from envhub_worker.protocol.codec import arrays
 
-    return numpy_forms.BUILDERS[head.code](head.payload, items, decoder.tensors)
+    return arrays.BUILDERS[head.code](head.payload, items, decoder.tensors)
 
 
 def _build_enum(decoder: Decoder, head: _Head, items: list[Any]) -> object:

@@ -1,15 +1,17 @@
 """Values to one msgpack document and the bytes of its arrays.
 
 It needs no numpy: a worker server passes on frames that hold arrays unread, and starts sooner
-without. ``numpy_forms`` has the forms of arrays, and is loaded with the first value that needs it.
+without. ``arrays`` has the forms of arrays, and is loaded with the first value that needs it.
 """
 
 from __future__ import annotations
 
+import contextlib
 import sys
 from collections.abc import Callable, Sequence
 from enum import Enum
 from functools import cache
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 import msgpack  # type: ignore[import-untyped]
@@ -40,22 +42,18 @@ class Encoder:
 
     def frames(self, value: object) -> list[Buffer]:
         """Returns the header frame and the arrays' frames."""
-        document = self._pack(value)
+        options: dict[str, Any] = {"default": self.default, "strict_types": True}
+        try:
+            document = msgpack.packb(value, **options)
+        except UnicodeEncodeError:
+            # Lone surrogates are not UTF-8. They arrive as the text "\\udc80", visibly.
+            self._writer = None
+            document = msgpack.packb(value, **options, unicode_errors="backslashreplace")
         wire.check_document(document, self.limits)
         prefix = wire.DOCUMENT_BYTES.pack(len(document))
         if self._writer is None:
             return [prefix + document]
         return [b"".join((prefix, document, *self._writer.tail)), *self._writer.frames]
-
-    def _pack(self, value: object) -> bytes:
-        options: dict[str, Any] = {"default": self.default, "strict_types": True}
-        try:
-            packed: bytes = msgpack.packb(value, **options)
-        except UnicodeEncodeError:
-            # Lone surrogates are not UTF-8. They arrive as the text "\\udc80", visibly.
-            self._writer = None
-            packed = msgpack.packb(value, **options, unicode_errors="backslashreplace")
-        return packed
 
     def default(self, value: Any) -> object:
         """Returns what msgpack packs in place of ``value``."""
@@ -124,28 +122,19 @@ def _write_other(encoder: Encoder, value: Any) -> object:
 
 @cache
 def _numpy_writer() -> Callable[[Encoder, Any], object]:
-    from envhub_worker.protocol.codec import numpy_forms
+    from envhub_worker.protocol.codec import arrays
 
-    _WRITERS.update(numpy_forms.WRITERS)
-    return numpy_forms.write_numpy
+    _WRITERS.update(arrays.WRITERS)
+    return arrays.write_numpy
 
 
-def _headed(code: int) -> Callable[[Encoder, Any], object]:
+def _headed(code: int, *names: str) -> Callable[[Encoder, Any], object]:
+    """A head and the attributes of these names; the elements, where none is named."""
     head = _HEADS[code]
-    return lambda encoder, value: [head, *value]
-
-
-def _bounds(code: int) -> Callable[[Encoder, Any], object]:
-    head = _HEADS[code]
-    return lambda encoder, value: [head, value.start, value.stop, value.step]
-
-
-def _write_remote(encoder: Encoder, value: RemoteObject) -> object:
-    return [_HEADS[wire.REMOTE], value.type_name, value.text]
-
-
-def _write_remote_enum(encoder: Encoder, value: RemoteEnum) -> object:
-    return [_HEADS[wire.ENUM], value.type_name, value.text, value.value]
+    if not names:
+        return lambda encoder, value: [head, *value]
+    parts = attrgetter(*names)
+    return lambda encoder, value: [head, *parts(value)]
 
 
 _HEADS = {code: msgpack.ExtType(code, b"") for code in range(wire.TUPLE, wire.GENERATOR + 1)}
@@ -156,11 +145,11 @@ _WRITERS: dict[type, Callable[[Encoder, Any], object]] = {
     set: _headed(wire.SET),
     frozenset: _headed(wire.FROZENSET),
     complex: _write_complex,
-    range: _bounds(wire.RANGE),
-    slice: _bounds(wire.SLICE),
+    range: _headed(wire.RANGE, "start", "stop", "step"),
+    slice: _headed(wire.SLICE, "start", "stop", "step"),
     PickledValue: _write_pickled,
-    RemoteObject: _write_remote,
-    RemoteEnum: _write_remote_enum,
+    RemoteObject: _headed(wire.REMOTE, "type_name", "text"),
+    RemoteEnum: _headed(wire.ENUM, "type_name", "text", "value"),
 }
 _PLAIN: dict[type, Callable[[Any], object]] = {
     str: str.__str__,
@@ -200,43 +189,23 @@ def encode(
         LocalProtocolError: The value is cyclic, too deep, too large, or holds a dtype that
             cannot cross. The text names the path to the offender. Nothing was sent.
     """
-    encoder = Encoder(pickler, limits, describer)
     try:
-        frames = encoder.frames(value)
+        frames = Encoder(pickler, limits, describer).frames(value)
         if reduces:
             wire.check_outgoing_frames(frames, limits)
+    # Objects' own code runs here (__array__, iteration): anything can come out of it.
     except Exception as error:
+        from envhub_worker.protocol.codec.unsendable import explain, reduced
+
+        def send(part: object) -> list[Buffer]:
+            frames = Encoder(pickler, limits, describer).frames(part)
+            if reduces:
+                wire.check_outgoing_frames(frames, limits)
+            return frames
+
         if reduces and type(value) is list:
-            smaller = _reduced_frames(value, limits, describer)
-            if smaller is not None:
-                return smaller
-        # Objects' own code runs here (__array__, iteration): anything can come out of it.
-        from envhub_worker.protocol.codec.unsendable import explain
-
-        def send(leaf: object) -> list[Buffer]:
-            return Encoder(pickler, limits).frames(leaf)
-
+            with contextlib.suppress(Exception):
+                return send(reduced(value, send, limits))
         raise LocalProtocolError(explain(value, error, limits, send, names)) from error
     wire.check_outgoing_frames(frames, limits)
-    return frames
-
-
-def _reduced_frames(
-    message: list[Any], limits: WireLimits, describer: Describer | None
-) -> list[Buffer] | None:
-    """Those of the message without what cannot be sent; None where that does not help."""
-    from envhub_worker.protocol.codec.unsendable import reduced
-
-    def sendable(value: object) -> bool:
-        try:
-            wire.check_outgoing_frames(Encoder(None, limits, describer).frames(value), limits)
-        except Exception:
-            return False
-        return True
-
-    try:
-        frames = Encoder(None, limits, describer).frames(reduced(message, sendable, limits))
-        wire.check_outgoing_frames(frames, limits)
-    except Exception:
-        return None
     return frames

@@ -120,10 +120,6 @@ def _is_unit(dtype: np.dtype[Any]) -> bool:
     return dtype.kind not in "mM" or np.datetime_data(dtype)[1] <= MAX_UNIT_COUNT
 
 
-def _always(judge: _Judge, value: Any, depth: int) -> bool:
-    return True
-
-
 _CHECKS: dict[type, Callable[[_Judge, Any, int], bool]] = {
     int: _Judge.number,
     bytes: _Judge.bytes,
@@ -138,12 +134,14 @@ _CHECKS: dict[type, Callable[[_Judge, Any, int], bool]] = {
     range: _Judge.bounds,
     slice: _Judge.bounds,
     np.ndarray: _Judge.array,
-    RemoteObject: _always,
-    RemoteEnum: _always,
+    RemoteObject: lambda judge, value, depth: True,
+    RemoteEnum: lambda judge, value, depth: True,
     **dict.fromkeys(_SCALARS, _Judge.scalar),
 }
 
 Path = tuple[object, ...]
+Send = Callable[[object], object]
+"""Raises for a value that is no container and cannot be sent by itself."""
 _ATTEMPTS = 2000
 """Values that are pickled to find the one that cannot be."""
 
@@ -152,10 +150,10 @@ def explain(
     value: object,
     error: Exception,
     limits: WireLimits,
-    send: Callable[[object], object],
+    send: Send,
     names: Sequence[str] = (),
 ) -> str:
-    """Says what cannot be sent, and where in the value it is; ``send`` raises for such a leaf."""
+    """Says what cannot be sent, and where in the value it is."""
     found = _Search(limits, send).first(value, (), ())
     if found is None:
         return f"The value cannot be sent: {error}"
@@ -203,7 +201,7 @@ def _members(value: object) -> Iterator[tuple[str, object]]:
 class _Search:
     """Walks a value until it meets the offender, or has met as many values as may be sent."""
 
-    def __init__(self, limits: WireLimits, send: Callable[[object], object]) -> None:
+    def __init__(self, limits: WireLimits, send: Send) -> None:
         self.limits, self._send = limits, send
         self._left = limits.items
 
@@ -211,7 +209,7 @@ class _Search:
         """Returns path and reason of the first value that is cyclic, too deep, or refused."""
         children = _children(value)
         if children is None:
-            reason = self._refusal(value)
+            reason = _refusal(value, self._send)
             return None if reason is None else (path, reason)
         if id(value) in above:
             return path, "it contains itself"
@@ -226,12 +224,13 @@ class _Search:
                 return found
         return None
 
-    def _refusal(self, value: object) -> str | None:
-        try:
-            self._send(value)
-        except Exception as error:
-            return str(error).rstrip(".") or type(error).__name__
-        return None
+
+def _refusal(value: object, send: Send) -> str | None:
+    try:
+        send(value)
+    except Exception as error:
+        return str(error).rstrip(".") or type(error).__name__
+    return None
 
 
 def _children(value: object) -> list[tuple[object, object]] | None:
@@ -267,33 +266,30 @@ _AROUND = 2
 """Containers: the message, and a description, which is one itself."""
 _SPARE = 64
 """Items for what stands around the value in a message."""
-Sendable = Callable[[object], bool]
 
 
-def reduced(message: list[Any], sendable: Sendable, limits: WireLimits) -> list[Any]:
+def reduced(message: list[Any], send: Send, limits: WireLimits) -> list[Any]:
     """The fields of a message with descriptions in the place of what cannot be sent.
 
     A field that is a mapping or a tuple stays one.
-
-    Args:
-        sendable: Whether a value that is no container can be sent by itself.
     """
-    walk = _Walk(sendable, limits)
-    return [walk.members(field, 1) if walk.is_container(field) else field for field in message]
+    walk = _Walk(send, limits)
+    return [walk.members(field, 1) if _is_container(field) else field for field in message]
+
+
+def _is_container(value: Any) -> bool:
+    objects = isinstance(value, np.ndarray) and value.dtype.kind == "O"
+    return objects or isinstance(value, (dict, list, tuple, set, frozenset))
 
 
 class _Walk:
     """Copies a value, in order, until as many items as may be sent are spent."""
 
-    def __init__(self, sendable: Sendable, limits: WireLimits) -> None:
-        self._sendable = sendable
+    def __init__(self, send: Send, limits: WireLimits) -> None:
+        self._send = send
         self._depth = limits.depth - _AROUND
         self._left = limits.items - _SPARE
         self._text_left = limits.header_bytes // 2
-
-    def is_container(self, value: Any) -> bool:
-        objects = isinstance(value, np.ndarray) and value.dtype.kind == "O"
-        return objects or isinstance(value, (dict, list, tuple, set, frozenset))
 
     def value(self, value: Any, depth: int) -> Any:
         """What is sent of it."""
@@ -303,16 +299,21 @@ class _Walk:
             return value
         if kind is str or kind is bytes:
             short = len(value) <= _SHORT and value.isascii()
-            if len(value) > self._text_left or not (short or self._sendable(value)):
+            if len(value) > self._text_left or not (short or self.is_sent(value)):
                 return inert_copy(value)
             self._text_left -= len(value)
             return value
-        if not self.is_container(value):
-            return value if self._sendable(value) else inert_copy(value)
+        if not _is_container(value):
+            return value if self.is_sent(value) else inert_copy(value)
         count = value.size if isinstance(value, np.ndarray) else len(value)
         if depth >= self._depth or count * (1 + isinstance(value, dict)) > self._left:
-            return RemoteObject(type_name(kind), _counted(value, count))
+            large = RemoteObject(type_name(kind), f"<{count} items>")
+            return large if count > _SHORT else inert_copy(value)
         return self.members(value, depth)
+
+    def is_sent(self, value: object) -> bool:
+        """Whether it can be sent as it is."""
+        return _refusal(value, self._send) is None
 
     def members(self, value: Any, depth: int) -> Any:
         """A container of what is sent of its members."""
@@ -325,16 +326,6 @@ class _Walk:
                 array[index] = self.value(one, depth + 1)
             return array.reshape(value.shape)
         if isinstance(value, (set, frozenset)):
-            return value if self._sendable(value) else inert_copy(value)
+            return value if self.is_sent(value) else inert_copy(value)
         members = [self.value(one, depth + 1) for one in value]
         return tuple(members) if isinstance(value, tuple) else members
-
-
-def _counted(value: Any, count: int) -> str:
-    """Of a small one its text; of a large one, how large it is."""
-    if count > _SHORT:
-        return f"<{count} items>"
-    try:
-        return one_line(repr(value))
-    except Exception as error:
-        return f"<repr failed with {type(error).__name__}>"
