@@ -35,7 +35,6 @@ from envhub_sandbox.settings.options import option_name
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.inert import one_line
 from envhub_worker.protocol.confinement import Reason
-from envhub_worker.protocol.messages.busy import ERROR, Busy
 from envhub_worker.protocol.text import continued, printable, quoted
 
 _PROFILE = 'profile "(strict|no-userns|container)"'
@@ -148,8 +147,7 @@ def refusal(reply: m.Refusal) -> Exception:
         return SandboxUnavailableError(f"this host cannot enforce {layer}{message}{fix}")
     if reply.error == "WorkerDiedError":
         return WorkerDiedError(message, reason="gone")
-    if reply.error == ERROR:
-        busy = Busy.read(reply.missing, reply.fix)
+    if busy := reply.busy:
         return ServerBusyError(
             message, quota=busy.quota, used=busy.used, limit=busy.limit, retry_s=busy.retry_s
         )

@@ -31,7 +31,7 @@ from envhub_sandbox.transport.values import generator
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import UNTRUSTED
 from envhub_worker.protocol.manifest.manifest import EnvManifest, decode_manifest
-from envhub_worker.protocol.messages.busy import DRAINING
+from envhub_worker.protocol.messages.server import DRAINING
 
 if TYPE_CHECKING:
     from envhub_sandbox.transport.connection import WorkerConnection

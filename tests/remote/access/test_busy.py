@@ -16,7 +16,6 @@ from envhub_sandbox.errors import PolicyError, ServerBusyError, WorkerError
 from envhub_sandbox.sandboxes.remote import RemoteSandbox
 from envhub_worker.access import keys
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.messages.busy import Busy
 from tests.remote.listening import Listening, listening
 from tests.remote.peers import peer
 from tests.support.processes import eventually
@@ -85,7 +84,8 @@ def test_a_session_is_waited_for_like_a_jail(tmp_path: Path) -> None:
                 assert isinstance(first.ask(m.Hello(m.VERSION, b"first")), m.Welcome)
                 refused = waiting.refused(m.Hello(m.VERSION, b"waiting"))
                 assert (refused.error, refused.missing) == ("ServerBusyError", "sessions")
-                assert Busy.read(refused.missing, refused.fix).used == 1
+                assert refused.busy is not None
+                assert refused.busy.used == 1
             hello = m.Hello(m.VERSION, b"waiting")
             assert eventually(lambda: isinstance(waiting.ask(hello), m.Welcome))
 

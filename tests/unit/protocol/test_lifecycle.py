@@ -73,10 +73,3 @@ def test_every_state_can_be_reached() -> None:
     while more := {TABLE[key] for key in TABLE if key[0] in reached} - reached:
         reached |= more
     assert reached == set(State)
-
-
-def test_states_and_events_read_as_words() -> None:
-    for kind in (State, Event):
-        texts = [member.value for member in kind]
-        assert len(set(texts)) == len(texts)
-        assert all(text == text.strip() != "" for text in texts)

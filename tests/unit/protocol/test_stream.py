@@ -6,6 +6,7 @@ import itertools
 import struct
 import tracemalloc
 
+import psutil
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -102,15 +103,10 @@ def test_declared_and_never_sent_costs_no_memory() -> None:
     """A runner that promises 256 MB and sends nothing does not make anybody touch them."""
     limits = WireLimits()
     reader = StreamReader(limits)
-    before = resident_bytes()
+    process = psutil.Process()
+    before = process.memory_info().rss
     assert list(reader.feed(head(2, 100, limits.frame_bytes - 1000))) == []
-    assert resident_bytes() - before < 64 * 1024 * 1024
-
-
-def resident_bytes() -> int:
-    """Memory of this process that is really there."""
-    with open("/proc/self/statm") as file:
-        return int(file.read().split()[1]) * 4096
+    assert process.memory_info().rss - before < 64 * 1024 * 1024
 
 
 def test_many_small_packets_keep_nothing() -> None:

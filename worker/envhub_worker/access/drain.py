@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 from envhub_worker.access.audit.log import Log
 from envhub_worker.access.quotas import RETRY_S, BusyError
-from envhub_worker.protocol.messages.busy import DRAINING, Busy
+from envhub_worker.protocol.messages.server import DRAINING, Busy
 
 _QUIET_S = 1.0
 """Between the end of the last jail and the server's own: its client learns why from this one."""

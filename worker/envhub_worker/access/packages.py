@@ -23,7 +23,7 @@ from envhub_worker.access.quotas import BusyError, Quotas
 from envhub_worker.access.store.blob_store import make_passable
 from envhub_worker.access.store.shared_use import SHARED
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.messages.busy import Busy
+from envhub_worker.protocol.messages.server import Busy
 from envhub_worker.protocol.runtime import Runtime
 from envhub_worker.supervisor.records import RefusedError
 

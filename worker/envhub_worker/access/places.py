@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from envhub_worker.access.quotas import RETRY_S, BusyError, Quotas, Use, check_jail
 from envhub_worker.access.session_expiry import SessionExpiry, longest_gone
 from envhub_worker.access.sessions import WATCHER, Sessions
-from envhub_worker.protocol.messages.busy import Busy
+from envhub_worker.protocol.messages.server import Busy
 from envhub_worker.supervisor.jails import Jails
 from envhub_worker.supervisor.records import Asker
 

@@ -8,8 +8,7 @@ from dataclasses import field
 
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import GIB, MIB, PROFILES, Confinement
-from envhub_worker.protocol.messages import busy as busy_words
-from envhub_worker.protocol.messages.busy import Busy
+from envhub_worker.protocol.messages.server import BUSY_ERROR, Busy
 from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.text import size_text
 from envhub_worker.supervisor.records import Asker, RefusedError
@@ -22,7 +21,7 @@ class BusyError(RefusedError):
     """There is no room at present."""
 
     def __init__(self, busy: Busy, message: str) -> None:
-        super().__init__(busy_words.ERROR, message, busy.quota, busy.words())
+        super().__init__(BUSY_ERROR, message, busy.quota, busy.words())
 
 
 @dataclass(frozen=True, kw_only=True)

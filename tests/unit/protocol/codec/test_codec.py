@@ -6,7 +6,6 @@ import collections
 import dataclasses
 import enum
 import pickle
-import subprocess
 import sys
 from collections.abc import Callable
 from typing import Any
@@ -225,27 +224,7 @@ def test_description_is_bounded_printable_and_without_addresses() -> None:
     assert through(Unprintable()).text == "<repr failed with RuntimeError>"
 
 
-def test_remote_objects_can_be_passed_on() -> None:
-    value = [RemoteObject("a.B", "<b>"), RemoteEnum("a.E", "X", 3)]
-    again = through(value)
-    assert again == value
-    assert again[1].value == 3
-
-
 # --- pickles, tensors, arrays of other libraries ------------------------------------------------
-
-
-def test_pickles_travel_only_where_both_ends_say_so() -> None:
-    """Unknown objects are pickled with a pickler, and loaded with an unpickler."""
-    frames = encode({"p": Point(3)}, pickler=pickle.dumps)
-    assert decode(frames, unpickler=pickle.loads) == {"p": Point(3)}
-    with pytest.raises(RemoteProtocolError, match="never loaded"):
-        decode(frames)
-
-
-def test_known_values_are_never_pickled() -> None:
-    value = [1, (2.0, {"a": np.zeros(3)}), {None}, Level.LOW]
-    assert encode(value, pickler=pickle.dumps) == encode(value)
 
 
 def test_failures_of_pickler_and_unpickler_are_protocol_errors() -> None:
@@ -344,15 +323,6 @@ def test_decoded_arrays_do_not_alias_the_transport() -> None:
     small, large = decode([memoryview(buffer) for buffer in buffers])
     for buffer in buffers:
         buffer[:] = bytes(len(buffer))
-    assert small.all()
-    assert large.all()
-
-
-def test_the_value_layer_imports_little() -> None:
-    """Importing the codec loads no Gymnasium, no ZeroMQ, no Hub client and no torch."""
-    code = (
-        "import sys, envhub_worker.protocol.codec.encoder;"
-        "print({'gymnasium', 'zmq', 'huggingface_hub', 'torch', 'pickle5'} & set(sys.modules))"
-    )
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert run.stdout.strip() == "set()"
+    for array in (small, large):
+        assert array.all()
+        assert array.flags.writeable

@@ -16,11 +16,11 @@ from hypothesis import strategies as st
 import envhub_worker
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.encoder import encode
-from envhub_worker.protocol.errors import LocalProtocolError, RemoteProtocolError
+from envhub_worker.protocol.errors import RemoteProtocolError
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
-from envhub_worker.protocol.messages import compression
+from envhub_worker.protocol.messages import compression, server
+from envhub_worker.protocol.messages.server import Busy
 from tests.support.compare import assert_same
-from tests.support.wire import deep
 
 GOLDEN = Path(__file__).parents[2] / "golden" / "messages"
 REQUEST_ID = 7
@@ -154,10 +154,11 @@ def test_the_id_of_a_header_that_cannot_be_read_is_known() -> None:
             m.unpack_header(spoiled)
 
 
-@pytest.mark.parametrize("number", [0, 2**63, 2**64 - 1])
-def test_an_impossible_id_is_refused(number: int) -> None:
-    [header] = m.pack(m.Done())
-    frame = number.to_bytes(8, "big") + bytes(header)
+@pytest.mark.parametrize(
+    "start", [b"", b"\0\0\0", *(number.to_bytes(8, "big") for number in (0, 2**63, 2**64 - 1))]
+)
+def test_an_impossible_id_is_refused(start: bytes) -> None:
+    frame = start + bytes(m.pack(m.Done())[0]) if len(start) == 8 else start
     assert m.id_of(frame) is None
     with pytest.raises(RemoteProtocolError, match="starts with the id"):
         m.unpack_header(frame)
@@ -206,11 +207,6 @@ def test_arbitrary_headers_raise_nothing_but_protocol_errors(noise: bytes, with_
     assert number.bit_length() <= 63
 
 
-def test_unsendable_fields_are_our_own_fault() -> None:
-    with pytest.raises(LocalProtocolError, match="nested deeper than 32"):
-        m.pack(m.Value(deep(100)))
-
-
 def test_messages_cannot_be_changed() -> None:
     with pytest.raises(AttributeError, match=r"CloseJail\.jail"):
         m.CloseJail(3).jail = 4  # type: ignore[misc]
@@ -227,6 +223,27 @@ def test_messages_are_made_like_dataclasses() -> None:
     for values, named in (((), {}), ((3, 4), {}), ((3,), {"jail": 3}), ((3,), {"other": 1})):
         with pytest.raises(TypeError, match="KeepJail"):
             m.KeepJail(*values, **named)
+
+
+def _refused(missing: str, fix: str) -> Busy | None:
+    return m.Refusal(server.BUSY_ERROR, "no room", missing, fix).busy
+
+
+def test_a_refusal_for_want_of_room_says_so() -> None:
+    assert _refused("jails", Busy("jails", 3, 4, 2.5).words()) == Busy("jails", 3, 4, 2.5)
+    assert _refused("jails", "3 4 9999") == Busy("jails", 3, 4, server.LONGEST_S)
+    assert m.Refusal("SandboxUnavailableError", "no", "jails", "3 4 1").busy is None
+
+
+@pytest.mark.parametrize(
+    ("quota", "words"),
+    [
+        *(("jails", text) for text in ("", "3 4", "3 4 -1", "3 4 nan", "9" * 19 + " 1 1")),
+        *((name, "3 4 1") for name in ("", "Jails", "a" * 33, "\x1b[2J")),
+    ],
+)
+def test_anything_else_says_nothing(quota: str, words: str) -> None:
+    assert _refused(quota, words) == Busy("", 0, 0, 1.0)
 
 
 OF_A_SERVER = ("Hello", "OpenJail", "JailOpened", "Relay", "Death")

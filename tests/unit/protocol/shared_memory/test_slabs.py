@@ -100,13 +100,6 @@ def test_too_many_leaves_have_no_slab() -> None:
     assert slabs.layout_of(many, 1) is None
 
 
-def test_every_action_dtype_has_one_code() -> None:
-    assert len(slabs.DTYPE_CODES) == len(slabs.ACTION_DTYPES)
-    for code, dtype in enumerate(slabs.ACTION_DTYPES):
-        assert slabs.DTYPE_CODES[dtype] == code
-        assert dtype.itemsize <= 8
-
-
 def test_a_step_is_its_arrays() -> None:
     layout, observed = slabs.layout_of(BOX, 4), slabs.observation_layout(NESTED, 4, 3)
     assert layout is not None

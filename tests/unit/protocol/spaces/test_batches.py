@@ -173,109 +173,53 @@ def test_lies_about_members_are_left_as_they_are(name: str, member: object) -> N
     assert batches.restore(SINGLE_SPACES[name], member) == member
 
 
-class TestJoinedInfos:
-    """Infos of shards against ``VectorEnv._add_info`` over all sub-environments at once."""
+@pytest.mark.parametrize(
+    "lie",
+    [
+        {"a": 3},
+        {"a": np.array(3)},
+        {"a": None},
+        {"a": np.zeros(5)},
+        {"a": np.zeros((0, 10**13)), "_a": np.array([True])},
+        {"a": {"b": "text"}},
+    ],
+    ids=["int", "0-d", "None", "too long", "absurd shape", "nested text"],
+)
+def test_lies_are_the_workers_fault(lie: dict[str, Any]) -> None:
+    honest = {"a": np.array([1.0]), "_a": np.array([True])}
+    for parts in ([honest, lie], [lie, honest]):
+        with pytest.raises(RemoteProtocolError, match="do not fit together"):
+            batches.join_infos(parts, [1, 1])
 
-    @staticmethod
-    def added(infos: list[dict[str, Any]]) -> dict[str, Any]:
-        """What Gymnasium makes of one info per sub-environment."""
-        env: gym.vector.VectorEnv[Any, Any, Any] = gym.vector.VectorEnv()
-        env.num_envs = len(infos)
-        made: dict[str, Any] = {}
-        for index, info in enumerate(infos):
-            made = env._add_info(made, info, index)
-        return made
 
-    @given(
-        st.lists(
-            st.dictionaries(
-                st.sampled_from("abc"),
-                st.one_of(st.none(), st.text(max_size=3), st.lists(st.integers(0, 3), max_size=2)),
-                max_size=3,
-            ),
-            min_size=NUM_ENVS,
-            max_size=NUM_ENVS,
-        ),
-        SHARDS,
-    )
-    def test_objects(self, infos: list[dict[str, Any]], shards: int) -> None:
-        """Text, None and lists are object arrays with masks, whoever had them first."""
-        self.check(infos, shards)
+@pytest.mark.parametrize(
+    "other",
+    [np.array(["text"]), np.array([1]), np.zeros((1, 2)), {"b": np.array([1.0])}, None],
+    ids=["text", "another dtype", "another shape", "nested", "apart"],
+)
+def test_shards_that_do_not_agree_are_to_be_asked_apart(other: Any) -> None:
+    """Which dtype a key has is not decided by its arrays: the values have been cast."""
+    one = {"a": np.array([1.0]), "_a": np.array([True])}
+    another = batches.APART if other is None else {"a": other, "_a": np.array([True])}
+    for parts in ([one, another], [another, one]):
+        with pytest.raises(batches.Misfit):
+            batches.join_infos(parts, [1, 1])
 
-    @given(
-        st.lists(
-            st.fixed_dictionaries(
-                {},
-                optional={
-                    "float": st.floats(allow_nan=False),
-                    "bool": st.booleans(),
-                    "int": st.integers(-5, 5),
-                    "array": st.lists(st.integers(0, 9), min_size=2, max_size=2).map(np.array),
-                    "nested": st.fixed_dictionaries({}, optional={"x": st.floats(0, 1)}),
-                },
-            ),
-            min_size=NUM_ENVS,
-            max_size=NUM_ENVS,
-        ),
-        SHARDS,
-    )
-    def test_numbers(self, infos: list[dict[str, Any]], shards: int) -> None:
-        """Numbers and arrays keep the dtype that Gymnasium gives them; masks are nested too."""
-        self.check(infos, shards)
 
-    def check(self, infos: list[dict[str, Any]], shards: int) -> None:
-        """Compare the joined infos of some shards with those of one process."""
-        bounds = batches.even_bounds(NUM_ENVS, shards)
-        parts = [self.added(infos[start:stop]) for start, stop in bounds]
-        joined = batches.join_infos(parts, [stop - start for start, stop in bounds])
-        expected = self.added(infos)
-        assert expected.keys() == joined.keys()
-        assert_same(expected, {key: joined[key] for key in expected})
+def test_one_row_makes_no_endless_column() -> None:
+    """What all shards have sent is joined, whatever it takes; what one has sent is bounded."""
+    row = {"a": np.zeros((1, 1000), np.uint8), "_a": np.ones(1, bool)}
+    nested = {"x": row, "_x": np.ones(1, bool)}
+    for part in (row, nested):
+        assert batches.join_infos([part] * 64, [1] * 64, 100).keys() == part.keys()
+        assert batches.join_infos([part, {}], [1, 63], 70_000).keys() == part.keys()
+        with pytest.raises(batches.Misfit, match="more than 60000 bytes"):
+            batches.join_infos([part, {}], [1, 63], 60_000)
 
-    @pytest.mark.parametrize(
-        "lie",
-        [
-            {"a": 3},
-            {"a": np.array(3)},
-            {"a": None},
-            {"a": np.zeros(5)},
-            {"a": np.zeros((0, 10**13)), "_a": np.array([True])},
-            {"a": {"b": "text"}},
-        ],
-        ids=["int", "0-d", "None", "too long", "absurd shape", "nested text"],
-    )
-    def test_lies_are_the_workers_fault(self, lie: dict[str, Any]) -> None:
-        honest = {"a": np.array([1.0]), "_a": np.array([True])}
-        for parts in ([honest, lie], [lie, honest]):
-            with pytest.raises(RemoteProtocolError, match="do not fit together"):
-                batches.join_infos(parts, [1, 1])
 
-    @pytest.mark.parametrize(
-        "other",
-        [np.array(["text"]), np.array([1]), np.zeros((1, 2)), {"b": np.array([1.0])}, None],
-        ids=["text", "another dtype", "another shape", "nested", "apart"],
-    )
-    def test_shards_that_do_not_agree_are_to_be_asked_apart(self, other: Any) -> None:
-        """Which dtype a key has is not decided by its arrays: the values have been cast."""
-        one = {"a": np.array([1.0]), "_a": np.array([True])}
-        another = batches.APART if other is None else {"a": other, "_a": np.array([True])}
-        for parts in ([one, another], [another, one]):
-            with pytest.raises(batches.Misfit):
-                batches.join_infos(parts, [1, 1])
-
-    def test_one_row_makes_no_endless_column(self) -> None:
-        """What all shards have sent is joined, whatever it takes; what one has sent is bounded."""
-        row = {"a": np.zeros((1, 1000), np.uint8), "_a": np.ones(1, bool)}
-        nested = {"x": row, "_x": np.ones(1, bool)}
-        for part in (row, nested):
-            assert batches.join_infos([part] * 64, [1] * 64, 100).keys() == part.keys()
-            assert batches.join_infos([part, {}], [1, 63], 70_000).keys() == part.keys()
-            with pytest.raises(batches.Misfit, match="more than 60000 bytes"):
-                batches.join_infos([part, {}], [1, 63], 60_000)
-
-    def test_few_bytes_make_no_large_column(self) -> None:
-        """One value of each sub-environment is as long as the first one's, and is counted so."""
-        pairs = [(0, {"a": np.zeros(1000, np.uint8)}), (1, {"a": np.uint8(1)})]
-        assert batches.join_pairs(pairs, 2, 2000)["a"].nbytes == 2000
-        with pytest.raises(MessageTooLargeError):
-            batches.join_pairs(pairs, 3, 2000)
+def test_few_bytes_make_no_large_column() -> None:
+    """One value of each sub-environment is as long as the first one's, and is counted so."""
+    pairs = [(0, {"a": np.zeros(1000, np.uint8)}), (1, {"a": np.uint8(1)})]
+    assert batches.join_pairs(pairs, 2, 2000)["a"].nbytes == 2000
+    with pytest.raises(MessageTooLargeError):
+        batches.join_pairs(pairs, 3, 2000)

@@ -11,8 +11,6 @@ from envhub_worker.access.audit.log import Log
 from envhub_worker.access.sessions import WATCHER, Session
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.keys import KEY_BYTES, key_text
-from envhub_worker.protocol.messages import busy
-from envhub_worker.protocol.messages.busy import Busy
 from envhub_worker.protocol.text import shortage
 from envhub_worker.supervisor.records import Asker, JailRecord, Witness
 
@@ -69,8 +67,7 @@ class Events(Witness):
         """A request was not done. Who waits in line asks every second: that is said once."""
         owner, level = asker.session or asker.key, "warning"
         fields: dict[str, object] = {"error": refused.error, "why": refused.message}
-        if refused.error == busy.ERROR:
-            found = Busy.read(refused.missing, refused.fix)
+        if found := refused.busy:
             fields |= {"quota": found.quota, "used": found.used, "limit": found.limit}
             level = "debug" if (owner, found.quota) in self._in_line else level
             self._in_line.add((owner, found.quota))

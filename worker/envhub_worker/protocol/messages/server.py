@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 
 from envhub_worker.protocol.confinement import Reason
 from envhub_worker.protocol.messages.message import Message
+from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.runtime import HubCopy, Runtime, read_hub_copies
 
 
@@ -25,11 +27,42 @@ class Welcome(Message, kind=2):
     pid: int
 
 
+BUSY_ERROR = "ServerBusyError"
+DRAINING = "draining"
+"""In the place of a quota: the server is about to end."""
+LONGEST_S = 60.0
+_NUMBERS = r"(\d{1,18}) (\d{1,18}) (\d{1,4}(?:\.\d{1,3})?)"
+_NAME = r"[a-z_]{1,32}"
+
+
+@dataclass(frozen=True)
+class Busy:
+    """What a ``Refusal`` for want of room says, whose ``error`` is then ``BUSY_ERROR``.
+
+    A client that knows nothing of it has a ``WorkerError`` with the text.
+
+    Attributes:
+        quota: Its name; travels as ``missing``.
+        used: How much of it others of the same key have.
+        limit: How much there is.
+        retry_s: After how many seconds it is worth asking again.
+    """
+
+    quota: str
+    used: int
+    limit: int
+    retry_s: float
+
+    def words(self) -> str:
+        """The numbers, which travel as ``fix``."""
+        return f"{self.used} {self.limit} {self.retry_s:.3f}"
+
+
 class Refusal(Message, kind=3):
     """The server did not do it. ``error`` is a name out of a table in the client.
 
     ``missing`` is the layer of the confinement that cannot be had, or the quota under which there
-    is no room (``busy.py``), by name; ``fix`` how to get it, or when to ask again. Else both are
+    is no room (``Busy``), by name; ``fix`` how to get it, or when to ask again. Else both are
     empty.
     """
 
@@ -37,6 +70,19 @@ class Refusal(Message, kind=3):
     message: str
     missing: str
     fix: str
+
+    @property
+    def busy(self) -> Busy | None:
+        """Why there is no room, if that is why; with nothing in it where that is not said rightly.
+
+        Trust: input from the worker.
+        """
+        if self.error != BUSY_ERROR:
+            return None
+        found = re.fullmatch(_NUMBERS, self.fix)
+        if found is None or not re.fullmatch(_NAME, self.missing):
+            return Busy("", 0, 0, 1.0)
+        return Busy(self.missing, int(found[1]), int(found[2]), min(float(found[3]), LONGEST_S))
 
 
 class OpenJail(Message, kind=4):

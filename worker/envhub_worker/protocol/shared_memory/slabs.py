@@ -27,6 +27,7 @@ from __future__ import annotations
 import math
 import mmap
 from collections.abc import Callable, Iterator
+from operator import itemgetter
 from typing import Any
 
 import gymnasium as gym
@@ -209,17 +210,13 @@ def results(buffer: Any, layout: ObservationLayout) -> tuple[Array, Array]:
 def assembler(space: gym.Space[Any]) -> Callable[[list[Any]], Any]:
     """A function that puts a flat list of leaves, in their order, into the space's structure."""
     if isinstance(space, ARRAY_SPACES):
-        return _first
+        return itemgetter(0)
     if isinstance(space, spaces.Dict):
         keys = list(space.spaces)
         if all(isinstance(sub, ARRAY_SPACES) for sub in space.spaces.values()):
             return lambda leaves: dict(zip(keys, leaves, strict=True))
     nested = _nested(space)
     return lambda leaves: nested(iter(leaves))
-
-
-def _first(leaves: list[Any]) -> Any:
-    return leaves[0]
 
 
 def _nested(space: gym.Space[Any]) -> Callable[[Iterator[Any]], Any]:

@@ -17,7 +17,7 @@ from envhub_sandbox.session.jails.loaded import LoadedJail
 from envhub_sandbox.transport import connection
 from envhub_sandbox.transport.deadline import StartupDeadline
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.messages.busy import DRAINING
+from envhub_worker.protocol.messages.server import DRAINING
 from tests.support.in_process.fake_lane import FakeLane, session_over
 
 _SERVER: Any = SimpleNamespace(endpoint="", process_fd=0, far=None)
