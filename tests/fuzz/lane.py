@@ -35,7 +35,7 @@ class Slabs:
         self.observations = ObservationSlab(SPACE, observed)
         self.shard = LaneShard(layout, self.observations.fd)
         self.layout = layout
-        self.reply = memory(self.shard.fds[1], layout.reply_bytes)
+        self.reply = memory(self.shard.fds[1], slabs.REPLY_BYTES)
         self.batch = memory(self.observations.fd, observed.total_bytes)
         self.results = Results(env_manifest(single_observation_space=SPACE), [(0, COUNT)])
 
@@ -71,8 +71,8 @@ def lane(dice: Dice) -> None:
     packet = b"".join(bytes(part) for part in pack_packet(0, frames))
     if rng.random() < 0.2:
         packet = dice.spoiler.raw(packet)
-    _put(ours, ours.layout.infos, frames[0])
-    _put(ours, ours.layout.answer, packet)
+    _put(ours, slabs.INFOS, frames[0])
+    _put(ours, slabs.ANSWER, packet)
     words[slabs.OUTCOME] = rng.choice((1, 2, 3, 4, 4, 0, 5, 2**64 - 1))
     in_answer = rng.random() < 0.4
     length = len(packet) if in_answer else len(frames[0])

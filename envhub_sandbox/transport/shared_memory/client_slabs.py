@@ -167,7 +167,7 @@ class ShardSlabs:
             raise RemoteProtocolError("the worker wrote an impossible reply into its slab")
         if not length:
             return kind, None
-        start = self.layout.infos
+        start = slabs.INFOS
         message = unpacked([self._reply[start : start + length]])
         if isinstance(message, m.Value) and type(message.value) is dict:
             with UNTRUSTED:
@@ -183,13 +183,13 @@ class ShardSlabs:
             raise RemoteProtocolError("the worker wrote an impossible answer into its slab")
         if kind == slabs.RAISED:
             return self.outcome()[1]
-        start = self.layout.answer
+        start = slabs.ANSWER
         with UNTRUSTED:
             packet = read_packet(self._reply[start : start + length])
         return unpacked(packet.frames)
 
     def _learn(self, infos: dict[Any, Any]) -> None:
-        start = self.layout.infos
+        start = slabs.INFOS
         columns = columns_of(infos) or ()
         self._columns = [(column, column.view(self._reply, start)) for column in columns]
         self._own = None if own_info(infos) is None else infos
@@ -244,7 +244,7 @@ class LaneShard(ShardSlabs):
         )
 
         asks, request = sealed_memfd("request", layout.request_bytes, SEAL_FUTURE_WRITE)
-        tells, reply = sealed_memfd("reply", layout.reply_bytes)
+        tells, reply = sealed_memfd("reply", slabs.REPLY_BYTES)
         super().__init__(layout, asks, tells)
         self._runner_bell, self.bell = RunnerBell(), OwnBell()
         self._ring = self._runner_bell.ring

@@ -254,7 +254,7 @@ class ServedShard:
     ) -> None:
         self._space, self._layout, self._observed = space, layout, observed
         request = bytearray(layout.request_bytes)
-        self._reply = memoryview(bytearray(layout.reply_bytes))
+        self._reply = memoryview(bytearray(slabs.REPLY_BYTES))
         self._received = memoryview(bytearray(observed.total_bytes))
         self._plain_bytes = _HEAD.size + observed.total_bytes
         leaves = len(layout.actions)
@@ -300,7 +300,7 @@ class ServedShard:
         pieces: list[Buffer] = [rest, *frames[1:]]
         if len(infos) < size or sum(map(len, pieces)) != len(self._received):
             raise RemoteProtocolError("the worker sent slabs of another size than was agreed on")
-        self._reply[slabs.HEADER_BYTES : slabs.HEADER_BYTES + size] = infos
+        self._reply[slabs.INFOS : slabs.INFOS + size] = infos
         # of a large batch, what has a place of its own is copied there, and once
         self._pieces = pieces if len(self._received) > LARGE_BYTES else []
         start = self._observed.results if self._pieces else 0

@@ -56,7 +56,7 @@ def attack(shard: LaneShard, code: str) -> str:
     head = f"""
 import ctypes, errno, mmap, os, struct
 request, reply, observations = {request}, {reply}, {observations}
-request_bytes, reply_bytes = {layout.request_bytes}, {layout.reply_bytes}
+request_bytes, reply_bytes = {layout.request_bytes}, {slabs.REPLY_BYTES}
 def outcome(call, *arguments, **keywords):
     try:
         call(*arguments, **keywords)
@@ -165,7 +165,7 @@ def answers(shard: LaneShard, answer: str) -> None:
     attack(
         shard,
         f"answer = {answer}\n"
-        f"os.pwrite(reply, answer, {shard.layout.answer})\n"
+        f"os.pwrite(reply, answer, {slabs.ANSWER})\n"
         f"os.pwrite(reply, struct.pack('QQ', {slabs.DONE}, len(answer)), {slabs.OUTCOME * 8})",
     )
 
@@ -201,7 +201,7 @@ def test_garbage_for_infos_is_refused(shard: LaneShard, bytes_: str) -> None:
     shard.ask([np.zeros((2, 2), np.float32)], (0, 0, 0))
     attack(
         shard,
-        f"os.pwrite(reply, {bytes_}, {shard.layout.infos})\n"
+        f"os.pwrite(reply, {bytes_}, {slabs.INFOS})\n"
         f"os.pwrite(reply, struct.pack('QQ', {slabs.DONE}, 64), {slabs.OUTCOME * 8})",
     )
     with pytest.raises(RemoteProtocolError):

@@ -68,7 +68,7 @@ class Lane:
             raise ValueError("these spaces have no fixed layout")
         *slab_fds, self.bell, self._client_bell = fds
         self._request = mmap.mmap(slab_fds[0], layout.request_bytes, prot=mmap.PROT_READ)
-        self._reply = mmap.mmap(slab_fds[1], layout.reply_bytes)
+        self._reply = mmap.mmap(slab_fds[1], slabs.REPLY_BYTES)
         self._observations = mmap.mmap(slab_fds[2], observed.total_bytes)
         for fd in slab_fds:
             os.close(fd)
@@ -83,7 +83,7 @@ class Lane:
         self._codes: list[int] = []
         self._takes: list[Callable[[], Any]] = []
         self._pairs: Pairs = []
-        self._writer = InfoWriter(self._reply, layout.infos, layout.count, pack, joined=env.joined)
+        self._writer = InfoWriter(self._reply, slabs.INFOS, layout.count, pack, joined=env.joined)
         self._changes = self._cpu = self._spin_ns = 0
         self._move(attach.start, observed)
 
@@ -185,7 +185,7 @@ class Lane:
             self.unsent = frames
             return slabs.FETCH, 0
         self.unsent = []
-        start = self._layout.answer
+        start = slabs.ANSWER
         self._reply[start : start + len(data)] = data
         return slabs.DONE, len(data)
 

@@ -126,7 +126,7 @@ class ServedSlabs:
         head = self._reply[_HEAD_AT : _HEAD_AT + _HEAD.size]
         outcome, length = _HEAD.unpack(head)
         size = self._known if outcome == words.COLUMNS else min(length, words.INFO_BYTES)
-        first = head + self._reply[words.HEADER_BYTES : words.HEADER_BYTES + size]
+        first = head + self._reply[words.INFOS : words.INFOS + size]
         observed = self._observed
         if len(observed) <= LARGE_BYTES:
             return owner, [first + observed]

@@ -53,8 +53,8 @@ def test_nothing_in_a_slab_overlaps(space: gym.Space[Any], count: int) -> None:
     observed = slabs.observation_layout(space, count, 3)
     assert layout is not None
     assert observed is not None
-    infos = (layout.infos, layout.infos + slabs.INFO_BYTES)
-    assert_apart([(0, slabs.HEADER_BYTES), infos], layout.reply_bytes)
+    infos = (slabs.INFOS, slabs.INFOS + slabs.INFO_BYTES)
+    assert_apart([(0, slabs.HEADER_BYTES), infos], slabs.REPLY_BYTES)
     results = (observed.results, observed.results + 10 * count)
     assert_apart([(0, 3 * observed.slot_bytes), results], observed.total_bytes)
     assert_apart(sizes(observed.leaves), observed.slot_bytes)

@@ -43,7 +43,6 @@ from envhub_worker.protocol.shared_memory.words import (
     INFO_BYTES,
     LINE,
     MAX_LEAVES,
-    REPLY_BYTES,
 )
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES, BOX_DTYPES
@@ -82,25 +81,19 @@ class Leaf:
 
 @dataclass(frozen=True)
 class Layout:
-    """Where a shard's actions and infos lie.
+    """Where a shard's actions lie in its request slab. Reply slabs are all alike: see ``words``.
 
     Attributes:
         count: Sub-environments of the shard.
-        actions: Leaves of the action space, in the request slab.
-        message: Offset of a message, in the request slab.
-        request_bytes: Size of the request slab.
-        infos: Offset of the encoded infos, in the reply slab.
-        answer: Offset of the answer to a message, in the reply slab.
-        reply_bytes: Size of the reply slab.
+        actions: Leaves of the action space.
+        message: Offset of a message.
+        request_bytes: Size of the slab.
     """
 
     count: int
     actions: tuple[Leaf, ...]
     message: int
     request_bytes: int
-    infos: int
-    answer: int
-    reply_bytes: int
 
     @property
     def action_bytes(self) -> int:
@@ -147,8 +140,7 @@ def layout_of(action: gym.Space[Any], count: int) -> Layout | None:
     request_bytes = message + INFO_BYTES
     if request_bytes > MAX_SLAB_BYTES:
         return None
-    infos, answer = HEADER_BYTES, HEADER_BYTES + INFO_BYTES
-    return Layout(count, actions, message, request_bytes, infos, answer, REPLY_BYTES)
+    return Layout(count, actions, message, request_bytes)
 
 
 def observation_layout(space: gym.Space[Any], count: int, slots: int) -> ObservationLayout | None:

@@ -45,11 +45,14 @@ DONE, RAISED, FETCH, COLUMNS = 1, 2, 3, 4
 """Results and encoded infos are in the slab; an encoded ``RaisedException`` is; the infos must be
 fetched; the infos are columns (see ``slabs``)."""
 
+INFOS = HEADER_BYTES
+"""Offset of the encoded infos in a reply slab."""
+ANSWER = INFOS + INFO_BYTES
+"""Offset of the answer to a message in a reply slab."""
+REPLY_BYTES = ANSWER + INFO_BYTES
 OWN_BYTES = SPIN * 8
 """Where the client's own words begin in the request slab. Before them stand those of who announces
 the request: the client, or the server in its place."""
-REPLY_BYTES = HEADER_BYTES + 2 * INFO_BYTES
-"""A reply slab: header, infos, the answer to a message."""
 _MAX_SERVED_REQUEST_BYTES = 1 << 20
 _MAX_SERVED_BYTES = 1 << 26
 

@@ -56,7 +56,7 @@ class Both:
             memoryview(memory(fd, size))
             for fd, size in zip(
                 self.server.deposit,
-                (self.layout.request_bytes, self.layout.reply_bytes, self.observed.total_bytes),
+                (self.layout.request_bytes, slabs.REPLY_BYTES, self.observed.total_bytes),
                 strict=False,
             )
         ]
