@@ -13,8 +13,6 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import given
-from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 
 from envhub_worker.protocol.codec.arrays import INLINE_BYTES
 from envhub_worker.protocol.codec.encoder import encode
@@ -24,6 +22,7 @@ from envhub_worker.protocol.errors import LocalProtocolError, RemoteProtocolErro
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
 from tests.support.compare import assert_same
 from tests.support.decode import decode
+from tests.support.values import objects, values
 from tests.support.wire import deep, ext, packed
 
 
@@ -57,52 +56,7 @@ def through(value: object, **options: Any) -> Any:
     return decode([bytes(frame) for frame in encode(value)], **options)
 
 
-def as_objects(items: list[Any]) -> np.ndarray[Any, Any]:
-    """A 2x2 object array of four values, whatever they are."""
-    array = np.empty(4, dtype=object)
-    for index, item in enumerate(items):
-        array[index] = item
-    return array.reshape(2, 2)
-
-
 # --- what arrives -------------------------------------------------------------------------------
-
-scalars = (
-    st.none()
-    | st.booleans()
-    | st.integers(-(2**200), 2**200)
-    | st.floats()
-    | st.complex_numbers(allow_nan=False)
-    | st.text(st.characters(exclude_categories=["Cs"]))
-    | st.binary()
-    | st.builds(range, st.integers(), st.integers(), st.integers(1, 5))
-    | hnp.from_dtype(np.dtype("f4"))
-    | hnp.from_dtype(np.dtype("?"))
-    | hnp.from_dtype(np.dtype("i8"))
-)
-keys = st.recursive(
-    st.text(st.characters(exclude_categories=["Cs"]), max_size=5)
-    | st.integers()
-    | st.booleans()
-    | st.none(),
-    lambda children: st.tuples(children, children) | st.frozensets(children, max_size=3),
-    max_leaves=3,
-)
-plain_arrays = hnp.arrays(
-    st.sampled_from(["f4", "f8", "u1", "?", "i8"]),
-    hnp.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=4),
-)
-values = st.recursive(
-    scalars | plain_arrays,
-    lambda children: (
-        st.lists(children, max_size=4)
-        | st.lists(children, max_size=4).map(tuple)
-        | st.dictionaries(keys, children, max_size=4)
-        | st.sets(keys, max_size=4)
-        | st.lists(children, min_size=4, max_size=4).map(as_objects)
-    ),
-    max_leaves=20,
-)
 
 
 @given(values)
@@ -121,7 +75,7 @@ def test_nested_values_arrive_with_their_types(value: object) -> None:
         np.str_("é"), np.str_(""), np.bytes_(b"ab"), np.datetime64("2020-01-01T00", "h"),
         np.timedelta64(5, "ms"), np.array(None), np.zeros((0, 3), dtype=object),
         {"r": [np.array([1]), {"s": (np.float32(1), None)}]},
-        as_objects([[1, 2], np.zeros(3), np.array(5), (1,)]), deep(32),
+        objects([1, 2], np.zeros(3), np.array(5), (1,)).reshape(2, 2), deep(32),
         [deep(31), ["x" * 100] * 400],
     ],
     ids=repr,

@@ -25,6 +25,7 @@ from envhub_worker.protocol.limits import DEFAULT_LIMITS
 from tests.support.compare import assert_identical, assert_same
 from tests.support.decode import decode
 from tests.support.objects import handed
+from tests.support.values import objects
 from tests.support.wire import deep
 
 
@@ -142,20 +143,13 @@ def test_what_cannot_be_sent_is_named(message: m.Message, words: str) -> None:
         assert "Pass plain data" in str(caught.value)
 
 
-def _objects(*items: Any) -> np.ndarray[Any, Any]:
-    array = np.empty(len(items), dtype=object)
-    for index, item in enumerate(items):
-        array[index] = item
-    return array
-
-
 @pytest.mark.parametrize(
     ("sent", "arrives"),
     [
-        (np.array([(1, 2.5)], "i4,f4"), _objects((1, 2.5))),
+        (np.array([(1, 2.5)], "i4,f4"), objects((1, 2.5))),
         (np.array([(1, 2)], [("a", "i4"), ("b", "i8")])[0], (1, 2)),
         (np.void(b"x"), b"x"),
-        (np.array([b"ab"], "V2"), _objects(b"ab")),
+        (np.array([b"ab"], "V2"), objects(b"ab")),
         (np.longdouble(1.5), np.float64(1.5)),
         (np.array([1.5], np.clongdouble), np.array([1.5], np.complex128)),
     ],
@@ -186,7 +180,7 @@ _PARTS = {
     "large array": np.broadcast_to(np.uint8(0), (DEFAULT_LIMITS.frame_bytes + 1,)),
     "large set": set(range(_MOST)),
     "two in a tuple": (deep(40), 2**10_000),
-    "in an object array": _objects(1, 2**10_000),
+    "in an object array": objects(1, 2**10_000),
 }
 
 
