@@ -29,7 +29,7 @@ def described(space: Any = None) -> dict[str, Any]:
     """An honest manifest with a seeded space."""
     space = spaces.Discrete(1000, seed=5) if space is None else space
     env: EnvManifest = env_manifest(single_action_space=space)
-    return encode_manifest(Manifest(envs=(env,), lazy=True), seeded=True)
+    return encode_manifest(Manifest(envs=(env,), lazy=True))
 
 
 def space_of(value: Any) -> dict[str, Any]:

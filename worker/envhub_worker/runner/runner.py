@@ -132,7 +132,7 @@ class Runner:
     def load(self, request: m.Load) -> m.Message:
         """Import the repository, call ``make_env``, describe what came back."""
         made = manifest.describe(self._load(request))
-        return m.LoadDone(encode_manifest(made, seeded=True))
+        return m.LoadDone(encode_manifest(made))
 
     def load_task(self, request: m.LoadTask) -> m.Message:
         """Import the repository, call ``make_env``, and describe nothing: it is known."""

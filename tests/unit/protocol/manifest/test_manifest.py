@@ -96,12 +96,6 @@ def test_only_a_vector_environment_with_a_step_of_its_own_decides_what_a_batch_i
     assert an_env(action_space=other).own_batch("action_space") is None
 
 
-def test_every_field_crosses() -> None:
-    made = value_of()
-    assert set(made) == {field.name for field in dataclasses.fields(Manifest)}
-    assert set(made["envs"][0]) == {field.name for field in dataclasses.fields(EnvManifest)}
-
-
 @pytest.mark.parametrize("name", [field.name for field in dataclasses.fields(EnvManifest)])
 @pytest.mark.parametrize("lie", [b"bytes", 1.5, {3: 4}, [[]], object], ids=repr)
 def test_fields_of_another_type_are_refused(name: str, lie: object) -> None:

@@ -115,10 +115,10 @@ def encode_env(manifest: EnvManifest, *, seeded: bool = False) -> dict[str, obje
     return value | described
 
 
-def encode_manifest(manifest: Manifest, *, seeded: bool = False) -> dict[str, object]:
-    """The plain value of a manifest; with the generators of ``seeded`` spaces."""
+def encode_manifest(manifest: Manifest) -> dict[str, object]:
+    """The plain value of a manifest, with the generators of seeded spaces."""
     return {
-        "envs": tuple(encode_env(env, seeded=seeded) for env in manifest.envs),
+        "envs": tuple(encode_env(env, seeded=True) for env in manifest.envs),
         "lazy": manifest.lazy,
         "interpreter": manifest.interpreter,
         "packages": manifest.packages,
@@ -144,23 +144,20 @@ def decode_manifest(
         RemoteProtocolError: It is not a manifest, or over a limit.
     """
     with UNTRUSTED:
-        return _decode_manifest(value, SpaceReader(max_elements, check, generator))
-
-
-def _decode_manifest(value: object, reader: SpaceReader) -> Manifest:
-    fields = _mapping(value, _FIELDS, "a manifest")
-    envs = fields["envs"]
-    if type(envs) is not tuple or not 1 <= len(envs) <= MAX_ENVS:
-        raise RemoteProtocolError(f"a manifest holds 1 to {MAX_ENVS} environments")
-    decoded = tuple(_decode_env(env, reader) for env in envs)
-    if len({(env.suite, env.task) for env in decoded}) != len(decoded):
-        raise RemoteProtocolError("a manifest names the same task twice")
-    return Manifest(
-        envs=decoded,
-        lazy=_typed(fields, "lazy", bool),
-        interpreter=_texts(fields["interpreter"], "interpreter"),
-        packages=_texts(fields["packages"], "packages"),
-    )
+        fields = _mapping(value, _FIELDS, "a manifest")
+        envs = fields["envs"]
+        if type(envs) is not tuple or not 1 <= len(envs) <= MAX_ENVS:
+            raise RemoteProtocolError(f"a manifest holds 1 to {MAX_ENVS} environments")
+        reader = SpaceReader(max_elements, check, generator)
+        decoded = tuple(_decode_env(env, reader) for env in envs)
+        if len({(env.suite, env.task) for env in decoded}) != len(decoded):
+            raise RemoteProtocolError("a manifest names the same task twice")
+        return Manifest(
+            envs=decoded,
+            lazy=_typed(fields, "lazy", bool),
+            interpreter=_texts(fields["interpreter"], "interpreter"),
+            packages=_texts(fields["packages"], "packages"),
+        )
 
 
 def decode_env(value: object, *, max_elements: int) -> EnvManifest:

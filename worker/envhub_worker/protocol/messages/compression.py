@@ -6,7 +6,7 @@ a network, for frames that shrink (rendered images do, noise does not): a sample
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from envhub_worker.protocol import messages as m
@@ -66,9 +66,12 @@ def unpack_frames(frames: Sequence[Buffer], limits: WireLimits) -> list[Buffer]:
         raise RemoteProtocolError("the id 0 stands before CompressionHeader alone")
     bodies = list(frames[1:])
     _check(header, bodies, limits)
-    unpack = _unpacker(header.compression)
+    block = _lz4() if header.compression == "lz4" else None
+    if block is None:
+        name = header.compression[:20]
+        raise RemoteProtocolError(f"there is no agreement on the compression {name!r}")
     return [
-        body if size == -1 else unpack(body, size)
+        body if size == -1 else _unpacked(body, size, block)
         for body, size in zip(bodies, header.sizes, strict=True)
     ]
 
@@ -83,21 +86,14 @@ def _check(header: m.CompressionHeader, bodies: Sequence[Buffer], limits: WireLi
         raise MessageTooLargeError(f"{total} bytes when unpacked are over the limit.")
 
 
-def _unpacker(compression: str) -> Callable[[Buffer, int], bytes]:
-    block = _lz4() if compression == "lz4" else None
-    if block is None:
-        raise RemoteProtocolError(f"there is no agreement on the compression {compression[:20]!r}")
-
-    def unpack(body: Buffer, size: int) -> bytes:
-        try:
-            made: bytes = block.decompress(body, uncompressed_size=size)
-        except Exception as error:  # lz4 has errors of its own
-            raise RemoteProtocolError(f"a frame cannot be unpacked: {error}") from None
-        if len(made) != size:
-            raise RemoteProtocolError("a frame is not as large as it says")
-        return made
-
-    return unpack
+def _unpacked(body: Buffer, size: int, block: Any) -> bytes:
+    try:
+        made: bytes = block.decompress(body, uncompressed_size=size)
+    except Exception as error:  # lz4 has errors of its own
+        raise RemoteProtocolError(f"a frame cannot be unpacked: {error}") from None
+    if len(made) != size:
+        raise RemoteProtocolError("a frame is not as large as it says")
+    return made
 
 
 def _size(frame: Buffer) -> int:
