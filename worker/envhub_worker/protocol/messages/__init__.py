@@ -1,4 +1,4 @@
-"""Every message, one class each; ``docs/protocol.md`` is their document.
+"""Every message, one class each; ``docs/protocol.md`` has what each field means.
 
 Two conversations share this package: ``server.py`` is between client and worker server, to open
 and close jails and to relay; ``runner.py`` is between client and runner, about environments.

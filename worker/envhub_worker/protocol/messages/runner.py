@@ -33,10 +33,7 @@ class LoadDone(Message, kind=65):
 
 
 class Build(Message, kind=66):
-    """Build sub-environments ``start`` to ``stop`` of a task as ``env``. Reply: ``BuildDone``.
-
-    The reply's manifest is that of the built slice.
-    """
+    """Build sub-environments ``start`` to ``stop`` of a task as ``env``. Reply: ``BuildDone``."""
 
     env: int
     suite: str
@@ -128,12 +125,7 @@ class CallOwn(Message, kind=77, asks="method", handed=("args", "kwargs")):
 
 
 class GetOne(Message, kind=78):
-    """An attribute of one sub-environment. Reply: ``Value``, or ``Method`` if it can be called.
-
-    ``index`` is its place in the slice; None where the slice does not hold it, whose reply is a
-    ``Value`` of None. ``depth`` wrappers are looked through, or all of them if it is None; if it is
-    -1, whichever has it.
-    """
+    """An attribute of one sub-environment. Reply: ``Value``, or ``Method`` if it can be called."""
 
     env: int
     index: int | None
@@ -165,11 +157,9 @@ class Close(Message, kind=81):
 
 
 class Attach(Message, kind=82):
-    """Serve an environment's steps over the slabs and doorbells that come along.
+    """Serve an environment's steps over the slabs and doorbells that come along. Reply: ``Value``.
 
-    The descriptors: request slab, reply slab, observation slab, the runner's doorbell, the
-    client's. The shard's rows of a batch of ``count`` begin at ``start``. Reply: ``Value``; False
-    where the environment has no fixed layout.
+    The shard's rows of a batch of ``count`` begin at ``start``. False: it has no fixed layout.
     """
 
     env: int
@@ -196,31 +186,19 @@ class Revive(Message, kind=84):
 
 
 class FetchInfosApart(Message, kind=85):
-    """Ask for the last reset's or step's infos as each sub-environment gave them.
-
-    For shards that do not agree about a key: the first sub-environment of all decides.
-    Reply: ``Value`` of ``((index in the slice, info), ...)``.
-    """
+    """Ask for the last infos as each sub-environment gave them. Reply: ``Value`` of pairs."""
 
     env: int
 
 
 class TakeApart(Message, kind=93):
-    """Infos are not joined from now on, but those of the only sub-environment. Reply: ``Value``.
-
-    ``{0: info}``, or ``{0: {"final_obs": ..., "final_info": ...}, 1: info}`` where an episode has
-    ended; under -1, if one is, which of an observation's discrete members are Python's integers.
-    """
+    """Infos are not joined from now on, but those of the only sub-environment. Reply: ``Value``."""
 
     env: int
 
 
 class LoadTask(Message, kind=86, asks="make_env", handed=("cfg", "env_kwargs")):
-    """As ``Load``, where the client knows what comes back: nothing is described, nor built for it.
-
-    Reply: ``Value`` of the task's ``(num_envs, shardable)``, None if there is none, or
-    ``RaisedException``.
-    """
+    """As ``Load``, where the manifest is known. Reply: ``Value`` or ``RaisedException``."""
 
     n_envs: int
     use_async_envs: bool
@@ -237,19 +215,13 @@ class Value(Message, kind=87):
 
 
 class Warnings(Message, kind=88):
-    """In front of the frames of a reply: what the repository has warned of. See ``warnings``.
-
-    ``((category, text), ...)``.
-    """
+    """In front of the frames of a reply: what the repository has warned of."""
 
     warnings: tuple[object, ...]
 
 
 class Watch(Message, kind=89, asks="call"):
-    """As ``Call`` without arguments; from now on the runner says when that is not true any more.
-
-    Reply: ``WatchDone``.
-    """
+    """As ``Call`` without arguments; its result is watched from now on. Reply: ``WatchDone``."""
 
     env: int
     name: str
@@ -263,10 +235,7 @@ class WatchDone(Message, kind=90):
 
 
 class Changes(Message, kind=91):
-    """In front of the frames of a reply: what is another now, and watched no more. See ``changed``.
-
-    ``((env, name), ...)``.
-    """
+    """In front of the frames of a reply: what is another now, and watched no more."""
 
     attributes: tuple[object, ...]
 

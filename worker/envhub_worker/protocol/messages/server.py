@@ -59,12 +59,7 @@ class Busy:
 
 
 class Refusal(Message, kind=3):
-    """The server did not do it. ``error`` is a name out of a table in the client.
-
-    ``missing`` is the layer of the confinement that cannot be had, or the quota under which there
-    is no room (``Busy``), by name; ``fix`` how to get it, or when to ask again. Else both are
-    empty.
-    """
+    """The server did not do it. ``error`` is a name out of a table in the client; see ``Busy``."""
 
     error: str
     message: str
@@ -89,10 +84,6 @@ class OpenJail(Message, kind=4):
     """Fork a jail for a snapshot. Reply: ``JailOpened``, ``Refusal`` or ``Death``.
 
     ``confinement`` holds the fields of ``Confinement``, with ``limits`` as a nested mapping.
-    ``python`` is the interpreter that runs the repository; empty for the server's own.
-    ``packages`` is a folder of packages for it, which are used instead of that interpreter's own;
-    empty for these. Nothing of the folder runs outside of the jail.
-    ``hub_copies`` has a ``HubCopy`` for each repository in the jail's cache of the Hub.
     """
 
     name: str
@@ -205,23 +196,13 @@ class GetStatus(Message, kind=14):
 
 
 class Status(Message, kind=15):
-    """One mapping per jail: ``jail``, ``name``, ``pids``, ``states``, ``busy_s``, ``operation``.
-
-    Of one that lives also ``processes``, ``threads``, ``files`` and ``memory_bytes``, counted from
-    outside.
-    Where denials are recorded: ``denied``, a tuple of texts.
-    """
+    """One mapping per jail."""
 
     jails: tuple[object, ...]
 
 
 class Deposit(Message, kind=16):
-    """Over the descriptor socket: descriptors for a runner, which the next request brings to it.
-
-    That has to be an ``Attach``; the server, which decodes no such message, does not look.
-    Reply, over the same socket: ``TAKEN``, with a pidfd of the jail, or ``NOT_YET`` where the
-    server has not heard of the jail: to be asked again.
-    """
+    """Over the descriptor socket: descriptors for a runner. Reply: ``TAKEN`` or ``NOT_YET``."""
 
     session: bytes
     jail: int
@@ -232,11 +213,7 @@ TAKEN, NOT_YET = b"k", b"w"
 
 
 class KeepJail(Message, kind=17):
-    """From now on a runner's death does not end the jail. Reply: ``Done``, or ``Death``.
-
-    A ``Relay`` to a runner that has died, or dies before it answers, is then answered with
-    ``RelayDonePartly``; further runners can be started in its place.
-    """
+    """From now on a runner's death does not end the jail. Reply: ``Done``, or ``Death``."""
 
     jail: int
 
@@ -298,11 +275,7 @@ class Agreement(Message, kind=24):
 
 
 class CompressionHeader(Message, kind=25):
-    """In front of a message's frames: some of them are compressed.
-
-    ``sizes`` has one number for each frame that follows: its size when unpacked, or -1 for a
-    frame that is as it was.
-    """
+    """In front of frames: the size of each when unpacked, or -1 for one that is as it was."""
 
     compression: str
     sizes: tuple[int, ...]
@@ -313,20 +286,14 @@ class GetSessions(Message, kind=26):
 
 
 class Sessions(Message, kind=27):
-    """One mapping a session: ``client``, ``session``, ``heard_s``, ``connections``, ``jails``.
-
-    ``server`` has figures of the server itself.
-    """
+    """One mapping a session; ``server`` has figures of the server itself."""
 
     sessions: tuple[object, ...]
     server: dict[str, object]
 
 
 class FollowOutput(Message, kind=28):
-    """Ask for what a jail has printed from its ``offset``-th byte on. Reply: ``OutputBytes``.
-
-    Also after the jail's death, until it is closed.
-    """
+    """Ask for what a jail has printed from its ``offset``-th byte on. Reply: ``OutputBytes``."""
 
     jail: int
     offset: int
@@ -340,10 +307,7 @@ class OutputBytes(Message, kind=29):
 
 
 class ExpireIdle(Message, kind=30):
-    """End a jail whose runners do nothing for so many milliseconds. Reply: ``Done``, or ``Death``.
-
-    Later requests to it are answered with ``Death``, whose reason is ``"idle"``.
-    """
+    """End a jail after so many milliseconds without a request. Reply: ``Done``, or ``Death``."""
 
     jail: int
     idle_ms: int
@@ -387,13 +351,7 @@ class Packages(Message, kind=32):
 
 
 class ShareSlabs(Message, kind=33):
-    """Make slabs and doorbells for runners.
-
-    Each is ``(runner, leaves, request_bytes, observation_bytes)``: leaves of the actions, and the
-    sizes of two slabs. They wait as a ``Deposit`` does, for ``Attach``; from then on the server
-    takes the steps that a ``Relay`` says are ``stepped``. Reply: ``Done``, or ``Refusal`` where
-    they are too large.
-    """
+    """Make slabs and doorbells for runners. Reply: ``Done``, or ``Refusal``: they are too large."""
 
     jail: int
     slabs: tuple[object, ...]
