@@ -63,9 +63,10 @@ def test_what_comes_again_is_packed_and_unpacked_as_the_first_time(value: Any) -
 @pytest.mark.parametrize(("one", "other"), [(1, True), (0, False), (0.0, -0.0), ("a", b"a")])
 def test_what_is_equal_and_not_the_same_is_kept_apart(one: Any, other: Any) -> None:
     for value in (one, one, one, other, other, other):
-        message = m.unpack(m.pack(m.Value((value, np.zeros(2)))))
+        message = m.unpack(m.pack(m.Value((value,))))
         assert isinstance(message, m.Value)
-        assert_same((value, np.zeros(2)), message.value)
+        assert_same((value,), message.value)
+    assert inside.forms(INCOMING)
 
 
 MAPPED = RemoteEnum("a.E", "MAPPED", {"x": [1]})
@@ -90,7 +91,6 @@ def test_keys_that_are_no_text_recur(key: object) -> None:
 
 def test_a_form_that_cannot_be_made_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
     """For whatever reason: what was packed and unpacked without one is so again."""
-
     for name in ("Outgoing", "Incoming"):
         monkeypatch.setattr(message, name, Mock(side_effect=RuntimeError))
     for _ in range(5):
