@@ -68,7 +68,7 @@ _COMMANDS: dict[str, tuple[str, str | Where]] = {
     ),
     "doctor": (
         "Test what this host can enforce, and print what is missing and how to get it.",
-        "doctor.doctor:doctor",
+        "doctor:doctor",
     ),
     "cache": (
         "List and remove snapshots, installed packages, and what killed clients left behind.",

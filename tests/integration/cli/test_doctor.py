@@ -10,8 +10,8 @@ import pytest
 from typer.testing import CliRunner
 
 from envhub_sandbox import __version__
+from envhub_sandbox.cli import doctor as doctor_command
 from envhub_sandbox.cli.app import app
-from envhub_sandbox.cli.doctor import doctor as doctor_command
 from envhub_sandbox.errors import SandboxUnavailableError, WorkerStartupError
 from envhub_sandbox.settings.policy import PROFILES
 from envhub_worker.lockdown.gpus import gpu_devices

@@ -12,7 +12,7 @@ import pytest
 
 from envhub_sandbox.check.judge import judge
 from envhub_sandbox.check.settings import JudgeOptions
-from envhub_sandbox.cli.starter import starter
+from envhub_sandbox.cli.init import starter
 from envhub_sandbox.hub.local import LocalFolder
 from tests.support.command_line import COMMAND
 

@@ -12,7 +12,7 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.cli.app import app
-from envhub_sandbox.cli.starter import starter
+from envhub_sandbox.cli.init import starter
 from tests.hub.stub_hub import StubHub
 
 pytestmark = pytest.mark.same_for("users")

@@ -17,7 +17,7 @@ import sys
 from collections.abc import Iterable
 from pathlib import Path
 
-from envhub_sandbox.cli.starter import starter
+from envhub_sandbox.cli.init import starter
 from tests.hub.stub_hub import StubHub
 from tests.support.documents.blocks import CHECKOUT, RUN, Block, tested
 

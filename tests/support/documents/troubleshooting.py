@@ -112,7 +112,6 @@ _NO_FILES = (
     "envhub_sandbox/check/checks.py",
     "envhub_sandbox/check/static.py",
     "envhub_sandbox/cli/app.py",
-    "envhub_sandbox/cli/starter.py",
     "envhub_sandbox/dependencies/locks/lockfile.py",
 )
 # Nor is this: parts of other formats, what is said after success, and answers to our own client.

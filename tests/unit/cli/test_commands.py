@@ -15,9 +15,8 @@ from typing import Any, cast
 import pytest
 from typer.testing import CliRunner
 
-from envhub_sandbox.cli import cache, init, inspect, starter
+from envhub_sandbox.cli import cache, doctor, init, inspect
 from envhub_sandbox.cli.app import app
-from envhub_sandbox.cli.doctor.remote import examine
 from envhub_sandbox.cli.shared import exits, findings, host
 from envhub_sandbox.cli.shared.console import guarded
 from envhub_sandbox.cli.shared.exits import Exit
@@ -102,7 +101,7 @@ def test_a_snapshot_is_called_by_repository_or_commit() -> None:
 def test_a_repository_has_the_name_of_its_folder(name: str) -> None:
     """Where the Hub takes it; its files are Python that can be read, and name it."""
     assert init.repository_name(Path(name)) == name
-    files = starter.starter(name, 2026)
+    files = init.starter(name, 2026)
     assert {"env.py", "README.md", "LICENSE"} <= set(files)
     for path, text in files.items():
         assert "$" not in text.replace("${{", ""), path
@@ -121,7 +120,7 @@ def test_init_writes_all_or_nothing() -> None:
     assert said("init", "there")[0] == 2
     assert os.listdir("there") == ["file"]
     assert said("init", "new")[0] == 0
-    assert set(starter.starter("new", 2026)) <= {
+    assert set(init.starter("new", 2026)) <= {
         str(path.relative_to("new")) for path in Path("new").rglob("*")
     }
 
@@ -199,7 +198,7 @@ def looks() -> Iterator[Examine]:
         def run(said: dict[Any, Any], profile: str = "no-userns", *, json: bool = False) -> Exit:
             answer = m.Sessions((), said)
             server.lies[m.GetSessions] = lambda asked: [asked.answer(answer)]
-            return examine(cast("RemoteSandbox", _Place(server)), profile, json=json)
+            return doctor.examine_server(cast("RemoteSandbox", _Place(server)), profile, json=json)
 
         yield run
 

@@ -225,7 +225,7 @@ def test_no_error_has_a_spelling_of_its_own() -> None:
     names = "|".join({one.argument for one in OPTIONS.values()} - {"copy", "token", "n_envs"})
     written = re.compile(rf"(?<![-\w.])(?:{names})=(?:['\"{{.]|[A-Z]{{2}})|Policy\(|Timeouts\(")
     found = []
-    ours = ("starter", "options", "inprocess", "make_env", "app")
+    ours = ("init", "options", "inprocess", "make_env", "app")
     for name, module in modules().items():
         if name.startswith("envhub_worker") or name.endswith(tuple(f".{one}" for one in ours)):
             continue

@@ -1,1 +1,0 @@
-"""``envhub doctor``: this host, and a server on another."""
