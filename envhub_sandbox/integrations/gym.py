@@ -17,7 +17,7 @@ from gymnasium.vector import VectorEnv
 
 from envhub_sandbox.factory.make_env import make_env
 from envhub_sandbox.vector.single_env import SingleEnv
-from envhub_sandbox.vector.suites import choose
+from envhub_sandbox.vector.suites import choose, closed_if_it_fails
 from envhub_sandbox.vector.tracebacks import short_traceback
 
 ID = "Hub-v0"
@@ -49,11 +49,8 @@ class SandboxEnv(SingleEnv):
         **options: Any,
     ) -> None:
         suites = make_env(ref, n_envs=1, **_with_render_mode(options, render_mode))
-        try:
+        with closed_if_it_fails(suites):
             super().__init__(choose(suites, suite, task), suites.close)
-        except BaseException:
-            suites.close()
-            raise
 
 
 @short_traceback
@@ -77,20 +74,15 @@ def make_vector(
         options: ``make_env``'s.
     """
     suites = make_env(ref, n_envs=num_envs, **_with_render_mode(options, render_mode))
-    try:
+    with closed_if_it_fails(suites):
         return choose(suites, suite, task)
-    except BaseException:
-        suites.close()
-        raise
 
 
 def _with_render_mode(options: dict[str, Any], render_mode: str | None) -> dict[str, Any]:
     if render_mode is None:
         return options
-    return {
-        **options,
-        "env_kwargs": {**(options.get("env_kwargs") or {}), "render_mode": render_mode},
-    }
+    given = {**(options.get("env_kwargs") or {}), "render_mode": render_mode}
+    return {**options, "env_kwargs": given}
 
 
 if ID not in gymnasium.registry:

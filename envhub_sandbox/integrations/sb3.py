@@ -19,7 +19,7 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 
 from envhub_sandbox.factory.make_env import make_env
 from envhub_sandbox.vector.single_env import info_of
-from envhub_sandbox.vector.suites import choose
+from envhub_sandbox.vector.suites import choose, closed_if_it_fails
 from envhub_worker.protocol.errors import UNTRUSTED
 
 _Indices = int | Iterable[int] | None
@@ -72,12 +72,8 @@ class SandboxVecEnv(VecEnv):
             ValueError: The repository has several environments, or not the one that is named.
             EnvHubError: As ``make_env``.
         """
-        suites = make_env(ref, n_envs=n_envs, **options)
-        try:
+        with closed_if_it_fails(make_env(ref, n_envs=n_envs, **options)) as suites:
             return cls(choose(suites, suite, task))
-        except BaseException:
-            suites.close()
-            raise
 
     def reset(self) -> Any:
         """Observations, with the seeds of ``seed()`` and the options of ``set_options()``."""

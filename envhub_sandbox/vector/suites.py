@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import threading
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from types import TracebackType
 from typing import Any, Generic, TypeVar
 
@@ -144,6 +144,16 @@ class EnvSuites(dict[str, dict[Any, VectorEnv[Any, Any, Any]]]):
         traceback: TracebackType | None,
     ) -> None:
         self.close()
+
+
+@contextlib.contextmanager
+def closed_if_it_fails(suites: EnvSuites) -> Iterator[EnvSuites]:
+    """Close them where what is done with them raises."""
+    try:
+        yield suites
+    except BaseException:
+        suites.close()
+        raise
 
 
 def choose(

@@ -25,7 +25,13 @@ from envhub_sandbox.cli.shared.console import (
     show_rows,
 )
 from envhub_sandbox.cli.shared.exits import Exit, UsageError, reported
-from envhub_sandbox.cli.shared.findings import STYLES, annotate, level, show_finding, write_report
+from envhub_sandbox.cli.shared.findings import (
+    FailOn,
+    annotate,
+    level,
+    show_finding,
+    write_report,
+)
 
 if TYPE_CHECKING:
     from envhub_sandbox.check.findings import Finding, Report
@@ -82,14 +88,7 @@ def check(
         ),
     ] = 1.0,
     seed: Annotated[int, typer.Option("--seed", "-s", min=0, help="The seed of each play.")] = 0,
-    fail_on: Annotated[
-        str,
-        typer.Option(
-            metavar="|".join(STYLES),
-            help="Exit with 1 for findings of this severity or a worse one.",
-            autocompletion=lambda: list(STYLES),
-        ),
-    ] = "error",
+    fail_on: FailOn = "error",
     settings: Annotated[
         Path | None,
         typer.Option(
@@ -161,7 +160,7 @@ def check(
     """
     if not math.isfinite(deadline):
         raise UsageError(f"--deadline is {deadline}; it takes seconds, such as 900")
-    least, allowed = level(fail_on), _known(allow or ())
+    least, allowed = level(str(fail_on)), _known(allow or ())
     if listed is not None:
         _refuse_beside_a_list(ref=ref, sarif=sarif, html=html)
         from envhub_sandbox.cli.check import list_run

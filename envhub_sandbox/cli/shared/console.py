@@ -165,7 +165,10 @@ def show_below(text: str, margin: str = "  ") -> None:
 
 def _hanging(begin: str, text: str, *, stderr: bool = False) -> str:
     """A line; in a terminal it is wrapped below the end of its beginning."""
-    room = _columns(stderr=stderr) - len(begin)
+    stream = sys.stderr if stderr else sys.stdout
+    # more columns than any line has where it is none
+    columns = shutil.get_terminal_size().columns if stream.isatty() else _MOST
+    room = columns - len(begin)
     if len(text) > room >= _NARROWEST:
         # a path or a command stays in one piece, to be copied
         lines = textwrap.wrap(text, room, break_on_hyphens=False, break_long_words=False)
@@ -189,24 +192,13 @@ def show_rows(
     """
     lines = [[*map(safe_line, row[:-1]), safe_line(row[-1], _LONGEST)] for row in rows]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
-    begin = sum(widths[:-1]) + 2 * len(widths[:-1])
-    room = _columns() - begin
     for number, line in enumerate(lines):
         cells = [
             cell.rjust(width) if column in right else cell.ljust(width)
             for column, (cell, width) in enumerate(zip(line, widths, strict=True))
         ]
-        text = "  ".join(cells).rstrip()
-        if len(text) > begin + room and room >= _NARROWEST:
-            wrapped = textwrap.wrap(line[-1], room, break_on_hyphens=False)
-            text = text[:begin] + f"\n{' ' * begin}".join(wrapped)
+        text = _hanging("".join(f"{cell}  " for cell in cells[:-1]), cells[-1].rstrip())
         out(text, (styles or {}).get(number, None if number else "bold"))
-
-
-def _columns(*, stderr: bool = False) -> int:
-    """Of the terminal on this stream; more than any line has where it is none."""
-    stream = sys.stderr if stderr else sys.stdout
-    return shutil.get_terminal_size().columns if stream.isatty() else _MOST
 
 
 def command(line: str) -> None:

@@ -34,7 +34,7 @@ from envhub_sandbox.errors import EnvHubError, HubReferenceError
 from envhub_sandbox.factory.make_env import make_env
 from envhub_sandbox.hub.logins import without_login
 from envhub_sandbox.settings.options import OPTIONS, on_lerobots_command_line, use_option_names
-from envhub_sandbox.vector.suites import EnvSuites, keep_only
+from envhub_sandbox.vector.suites import EnvSuites, closed_if_it_fails, keep_only
 
 ASKS_CONFIGS = hasattr(EnvConfig, "create_envs")
 """Whether this LeRobot asks a configuration for its environments: 0.6 does, 0.4 and 0.5 do not."""
@@ -155,13 +155,9 @@ class SandboxedEnvConfig(EnvConfig):
                 "it into the environment variable HF_ENDPOINT"
             )
         n_envs, use_async_envs = _expected()
-        suites = self._made(n_envs, use_async_envs)
-        try:
+        with closed_if_it_fails(self._made(n_envs, use_async_envs)) as suites:
             self.repo = suites.reference
             self._describe(suites)
-        except BaseException:
-            suites.close()
-            raise
         _SPARES.put(self._key(n_envs, use_async_envs), suites)
 
     @property
@@ -206,11 +202,8 @@ class SandboxedEnvConfig(EnvConfig):
         asked = {"n_envs": n_envs, "use_async_envs": use_async_envs, **self._options()}
         with use_option_names(on_lerobots_command_line()):
             suites = make_env(self.repo, **asked)
-        try:
+        with closed_if_it_fails(suites):
             keep_only(suites, self.suite, self.task)
-        except BaseException:
-            suites.close()
-            raise
         return suites
 
     def _describe(self, suites: EnvSuites) -> None:

@@ -1,15 +1,10 @@
-"""Some of the hostile payloads, samples and mutants, judged.
-
-``tests.support.judging.judged`` and ``tests.support.judging.mutants`` have them all.
-"""
+"""Some of the hostile payloads and samples, judged; ``tests.support.judged`` has them all."""
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
-from tests.support.judging import judged, mutants
+from tests.support import judged
 from tests.support.samples import SAMPLES
 
 
@@ -37,10 +32,3 @@ def test_a_sample_is_judged_as_it_is(name: str) -> None:
     """Honest ones pass, and of others what fails is what is wrong with them."""
     found = judged.failing(name)
     assert judged.is_as_it_stands(name, found), [one.text for one in found]
-
-
-def test_a_fault_in_a_sample_is_told_by_its_check(tmp_path: Path) -> None:
-    name, fault = "counter", "wrong dtype"
-    itself = mutants.told_of(str(judged.sample(name)))
-    found = mutants.told_of(mutants.mutant(name, fault, tmp_path), fault)
-    assert found - itself == mutants.FAULTS[fault].told_in(name) != set()

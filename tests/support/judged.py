@@ -1,6 +1,6 @@
 """What ``envhub check`` says of the hostile payloads and of the samples, as it has to.
 
-``python -m tests.support.judging.judged [NAME ...]`` gives each to it, one after the other
+``python -m tests.support.judged [NAME ...]`` gives each to it, one after the other
 (minutes), prints what is told, and ends with 1 where that is not what stands here. A few are in
 the tests.
 """

@@ -1,1 +1,0 @@
-"""What envhub check says of what is known to be hostile, honest or faulty."""
