@@ -102,12 +102,6 @@ def test_the_chosen_profile_decides(monkeypatch: pytest.MonkeyPatch) -> None:
     assert RUNNER.invoke(app, ["doctor", "--profile", "no-userns"]).exit_code == 6
 
 
-def test_an_unknown_profile_is_usage() -> None:
-    done = RUNNER.invoke(app, ["doctor", "--profile", "lax"])
-    assert (done.exit_code, done.stdout) == (2, "")
-    assert "strict, no-userns, container" in done.stderr
-
-
 def test_a_cache_that_cannot_be_used_hides_no_layer(monkeypatch: pytest.MonkeyPatch) -> None:
     """The layers are tried with a cache of its own, and what is wrong with the caller's is said."""
     monkeypatch.setenv("ENVHUB_CACHE", "/dev/null/none")

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.hub.olah_server import OlahServer
 from tests.support.command_line import document, envhub
 from tests.support.repositories import CARTPOLE, STILL, write_repository
 from tests.support.samples import EXAMPLES, sample
@@ -210,3 +211,24 @@ def test_diff_compares_spaces_where_that_is_asked_for(tmp_path: Path) -> None:
     ran = envhub("diff", old, new, "--run")
     assert ran.returncode == 7, ran.stderr
     assert "actions were Discrete(2), now Discrete(3)" in ran.stdout
+
+
+@pytest.fixture
+def hub(olah: OlahServer, hub_cache: Path) -> list[str]:
+    return ["--endpoint", olah.endpoint, "--hub-cache-dir", str(hub_cache)]
+
+
+def test_a_repository_of_the_hub_runs(
+    olah: OlahServer, hub: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The commit is in the provenance, nothing but results is printed, and then it needs no Hub."""
+    code = (EXAMPLES / "cartpole" / "env.py").read_text()
+    commit = olah.repository("org/cli-runs", "model").commit({"env.py": code})
+    named = envhub("run", "org/cli-runs@main", "--episodes", "2", *hub)
+    assert (named.returncode, named.stderr) == (0, "")
+    assert f"org/cli-runs (model) at {commit}, env.py" in named.stdout
+    monkeypatch.setenv("HF_HUB_OFFLINE", "1")
+    pinned = envhub("run", f"org/cli-runs@{commit}", "--episodes", "2", "--json", *hub)
+    assert json.loads(pinned.stdout)["provenance"]["commit"] == commit
+    listed = envhub("cache", "list", "--json")
+    assert [one["commit"] for one in json.loads(listed.stdout)["snapshots"]] == [commit]

@@ -6,6 +6,7 @@ import contextlib
 import os
 import pty
 import signal
+import socket
 import subprocess
 import tempfile
 from pathlib import Path
@@ -107,3 +108,18 @@ def test_a_terminal_sees_progress_and_a_pipe_gets_the_results() -> None:
     assert seen.rfind(b"\x1b[?25h") > seen.rfind(b"\x1b[?25l")
     assert b"\x1b" not in out
     assert b"steps/s" in out
+
+
+def test_ctrl_c_ends_a_download_that_hangs(hub_cache: Path) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        endpoint = f"http://127.0.0.1:{silent.getsockname()[1]}"
+        arguments = ["run", "org/repo", "--endpoint", endpoint, "--hub-cache-dir", str(hub_cache)]
+        with subprocess.Popen(
+            [*COMMAND, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        ) as process:
+            silent.settimeout(60)
+            connection, _ = silent.accept()
+            process.send_signal(signal.SIGINT)
+            out, err = process.communicate(timeout=60)
+            connection.close()
+    assert (process.returncode, out, err) == (130, "", "Interrupted.\n")

@@ -467,12 +467,6 @@ def test_the_protocol_loads_neither_zeromq_nor_the_hub() -> None:
     assert not loaded & {"zmq", "huggingface_hub", "envhub_sandbox", "torch", "psutil"}
 
 
-def test_the_command_line_helps_without_loading_anything_heavy() -> None:
-    """``envhub --help`` answers at once."""
-    loaded = loaded_by("import envhub_sandbox.cli")
-    assert not loaded & {"zmq", "huggingface_hub", "gymnasium", "numpy", "torch"}
-
-
 def test_what_speaks_with_a_server_is_imported_while_that_starts(snapshot_store: Path) -> None:
     """It costs nothing then. A known manifest, ``make_env`` and the start need none of it."""
     made = f"""

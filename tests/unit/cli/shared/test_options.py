@@ -79,12 +79,11 @@ def test_only_what_was_given_reaches_the_policy() -> None:
     assert given.arguments()["policy"] == {**granted, "gpu": True, "limits": limits}
     assert given.arguments()["sandbox"] == "tcp://127.0.0.1:5555"
     assert given.arguments()["server_key"] == "k"
-    for name, zero in (
-        ("memory_bytes", "0"),
-        ("disk_bytes", "0"),
-        ("processes", 0),
-        ("cpu_time_s", 0),
-    ):
+    read = options(env_kwargs=["size=8"], dependencies='{"python": "3.12"}', output="-").arguments()
+    assert (read["env_kwargs"], read["dependencies"]) == ({"size": 8}, {"python": "3.12"})
+    assert (read["cfg"], "output" in read["policy"]) == ("org/repo", False)
+    zeros = {"memory_bytes": "0", "disk_bytes": "0", "processes": 0, "cpu_time_s": 0}
+    for name, zero in zeros.items():
         with pytest.raises(PolicyError, match="above 0"):
             policy_from(options(**{name: zero}).arguments()["policy"], None)
 

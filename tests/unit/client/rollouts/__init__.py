@@ -1,1 +1,0 @@
-"""Unit tests of what plays in ``envhub_sandbox/check/play``."""
