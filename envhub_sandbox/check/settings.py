@@ -96,6 +96,20 @@ def is_judged(path: Path, reference: str) -> bool:
     return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
 
 
+def refuse_files_of_the_judged(
+    places: Mapping[str, Path | None], reference: str, where: str = ""
+) -> None:
+    """No repository says how it is judged, and none holds what is found in it: refuse such places.
+    Raises ``PolicyError``: one lies in it.
+    """
+    for option, path in places.items():
+        if path is not None and is_judged(path, reference):
+            raise PolicyError(
+                f"{option} {path} is inside the repository that is checked, {reference}{where}, "
+                "and a repository must not influence its own check: take a place outside"
+            )
+
+
 def read_file(path: Path) -> dict[str, Any]:
     """A caller's TOML, such as the fields of a ``Policy``, which ``make_env`` then checks.
     Raises ``PolicyError``: it cannot be read.

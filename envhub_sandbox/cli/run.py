@@ -264,29 +264,22 @@ def _logged(*, verbose: bool, worker_output: str | None) -> Iterator[None]:
     """Show logs on stderr while it lasts."""
     from envhub_sandbox.system.log import OUTPUT, ROOT
 
-    shown = []
-    if verbose:
-        shown.append(_show(ROOT, logging.DEBUG, "%(asctime)s %(message)s"))
-        shown[-1][1].addFilter(lambda record: record.name != OUTPUT.name)
-        shown.append((OUTPUT, logging.NullHandler(), OUTPUT.level))
-        OUTPUT.setLevel(logging.INFO)  # else no jail's output is followed
-    if worker_output == "-":
-        shown.append(_show(OUTPUT, logging.DEBUG, "%(message)s"))
-    try:
+    with contextlib.ExitStack() as shown:
+        if verbose:
+            handler = _show(shown, ROOT, "%(asctime)s %(message)s")
+            handler.addFilter(lambda record: record.name != OUTPUT.name)
+            shown.callback(OUTPUT.setLevel, OUTPUT.level)
+            OUTPUT.setLevel(logging.INFO)  # else no jail's output is followed
+        if worker_output == "-":
+            _show(shown, OUTPUT, "%(message)s")
         yield
-    finally:
-        for logger, handler, level in reversed(shown):
-            logger.removeHandler(handler)
-            logger.setLevel(level)
 
 
-def _show(
-    logger: logging.Logger, level: int, form: str
-) -> tuple[logging.Logger, logging.Handler, int]:
+def _show(shown: contextlib.ExitStack, logger: logging.Logger, form: str) -> logging.Handler:
     handler = logging.StreamHandler()
-    handler.setLevel(level)
     handler.setFormatter(_SafeFormatter(form, "%H:%M:%S"))
-    before = logger.level
+    shown.callback(logger.setLevel, logger.level)
+    shown.callback(logger.removeHandler, handler)
     logger.addHandler(handler)
-    logger.setLevel(level)
-    return logger, handler, before
+    logger.setLevel(logging.DEBUG)
+    return handler

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from envhub_sandbox.cli.check import options as own
 from envhub_sandbox.cli.check.deadline import DeadlineReached, deadline_alarm
 from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import (
@@ -36,7 +35,16 @@ from envhub_sandbox.cli.shared.findings import (
 if TYPE_CHECKING:
     from envhub_sandbox.check.findings import Finding, Report
 
+SETTINGS = (
+    *("steps", "resets", "slow_step", "seed", "fail_on", "allow", "policy", "n_envs"),
+    *("timeout", "memory", "disk", "processes", "cpu_time"),
+    *("jobs", "max_memory", "deadline"),
+)
+"""What may stand in ``[check]`` of ``--settings FILE``, by the names in Python."""
+OF_A_LIST = ("output", "jobs", "max_memory", "again")
+"""What means nothing for one repository; it may stand in a file that is for both."""
 _PANEL = "What it says"
+_LIST = "A list"
 _FILE = "FILE"
 _MAY = "What it may do"
 _LONG_S = 10.0
@@ -49,7 +57,7 @@ def _with_settings(ctx: typer.Context, path: Path | None) -> Path | None:
         from envhub_sandbox.check import settings
 
         with reported(debug=False):
-            ctx.default_map = settings.read_settings(path, own.SETTINGS)
+            ctx.default_map = settings.read_settings(path, SETTINGS)
     return path
 
 
@@ -129,12 +137,57 @@ def check(
             rich_help_panel=_PANEL,
         ),
     ] = False,
-    listed: own.File = None,
-    output: own.Output = None,
-    jobs: own.Jobs = None,
-    max_memory: own.MaxMemory = None,
-    deadline: own.Deadline = own.DEADLINE_S,
-    again: own.Again = False,
+    listed: Annotated[
+        str | None,
+        typer.Option(
+            "--all",
+            metavar="FILE",
+            help="Judge a list of references, one per line; '-' is stdin.",
+            rich_help_panel=_LIST,
+        ),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="DIR",
+            help="With --all: the folder for reports and their index. A run continues there.",
+            rich_help_panel=_LIST,
+        ),
+    ] = None,
+    jobs: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="With --all: repositories judged at once; by default one for every two cores.",
+            rich_help_panel=_LIST,
+        ),
+    ] = None,
+    max_memory: Annotated[
+        str | None,
+        typer.Option(
+            metavar="SIZE",
+            help="With --all: sum of the memory limits of all jails at once; by default the free "
+            "memory of this machine and its control groups.",
+            rich_help_panel=_LIST,
+        ),
+    ] = None,
+    deadline: Annotated[
+        float,
+        typer.Option(
+            "--deadline",
+            metavar="SECONDS",
+            min=1,
+            help="Time for one repository; after it the report names what was not judged.",
+        ),
+    ] = 900.0,
+    again: Annotated[
+        bool,
+        typer.Option(
+            "--again",
+            help="With --all: judge also repositories that have results.",
+            rich_help_panel=_LIST,
+        ),
+    ] = False,
     suite: opt.Suite = None,
     task: opt.Task = None,
     policy: Annotated[
@@ -183,9 +236,11 @@ def check(
         return
     if ref is None:
         raise UsageError("name a repository, or a list of them: --all FILE --output DIR")
-    if any(opt.is_typed(ctx, name) for name in own.OF_A_LIST):
+    if any(opt.is_typed(ctx, name) for name in OF_A_LIST):
         raise UsageError("--output, --jobs, --max-memory and --again are for --all FILE")
-    own.refuse_options_of_the_judged({"--settings": settings, "--policy": policy}, ref)
+    from envhub_sandbox.check.settings import refuse_files_of_the_judged
+
+    refuse_files_of_the_judged({"--settings": settings, "--policy": policy}, ref)
     report = _judge(
         make,
         policy,

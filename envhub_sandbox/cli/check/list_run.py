@@ -24,8 +24,11 @@ from envhub_sandbox.check.many.results import (
     Results,
     Verdict,
 )
-from envhub_sandbox.check.settings import merged_settings, read_file
-from envhub_sandbox.cli.check.options import refuse_options_of_the_judged
+from envhub_sandbox.check.settings import (
+    merged_settings,
+    read_file,
+    refuse_files_of_the_judged,
+)
 from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import (
     BAD,
@@ -120,9 +123,7 @@ class ListRun:
         self.of = {one: Result(listed=one) for one in self._listed()}
         places = {"--settings": self.settings, "--policy": self.policy, "--output": self.output}
         for one in self.of:
-            refuse_options_of_the_judged(
-                places, one.reference, f" (line {one.line} of {self.file})"
-            )
+            refuse_files_of_the_judged(places, one.reference, f" (line {one.line} of {self.file})")
         try:
             policy = b"" if self.policy is None else self.policy.read_bytes()
         except OSError as error:

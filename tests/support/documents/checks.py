@@ -9,7 +9,7 @@ import textwrap
 from collections.abc import Iterator
 
 from envhub_sandbox.check.checks import CHECKS
-from envhub_sandbox.cli.check.options import SETTINGS
+from envhub_sandbox.cli.check.check import SETTINGS
 from tests.corpus.entries import Entry
 from tests.corpus.faults import FAULTS
 from tests.corpus.honest import HONEST

@@ -16,9 +16,8 @@ from envhub_sandbox.check.many.results import Result as Judgement
 from envhub_sandbox.check.many.results import Verdict
 from envhub_sandbox.cli.app import app, whole_command
 from envhub_sandbox.cli.check import list_run
-from envhub_sandbox.cli.check.check import check
+from envhub_sandbox.cli.check.check import OF_A_LIST, SETTINGS, check
 from envhub_sandbox.cli.check.deadline import DeadlineReached, deadline_alarm
-from envhub_sandbox.cli.check.options import OF_A_LIST, SETTINGS
 from envhub_sandbox.cli.shared.exits import Exit
 
 _RUNNER = CliRunner()
