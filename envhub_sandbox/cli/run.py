@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
@@ -33,9 +33,7 @@ from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.settings.options import OPTIONS
 
 if TYPE_CHECKING:
-    from envhub_sandbox.check.play.episodes import EpisodeCounter, Rollout
-    from envhub_sandbox.check.play.plays import VideoWriter
-
+    from envhub_sandbox.check.play.episodes import EpisodeCounter
 
 Verbose = Annotated[
     bool,
@@ -160,44 +158,37 @@ class _Run:
     def _play_task(
         self, bar: ProgressBar, suite: str, task: int | str, env: Any, video: Path | None
     ) -> TaskResult:
-        from envhub_sandbox.check.play.episodes import autoreset_mode
+        from envhub_sandbox.check.play.episodes import autoreset_mode, rollout
+        from envhub_sandbox.check.play.plays import fps_of, frame_of, video_writer
 
-        if video is None:
-            rollout = self._roll_out(env, bar, None)
-        else:
-            from envhub_sandbox.check.play.plays import VideoWriter, fps_of
+        add: Callable[[Any], None] | None = None
 
-            with VideoWriter(video, fps_of(env.metadata)) as writer:
-                rollout = self._roll_out(env, bar, writer)
+        def observe(counter: EpisodeCounter) -> None:
+            nonlocal add
+            if add is not None:
+                add(frame_of(env))
+                if not counter.wants(0):  # now the last episode's last frame is in
+                    add = None
+            bar.update(counter)
+
+        with contextlib.ExitStack() as stack:
+            if video is not None:
+                add = stack.enter_context(video_writer(video, fps_of(env.metadata)))
+            played = rollout(
+                env,
+                episodes=self.episodes,
+                seed=self.seed,
+                actions=self.actions,
+                max_steps=self.steps,
+                observe=observe,
+            )
         return TaskResult(
             suite=suite,
             task=task,
             num_envs=env.num_envs,
             autoreset_mode=autoreset_mode(env),
-            rollout=rollout,
+            rollout=played,
             video=None if video is None else str(video),
-        )
-
-    def _roll_out(self, env: Any, bar: ProgressBar, writer: VideoWriter | None) -> Rollout:
-        from envhub_sandbox.check.play.episodes import rollout
-        from envhub_sandbox.check.play.plays import frame_of
-
-        filming = writer is not None
-
-        def observe(counter: EpisodeCounter) -> None:
-            nonlocal filming
-            if writer is not None and filming:
-                writer.add(frame_of(env))
-                filming = counter.wants(0)  # so that the last episode's last frame is in
-            bar.update(counter)
-
-        return rollout(
-            env,
-            episodes=self.episodes,
-            seed=self.seed,
-            actions=self.actions,
-            max_steps=self.steps,
-            observe=observe,
         )
 
     # --- what is printed -----------------------------------------------------------------------

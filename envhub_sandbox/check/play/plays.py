@@ -5,6 +5,7 @@ No check asks for it. Frames come from the worker, so they are judged before the
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import os
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
@@ -74,9 +75,9 @@ def encoded(frames: Sequence[Frame], fps: float) -> bytes:
     try:
         with TemporaryDirectory(prefix="envhub-film-") as folder:
             path = Path(folder) / "film.mp4"
-            with VideoWriter(path, fps) as writer:
+            with video_writer(path, fps) as add:
                 for frame in frames:
-                    writer.add(frame)
+                    add(frame)
             return path.read_bytes()
     except OSError as error:
         raise VideoError(f"no video can be written: {error.strerror}") from error
@@ -138,62 +139,46 @@ def _advice(render_mode: str | None) -> str:
     )
 
 
-class VideoWriter:
-    """Writes one file. A context manager; what was written when it ends can be played.
-
-    Args:
-        path: The file; see ``check_target``.
-        fps: Frames per second.
+@contextlib.contextmanager
+def video_writer(path: Path, fps: float) -> Iterator[Callable[[Frame], None]]:
+    """Write one file: gives what appends a frame as ``first_frame`` gives it, or raises
+    ``VideoError``. What was written when this ends can be played.
     """
+    import imageio_ffmpeg  # type: ignore[import-untyped]
 
-    def __init__(self, path: Path, fps: float) -> None:
-        self.path = path
-        self.frames = 0
-        self._fps = fps
-        self._size: tuple[int, int] | None = None
-        self._encoder: Generator[None, Any, None] | None = None
+    encoder: Generator[None, Any, None] | None = None
+    size, count = (0, 0), 0
 
-    def add(self, frame: Frame) -> None:
-        """Append a frame as ``first_frame`` gives it. Raises ``VideoError``."""
-        size = (frame.shape[1], frame.shape[0])
-        if self._encoder is None:
-            self._size, self._encoder = size, self._open(size)
-        if size != self._size:
-            raise VideoError(f"the size of frames changed from {self._size} to {size} pixels")
+    def add(frame: Frame) -> None:
+        nonlocal encoder, size, count
+        given = (frame.shape[1], frame.shape[0])
         try:
-            self._encoder.send(np.ascontiguousarray(frame))
-        except OSError as error:
-            raise VideoError(f"{self.path}: ffmpeg ended after {self.frames} frames") from error
-        self.frames += 1
-
-    def _open(self, size: tuple[int, int]) -> Generator[None, Any, None]:
-        import imageio_ffmpeg  # type: ignore[import-untyped]
-
-        # absolute, so that ffmpeg can take no name for an option or a protocol
-        encoder: Generator[None, Any, None] = imageio_ffmpeg.write_frames(
-            os.path.abspath(self.path),
-            size,
-            fps=self._fps,
-            macro_block_size=2,
-            ffmpeg_log_level="error",
-        )
-        try:
-            encoder.send(None)
+            if encoder is None:
+                size = given
+                # absolute, so that ffmpeg can take no name for an option or a protocol
+                encoder = imageio_ffmpeg.write_frames(
+                    os.path.abspath(path),
+                    size,
+                    fps=fps,
+                    macro_block_size=2,
+                    ffmpeg_log_level="error",
+                )
+                encoder.send(None)
         except (OSError, RuntimeError) as error:
             raise VideoError(f"ffmpeg does not start: {error}") from error
-        return encoder
+        if given != size:
+            raise VideoError(f"the size of frames changed from {size} to {given} pixels")
+        try:
+            encoder.send(np.ascontiguousarray(frame))
+        except OSError as error:
+            raise VideoError(f"{path}: ffmpeg ended after {count} frames") from error
+        count += 1
 
-    def close(self) -> None:
-        """Finish the file. Idempotent."""
-        if self._encoder is not None:
-            self._encoder.close()
-            self._encoder = None
-
-    def __enter__(self) -> VideoWriter:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
+    try:
+        yield add
+    finally:
+        if encoder is not None:
+            encoder.close()
 
 
 def even(frame: Frame) -> Frame:

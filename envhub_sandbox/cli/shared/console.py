@@ -261,56 +261,29 @@ def prints_on_stderr() -> Iterator[None]:
 _EVERY_S = 0.1
 
 
-class _LongWaits:
-    """Prints what takes so many seconds, where no terminal shows it; again after twice as many."""
-
-    def __init__(self, long_s: float) -> None:
-        self._long_s = long_s
-        self._what, self._begun, self._next = "", time.monotonic(), long_s
-        self._ended = threading.Event()
-        self._thread = threading.Thread(target=self._watch, name="envhub-progress", daemon=True)
-
-    def start(self) -> None:
-        self._thread.start()
-
-    def begin(self, what: str) -> None:
-        self._what, self._begun, self._next = what, time.monotonic(), self._long_s
-
-    def stop(self) -> None:
-        self._ended.set()
-        self._thread.join()
-
-    def _watch(self) -> None:
-        while not self._ended.wait(self._long_s / 10):
-            spent = time.monotonic() - self._begun
-            if self._what and spent >= self._next:
-                self._next *= 2
-                say(f"{safe_line(self._what)}: {duration_text(round(spent))} so far", "dim")
-
-
 class ProgressBar:
     """A progress bar; shows nothing if stderr is no terminal. A context manager.
 
     Args:
         quiet: Show nothing at all.
-        long_s: If stderr is no terminal, print a line about what takes so long; 0 prints none.
+        long_s: If stderr is no terminal, print a line about what takes so long, and again after
+            twice as many seconds; 0 prints none.
     """
 
     def __init__(self, *, quiet: bool, long_s: float = 0.0) -> None:
         terminal = sys.stderr.isatty()
         self._progress = None if quiet or not terminal else _progress()
-        self._waits = _LongWaits(long_s) if long_s and not terminal else None
+        self._long_s = self._next_s = 0.0 if terminal else long_s
         self._task: TaskID | None = None
-        self._total = 0
+        self._what, self._total = "", 0
         self._begun = self._shown = time.monotonic()
-        self._also = contextlib.ExitStack()
+        self._ended = threading.Event()
+        self._entered = contextlib.ExitStack()
 
     def begin(self, title: str, total: int | None = None) -> None:
         """Show what begins; ``total`` in episodes, None where that is unknown."""
-        self._total = total or 0
+        self._what, self._total, self._next_s = title, total or 0, self._long_s
         self._begun = self._shown = time.monotonic()
-        if self._waits is not None:
-            self._waits.begin(title)
         if self._progress is None:
             return
         if self._task is not None:
@@ -330,18 +303,24 @@ class ProgressBar:
 
     def __enter__(self) -> ProgressBar:
         if self._progress is not None:
-            self._progress.start()
-        if self._waits is not None:
-            self._waits.start()
-        self._also.enter_context(progress_shown_by(self.begin))
+            self._entered.enter_context(self._progress)
+        if self._long_s:
+            thread = threading.Thread(target=self._watch, name="envhub-progress", daemon=True)
+            thread.start()
+            self._entered.callback(thread.join)
+            self._entered.callback(self._ended.set)
+        self._entered.enter_context(progress_shown_by(self.begin))
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._also.close()
-        if self._waits is not None:
-            self._waits.stop()
-        if self._progress is not None:
-            self._progress.stop()
+        self._entered.close()
+
+    def _watch(self) -> None:
+        while not self._ended.wait(self._long_s / 10):
+            spent = time.monotonic() - self._begun
+            if self._what and spent >= self._next_s:
+                self._next_s *= 2
+                say(f"{safe_line(self._what)}: {duration_text(round(spent))} so far", "dim")
 
 
 def _progress() -> Progress:

@@ -64,29 +64,23 @@ def code_for(error: BaseException) -> Exit:
         return Exit.INTERRUPTED
     if not isinstance(error, EnvHubError):
         return Exit.USAGE if _is_full(error) else Exit.BUG
-    codes = _codes()
-    return next((code for kind, code in codes if isinstance(error, kind)), Exit.ENVIRONMENT)
-
-
-def _codes() -> tuple[tuple[type[EnvHubError], Exit], ...]:
     # imported here: only a failure pays for multiprocessing and numpy
     from envhub_sandbox import errors
     from envhub_sandbox.check.play.plays import VideoError
 
-    return (
-        (UsageError, Exit.USAGE),
-        (VideoError, Exit.USAGE),
-        (errors.HubReferenceError, Exit.USAGE),
-        (errors.PolicyError, Exit.USAGE),
-        (errors.BundleError, Exit.USAGE),
-        (errors.LockDriftError, Exit.DIFFERENT),  # before the error of which it is one
-        (errors.LockError, Exit.USAGE),
-        (errors.SnapshotError, Exit.SNAPSHOT),
-        (errors.LoadError, Exit.LOAD),
-        (errors.DependencyError, Exit.LOAD),
-        (errors.WorkerError, Exit.WORKER),
-        (errors.ProtocolError, Exit.WORKER),
-        (errors.SandboxUnavailableError, Exit.SANDBOX),
+    codes = {
+        Exit.DIFFERENT: (errors.LockDriftError,),  # before the error of which it is one
+        Exit.USAGE: (
+            *(UsageError, VideoError, errors.HubReferenceError, errors.PolicyError),
+            *(errors.BundleError, errors.LockError),
+        ),
+        Exit.SNAPSHOT: (errors.SnapshotError,),
+        Exit.LOAD: (errors.LoadError, errors.DependencyError),
+        Exit.WORKER: (errors.WorkerError, errors.ProtocolError),
+        Exit.SANDBOX: (errors.SandboxUnavailableError,),
+    }
+    return next(
+        (code for code, kinds in codes.items() if isinstance(error, kinds)), Exit.ENVIRONMENT
     )
 
 

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from envhub_sandbox.check.play.plays import (
     MAX_SIDE,
     VideoError,
-    VideoWriter,
     check_target,
     first_frame,
     fps_of,
     frame_of,
+    video_writer,
 )
 from envhub_sandbox.errors import RemoteEnvError
 from envhub_sandbox.vector.pictures import png, small_picture
@@ -99,25 +99,24 @@ def test_a_written_video_can_be_read(
     tmp_path: Path, size: tuple[int, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "out.mp4"
-    with VideoWriter(path, 10.0) as writer:
+    with video_writer(path, 10.0) as add:
         for value in range(0, 250, 10):
-            writer.add(frame(*size, value))
-    assert writer.frames == 25
+            add(frame(*size, value))
     assert imageio_ffmpeg.count_frames_and_secs(str(path))[0] == 25
     meta = next(imageio_ffmpeg.read_frames(str(path)))
     assert meta["size"] == size[::-1]
     assert meta["fps"] == 10.0
     monkeypatch.chdir(tmp_path)  # a file that begins with a dash is a file, and no option
-    with VideoWriter(Path("-version.mp4"), 10.0) as writer:
-        writer.add(frame())
+    with video_writer(Path("-version.mp4"), 10.0) as add:
+        add(frame())
     assert (tmp_path / "-version.mp4").stat().st_size > 0
 
 
 def test_frames_of_another_size_are_refused(tmp_path: Path) -> None:
-    with VideoWriter(tmp_path / "out.mp4", 10.0) as writer:
-        writer.add(frame(4, 6))
+    with video_writer(tmp_path / "out.mp4", 10.0) as add:
+        add(frame(4, 6))
         with pytest.raises(VideoError, match=r"changed from \(6, 4\) to \(4, 4\)"):
-            writer.add(frame(4, 4))
+            add(frame(4, 4))
 
 
 @pytest.mark.parametrize("name", ["out.txt", "nowhere/out.mp4", "folder.mp4"])
@@ -143,8 +142,8 @@ def test_targets_that_cannot_work_are_refused_early(
     ],
 )
 def test_views_of_every_kind_are_frames(tmp_path: Path, picture: Any) -> None:
-    with VideoWriter(tmp_path / "x.mp4", 30.0) as writer:
-        writer.add(first_frame((picture,), "rgb_array"))
+    with video_writer(tmp_path / "x.mp4", 30.0) as add:
+        add(first_frame((picture,), "rgb_array"))
     assert (tmp_path / "x.mp4").stat().st_size > 0
 
 
