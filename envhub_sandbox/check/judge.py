@@ -61,11 +61,8 @@ class _StoppedError(Exception):
 
 
 def judge(asked: JudgeOptions, report: Report | None = None) -> Report:
-    """Judge a repository.
-
-    Args:
-        asked: What is judged, and how.
-        report: Takes what is found as it is found, so that an interrupt loses none of it.
+    """Judge a repository; ``report`` takes what is found as it is found, so that an interrupt loses
+    none of it.
 
     Raises:
         EnvHubError: It could not be judged: it could not be had, this host cannot confine it, or

@@ -267,11 +267,7 @@ lerobot-eval --env.discover_packages_path=envhub_sandbox.integrations.lerobot \\
 
 def starter(name: str, year: int, *, lerobot: bool = False) -> dict[str, str]:
     """The files of a new repository, by path.
-
-    Args:
-        name: The repository's, which the Hub would take.
-        year: For the licence.
-        lerobot: Whether it observes what LeRobot's policies are given.
+    ``lerobot``: whether it observes what LeRobot's policies are given.
     """
     given = {"name": name, "year": str(year)}
     chosen = _FOR_LEROBOT if lerobot else _PLAIN

@@ -121,14 +121,10 @@ def _publish(
     message: str,
     private: bool,
 ) -> tuple[HubRef, list[str]]:
-    """Upload the copy in the store, and see that it has arrived.
-
-    Returns:
-        The pinned reference, and the files of its commit that the folder does not have.
-
-    Raises:
-        RepositoryUnavailableError: The Hub refused.
-        SnapshotIntegrityError: It has other files now.
+    """Upload the copy in the store, and see that it has arrived; gives the pinned reference, and
+    the files of its commit that the folder does not have.
+    Raises ``RepositoryUnavailableError``: the Hub refused; ``SnapshotIntegrityError``: it has other
+    files now.
     """
     from dataclasses import replace
 

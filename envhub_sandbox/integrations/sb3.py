@@ -32,11 +32,8 @@ class SandboxVecEnv(VecEnv):
     ``info["terminal_observation"]``. Where the vector environment does not do so itself
     (``AutoresetMode.SAME_STEP``), those that have ended are reset here, by ``reset_mask``.
 
-    Args:
-        vector: What ``make_env`` made.
-
     Attributes:
-        vector: The same, for ``sandbox`` and the rest.
+        vector: What ``make_env`` made, for ``sandbox`` and the rest.
     """
 
     def __init__(self, vector: VectorEnv[Any, Any, Any]) -> None:
@@ -62,15 +59,9 @@ class SandboxVecEnv(VecEnv):
         """The environments of a repository.
 
         Args:
-            ref: What ``make_env`` takes.
-            n_envs: Number of sub-environments.
-            suite: Which suite of the repository; needed where there are several.
-            task: Which task of it; likewise.
-            options: ``make_env``'s.
-
-        Raises:
-            ValueError: The repository has several environments, or not the one that is named.
-            EnvHubError: As ``make_env``.
+            ref, n_envs: What ``make_env`` takes, and raises for; so ``options``.
+            suite, task: Needed where there are several; ``ValueError``: there is none of these, or
+                no only one.
         """
         with closed_if_it_fails(make_env(ref, n_envs=n_envs, **options)) as suites:
             return cls(choose(suites, suite, task))
@@ -146,11 +137,7 @@ class SandboxVecEnv(VecEnv):
         return [values[index] for index in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: _Indices = None) -> None:
-        """Set an attribute of every sub-environment.
-
-        Raises:
-            ValueError: Only some are meant.
-        """
+        """Set an attribute of every sub-environment. Raises ``ValueError``: only some are meant."""
         if set(self._get_indices(indices)) != set(range(self.num_envs)):
             raise ValueError("a sandboxed vector environment sets an attribute of all or of none")
         self.vector.set_attr(attr_name, [value] * self.num_envs)

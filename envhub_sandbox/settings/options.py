@@ -72,10 +72,8 @@ class Option:
         return self.argument if iskeyword(name) else name
 
     def checked(self, value: Any) -> Any:
-        """The form of a value that the rest relies on.
-
-        Raises:
-            TypeError, ValueError, PolicyError: Nothing can be made of it.
+        """The form of a value that the rest relies on. Raises ``TypeError``, ``ValueError`` or
+        ``PolicyError``: nothing can be made of it.
         """
         if self.check is not None:
             return self.check(value)
@@ -259,21 +257,12 @@ class Options:
         return {key: getattr(self, key) for key in ("token", "endpoint", "hub_cache_dir")}
 
     def checked(self) -> Options:
-        """The same, where each has the form that the rest relies on; nothing has been started yet.
-
-        Raises:
-            TypeError, ValueError: Something that nothing can be made of.
-            PolicyError: An unknown lane.
-        """
+        """The same, where each has the form that the rest relies on."""
         values = vars(self).items()
         return Options(**{name: OPTIONS[name].checked(value) for name, value in values})
 
     def refuse_sandboxed(self) -> None:
-        """Without a sandbox: refuse what would silently do nothing, by name.
-
-        Raises:
-            PolicyError: Some of these were given.
-        """
+        """Without a sandbox: refuse what would silently do nothing, by name."""
         given = {name: value for name, value in vars(self).items() if OPTIONS[name].sandboxed}
         idle = [name for name, value in given.items() if value and value != OPTIONS[name].default]
         if idle:
@@ -379,10 +368,7 @@ def in_python(option: Option, value: Any) -> str:
 
 def on_command_line(known: Collection[str]) -> Spelling:
     """``--dependencies host``, ``--profile no-userns``, an option again for each of a list; in
-    Python what a command does not have.
-
-    Args:
-        known: The options of the command.
+    Python what is not ``known`` to the command.
     """
 
     def spelling(option: Option, value: Any) -> str:
@@ -417,12 +403,7 @@ _spelling: Spelling = in_python
 
 
 def option_name(key: str, value: Any = _NO_VALUE) -> str:
-    """An option, with a value to give to it, as it is written where the user is.
-
-    Args:
-        key: Of ``OPTIONS``.
-        value: Plain data; none for the option's name alone.
-    """
+    """An option, with a value to give to it, as it is written where the user is."""
     return _spelling(OPTIONS[key], value)
 
 

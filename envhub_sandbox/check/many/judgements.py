@@ -170,13 +170,8 @@ def judgements(
 ) -> Generator[Outcome[T], None, None]:
     """Run a command for each order, and yield what came of each as it ends.
 
-    A caller that stops asking, or is interrupted, must close the iterator: then all are ended.
-
-    Args:
-        orders: What is asked for the next as soon as there is room for it.
-        command: What is run for an order, with a folder of its own, and a pidfd of ours that it has
-            to end with.
-        patience_s: For one that has been asked to end.
+    A caller that stops asking, or is interrupted, must close the iterator: then all are ended. A
+    command gets a folder of its own, and a pidfd of ours that it has to end with.
     """
     waiting = enumerate(orders)
     running: list[_Job[T]] = []

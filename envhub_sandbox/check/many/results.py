@@ -95,10 +95,7 @@ class Result:
 
 class Results:
     """A folder of results, which one run at a time has.
-
-    Args:
-        folder: It is made if it is missing.
-        settings: A digest of how is judged: results of others do not count.
+    ``settings``: a digest of how is judged: results of others do not count.
     """
 
     def __init__(self, folder: Path, settings: str) -> None:

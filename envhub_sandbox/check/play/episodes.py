@@ -57,8 +57,7 @@ class Rollout:
 
     Attributes:
         episodes: Finished and within the quota, in the order in which they ended.
-        steps: Steps of all sub-environments together; resets are no steps.
-        step_s: Seconds spent in ``step``.
+        steps: Of all sub-environments together; resets are no steps.
         first_step_s: Seconds from the call of ``reset`` to the first step's result.
         complete: Every quota was met.
     """

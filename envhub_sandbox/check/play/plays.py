@@ -105,10 +105,6 @@ def frame_of(env: Any) -> Frame:
 def first_frame(rendered: Any, render_mode: str | None) -> Frame:
     """The first sub-environment's frame: uint8 ``(height, width, 3)``, both sides even.
 
-    Args:
-        rendered: What a vector environment's ``render`` returned.
-        render_mode: To explain what came instead of a frame.
-
     Raises:
         VideoError: There is no such frame. Trust: input from the worker.
     """

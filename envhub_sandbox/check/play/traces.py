@@ -71,9 +71,7 @@ def play(
     """Reset and step with seeded random actions.
 
     Args:
-        env: Is left open.
         seed: Of the environment, and of the actions unless ``actions_seed`` is given.
-        actions_seed: Of the actions alone.
         like: Stop at the first step that differs from this one.
         observe: Called with the number of each step that was made; 0 is the reset.
     """

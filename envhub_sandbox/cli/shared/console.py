@@ -183,12 +183,8 @@ def show_rows(
     styles: Mapping[int, str] | None = None,
 ) -> None:
     """Print a table on stdout, a line each row, the first of which has the names of the columns.
-    In a terminal the last cell is wrapped below itself.
-
-    Args:
-        rows: Cells, which may be a stranger's.
-        right: Columns of numbers.
-        styles: Of rows, by their index.
+    In a terminal the last cell is wrapped below itself. Cells may be a stranger's; ``right`` are
+    columns of numbers, ``styles`` those of rows.
     """
     lines = [[*map(safe_line, row[:-1]), safe_line(row[-1], _LONGEST)] for row in rows]
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]

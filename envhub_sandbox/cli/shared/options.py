@@ -55,11 +55,7 @@ def with_options(*keys: str, **defaults: Any) -> Callable[[_Command], _Command]:
     """Report what ends a command, and give it options.
 
     These are ``--debug``, and options of ``make_env`` in place of a parameter ``make``, which gets
-    ``MakeOptions``.
-
-    Args:
-        keys: Of ``OPTIONS``.
-        defaults: Those that differ from ``make_env``'s, by key.
+    ``MakeOptions``. ``defaults`` are those that differ from ``make_env``'s.
     """
     made = {OPTIONS[key].parameter: _parameter(key, keys, defaults) for key in keys}
 

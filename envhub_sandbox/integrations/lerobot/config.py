@@ -54,11 +54,8 @@ class SpareSuites:
     """Environments that have answered for their spaces, kept for the request that follows.
 
     LeRobot wants the features of an environment before it makes any. The jail that answered is used
-    then, so that a simulator is loaded once. Where no request follows, as before a training whose
-    first evaluation is an hour away, it is closed. At most one is kept for each key.
-
-    Args:
-        seconds: For how long one is kept.
+    then, so that a simulator is loaded once. Where no request follows within ``seconds``, as before
+    a training whose first evaluation is an hour away, it is closed. One is kept for each key.
     """
 
     def __init__(self, seconds: float = 60.0) -> None:
@@ -167,10 +164,8 @@ class SandboxedEnvConfig(EnvConfig):
 
     @property
     def gym_id(self) -> str:
-        """Only a LeRobot that asks no configuration for environments looks at it.
-
-        Raises:
-            RuntimeError: Always.
+        """Raises ``RuntimeError``: only a LeRobot that asks no configuration for environments looks
+        at it.
         """
         raise RuntimeError(
             "this version of LeRobot does not let a configuration make its environments: run "
@@ -259,10 +254,7 @@ def features_of(
     records. What LeRobot has no tensor for is left out: actions that are not a vector too, which
     its evaluation does not give.
 
-    Args:
-        observations: The space of one sub-environment's observations.
-        actions: The space of its actions.
-        others: Whether this LeRobot hands on vectors of other names.
+    ``others``: whether this LeRobot hands on vectors of other names.
     """
     found: dict[str, tuple[str, FeatureType, tuple[int, ...]]] = {}
     if isinstance(actions, Box) and len(actions.shape) == 1:
