@@ -20,7 +20,7 @@ _ELSEWHERE = {
     "deadline": "test_deadline.py",
     "lerobot": "test_findings.py",
     "licence": "test_findings.py",
-    "limits-reached": "test_judged.py",
+    "limits-reached": "test_findings.py",
     "pinned": "test_survey_checkouts.py",
     "source-ignored": "test_survey_checkouts.py",
     "source-link": "test_survey.py",
