@@ -238,13 +238,12 @@ class _Judge:
 
         That makes steps longer, so no time is measured in this play.
         """
-        if not self._is_here:
-            self._unrecorded = "only --sandbox process records them"
-            return self.make(num_workers=1, validate=True)
-        try:
-            return self.make(record_denials=True, num_workers=1, validate=True)
-        except SandboxUnavailableError as error:  # of the profile, too: then it is raised again
-            self._unrecorded = str(error)
+        self._unrecorded = "" if self._is_here else "only --sandbox process records them"
+        if self._is_here:
+            try:
+                return self.make(record_denials=True, num_workers=1, validate=True)
+            except SandboxUnavailableError as error:  # of the profile, too: then it is raised again
+                self._unrecorded = str(error)
         return self.make(num_workers=1, validate=True)
 
     @contextmanager

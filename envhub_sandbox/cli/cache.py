@@ -97,11 +97,19 @@ def list_(
         print_json({"folder": folder, "snapshots": own, "environments": theirs})
         return
     if found:
-        _print(found)
+        snapshots = [
+            (one.repository, one.commit[:_SHOWN], one.revision or "", *_when_and_size(one))
+            for one in found
+        ]
+        heads = ("repository", "commit", "revision", "last used", "size")
+        show_rows([heads, *snapshots], right=(4,))
     if found and made:
         out()
     if made:
-        _print_environments(made)
+        rows = [
+            (one.key[:12], one.version, *_when_and_size(one), " ".join(one.pins)) for one in made
+        ]
+        show_rows([("environment", "Python", "last used", "size", "packages"), *rows], right=(3,))
     say(f"{_told(found, made)}, in {cache_root()}")
 
 
@@ -109,14 +117,6 @@ def _told(found: list[StoredSnapshot], made: list[Environment]) -> str:
     total = sum(one.size for one in found) + sum(one.size for one in made)
     snapshots, environments = counted(len(found), "snapshot"), counted(len(made), "environment")
     return f"{snapshots}, {environments}, {size_text(total)}"
-
-
-def _print_environments(made: list[Environment]) -> None:
-    rows = [
-        (one.key[:12], one.version, _day(one.used), size_text(one.size), " ".join(one.pins))
-        for one in made
-    ]
-    show_rows([("environment", "Python", "last used", "size", "packages"), *rows], right=(3,))
 
 
 def _documents(found: Sequence[StoredSnapshot | Environment], **named: str) -> list[dict[str, Any]]:
@@ -131,22 +131,8 @@ def _documents(found: Sequence[StoredSnapshot | Environment], **named: str) -> l
     ]
 
 
-def _print(found: list[StoredSnapshot]) -> None:
-    rows = [
-        (
-            one.repository,
-            one.commit[:_SHOWN],
-            one.revision or "",
-            _day(one.used),
-            size_text(one.size),
-        )
-        for one in found
-    ]
-    show_rows([("repository", "commit", "revision", "last used", "size"), *rows], right=(4,))
-
-
-def _day(seconds: float) -> str:
-    return time.strftime("%F", time.localtime(seconds))
+def _when_and_size(one: StoredSnapshot | Environment) -> tuple[str, str]:
+    return time.strftime("%F", time.localtime(one.used)), size_text(one.size)
 
 
 @opt.with_options()

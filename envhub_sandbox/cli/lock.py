@@ -118,8 +118,9 @@ def verify(
         locked = lockfile.read(file)
         snapshot = make.snapshot_with_assets(_reference(ref, locked, file), locked.assets)
         now = _now(locked, snapshot, no_index=no_index)
-        if not no_spaces and not making.differences(locked, now):
-            now = _spaces_again(now, locked, snapshot, make.hub)
+        if not (no_spaces or locked.spaces is None or making.differences(locked, now)):
+            kwargs = opt.read_env_kwargs([locked.spaces.arguments])
+            now = _with_spaces(locked, snapshot, kwargs, make.hub)
         found = making.differences(locked, now)
     if json:
         print_json({"lock": str(file), "reference": snapshot.label, "drift": found})
@@ -212,19 +213,10 @@ def _reference(ref: str | None, locked: LockFile, file: Path) -> str:
 def _now(locked: LockFile, snapshot: Snapshot, *, no_index: bool) -> LockFile:
     from envhub_sandbox.dependencies import interpreters
     from envhub_sandbox.dependencies.locks import lockfile, making
-    from envhub_sandbox.dependencies.locks.making import with_files
 
     here = lockfile.Runner.of(interpreters.find(locked.runner.python))
-    now = replace(with_files(locked, snapshot), runner=here)
+    now = replace(making.with_files(locked, snapshot), runner=here)
     return now if no_index else replace(now, packages=making.relisted(locked).packages)
-
-
-def _spaces_again(
-    now: LockFile, locked: LockFile, snapshot: Snapshot, hub: dict[str, Any]
-) -> LockFile:
-    if locked.spaces is None:
-        return now
-    return _with_spaces(locked, snapshot, opt.read_env_kwargs([locked.spaces.arguments]), hub)
 
 
 def _print(
@@ -233,18 +225,10 @@ def _print(
     from envhub_sandbox.dependencies.locks import lockfile
 
     if as_json:
+        document = {"lock": str(path), "reference": lockfile.reference_of(made)}
+        document |= {"commit": made.commit, "python": str(made.runner)}
         packages = [f"{one.name}=={one.version}" for one in made.packages]
-        reference = lockfile.reference_of(made)
-        print_json(
-            {
-                "lock": str(path),
-                "reference": reference,
-                "commit": made.commit,
-                "python": str(made.runner),
-                "packages": packages,
-                "changes": changes,
-            }
-        )
+        print_json({**document, "packages": packages, "changes": changes})
         return
     for line in changes:
         out(safe_line(line, 500))

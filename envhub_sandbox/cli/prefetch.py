@@ -32,31 +32,24 @@ def prefetch(
     with ProgressBar(quiet=json) as bar:
         bar.begin(f"reading {ref}")
         snapshot = make.snapshot_with_assets(ref)
-        given, lock = make["dependencies"], make["lock"]
-        environment = (
-            _environment(snapshot, given, upgrade)
-            if lock is None
-            else _of_lock(snapshot, lock, given)
-        )
+        environment = _environment(snapshot, make, upgrade)
     if json:
         print_json(_document(snapshot, environment))
     else:
         _print(snapshot, environment)
 
 
-def _environment(snapshot: Snapshot, given: Any, upgrade: bool) -> Environment | None:
-    from envhub_sandbox.dependencies.packages import ThisMachine, packages_for
+def _environment(snapshot: Snapshot, make: opt.MakeOptions, upgrade: bool) -> Environment | None:
+    from envhub_sandbox.dependencies import packages
     from envhub_sandbox.dependencies.request import chosen
 
-    choice, _ = chosen(given, None)
-    made = packages_for(snapshot, choice, ThisMachine(upgrade=upgrade))
+    given, lock = make["dependencies"], make["lock"]
+    if lock is not None:
+        opened = packages.opened_lock(lock, "process", None, given)
+        return packages.locked_packages(snapshot, opened).environment
+    place = packages.ThisMachine(upgrade=upgrade)
+    made = packages.packages_for(snapshot, chosen(given, None)[0], place)
     return None if made is None else made.environment
-
-
-def _of_lock(snapshot: Snapshot, lock: str, given: Any) -> Environment | None:
-    from envhub_sandbox.dependencies.packages import locked_packages, opened_lock
-
-    return locked_packages(snapshot, opened_lock(lock, "process", None, given)).environment
 
 
 def _document(snapshot: Snapshot, environment: Environment | None) -> dict[str, Any]:

@@ -6,12 +6,15 @@ a value is JSON or text: ``--sandbox.policy='{"gpu": true}'``.
 
 from __future__ import annotations
 
-import json
 import sys
 from importlib.util import find_spec
 from typing import Any
 
-from envhub_sandbox.settings.options import on_lerobots_command_line, use_option_names
+from envhub_sandbox.settings.options import (
+    json_or_text,
+    on_lerobots_command_line,
+    use_option_names,
+)
 
 _PREFIX = "--sandbox."
 
@@ -42,12 +45,5 @@ def split_eval_arguments(arguments: list[str]) -> tuple[dict[str, Any], list[str
         name, equals, text = one.removeprefix(_PREFIX).partition("=")
         if not equals:
             sys.exit(f"lerobot-eval-sandboxed: {one} takes a value: {one}=...")
-        options[name.replace("-", "_")] = _value(text)
+        options[name.replace("-", "_")] = json_or_text(text)
     return options, [one for one in arguments if one not in ours]
-
-
-def _value(text: str) -> Any:
-    try:
-        return json.loads(text)
-    except ValueError:
-        return text

@@ -395,6 +395,14 @@ def on_lerobots_command_line(prefix: str = "--env.") -> Spelling:
     return spelling
 
 
+def json_or_text(text: str) -> Any:
+    """A value that was typed as JSON, or else is a text."""
+    try:
+        return json.loads(text)
+    except ValueError:
+        return text
+
+
 def _text(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(value)
 

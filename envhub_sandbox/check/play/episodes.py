@@ -218,15 +218,6 @@ def _on_cpu(values: Any) -> Any:
     return values.cpu() if callable(getattr(values, "cpu", None)) else values
 
 
-def _chooser(actions: str, space: gym.Space[Any], seed: int) -> Callable[[], Any]:
-    """A function that gives the next batch of actions."""
-    if actions == "zero":
-        action = zero_action(space)
-        return lambda: action
-    space.seed(seed)
-    return space.sample
-
-
 def rollout(
     env: VectorEnv[Any, Any, Any],
     *,
@@ -253,11 +244,13 @@ def rollout(
     result = Rollout(episodes=counter.counted)
     begun, taken = time.perf_counter(), 0
     try:
-        choose = _chooser(actions, env.action_space, seed)
+        zero = zero_action(env.action_space) if actions == "zero" else None
+        env.action_space.seed(seed)
         env.reset(seed=seed)
         observe(counter)
         while not counter.finished and (max_steps is None or taken < max_steps):
-            _step(env, choose(), counter, result)
+            action = env.action_space.sample() if zero is None else zero
+            _step(env, action, counter, result)
             taken += 1
             if taken == 1:
                 result.first_step_s = time.perf_counter() - begun
@@ -292,36 +285,27 @@ def zero_action(space: gym.Space[Any]) -> Any:
     raise CustomSpaceError(f"no zero action is known for {type(space).__name__}")
 
 
-def _of_discrete(space: spaces.Discrete) -> Any:
-    return space.dtype.type(min(max(0, int(space.start)), int(space.start) + int(space.n) - 1))
-
-
-def _of_multi_discrete(space: spaces.MultiDiscrete) -> Any:
-    return np.clip(0, space.start, space.start + space.nvec - 1).astype(space.dtype)
-
-
-def _of_sequence(space: spaces.Sequence) -> Any:
-    return gym.vector.utils.create_empty_array(space.feature_space, 0) if space.stack else ()
-
-
-def _of_graph(space: spaces.Graph) -> Any:
-    nodes = np.array([zero_action(space.node_space)])
-    return spaces.GraphInstance(nodes=nodes, edges=None, edge_links=None)
-
-
 _ZEROS: dict[Any, Any] = {
     spaces.Box: lambda space: np.array(
         np.clip(np.zeros(space.shape), space.low, space.high), space.dtype
     ),
-    spaces.Discrete: _of_discrete,
-    spaces.MultiDiscrete: _of_multi_discrete,
+    spaces.Discrete: lambda space: space.dtype.type(
+        min(max(0, int(space.start)), int(space.start) + int(space.n) - 1)
+    ),
+    spaces.MultiDiscrete: lambda space: np.clip(
+        0, space.start, space.start + space.nvec - 1
+    ).astype(space.dtype),
     spaces.MultiBinary: lambda space: np.zeros(space.shape, space.dtype),
     spaces.Text: lambda space: (
         space.character_list[0] * space.min_length if space.min_length else ""
     ),
     spaces.Dict: lambda space: {key: zero_action(one) for key, one in space.spaces.items()},
     spaces.Tuple: lambda space: tuple(map(zero_action, space.spaces)),
-    spaces.Sequence: _of_sequence,
-    spaces.Graph: _of_graph,
+    spaces.Sequence: lambda space: (
+        gym.vector.utils.create_empty_array(space.feature_space, 0) if space.stack else ()
+    ),
+    spaces.Graph: lambda space: spaces.GraphInstance(
+        nodes=np.array([zero_action(space.node_space)]), edges=None, edge_links=None
+    ),
     spaces.OneOf: lambda space: (0, zero_action(space.spaces[0])),
 }

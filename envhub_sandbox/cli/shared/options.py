@@ -16,7 +16,7 @@ import typer
 from envhub_sandbox.cli.shared.console import prints_on_stderr, safe_line
 from envhub_sandbox.cli.shared.exits import ForeignError, UsageError, reported
 from envhub_sandbox.errors import EnvHubError
-from envhub_sandbox.settings.options import OPTIONS
+from envhub_sandbox.settings.options import OPTIONS, json_or_text
 from envhub_worker.protocol.text import parse_size
 
 if TYPE_CHECKING:
@@ -256,13 +256,8 @@ def read_env_kwargs(texts: Sequence[str]) -> dict[str, Any]:
                 f"--env-kwargs is {text!r}; it takes a JSON object such as '{{\"size\": 8}}', or "
                 "key=value"
             )
-        values[key] = _json_or_text(value)
+        values[key] = json_or_text(value)
     return values
-
-
-def read_dependencies(text: str) -> str | dict[str, Any]:
-    """The argument of ``make_env``: text, or a JSON object. Raises ``UsageError``."""
-    return _json_object("--dependencies", text) if text.lstrip().startswith("{") else text
 
 
 def _json_object(option: str, text: str) -> dict[str, Any]:
@@ -273,17 +268,12 @@ def _json_object(option: str, text: str) -> dict[str, Any]:
     return value
 
 
-def _json_or_text(value: str) -> Any:
-    try:
-        return json.loads(value)
-    except ValueError:
-        return value
-
-
 _READERS: dict[str, Callable[[Any], Any]] = {
     "sandbox": lambda name: None if name == "none" else name,
     "env_kwargs": lambda texts: read_env_kwargs(texts or ()),
-    "dependencies": read_dependencies,
+    "dependencies": lambda text: (
+        _json_object("--dependencies", text) if text.lstrip().startswith("{") else text
+    ),
     "output": lambda name: None if name == "-" else name,  # the log of run
     "gpu": read_gpu,
 }
