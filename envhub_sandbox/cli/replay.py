@@ -60,131 +60,108 @@ def replay(
 
     [bold]envhub replay ~/.cache/envhub-sandbox/crashes/20261121T081500-5f3a9c01[/bold]
     """
-    _Replay(bundle, grant, make, as_json=json).execute()
+    from envhub_sandbox.session.crash import bundle_reader
+    from envhub_sandbox.session.crash import replay as repeating
 
-
-class _Replay:
-    """One ``envhub replay``."""
-
-    def __init__(self, folder: Path, grant: bool, make: opt.MakeOptions, *, as_json: bool) -> None:
-        self._folder, self._grant, self._sandbox = folder, grant, make["sandbox"]
-        given = {name: value for name, value in make.given.items() if name != "sandbox"}
-        self._given = {name: value for name, value in given.items() if value is not None}
-        self._as_json = as_json
-        self._changed: list[str] = []
-
-    def execute(self) -> None:
-        """Read, check, repeat, print; the exit code is the verdict."""
-        from envhub_sandbox.session.crash.bundle_reader import load_bundle
-        from envhub_sandbox.session.crash.replay import Verdict
-
-        bundle = load_bundle(self._folder)
-        self._refuse_wishes(bundle)
-        for doubt in bundle.doubts:
-            show("not exact", doubt, "yellow", stderr=True)
-        place = bundle.arguments.get("sandbox")
-        if place != self._sandbox:
-            show("sandbox", f"it died in {place}; this is {self._sandbox}", "yellow", stderr=True)
-        with ProgressBar(quiet=self._as_json) as bar:
-            replayed = self._run(bundle, bar)
-        self._print(bundle, replayed)
-        codes = {Verdict.SAME: Exit.OK, Verdict.DIFFERENT: Exit.DIFFERENT}
-        raise typer.Exit(codes.get(replayed.verdict, Exit.SURVIVED))
-
-    def _refuse_wishes(self, bundle: Bundle) -> None:
-        from envhub_sandbox.session.crash.bundle_reader import wishes
-
-        wanted = [wish for wish in wishes(bundle) if wish.partition("=")[0] not in self._given]
-        if wanted and not self._grant:
-            raise UsageError(
-                f"the bundle needs more permissions than an ordinary run: {', '.join(wanted)}. If "
-                "you trust its source, add --grant"
-            )
-
-    def _run(self, bundle: Bundle, bar: ProgressBar) -> ReplayResult:
-        from envhub_sandbox.session.crash.replay import replay
-
-        bar.begin(f"loading {safe_line(bundle.label)}")
-        with contextlib.ExitStack() as stack:
-            return replay(lambda: self._make(bundle, bar, stack), bundle)
-
-    def _make(self, bundle: Bundle, bar: ProgressBar, stack: contextlib.ExitStack) -> Any:
-        """The environment that the bundle is about; None if it is about ``make_env`` alone."""
-        from envhub_sandbox.factory.make_env import make_env
-        from envhub_sandbox.session.crash.replay import changed_files
-        from envhub_sandbox.session.repository import Recipe
-
-        recipe = Recipe(
-            make_env=make_env,
-            reference=bundle.reference,
-            config=bundle.load.cfg,
-            options=self._options(bundle),
+    sandbox, loaded = make["sandbox"], bundle_reader.load_bundle(bundle)
+    given = {
+        name: value for name, value in make.given.items() if name != "sandbox" and value is not None
+    }
+    wishes = bundle_reader.wishes(loaded)
+    wanted = [wish for wish in wishes if wish.partition("=")[0] not in given]
+    if wanted and not grant:
+        raise UsageError(
+            f"the bundle needs more permissions than an ordinary run: {', '.join(wanted)}. If "
+            "you trust its source, add --grant"
         )
-        envs = stack.enter_context(recipe.make())
-        self._changed = list(changed_files(bundle.files, envs.provenance["files"]))
-        if self._changed:
-            show("changed", ", ".join(self._changed), "yellow", stderr=True)
-        if bundle.task is None:
-            opt.select_envs(envs, None, None)[0][2].np_random  # noqa: B018  # starts it, and changes nothing
-            return None
-        bar.begin(f"repeating {len(bundle.requests)} requests")
-        return self._chosen(envs, bundle.task)
+    for doubt in loaded.doubts:
+        show("not exact", doubt, "yellow", stderr=True)
+    place = loaded.arguments.get("sandbox")
+    if place != sandbox:
+        show("sandbox", f"it died in {place}; this is {sandbox}", "yellow", stderr=True)
+    options = bundle_reader.replayed_arguments(loaded, granted=grant)
+    if "profile" in given:
+        options["policy"] = {**options["policy"], "profile": given.pop("profile")}
+    options |= {**given, "sandbox": sandbox}
+    changed: list[str] = []
+    with ProgressBar(quiet=json) as bar, contextlib.ExitStack() as stack:
+        bar.begin(f"loading {safe_line(loaded.label)}")
+        replayed = repeating.replay(lambda: _made(loaded, options, bar, stack, changed), loaded)
+    if json:
+        print_json(_document(bundle, loaded, replayed, changed))
+    else:
+        _print(loaded, replayed)
+    codes = {repeating.Verdict.SAME: Exit.OK, repeating.Verdict.DIFFERENT: Exit.DIFFERENT}
+    raise typer.Exit(codes.get(replayed.verdict, Exit.SURVIVED))
 
-    def _chosen(self, envs: Any, task: dict[str, Any]) -> Any:
-        env = envs.get(task["suite"], {}).get(task["task"])
-        if env is None or env.num_envs != task["num_envs"]:
-            name = safe_line(f"{task['suite']} / {task['task']}")
-            raise UsageError(
-                f"make_env gives no {name} of {task['num_envs']} sub-environments any more, so "
-                "nothing can be repeated"
-            )
-        return env
 
-    def _options(self, bundle: Bundle) -> dict[str, Any]:
-        from envhub_sandbox.session.crash.bundle_reader import replayed_arguments
+def _made(
+    bundle: Bundle,
+    options: dict[str, Any],
+    bar: ProgressBar,
+    stack: contextlib.ExitStack,
+    changed: list[str],
+) -> Any:
+    """The environment that the bundle is about; None if it is about ``make_env`` alone."""
+    from envhub_sandbox.factory.make_env import make_env
+    from envhub_sandbox.session.crash.replay import changed_files
+    from envhub_sandbox.session.repository import Recipe
 
-        options = replayed_arguments(bundle, granted=self._grant)
-        given = dict(self._given)
-        if "profile" in given:
-            options["policy"] = {**options["policy"], "profile": given.pop("profile")}
-        return {**options, **given, "sandbox": self._sandbox}
-
-    # --- what is printed -----------------------------------------------------------------------
-
-    def _print(self, bundle: Bundle, replayed: ReplayResult) -> None:
-        if self._as_json:
-            print_json(self._document(bundle, replayed))
-            return
-        show("repository", bundle.label, "bold")
-        out()
-        show_rows(
-            [
-                ("", "request", "step", "how it ended"),
-                _row("recorded", len(bundle.requests), bundle.steps, bundle.death),
-                _row("replayed", replayed.requests, replayed.steps, replayed.death),
-            ],
-            right=(1, 2),
+    recipe = Recipe(
+        make_env=make_env, reference=bundle.reference, config=bundle.load.cfg, options=options
+    )
+    envs = stack.enter_context(recipe.make())
+    changed += changed_files(bundle.files, envs.provenance["files"])
+    if changed:
+        show("changed", ", ".join(changed), "yellow", stderr=True)
+    if bundle.task is None:
+        opt.select_envs(envs, None, None)[0][2].np_random  # noqa: B018  # starts it, and changes nothing
+        return None
+    bar.begin(f"repeating {len(bundle.requests)} requests")
+    suite, task = bundle.task["suite"], bundle.task["task"]
+    env = envs.get(suite, {}).get(task)
+    if env is None or env.num_envs != bundle.task["num_envs"]:
+        raise UsageError(
+            f"make_env gives no {safe_line(f'{suite} / {task}')} of {bundle.task['num_envs']} "
+            "sub-environments any more, so nothing can be repeated"
         )
-        out()
-        if replayed.note:
-            show("note", replayed.note)
-        out(*_CONCLUSIONS[replayed.verdict.value])
+    return env
 
-    def _document(self, bundle: Bundle, replayed: ReplayResult) -> dict[str, Any]:
-        return {
-            "bundle": str(self._folder),
-            "label": bundle.label,
-            "verdict": replayed.verdict.value,
-            "changed_files": [safe_line(path) for path in self._changed],
-            "doubts": list(bundle.doubts),
-            "recorded": {"requests": len(bundle.requests), **bundle.death},
-            "replayed": {
-                "requests": replayed.requests,
-                "steps": replayed.steps,
-                "death": replayed.death,
-                "note": replayed.note,
-            },
-        }
+
+def _print(bundle: Bundle, replayed: ReplayResult) -> None:
+    show("repository", bundle.label, "bold")
+    out()
+    show_rows(
+        [
+            ("", "request", "step", "how it ended"),
+            _row("recorded", len(bundle.requests), bundle.steps, bundle.death),
+            _row("replayed", replayed.requests, replayed.steps, replayed.death),
+        ],
+        right=(1, 2),
+    )
+    out()
+    if replayed.note:
+        show("note", replayed.note)
+    out(*_CONCLUSIONS[replayed.verdict.value])
+
+
+def _document(
+    folder: Path, bundle: Bundle, replayed: ReplayResult, changed: list[str]
+) -> dict[str, Any]:
+    return {
+        "bundle": str(folder),
+        "label": bundle.label,
+        "verdict": replayed.verdict.value,
+        "changed_files": [safe_line(path) for path in changed],
+        "doubts": list(bundle.doubts),
+        "recorded": {"requests": len(bundle.requests), **bundle.death},
+        "replayed": {
+            "requests": replayed.requests,
+            "steps": replayed.steps,
+            "death": replayed.death,
+            "note": replayed.note,
+        },
+    }
 
 
 _CONCLUSIONS = {
