@@ -6,7 +6,6 @@ With ``--static``: what it would do, read without running it.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -20,9 +19,7 @@ from envhub_sandbox.cli.shared.results import print_provenance
 from envhub_worker.protocol.text import size_text
 
 if TYPE_CHECKING:
-    from envhub_sandbox.check.findings import Finding
     from envhub_sandbox.check.static import Static
-    from envhub_sandbox.hub.snapshot import Snapshot
 
 _SPACES = ("single_observation_space", "single_action_space", "observation_space", "action_space")
 _SPACE_TEXT = 2000
@@ -60,21 +57,15 @@ def inspect(
     if static:
         inspect_static(ref, as_json=json, sarif=sarif, fail_on=fail_on, make=make)
         return
-    _inspect(make, suite, task, as_json=json)
-
-
-def _inspect(
-    make: opt.MakeOptions, suites: list[str] | None, tasks: list[str] | None, *, as_json: bool
-) -> None:
     arguments = make.arguments()
     from envhub_sandbox.factory.make_env import make_env
 
-    with ProgressBar(quiet=as_json) as bar, make.explained():
+    with ProgressBar(quiet=json) as bar, make.explained():
         bar.begin(f"loading {make.ref} in a sandbox")
         with make_env(**arguments) as envs:
-            found = [describe_env(*item) for item in opt.select_envs(envs, suites, tasks)]
+            found = [describe_env(*item) for item in opt.select_envs(envs, suite, task)]
             provenance = envs.provenance
-    if as_json:
+    if json:
         print_json({"reference": make.ref, "envs": found, "provenance": provenance})
     else:
         _print(found, provenance, in_process=make.in_process)
@@ -140,28 +131,20 @@ def inspect_static(
     least = None if fail_on is None else level(fail_on)
     with ProgressBar(quiet=as_json) as bar:
         bar.begin(f"reading {ref}")
+        from envhub_sandbox.check import reports
+        from envhub_sandbox.check.findings import Report
         from envhub_sandbox.check.static import document, static
 
-        snapshot = make.snapshot(ref)
-        read = static(snapshot)
+        read = static(make.snapshot(ref))
     failures = [one for one in read.findings if least and one.check.severity.reaches(least)]
     if sarif is not None:
-        _write(sarif, snapshot, read.findings, failures)
+        write_report(sarif, reports.sarif(Report(read.reference, read.findings), failures))
     if as_json:
         print_json(document(read))
     else:
         _print_static(read)
     if failures:
         raise typer.Exit(Exit.ENVIRONMENT)
-
-
-def _write(
-    path: Path, snapshot: Snapshot, findings: Sequence[Finding], failures: list[Finding]
-) -> None:
-    from envhub_sandbox.check import reports
-    from envhub_sandbox.check.findings import Report
-
-    write_report(path, reports.sarif(Report(snapshot.reference, list(findings)), failures))
 
 
 def _print_static(read: Static) -> None:

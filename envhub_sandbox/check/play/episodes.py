@@ -169,7 +169,7 @@ class EpisodeCounter:
     def _numbers(self, rewards: Any) -> Floats:
         count = len(self._left)
         try:
-            numbers = np.array(_on_cpu(rewards), np.float64)
+            numbers = np.array(on_cpu(rewards), np.float64)
         except (TypeError, ValueError) as error:
             raise RolloutError(f"rewards are not numbers: {error}") from error
         if numbers.ndim not in (1, 2) or numbers.shape[0] != count:
@@ -181,7 +181,7 @@ class EpisodeCounter:
         return numbers
 
     def _flags(self, name: str, values: Any) -> Bools:
-        flags = np.asarray(_on_cpu(values))
+        flags = np.asarray(on_cpu(values))
         if flags.shape != self._left.shape or flags.dtype.kind not in "biu":
             raise RolloutError(f"{name} are {flags.dtype} {flags.shape}, not bool (num_envs,)")
         return flags.astype(np.bool_)
@@ -208,14 +208,15 @@ def _success_in(infos: Any, index: int) -> Any:
         mask = infos.get("_is_success")
         if mask is not None and not mask[index]:
             return None
-        return np.asarray(_on_cpu(infos["is_success"]))[index].item()
+        return np.asarray(on_cpu(infos["is_success"]))[index].item()
     except (AttributeError, IndexError, KeyError, TypeError, ValueError):
         return None
 
 
-def _on_cpu(values: Any) -> Any:
-    """A tensor on another device as numpy can read it; everything else as it is."""
-    return values.cpu() if callable(getattr(values, "cpu", None)) else values
+def on_cpu(value: Any) -> Any:
+    """A tensor as an array; everything else as it is."""
+    is_tensor = hasattr(value, "tolist") and hasattr(value, "cpu")
+    return value.cpu().numpy() if is_tensor else value
 
 
 def rollout(

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from gymnasium.vector import VectorEnv
 
-from envhub_sandbox.check.play.episodes import Episode, EpisodeCounter, RolloutError
+from envhub_sandbox.check.play.episodes import Episode, EpisodeCounter, RolloutError, on_cpu
 
 Env = VectorEnv[Any, Any, Any]
 _NOTED = 3
@@ -166,7 +166,7 @@ def _leaves(value: Any, without: Collection[str] = ()) -> Iterator[Any]:
 def _unbounded(observations: Any) -> Iterator[str]:
     """What is not finite in observations."""
     for leaf in _leaves(observations):
-        value = _on_cpu(leaf)
+        value = on_cpu(leaf)
         if isinstance(value, (float, np.ndarray, np.generic)):
             array = np.asarray(value)
             if array.dtype.kind in "fc" and not np.isfinite(array).all():
@@ -182,12 +182,6 @@ def _weight(leaf: Any) -> int:
     if isinstance(leaf, np.ndarray):
         return leaf.nbytes
     return len(leaf) if isinstance(leaf, (str, bytes)) else 8
-
-
-def _on_cpu(value: Any) -> Any:
-    """A tensor as an array; everything else as it is."""
-    is_tensor = hasattr(value, "tolist") and hasattr(value, "cpu")
-    return value.cpu().numpy() if is_tensor else value
 
 
 def _masks(infos: Mapping[Any, Any], count: int) -> Iterator[str]:
@@ -212,7 +206,7 @@ def digest(value: Any) -> str:
 
 
 def _feed(hashed: Any, value: Any) -> None:
-    value = _on_cpu(value)
+    value = on_cpu(value)
     if isinstance(value, np.ndarray) and value.dtype != object:
         hashed.update(f"array {value.dtype.str} {value.shape}".encode())
         hashed.update(np.ascontiguousarray(value).tobytes())
