@@ -226,6 +226,18 @@ def render(self):
     frame = np.zeros((8, 8, 3), np.uint8)
     return {"ansi": "o", "rgb_array": frame, "rgb_array_list": [frame]}[self.render_mode]
 """
+_WORDLESS = """
+import gymnasium
+
+class Words(gymnasium.spaces.Space):
+    shape, dtype = None, None
+"""
+_OWN_SPACE = """
+observation_space = gym.spaces.Dict({"at": Walk.observation_space, "word": Words()})
+
+def observation(self):
+    return {"at": super().observation(), "word": "left"}
+"""
 _WITH_MODE = """
 def make_env(n_envs=1, use_async_envs=False, render_mode="rgb_array"):
     return gym.vector.SyncVectorEnv([lambda: Env(render_mode)] * n_envs)
@@ -391,6 +403,7 @@ HONEST: dict[str, Entry] = {
         def render(self):
             return "." * self.count + "o"
     """),
+    "a space of its own": _env(_OWN_SPACE, head=_WORDLESS),
     "no rendering": _env("metadata, render_mode = {}, None"),
     "modules of a package": _env(
         "length = int(48 * SIZES[0])", head="from walking import SIZES\n", files=_MODULES

@@ -106,13 +106,6 @@ def _is_full(error: BaseException) -> bool:
     return isinstance(error, OSError) and error.errno in full and not isinstance(error, EnvHubError)
 
 
-def _has_traceback(error: BaseException) -> bool:
-    remote = (error, error.__cause__)
-    return any(getattr(one, "traceback", "") for one in remote) or not isinstance(
-        error, EnvHubError
-    )
-
-
 @contextlib.contextmanager
 def reported(*, debug: bool) -> Iterator[None]:
     """Turn whatever ends a command into a message on stderr and an exit code."""
@@ -143,13 +136,14 @@ def _ignoring_full_or_closed_output() -> Iterator[None]:
 
 
 def _explain(error: Exception, debug: bool) -> None:
+    both = (error, error.__cause__)
+    remotes = [text for one in both if (text := getattr(one, "traceback", ""))]
     if debug:
         say(safe_text("".join(traceback.format_exception(error)), limit=200_000))
-        for one in (error, error.__cause__):
-            if remote := getattr(one, "traceback", ""):
-                say(f"In the worker:\n{safe_text(remote, limit=200_000)}")
+        for remote in remotes:
+            say(f"In the worker:\n{safe_text(remote, limit=200_000)}")
     say(f"Error: {describe(error)}", style="red")
-    if not debug and _has_traceback(error):
+    if not debug and (remotes or not isinstance(error, EnvHubError)):
         say("(--debug shows the traceback)")
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import platform
 import re
 from collections.abc import Iterator
@@ -69,20 +68,11 @@ def _groups(process: Path) -> Iterator[Path]:
     lines = [line.split(":", 2) for line in _text(process / "cgroup").splitlines()]
     own = {name: line[2] for line in lines if len(line) == 3 for name in line[1].split(",")}
     for kind, root, top in _mounts(process / "mountinfo"):
-        folder = top / _below(own.get(kind, "/"), root)
-        yield folder
-        while folder != top:
-            folder = folder.parent
-            yield folder
-
-
-def _below(path: str, root: str) -> PurePosixPath:
-    """Where a group is in a mount of one around it: in a container it may be out of sight."""
-    with contextlib.suppress(ValueError):
-        below = PurePosixPath(path).relative_to(root)
-        if ".." not in below.parts:
-            return below
-    return PurePosixPath()
+        group = PurePosixPath(own.get(kind, "/"))
+        # of a container it may be out of sight
+        is_seen = group.is_relative_to(root) and ".." not in group.parts
+        folder = top / (group.relative_to(root) if is_seen else "")
+        yield from (one for one in (folder, *folder.parents) if one.is_relative_to(top))
 
 
 def _mounts(mountinfo: Path) -> Iterator[tuple[str, str, Path]]:

@@ -134,7 +134,7 @@ def print_provenance(provenance: dict[str, Any], *, in_process: bool) -> None:
     if interpreter:
         shown = {*_SHOWN_PACKAGES}
         if provenance["repo_type"] == "pypi":  # which says no version, or only in the reference
-            shown.add(_canonical(re.split(r"[\[@#]", provenance["repository"])[0]))
+            shown.add(re.split(r"[\[@#]", provenance["repository"])[0])
         text = _interpreter(interpreter, provenance.get("packages") or {}, shown)
         show("ran on", text)
     for title, text in _confinement(provenance, in_process):
@@ -149,13 +149,12 @@ def _repository(provenance: dict[str, Any]) -> str:
     return f"{provenance['repository']} ({kind}) at {commit}, {provenance['path']}"
 
 
-def _canonical(name: str) -> str:
-    return re.sub(r"[-_.]+", "-", name).lower()
-
-
 def _interpreter(interpreter: dict[str, str], packages: dict[str, str], names: set[str]) -> str:
-    found = {_canonical(name): release for name, release in packages.items()}
-    shown = [f"{name} {found[name]}" for name in sorted(names & found.keys())]
+    from packaging.utils import canonicalize_name
+
+    found = {canonicalize_name(name): release for name, release in packages.items()}
+    wanted = {canonicalize_name(name) for name in names}
+    shown = [f"{name} {found[name]}" for name in sorted(wanted & found.keys())]
     version, executable = interpreter.get("version", ""), interpreter.get("executable", "")
     return ", ".join([f"{version} ({executable})", *shown])
 

@@ -20,6 +20,7 @@ from envhub_sandbox.check.settings import JudgeOptions
 from envhub_sandbox.errors import SandboxUnavailableError, SnapshotError
 from envhub_sandbox.vector.pictures import png
 from tests.corpus.entries import Entry
+from tests.corpus.honest import HONEST
 from tests.support import judged as corpus
 from tests.support.command_line import envhub, python
 from tests.support.documents import checks
@@ -46,17 +47,6 @@ _HONEST = (
     .replace("int(action)", "int(action[0])")
 )
 """What LeRobot's policies can play, too."""
-
-
-_MODES = """
-    def __init__(self, render_mode):
-        self.render_mode = render_mode or "rgb_array"
-
-    def render(self):
-        given = {"ansi": ".", "rgb_array": self.frame(), "rgb_array_list": [self.frame()]}
-        return given[self.render_mode]
-
-"""
 
 
 def repository(folder: Path, text: str = _HONEST, **files: str) -> Path:
@@ -110,25 +100,13 @@ def test_for_whom_it_is_playable_is_noted(tmp_path: Path) -> None:
 
 
 def test_each_mode_that_is_declared_is_rendered(tmp_path: Path) -> None:
-    """Where make_env takes one; an honest one passes, and who returns none of it does not."""
-    text = _HONEST.replace('"rgb_array"]', '"human", "rgb_array", "ansi", "rgb_array_list"]')
-    text = text.replace("def render(", "def frame(").replace("(n_envs", "(render_mode=None, n_envs")
-    text = text.replace("    length = 12\n", "    length = 12\n" + _MODES, 1)
-    text = text.replace("[Env] * n_envs", "[lambda: Env(render_mode)] * n_envs")
-    assert judged(repository(tmp_path / "honest", text), 2, resets=0).findings == []
-    text = text.replace('"ansi": "."', '"ansi": None').replace("[self.frame()]", "self.frame()")
-    [ansi, rgb] = judged(repository(tmp_path / "wrong", text), 2, resets=0).findings
+    """Where make_env takes one; the control is the honest one of the corpus."""
+    text = HONEST["several modes of rendering"].source()
+    text = text.replace('"ansi": "o"', '"ansi": None').replace("[frame]}", "frame}")
+    report = judged(repository(tmp_path / "wrong", text), 2, resets=0)
+    [ansi, rgb] = report.failures(Severity.ERROR)
     assert (ansi.id, rgb.id) == ("render", "render")
     assert {ansi.message.split(":")[0], rgb.message.split(":")[0]} == {"ansi", "rgb_array_list"}
-
-
-def test_a_space_of_its_own_is_no_finding(tmp_path: Path) -> None:
-    """Its code is not here, and so nobody here says what is in it."""
-    own = f"gym.spaces.Dict({{'at': {_BOX}, 'word': Words()}})"
-    words = "class Words(gym.spaces.Space):\n    shape, dtype = None, None\n\nclass Walk"
-    text = _HONEST.replace(_BOX, own).replace("class Walk", words, 1)
-    text = text.replace(_PLACE, f"{{'at': {_PLACE}, 'word': 'left'}}")
-    assert judged(repository(tmp_path / "walk", text)).findings == []
 
 
 _TRYING = """
