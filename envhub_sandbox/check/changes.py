@@ -10,12 +10,11 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from envhub_sandbox.check.checks import Severity
 from envhub_sandbox.check.findings import Finding
-from envhub_sandbox.check.static import Static
+from envhub_sandbox.check.static import Static, bytes_of
 from envhub_sandbox.dependencies.locks.fingerprint import TaskFingerprint
 from envhub_sandbox.dependencies.locks.making import drift_of_tasks
 from envhub_sandbox.hub.listing import FileRecord, differing
@@ -141,19 +140,12 @@ def _by_line(read: Static) -> dict[tuple[str, ...], list[Finding]]:
     found: dict[tuple[str, ...], list[Finding]] = {}
     for one in read.findings:
         if one.line and one.file not in lines:
-            lines[one.file] = _lines(read.snapshot.root / one.file)
+            data = bytes_of(read.snapshot.root / one.file, _MOST_BYTES)
+            split = re.split("\r\n|\r|\n", data.decode("utf-8", "replace"))
+            lines[one.file] = [line.strip() for line in split]
         text = lines[one.file][one.line - 1 : one.line] if one.line else []
         found.setdefault((one.id, one.file, one.message, *text), []).append(one)
     return found
-
-
-def _lines(path: Path) -> list[str]:
-    try:
-        with path.open("rb") as file:
-            text = file.read(_MOST_BYTES).decode("utf-8", "replace")
-    except OSError:
-        return []
-    return [line.strip() for line in re.split("\r\n|\r|\n", text)]
 
 
 def environments(then: Sequence[TaskFingerprint], now: Sequence[TaskFingerprint]) -> list[Change]:

@@ -79,8 +79,8 @@ def survey(snapshot: Snapshot, parsed: Mapping[str, ParsedFile | None]) -> Surve
     left = _MOST_BYTES_IN_ALL
     for record in sorted(snapshot.files, key=lambda one: one.path):
         path = snapshot.root / record.path
-        ending = _bytes(path, contents.ENDING, max(record.size - contents.ENDING, 0))
-        kind = contents.kind_of_contents(record.path, _bytes(path, contents.BEGINNING), ending)
+        ending = bytes_of(path, contents.ENDING, max(record.size - contents.ENDING, 0))
+        kind = contents.kind_of_contents(record.path, bytes_of(path, contents.BEGINNING), ending)
         found.files.append(File(record, kind))
         found.add(contents.of_kind(record.path, kind, is_folder=snapshot.repo_type == "local"))
         for one in contents.hidden(record.path, record.path, is_code=True):
@@ -97,7 +97,8 @@ def survey(snapshot: Snapshot, parsed: Mapping[str, ParsedFile | None]) -> Surve
     return found
 
 
-def _bytes(path: Path, most: int, start: int = 0) -> bytes:
+def bytes_of(path: Path, most: int, start: int = 0) -> bytes:
+    """So many of a file; none of one that cannot be read."""
     try:
         with path.open("rb") as file:
             file.seek(start)
@@ -107,7 +108,7 @@ def _bytes(path: Path, most: int, start: int = 0) -> bytes:
 
 
 def _in_text(record: FileRecord, path: Path, *, is_code: bool) -> Iterator[Finding]:
-    text = _bytes(path, record.size).decode("utf-8-sig", "replace")
+    text = bytes_of(path, record.size).decode("utf-8-sig", "replace")
     yield from contents.hidden(record.path, text, is_code=is_code)
     if is_code:
         yield from contents.long_lines(record.path, text)
@@ -208,7 +209,7 @@ def _in_front(snapshot: Snapshot) -> Iterator[Finding]:
 def _target(snapshot: Snapshot, record: FileRecord, there: set[str]) -> str | None:
     if record.size > _LONGEST_LINK:
         return None
-    text = _bytes(snapshot.root / record.path, _LONGEST_LINK).decode("utf-8", "replace")
+    text = bytes_of(snapshot.root / record.path, _LONGEST_LINK).decode("utf-8", "replace")
     if not text or not text.isprintable() or text != text.strip():
         return None
     if text.startswith(("../", "/")):
