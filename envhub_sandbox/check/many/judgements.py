@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Generator, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 from envhub_sandbox.errors import WorkerStartupError
 from envhub_sandbox.system import processes
@@ -67,15 +67,21 @@ class _Job(Generic[T]):
             self._file("err").open("xb") as err,
             processes.pidfd() as ourselves,
         ):
-            self._process = _started(
-                command(order, folder, ourselves),
-                stdin=subprocess.DEVNULL,
-                stdout=out,
-                stderr=err,
-                env={**os.environ, **variables},
-                pass_fds=(ourselves,),
-                **own_group(),  # Ctrl-C is for us, who then end it
-            )
+            try:
+                self._process: subprocess.Popen[bytes] = subprocess.Popen(
+                    command(order, folder, ourselves),
+                    stdin=subprocess.DEVNULL,
+                    stdout=out,
+                    stderr=err,
+                    env={**os.environ, **variables},
+                    pass_fds=(ourselves,),
+                    **own_group(),  # Ctrl-C is for us, who then end it
+                )
+            except OSError as error:
+                raise WorkerStartupError(
+                    f"no check can be started: {error.strerror}. Finished results are kept; run "
+                    "fewer at once with --jobs"
+                ) from error
 
     @property
     def has_ended(self) -> bool:
@@ -146,16 +152,6 @@ class _Job(Generic[T]):
 
     def _file(self, name: str) -> Path:
         return self._folder / name
-
-
-def _started(command: list[str], **how: Any) -> subprocess.Popen[bytes]:
-    try:
-        return subprocess.Popen(command, **how)
-    except OSError as error:
-        raise WorkerStartupError(
-            f"no check can be started: {error.strerror}. Finished results are kept; run fewer at "
-            "once with --jobs"
-        ) from error
 
 
 def judgements(

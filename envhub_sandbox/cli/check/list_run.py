@@ -47,7 +47,7 @@ from envhub_sandbox.hub.snapshot import commit_of
 from envhub_sandbox.sandboxes.ray import cluster
 from envhub_sandbox.settings.policy import policy_from
 from envhub_sandbox.system.platform import IS_WINDOWS, cores
-from envhub_worker.protocol.text import duration_text, size_text
+from envhub_worker.protocol.text import duration_text, parse_size, size_text
 
 if TYPE_CHECKING:
     from envhub_sandbox.check.many.entries import ListEntry
@@ -262,7 +262,11 @@ class ListRun:
         given = self.make.arguments()["policy"]
         says = {} if self.policy is None else read_file(self.policy)
         one = policy_from(merged_settings(says, given), None).limits.memory_bytes
-        each, budget = _JAILS * one, opt.read_size("--max-memory", self.max_memory)
+        each = _JAILS * one
+        try:
+            budget = None if self.max_memory is None else parse_size(self.max_memory)
+        except ValueError as error:
+            raise UsageError(f"--max-memory is {self.max_memory!r}; {error}") from None
         needs = f"a judgement may take {size_text(each)}: {_JAILS} jails of {size_text(one)}"
         if budget is None:
             budget = max(each, free_memory_bytes() or 0)

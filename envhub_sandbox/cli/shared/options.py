@@ -17,7 +17,6 @@ from envhub_sandbox.cli.shared.console import prints_on_stderr, safe_line
 from envhub_sandbox.cli.shared.exits import ForeignError, UsageError, reported
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.settings.options import OPTIONS, json_or_text
-from envhub_worker.protocol.text import parse_size
 
 if TYPE_CHECKING:
     from envhub_sandbox.hub.snapshot import Snapshot
@@ -227,18 +226,6 @@ def is_typed(context: typer.Context, name: str) -> bool:
     """Whether a parameter stands on the command line, and not in a file or nowhere."""
     source = context.get_parameter_source(name)
     return source is not None and source.name == "COMMANDLINE"
-
-
-def read_size(option: str, text: str | None) -> int | None:
-    """Bytes from ``"512M"``, ``"1.5GiB"`` or ``"1048576"``; units are powers of 1024.
-    Raises ``UsageError``: it is no size.
-    """
-    if text is None:
-        return None
-    try:
-        return parse_size(text)
-    except ValueError as error:
-        raise UsageError(f"{option} is {text!r}; {error}") from None
 
 
 def read_env_kwargs(texts: Sequence[str]) -> dict[str, Any]:

@@ -117,6 +117,7 @@ def test_every_option_is_handed_on_or_about_the_list() -> None:
         ("--all list --output out --allow nothing", "there are: requirements"),
         ("--all list --output out --memory much", "takes a size"),
         ("--all list --output out --max-memory 4G", "is too little"),
+        ("--all list --output out --max-memory much", "--max-memory is 'much'; it takes a size"),
         ("--all nowhere --output out", "cannot be read"),
         ("--all list --output out --policy nowhere.toml", "cannot be read"),
         ("--all list --output .", "has other files"),

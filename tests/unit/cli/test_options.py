@@ -13,7 +13,6 @@ from envhub_sandbox.cli.shared.options import (
     MakeOptions,
     read_env_kwargs,
     read_gpu,
-    read_size,
     select_envs,
     with_options,
 )
@@ -48,15 +47,6 @@ def test_every_option_of_a_command_reaches_make_env() -> None:
     assert made == [MakeOptions("<ref>", given)]
     assert names == {*(OPTIONS[key].parameter for key in ALL), "ref", "debug"}
     assert given["step_s"] == given["startup_s"] == "<timeout>"
-
-
-@pytest.mark.parametrize(("text", "size"), [("1.5GiB", 3 * 2**29), ("2 KB", 2048), (None, None)])
-def test_sizes_are_read(text: str | None, size: int | None) -> None:
-    """In the spellings that people use; what is none is refused with the option's name."""
-    assert read_size("--memory", text) == size
-    for wrong in ("4 gigs", "nan", ""):
-        with pytest.raises(UsageError, match="--memory"):
-            read_size("--memory", wrong)
 
 
 def test_env_kwargs_take_json_and_pairs() -> None:
