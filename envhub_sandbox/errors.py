@@ -1,4 +1,4 @@
-"""Every error that a caller can get.
+"""Every error that a caller can get, each below its base; the protocol has those of its own.
 
 A remote exception arrives as text. ``remote_error`` looks up its builtin base class in a fixed
 table, so ``except AttributeError`` works although nothing of the worker is imported. A warning of

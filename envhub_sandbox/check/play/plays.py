@@ -33,8 +33,6 @@ _FPS = 25.0
 _LASTS = 3.0
 """Seconds, where there are so few frames that at their own rate a film were over at once."""
 _STILLS = 4
-_SAMPLES = 10
-"""How often memory is counted in a play: a server counts only so often (``CountLimit``)."""
 MAX_SIDE = 4096
 """Pixels: H.264 encoders stop there, and a frame stays below 50 MB."""
 DEFAULT_FPS = 30.0
@@ -222,27 +220,11 @@ class Play:
     played: int = 0
     film: Film | None = None
 
-    def counting(self, usage: Callable[[], dict[str, int]]) -> Callable[[], dict[str, int]]:
-        """The same function, of which the memory is noted each time."""
-
-        def counted() -> dict[str, int]:
-            used = usage()
-            if "memory_bytes" in used:
-                self.memory.append(used["memory_bytes"])
-            return used
-
-        return counted
-
-    def sampling(self, usage: Callable[[], dict[str, int]], steps: int) -> Callable[[int], None]:
-        """A function that notes the memory after some of so many steps; given its number."""
-        counted, every = self.counting(usage), -(-steps // _SAMPLES)
-
-        def seen(number: int) -> None:
-            if number % every == 0:
-                counted()
-                self.played = len(self.memory)
-
-        return seen
+    def count(self, used: dict[str, int]) -> dict[str, int]:
+        """Keep the memory of what a jail uses; gives the same."""
+        if "memory_bytes" in used:
+            self.memory.append(used["memory_bytes"])
+        return used
 
 
 def facts_of(env: VectorEnv[Any, Any, Any]) -> dict[str, str]:

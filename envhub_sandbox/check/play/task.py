@@ -25,6 +25,7 @@ from envhub_worker.protocol.text import printable, size_text
 
 _PICTURED = 12
 """Tasks of which a page has pictures: a suite may have hundreds."""
+_SAMPLES = 10
 _MODES = ("NextStep", "SameStep", "Disabled")
 _RESET = 5
 """How many slow steps a reset may take."""
@@ -85,9 +86,7 @@ class TaskJudge:
         wanted = self._asked.arguments.get("n_envs", 1)
         gave = f"make_env(n_envs={wanted}) gave {self._env.num_envs} sub-environments"
         self._holds("num-envs", self._env.num_envs == wanted, gave)
-        seen = {}
-        if self._sandbox is not None and self._pictured:
-            seen["observe"] = self._play.sampling(self._sandbox.usage, self._asked.steps)
+        seen = {"observe": self._sample} if self._sandbox is not None and self._pictured else {}
         self._tell("first play")
         first = self._played(self._env, mode, **seen)
         self._play.episodes = first.counted
@@ -239,16 +238,25 @@ class TaskJudge:
     def _leaks(self) -> None:
         if self._sandbox is None or not self._asked.resets:
             return
-        resets, counting = self._asked.resets, self._play.counting(self._sandbox.usage)
-        steps = min(_BEGUN, self._asked.steps)
+        resets, steps = self._asked.resets, min(_BEGUN, self._asked.steps)
         begin = partial(self._ends, self._env, steps)
-        seen = probes.usage_per_round(begin, counting, resets, self._tell)
+        seen = probes.usage_per_round(begin, self._used, resets, self._tell)
         if not seen:
             return  # a server on another host that does not count
         self._report.figures[self._name] |= {name: float(n) for name, n in seen[-1].items()}
         grown, words = probes.leak(seen, resets) or ("", "")
         for check in probes.LEAK_CHECKS:
             self._holds(check, check != grown, words)
+
+    def _used(self) -> dict[str, int]:
+        assert self._sandbox is not None
+        return self._play.count(self._sandbox.usage())
+
+    def _sample(self, number: int) -> None:
+        """Count after some of the steps: a server counts only so often (``CountLimit``)."""
+        if number % -(-self._asked.steps // _SAMPLES) == 0:
+            self._used()
+            self._play.played = len(self._play.memory)
 
     def _render(self) -> None:
         wrong: list[str] = []

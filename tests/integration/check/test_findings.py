@@ -77,7 +77,7 @@ def test_an_honest_repository_passes(tmp_path: Path) -> None:
     play = report.plays["hub_env / 0"]
     assert [(one.returns, one.length) for one in play.episodes] == [((10.0,), 10)] * 4
     assert len(play.step_s) == 25
-    assert play.played >= 9, "memory, while it was played"
+    assert 9 <= play.played <= 11, "memory, a few times while it was played"
     assert len(play.memory) == play.played + 4, "and after each round of resets"
     assert play.film is not None
     assert play.film.stills[0] == png(np.zeros((4, 6, 3), np.uint8))

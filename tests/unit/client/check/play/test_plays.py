@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from envhub_sandbox.check.play import plays, traces
-from envhub_sandbox.check.play.plays import Play, facts_of, film
+from envhub_sandbox.check.play.plays import facts_of, film
 from envhub_sandbox.errors import RemoteEnvError
 
 pytest.importorskip("imageio_ffmpeg")
@@ -96,20 +96,6 @@ def test_what_an_environment_says_is_printable_and_bounded() -> None:
     assert told["actions"] == "Discrete(2)"
     assert told["autoreset"] == "NEXT_STEP"
     assert all(len(value) < 8_000 and value.isascii() for value in told.values())
-
-
-def test_memory_is_counted_a_few_times() -> None:
-    """However many steps there are: a server counts only so often."""
-    play = Play()
-    seen = play.sampling(lambda: {"memory_bytes": 3}, 1_000)
-    for number in range(1_001):
-        seen(number)
-    assert play.memory == [3] * 11
-    play.counting(lambda: {"memory_bytes": 4})()
-    assert (play.memory[11:], play.played) == ([4], 11)
-    nobody_counts = Play()
-    nobody_counts.sampling(dict, 3)(0)
-    assert nobody_counts.memory == []
 
 
 def test_a_play_counts_episodes_until_rewards_cannot_be_counted() -> None:
