@@ -1,4 +1,44 @@
-"""Every error that a caller can get, each below its base; the protocol has those of its own.
+"""Every error that a caller can get.
+
+::
+
+    EnvHubError
+      HubReferenceError (ValueError)
+      SnapshotError
+        SnapshotTooLargeError
+        SnapshotIntegrityError
+        RepositoryUnavailableError (OSError)
+      PolicyError (ValueError)
+      BundleError (ValueError)
+      LockError (ValueError)
+        LockDriftError
+      ActionError (ValueError)
+        ActionTypeError (TypeError)
+      ObservationError (ValueError)
+      SandboxUnavailableError
+      DependencyError (ImportError)
+        RequirementError
+        ResolutionError
+        IndexUnavailableError
+        PackageIntegrityError
+        PackagesTooLargeError
+        InterpreterUnavailableError
+        MissingModuleError (ModuleNotFoundError)
+      LoadError
+        LoadAttributeError (AttributeError), LoadValueError (ValueError), ...
+      WorkerError
+        WorkerStartupError
+        WorkerDiedError
+        WorkerTimeoutError (TimeoutError, multiprocessing.TimeoutError)
+        ServerBusyError
+      ProtocolError
+        LocalProtocolError
+        RemoteProtocolError
+          MessageTooLargeError
+          VersionMismatchError
+      RemoteEnvError
+        RemoteAttributeError (AttributeError), RemoteValueError (ValueError), ...
+        RemoteResetNeeded (gymnasium.error.ResetNeeded), ...
 
 A remote exception arrives as text. ``remote_error`` looks up its builtin base class in a fixed
 table, so ``except AttributeError`` works although nothing of the worker is imported. A warning of

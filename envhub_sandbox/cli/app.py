@@ -19,19 +19,57 @@ from envhub_sandbox.cli.shared.console import guarded, out, say
 from envhub_sandbox.cli.shared.exits import EXIT_CODES, Exit, reported
 from envhub_sandbox.settings.options import on_command_line, use_option_names
 
-# each command's function, below this package; a group with its help, and those of its commands
-_COMMANDS: dict[str, str | tuple[str, Mapping[str, str]]] = {
-    "run": "run:run",
-    "inspect": "inspect:inspect",
-    "check": "check.check:check",
-    "diff": "diff:diff",
-    "prefetch": "prefetch:prefetch",
-    "lock": "lock:lock",
-    "verify": "lock:verify",
-    "init": "init:init",
-    "push": "push:push",
-    "replay": "replay:replay",
-    "doctor": "doctor:doctor",
+Where = Mapping[str, str]
+"""The commands of a group: where the function of each is, below this package."""
+
+# each with the first line of its help, so that a list of them imports none
+_COMMANDS: dict[str, tuple[str, str | Where]] = {
+    "run": (
+        "Play episodes of an environment and print returns, lengths, speed and provenance.",
+        "run:run",
+    ),
+    "inspect": (
+        "Print suites, tasks, spaces, metadata and provenance, without stepping anything.",
+        "inspect:inspect",
+    ),
+    "check": (
+        "Run a repository in a sandbox and report what is wrong with it.",
+        "check.check:check",
+    ),
+    "diff": (
+        "Compare two commits: files, packages, imports and findings; with --run, tasks and spaces.",
+        "diff:diff",
+    ),
+    "prefetch": (
+        "Download a repository and install its packages, without running the repository.",
+        "prefetch:prefetch",
+    ),
+    "lock": (
+        "Record commit, file hashes, packages, Python and spaces in a file for "
+        "make_env(lock=FILE).",
+        "lock:lock",
+    ),
+    "verify": (
+        "Compare a repository with its lock file; exit code 7 if something differs.",
+        "lock:verify",
+    ),
+    "init": (
+        "Write a new environment's repository: env.py, requirements, card, licence, test, CI "
+        "workflow.",
+        "init:init",
+    ),
+    "push": (
+        "Publish a folder on the Hub as one commit, and print the pinned reference.",
+        "push:push",
+    ),
+    "replay": (
+        "Repeat the requests of a crash bundle, and report whether it dies in the same way.",
+        "replay:replay",
+    ),
+    "doctor": (
+        "Test what this host can enforce, and print what is missing and how to get it.",
+        "doctor:doctor",
+    ),
     "cache": (
         "List and remove snapshots, installed packages, and what killed clients left behind.",
         {"list": "cache:list_", "remove": "cache:remove", "gc": "cache:gc"},
@@ -43,19 +81,21 @@ _COMMANDS: dict[str, str | tuple[str, Mapping[str, str]]] = {
 class Program(TyperGroup):
     """``envhub``: CI systems obey nothing of what it prints, usage errors included.
 
-    A command is imported when it is called, or all are listed.
+    A command is imported when it is called: until then it has its name and its line in the list.
     """
 
     def __init__(self, **given: Any) -> None:
         super().__init__(**given)
         if not self.commands:
-            names: Any = dict.fromkeys(_COMMANDS)
-            self.commands = names
+            self.commands = {
+                name: Command(name, help=text) for name, (text, _) in _COMMANDS.items()
+            }
 
-    def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """A command, with its options."""
-        known = super().get_command(ctx, cmd_name)
-        return whole_command(cmd_name) if known is None and cmd_name in self.commands else known
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """The command that is called, with its options."""
+        if args[0] in _COMMANDS:
+            self.commands[args[0]] = whole_command(args[0])
+        return super().resolve_command(ctx, args)
 
     def main(self, *args: Any, **options: Any) -> Any:
         """Run a command."""
@@ -115,9 +155,9 @@ class Command(TyperCommand):
 
 def functions(name: str) -> dict[str, Callable[..., None]]:
     """The function of a command, or those of a group, by name."""
-    where = _COMMANDS[name]
+    where = _COMMANDS[name][1]
     found = {}
-    for one, place in ({name: where} if isinstance(where, str) else where[1]).items():
+    for one, place in ({name: where} if isinstance(where, str) else where).items():
         module, _, function = place.partition(":")
         found[one] = getattr(importlib.import_module(f"{__package__}.{module}"), function)
     return found
@@ -125,8 +165,8 @@ def functions(name: str) -> dict[str, Callable[..., None]]:
 
 def whole_command(name: str) -> Any:
     """A command, or a group, with all its options."""
-    where = _COMMANDS[name]
-    made = _typer("" if isinstance(where, str) else where[0])
+    text, where = _COMMANDS[name]
+    made = _typer(text)
     for one, function in functions(name).items():
         made.command(one, cls=Command, no_args_is_help=one == "remove")(function)
     group = typer.main.get_group(made)

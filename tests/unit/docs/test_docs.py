@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import re
 import string
 import subprocess
@@ -261,6 +262,30 @@ def test_the_map_has_every_package() -> None:
 
 # said nowhere in the project: they name people's machines and tools, not the project
 _FORBIDDEN = re.compile(r"(?<![\w./-])/(work|root)/\w|TODO|FIXME|XXX(?!X)")
+
+
+def error_tree() -> list[tuple[int, str]]:
+    """The tree in the docstring of ``errors``: depth and name."""
+    errors: Any = importlib.import_module("envhub_sandbox.errors")
+    block = errors.__doc__.partition("::\n\n")[2].partition("\n\nA remote")[0]
+    found = []
+    for line in block.splitlines():
+        depth = (len(line) - len(line.lstrip())) // 2
+        found += [(depth, name) for name in re.findall(r"(\w+Error)(?: \(\w+\))?", line)[:1]]
+    return found
+
+
+def test_error_tree_is_the_tree() -> None:
+    """The docstring of ``errors`` shows each class below its base."""
+    errors: Any = importlib.import_module("envhub_sandbox.errors")
+    parents: dict[int, type] = {}
+    tree = error_tree()
+    for depth, name in tree:
+        cls = parents[depth] = getattr(errors, name)
+        if depth - 1 in parents:
+            assert issubclass(cls, parents[depth - 1]), name
+    shown = {name for _, name in tree}
+    assert {name for name in errors.__all__ if name.endswith("Error")} <= shown
 
 
 @pytest.mark.parametrize("written", [settings, options, charts])
