@@ -15,7 +15,7 @@ from typing import Any
 from envhub_sandbox.check.checks import Severity
 from envhub_sandbox.check.findings import Finding
 from envhub_sandbox.check.static import Static, bytes_of
-from envhub_sandbox.dependencies.locks.fingerprint import TaskFingerprint
+from envhub_sandbox.dependencies.locks.lockfile import TaskFingerprint
 from envhub_sandbox.dependencies.locks.making import drift_of_tasks
 from envhub_sandbox.hub.listing import FileRecord, differing
 from envhub_worker.protocol.text import printable, size_text

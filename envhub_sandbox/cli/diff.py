@@ -23,7 +23,7 @@ from envhub_worker.protocol.text import counted
 
 if TYPE_CHECKING:
     from envhub_sandbox.check.changes import Change
-    from envhub_sandbox.dependencies.locks.fingerprint import TaskFingerprint
+    from envhub_sandbox.dependencies.locks.lockfile import TaskFingerprint
     from envhub_sandbox.hub.snapshot import Snapshot
 
 

@@ -24,6 +24,7 @@ from packaging.version import InvalidVersion, Version
 
 from envhub_sandbox.errors import RequirementError
 from envhub_sandbox.hub.sources import toml
+from envhub_sandbox.hub.sources.toml import table
 from envhub_sandbox.settings.options import option_name
 
 _GIT = re.compile(
@@ -78,6 +79,7 @@ def of_git(requirement: Requirement, where: str) -> Source | None:
 
 
 PROJECT = "pyproject.toml"
+_OPTIONAL = f"[project.optional-dependencies] of {PROJECT}"
 MAX_BYTES = 256 * 1024
 MAX_REQUIREMENTS = 1000
 MAX_FILES = 16
@@ -134,25 +136,21 @@ def declared(root: Path, entry: str) -> DeclaredPackages | None:
     script = _script(root / entry, entry)
     if script is not None:
         return script
-    project = _project(root / PROJECT)
+    project = _project(root)
     beside = os.path.join(os.path.dirname(entry), "requirements.txt")
     names = (beside, "requirements.txt")
     listed = next((name for name in names if (root / name).is_file()), None)
     if listed is not None:
-        python = "" if project is None else project.python
         wanted, constraints = read(root, listed)
-        return DeclaredPackages(listed, tuple(wanted), python, tuple(constraints))
-    return project if project is not None and (project.wanted or project.python) else None
+        return DeclaredPackages(listed, tuple(wanted), project.python, tuple(constraints))
+    return project if project.wanted or project.python else None
 
 
-def optional(root: Path, entry: str) -> dict[str, WantedPackage]:
+def optional(root: Path) -> dict[str, WantedPackage]:
     """What optional extras of a project bring, by canonical name; empty where none can be read."""
     try:
-        project = _toml(_text(root / PROJECT, PROJECT), PROJECT).get("project", {})
-        extras = project.get("optional-dependencies", {}) if isinstance(project, dict) else {}
-        rows = extras.values() if isinstance(extras, dict) else ()
-        where = f"[project.optional-dependencies] of {PROJECT}"
-        found = [wanted for row in rows for wanted in _list(row, where)]
+        extras = table(pyproject(root), "project", "optional-dependencies")
+        found = [wanted for row in extras.values() for wanted in _list(row, _OPTIONAL)]
     except RequirementError:
         return {}
     return {canonicalize_name(one.requirement.name): one for one in found}
@@ -163,13 +161,12 @@ def not_read(root: Path, entry: str) -> list[str]:
     beside = (root / entry).parent
     found = [name for name in _NOT_READ if (beside / name).is_file() or (root / name).is_file()]
     try:
-        data = _toml(_text(root / PROJECT, PROJECT), PROJECT)
+        data = pyproject(root)
     except RequirementError:
         return found
-    tool, project = data.get("tool"), data.get("project")
-    if isinstance(tool, dict) and isinstance(tool.get("poetry"), dict):
+    if "poetry" in table(data, "tool"):
         found.append(f"[tool.poetry] of {PROJECT}")
-    dynamic = project.get("dynamic") if isinstance(project, dict) else None
+    dynamic = table(data, "project").get("dynamic")
     if isinstance(dynamic, list) and "dependencies" in dynamic:
         found.append(f"dynamic dependencies of {PROJECT}")
     return found
@@ -245,18 +242,15 @@ def read(root: Path, name: str) -> tuple[list[WantedPackage], list[WantedPackage
 
 def _of_itself(root: Path, extras: str, where: str) -> Iterator[WantedPackage]:
     """What ``-e .`` brings besides the repository, whose modules are there already."""
-    data = _toml(_text(root / PROJECT, PROJECT), PROJECT) if _is_file(root / PROJECT) else {}
-    project = data.get("project")
+    project = pyproject(root).get("project")
     if not isinstance(project, dict):
         raise RequirementError(
             f"{where} installs the repository itself, but its requirements are read only from "
             f"[project] of {PROJECT}, which does not exist. {_advice()}"
         )
     yield from _list(project.get("dependencies", []), f"[project] of {PROJECT}")
-    optional = project.get("optional-dependencies", {})
     for name in filter(None, map(str.strip, extras.split(","))):
-        rows = optional.get(name, []) if isinstance(optional, dict) else []
-        yield from _list(rows, f"[project.optional-dependencies] of {PROJECT}")
+        yield from _list(table(project, "optional-dependencies").get(name, []), _OPTIONAL)
 
 
 def _beside(root: Path, file: str, named: str, where: str) -> str:
@@ -326,15 +320,17 @@ def _block(lines: Sequence[str], start: int) -> str | None:
     return None if closed is None else "\n".join(inside[:closed])
 
 
-def _project(path: Path) -> DeclaredPackages | None:
-    if not path.is_file():
-        return None
-    project = _toml(_text(path, PROJECT), PROJECT).get("project")
-    if not isinstance(project, dict):
-        return None
+def _project(root: Path) -> DeclaredPackages:
+    project = table(pyproject(root), "project")
     where = f"[project] of {PROJECT}"
     python = _specifier(project.get("requires-python", ""), where)
     return DeclaredPackages(PROJECT, _list(project.get("dependencies", []), where), python)
+
+
+def pyproject(root: Path, where: str = PROJECT) -> dict[str, Any]:
+    """The whole of ``pyproject.toml``; empty where there is none."""
+    path = root / PROJECT
+    return _toml(_text(path, where), where) if path.is_file() else {}
 
 
 def _toml(text: str, where: str) -> dict[str, Any]:

@@ -88,7 +88,7 @@ def _guessed(root: Path, entry: str, rows: tuple[tuple[str, str, int], ...]) -> 
         return ()
     from envhub_sandbox.dependencies.declared import optional, parse_requirement
 
-    extras = optional(root, entry)
+    extras = optional(root)
     found: dict[str, Guess] = {}
     for name, file, line in rows:
         known = _of_id(name) if "-" in name else _of_module(name, extras)

@@ -214,11 +214,10 @@ def lock_checker(
         if lock is None or lock.spaces is None or config is not None:
             return
         from envhub_sandbox.dependencies.locks import lockfile, making
-        from envhub_sandbox.dependencies.locks.fingerprint import fingerprint_of_task
 
         if lockfile.arguments_text(env_kwargs) == lock.spaces.arguments:
             now = [
-                fingerprint_of_task(
+                making.fingerprint_of_task(
                     *(env.suite, env.task, env.autoreset_mode),
                     *(env.single_observation_space, env.single_action_space),
                 )

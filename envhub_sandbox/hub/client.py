@@ -36,6 +36,7 @@ from envhub_sandbox.hub.grammar import is_commit
 from envhub_sandbox.hub.listing import (
     GIT_SHA1,
     SHA256,
+    CommitFiles,
     Copier,
     FileRecord,
     HashMismatch,
@@ -135,9 +136,36 @@ class HubClient:
             query = _next_page(following, query)
 
     @contextmanager
-    def files(self, repo: Repository, commit: str) -> Iterator[_HubFiles]:
+    def files(self, repo: Repository, commit: str) -> Iterator[CommitFiles]:
         """The files of a commit."""
-        yield _HubFiles(self, repo, commit)
+        yield CommitFiles(self.listing(repo, commit), partial(self._copier, repo, commit))
+
+    def _copier(
+        self, repo: Repository, commit: str, files: Sequence[FileRecord], title: str
+    ) -> Copier:
+        folder = self.download(repo, commit, [file.path for file in files])
+
+        def copy(record: FileRecord, target: Path) -> None:
+            try:
+                copy_verified(folder / record.path, target, record)
+                return
+            except HashMismatch:
+                # The Hub cache may hold an edited or half-written file: once more, from the Hub.
+                target.unlink(missing_ok=True)
+            with self._explained(repo, commit):
+                again = self._download(repo, commit, record.path, force_download=True)
+            try:
+                copy_verified(again, target, record)
+            except HashMismatch as mismatch:
+                raise SnapshotIntegrityError(
+                    f"{title}: the file {record.path!r} came with other content than the "
+                    f"commit's listing says: {mismatch.found}, not {record.size} bytes with "
+                    f"{record.digest}. Nothing of it was used. A proxy, a mirror or the Hub cache "
+                    f"changes files: try another network or endpoint, and remove the bad copy: "
+                    f"rm '{again}'"
+                ) from mismatch
+
+        return copy
 
     def download(self, repo: Repository, commit: str, paths: Sequence[str]) -> Path:
         """Download these files into the Hub cache; the folder of the commit there.
@@ -150,11 +178,6 @@ class HubClient:
             downloads = [partial(self._download, repo, commit, path) for path in paths]
             place = Calls(downloads, _WORKERS).results()[0]
         return place.parents[paths[0].count("/")]
-
-    def download_again(self, repo: Repository, commit: str, path: str) -> Path:
-        """Download one file anew, whatever the Hub cache has of it."""
-        with self._explained(repo, commit):
-            return self._download(repo, commit, path, force_download=True)
 
     def publish(
         self, repo: Repository, folder: Path, revision: str | None, message: str, *, private: bool
@@ -242,46 +265,6 @@ class HubClient:
         login = login_of(self.endpoint)
         secrets = (token, *self._login().values(), login and login[1])
         return tuple(secret for secret in secrets if secret)
-
-
-@dataclass(frozen=True)
-class _HubFiles:
-    """The files of a commit at the Hub."""
-
-    hub: HubClient
-    repo: Repository
-    commit: str
-
-    @property
-    def listing(self) -> Iterator[FileRecord]:
-        return self.hub.listing(self.repo, self.commit)
-
-    def copier(self, files: Sequence[FileRecord], title: str) -> Copier:
-        folder = self.hub.download(self.repo, self.commit, [file.path for file in files])
-
-        def copy(record: FileRecord, target: Path) -> None:
-            try:
-                copy_verified(folder / record.path, target, record)
-            except HashMismatch:
-                # The Hub cache may hold an edited or half-written file: once more, from the Hub.
-                target.unlink(missing_ok=True)
-                again = self.hub.download_again(self.repo, self.commit, record.path)
-                _copy_or_refuse(title, again, target, record)
-
-        return copy
-
-
-def _copy_or_refuse(title: str, source: Path, target: Path, record: FileRecord) -> None:
-    try:
-        copy_verified(source, target, record)
-    except HashMismatch as mismatch:
-        raise SnapshotIntegrityError(
-            f"{title}: the file {record.path!r} came with other content than the "
-            f"commit's listing says: {mismatch.found}, not {record.size} bytes with "
-            f"{record.digest}. Nothing of it was used. A proxy, a mirror or the Hub cache "
-            f"changes files: try another network or endpoint, and remove the bad copy: "
-            f"rm '{source}'"
-        ) from mismatch
 
 
 def _next_page(url: str | None, query: dict[str, str]) -> dict[str, str] | None:

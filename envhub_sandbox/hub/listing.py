@@ -56,15 +56,16 @@ class Repository(NamedTuple):
     repo_id: str
 
 
-class CommitFiles(Protocol):
-    """The files of a commit at a host."""
+class CommitFiles(NamedTuple):
+    """The files of a commit at a host.
 
-    @property
-    def listing(self) -> Iterator[FileRecord]:
-        """What there is, before anything of it is believed."""
+    Attributes:
+        listing: What there is, before anything of it is believed.
+        copier: Brings these files, and gives what copies each into the store; has a title, too.
+    """
 
-    def copier(self, files: Sequence[FileRecord], title: str) -> Copier:
-        """Bring these files, and give what copies each into the store."""
+    listing: Iterator[FileRecord]
+    copier: Callable[[Sequence[FileRecord], str], Copier]
 
 
 class RepositoryHost(Protocol):

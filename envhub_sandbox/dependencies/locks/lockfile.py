@@ -10,18 +10,18 @@ import json
 import os
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from envhub_sandbox.dependencies.declared import parse_requirement
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.dependencies.locks import pylock
-from envhub_sandbox.dependencies.locks.fingerprint import TaskFingerprint
-from envhub_sandbox.dependencies.locks.pylock import PylockPackage, quoted, table
+from envhub_sandbox.dependencies.locks.pylock import PylockPackage, as_toml, rows
 from envhub_sandbox.dependencies.request import DATE
 from envhub_sandbox.errors import LockError, RequirementError
 from envhub_sandbox.hub.snapshot import Snapshot
+from envhub_sandbox.hub.sources.toml import table
 from envhub_sandbox.system.folders import write_whole_file
 
 FORMAT = 1
@@ -35,6 +35,8 @@ _COMMIT = re.compile(r"[0-9a-f]{40}|(local|pypi)-[0-9a-f]+")
 _PYTHON = re.compile(r"3\.\d{1,3}")
 _WORD = re.compile(r"[a-z0-9_]{1,40}")
 _DIGEST = re.compile(r"git-sha1:[0-9a-f]{40}|sha256:[0-9a-f]{64}")
+_TEXTS = {"repository": None, "commit": _COMMIT, "entry": None}
+_RUNNER = {"implementation": _WORD, "python": _PYTHON, "machine": _WORD}
 
 
 @dataclass(frozen=True)
@@ -53,6 +55,31 @@ class Runner:
         """That of an interpreter which is here."""
         python = ".".join(interpreter.version.split(".")[:2])
         return cls(interpreter.implementation, python, interpreter.machine)
+
+
+@dataclass(frozen=True)
+class TaskFingerprint:
+    """One environment, in a form that can be compared later and elsewhere.
+
+    Attributes:
+        suite: Key of the outer mapping.
+        task: Key of the inner one.
+        mode: Its autoreset mode; empty if it states none.
+        observations: The space of one sub-environment's observations, to be read.
+        spaces: SHA-256 of both, with every bound.
+    """
+
+    suite: str
+    task: int | str
+    mode: str
+    observations: str
+    actions: str
+    spaces: str
+
+    @property
+    def name(self) -> str:
+        """For texts."""
+        return f"{self.suite}/{self.task}"
 
 
 @dataclass(frozen=True)
@@ -133,7 +160,7 @@ def read(path: str | os.PathLike[str]) -> LockFile:
     packages = pylock.read(document, where)
     if not packages:
         raise LockError(f"{where} has no packages")
-    ours = table(table(document, "tool"), "envhub")
+    ours = table(document, "tool", "envhub")
     if ours.get("format") != FORMAT:
         raise LockError(
             f"{where} has no [tool.envhub] of format {FORMAT}: it was written by another program, "
@@ -150,37 +177,31 @@ class _Reader:
         self._ours = ours
 
     def lock(self, packages: tuple[PylockPackage, ...]) -> LockFile:
-        text = self._text
-        newer = (
-            text(self._ours, "exclude-newer", re.compile(DATE))
-            if "exclude-newer" in self._ours
-            else None
-        )
+        text, ours = self._text, self._ours
+        found: dict[str, Any] = {name: text(ours, name, form) for name, form in _TEXTS.items()}
+        if "exclude-newer" in ours:
+            found["exclude_newer"] = text(ours, "exclude-newer", re.compile(DATE))
+        found |= {name: self._requirements(name) for name in _REQUIREMENTS if name in ours}
         return LockFile(
-            repository=text(self._ours, "repository"),
-            commit=text(self._ours, "commit", _COMMIT),
-            entry=text(self._ours, "entry"),
+            **found,
             files=self._files(),
-            runner=Runner(
-                text(self._ours, "implementation", _WORD),
-                text(self._ours, "python", _PYTHON),
-                text(self._ours, "machine", _WORD),
-            ),
+            runner=Runner(**{name: text(ours, name, form) for name, form in _RUNNER.items()}),
             packages=packages,
             inferred=self._texts("inferred"),
             assets=self._texts("assets"),
-            exclude_newer=newer,
             spaces=self._spaces(),
-            **{name: self._requirements(name) for name in _REQUIREMENTS if name in self._ours},
         )
 
     def _text(
         self, table: Mapping[str, Any], name: str, pattern: re.Pattern[str] | None = None
     ) -> str:
         value = table.get(name)
-        if not isinstance(value, str) or not value.isprintable() or len(value) > MAX_TEXT:
-            raise self._wrong(name)
-        if pattern is not None and not pattern.fullmatch(value):
+        if (
+            not isinstance(value, str)
+            or not value.isprintable()
+            or len(value) > MAX_TEXT
+            or (pattern is not None and not pattern.fullmatch(value))
+        ):
             raise self._wrong(name)
         return value
 
@@ -235,47 +256,36 @@ class _Reader:
 
 def written(lock: LockFile) -> str:
     """The file's text."""
-    runner = lock.runner
-    head = [
-        "# Written by 'envhub lock'; 'envhub lock --upgrade' writes it again.",
-        'lock-version = "1.0"',
-        'created-by = "envhub-sandbox"',
-        f"requires-python = {quoted(f'=={runner.python}.*')}",
-    ]
-    facts = {
-        "repository": lock.repository,
-        "commit": lock.commit,
-        "entry": lock.entry,
-        "implementation": runner.implementation,
-        "python": runner.python,
-        "machine": runner.machine,
+    head = {
+        "lock-version": "1.0",
+        "created-by": "envhub-sandbox",
+        "requires-python": f"=={lock.runner.python}.*",
     }
+    ours: dict[str, object] = {"format": FORMAT}
+    ours |= {name: getattr(lock, name) for name in _TEXTS} | asdict(lock.runner)
     if lock.exclude_newer is not None:
-        facts["exclude-newer"] = lock.exclude_newer
-    ours = ["", "[tool.envhub]", f"format = {FORMAT}"]
-    ours += [f"{name} = {quoted(value)}" for name, value in facts.items()]
-    lists = {name: getattr(lock, name) for name in (*_REQUIREMENTS, "inferred", "assets")}
-    ours += [
-        f"{name} = [{', '.join(map(quoted, texts))}]"
-        for name, texts in lists.items()
-        if texts or name == "extra" or (name == "only" and texts is not None)
+        ours["exclude-newer"] = lock.exclude_newer
+    for name in (*_REQUIREMENTS, "inferred", "assets"):
+        texts = getattr(lock, name)
+        if texts or name == "extra" or (name == "only" and texts is not None):
+            ours[name] = texts
+    text = [
+        "# Written by 'envhub lock'; 'envhub lock --upgrade' writes it again.",
+        *rows(head),
+        pylock.written(lock.packages),
+        *("", "[tool.envhub]", *rows(ours)),
+        *("", "[tool.envhub.files]"),
+        *(f"{as_toml(name)} = {as_toml(digest)}" for name, digest in sorted(lock.files.items())),
     ]
-    ours += ["", "[tool.envhub.files]"]
-    ours += [f"{quoted(name)} = {quoted(digest)}" for name, digest in sorted(lock.files.items())]
     if lock.spaces is not None:
-        ours += ["", "[tool.envhub.spaces]", f"env-kwargs = {quoted(lock.spaces.arguments)}"]
-        ours += ["tasks = [", *map(_task_line, lock.spaces.tasks), "]"]
-    return "\n".join([*head, pylock.written(lock.packages), *ours, ""])
+        text += ["", "[tool.envhub.spaces]", *rows({"env-kwargs": lock.spaces.arguments})]
+        text += ["tasks = [", *(f"    {as_toml(_task(one))}," for one in lock.spaces.tasks), "]"]
+    return "\n".join([*text, ""])
 
 
-def _task_line(task: TaskFingerprint) -> str:
-    name = str(task.task) if isinstance(task.task, int) else quoted(task.task)
-    return (
-        f"    {{ suite = {quoted(task.suite)}, task = {name}, "
-        f"autoreset-mode = {quoted(task.mode)}, "
-        f"observations = {quoted(task.observations)}, actions = {quoted(task.actions)}, "
-        f"spaces = {quoted(task.spaces)} }},"
-    )
+def _task(task: TaskFingerprint) -> dict[str, object]:
+    names = {"mode": "autoreset-mode"}
+    return {names.get(name, name): value for name, value in asdict(task).items()}
 
 
 def write(lock: LockFile, path: Path) -> None:

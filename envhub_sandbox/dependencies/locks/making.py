@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
+import gymnasium as gym
+import numpy as np
+
 from envhub_sandbox.dependencies import interpreters
 from envhub_sandbox.dependencies.declared import WantedPackage, parse_requirement
 from envhub_sandbox.dependencies.locks import lockfile, pylock
-from envhub_sandbox.dependencies.locks.fingerprint import TaskFingerprint, fingerprint_of_task
 from envhub_sandbox.dependencies.locks.lockfile import (
     LOCAL,
     LockFile,
     Runner,
     Spaces,
+    TaskFingerprint,
     repository_of,
 )
 from envhub_sandbox.dependencies.locks.pylock import PylockPackage
@@ -22,9 +26,11 @@ from envhub_sandbox.dependencies.request import Choice, request_of
 from envhub_sandbox.dependencies.resolutions import resolution_for
 from envhub_sandbox.errors import LockDriftError, LockError
 from envhub_sandbox.hub.snapshot import Snapshot
+from envhub_worker.protocol.spaces.spaces import encode_space
 from envhub_worker.protocol.text import printable
 
 _SHOWN = 30
+_TEXT = 200
 
 
 def differences(then: LockFile, now: LockFile) -> list[str]:
@@ -218,3 +224,47 @@ def tasks_of(suites: Mapping[str, Mapping[Any, Any]]) -> tuple[TaskFingerprint, 
             spaces = env.single_observation_space, env.single_action_space
             found.append(fingerprint_of_task(suite, task, getattr(mode, "value", mode), *spaces))
     return tuple(found)
+
+
+def fingerprint_of_task(
+    suite: str,
+    task: int | str,
+    mode: str | None,
+    observations: gym.Space[Any],
+    actions: gym.Space[Any],
+) -> TaskFingerprint:
+    """What is to be remembered of an environment. Trust: input from the worker, already checked."""
+    spaces = fingerprint_of_spaces(observations, actions)
+    texts = (" ".join(str(one).split()) for one in (observations, actions))
+    seen, done = (printable(text, _TEXT).replace("\n", " ") for text in texts)
+    return TaskFingerprint(suite, task, mode or "", seen, done, spaces)
+
+
+def fingerprint_of_spaces(*spaces: gym.Space[Any]) -> str:
+    """A hash of spaces: of their kinds, shapes, dtypes and bounds, and of no generator's state."""
+    digest = hashlib.sha256()
+    for space in spaces:
+        _add(digest, encode_space(space))
+    return f"sha256:{digest.hexdigest()}"
+
+
+def _add(digest: Any, value: object) -> None:
+    """Each value with its kind and length before it, so that no two look alike."""
+    if isinstance(value, dict):
+        if value.get("kind") == "opaque":  # its text may hold an address
+            value = {name: item for name, item in value.items() if name != "text"}
+        digest.update(f"dict {len(value)};".encode())
+        for key, item in value.items():  # the order of a Dict space is part of it
+            _add(digest, key)
+            _add(digest, item)
+    elif isinstance(value, (list, tuple)):
+        digest.update(f"list {len(value)};".encode())
+        for item in value:
+            _add(digest, item)
+    elif isinstance(value, (np.ndarray, np.generic)):
+        array = np.ascontiguousarray(value)
+        plain = array.astype(array.dtype.newbyteorder("<"), copy=False)
+        digest.update(f"array {plain.dtype.str} {np.shape(value)};".encode() + plain.tobytes())
+    else:
+        data = repr(value).encode("utf-8", "backslashreplace")
+        digest.update(f"{type(value).__name__} {len(data)};".encode() + data)

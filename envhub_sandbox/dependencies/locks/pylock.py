@@ -27,6 +27,7 @@ from envhub_sandbox.dependencies.resolve import Lock, Target, torch_options
 from envhub_sandbox.errors import LockError, PackageIntegrityError
 from envhub_sandbox.hub.logins import without_login
 from envhub_sandbox.hub.sources import toml
+from envhub_sandbox.hub.sources.toml import table
 
 MAX_CHARACTERS = 16 * 1024 * 1024
 MAX_PACKAGES = 2000
@@ -181,19 +182,13 @@ def _wheel(given: object, where: str) -> Wheel:
     return Wheel(found, without_login(url) if isinstance(url, str) else "", size)
 
 
-def table(given: object, name: str) -> Mapping[str, Any]:
-    """A table in a table; an empty one where there is none."""
-    found = given.get(name) if isinstance(given, dict) else None
-    return found if isinstance(found, dict) else {}
-
-
 def _is(value: object, form: re.Pattern[str]) -> TypeGuard[str]:
     return isinstance(value, str) and form.fullmatch(value) is not None
 
 
 def _origin(given: Mapping[str, Any], name: str, version: str, where: str) -> WheelOrigin | None:
     """What a package is built of; None for one that has wheels on an index."""
-    ours = table(table(given, "tool"), "envhub")
+    ours = table(given, "tool", "envhub")
     if not ours:
         return None
     wheel, environment = ours.get("wheel"), ours.get("environment")
@@ -232,33 +227,39 @@ def written(packages: Sequence[PylockPackage]) -> str:
     """The packages as the standard has them."""
     lines = []
     for package in packages:
-        lines += ["", "[[packages]]", f"name = {quoted(package.name)}"]
-        lines += [f"version = {quoted(package.version)}"]
+        lines += ["", "[[packages]]", *rows({"name": package.name, "version": package.version})]
         if package.origin is not None:
-            lines += _written_origin(package.origin)
-            continue
-        lines += ["wheels = ["]
-        for wheel in package.wheels:
-            size = "" if wheel.size is None else f"size = {wheel.size}, "
-            hashes = f"hashes = {{ sha256 = {quoted(wheel.sha256)} }}"
-            lines.append(f"    {{ url = {quoted(wheel.url)}, {size}{hashes} }},")
-        lines.append("]")
+            lines += rows(_of_origin(package.origin))
+        else:
+            lines += ["wheels = [", *(f"    {as_toml(_row(one))}," for one in package.wheels), "]"]
     return "\n".join([*lines, ""])
 
 
-def _written_origin(origin: WheelOrigin) -> list[str]:
+def _row(wheel: Wheel) -> dict[str, object]:
+    size = {} if wheel.size is None else {"size": wheel.size}
+    return {"url": wheel.url, **size, "hashes": {"sha256": wheel.sha256}}
+
+
+def _of_origin(origin: WheelOrigin) -> dict[str, object]:
     source = origin.source
-    if source.commit:
-        below = f", subdirectory = {quoted(source.subdirectory)}" * bool(source.subdirectory)
-        where = f"url = {quoted(source.url)}, commit-id = {quoted(source.commit)}{below}"
-        first = f'vcs = {{ type = "git", {where} }}'
-    else:
-        hashes = f"hashes = {{ sha256 = {quoted(source.sha256)} }}"
-        first = f"sdist = {{ url = {quoted(source.url)}, {hashes} }}"
-    ours = f"wheel = {quoted(origin.wheel)}, environment = {quoted(origin.environment)}"
-    return [first, f"tool = {{ envhub = {{ {ours} }} }}"]
+    ours = {"envhub": {"wheel": origin.wheel, "environment": origin.environment}}
+    if not source.commit:
+        sdist = {"url": source.url, "hashes": {"sha256": source.sha256}}
+        return {"sdist": sdist, "tool": ours}
+    below = {"subdirectory": source.subdirectory} if source.subdirectory else {}
+    vcs = {"type": "git", "url": source.url, "commit-id": source.commit, **below}
+    return {"vcs": vcs, "tool": ours}
 
 
-def quoted(text: str) -> str:
-    """A text of TOML: JSON's is one, but for the one control character that JSON lets through."""
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
+def rows(table: Mapping[str, object]) -> list[str]:
+    """The lines of a table of TOML."""
+    return [f"{name} = {as_toml(value)}" for name, value in table.items()]
+
+
+def as_toml(value: object) -> str:
+    """A value in one line. A text of JSON is one of TOML, but for one control character."""
+    if isinstance(value, Mapping):
+        return f"{{ {', '.join(rows(value))} }}"
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(map(as_toml, value))}]"
+    return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

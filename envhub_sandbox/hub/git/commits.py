@@ -17,6 +17,7 @@ import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
@@ -31,6 +32,7 @@ from envhub_sandbox.hub.git import address
 from envhub_sandbox.hub.grammar import is_commit
 from envhub_sandbox.hub.listing import (
     GIT_SHA1,
+    CommitFiles,
     Copier,
     FileRecord,
     HashMismatch,
@@ -321,18 +323,21 @@ class GitHost:
         return resolve(f"{self.public_endpoint}/{repo.repo_id}", revision or "HEAD")
 
     @contextmanager
-    def files(self, repo: Repository, commit: str) -> Iterator[_FetchedFiles]:
+    def files(self, repo: Repository, commit: str) -> Iterator[CommitFiles]:
         """The files of a commit. Links are files with their text; submodules are left out."""
         with fetched(f"{self.public_endpoint}/{repo.repo_id}", commit) as found:
             title = f"{repo.repo_id}@{commit[:12]}"
             if found.submodules:
-                shown = ", ".join(map(repr, found.submodules[:_SHOWN]))
-                more = f" and {len(found.submodules) - _SHOWN} more"
-                more = more if len(found.submodules) > _SHOWN else ""
-                SNAPSHOT.warning("%s: submodules are left out: %s%s", title, shown, more)
+                shown, left = map(repr, found.submodules[:_SHOWN]), len(found.submodules) - _SHOWN
+                more = f" and {left} more" if left > 0 else ""
+                SNAPSHOT.warning("%s: submodules are left out: %s%s", title, ", ".join(shown), more)
             if _has_lfs(found):
                 SNAPSHOT.warning("%s: of its files in LFS only the pointers are here", title)
-            yield _FetchedFiles(found)
+            records = (
+                FileRecord(blob.path, blob.size, f"{GIT_SHA1}:{blob.digest}")
+                for blob in found.blobs
+            )
+            yield CommitFiles(records, partial(_copier, found))
 
 
 def _has_lfs(found: GitFiles) -> bool:
@@ -344,28 +349,17 @@ def _has_lfs(found: GitFiles) -> bool:
     return False
 
 
-@dataclass(frozen=True)
-class _FetchedFiles:
-    """The files of a commit that was fetched."""
+def _copier(found: GitFiles, files: Sequence[FileRecord], title: str) -> Copier:
+    blobs = {blob.path: blob for blob in found.blobs}
 
-    found: GitFiles
+    def copy(record: FileRecord, target: Path) -> None:
+        try:
+            with found.open(blobs[record.path]) as stream:
+                write_verified(stream, target, record)
+        except HashMismatch as mismatch:
+            raise SnapshotIntegrityError(
+                f"{title}: git returned {mismatch.found} as {record.path!r}, which is "
+                f"{record.digest}. Nothing of it was used; try again, with another git"
+            ) from mismatch
 
-    @property
-    def listing(self) -> Iterator[FileRecord]:
-        for blob in self.found.blobs:
-            yield FileRecord(blob.path, blob.size, f"{GIT_SHA1}:{blob.digest}")
-
-    def copier(self, files: Sequence[FileRecord], title: str) -> Copier:
-        blobs = {blob.path: blob for blob in self.found.blobs}
-
-        def copy(record: FileRecord, target: Path) -> None:
-            try:
-                with self.found.open(blobs[record.path]) as stream:
-                    write_verified(stream, target, record)
-            except HashMismatch as mismatch:
-                raise SnapshotIntegrityError(
-                    f"{title}: git returned {mismatch.found} as {record.path!r}, which is "
-                    f"{record.digest}. Nothing of it was used; try again, with another git"
-                ) from mismatch
-
-        return copy
+    return copy

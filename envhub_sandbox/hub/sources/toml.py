@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
+from collections.abc import Mapping
 from typing import Any
 
 if sys.version_info >= (3, 11):
@@ -44,3 +45,10 @@ def loads(text: str, most: int, *, generated: bool = False) -> dict[str, Any]:
     except (ValueError, RecursionError) as error:
         raise ValueError(str(error)[:200]) from error
     return document
+
+
+def table(given: object, *names: str) -> Mapping[str, Any]:
+    """A table within tables; an empty one where there is none."""
+    for name in names:
+        given = given.get(name) if isinstance(given, dict) else None
+    return given if isinstance(given, dict) else {}

@@ -12,8 +12,8 @@ from gymnasium import spaces
 
 from envhub_sandbox.dependencies import interpreters, packages
 from envhub_sandbox.dependencies.locks import lockfile
-from envhub_sandbox.dependencies.locks.fingerprint import fingerprint_of_task
 from envhub_sandbox.dependencies.locks.lockfile import LockFile, Runner, Spaces
+from envhub_sandbox.dependencies.locks.making import fingerprint_of_task
 from envhub_sandbox.dependencies.locks.pylock import PylockPackage, Wheel
 from envhub_sandbox.errors import LockDriftError, LockError, PolicyError
 from envhub_sandbox.hub.snapshot import Snapshot, local

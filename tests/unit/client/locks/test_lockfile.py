@@ -14,8 +14,8 @@ import pytest
 
 from envhub_sandbox.dependencies import interpreters, uv
 from envhub_sandbox.dependencies.locks import lockfile, making, pylock
-from envhub_sandbox.dependencies.locks.fingerprint import fingerprint_of_spaces, fingerprint_of_task
 from envhub_sandbox.dependencies.locks.lockfile import LockFile, Runner, Spaces
+from envhub_sandbox.dependencies.locks.making import fingerprint_of_spaces, fingerprint_of_task
 from envhub_sandbox.dependencies.locks.pylock import PylockPackage, Wheel
 from envhub_sandbox.dependencies.request import chosen
 from envhub_sandbox.errors import EnvHubError, LockDriftError, LockError, PackageIntegrityError
