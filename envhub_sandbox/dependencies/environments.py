@@ -211,7 +211,8 @@ def _made(
         watch = Watch(Bounds.set(), building, [index.uv_cache()])
         with uv.cleared_after_refusal(lock.packages):
             _install(lock, interpreter, building, held, watch, tell)
-            size = _size(packages, watch.bounds)
+            size, count = checked(packages)
+            watch.bounds.check(size, count, "its packages have")
         tell(f"compiling {size / 2**20:.0f} MiB")
         _compile(interpreter, packages, held)
         checked(packages)  # again: a compiler with a fault may leave a link, which chmod follows
@@ -279,13 +280,6 @@ def _install(
         file_bytes=watch.bounds.bytes,
     )
     (packages / ".lock").unlink(missing_ok=True)  # uv's own
-
-
-def _size(packages: Path, bounds: Bounds) -> int:
-    """Bytes of all files; what is over the bounds, or no file, is refused."""
-    size, count = checked(packages)
-    bounds.check(size, count, "its packages have")
-    return size
 
 
 def _compile(interpreter: Interpreter, packages: Path, held: int) -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -191,11 +190,6 @@ class PackageRequest:
     fetch_python: bool = False
     gpu: bool = False
     runs_worker: bool = True
-
-    def plus(self, guesses: tuple[Guess, ...]) -> PackageRequest:
-        """The same with these as requirements, and no guesses."""
-        wanted = (*self.wanted, *(one.wanted for one in guesses))
-        return replace(self, wanted=wanted, guesses=())
 
 
 def request_of(snapshot: Snapshot, choice: Choice, *, gpu: bool = False) -> PackageRequest | None:

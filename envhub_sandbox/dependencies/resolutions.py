@@ -197,7 +197,8 @@ def versions_for(
         taken = tuple(one for one in request.guesses if not one.is_among(names))
         if not taken:
             return lock, ()
-    return resolved(request.plus(taken)), taken
+    wanted = (*request.wanted, *(one.wanted for one in taken))
+    return resolved(replace(request, wanted=wanted, guesses=())), taken
 
 
 def root() -> Path:

@@ -228,14 +228,11 @@ def _error(what: str, said: str) -> DependencyError:
     text = _in_the_users_words(said)[-_SHOWN:]
     for pattern, kind, meaning in _MEANINGS:
         if re.search(pattern, said):
-            cure = f" {meaning}{_offline() if meaning == _NO_INDEX else ''}." if meaning else ""
+            host = option_name("dependencies", "host")
+            offline = f", and {host} takes the packages of this interpreter as they are"
+            cure = f" {meaning}{offline * (meaning == _NO_INDEX)}." if meaning else ""
             return kind(f"{what}.{cure}\n{text}")
     return DependencyError(f"{what}; uv says:\n{text}")
-
-
-def _offline() -> str:
-    host = option_name("dependencies", "host")
-    return f", and {host} takes the packages of this interpreter as they are"
 
 
 def _in_the_users_words(said: str) -> str:

@@ -99,7 +99,7 @@ class LocalFolder:
             if self.checkout is None:
                 error.args = (f"{error}. {_ALL_COUNTS}",)
             raise
-        records = hash_files(found, str(self))
+        records = tuple(FileRecord(one.path, one.size, _digest(one, str(self))) for one in found)
         check_listing_names(records, str(self))
         return found, records
 
@@ -244,11 +244,6 @@ def _example(text: str) -> Path:
             + (", ".join(f"{_EXAMPLES}{one}" for one in known) or "none is installed")
         )
     return examples / name
-
-
-def hash_files(files: tuple[LocalFile, ...], title: str) -> tuple[FileRecord, ...]:
-    """The records of files, by reading all of them."""
-    return tuple(FileRecord(file.path, file.size, _digest(file, title)) for file in files)
 
 
 def _digest(file: LocalFile, title: str) -> str:

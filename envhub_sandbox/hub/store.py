@@ -108,12 +108,12 @@ def load(slot: Slot) -> tuple[FileRecord, ...] | None:
         SnapshotIntegrityError: The tree is not what was verified; the text says how to remove it.
     """
     text = _record_of(slot)
-    if text is None and os.path.lexists(slot.home):
+    if text is None:
+        if not os.path.lexists(slot.home):
+            return None
         text = _record_of(slot)  # another may have put the whole of it there in between
         if text is None:
-            raise HalfDeletedError(_damage(slot, "its record.json is missing"))
-    if text is None:
-        return None
+            raise _damaged(slot, "its record.json is missing", HalfDeletedError)
     with contextlib.suppress(FileNotFoundError):  # which is said below
         _refuse_shared_store(slot.tree)
     document, entries = _read_record(slot, text)
@@ -129,7 +129,7 @@ def load(slot: Slot) -> tuple[FileRecord, ...] | None:
     ]
     _verify_again(slot, changed)
     if missing := sorted(recorded - found.keys()):
-        raise HalfDeletedError(_damage(slot, f"the file {missing[0]!r} is missing"))
+        raise _damaged(slot, f"the file {missing[0]!r} is missing", HalfDeletedError)
     if changed:
         with contextlib.suppress(OSError):  # A read-only store only stays slower.
             _write_record(slot.home, slot.tree, document, entries)
@@ -198,12 +198,10 @@ def _verify_again(slot: Slot, changed: list[FileRecord]) -> None:
             path.chmod(_FILE_MODE)
 
 
-def _damaged(slot: Slot, what: str) -> SnapshotIntegrityError:
-    return SnapshotIntegrityError(_damage(slot, what))
-
-
-def _damage(slot: Slot, what: str) -> str:
-    return (
+def _damaged(
+    slot: Slot, what: str, kind: type[SnapshotIntegrityError] = SnapshotIntegrityError
+) -> SnapshotIntegrityError:
+    return kind(
         f"{slot.title}: the copy in the store is not what was verified: {what}. Nothing of it was "
         f"used. Remove it; the next use downloads it again: chmod -R u+w '{slot.home}' && rm -r "
         f"'{slot.home}'"

@@ -15,7 +15,7 @@ import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import unquote, urlsplit
@@ -135,7 +135,8 @@ def _wheel(source: Source, interpreter: Interpreter, tell: Tell, choose: Choose)
     with _under_way(source), tempfile.TemporaryDirectory(prefix="envhub-build-") as place:
         Path(place).chmod(0o755)  # a jail's user is another one
         tree = _fetched(source, Path(place), tell)
-        return _Build(source, tree, Path(place), interpreter, tell, choose).wheel()
+        said = project.read(tree, _title(source))
+        return _Build(source, said, tree, Path(place), interpreter, tell, choose).wheel()
 
 
 @contextmanager
@@ -189,25 +190,17 @@ def _title(source: Source) -> str:
     return f"{source.name} {source.version}"
 
 
+@dataclass(frozen=True)
 class _Build:
     """One source, unpacked."""
 
-    def __init__(
-        self,
-        source: Source,
-        tree: Path,
-        place: Path,
-        interpreter: Interpreter,
-        tell: Tell,
-        choose: Choose,
-    ) -> None:
-        self._source = source
-        self._tree = tree
-        self._place = place
-        self._interpreter = interpreter
-        self._tell = tell
-        self._choose = choose
-        self._project = project.read(tree, _title(source))
+    _source: Source
+    _project: project.Project
+    _tree: Path
+    _place: Path
+    _interpreter: Interpreter
+    _tell: Tell
+    _choose: Choose
 
     def wheel(self) -> Path:
         """Built, checked and kept. Raises ``ResolutionError``."""
@@ -216,9 +209,8 @@ class _Build:
             try:
                 return self._tried(further)
             except BuildFailedError as failed:
-                more = self._remedy(str(failed), further)
-                if not more:
-                    raise self._failed(failed) from failed
+                if not (more := self._remedy(str(failed), further)):
+                    raise self._failed(str(failed)) from failed
                 further = (*further, *more)
 
     def _remedy(self, log: str, tried: tuple[str, ...]) -> tuple[str, ...]:
@@ -284,9 +276,8 @@ class _Build:
         environment = environments.provide(lock, self._interpreter, self._tell)
         return environment.python, str(environment.packages)
 
-    def _failed(self, failed: DependencyError) -> ResolutionError:
-        source, log = self._source, str(failed)
-        said = project.advice(log)
+    def _failed(self, log: str) -> ResolutionError:
+        source, said = self._source, project.advice(log)
         needed_by = f" ({source.where})" if source.where else ""
         return ResolutionError(
             f"{_title(source)}{needed_by} has no wheel for Python {self._interpreter.version}, and "

@@ -15,6 +15,7 @@ import zlib
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
@@ -169,14 +170,14 @@ def _of_tar(archive: tarfile.TarFile, title: str) -> Iterator[Member]:
             continue
         if not member.isreg():
             raise _no_file(title, member.name)
-
-        def opened(member: tarfile.TarInfo = member) -> IO[bytes]:
-            stream = archive.extractfile(member)
-            assert stream is not None
-            return stream
-
-        path = member.name.removeprefix("./")
+        path, opened = member.name.removeprefix("./"), partial(_opened, archive, member)
         yield Member(path, member.size, bool(member.mode & stat.S_IXUSR), opened)
+
+
+def _opened(archive: tarfile.TarFile, member: tarfile.TarInfo) -> IO[bytes]:
+    stream = archive.extractfile(member)
+    assert stream is not None
+    return stream
 
 
 def check_zip_member(member: zipfile.ZipInfo, title: str) -> None:
@@ -196,10 +197,7 @@ def _of_zip(archive: zipfile.ZipFile, title: str) -> Iterator[Member]:
         if member.is_dir():
             continue
         check_zip_member(member, title)
-
-        def opened(member: zipfile.ZipInfo = member) -> IO[bytes]:
-            return archive.open(member)
-
+        opened = partial(archive.open, member)
         yield Member(member.filename, member.file_size, bool(mode & stat.S_IXUSR), opened)
 
 

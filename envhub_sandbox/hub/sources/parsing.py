@@ -15,11 +15,11 @@ import stat
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, NamedTuple
 
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.hub.sources import parser
@@ -34,8 +34,7 @@ _PATIENCE_S = 600.0
 """For a child that neither computes nor ends, as nothing lets it; the bound is its CPU time."""
 
 
-@dataclass(frozen=True)
-class ImportStatement:
+class ImportStatement(NamedTuple):
     """One statement of import.
 
     Attributes:
@@ -50,7 +49,7 @@ class ImportStatement:
 
     level: int
     module: str
-    names: tuple[str, ...]
+    names: Sequence[str]
     required: bool
     line: int
     within: str = ""
@@ -82,7 +81,7 @@ class ParsedFile:
     texts: tuple[tuple[str, str, int, int], ...] = ()
     entries: tuple[tuple[str, int], ...] = ()
     ids: tuple[tuple[str, int], ...] = ()
-    definitions: tuple[tuple[str, tuple[str, ...]], ...] = ()
+    definitions: tuple[tuple[str, Sequence[str]], ...] = ()
     encoding: str | None = None
     is_python: bool = True
 
@@ -173,17 +172,9 @@ def _answer(row: Any) -> ParsedFile | None:
         return None
     if not row or "encoding" in row:
         return ParsedFile(is_python=bool(row), **row)
-    imports = (
-        ImportStatement(level, module, tuple(names), required, line, within)
-        for level, module, names, required, line, within in row["imports"]
-    )
-    definitions = ((name, tuple(names)) for name, names in row["definitions"])
-    rest: dict[str, Any] = {
-        kind: tuple(map(tuple, rows))
-        for kind, rows in row.items()
-        if kind not in ("imports", "definitions")
-    }
-    return ParsedFile(imports=tuple(imports), definitions=tuple(definitions), **rest)
+    found: dict[str, Any] = {kind: tuple(map(tuple, rows)) for kind, rows in row.items()}
+    found["imports"] = tuple(ImportStatement(*one) for one in row["imports"])
+    return ParsedFile(**found)
 
 
 Files = Mapping[str, ParsedFile | None]
