@@ -18,6 +18,7 @@ import subprocess
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from importlib import metadata
 from typing import NamedTuple
 
@@ -212,8 +213,8 @@ def first_unmet(
     hashed = next((one for one in request.wanted if one.hashes or one.requirement.url), None)
     if hashed is not None:
         return str(hashed.requirement)
-    there_or_here = _InstalledPackages() if there is None else _InstalledPackages(there, found)
-    for wanted, met_by in there_or_here.reached(one.requirement for one in request.wanted):
+    reached = _reached((one.requirement for one in request.wanted), there, found)
+    for wanted, met_by in reached:
         if met_by is None or not _is_among(met_by, wanted.specifier):
             return str(wanted)
     return None
@@ -221,63 +222,52 @@ def first_unmet(
 
 def brought(requirements: Iterable[Requirement]) -> list[metadata.Distribution]:
     """What this interpreter has of these, whichever version, and of all that they lead to."""
-    found = (one for _, one in _InstalledPackages().reached(requirements))
-    return [one for one in found if isinstance(one, metadata.Distribution)]
+    return [one for _, one in _reached(requirements) if isinstance(one, metadata.Distribution)]
 
 
-class _InstalledPackages:
-    """What an interpreter has: this one, or one elsewhere of that version."""
-
-    def __init__(
-        self, elsewhere: Mapping[str, InstalledPackage] | None = None, version: str = ""
-    ) -> None:
-        self._met: set[tuple[str, frozenset[str]]] = set()
-        self._is_here = elsewhere is None
-        self._found: dict[str, metadata.Distribution | InstalledPackage | None] = {
-            canonicalize_name(name): one for name, one in (elsewhere or {}).items()
-        }
-        self._environment = {str(k): str(v) for k, v in default_environment().items()}
-        if version:
-            minor = ".".join(version.split(".")[:2])
-            self._environment |= {"python_full_version": version, "python_version": minor}
-
-    def reached(
-        self, requirements: Iterable[Requirement]
-    ) -> Iterator[tuple[Requirement, metadata.Distribution | InstalledPackage | None]]:
-        """Each that applies here, of all that they lead to, and what is here of that name."""
-        waiting = [(one, frozenset[str]()) for one in requirements]
-        while waiting:
-            wanted, extras = waiting.pop()
-            try:
-                if not self._applies(wanted, extras):
-                    continue
-            except (
-                ValueError,
-                LookupError,
-            ):  # its marker cannot be evaluated, as uv will say
-                yield wanted, None
+def _reached(
+    requirements: Iterable[Requirement],
+    there: Mapping[str, InstalledPackage] | None = None,
+    version: str = "",
+) -> Iterator[tuple[Requirement, metadata.Distribution | InstalledPackage | None]]:
+    """Each that applies, of all that they lead to, and what is installed of that name: here, or
+    ``there``, where Python is of that version.
+    """
+    environment = {str(k): str(v) for k, v in default_environment().items()}
+    if there is not None:
+        there = {canonicalize_name(name): one for name, one in there.items()}
+        minor = ".".join(version.split(".")[:2])
+        environment |= {"python_full_version": version, "python_version": minor}
+    here = cache(_distribution)
+    met: set[tuple[str, frozenset[str]]] = set()
+    waiting = [(one, frozenset[str]()) for one in requirements]
+    while waiting:
+        wanted, extras = waiting.pop()
+        try:
+            if not _applies(wanted, extras, environment):
                 continue
-            found = self._distribution(wanted.name)
-            yield wanted, found
-            key = (canonicalize_name(wanted.name), frozenset(wanted.extras))
-            if found is not None and key not in self._met:
-                self._met.add(key)
-                waiting += [(one, key[1]) for one in _needs(found)]
+        except (ValueError, LookupError):  # its marker cannot be evaluated, as uv will say
+            yield wanted, None
+            continue
+        key = (canonicalize_name(wanted.name), frozenset(wanted.extras))
+        found = here(wanted.name) if there is None else there.get(key[0])
+        yield wanted, found
+        if found is not None and key not in met:
+            met.add(key)
+            waiting += [(one, key[1]) for one in _needs(found)]
 
-    def _applies(self, wanted: Requirement, extras: frozenset[str]) -> bool:
-        if wanted.marker is None:
-            return True
-        each = ({**self._environment, "extra": extra} for extra in extras or ("",))
-        return any(wanted.marker.evaluate(environment) for environment in each)
 
-    def _distribution(self, name: str) -> metadata.Distribution | InstalledPackage | None:
-        key = canonicalize_name(name)
-        if self._is_here and key not in self._found:
-            try:
-                self._found[key] = metadata.distribution(name)
-            except (metadata.PackageNotFoundError, ValueError):
-                self._found[key] = None
-        return self._found.get(key)
+def _applies(wanted: Requirement, extras: frozenset[str], environment: dict[str, str]) -> bool:
+    marker = wanted.marker
+    each = ({**environment, "extra": extra} for extra in extras or ("",))
+    return marker is None or any(marker.evaluate(one) for one in each)
+
+
+def _distribution(name: str) -> metadata.Distribution | None:
+    try:
+        return metadata.distribution(name)
+    except (metadata.PackageNotFoundError, ValueError):
+        return None
 
 
 def _is_among(found: metadata.Distribution | InstalledPackage, versions: SpecifierSet) -> bool:

@@ -185,9 +185,8 @@ class HubClient:
         """Upload a folder as one commit; a repository that is not there is made."""
         client: Any = import_module("huggingface_hub")
         with self._explained(repo, revision):
-            login = self._login()
-            token = False if login else self.token
-            hub = client.HfApi(self.public_endpoint, token=token, headers=login, **_LIBRARY)
+            headers, token = self._login()
+            hub = client.HfApi(self.public_endpoint, token=token, headers=headers, **_LIBRARY)
             sdk = {"space_sdk": "static"} if repo.repo_type == "space" else {}
             hub.create_repo(**repo._asdict(), private=private or None, exist_ok=True, **sdk)
             given = {"folder_path": folder, "revision": revision, "commit_message": message}
@@ -200,28 +199,29 @@ class HubClient:
     def _download(self, repo: Repository, commit: str, path: str, **more: Any) -> Path:
         from huggingface_hub import hf_hub_download
 
-        arguments = {**self._arguments(repo, commit), "filename": path, **more}
+        headers, token = self._login()
+        arguments = {
+            **repo._asdict(),
+            "revision": commit,
+            "filename": path,
+            # Not every version expands "~" itself; one would make a folder of that name.
+            "cache_dir": None if self.cache_dir is None else os.path.expanduser(self.cache_dir),
+            "token": token,
+            "headers": headers,
+            "endpoint": self.public_endpoint,
+            **_LIBRARY,
+            **more,
+        }
         # a session may be the thread's own
         with guarded(import_module("huggingface_hub.utils").get_session()):
             return Path(_with_xet_or_without(hf_hub_download, **arguments))
 
-    def _arguments(self, repo: Repository, commit: str) -> dict[str, Any]:
-        login = self._login()
-        return {
-            **repo._asdict(),
-            "revision": commit,
-            # Not every version expands "~" itself; one would make a folder of that name.
-            "cache_dir": None if self.cache_dir is None else os.path.expanduser(self.cache_dir),
-            "token": False if login else self.token,
-            "headers": login,
-            "endpoint": self.public_endpoint,
-            **_LIBRARY,
-        }
-
-    def _login(self) -> dict[str, str]:
-        """The header of a login, which goes before a token, as in a URL."""
+    def _login(self) -> tuple[dict[str, str], str | bool | None]:
+        """The header of a login, which goes before a token, as in a URL; and the token."""
         login = login_of(self.endpoint)
-        return {} if login is None else {"authorization": authorization(login)}
+        if login is None:
+            return {}, self.token
+        return {"authorization": authorization(login)}, False
 
     def _api(self, repo: Repository) -> str:
         return f"{self.public_endpoint}/api/{repo.repo_type}s/{repo.repo_id}"
@@ -231,8 +231,7 @@ class HubClient:
         # HfApi.list_repo_tree has no timeout, and in 2.x retries a broken Hub for 24 s.
         client: Any = import_module("huggingface_hub.utils")
         timeout = import_module("huggingface_hub.constants").HF_HUB_ETAG_TIMEOUT
-        login = self._login()
-        token = False if login else self.token
+        login, token = self._login()
         headers = {**client.build_hf_headers(token=token, **_LIBRARY), **login}
         options = {"headers": headers, "params": query, "timeout": timeout}
         with streamed(client.get_session(), url, options) as response:
@@ -263,7 +262,7 @@ class HubClient:
 
         token = self.token if isinstance(self.token, str) else get_token()
         login = login_of(self.endpoint)
-        secrets = (token, *self._login().values(), login and login[1])
+        secrets = (token, *self._login()[0].values(), login and login[1])
         return tuple(secret for secret in secrets if secret)
 
 

@@ -88,7 +88,7 @@ def resolve(url: str, revision: str, variables: Variables | None = None) -> str:
     names = [f"refs/tags/{revision}^{{}}", f"refs/tags/{revision}", f"refs/heads/{revision}"]
     names = ["HEAD"] if revision == "HEAD" else names
     with tempfile.TemporaryDirectory(prefix="envhub-git-") as place:
-        git = _Git(Path(place), os.environ if variables is None else variables)
+        git = _Git(Path(place), variables)
         said = git.run("ls-remote", "--quiet", _checked(url), *names)
     rows = said.decode("utf-8", "replace").splitlines()  # other names may end with these
     found = {name: commit for commit, _, name in (row.partition("\t") for row in rows)}
@@ -167,7 +167,7 @@ def fetched(url: str, commit: str, variables: Variables | None = None) -> Iterat
     title = f"{url}@{commit[:12]}"
     with tempfile.TemporaryDirectory(prefix="envhub-git-") as place:
         store = Path(place)
-        git = _Git(store, os.environ if variables is None else variables)
+        git = _Git(store, variables)
         git.run("init", "--quiet", "--bare", "--template=", ".")
         options = ("--quiet", "--depth=1", "--no-tags", "--no-recurse-submodules", "--no-auto-gc")
         git.run("fetch", *options, source, commit)
@@ -225,10 +225,11 @@ def _checked(url: str) -> str:
 class _Git:
     """Git in one folder, with nothing of the user's own settings and logins."""
 
-    def __init__(self, store: Path, variables: Variables) -> None:
+    def __init__(self, store: Path, variables: Variables | None) -> None:
         self._store = store
         ours = {"GIT_CONFIG_NOSYSTEM": "1", "GIT_CONFIG_GLOBAL": os.devnull, "HOME": str(store)}
-        self._environment = {**_to_the_network(variables), **ours, **_ALONE}
+        theirs = os.environ if variables is None else variables
+        self._environment = {**_to_the_network(theirs), **ours, **_ALONE}
 
     def run(self, *arguments: str, given: bytes = b"", output: IO[bytes] | None = None) -> bytes:
         """Run git, and return the first of what it prints, where there is no file for that.
@@ -249,8 +250,10 @@ class _Git:
                     [*_limited(), *command], given, stdout=output or kept, stderr=said
                 )
             except (OSError, subprocess.SubprocessError) as error:
+                late = isinstance(error, subprocess.TimeoutExpired)
+                why = f"it took longer than {TIMEOUT_S:.0f} s" if late else str(error)
                 said.seek(max(0, said.seek(0, os.SEEK_END) - _SAID_BYTES))
-                text = said.read(_SAID_BYTES).decode("utf-8", "replace") or _why(error)
+                text = said.read(_SAID_BYTES).decode("utf-8", "replace") or why
                 what = f"git {arguments[0]} failed: {printable(text, _SAID_BYTES).strip()}"
                 advice = "Check the address, the commit and the network"
                 raise HubFailure(Kind.UNREACHABLE, what, advice) from error
@@ -279,11 +282,6 @@ class _Git:
                 kill_group(process)
         if process.returncode:
             raise subprocess.CalledProcessError(process.returncode, "git")
-
-
-def _why(error: Exception) -> str:
-    late = isinstance(error, subprocess.TimeoutExpired)
-    return f"it took longer than {TIMEOUT_S:.0f} s" if late else str(error)
 
 
 def _limited() -> tuple[str, ...]:

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from envhub_sandbox import make_env
-from envhub_sandbox.errors import HubReferenceError, RemoteEnvError, RepositoryUnavailableError
+from envhub_sandbox.errors import RemoteEnvError
 from envhub_sandbox.system.folders import remove_tree
 from tests.hub.stub_hub import StubHub, StubRepository
 from tests.support.interpreter import profiles
@@ -153,35 +153,3 @@ def test_a_card_declares_assets(
     tokens = {"data" if "org/data" in one else "own": token for one, token in asked}
     assert tokens["own"] is not None
     assert tokens["data"] is None
-
-
-def test_an_asset_that_is_not_there_is_named(make: Make, own: StubRepository) -> None:
-    """The error says that it is an asset, and of which argument; one of a card may be one that a
-    login would show."""
-    own.files["README.md"] = f"---\nenvhub: {{assets: [org/no@{DATA}]}}\n---\n".encode()
-    with pytest.raises(RepositoryUnavailableError, match="names it, and it is fetched without"):
-        make()
-    with pytest.raises(RepositoryUnavailableError, match="It is an asset: assets names it"):
-        make(assets=["org/nothing@" + "e" * 40])
-
-
-@pytest.mark.parametrize(
-    ("asset", "why"),
-    [
-        ("Org/Repo@" + "a" * 40, "own repository"),
-        (f"org/data@{DATA}:mesh.txt", "names a file"),
-        ("org/../data@" + "a" * 40, "holds"),
-        ("/etc", "is a repository of the Hub"),
-        ("pypi:minigrid#MiniGrid-Empty-5x5-v0", "is a repository of the Hub"),
-        ("git+https://127.0.0.1:9/org/data@" + "a" * 40, "a repository of the Hub"),
-    ],
-)
-def test_what_is_no_asset_is_refused(make: Make, own: StubRepository, asset: str, why: str) -> None:
-    """The environment's own repository, one file, tricks with paths, and hosts of git.
-
-    Of a card, too: by a host of git it would have the client ask any server that it can reach.
-    """
-    own.files["README.md"] = f"---\nenvhub: {{assets: ['{asset}']}}\n---\n".encode()
-    for options in ({}, {"assets": [asset]}):
-        with pytest.raises(HubReferenceError, match=f"(?s){why}"):
-            make(**options)

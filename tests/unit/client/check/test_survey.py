@@ -376,4 +376,4 @@ def test_code_in_another_encoding_is_reported(
 def test_what_is_utf_8_is_read(source: bytes) -> None:
     """However it says so, wherever its lines end, and by the names that Python makes of letters."""
     [one] = parsing.parsed({"odd.py": source})["odd.py"].imports  # type: ignore[union-attr]
-    assert one.names == ("os",)
+    assert one.names == ["os"]

@@ -1,4 +1,4 @@
-"""The forms of a reference, what the Hub's failures mean, and TOML of strangers, by themselves."""
+"""What the Hub's answers and failures mean, and TOML of strangers, by themselves."""
 
 from __future__ import annotations
 
@@ -8,37 +8,9 @@ from typing import Any
 
 import pytest
 
-from envhub_sandbox.hub import answers, grammar
+from envhub_sandbox.hub import answers
 from envhub_sandbox.hub.answers import HostileAnswerError, Kind, bounded_body, guarded
 from envhub_sandbox.hub.sources import toml
-
-
-@pytest.mark.parametrize(
-    ("text", "write"),
-    [
-        ("minigrid#MiniGrid-Empty-5x5-v0", "pypi:minigrid#MiniGrid-Empty-5x5-v0"),
-        ("pip:minigrid@3.0.0#MiniGrid-Empty-5x5-v0", "pypi:minigrid@3.0.0#MiniGrid-Empty-5x5-v0"),
-        ("CartPole-v1", "pypi:PACKAGE#CartPole-v1"),
-    ],
-)
-def test_an_environment_of_a_package(text: str, write: str) -> None:
-    """What is named as Gymnasium names environments leads to the reference of a package."""
-    with pytest.raises(grammar.Wrong, match="environment of Gymnasium") as wrong:
-        grammar.read(text)
-    assert write in wrong.value.write
-
-
-def test_a_file_that_is_not_here() -> None:
-    with pytest.raises(grammar.Wrong, match="does not exist here") as wrong:
-        grammar.read("env.py")
-    assert "OWNER/NAME:env.py" in wrong.value.write
-
-
-def test_commits_are_told_from_names() -> None:
-    assert grammar.is_commit("0123456789abcdef" * 2 + "01234567")
-    assert not grammar.is_commit("0123456789ABCDEF" * 2 + "01234567")
-    assert grammar.has_control_characters("a\x1b[2J")
-    assert not grammar.has_control_characters("a ü")
 
 
 def failed(error: BaseException, *secrets: str) -> answers.HubFailure:
@@ -79,14 +51,6 @@ def test_each_failure_has_its_kind(error: BaseException, kind: Kind | None) -> N
     wrapper = type("LocalEntryNotFoundError", (Exception,), {})("wrapped")
     wrapper.__cause__ = error
     assert failed(wrapper).kind is expected
-
-
-def test_a_failure_says_what_to_do() -> None:
-    failure = failed(answered(429, Retry_After="30", X_Error_Message="too\nmany"))
-    assert 'it said: "too many"' in failure.what
-    assert "Wait 30 s" in failure.advice
-    gated = failed(type("GatedRepoError", (Exception,), {})())
-    assert "https://hub.example/spaces/owner/name" in gated.advice
 
 
 def test_a_secret_that_is_echoed_is_in_no_text() -> None:

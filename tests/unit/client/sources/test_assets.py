@@ -118,6 +118,9 @@ def own(stub_hub: StubHub, hub: dict[str, Any], *declared: str) -> Snapshot:
         ("https://user:hf_secret@huggingface.co/org/data", "user or token"),
         ("org/data:env.py", "names a file"),
         ("org/data@v1:x.py", "names a file"),
+        ("org/../data@" + "a" * 40, "holds"),
+        ("/etc", "a repository of the Hub"),
+        (f"git+https://127.0.0.1:9/org/data@{COMMIT}", "a repository of the Hub"),
         ("data", "owner is missing"),
         ("ORG/repo", "own repository"),
         (f"models/org/repo@{COMMIT}", "own repository"),
@@ -126,13 +129,16 @@ def own(stub_hub: StubHub, hub: dict[str, Any], *declared: str) -> Snapshot:
 def test_what_is_no_asset_is_refused_before_any_request(
     stub_hub: StubHub, hub: dict[str, Any], text: str, said: str
 ) -> None:
-    snapshot = own(stub_hub, hub)
-    before = len(stub_hub.requests)
-    with pytest.raises(HubReferenceError, match=said) as caught:
-        with_assets(snapshot, [text], hub)
-    assert str(caught.value).startswith(f"{snapshot.label}: assets holds ")
-    assert "hf_secret" not in str(caught.value)
-    assert len(stub_hub.requests) == before
+    """By the caller's word and by a card's, which could have any server asked that we can reach."""
+    for declared, given in ((), [text]), ((f"'{text}'",), []):
+        snapshot = own(stub_hub, hub, *declared)
+        before = len(stub_hub.requests)
+        with pytest.raises(HubReferenceError, match=said) as caught:
+            with_assets(snapshot, given, hub)
+        where = "assets" if given else "its README.md"
+        assert str(caught.value).startswith(f"{snapshot.label}: {where} holds ")
+        assert "hf_secret" not in str(caught.value)
+        assert len(stub_hub.requests) == before
 
 
 def test_one_repository_is_shown_at_one_commit(stub_hub: StubHub, hub: dict[str, Any]) -> None:
