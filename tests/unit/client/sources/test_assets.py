@@ -109,6 +109,7 @@ def own(stub_hub: StubHub, hub: dict[str, Any], *declared: str) -> Snapshot:
     return fetch(HubRef.parse("models/org/repo"), **hub)
 
 
+@pytest.mark.parametrize("where", ["assets", "its README.md"])
 @pytest.mark.parametrize(
     ("text", "said"),
     [
@@ -127,18 +128,16 @@ def own(stub_hub: StubHub, hub: dict[str, Any], *declared: str) -> Snapshot:
     ],
 )
 def test_what_is_no_asset_is_refused_before_any_request(
-    stub_hub: StubHub, hub: dict[str, Any], text: str, said: str
+    stub_hub: StubHub, hub: dict[str, Any], text: str, said: str, where: str
 ) -> None:
     """By the caller's word and by a card's, which could have any server asked that we can reach."""
-    for declared, given in ((), [text]), ((f"'{text}'",), []):
-        snapshot = own(stub_hub, hub, *declared)
-        before = len(stub_hub.requests)
-        with pytest.raises(HubReferenceError, match=said) as caught:
-            with_assets(snapshot, given, hub)
-        where = "assets" if given else "its README.md"
-        assert str(caught.value).startswith(f"{snapshot.label}: {where} holds ")
-        assert "hf_secret" not in str(caught.value)
-        assert len(stub_hub.requests) == before
+    snapshot = own(stub_hub, hub, *([f"'{text}'"] if where != "assets" else []))
+    before = len(stub_hub.requests)
+    with pytest.raises(HubReferenceError, match=said) as caught:
+        with_assets(snapshot, [text] if where == "assets" else [], hub)
+    assert str(caught.value).startswith(f"{snapshot.label}: {where} holds ")
+    assert "hf_secret" not in str(caught.value)
+    assert len(stub_hub.requests) == before
 
 
 def test_one_repository_is_shown_at_one_commit(stub_hub: StubHub, hub: dict[str, Any]) -> None:
