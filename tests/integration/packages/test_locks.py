@@ -119,9 +119,12 @@ def test_a_package_that_was_replaced_is_refused(
 
 def test_other_arguments_say_something_else(folder: Path) -> None:
     lock(folder, "--no-spaces")
-    for other in ({"python": "/usr/bin/python3"}, {"dependencies": "host"}, {"sandbox": "docker"}):
-        with pytest.raises(PolicyError, match="lock"):
+    for other in ({"python": "/usr/bin/python3"}, {"dependencies": "host"}, {"dependencies": {}}):
+        with pytest.raises(PolicyError, match="has the packages already"):
             make_env(folder, lock=path_of(folder), **other)
+    for place in ("docker", "tcp://host:1", ["process"]):
+        with pytest.raises(PolicyError, match="lock is for sandbox='process'"):
+            make_env(folder, lock=path_of(folder), sandbox=place)
     with pytest.raises(PolicyError, match="lock"):
         make_env(folder, lock=path_of(folder), sandbox=None, trust_remote_code=True)
     with pytest.raises(LockError, match="envhub lock REF"):

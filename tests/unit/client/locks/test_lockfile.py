@@ -17,9 +17,12 @@ from envhub_sandbox.dependencies.locks import lockfile, making, pylock
 from envhub_sandbox.dependencies.locks.lockfile import LockFile, Runner, Spaces
 from envhub_sandbox.dependencies.locks.making import fingerprint_of_spaces, fingerprint_of_task
 from envhub_sandbox.dependencies.locks.pylock import PylockPackage, Wheel
+from envhub_sandbox.dependencies.packages import lock_checker
 from envhub_sandbox.dependencies.request import chosen
 from envhub_sandbox.errors import EnvHubError, LockDriftError, LockError, PackageIntegrityError
 from envhub_sandbox.hub.snapshot import local
+from envhub_worker.protocol.manifest.manifest import Manifest
+from tests.support import wire
 from tests.support.packages.wheels import WORKERS, Index, make_wheel, served
 
 A, B = "a" * 64, "b" * 64
@@ -210,6 +213,26 @@ def test_no_two_spaces_look_alike(other: gym.Space[Any]) -> None:
     assert fingerprint_of_spaces(same) == fingerprint_of_spaces(BOX)
     assert fingerprint_of_spaces(other) != fingerprint_of_spaces(BOX)
     assert fingerprint_of_spaces(BOX, other) != fingerprint_of_spaces(other, BOX)
+
+
+def test_spaces_are_held_against_the_lock_for_the_same_arguments() -> None:
+    """With others the repository may make others; so it may with ``cfg``."""
+    manifest = Manifest(envs=(wire.env_manifest(BOX, gym.spaces.Discrete(2), 2),), lazy=True)
+    env = manifest.envs[0]
+    key = (env.suite, env.task, env.autoreset_mode, BOX)
+    same, other = (fingerprint_of_task(*key, gym.spaces.Discrete(count)) for count in (2, 3))
+
+    def check(task: Any, given: dict[str, Any], config: object = None) -> None:
+        lock = changed(spaces=Spaces('{"size": 8}', (task,)))
+        lock_checker(lock, "org/repo", given, config)(manifest)
+
+    check(same, {"size": 8})
+    check(other, {"size": 9})
+    check(other, {"size": 8}, config={"a": 1})
+    with pytest.raises(LockDriftError, match="actions were"):
+        check(other, {"size": 8})
+    for lock in (None, changed(spaces=None)):
+        lock_checker(lock, "org/repo", {}, None)(manifest)
 
 
 def spoiled(tmp_path: Path, change: Callable[[str], str]) -> Path:
