@@ -52,14 +52,12 @@ _BOOTSTRAP = Path(envhub_worker.protocol.__file__).parent.parent / "bootstrap.py
 
 @dataclass(frozen=True)
 class Environment:
-    """A complete environment.
+    """A complete environment, for an interpreter by its absolute path.
 
     Attributes:
         key: The hash of the lock and the interpreter.
-        python: The interpreter that it is for, by absolute path.
         lock: SHA-256 of the lock's text.
         pins: ``name==version`` of each package.
-        size: Bytes of all files.
         used: Unix time (seconds) of the last use.
     """
 

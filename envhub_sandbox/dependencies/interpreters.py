@@ -47,13 +47,7 @@ _ASK = (
 
 @dataclass(frozen=True)
 class Interpreter:
-    """An interpreter, without its packages.
-
-    Attributes:
-        path: Absolute, and no link.
-        version: ``"3.11.2"``.
-        libc: glibc's version.
-    """
+    """An interpreter, without its packages, by its absolute path, which is no link."""
 
     path: str
     implementation: str
@@ -94,11 +88,8 @@ def release(version: str) -> str:
 def find(asked: str, declared: str = "", *, fetch: bool = False) -> Interpreter:
     """An interpreter that fits: this one if it does, else the newest that is at hand.
 
-    Args:
-        asked: The caller's choice: a version (``"3.11"``), versions (``">=3.11,<3.13"``) or a path;
-            empty for none.
-        declared: The versions that the repository runs in.
-        fetch: Whether uv may download one where none is at hand.
+    The caller may ask for a version (``"3.11"``), versions (``">=3.11,<3.13"``) or a path; the
+    repository declares versions. Where none is at hand uv may ``fetch`` one.
     """
     if os.sep in asked:
         return _at(os.path.abspath(os.path.expanduser(asked)))

@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from envhub_sandbox.dependencies.declared import DeclaredPackages, WantedPackage
 
 _FORMAT = 1
-_READ: dict[tuple[Path, str], tuple[tuple[str, str, int], ...]] = {}
 _MOST = 64
 _SHOWN = 20
 _MISSING = r"No module named '([\w.]+)'"
@@ -74,21 +73,18 @@ class Guess:
         return not set(self.brought_by).isdisjoint(names)
 
 
+@lru_cache(maxsize=64)
 def guessed(snapshot: Snapshot) -> tuple[Guess, ...]:
     """What a repository imports, as far as it is known what brings it.
 
     What its declared packages bring is among it: that is known once versions are chosen.
     """
-    return _guessed(snapshot.root, snapshot.path, read(snapshot))
-
-
-@lru_cache(maxsize=64)
-def _guessed(root: Path, entry: str, rows: tuple[tuple[str, str, int], ...]) -> tuple[Guess, ...]:
+    rows = read(snapshot)
     if not rows:
         return ()
     from envhub_sandbox.dependencies.declared import optional, parse_requirement
 
-    extras = optional(root)
+    extras = optional(snapshot.root)
     found: dict[str, Guess] = {}
     for name, file, line in rows:
         known = _of_id(name) if "-" in name else _of_module(name, extras)
@@ -127,20 +123,12 @@ def is_here(guess: Guess) -> bool:
     return PathFinder.find_spec(guess.module, here) is not None
 
 
+@lru_cache(maxsize=64)
 def read(snapshot: Snapshot) -> tuple[tuple[str, str, int], ...]:
     """Modules that a repository imports and does not have, and ids of environments; file and line.
 
     A commit's are remembered: they are read in a process of their own.
     """
-    place = snapshot.root, snapshot.path  # a root holds one commit
-    if place not in _READ:
-        if len(_READ) >= _MOST:
-            _READ.clear()
-        _READ[place] = _recalled(snapshot)
-    return _READ[place]
-
-
-def _recalled(snapshot: Snapshot) -> tuple[tuple[str, str, int], ...]:
     folder = cache_root() / "imports"
     facts = json.dumps([_FORMAT, sys.version_info[:2], snapshot.commit, snapshot.path])
     key = hashlib.sha256(facts.encode()).hexdigest()
@@ -159,13 +147,9 @@ def _recalled(snapshot: Snapshot) -> tuple[tuple[str, str, int], ...]:
 
 @dataclass(frozen=True)
 class MissingModule:
-    """Advice for a repository whose import fails.
-
-    Attributes:
-        place: The sandbox's name.
-        where: Where its packages were to come from, as ``Choice`` has it.
-        python: The interpreter that the caller named.
-        own: Whether it ran in an environment that was made for it.
+    """Advice for a repository whose import fails: in which sandbox it ran, ``where`` its packages
+    were to come from (see ``Choice``), the interpreter that the caller named, and whether it ran in
+    an environment of its own.
     """
 
     snapshot: Snapshot

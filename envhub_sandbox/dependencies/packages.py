@@ -75,11 +75,11 @@ class PackageTarget(Protocol):
         """Packages of the repository's own; None where the place says that its own are enough."""
 
 
+@dataclass(frozen=True)
 class ThisMachine:
     """The interpreters of this machine; with ``upgrade``, versions are chosen again."""
 
-    def __init__(self, *, upgrade: bool = False) -> None:
-        self._upgrade = upgrade
+    upgrade: bool = False
 
     def meets(self, request: PackageRequest) -> bool:
         """Whether this process's interpreter has all of it."""
@@ -92,7 +92,7 @@ class ThisMachine:
         """An environment; raises as ``resolution_for`` and ``environments.provide``."""
         from envhub_sandbox.dependencies import environments, resolutions
 
-        found = resolutions.resolution_for(request, tell, upgrade=self._upgrade)
+        found = resolutions.resolution_for(request, tell, upgrade=self.upgrade)
         made = PackageSet.of(environments.provide(found.lock, found.interpreter, tell))
         inferred = [one.facts for one in request.guesses if one.module in found.taken]
         return replace(made, facts=made.facts | {"inferred": inferred}) if inferred else made
@@ -131,9 +131,7 @@ def packages_for(
 def opened_lock(
     path: str | os.PathLike[str], sandbox: object, python: object, dependencies: object
 ) -> LockFile:
-    """The lock of these arguments of ``make_env``; ``PolicyError`` if the others say something
-    else.
-    """
+    """The lock of these arguments of ``make_env``; ``PolicyError`` if others say something else."""
     if python is not None or dependencies != "auto":
         raise PolicyError(
             f"{option_name('lock')} has the packages already; leave out {option_name('python')} "
@@ -204,10 +202,8 @@ def _with_wheels(
 def lock_checker(
     lock: LockFile | None, label: str, env_kwargs: Mapping[str, Any], config: object
 ) -> Callable[[Manifest], None]:
-    """What holds a manifest against the lock.
-
-    With other arguments than those that were locked a repository may well make other environments:
-    then there is nothing to hold it against.
+    """What holds a manifest against the lock; with other arguments a repository may well make other
+    environments.
     """
 
     def check(manifest: Manifest) -> None:

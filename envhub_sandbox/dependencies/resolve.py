@@ -106,13 +106,8 @@ def resolve(
 ) -> Lock:
     """Pins for a target; wheels only, nothing is built.
 
-    Args:
-        request: What is asked for; what the worker needs comes on top. Guesses are not looked at.
-        target: What the packages are for.
-        options: Further ones, which the installation needs, too.
-        refresh: Ask the index anew for what uv has seen a moment ago.
-        tell: Gets each line of uv's progress.
-
+    What the worker needs comes on top; guesses are not looked at. The installation needs the
+    ``options``, too. With ``refresh`` the index is asked anew for what uv has seen a moment ago.
     Raises ``ResolutionError``; and ``PackageIntegrityError`` for a version that is there, but not
     with a hash that was asked for.
     """

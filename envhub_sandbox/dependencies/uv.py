@@ -104,15 +104,13 @@ def run(
     """Run uv to its end, and return what it printed.
 
     Args:
-        arguments: After ``uv``.
         keep: Descriptors that it keeps open for as long as it lives.
         watch: Called now and then; what it raises ends it.
         file_bytes: The largest file that it may write.
         files: Texts that it finds in its folder, by name.
         variables: Of its environment, instead of ours.
 
-    Raises:
-        DependencyError: It failed, or there is none.
+    Raises ``DependencyError``: it failed, or there is none.
     """
     lines: list[str] = []
     with (

@@ -31,13 +31,10 @@ MAX_DEPTH = 64
 
 @dataclass(frozen=True)
 class FileRecord:
-    """One file of a snapshot.
+    """One file of a snapshot, by its path relative to the root, with ``/``, and its bytes.
 
-    Attributes:
-        path: Relative to the root, with ``/``.
-        size: In bytes.
-        digest: ``"git-sha1:<40 hex>"``, the git blob id, or ``"sha256:<64 hex>"`` for files in
-            LFS and files of a local folder.
+    The digest is ``"git-sha1:<40 hex>"``, the git blob id, or ``"sha256:<64 hex>"`` for files in
+    LFS and files of a local folder.
     """
 
     path: str
@@ -185,13 +182,7 @@ def _cached_revisions(snapshot: Snapshot) -> tuple[str, ...]:
 
 @dataclass(frozen=True, kw_only=True)
 class SnapshotLimits:
-    """What a repository may bring: judged by its listing before the download, then on disk.
-
-    Attributes:
-        max_bytes: All files together.
-        max_files: Their number.
-        max_file_bytes: The largest one.
-    """
+    """What a repository may bring: judged by its listing before the download, then on disk."""
 
     max_bytes: int = 4 * 2**30
     max_files: int = 20_000
@@ -306,12 +297,9 @@ def copy_verified(source: Path, target: Path, record: FileRecord) -> None:
 
 
 def write_verified(stream: IO[bytes], target: Path, record: FileRecord) -> None:
-    """Write a new file; what was written is exactly what the record says.
+    """Write a new file; what was written is exactly what the record says, or ``HashMismatch``.
 
     The hash is taken of the bytes on their way, so they cannot change in between.
-
-    Raises:
-        HashMismatch: Other bytes or another size. The new file may be there in part.
     """
     running = _start(record.digest.partition(":")[0], record.size)
     written = 0

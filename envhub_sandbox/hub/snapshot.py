@@ -227,13 +227,11 @@ def local(
     Args:
         folder: A folder, ``folder:path/env.py``, or a ``.py`` file (whose folder is taken).
         path: The entry file in the folder, unless ``folder`` names one.
-        limits: What the folder may bring.
 
     Raises:
         RepositoryUnavailableError: There is no such folder or entry file.
-        SnapshotTooLargeError: Over the limits.
         SnapshotError: A link leaves the folder, a file cannot be read, or has a name that the Hub
-            cannot have.
+            cannot have; ``SnapshotTooLargeError`` over the limits.
     """
     from envhub_sandbox.hub.local import LocalFolder, copier, split_local  # no pin needs it
 

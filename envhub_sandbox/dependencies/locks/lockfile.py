@@ -92,18 +92,13 @@ class Spaces:
 
 @dataclass(frozen=True)
 class LockFile:
-    """All that is locked.
+    """All that is locked; what ``Choice`` has, too, is the same here.
 
     Attributes:
         repository: As a reference begins, such as ``"org/repo"``; or ``LOCAL``.
         commit: The full commit; of a folder its content's.
         runner: What the packages are for.
-        extra: Requirements that the caller added.
-        exclude_newer: The date before which versions were chosen, if there was one.
         spaces: What the environments looked like; None where nothing was run.
-        only: Those that he gave instead of what is declared; None where that counts.
-        override: Those that hold instead of all others of the same package.
-        without: Packages that he left out.
         inferred: What was taken though nothing declares it, and where it is imported.
         assets: Further repositories that it may read, each at its commit.
     """

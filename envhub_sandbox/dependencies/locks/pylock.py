@@ -43,12 +43,8 @@ _DESCRIBE_S = 600.0
 
 @dataclass(frozen=True)
 class Wheel:
-    """One file of a package.
-
-    Attributes:
-        sha256: Hexadecimal.
-        url: Where it was found, for the reader: the user's settings say where it is taken from.
-        size: In bytes; None where the index does not say.
+    """One file of a package; where it was found is for the reader: the user's settings say where it
+    is taken from. Its size may not be known.
     """
 
     sha256: str

@@ -49,7 +49,6 @@ class Checkout:
     """A folder that lies in a git checkout.
 
     Attributes:
-        folder: The folder.
         files: What a commit of everything would hold of it, relative to it; among them folders
             that are repositories of their own, of which it would hold a pointer.
         folders: Every folder above these.
@@ -69,10 +68,8 @@ class Checkout:
         """Which of these files git commits with other bytes, and by which attribute.
 
         ``.gitattributes`` counts as it lies in the folder, and as it lies in the index: by the
-        latter git made the folder, and it may have converted ``.gitattributes``, too.
-
-        Raises:
-            SnapshotError: Git cannot say.
+        latter git made the folder, and it may have converted ``.gitattributes``, too. Raises
+        ``SnapshotError`` where git cannot say.
         """
         given = b"".join(os.fsencode(name) + b"\0" for name in names)
         return sorted({*self._attributes(given), *self._attributes(given, "--cached")})
@@ -92,14 +89,12 @@ class Checkout:
 
 
 def read_checkout(folder: Path) -> Checkout | None:
-    """What git says of a folder; None where it is in no checkout, or git cannot tell.
+    """What git says of a folder (an absolute path without links); None where it is in no checkout,
+    or git cannot tell.
 
     Git runs no program and writes nothing. A folder that the checkout around it ignores as a whole
     is in none. A ``.git`` counts only where it belongs to root, to us or to the folder's owner: in
     ``/tmp`` every user of the machine can make one.
-
-    Args:
-        folder: An absolute path without links.
     """
     repository = _repository_of(folder)
     if repository is None:

@@ -75,9 +75,7 @@ Variables = Mapping[str, str]
 def resolve(url: str, revision: str, variables: Variables | None = None) -> str:
     """The full commit that a branch or a tag means now; one that is full is not asked for.
 
-    Raises:
-        HubReferenceError: The URL or the name is none that is taken.
-        HubFailure: The host does not answer, or has no such name.
+    Raises ``HubReferenceError`` for a URL or a name that is not taken, and ``HubFailure``.
     """
     if is_commit(revision):
         return revision
@@ -157,11 +155,7 @@ class _Part(io.RawIOBase):
 def fetched(url: str, commit: str, variables: Variables | None = None) -> Iterator[GitFiles]:
     """The files of a full commit, for as long as the context lasts.
 
-    Raises:
-        HubReferenceError: The URL is none that is taken.
-        HubFailure: The host does not answer, or does not give this commit.
-        SnapshotTooLargeError: It has more files or bytes than are taken.
-        SnapshotError: It holds what git itself would not commit; or there is no git here.
+    Raises as ``resolve``, and ``SnapshotTooLargeError`` or ``SnapshotError`` for what it holds.
     """
     source = _checked(url)
     title = f"{url}@{commit[:12]}"

@@ -44,11 +44,7 @@ class CardError(ValueError):
 
 
 def declared_assets(root: Path) -> list[str]:
-    """The repositories that a card declares as assets, as it writes them; not yet judged.
-
-    Raises:
-        CardError: ``envhub`` or its ``assets`` is something else, or they are too many.
-    """
+    """The repositories that a card declares as assets, as it writes them; or ``CardError``."""
     try:
         with (root / CARD).open("rb") as file:
             text = file.read(_MAX_BYTES).decode("utf-8", "replace")
@@ -94,14 +90,8 @@ def _value(node: Any, key: str) -> Any:
 def with_assets(snapshot: Snapshot, given: Sequence[str], hub: Mapping[str, Any]) -> Snapshot:
     """The snapshot with its assets, fetched and verified.
 
-    Args:
-        snapshot: The environment's own files.
-        given: References of the caller; one replaces the card's of the same repository.
-        hub: ``hub_cache_dir``, ``token`` and ``endpoint``, as ``fetch`` takes them.
-
-    Raises:
-        HubReferenceError: An asset is none, is the environment's own repository, or is named twice.
-        SnapshotError: The card cannot be read, or an asset cannot be had; see ``fetch``.
+    References of the caller replace the card's of the same repository. ``hub`` is what ``fetch``
+    takes. Raises as that, and for a card that cannot be read, and for what is no asset.
     """
     wanted = [_asset(text, snapshot, option_name("assets")) for text in given]
     declared = _declared(snapshot)

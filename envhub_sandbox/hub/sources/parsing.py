@@ -40,10 +40,8 @@ class ImportStatement(NamedTuple):
     Attributes:
         level: Of a relative ``from``; -1 for ``import``.
         module: Behind ``from``.
-        names: What is imported.
         required: Whether the file does not work without: it is not within a ``try`` that goes on
             without it, nor for type checkers or for the file as a program.
-        line: Where it stands.
         within: The function or class at the top of the file that it stands in; empty for none.
     """
 

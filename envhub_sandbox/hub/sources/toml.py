@@ -19,16 +19,9 @@ _TIME = re.compile(r":\d\d\.\d")
 
 
 def loads(text: str, most: int, *, generated: bool = False) -> dict[str, Any]:
-    """A document.
+    """A document of at most so many characters; ``ValueError`` if it is none, or too long.
 
-    Args:
-        text: Its text.
-        most: The most characters.
-        generated: Whether it is of a form without texts of several lines. Then dots in texts,
-            of which one that people write may have 2000 at most, do not count.
-
-    Raises:
-        ValueError: It is none, or too long.
+    One that is ``generated`` has no texts of several lines, and dots in its texts do not count.
     """
     if len(text) > most:
         raise ValueError(f"it has {len(text)} characters; at most {most} are read")
