@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 
 from envhub_sandbox.errors import EnvHubError, PolicyError
 from envhub_sandbox.hub.local import split_local
-from envhub_sandbox.hub.reference import DEFAULT_PATH
 from envhub_sandbox.hub.snapshot import is_here
 from envhub_sandbox.hub.sources import toml
 from envhub_worker.protocol.text import size_text
@@ -90,7 +89,7 @@ def is_judged(path: Path, reference: str) -> bool:
     if not is_here(reference):
         return False
     try:
-        folder, _ = split_local(reference, DEFAULT_PATH)
+        folder, _ = split_local(reference)
     except EnvHubError:
         return False  # nothing is judged: what reads it says why
     return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))

@@ -22,12 +22,13 @@ from envhub_sandbox.errors import (
     SnapshotTooLargeError,
 )
 from envhub_sandbox.hub.git.checkout import Checkout, read_checkout
+from envhub_sandbox.hub.grammar import DEFAULT_PATH
 from envhub_sandbox.hub.listing import (
+    DEFAULT_LIMITS,
     MAX_DEPTH,
     SHA256,
     FileRecord,
     HashMismatch,
-    SnapshotLimits,
     check_listing_names,
     copy_verified,
     digest_of,
@@ -87,12 +88,10 @@ class LocalFolder:
         """
         return (one for one in self._found() if isinstance(one, LocalFile))
 
-    def listed(
-        self, limits: SnapshotLimits
-    ) -> tuple[tuple[LocalFile, ...], tuple[FileRecord, ...]]:
+    def listed(self) -> tuple[tuple[LocalFile, ...], tuple[FileRecord, ...]]:
         """The files of the snapshot, within limits, and their records, by reading all of them."""
         try:
-            found = listing_within_limits(self.files(), limits, str(self))
+            found = listing_within_limits(self.files(), DEFAULT_LIMITS, str(self))
         except OSError as error:
             raise SnapshotError(f"{self}: it cannot be read: {error}") from error
         except SnapshotTooLargeError as error:
@@ -196,13 +195,13 @@ def _is_empty_folder(path: Path) -> bool:
         return False  # what may not be read may hold anything
 
 
-def split_local(text: str, path: str) -> tuple[Path, str]:
+def split_local(text: str) -> tuple[Path, str]:
     """The folder and entry of ``./env``, ``./env:sub/env.py``, ``./x/other.py``, ``examples:x``."""
     if text.startswith(_EXAMPLES):
         text = str(_example(text))
     folder = Path(os.path.abspath(os.path.expanduser(text)))
     if folder.is_dir():
-        return folder, _in_a_snapshot(path)
+        return folder, DEFAULT_PATH
     if folder.is_file():
         if folder.suffix != ".py":
             raise RepositoryUnavailableError(
@@ -212,18 +211,13 @@ def split_local(text: str, path: str) -> tuple[Path, str]:
     before, colon, after = text.rpartition(":")
     if colon and before and after:
         inner = Path(os.path.abspath(os.path.expanduser(before)))
-        if inner.is_dir():
-            return inner, _in_a_snapshot(after)
+        if inner.is_dir():  # on Windows the path may be written with backslashes
+            return inner, posixpath.normpath(after.replace(os.sep, "/"))
     raise RepositoryUnavailableError(
         f"local folder {text!r}: there is no such folder or file here (looked for {folder}). "
         "Write './folder', './folder:path/env.py' or './folder/env.py'; a repository of the Hub "
         "is owner/name"
     )
-
-
-def _in_a_snapshot(path: str) -> str:
-    """A path as a snapshot has it; on Windows one may be written with backslashes."""
-    return posixpath.normpath(path.replace(os.sep, "/"))
 
 
 def _example(text: str) -> Path:

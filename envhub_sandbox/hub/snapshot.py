@@ -13,7 +13,7 @@ import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from envhub_sandbox.errors import (
     HubReferenceError,
@@ -50,23 +50,16 @@ _SHOWN_FILES = 20
 T = TypeVar("T")
 
 
-def snapshot_named(
-    reference: str,
-    *,
-    hub_cache_dir: str | Path | None = None,
-    token: str | bool | None = None,
-    endpoint: str | None = None,
-) -> Snapshot:
+def snapshot_named(reference: str, **hub: Any) -> Snapshot:
     """The snapshot of a hub reference or of a local folder; raises as ``fetch`` and ``local`` do.
 
     The path of a ``.py`` file that is here means that file. A reference that is also a folder here
-    gets a hint.
+    gets a hint. ``hub`` are ``hub_cache_dir``, ``token`` and ``endpoint``, as ``fetch`` takes them.
     """
     if is_here(reference):
         return local(reference)
     try:
-        ref = HubRef.parse(reference)
-        return fetch(ref, hub_cache_dir=hub_cache_dir, token=token, endpoint=endpoint)
+        return fetch(HubRef.parse(reference), **hub)
     except (HubReferenceError, SnapshotError) as error:
         if os.path.exists(reference.partition(":")[0]):
             hint = f"There is a folder of that name here; for the folder, write './{reference}'."
@@ -79,13 +72,7 @@ def is_here(reference: str) -> bool:
     return is_local(reference) or (reference.endswith(".py") and os.path.isfile(reference))
 
 
-def commit_of(
-    reference: str,
-    *,
-    hub_cache_dir: str | Path | None = None,
-    token: str | bool | None = None,
-    endpoint: str | None = None,
-) -> str:
+def commit_of(reference: str, **hub: Any) -> str:
     """The commit that a reference means now; raises as ``snapshot_named`` does.
 
     Nothing is downloaded or copied, and a full commit costs no request. Whether it has the entry
@@ -94,15 +81,14 @@ def commit_of(
     if is_here(reference):
         from envhub_sandbox.hub.local import LocalFolder, split_local
 
-        root, _ = split_local(reference, DEFAULT_PATH)
-        return f"local-{content_digest(LocalFolder.at(root).listed(DEFAULT_LIMITS)[1])}"
+        root, _ = split_local(reference)
+        return f"local-{content_digest(LocalFolder.at(root).listed()[1])}"
     ref = HubRef.parse(reference)
     if ref.repo_type == registered.KIND:
         return fetch(ref).commit
     if ref.is_pinned and ref.revision is not None:
         return ref.revision
-    candidates = _candidates(ref, DEFAULT_LIMITS, endpoint, token, hub_cache_dir)
-    return _first(candidates, _Candidate.resolved)
+    return _first(_candidates(ref, **hub), _Candidate.resolved)
 
 
 def fetch(
@@ -136,7 +122,7 @@ def fetch(
     """
     if ref.repo_type == registered.KIND:
         return _registered(ref)
-    candidates = _candidates(ref, limits, endpoint, token, hub_cache_dir, needs_entry)
+    candidates = _candidates(ref, hub_cache_dir, token, endpoint, limits, needs_entry)
     try:
         for candidate in candidates if ref.is_pinned else ():
             if (stored := candidate.stored()) is not None:
@@ -154,10 +140,10 @@ def fetch(
 
 def _candidates(
     ref: HubRef,
-    limits: SnapshotLimits,
-    endpoint: str | None,
-    token: str | bool | None,
-    hub_cache_dir: str | Path | None,
+    hub_cache_dir: str | Path | None = None,
+    token: str | bool | None = None,
+    endpoint: str | None = None,
+    limits: SnapshotLimits = DEFAULT_LIMITS,
     needs_entry: bool = True,
 ) -> Sequence[_Candidate]:
     """As what it may be read; the last four are of the Hub alone."""
@@ -217,16 +203,11 @@ def _in_store(candidates: Sequence[_Candidate], even_if_none: bool) -> str:
     return f" These are in the store and need no Hub: {shown}."
 
 
-def local(
-    folder: str | Path, path: str = DEFAULT_PATH, *, limits: SnapshotLimits = DEFAULT_LIMITS
-) -> Snapshot:
+def local(folder: str | Path) -> Snapshot:
     """Copy a folder of this machine into the store, by content: unchanged is the same snapshot.
 
-    In a git checkout that is what git would commit, and elsewhere every file; see ``hub.local``.
-
-    Args:
-        folder: A folder, ``folder:path/env.py``, or a ``.py`` file (whose folder is taken).
-        path: The entry file in the folder, unless ``folder`` names one.
+    It may also be ``folder:path/env.py``, or a ``.py`` file (whose folder is taken). In a git
+    checkout that is what git would commit, and elsewhere every file; see ``hub.local``.
 
     Raises:
         RepositoryUnavailableError: There is no such folder or entry file.
@@ -235,9 +216,9 @@ def local(
     """
     from envhub_sandbox.hub.local import LocalFolder, copier, split_local  # no pin needs it
 
-    root, path = split_local(str(folder), path)
+    root, path = split_local(str(folder))
     here = LocalFolder.at(root)
-    found, files = here.listed(limits)
+    found, files = here.listed()
     if all(file.path != path for file in files):
         what, advice = here.why_left_out(path) or _missing_entry(path, files)
         raise RepositoryUnavailableError(f"{here} {what}. {advice}")

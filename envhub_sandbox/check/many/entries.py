@@ -13,7 +13,7 @@ from typing import IO
 from envhub_sandbox.errors import EnvHubError, HubReferenceError
 from envhub_sandbox.hub.grammar import has_control_characters
 from envhub_sandbox.hub.local import split_local
-from envhub_sandbox.hub.reference import DEFAULT_PATH, HubRef
+from envhub_sandbox.hub.reference import HubRef
 from envhub_sandbox.hub.snapshot import is_here
 from envhub_worker.protocol.text import printable, size_text
 
@@ -103,7 +103,7 @@ def _meaning(reference: str) -> tuple[str, str]:
             "this is not a reference: it is too long, or has control characters"
         )
     if is_here(reference):
-        folder, path = split_local(reference, DEFAULT_PATH)
+        folder, path = split_local(reference)
         if path == os.pardir or path.startswith(f"{os.pardir}/") or os.path.isabs(path):
             raise HubReferenceError(f"{reference}: its entry file is outside its folder")
         return reference, f"{folder.resolve()}:{path}"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -148,17 +148,11 @@ def drift_of_tasks(
             yield f"environment {shown}: {text}"
 
 
-def locked(
-    snapshot: Snapshot,
-    choice: Choice,
-    tell: Callable[[str], None] = lambda line: None,
-    *,
-    upgrade: bool = False,
-) -> LockFile:
+def locked(snapshot: Snapshot, choice: Choice, *, upgrade: bool = False) -> LockFile:
     """A lock of a repository with the packages of a choice; nothing of either runs."""
     request = request_of(snapshot, replace(choice, where="own"))
     assert request is not None  # which only another choice gives
-    found = resolution_for(request, tell, upgrade=upgrade)
+    found = resolution_for(request, upgrade=upgrade)
     empty = LockFile(
         *("", "", "", {}, Runner.of(found.interpreter)),
         packages=pylock.described(found.lock, found.interpreter.path),

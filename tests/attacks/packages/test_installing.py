@@ -12,7 +12,6 @@ import shutil
 import socket
 import subprocess
 import tarfile
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -170,16 +169,16 @@ requires = []
 build-backend = "backend"
 backend-path = ["."]
 [project]
-name = "{name}"
+name = "trapped"
 dynamic = ["version", "dependencies"]
 """
 
 
-def source(folder: Path, name: str, traces: Path) -> Path:
+def source(folder: Path, traces: Path) -> Path:
     """A project that springs a trap when it is built, and needs nothing for that."""
     folder.mkdir()
-    (folder / "backend.py").write_text(BACKEND.format(trap=trap(traces, name)))
-    (folder / "pyproject.toml").write_text(PROJECT.format(name=name))
+    (folder / "backend.py").write_text(BACKEND.format(trap=trap(traces, "built")))
+    (folder / "pyproject.toml").write_text(PROJECT)
     return folder
 
 
@@ -192,56 +191,44 @@ def plain_uv(given: str, cwd: Path) -> None:
     )
 
 
-def only_source(index: Index, folder: Path, traces: Path) -> tuple[str, Callable[[], object]]:
-    """A package of the index that has no wheel."""
-    made = source(folder / "source", "sourced", traces)
-    with tarfile.open(index.folder / "sourced-1.0.tar.gz", "w:gz") as archive:
-        archive.add(made, "sourced-1.0")
-    return "sourced", lambda: plain_uv("sourced\n", folder)
+LINES = {
+    # an option that installs a folder; uv builds that although it is told to build nothing
+    "editable": "-e {source}",
+    # a requirement that is a path, in the form of a URL
+    "linked": "trapped @ file://{source}",
+    # the repository's own folder, by a relative path
+    "relative": "./source",
+    # an option in a marker's text, which is read with its escapes and was printed without them
+    "smuggled": 'numpy; os_name == "x" or os_name == "posix"\n-e {source}\nnumpy; os_name == "x"',
+}
 
 
-def editable(index: Index, folder: Path, traces: Path) -> tuple[str, Callable[[], object]]:
-    """An option that installs a folder; uv builds that although it is told to build nothing."""
-    made = source(folder / "source", "edited", traces)
-    line = f"-e {made}"
-    return line, lambda: plain_uv(f"{line}\n", folder)
-
-
-def linked(index: Index, folder: Path, traces: Path) -> tuple[str, Callable[[], object]]:
-    """A requirement that is a path, in the form of a URL."""
-    made = source(folder / "source", "linked", traces)
-    line = f"linked @ file://{made}"
-    return line, lambda: plain_uv(f"{line}\n", folder)
-
-
-def relative(index: Index, folder: Path, traces: Path) -> tuple[str, Callable[[], object]]:
-    """The repository's own folder, by a relative path."""
-    source(folder / "source", "relative", traces)
-    return "./source", lambda: plain_uv("./source\n", folder)
-
-
-def smuggled(index: Index, folder: Path, traces: Path) -> tuple[str, Callable[[], object]]:
-    """An option in a marker's text, which is read with its escapes and was printed without them."""
-    made = source(folder / "source", "smuggled", traces)
-    text = f'numpy; os_name == "x" or os_name == "posix"\n-e {made}\nnumpy; os_name == "x"'
+def set_trap(kind: str, folder: Path, traces: Path) -> str:
+    """The line by which a repository asks for a source; plain uv has built it: the control."""
+    text = LINES[kind].format(source=source(folder / "source", traces))
+    plain_uv(f"{text}\n", folder)
+    assert sprung(traces), "the control builds nothing"
+    if kind != "smuggled":
+        return text
     inside = text[len('numpy; os_name == "') : -1].replace("\n", r"\n").replace('"', r"\"")
-    return f"numpy; os_name == '{inside}'", lambda: plain_uv(f"{text}\n", folder)
+    return f"numpy; os_name == '{inside}'"
 
 
-@pytest.mark.parametrize("kind", [only_source, editable, linked, relative, smuggled])
+@pytest.mark.parametrize("kind", ["of the index", *LINES])
 def test_what_would_be_built_is_not(
-    real_index: Index,
-    tmp_path: Path,
-    traces: Path,
-    kind: Callable[[Index, Path, Path], tuple[str, Callable[[], object]]],
+    real_index: Index, tmp_path: Path, traces: Path, kind: str
 ) -> None:
     """A build runs what the package says: an index's source in a jail, and others not at all."""
-    line, control = kind(real_index, tmp_path, traces)
-    control()
-    assert sprung(traces), "the control builds nothing"
+    if kind == "of the index":
+        line, made = "trapped", source(tmp_path / "source", traces)
+        with tarfile.open(real_index.folder / "trapped-1.0.tar.gz", "w:gz") as archive:
+            archive.add(made, "trapped-1.0")
+        plain_uv("trapped\n", tmp_path)
+        assert sprung(traces), "the control builds nothing"
+    else:
+        line = set_trap(kind, tmp_path, traces)
     folder = write_repository(tmp_path / "repo", ENV, requirements__txt=f"{line}\n")
-    if (tmp_path / "source").is_dir():
-        shutil.copytree(tmp_path / "source", folder / "source")
+    shutil.copytree(tmp_path / "source", folder / "source")
     with pytest.raises(DependencyError):
         make_env(folder)
     assert sprung(traces) == set()
@@ -354,17 +341,12 @@ def ordered(folder: Path, line: str, quota: int = Quotas().packages_bytes) -> st
     return states[-1]
 
 
-@pytest.mark.parametrize("kind", [editable, linked, relative, smuggled])
+@pytest.mark.parametrize("kind", LINES)
 def test_a_client_that_checks_nothing_has_nothing_built(
-    real_index: Index,
-    tmp_path: Path,
-    traces: Path,
-    kind: Callable[[Index, Path, Path], tuple[str, Callable[[], object]]],
+    real_index: Index, tmp_path: Path, traces: Path, kind: str
 ) -> None:
     """The server reads an order as a stranger's file, whatever its client has made of it."""
-    line, control = kind(real_index, tmp_path, traces)
-    control()
-    assert sprung(traces), "the control builds nothing"
+    line = set_trap(kind, tmp_path, traces)
     assert ordered(tmp_path / "packages", line) == "RequirementError"
     assert sprung(traces) == set()
 

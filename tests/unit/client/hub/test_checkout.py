@@ -71,7 +71,7 @@ def test_what_git_ignores_is_left_out_unless_it_is_committed(
     assert set(files(folder)) == {".gitignore", "env.py", "forced.pyc", "new.py"}
     assert left_out(folder) == [(".venv/", False), ("a.pyc", False), ("mine.txt", False)]
     with pytest.raises(RepositoryUnavailableError, match=r"git would not commit.*add --force"):
-        local(folder, "a.pyc")
+        local(f"{folder}:a.pyc")
     repository.git("worktree", "add", "--quiet", str(tmp_path / "more"))
     (tmp_path / "more/mine.txt").write_text("")
     (tmp_path / "more/new.py").write_text("")

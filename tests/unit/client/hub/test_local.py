@@ -16,6 +16,7 @@ from envhub_sandbox.errors import (
     SnapshotIntegrityError,
     SnapshotTooLargeError,
 )
+from envhub_sandbox.hub import local as module
 from envhub_sandbox.hub.local import split_local
 from envhub_sandbox.hub.snapshot import Snapshot, SnapshotLimits, commit_of, local, store
 
@@ -59,7 +60,7 @@ def test_unchanged_content_is_the_same_snapshot(folder: Path) -> None:
     assert second.commit != first.commit
     assert second.commit.startswith("local-")
     (folder / "env.py").rename(folder / "renamed.py")
-    assert local(folder, "renamed.py").commit not in (first.commit, second.commit)
+    assert local(f"{folder}:renamed.py").commit not in (first.commit, second.commit)
 
 
 @pytest.mark.parametrize(
@@ -100,7 +101,7 @@ def test_a_folders_commit_is_named_without_a_copy(folder: Path) -> None:
 def test_missing_entry_lists_the_python_files(folder: Path, path: str) -> None:
     """And a missing folder the forms that exist."""
     with pytest.raises(RepositoryUnavailableError, match=r"it has 'env\.py', 'sub/other\.py'"):
-        local(folder, path)
+        local(f"{folder}:{path}")
     with pytest.raises(RepositoryUnavailableError, match=r"no such folder.*'\./folder'"):
         local(folder.parent / "my-enf")
 
@@ -168,11 +169,14 @@ def test_bottomless_folder_is_refused(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["max_files", "max_bytes", "max_file_bytes"])
-def test_folder_over_a_limit_is_refused(folder: Path, name: str) -> None:
+def test_folder_over_a_limit_is_refused(
+    folder: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A home folder that was given by mistake is not copied; the error says what counts."""
     (folder / "env.py").write_text("22")
+    monkeypatch.setattr(module, "DEFAULT_LIMITS", SnapshotLimits(**{name: 1}))
     with pytest.raises(SnapshotTooLargeError, match=rf"{name}(.|\n)*every file in it is included"):
-        local(folder, limits=SnapshotLimits(**{name: 1}))
+        local(folder)
 
 
 def test_edited_copy_is_refused_and_half_of_one_made_again(folder: Path) -> None:
@@ -205,11 +209,11 @@ def test_an_example_is_found_from_anywhere(
     """The wheel brings them; in a checkout they are those of the checkout."""
     monkeypatch.chdir(tmp_path)
     for name in ("cartpole", "catch", "two_tasks"):
-        folder, entry = split_local(f"examples:{name}", "env.py")
+        folder, entry = split_local(f"examples:{name}")
         assert (folder / entry).read_bytes() == (checkout / "examples" / name / entry).read_bytes()
 
 
 @pytest.mark.parametrize("name", ["", "nope", "../tests", "cartpole/env.py", "ci"])
 def test_what_is_no_example_is_refused_with_those_that_there_are(name: str) -> None:
     with pytest.raises(RepositoryUnavailableError, match="choose one: examples:cartpole, "):
-        split_local(f"examples:{name}", "env.py")
+        split_local(f"examples:{name}")
