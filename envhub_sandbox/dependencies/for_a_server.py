@@ -227,13 +227,11 @@ def _alone(folder: Path) -> Iterator[int]:
     """Hold the lock of a client's folder: a killed server may have left a process there."""
     folder.mkdir(parents=True, exist_ok=True)
 
-    def waits() -> None:
-        _say({"progress": "waiting for another process, which makes packages there"})
-
+    waits = {"progress": "waiting for another process, which makes packages there"}
+    lock = locks.held(folder / "lock", wait_s=_LOCKED_S, on_wait=lambda: _say(waits))
     with contextlib.ExitStack() as stack:
         try:
-            held = locks.held(folder / "lock", wait_s=_LOCKED_S, on_wait=waits)
-            descriptor = stack.enter_context(held)
+            descriptor = stack.enter_context(lock)
         except TimeoutError:
             raise DependencyError("another process is making packages there; try again") from None
         yield descriptor

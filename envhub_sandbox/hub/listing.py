@@ -10,6 +10,7 @@ import hashlib
 import json
 import os
 import stat
+import sys
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -259,7 +260,7 @@ def _wrong_with_name(path: str) -> str | None:
     return wrong_here(path)
 
 
-_CHUNK_BYTES = 1 << 20
+_BLOCK = 1 << 20
 GIT_SHA1 = "git-sha1"
 SHA256 = "sha256"
 
@@ -285,8 +286,7 @@ def digest_of(source: Path, kind: str, size: int) -> str:
     """The digest of a file that should have ``size`` bytes, for example ``"sha256:..."``."""
     running = _start(kind, size)
     with _open_regular(source) as stream:
-        for chunk in _chunks(stream):
-            running.update(chunk)
+        copy_bounded(stream, None, sys.maxsize, running)
     return f"{kind}:{running.hexdigest()}"
 
 
@@ -301,16 +301,13 @@ def write_verified(stream: IO[bytes], target: Path, record: FileRecord) -> None:
 
     The hash is taken of the bytes on their way, so they cannot change in between.
     """
-    running = _start(record.digest.partition(":")[0], record.size)
-    written = 0
+    kind = record.digest.partition(":")[0]
+    running = _start(kind, record.size)
     with target.open("xb") as out:
-        for chunk in _chunks(stream):
-            written += len(chunk)
-            if written > record.size:
-                raise HashMismatch(f"more than {record.size} bytes")
-            running.update(chunk)
-            out.write(chunk)
-    found = f"{record.digest.partition(':')[0]}:{running.hexdigest()}"
+        written = copy_bounded(stream, out, record.size, running)
+    if written > record.size:
+        raise HashMismatch(f"more than {record.size} bytes")
+    found = f"{kind}:{running.hexdigest()}"
     if written != record.size or found != record.digest:
         raise HashMismatch(f"{written} bytes with {found}")
 
@@ -340,6 +337,15 @@ def _open_regular(path: Path) -> Iterator[IO[bytes]]:
         yield stream
 
 
-def _chunks(stream: IO[bytes]) -> Iterator[bytes]:
-    while chunk := stream.read(_CHUNK_BYTES):
-        yield chunk
+def copy_bounded(source: IO[bytes], target: IO[bytes] | None, most: int, digest: Any = None) -> int:
+    """Copy a stream by blocks, and hash it on its way, to the first byte beyond ``most`` at the
+    furthest; gives the number of bytes.
+    """
+    count = 0
+    while count <= most and (block := source.read(min(most + 1 - count, _BLOCK))):
+        count += len(block)
+        if digest is not None:
+            digest.update(block)
+        if target is not None:
+            target.write(block)
+    return count

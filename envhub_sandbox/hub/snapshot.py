@@ -146,7 +146,7 @@ def _candidates(
     limits: SnapshotLimits = DEFAULT_LIMITS,
     needs_entry: bool = True,
 ) -> Sequence[_Candidate]:
-    """As what it may be read; the last four are of the Hub alone."""
+    """As what it may be read."""
     if ref.repo_type == address.KIND:
         from envhub_sandbox.hub.git.commits import GitHost
 

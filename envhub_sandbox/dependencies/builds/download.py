@@ -35,12 +35,12 @@ from envhub_sandbox.errors import (
 )
 from envhub_sandbox.hub.answers import HubFailure
 from envhub_sandbox.hub.git import commits
+from envhub_sandbox.hub.listing import copy_bounded
 from envhub_sandbox.hub.logins import authorization, login_of, without_login
 from envhub_worker.protocol.text import printable, size_text
 
 MAX_BYTES = 512 * 2**20
 _TIMEOUT_S = 60.0
-_BLOCK = 1 << 20
 _USER_AGENT = "envhub-sandbox"
 _INDEXES = ("UV_DEFAULT_INDEX", "UV_INDEX", "UV_INDEX_URL", "UV_EXTRA_INDEX_URL")
 
@@ -48,28 +48,19 @@ _INDEXES = ("UV_DEFAULT_INDEX", "UV_INDEX", "UV_INDEX_URL", "UV_EXTRA_INDEX_URL"
 def download(url: str, sha256: str, target: Path) -> None:
     """Write the file of a URL, if it is there, not too large, and of this hash."""
     shown = without_login(url)
+    digest = hashlib.sha256()
     try:
         with _opened(url) as source, target.open("wb") as file:
-            found = _copy(source, file, shown)
+            size = copy_bounded(source, file, MAX_BYTES, digest)
     except (OSError, http.client.HTTPException, ValueError) as error:
         raise IndexUnavailableError(f"{shown} cannot be downloaded: {error}") from error
-    if found != sha256:
+    if size > MAX_BYTES:
+        raise PackagesTooLargeError(f"{shown} has more than {size_text(MAX_BYTES)}")
+    if (found := digest.hexdigest()) != sha256:
         raise PackageIntegrityError(
             f"{shown} has the SHA-256 {found}, and the index or the lock says {sha256}: it was "
             "replaced. Nothing of it was kept"
         )
-
-
-def _copy(source: IO[bytes], file: IO[bytes], shown: str) -> str:
-    digest = hashlib.sha256()
-    size = 0
-    while block := source.read(_BLOCK):
-        size += len(block)
-        if size > MAX_BYTES:
-            raise PackagesTooLargeError(f"{shown} has more than {size_text(MAX_BYTES)}")
-        digest.update(block)
-        file.write(block)
-    return digest.hexdigest()
 
 
 def _opened(url: str) -> IO[bytes]:

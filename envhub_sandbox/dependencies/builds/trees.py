@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from envhub_sandbox.errors import PackageIntegrityError, PackagesTooLargeError, SnapshotError
-from envhub_sandbox.hub.listing import FileRecord, check_listing_names
+from envhub_sandbox.hub.listing import FileRecord, check_listing_names, copy_bounded
 from envhub_sandbox.system import folders
 from envhub_worker.protocol.text import size_text
 
@@ -35,7 +35,6 @@ _HEADERS = 1000
 _PACKINGS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """How members of a zip may be packed: Python unpacks other ways whole, whatever it is asked for."""
 _FAR = 2 * MAX_BYTES
-_BLOCK = 1 << 20
 _BROKEN = (OSError, EOFError, ValueError, zlib.error, tarfile.TarError, zipfile.BadZipFile)
 _BROKEN_ZIP = (RuntimeError, NotImplementedError)  # it is encrypted, or compressed in another way
 
@@ -65,7 +64,10 @@ def write_tree(members: Iterable[Member], folder: Path, title: str) -> None:
         path = folder / member.path
         folders.make(path.parent)
         with member.open() as source, path.open("xb") as target:
-            _copy(source, target, member, title)
+            if copy_bounded(source, target, member.size) != member.size:
+                raise PackageIntegrityError(
+                    f"{title}: {member.path!r} has not the size that it says"
+                )
         path.chmod(0o755 if member.executable else 0o644)
 
 
@@ -79,17 +81,6 @@ def _bounded(members: Iterable[Member], title: str) -> Iterator[Member]:
                 "unpacked"
             )
         yield member
-
-
-def _copy(source: IO[bytes], target: IO[bytes], member: Member, title: str) -> None:
-    left = member.size
-    while block := source.read(min(left + 1, _BLOCK)):
-        left -= len(block)
-        if left < 0:
-            break
-        target.write(block)
-    if left != 0:
-        raise PackageIntegrityError(f"{title}: {member.path!r} has not the size that it says")
 
 
 def unpack_tree(archive: Path, folder: Path, title: str) -> Path:

@@ -37,6 +37,7 @@ from envhub_sandbox.hub.listing import (
     FileRecord,
     HashMismatch,
     check_listing_names,
+    copy_bounded,
     digest_of,
 )
 from envhub_sandbox.hub.logins import without_login
@@ -47,7 +48,6 @@ from envhub_worker.protocol.text import printable, size_text
 MAX_BYTES = 512 * 2**20
 MAX_UNPACKED = 4 * 2**30
 MAX_FILES = 100_000
-_BLOCK = 1 << 20
 _UNREADABLE = (
     *(OSError, EOFError, ValueError, RuntimeError, NotImplementedError, KeyError),
     *(zipfile.BadZipFile, zlib.error, csv.Error),
@@ -178,14 +178,10 @@ def _record(archive: zipfile.ZipFile, path: str) -> None:
 
 
 def _digest(archive: zipfile.ZipFile, name: str) -> str:
-    digest = hashlib.sha256()
-    left = archive.getinfo(name).file_size
+    digest, size = hashlib.sha256(), archive.getinfo(name).file_size
     with archive.open(name) as file:
-        while block := file.read(min(left + 1, _BLOCK)):
-            left -= len(block)
-            if left < 0:
-                raise PackageIntegrityError(f"{name[:200]!r} is longer than it says")
-            digest.update(block)
+        if copy_bounded(file, None, size, digest) > size:
+            raise PackageIntegrityError(f"{name[:200]!r} is longer than it says")
     return "sha256=" + base64.urlsafe_b64encode(digest.digest()).rstrip(b"=").decode()
 
 
