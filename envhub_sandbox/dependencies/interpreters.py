@@ -144,7 +144,9 @@ def _at(path: str) -> Interpreter:
 
 def _others(wanted: SpecifierSet) -> list[Interpreter]:
     """What uv finds, and what pyenv keeps where uv does not look; one of each series."""
-    paths = [*_pyenvs()]
+    root = os.environ.get("PYENV_ROOT") or os.path.expanduser("~/.pyenv")
+    # which may be another user's; this glob finds nothing where it may not look
+    paths = glob.glob(f"{glob.escape(root)}/versions/3.*/bin/python3")
     try:
         found = uv.run(
             ["python", "list", "--no-config", "--only-installed", "--output-format", "json"],
@@ -171,12 +173,6 @@ def _may_be(row: dict[str, object]) -> bool:
     """Whether it is worth asking: pyenv's shims are no interpreters, and 3.14t is another ABI."""
     default = row.get("variant", "default") == "default"
     return default and row.get("implementation") == "cpython" and "/shims/" not in str(row["path"])
-
-
-def _pyenvs() -> list[str]:
-    root = os.environ.get("PYENV_ROOT") or os.path.expanduser("~/.pyenv")
-    # which may be another user's; this glob finds nothing where it may not look
-    return glob.glob(f"{glob.escape(root)}/versions/3.*/bin/python3")
 
 
 class InstalledPackage(NamedTuple):

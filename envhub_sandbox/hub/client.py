@@ -143,7 +143,16 @@ class HubClient:
     def _copier(
         self, repo: Repository, commit: str, files: Sequence[FileRecord], title: str
     ) -> Copier:
-        folder = self.download(repo, commit, [file.path for file in files])
+        """Bring the files into the Hub cache; what copies each from there, or anew from the Hub.
+
+        One by one and not by ``snapshot_download``: that asks for a listing of its own, which may
+        be another than the one that was judged. Where one fails, or a Ctrl-C comes, those that run
+        are not waited for: all that they write is whole files of the Hub cache.
+        """
+        with self._explained(repo, commit):
+            downloads = [partial(self._download, repo, commit, file.path) for file in files]
+            first = Calls(downloads, _WORKERS).results()[0]
+        folder = first.parents[files[0].path.count("/")]
 
         def copy(record: FileRecord, target: Path) -> None:
             try:
@@ -166,18 +175,6 @@ class HubClient:
                 ) from mismatch
 
         return copy
-
-    def download(self, repo: Repository, commit: str, paths: Sequence[str]) -> Path:
-        """Download these files into the Hub cache; the folder of the commit there.
-
-        One by one and not by ``snapshot_download``: that asks for a listing of its own, which may
-        be another than the one that was judged. Where one fails, or a Ctrl-C comes, those that run
-        are not waited for: all that they write is whole files of the Hub cache.
-        """
-        with self._explained(repo, commit):
-            downloads = [partial(self._download, repo, commit, path) for path in paths]
-            place = Calls(downloads, _WORKERS).results()[0]
-        return place.parents[paths[0].count("/")]
 
     def publish(
         self, repo: Repository, folder: Path, revision: str | None, message: str, *, private: bool

@@ -51,21 +51,16 @@ def check(parts: Parts) -> None:
         raise Wrong(f"{env_id[:200]!r} is not the id of an environment", GRAMMAR)
 
 
-def requirement(parts: Parts) -> str:
-    """What its package is asked for as."""
-    package = parts.repo_id.partition("#")[0]
-    return package if parts.revision is None else f"{package}=={parts.revision}"
-
-
 _TEMPLATE = Path(__file__).with_name("registered_env.txt")
 
 
 def entry(parts: Parts) -> bytes:
     """The bytes of the file; the same for the same reference."""
     package, _, env_id = parts.repo_id.partition("#")
+    requirement = package if parts.revision is None else f"{package}=={parts.revision}"
     text = _TEMPLATE.read_text("utf-8")
     filled = {
-        "REQUIREMENT": ascii(requirement(parts)).replace("'", '"'),
+        "REQUIREMENT": ascii(requirement).replace("'", '"'),
         "DISTRIBUTION = None": f"DISTRIBUTION = {package.partition('[')[0]!r}",
         "ENV_ID = None": f"ENV_ID = {env_id!r}",
     }

@@ -32,11 +32,7 @@ def answered(status: int, **headers: str) -> BaseException:
     [
         (answered(401), Kind.NO_REPOSITORY),
         (answered(401, X_Error_Message="Invalid credentials in Authorization header"), None),
-        (answered(403), Kind.FORBIDDEN),
-        (answered(404), Kind.NO_REPOSITORY),
-        (answered(429), Kind.RATE_LIMITED),
         (answered(503), Kind.SERVER_ERROR),
-        (answered(418), Kind.OTHER),
         (OSError(errno.ENOSPC, "full"), Kind.DISK_FULL),
         (TimeoutError(), Kind.TIMEOUT),
         (ConnectionError("refused"), Kind.UNREACHABLE),
