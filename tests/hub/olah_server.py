@@ -8,7 +8,6 @@ are ``stub_hub``'s part.
 from __future__ import annotations
 
 import hashlib
-import os
 import re
 import socket
 import subprocess
@@ -17,6 +16,7 @@ import time
 from collections.abc import Mapping
 from pathlib import Path
 
+from tests.support.packages.git_server import git
 from tests.support.ports import lasting_port
 
 _CONFIG = """
@@ -30,20 +30,6 @@ mirrors-path = ["{home}/mirrors"]
 offline = true
 """
 
-_GIT_ENVIRONMENT = {
-    "GIT_CONFIG_GLOBAL": os.devnull,
-    "GIT_CONFIG_NOSYSTEM": "1",
-    **{
-        f"GIT_{who}_{what}": value
-        for who in ("AUTHOR", "COMMITTER")
-        for what, value in (
-            ("NAME", "Test"),
-            ("EMAIL", "test@example.org"),
-            ("DATE", "2026-01-01T00:00:00Z"),
-        )
-    },
-}
-
 
 class GitRepository:
     """A git repository with commits, branches, tags and LFS objects."""
@@ -54,11 +40,7 @@ class GitRepository:
         self.git("init", "--quiet", "--initial-branch=main")
 
     def git(self, *arguments: str) -> str:
-        """Run git here and return what it printed."""
-        environment = {**os.environ, **_GIT_ENVIRONMENT}
-        command = ["git", "-C", str(self.folder), *arguments]
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
-        return done.stdout.strip()
+        return git(self.folder, *arguments)
 
     def commit(
         self,

@@ -10,14 +10,25 @@ from pathlib import Path
 
 from tests.support.ports import QuietHandler, serving
 
-_OURS = {"GIT_CONFIG_GLOBAL": os.devnull, "GIT_CONFIG_NOSYSTEM": "1"}
+_OURS = {
+    "GIT_CONFIG_GLOBAL": os.devnull,
+    "GIT_CONFIG_NOSYSTEM": "1",
+    **{
+        f"GIT_{who}_{what}": value
+        for who in ("AUTHOR", "COMMITTER")
+        for what, value in (
+            ("NAME", "Test"),
+            ("EMAIL", "test@example.org"),
+            ("DATE", "2026-01-01T00:00:00Z"),
+        )
+    },
+}
 
 
 def git(folder: Path, *arguments: str, given: str | None = None) -> str:
-    """Run git in a folder, without this user's settings."""
-    who = ("-c", "user.name=a", "-c", "user.email=a@b.example")
+    """Run git in a folder, without this user's settings, and return what it printed."""
     done = subprocess.run(
-        ["git", *who, *arguments],
+        ["git", *arguments],
         input=given,
         cwd=folder,
         env=os.environ | _OURS,
