@@ -9,6 +9,7 @@ hide a call can. The walls are the sandbox's.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import stat
@@ -19,7 +20,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import IO, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.hub.sources import parser
@@ -142,27 +143,20 @@ def _answers(texts: list[bytes]) -> Iterator[ParsedFile | None]:
             given.write(len(text).to_bytes(4, "big"))
             given.write(text)
         given.seek(0)
-        _run(given, taken)
+        with contextlib.suppress(subprocess.TimeoutExpired):  # what it has answered counts
+            subprocess.run(
+                [sys.executable, "-I", "-S", parser.__file__],
+                stdin=given,
+                stdout=taken,
+                stderr=subprocess.DEVNULL,
+                cwd="/",
+                env=own_variables(),
+                timeout=_PATIENCE_S,
+                check=False,
+            )
         taken.seek(0)
         for line in taken.read(parser.OUTPUT).split(b"\n")[:-1]:  # the last one may be cut off
             yield _answer(json.loads(line))
-
-
-def _run(given: IO[bytes], taken: IO[bytes]) -> None:
-    command = [sys.executable, "-I", "-S", parser.__file__]
-    try:
-        subprocess.run(
-            command,
-            stdin=given,
-            stdout=taken,
-            stderr=subprocess.DEVNULL,
-            cwd="/",
-            env=own_variables(),
-            timeout=_PATIENCE_S,
-            check=False,
-        )
-    except subprocess.TimeoutExpired:
-        return  # it has been killed; what it has answered counts
 
 
 def _answer(row: Any) -> ParsedFile | None:

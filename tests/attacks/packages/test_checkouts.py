@@ -23,9 +23,8 @@ pytestmark = [
 
 
 @pytest.fixture
-def checkout(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> GitRepository:
+def checkout(tmp_path: Path, snapshot_store: Path) -> GitRepository:
     """One with a folder of its own for its snapshots."""
-    monkeypatch.setenv("ENVHUB_CACHE", str(tmp_path / "cache"))
     made = GitRepository(tmp_path / "hostile")
     made.commit({"env.py": "def make_env(): pass", "far/data.txt": "x", "sub/x.py": ""})
     return made

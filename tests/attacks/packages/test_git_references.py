@@ -40,12 +40,11 @@ pytestmark = [
 
 
 @pytest.fixture
-def repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def repository(tmp_path: Path, snapshot_store: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """One with an environment; http is permitted here alone, and its user has a home."""
     monkeypatch.setattr(address, "PROTOCOLS", ("http",))
     for name in ("NO_PROXY", "no_proxy"):
         monkeypatch.setenv(name, "127.0.0.1")
-    monkeypatch.setenv("ENVHUB_CACHE", str(tmp_path / "cache"))
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     monkeypatch.setenv("GIT_CONFIG_NOSYSTEM", "1")
     (tmp_path / "home").mkdir()

@@ -39,10 +39,9 @@ def repository(tmp_path: Path) -> Path:
 
 
 @pytest.fixture(autouse=True)
-def _permitted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def _permitted(snapshot_store: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(address, "PROTOCOLS", ("http",))
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
-    monkeypatch.setenv("ENVHUB_CACHE", str(tmp_path / "cache"))
 
 
 @pytest.fixture

@@ -21,12 +21,9 @@ from envhub_sandbox.hub.sources import parsing
 from tests.support import inside
 from tests.support.packages.wheels import Index, make_wheel
 
+pytestmark = pytest.mark.usefixtures("snapshot_store")
+
 MAKE = "\ndef make_env(n_envs=1, use_async_envs=False): ..."
-
-
-@pytest.fixture(autouse=True)
-def _own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ENVHUB_CACHE", str(tmp_path / "cache"))
 
 
 def snapshot(folder: Path, text: str, **files: str) -> Snapshot:

@@ -17,6 +17,8 @@ from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.errors import PackageIntegrityError
 from tests.support.packages.wheels import make_wheel
 
+pytestmark = pytest.mark.usefixtures("snapshot_store")
+
 OWN = interpreters.own()
 
 
@@ -128,11 +130,6 @@ def test_bounds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bound: str, val
 SOURCE = Source("toy", "1.0", "https://user:secret@index/toy-1.0.tar.gz", "a" * 64, where="line 3")
 PYTHON = Interpreter("/usr/bin/python3", "cpython", "3.11.2", "x86_64", "2.36")
 NAME = "toy-1.0-py3-none-any.whl"
-
-
-@pytest.fixture(autouse=True)
-def _own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("ENVHUB_CACHE", str(tmp_path / "cache"))
 
 
 @pytest.fixture
