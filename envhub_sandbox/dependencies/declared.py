@@ -79,7 +79,6 @@ def of_git(requirement: Requirement, where: str) -> Source | None:
 
 
 PROJECT = "pyproject.toml"
-_OPTIONAL = f"[project.optional-dependencies] of {PROJECT}"
 MAX_BYTES = 256 * 1024
 MAX_REQUIREMENTS = 1000
 MAX_FILES = 16
@@ -150,7 +149,8 @@ def optional(root: Path) -> dict[str, WantedPackage]:
     """What optional extras of a project bring, by canonical name; empty where none can be read."""
     try:
         extras = table(pyproject(root), "project", "optional-dependencies")
-        found = [wanted for row in extras.values() for wanted in _list(row, _OPTIONAL)]
+        where = f"[project.optional-dependencies] of {PROJECT}"
+        found = [wanted for row in extras.values() for wanted in _list(row, where)]
     except RequirementError:
         return {}
     return {canonicalize_name(one.requirement.name): one for one in found}
@@ -250,7 +250,8 @@ def _of_itself(root: Path, extras: str, where: str) -> Iterator[WantedPackage]:
         )
     yield from _list(project.get("dependencies", []), f"[project] of {PROJECT}")
     for name in filter(None, map(str.strip, extras.split(","))):
-        yield from _list(table(project, "optional-dependencies").get(name, []), _OPTIONAL)
+        rows = table(project, "optional-dependencies").get(name, [])
+        yield from _list(rows, f"[project.optional-dependencies] of {PROJECT}")
 
 
 def _beside(root: Path, file: str, named: str, where: str) -> str:
