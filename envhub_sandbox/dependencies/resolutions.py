@@ -48,16 +48,11 @@ class Resolution:
     taken: tuple[str, ...] = ()
 
 
-def lock_for(request: PackageRequest, interpreter: Interpreter, tell: Tell) -> Lock:
-    """Versions for one interpreter; what has no wheel is built."""
-    return _lock_for(request, interpreter, tell, builder=BUILDER)
-
-
 def build(sources: Sequence[Source], interpreter: Interpreter, tell: Tell) -> list[Path]:
     """A wheel of each source, in the same order: kept from before, or built in a jail."""
     from envhub_sandbox.dependencies.builds.build import build_wheels
 
-    return build_wheels(sources, interpreter, tell, lock_for)
+    return build_wheels(sources, interpreter, tell, partial(_lock_for, builder=BUILDER))
 
 
 BUILDER: Builder | None = build

@@ -223,9 +223,8 @@ class _Build:
         if program and program not in tried:
             return (program,)
         old = _old_tools(self._interpreter)
-        if not self._project.uses_setuptools or project.advice(log) or old[0] in tried:
-            return ()
-        return old
+        is_setuptools = self._project.backend.startswith("setuptools.")
+        return old if is_setuptools and not project.advice(log) and old[0] not in tried else ()
 
     def _tried(self, further: tuple[str, ...]) -> Path:
         known: tuple[str, ...] = ()

@@ -24,11 +24,6 @@ class Project:
     backend: str
     backend_path: tuple[str, ...] = ()
 
-    @property
-    def uses_setuptools(self) -> bool:
-        """Whether setuptools builds it."""
-        return self.backend.startswith("setuptools.")
-
 
 def read(tree: Path, title: str) -> Project:
     """What the sources say; where they say nothing, setuptools builds them."""

@@ -262,7 +262,8 @@ def _required(tree: ast.AST) -> Iterator[ast.AST]:
 
 
 def _needed_below(node: ast.AST) -> list[ast.AST]:
-    if isinstance(node, ast.If) and (_is_for_types(node) or _is_program(node) or _asks(node)):
+    for_types = isinstance(node, ast.If) and _last(node.test) == "TYPE_CHECKING"
+    if isinstance(node, ast.If) and (for_types or _is_program(node) or _asks(node)):
         return [*node.orelse]
     if isinstance(node, ast.With) and any(_suppresses(item.context_expr) for item in node.items):
         return []
@@ -302,10 +303,6 @@ def _asks(node: ast.If) -> bool:
 
 def _last(node: ast.expr) -> str:
     return _dotted(node).rpartition(".")[2]
-
-
-def _is_for_types(node: ast.If) -> bool:
-    return _last(node.test) == "TYPE_CHECKING"
 
 
 def _is_program(node: ast.AST) -> bool:

@@ -12,10 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from envhub_sandbox.dependencies import interpreters
+from envhub_sandbox.dependencies import interpreters, resolutions
 from envhub_sandbox.dependencies.builds import build
-from envhub_sandbox.dependencies.builds.build import build_wheels
-from envhub_sandbox.dependencies.resolutions import lock_for
 from envhub_sandbox.errors import DependencyError
 from tests.attacks.harness import Arena, kill_named, new_alias, pids_named, token
 from tests.attacks.network.listeners import TCP, listening
@@ -85,7 +83,7 @@ def built(folder: Path, files: dict[str, str]) -> tuple[Path | None, str]:
     """The wheel that a jail makes of them, or why there is none."""
     source = make_sdist(folder, "hostile", files=files)
     try:
-        [wheel] = build_wheels([source], interpreters.own(), lambda line: None, lock_for)
+        [wheel] = resolutions.build([source], interpreters.own(), lambda line: None)
     except DependencyError as error:
         return None, str(error)
     return wheel, ""

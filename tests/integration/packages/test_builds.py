@@ -11,12 +11,11 @@ import pytest
 from envhub_sandbox import make_env
 from envhub_sandbox.dependencies import interpreters
 from envhub_sandbox.dependencies.builds import wheels
-from envhub_sandbox.dependencies.builds.build import build_wheels
 from envhub_sandbox.dependencies.declared import Source
 from envhub_sandbox.dependencies.locks import lockfile
 from envhub_sandbox.dependencies.locks.making import locked
 from envhub_sandbox.dependencies.request import Choice
-from envhub_sandbox.dependencies.resolutions import lock_for
+from envhub_sandbox.dependencies.resolutions import build
 from envhub_sandbox.errors import DependencyError, PackageIntegrityError, ResolutionError
 from envhub_sandbox.hub.git import address
 from envhub_sandbox.hub.snapshot import local
@@ -57,7 +56,7 @@ def packages(index: Index) -> Index:
 
 def built(sources: list[Source], tell: Callable[[str], None] = lambda line: None) -> list[Path]:
     """A wheel of each, for this interpreter."""
-    return build_wheels(sources, OWN, tell, lock_for)
+    return build(sources, OWN, tell)
 
 
 def seen(wheel: Path) -> str:

@@ -175,7 +175,6 @@ def test_how_it_is_built(
     found = project.read(tmp_path, "x 1.0")
     assert [str(one.requirement) for one in found.requires] == requires
     assert found.backend == backend
-    assert found.uses_setuptools == (backend == LEGACY)
 
 
 @pytest.mark.parametrize(
