@@ -23,7 +23,6 @@ import json
 import os
 import stat
 import subprocess
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -32,6 +31,7 @@ import envhub_worker.protocol
 from envhub_sandbox.dependencies import index, uv
 from envhub_sandbox.dependencies.bounds import Bounds, Watch, checked, walk
 from envhub_sandbox.dependencies.interpreters import Interpreter
+from envhub_sandbox.dependencies.request import Tell
 from envhub_sandbox.dependencies.resolve import Lock
 from envhub_sandbox.errors import DependencyError
 from envhub_sandbox.system import folders, locks
@@ -104,9 +104,7 @@ def ready(key: str) -> Environment | None:
     return found
 
 
-def provide(
-    lock: Lock, interpreter: Interpreter, tell: Callable[[str], None] = lambda line: None
-) -> Environment:
+def provide(lock: Lock, interpreter: Interpreter, tell: Tell = lambda line: None) -> Environment:
     """The environment for a lock and an interpreter; made if there is none, and marked as used.
 
     A second process that asks for the same at once waits for the first.
@@ -199,9 +197,7 @@ def _read(home: Path) -> Environment | None:
         return None
 
 
-def _made(
-    key: str, lock: Lock, interpreter: Interpreter, held: int, tell: Callable[[str], None]
-) -> Environment:
+def _made(key: str, lock: Lock, interpreter: Interpreter, held: int, tell: Tell) -> Environment:
     for path in root().glob(f"{BUILDING}{key}-*"):
         remove_tree(path)  # its maker was killed: we hold what it held
     with draft(root(), f"{BUILDING}{key}-") as building:
@@ -250,7 +246,7 @@ def _install(
     building: Path,
     held: int,
     watch: Watch,
-    tell: Callable[[str], None],
+    tell: Tell,
 ) -> None:
     pins = building / "lock.txt"
     pins.write_text(lock.text)

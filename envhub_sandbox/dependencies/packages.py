@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Protocol
 
-from envhub_sandbox.dependencies.request import Choice, PackageRequest, request_of
+from envhub_sandbox.dependencies.request import Choice, PackageRequest, Tell, request_of
 from envhub_sandbox.errors import (
     DependencyError,
     IndexUnavailableError,
@@ -40,7 +40,6 @@ if TYPE_CHECKING:
 _CHECK_REFERENCE = (
     "The reference names the package: is it spelt so, and has the index that version?"
 )
-Tell = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -175,7 +174,7 @@ def _with_wheels(
     lock: Lock,
     locked: Sequence[WheelOrigin],
     interpreter: Interpreter,
-    tell: Callable[[str], None],
+    tell: Tell,
 ) -> Lock:
     """The lock with wheels of what has none: kept, or built again of the locked sources.
     Raises ``DependencyError`` where one cannot be built, or its source is another.

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -20,6 +20,8 @@ if TYPE_CHECKING:  # they cost time, and most repositories need none of them
     from envhub_sandbox.dependencies.declared import WantedPackage
     from envhub_sandbox.dependencies.modules import Guess
 
+Tell = Callable[[str], None]
+"""Gets a line for people, for each thing that happens."""
 DATE = r"\d{4}-\d{2}-\d{2}(T\d{2}:\d{2}:\d{2}(Z|[+-]\d{2}:\d{2}))?"
 _DECLARE = ("requirements.txt", "pyproject.toml")
 _SCRIPT, _LOOKED_AT = b"# /// script", 1024 * 1024  # as ``declared.py`` has them

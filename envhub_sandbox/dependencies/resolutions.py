@@ -21,7 +21,7 @@ from packaging.utils import parse_wheel_filename
 from envhub_sandbox.dependencies import index, interpreters, resolve
 from envhub_sandbox.dependencies.declared import Source, of_git, parse_requirement
 from envhub_sandbox.dependencies.interpreters import Interpreter
-from envhub_sandbox.dependencies.request import PackageRequest
+from envhub_sandbox.dependencies.request import PackageRequest, Tell
 from envhub_sandbox.dependencies.resolve import WORKERS, Lock, Target
 from envhub_sandbox.errors import ResolutionError
 from envhub_sandbox.settings.options import option_name
@@ -31,8 +31,7 @@ if TYPE_CHECKING:
     from envhub_sandbox.dependencies.modules import Guess
 
 _FORMAT = 2
-Tell = Callable[[str], None]
-Builder = Callable[[Sequence[Source], Interpreter, Callable[[str], None]], Sequence[Path]]
+Builder = Callable[[Sequence[Source], Interpreter, Tell], Sequence[Path]]
 """Makes one wheel of each source, in the same order; each lies in a folder of wheels alone, and
 stays there. Raises ``DependencyError``."""
 

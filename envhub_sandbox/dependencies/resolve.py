@@ -13,7 +13,7 @@ from packaging.version import Version
 
 from envhub_sandbox.dependencies import index, interpreters, uv
 from envhub_sandbox.dependencies.declared import Source, WantedPackage, parse_requirement
-from envhub_sandbox.dependencies.request import PackageRequest
+from envhub_sandbox.dependencies.request import PackageRequest, Tell
 from envhub_sandbox.errors import (
     DependencyError,
     PackageIntegrityError,
@@ -102,7 +102,7 @@ def resolve(
     *,
     options: Sequence[str] = (),
     refresh: bool = False,
-    tell: Callable[[str], None] = lambda line: None,
+    tell: Tell = lambda line: None,
 ) -> Lock:
     """Pins for a target; wheels only, nothing is built.
 
@@ -120,7 +120,7 @@ def _compiled(
     request: PackageRequest,
     target: Target,
     words: Sequence[str],
-    tell: Callable[[str], None],
+    tell: Tell,
     settings: Mapping[str, str] = {},
 ) -> str:
     """What ``uv pip compile`` prints; raises as ``resolve``."""

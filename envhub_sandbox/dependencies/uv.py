@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import IO
 
 from envhub_sandbox.dependencies import index
+from envhub_sandbox.dependencies.request import Tell
 from envhub_sandbox.errors import (
     DependencyError,
     IndexUnavailableError,
@@ -94,7 +95,7 @@ def run(
     what: str,
     given: str = "",
     timeout_s: float,
-    tell: Callable[[str], None] = lambda line: None,
+    tell: Tell = lambda line: None,
     keep: Iterable[int] = (),
     watch: Callable[[], None] = lambda: None,
     file_bytes: int | None = None,
@@ -178,7 +179,7 @@ def _wait(process: subprocess.Popen[str], timeout_s: float, watch: Callable[[], 
             watch()
 
 
-def _listen(stream: IO[str], lines: list[str], tell: Callable[[str], None]) -> None:
+def _listen(stream: IO[str], lines: list[str], tell: Tell) -> None:
     """Pass on what it writes on stderr, and keep the last lines of it."""
     for line in stream:
         del lines[:-_KEPT_LINES]

@@ -26,7 +26,7 @@ from envhub_sandbox.dependencies.builds import download, project, trees, wheels
 from envhub_sandbox.dependencies.builds.wheels import MAX_BYTES
 from envhub_sandbox.dependencies.declared import Source, parse_requirement
 from envhub_sandbox.dependencies.interpreters import Interpreter
-from envhub_sandbox.dependencies.request import PackageRequest
+from envhub_sandbox.dependencies.request import PackageRequest, Tell
 from envhub_sandbox.dependencies.resolve import Lock
 from envhub_sandbox.errors import DependencyError, RequirementError, ResolutionError
 from envhub_sandbox.hub.logins import without_login
@@ -101,7 +101,6 @@ def _run(order: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     return said
 
 
-Tell = Callable[[str], None]
 Choose = Callable[[PackageRequest, Interpreter, Tell], Lock]
 _DEEPEST = 8
 _MOST = 50

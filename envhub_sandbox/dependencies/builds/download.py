@@ -14,7 +14,7 @@ import re
 import ssl
 import urllib.error
 import urllib.request
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -23,6 +23,7 @@ from urllib.parse import unquote, urlsplit
 
 from envhub_sandbox.dependencies import index
 from envhub_sandbox.dependencies.builds.trees import Member, write_tree
+from envhub_sandbox.dependencies.request import Tell
 from envhub_sandbox.errors import (
     DependencyError,
     HubReferenceError,
@@ -122,7 +123,7 @@ def resolve(url: str, revision: str) -> str:
         return commits.resolve(url, revision, index.environment())
 
 
-def check_out(url: str, commit: str, folder: Path, tell: Callable[[str], None]) -> None:
+def check_out(url: str, commit: str, folder: Path, tell: Tell) -> None:
     """Write the files of a commit below a folder that is there and empty.
 
     Links and submodules are left out, and named to ``tell``. Raises ``DependencyError``.

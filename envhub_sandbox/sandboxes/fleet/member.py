@@ -8,8 +8,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from envhub_sandbox.dependencies.packages import PackageSet, Tell
-from envhub_sandbox.dependencies.request import PackageRequest
+from envhub_sandbox.dependencies.packages import PackageSet
+from envhub_sandbox.dependencies.request import PackageRequest, Tell
 from envhub_sandbox.errors import EnvHubError, PolicyError
 from envhub_sandbox.sandboxes.pool import ServerUse, WorkerServer
 from envhub_sandbox.sandboxes.sandbox import Sandbox, may_go_elsewhere
