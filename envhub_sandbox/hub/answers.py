@@ -36,15 +36,11 @@ class HostileAnswerError(Exception):
     """An answer that no Hub gives; the text says what is wrong with it."""
 
 
-@contextmanager
-def streamed(session: Any, url: str, options: Mapping[str, Any]) -> Iterator[Any]:
-    """The answer to a GET, before its body is read."""
+def streamed(session: Any, url: str, options: Mapping[str, Any]) -> Any:
+    """A context with the answer to a GET, before its body is read."""
     if callable(getattr(session, "stream", None)):  # httpx; of requests it is a bool
-        with session.stream("GET", url, **options) as response:
-            yield response
-    else:
-        with session.get(url, stream=True, **options) as response:
-            yield response
+        return session.stream("GET", url, **options)
+    return session.get(url, stream=True, **options)
 
 
 def bounded_body(response: Any) -> bytes:
@@ -67,21 +63,13 @@ def guarded(session: Any) -> Iterator[None]:
 
     Others may use the session meanwhile, and their answers are judged, too.
     """
-    hooks = getattr(session, "event_hooks", None)
-    if hooks is None:
-        hooks = session.hooks
-        before = list(hooks.get("response", ()))
-        hooks["response"] = [*before, _judge]
-        try:
-            yield
-        finally:
-            hooks["response"] = before
-        return
-    hooks["response"].append(_judge)
+    of_httpx = hasattr(session, "event_hooks")
+    hooks = (session.event_hooks if of_httpx else session.hooks).setdefault("response", [])
+    hooks.append(_judge)
     try:
         yield
     finally:
-        hooks["response"].remove(_judge)
+        hooks.remove(_judge)
 
 
 def _judge(response: Any, *_: object, **__: object) -> None:
