@@ -256,8 +256,7 @@ def copier(files: tuple[LocalFile, ...], title: str) -> Callable[[FileRecord, Pa
     def copy(record: FileRecord, target: Path) -> None:
         file = found[record.path]
         if file.link is not None:
-            with target.open("xb") as out:
-                out.write(file.link)
+            target.write_bytes(file.link)
             return
         try:
             copy_verified(file.source, target, record)

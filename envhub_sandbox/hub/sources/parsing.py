@@ -108,19 +108,17 @@ def content(path: Path, most: int) -> bytes | None:
     It is opened once: what was looked at is what is read, and a link is not followed.
     """
     try:
-        fd = os.open(path, os.O_RDONLY | open_flags("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC"))
-    except OSError:
-        return None
-    try:
-        if not stat.S_ISREG(os.fstat(fd).st_mode):
-            return None
-        with open(fd, "rb", closefd=False) as file:
+        with open(path, "rb", opener=_open_no_link) as file:
+            if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+                return None
             data = file.read(most + 1)
     except OSError:
         return None
-    finally:
-        os.close(fd)
     return data if len(data) <= most else None
+
+
+def _open_no_link(path: str, flags: int) -> int:
+    return os.open(path, flags | open_flags("O_NOFOLLOW", "O_NONBLOCK", "O_CLOEXEC"))
 
 
 def parsed(texts: Mapping[str, bytes]) -> dict[str, ParsedFile | None]:
