@@ -12,6 +12,13 @@ import gymnasium as gym
 import numpy as np
 
 
+def rolled(env: Any) -> list[Any]:
+    """What a seeded reset and twenty seeded steps return."""
+    found = [env.reset(seed=3)]
+    env.action_space.seed(3)
+    return found + [env.step(env.action_space.sample()) for _ in range(20)]
+
+
 def assert_same(expected: object, actual: object, what: str = "value") -> None:
     """Assert that two values are the same: types, dtypes, shapes, bits, order of keys.
 

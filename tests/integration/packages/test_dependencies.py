@@ -13,7 +13,7 @@ import pytest
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import DependencyError, RequirementError, ResolutionError
 from envhub_sandbox.system.log import DEPENDENCIES
-from tests.support.compare import assert_same
+from tests.support.compare import assert_same, rolled
 from tests.support.packages.wheels import Index, make_wheel
 from tests.support.repositories import CARTPOLE, CARTPOLES, importing, write_repository
 
@@ -28,23 +28,16 @@ def packages(real_index: Index) -> Index:
     return real_index
 
 
-def roll(env: Any) -> Any:
-    found = [env.reset(seed=3)]
-    env.action_space.seed(3)
-    found += [env.step(env.action_space.sample()) for _ in range(20)]
-    return found
-
-
 def test_it_gets_what_it_declares(packages: Index, tmp_path: Path) -> None:
     """In the jail, and not here; the results are those of this process."""
     folder = write_repository(tmp_path / "repo", ENV, requirements__txt="not-here<2\n")
     with make_env(folder, n_envs=2) as suites:
         assert suites.env.call("version") == ("1.0", "1.0")
-        rolled = roll(suites.env)
+        found = rolled(suites.env)
         installed = suites.provenance["installed"]
     namespace: dict[str, Any] = {}
     exec(CARTPOLES, namespace)
-    assert_same(roll(namespace["cartpoles"](2)), rolled)
+    assert_same(rolled(namespace["cartpoles"](2)), found)
     assert "not-here==1.0" in installed["packages"]
     assert installed["lock"].startswith("sha256:")
     assert "not_here" not in sys.modules

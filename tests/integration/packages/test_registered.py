@@ -14,7 +14,7 @@ from envhub_sandbox import make_env
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.errors import LoadError, ResolutionError, WorkerDiedError
 from envhub_sandbox.session.crash.bundle_reader import load_bundle
-from tests.support.compare import assert_same
+from tests.support.compare import assert_same, rolled
 from tests.support.packages.wheels import Index, make_wheel
 
 REGISTERS = """
@@ -96,23 +96,16 @@ def here() -> dict[str, Any]:
     return namespace
 
 
-def roll(env: Any) -> Any:
-    """A few seeded steps, beyond the time limit."""
-    found = [env.reset(seed=3)]
-    env.action_space.seed(3)
-    return found + [env.step(env.action_space.sample()) for _ in range(20)]
-
-
 def test_it_is_what_gymnasium_makes(packages: Index, here: dict[str, Any]) -> None:
     kwargs = {"size": 5}
     with make_env("pypi:walled@1.0#Walled/Maze-v1", 3, True, env_kwargs=kwargs) as suites:
-        rolled = roll(suites.env)
+        found = rolled(suites.env)
         assert suites.env.num_envs == 3
         installed, provenance = suites.provenance["installed"], suites.provenance
     gymnasium.register("Maze-v1", lambda **given: here["Maze"](**given), max_episode_steps=7)
     try:
         makes = [lambda: gymnasium.make("Maze-v1", size=5)] * 3
-        assert_same(roll(gymnasium.vector.SyncVectorEnv(makes)), rolled)
+        assert_same(rolled(gymnasium.vector.SyncVectorEnv(makes)), found)
     finally:
         gymnasium.registry.pop("Maze-v1")
     assert "walled==1.0" in installed["packages"]
