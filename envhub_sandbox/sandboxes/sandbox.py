@@ -1,10 +1,14 @@
-"""A place for workers: what ``make_env`` asks of each, with what most of them answer."""
+"""A place for workers: what ``make_env`` asks of each, with what most of them answer.
+
+Also what is done where one has no room: whether another is tried, and whether to ask it again.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from time import monotonic, sleep
+from typing import TYPE_CHECKING, TypeVar
 
 from envhub_sandbox.errors import (
     EnvHubError,
@@ -15,16 +19,22 @@ from envhub_sandbox.errors import (
     WorkerTimeoutError,
 )
 from envhub_sandbox.sandboxes.pool import ServerUse, WorkerServer
+from envhub_sandbox.system.log import WORKER
+from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.replies import UnreachableError
+from envhub_worker.protocol.messages.server import DRAINING
 from envhub_worker.protocol.runtime import OWN, Runtime
 
 if TYPE_CHECKING:
     from envhub_sandbox.dependencies.packages import PackageTarget
     from envhub_sandbox.settings.policy import Policy
     from envhub_sandbox.transport.connection import WorkerConnection
-    from envhub_sandbox.transport.deadline import Deadline
     from envhub_worker.protocol.messages import OpenJail
 
+T = TypeVar("T")
+_SOON_S = 0.1
+_SLICE_S = 0.1
+_AGAIN_S = 1.0
 FILE, DNS = "file:", "dns://"
 """What a fleet's place begins with that names a list of places."""
 
@@ -147,3 +157,58 @@ def worst_of(failures: Sequence[EnvHubError]) -> EnvHubError:
         more = "\n".join(["The other places of the fleet:", *others])
         error.args = (f"{error.args[0]}\n{more}", *error.args[1:])
     return error
+
+
+def retry_while_busy(
+    ask: Callable[[], T],
+    retry_s: float,
+    deadline: Deadline,
+    label: str,
+    refusal: EnvHubError | None = None,
+) -> T:
+    """Ask, and ask again while the answer is that there is no room.
+
+    The server keeps the order of those who go on asking: so the second time is soon, and takes the
+    place in the line. The time in the line does not count against the deadline.
+
+    Args:
+        deadline: For all else; once it is given up, the waiting ends.
+        refusal: The answer to an earlier try.
+
+    Raises:
+        ServerBusyError: There was no room in all that time.
+    """
+    until, pause_s = monotonic() + retry_s, _SOON_S
+    ends = refusal is not None and (is_draining(refusal) or is_unanswered(refusal))
+    while True:
+        try:
+            return ask()
+        except (ServerBusyError, WorkerDiedError, UnreachableError) as error:
+            left_s = until - monotonic()
+            ends = ends or is_draining(error)
+            worth_it = isinstance(error, ServerBusyError) or (ends and is_unanswered(error))
+            if left_s <= 0 or deadline.unasked or not worth_it:
+                raise
+            if pause_s == _SOON_S:
+                WORKER.warning("%s: %s; waiting for up to %.0f s", label, error, left_s)
+            _pause(min(pause_s, left_s), deadline)
+            pause_s = max(getattr(error, "retry_s", _AGAIN_S), _SLICE_S * 2)
+
+
+def is_draining(error: EnvHubError) -> bool:
+    """Whether another in its place is worth waiting for."""
+    return isinstance(error, ServerBusyError) and error.quota == DRAINING
+
+
+def is_unanswered(error: EnvHubError) -> bool:
+    """Whether there was no answer, so that it may have been between two servers."""
+    if isinstance(error, WorkerDiedError):
+        return error.reason == "connection"
+    return isinstance(error, UnreachableError)
+
+
+def _pause(pause_s: float, deadline: Deadline) -> None:
+    until = monotonic() + pause_s
+    while not deadline.unasked and (left_s := until - monotonic()) > 0:
+        sleep(min(left_s, _SLICE_S))
+    deadline.postpone(pause_s)

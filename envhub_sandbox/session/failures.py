@@ -218,4 +218,5 @@ class Failures:
             "lane": None if lease.lane is None else lease.lane.name,
         }
         recording, loaded = self._history.recording(), lease.loaded
-        lease.repository.keep_crash(error, recording, task, loaded, shared=lease.shared)
+        of_jail = () if loaded is None else (loaded.manifest, loaded.jail.report)
+        lease.repository.keep_crash(error, recording, task, *of_jail, shared=lease.shared)

@@ -15,14 +15,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from envhub_sandbox.errors import EnvHubError, ServerBusyError, WorkerDiedError, WorkerError
+from envhub_sandbox.sandboxes.pool import WorkerServer
+from envhub_sandbox.sandboxes.sandbox import is_draining, is_unanswered, retry_while_busy
 from envhub_sandbox.session.counters import Counters
 from envhub_sandbox.session.jails.builder import Builder, JailSource
-from envhub_sandbox.session.jails.launcher import (
-    is_draining,
-    is_unanswered,
-    retry_while_busy,
-)
-from envhub_sandbox.session.jails.loaded import LoadedJail
+from envhub_sandbox.session.jails.launcher import LoadedJail
 from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.system.processes import OwnerProcess
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
@@ -105,24 +102,30 @@ class Lease:
 
     def states(self) -> tuple[str, ...]:
         """What its runners are doing, one word each."""
-        return () if self.loaded is None else self._launcher.states(self.loaded)
+        states = self.status().get("states")
+        words = states if isinstance(states, tuple) else ()
+        return tuple(word for word in words if isinstance(word, str))
 
     def status(self) -> dict[str, Any]:
-        """What its server says of its jail. Trust: a server on another host may say anything."""
-        return {} if self.loaded is None else self._launcher.status(self.loaded)
+        """What its server says of its jail: see ``Launcher.status``."""
+        at = self._at()
+        return {} if at is None else self._launcher.status(*at)
 
     def denials(self) -> tuple[str, ...] | None:
         """What its jail was denied, also where that is dead; None where it is not recorded."""
-        loaded = self.loaded  # another thread may give it back
-        if loaded is None:
-            return None
-        return self._launcher.denials(loaded.server, loaded.jail.number)
+        at = self._at()
+        return None if at is None else self._launcher.denials(*at)
 
     def note_denied(self, error: EnvHubError) -> None:
         """Put that into the error that the jail ends with, before it is given back."""
+        at = self._at()
+        if at is not None:
+            self._launcher.note_denied(error, *at)
+
+    def _at(self) -> tuple[WorkerServer, int] | None:
+        """The server, and the number of its jail there."""
         loaded = self.loaded  # another thread may give it back
-        if loaded is not None:
-            self._launcher.note_denied(error, loaded.server, loaded.jail.number)
+        return None if loaded is None else (loaded.server, loaded.jail.number)
 
     def look(self, operation: str, deadline: Deadline) -> None:
         """Ask the server whether the jail lives. Raises ``WorkerDiedError``: it does not."""

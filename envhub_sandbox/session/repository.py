@@ -29,7 +29,6 @@ from envhub_sandbox.hub.logins import without_login
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.session.crash.history import Recording
 from envhub_sandbox.session.error_text import add_author_line, add_reach_advice
-from envhub_sandbox.session.jails.loaded import LoadedJail
 from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.settings.policy import Policy, Timeouts
 from envhub_sandbox.system.folders import cache_root
@@ -268,20 +267,18 @@ class Repository:
         error: WorkerDiedError | WorkerTimeoutError,
         recording: Recording | None = None,
         task: dict[str, Any] | None = None,
-        loaded: LoadedJail | None = None,
+        manifest: Manifest | None = None,
+        report: list[dict[str, Any]] | None = None,
         *,
         shared: bool = False,
     ) -> None:
         """Write a crash bundle and name it in the error. What hinders that is only logged.
 
-        ``recording``, ``task`` and ``loaded`` are None before there is an environment; ``shared``
-        says whether others lived in its jail.
+        ``shared``: whether others lived in its jail. All else is None before there is a jail.
         """
         ours = self.policy.crash_history and error.bundle is None
         if not ours or getattr(error, "reason", "") in ("killed", "idle", "gone", "connection"):
             return
-        manifest = None if loaded is None else loaded.manifest
-        report = None if loaded is None else loaded.jail.report
         from envhub_sandbox.session.crash.bundle_writer import Crash, write_bundle
 
         crash = Crash(

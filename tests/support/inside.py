@@ -29,8 +29,7 @@ from envhub_sandbox.session.counters import Ledger
 from envhub_sandbox.session.crash import bundle_writer
 from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.jails import launcher as launcher_module
-from envhub_sandbox.session.jails.launcher import Launcher
-from envhub_sandbox.session.jails.loaded import LoadedJail
+from envhub_sandbox.session.jails.launcher import Launcher, LoadedJail
 from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.session.repository import Recipe, Repository
 from envhub_sandbox.system import folders

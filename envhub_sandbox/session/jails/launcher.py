@@ -1,4 +1,4 @@
-"""Opens jails for one repository, in the place where its workers run; waits where it is full."""
+"""Opens jails for one repository, in the place where its workers run."""
 
 from __future__ import annotations
 
@@ -6,32 +6,31 @@ from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from time import monotonic, sleep
-from typing import TYPE_CHECKING, Any, TypeVar
+from time import monotonic
+from typing import TYPE_CHECKING, Any
 
 from envhub_sandbox.errors import (
     EnvHubError,
     LoadError,
-    ServerBusyError,
     WorkerDiedError,
     WorkerStartupError,
     WorkerTimeoutError,
 )
-from envhub_sandbox.sandboxes.pool import ServerUse, WorkerServer
+from envhub_sandbox.sandboxes.pool import ServerHold, ServerUse, WorkerServer
 from envhub_sandbox.sandboxes.sandbox import Sandbox, may_go_elsewhere, worst_of
 from envhub_sandbox.session.error_text import name_denied, read_denials
-from envhub_sandbox.session.jails.loaded import ExpectedManifest, LoadedJail, ServerHold
 from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.system.log import WORKER
+from envhub_sandbox.system.processes import OwnerProcess
 from envhub_sandbox.transport.deadline import Deadline, PartDeadline
 from envhub_sandbox.transport.output import OutputFollower, OutputSinks
-from envhub_sandbox.transport.replies import UnreachableError, expect_reply, typed_reply
+from envhub_sandbox.transport.replies import expect_reply, typed_reply
 from envhub_sandbox.transport.values import generator
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import UNTRUSTED
-from envhub_worker.protocol.manifest.manifest import EnvManifest, decode_manifest
-from envhub_worker.protocol.messages.server import DRAINING
+from envhub_worker.protocol.manifest.manifest import EnvManifest, Manifest, decode_manifest
+from envhub_worker.protocol.records import dataclass
 
 if TYPE_CHECKING:
     from envhub_sandbox.transport.connection import WorkerConnection
@@ -48,12 +47,77 @@ _SILENT_S = 30.0
 _STATUS_S = 1.0
 _DENIED_S = 10.0
 """A caller who has denials recorded wants to know them, also of a host that is busy."""
-_SOON_S = 0.1
-_SLICE_S = 0.1
-_AGAIN_S = 1.0
 _UNKNOWN = ("server", "connection", "gone")
 """How a jail died of which its server can say nothing."""
-T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class ExpectedManifest:
+    """What a repository's ``make_env`` has returned before.
+
+    Attributes:
+        task: The environment that a jail is wanted for.
+        shards: Over how many runners it is going to be spread.
+    """
+
+    manifest: Manifest
+    task: EnvManifest
+    shards: int = 1
+
+
+class LoadedJail:
+    """An open jail whose first runner has called ``make_env``.
+
+    It has to be given back. Where a Ctrl-C comes between its taking and its noting, its
+    finalizer does.
+
+    Attributes:
+        manifest: What ``make_env`` returned, checked.
+        loaded: Runners that have called it.
+        use: That of the server that it is in.
+        address: What errors call the place of that.
+        give_back: Gives it back: see ``Launcher.close`` and ``disconnect``.
+        ending: Whether its end was begun.
+        closing: Whether a call of ``Launcher.close`` is at it.
+        ended: Whether it was asked for, so that only the server's use is left.
+        closed: Whether all was given back.
+        lost: Whether the connection to its server was.
+        changed: Whether it returned something else in one of them than the manifest says.
+    """
+
+    def __init__(
+        self,
+        jail: JailHandle,
+        manifest: Manifest,
+        value: dict[str, object],
+        loaded: set[int],
+        use: ServerUse[WorkerServer],
+        give_back: Callable[[LoadedJail], None],
+        address: str = "",
+    ) -> None:
+        self.jail = jail
+        self.manifest = manifest
+        self.value = value
+        self.loaded = loaded
+        self.use = use
+        self.give_back = give_back
+        self.address = address
+        self.ending = self.closing = self.ended = self.closed = self.lost = self.changed = False
+        self.owner = OwnerProcess()
+
+    @property
+    def server(self) -> WorkerServer:
+        """Where it is."""
+        return self.use.server
+
+    def __del__(self) -> None:
+        # interruption.md, rule 5. At the end of the process no server is in use any more: nothing
+        # is closed one by one there (rule 13).
+        if "owner" not in vars(self):  # the last field: an interrupt came before there was a jail
+            return
+        if not self.closed and self.use.live and self.owner.is_here:
+            self.ending = True  # its connection may have gone before it
+            self.give_back(self)
 
 
 class Launcher:
@@ -333,25 +397,29 @@ class Launcher:
             loaded.jail.drop()
         loaded.ended = True
 
-    def states(self, loaded: LoadedJail) -> tuple[str, ...]:
-        """What a jail's runners are doing, one word each."""
-        states = self.status(loaded).get("states", ())
-        if not isinstance(states, tuple):
-            return ()
-        return tuple(state for state in states if isinstance(state, str))
-
-    def status(self, loaded: LoadedJail) -> dict[str, Any]:
+    def status(
+        self, server: WorkerServer, jail: int, timeout_s: float = _STATUS_S
+    ) -> dict[str, Any]:
         """What its server says of a jail; asked over a connection of its own. Empty if it cannot.
 
         The late reply may come at any moment on the jail's own connection, and would be dropped.
+        Trust: a server on another host may say anything.
         """
-        return self._status(loaded.server, loaded.jail.number, Deadline(_STATUS_S))
+        try:
+            status = self._ask(server, m.GetStatus(), Deadline(timeout_s))
+            with UNTRUSTED:
+                jails = [
+                    one for one in expect_reply(status, m.Status).jails if isinstance(one, dict)
+                ]
+                return next((one for one in jails if one.get("jail") == jail), {})
+        except EnvHubError:  # it is for a text, or a figure that may be missing
+            return {}
 
     def denials(self, server: WorkerServer, jail: int) -> tuple[str, ...] | None:
         """What a jail was denied; None where it is not recorded, or not known any more."""
         if not self.repository.policy.record_denials:
             return None
-        return read_denials(self._status(server, jail, Deadline(_DENIED_S)).get("denied"))
+        return read_denials(self.status(server, jail, _DENIED_S).get("denied"))
 
     def note_denied(self, error: BaseException, server: WorkerServer, jail: int) -> None:
         """Put what a jail was denied into the error that it ends with, before it is closed."""
@@ -361,17 +429,6 @@ class Launcher:
             error.denied = self.denials(server, jail)
             if isinstance(error, WorkerDiedError) and error.reason in ("exit", "signal"):
                 name_denied(error)
-
-    def _status(self, server: WorkerServer, jail: int, deadline: Deadline) -> dict[str, Any]:
-        try:
-            status = self._ask(server, m.GetStatus(), deadline)
-            with UNTRUSTED:
-                jails = [
-                    one for one in expect_reply(status, m.Status).jails if isinstance(one, dict)
-                ]
-                return next((one for one in jails if one.get("jail") == jail), {})
-        except EnvHubError:  # it is for a text, or a figure that may be missing
-            return {}
 
     def interrupt(self, loaded: LoadedJail) -> None:
         """End a jail over a connection of its own, while another thread waits on the first."""
@@ -404,58 +461,3 @@ def _is_what(value: object, task: EnvManifest) -> bool:
 def _refuse_late(deadline: Deadline) -> None:
     if deadline.passed:
         raise WorkerTimeoutError("the worker's manifest could not be read in time")
-
-
-def retry_while_busy(
-    ask: Callable[[], T],
-    retry_s: float,
-    deadline: Deadline,
-    label: str,
-    refusal: EnvHubError | None = None,
-) -> T:
-    """Ask, and ask again while the answer is that there is no room.
-
-    The server keeps the order of those who go on asking: so the second time is soon, and takes the
-    place in the line. The time in the line does not count against the deadline.
-
-    Args:
-        deadline: For all else; once it is given up, the waiting ends.
-        refusal: The answer to an earlier try.
-
-    Raises:
-        ServerBusyError: There was no room in all that time.
-    """
-    until, pause_s = monotonic() + retry_s, _SOON_S
-    ends = refusal is not None and (is_draining(refusal) or is_unanswered(refusal))
-    while True:
-        try:
-            return ask()
-        except (ServerBusyError, WorkerDiedError, UnreachableError) as error:
-            left_s = until - monotonic()
-            ends = ends or is_draining(error)
-            worth_it = isinstance(error, ServerBusyError) or (ends and is_unanswered(error))
-            if left_s <= 0 or deadline.unasked or not worth_it:
-                raise
-            if pause_s == _SOON_S:
-                WORKER.warning("%s: %s; waiting for up to %.0f s", label, error, left_s)
-            _pause(min(pause_s, left_s), deadline)
-            pause_s = max(getattr(error, "retry_s", _AGAIN_S), _SLICE_S * 2)
-
-
-def is_draining(error: EnvHubError) -> bool:
-    """Whether another in its place is worth waiting for."""
-    return isinstance(error, ServerBusyError) and error.quota == DRAINING
-
-
-def is_unanswered(error: EnvHubError) -> bool:
-    """Whether there was no answer, so that it may have been between two servers."""
-    if isinstance(error, WorkerDiedError):
-        return error.reason == "connection"
-    return isinstance(error, UnreachableError)
-
-
-def _pause(pause_s: float, deadline: Deadline) -> None:
-    until = monotonic() + pause_s
-    while not deadline.unasked and (left_s := until - monotonic()) > 0:
-        sleep(min(left_s, _SLICE_S))
-    deadline.postpone(pause_s)

@@ -73,6 +73,20 @@ def acquire(lease: Lease) -> None:
     lease.acquire(StartupDeadline(60))
 
 
+@pytest.mark.parametrize(
+    ("said", "words"),
+    [(("steps", "waits"), ("steps", "waits")), (("steps", 5, None), ("steps",)), ("text", ())],
+)
+def test_only_words_are_taken_of_a_status(
+    taken: tuple[Lease, _Jails], said: object, words: tuple[str, ...]
+) -> None:
+    lease, jails = taken
+    jails.launcher.status = lambda *_: {"states": said}
+    assert lease.states() == ()
+    acquire(lease)
+    assert lease.states() == words
+
+
 def test_a_jail_is_taken_built_in_and_given_back_once(taken: tuple[Lease, _Jails]) -> None:
     lease, jails = taken
     acquire(lease)

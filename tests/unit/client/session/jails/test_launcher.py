@@ -10,10 +10,9 @@ from typing import Any, cast
 import pytest
 
 from envhub_sandbox.errors import EnvHubError, ServerBusyError, WorkerDiedError, WorkerStartupError
-from envhub_sandbox.sandboxes.sandbox import Sandbox
-from envhub_sandbox.session.jails import launcher as module
-from envhub_sandbox.session.jails.launcher import Launcher, retry_while_busy
-from envhub_sandbox.session.jails.loaded import LoadedJail
+from envhub_sandbox.sandboxes import sandbox as module
+from envhub_sandbox.sandboxes.sandbox import Sandbox, retry_while_busy
+from envhub_sandbox.session.jails.launcher import Launcher, LoadedJail
 from envhub_sandbox.transport import connection
 from envhub_sandbox.transport.deadline import StartupDeadline
 from envhub_worker.protocol import messages as m
@@ -124,22 +123,20 @@ def test_an_interrupted_close_goes_on_over_another_connection(
 
 
 @pytest.mark.parametrize(
-    ("status", "states"),
+    ("status", "found"),
     [
-        (({"jail": 7, "states": ("steps", "waits")},), ("steps", "waits")),
-        (({"jail": 8, "states": ("another's",)},), ()),
-        (({"jail": 7, "states": ("steps", 5, None)},), ("steps",)),
-        (({"jail": 7, "states": "text"}, 3, None), ()),
+        (({"jail": 7, "states": ("steps", "waits")},), {"jail": 7, "states": ("steps", "waits")}),
+        (({"jail": 8, "states": ("another's",)},), {}),
+        (({"jail": 7}, 3, None), {"jail": 7}),
     ],
 )
-def test_only_words_are_taken_of_a_status(
-    launcher: Launcher, client: _Client, place: _Place, status: Any, states: tuple[str, ...]
+def test_the_status_of_its_own_jail_is_found(
+    launcher: Launcher, client: _Client, place: _Place, status: Any, found: dict[str, Any]
 ) -> None:
     client.status = status
-    loaded = opened(launcher, client, place)
-    assert launcher.states(loaded) == states
+    assert launcher.status(_SERVER, 7) == found
     client.refuses = WorkerDiedError("a silent one, which is no error: it is for a text")
-    assert launcher.status(loaded) == {}
+    assert launcher.status(_SERVER, 7) == {}
     place.fails = True
     with pytest.raises(WorkerStartupError):
         launcher.hold()

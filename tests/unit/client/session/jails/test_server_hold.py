@@ -10,9 +10,9 @@ from unittest.mock import MagicMock
 
 import pytest
 
-from envhub_sandbox.sandboxes.pool import ServerPool, ServerUse
+from envhub_sandbox.sandboxes.pool import ServerHold, ServerPool, ServerUse
 from envhub_sandbox.session.jails.builder import JailSource, SharedJail
-from envhub_sandbox.session.jails.loaded import ServerHold
+
 from envhub_sandbox.transport.deadline import Deadline
 from tests.unit.client.sandboxes.test_pool import Server
 
