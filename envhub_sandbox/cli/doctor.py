@@ -47,7 +47,7 @@ from envhub_worker.protocol.text import size_text
 
 if TYPE_CHECKING:
     from envhub_sandbox.sandboxes.remote import RemoteSandbox
-    from envhub_sandbox.sandboxes.server_facts import ServerFacts
+    from envhub_sandbox.sandboxes.remote import ServerFacts
 
 _PROBE_S = 60.0
 _PROFILES = ("profile", "available", "first step", "enforces", "without")
@@ -350,9 +350,9 @@ def examine_server(server: RemoteSandbox, profile: str, *, json: bool) -> Exit:
     """Ask a server and print what it says; the exit code is that of the profile.
     Raises ``EnvHubError``: it is not reached, or does not let us in.
     """
-    from envhub_sandbox.sandboxes.server_facts import ask
+    from envhub_sandbox.sandboxes.remote import ask_facts
 
-    facts = ask(server)
+    facts = ask_facts(server)
     code, problem = _verdict(facts, profile)
     if json:
         server_facts = {**asdict(facts), "endpoint": server.endpoint}

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+import shutil
+from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,17 +19,16 @@ from envhub_sandbox.dependencies.packages import (
 )
 from envhub_sandbox.dependencies.request import Choice, chosen
 from envhub_sandbox.errors import PolicyError
-from envhub_sandbox.factory import arguments
-from envhub_sandbox.factory.arguments import plain_config, reference_of
 from envhub_sandbox.factory.env_factory import EnvFactory
 from envhub_sandbox.hub.snapshot import Snapshot, snapshot_named
 from envhub_sandbox.hub.sources.assets import with_assets
 from envhub_sandbox.sandboxes import inprocess
-from envhub_sandbox.sandboxes.sandbox import Sandbox
+from envhub_sandbox.sandboxes.sandbox import Sandbox, is_list
 from envhub_sandbox.session.jails.launcher import Launcher
 from envhub_sandbox.session.repository import (
     Recipe,
     Repository,
+    plain_config,
     provenance_of,
 )
 from envhub_sandbox.settings.options import Options, option_name
@@ -235,17 +236,17 @@ def _wanted(sandbox: str | Sandbox, options: Options) -> _Plan:
     choice, python = chosen(options.dependencies, options.python)
     policy = policy_from(options.policy, options.limits)
     timeouts = timeouts_from(options.timeouts)
-    place = arguments.sandbox_of(sandbox, options.server_key)
+    place = sandbox_of(sandbox, options.server_key)
     if choice.where == "own" and place.package_target() is None:
         raise PolicyError(
             f"packages by {option_name('dependencies')} are for this machine, for containers and "
             "for servers on other hosts; this place has packages of its own"
         )
-    runtime = Runtime(arguments.interpreter(python))
+    runtime = Runtime(interpreter(python))
     place.note_interpreter(runtime)
     if place.is_here:
-        arguments.check_executable(runtime.python)
-        arguments.check_readable(policy.readable)
+        check_executable(runtime.python)
+        check_readable(policy.readable)
     return _Plan(place, policy, timeouts, choice, python, runtime, lock)
 
 
@@ -286,3 +287,103 @@ def _face(validate: bool) -> type[SandboxVectorEnv]:
     from envhub_sandbox.vector.validated import ValidatedVectorEnv
 
     return ValidatedVectorEnv
+
+
+# --- what arguments mean
+
+
+def reference_of(cfg: Any) -> tuple[str, Any]:
+    """The reference in ``cfg``, and the config object if it is one."""
+    if isinstance(cfg, str):
+        return cfg, None
+    if isinstance(cfg, os.PathLike):
+        return os.path.abspath(cfg), None
+    hub_path = getattr(cfg, "hub_path", None)
+    if isinstance(hub_path, os.PathLike):
+        return os.path.abspath(hub_path), cfg
+    if isinstance(hub_path, str):
+        return hub_path, cfg
+    kind = f"{type(cfg).__module__}.{type(cfg).__qualname__}"
+    if hasattr(cfg, "hub_path"):
+        raise TypeError(f"cfg is a {kind} whose hub_path is {hub_path!r}; it takes a hub reference")
+    raise TypeError(f"cfg is a hub reference, a folder, or an object with a hub_path, not {kind}")
+
+
+def sandbox_of(sandbox: str | Sandbox | list[str | Sandbox], server_key: str | None) -> Sandbox:
+    """The sandbox of a name, or the one that was given; of a list, a fleet of these.
+    Raises ``PolicyError``: there is none of that name; ``SandboxUnavailableError``: this platform
+    has none of that kind.
+    """
+    fleet: Any = sandbox
+    if isinstance(sandbox, (list, tuple)) or (isinstance(sandbox, str) and is_list(sandbox)):
+        from envhub_sandbox.sandboxes.fleet.fleet import Fleet
+
+        fleet = Fleet(sandbox)
+    if callable(getattr(fleet, "opened", None)):
+        opened: Sandbox = fleet.opened(partial(sandbox_of, server_key=None), server_key)
+        return opened
+    if isinstance(sandbox, str) and sandbox.startswith("tcp://"):
+        from envhub_sandbox.sandboxes.remote import RemoteSandbox
+
+        return RemoteSandbox(sandbox, server_key=server_key)
+    if server_key is not None:
+        raise PolicyError(
+            f"{option_name('server_key')} is for {option_name('sandbox', 'tcp://HOST:PORT')}; a "
+            "RemoteSandbox has its own"
+        )
+    if not isinstance(sandbox, str):
+        if isinstance(sandbox, list) or not callable(getattr(sandbox, "for_repository", None)):
+            raise _unknown(sandbox)
+        return sandbox
+    if sandbox == "process":
+        from envhub_sandbox.sandboxes.process import PROCESS, check_platform
+
+        check_platform()  # before anything is downloaded for it
+        return PROCESS
+    if sandbox == "ray":
+        from envhub_sandbox.sandboxes.ray.sandbox import RAY
+
+        return RAY
+    kind, _, image = sandbox.partition(":")
+    if kind == "docker":
+        from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
+
+        return DockerSandbox(image=image) if image else DockerSandbox()
+    raise _unknown(sandbox)
+
+
+def _unknown(sandbox: object) -> PolicyError:
+    return PolicyError(
+        f"sandbox is {sandbox!r}; it takes 'process', 'docker', 'ray', 'tcp://HOST:PORT', a list "
+        "of these, or None to run the code here"
+    )
+
+
+def interpreter(python: str | Path | None) -> str:
+    """Its path, absolute; a name alone is looked up as a shell does. Empty for ours."""
+    if python is None:
+        return ""
+    text = os.path.expanduser(python)
+    found = shutil.which(text) if os.sep not in str(text) else None
+    return os.path.abspath(found or text)
+
+
+def check_executable(python: str) -> None:
+    """Refuse an interpreter of this machine that cannot be run. Raises ``PolicyError``."""
+    if python and not (os.path.isfile(python) and os.access(python, os.X_OK)):
+        raise PolicyError(
+            f"{option_name('python')} is {python!r}, which is not a program; it takes the path of "
+            "an interpreter, such as '.venv/bin/python'"
+        )
+
+
+def check_readable(paths: Iterable[str]) -> None:
+    """Refuse to grant what is not on this machine: it would silently not be there.
+    Raises ``PolicyError``: a path leads to nothing.
+    """
+    for path in paths:
+        if not os.path.exists(path):
+            raise PolicyError(
+                f"{option_name('readable')} has {path!r}, and there is no such file or folder on "
+                "this machine"
+            )

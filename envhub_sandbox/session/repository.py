@@ -3,19 +3,24 @@
 What ran (``provenance_of``), and how to make it again in another process (``Recipe``): a process
 cannot be handed over, so a pickle of a proxy holds the arguments that made it. The other side gets
 a fresh environment in a worker of its own, of the very same commit. A token never travels, nor does
-a login in ``endpoint``: the other side uses its own.
+a login in ``endpoint``: the other side uses its own. A config object of the caller crosses as plain
+data (``plain_config``); what has no plain form does not.
 """
 
 from __future__ import annotations
 
+import inspect
 import os
 import shlex
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import field
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import field, fields, is_dataclass
+from enum import Enum
 from itertools import count
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
+
+import numpy as np
 
 from envhub_sandbox.errors import (
     DependencyError,
@@ -40,10 +45,14 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import LACKS_PACKAGES
 from envhub_worker.protocol.limits import WireLimits, limits_for
 from envhub_worker.protocol.manifest.manifest import Manifest
-from envhub_worker.protocol.messages import VERSION
+from envhub_worker.protocol.messages import CONFIG_CLASS, VERSION
 from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.runtime import RECORD, Runtime
 from envhub_worker.protocol.text import printable
+
+_PLAIN = (type(None), bool, int, float, complex, str, bytes, np.ndarray, np.generic)
+_MAX_DEPTH = 16
+_LEFT_OUT = object()
 
 
 @dataclass(frozen=True)
@@ -301,3 +310,75 @@ class Repository:
             again = f"To try the same again: envhub replay {shlex.quote(error.bundle)}"
             error.args = (f"{error.args[0]}\n{again}", *error.args[1:])
             CRASHES.info("%s: crash bundle %s", self.label, bundle)
+
+
+# --- a caller's config object
+
+
+def plain_config(config: Any) -> dict[str, object]:
+    """The attributes of a config object with nested ones, and its own public properties.
+
+    Dataclasses and other plain objects become mappings which say what their classes are called
+    (``messages.CONFIG_CLASS``), and so do members of enums and paths. What has no plain form (a
+    function, an open file) is left out: nothing of the caller is pickled.
+    """
+    return config.values if isinstance(config, PlainConfig) else _attributes(config, 0)
+
+
+def _attributes(config: Any, depth: int) -> dict[str, object]:
+    names = list(getattr(config, "__dict__", {}))
+    if is_dataclass(config):
+        names = list(dict.fromkeys([*(item.name for item in fields(config)), *names]))
+    made = _known({name: _plain(getattr(config, name, None), depth + 1) for name in names})
+    wanted = {item.name for item in fields(config)} if is_dataclass(config) else made
+    computed = _known({name: _plain(value, 1) for name, value in _computed(config, depth)})
+    described = (_names(type(config)), tuple(name for name in made if name in wanted), computed)
+    return {**made, CONFIG_CLASS: described}
+
+
+def _is_key(key: Any) -> bool:
+    plain = key.value if isinstance(key, Enum) else key
+    return isinstance(plain, Hashable) and type(_plain(plain, 0)) is type(plain)
+
+
+def _known(values: dict[Any, Any]) -> dict[Any, Any]:
+    return {name: value for name, value in values.items() if value is not _LEFT_OUT}
+
+
+def _names(kind: type) -> tuple[tuple[str, str], ...]:
+    """Module and name of a class and of those that it inherits from."""
+    return tuple((cls.__module__, cls.__qualname__) for cls in kind.__mro__ if cls is not object)
+
+
+def _computed(config: Any, depth: int) -> Iterator[tuple[str, Any]]:
+    """The public properties of a config that can be had: LeRobot's have their ``type`` so."""
+    kind = type(config)
+    for name in [] if depth else dir(kind):
+        if name.startswith("_") or not isinstance(inspect.getattr_static(kind, name), property):
+            continue
+        with suppress(Exception):
+            yield name, getattr(config, name)
+
+
+def _plain(value: Any, depth: int) -> Any:
+    if depth > _MAX_DEPTH or callable(value):
+        return _LEFT_OUT
+    if isinstance(value, Enum):
+        inner = _plain(value.value, depth)
+        return {CONFIG_CLASS: (_names(type(value)), None, {}), "value": inner}
+    if isinstance(value, _PLAIN):
+        return value
+    if isinstance(value, os.PathLike):
+        text = os.fspath(value)
+        named = {CONFIG_CLASS: ((("pathlib", "Path"),), None, {}), "value": text}
+        return named if isinstance(value, PurePath) else text
+    if isinstance(value, Mapping):
+        keys = {k: k.value if isinstance(k, Enum) else k for k in value if _is_key(k)}
+        kept = _known({key: _plain(value[k], depth + 1) for k, key in keys.items()})
+        return kept if type(value) is dict else {**kept, CONFIG_CLASS: ((), (), {})}
+    if isinstance(value, (list, tuple, set, frozenset)):
+        made = [item for item in (_plain(v, depth + 1) for v in value) if item is not _LEFT_OUT]
+        return tuple(made) if isinstance(value, tuple) else made
+    if hasattr(value, "__dict__") or is_dataclass(value):
+        return _attributes(value, depth)
+    return _LEFT_OUT

@@ -19,11 +19,11 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import WorkerDiedError, WorkerStartupError
-from envhub_sandbox.sandboxes import runtime_folder
 from envhub_sandbox.sandboxes.docker import leftovers
 from envhub_sandbox.sandboxes.docker.engines import Engine
 from envhub_sandbox.sandboxes.docker.run_arguments import FOLDER_LABEL, USER_LABEL
 from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
+from envhub_sandbox.sandboxes.process import CONTAINER, RuntimeFolder
 from tests.containers.kit import IMAGE, container_of, containers_of, folders, nothing_left, pids_in
 from tests.support.processes import descendants, eventually
 from tests.support.repositories import write_repository
@@ -217,7 +217,7 @@ def idle_container(engine: Engine, labels: dict[str, str]) -> Iterator[str]:
 def test_gc_removes_what_is_ours_and_dead_and_nothing_else(engine: Engine) -> None:
     me = str(os.geteuid())
     with contextlib.ExitStack() as stack:
-        kept = [runtime_folder.RuntimeFolder(runtime_folder.CONTAINER) for _ in range(2)]
+        kept = [RuntimeFolder(CONTAINER) for _ in range(2)]
         for one in kept:
             stack.callback(one.remove)
         alive, dead = [str(one.path) for one in kept]

@@ -9,7 +9,7 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import WorkerDiedError
-from envhub_sandbox.sandboxes import runtime_folder
+from envhub_sandbox.sandboxes.process import remove_stale, stale_folders
 from tests.faults.mortal import EXIT, LIVE, comes_off
 from tests.faults.remains.traces import temporary_root
 from tests.remote.listening import Listening, listening
@@ -97,10 +97,10 @@ def test_a_killed_server_leaves_nothing_that_nobody_finds(
                 mine = set(place.iterdir())
                 assert len(mine) == 1
                 assert not mine & left
-                assert list(runtime_folder.stale_folders(place)) == []
+                assert list(stale_folders(place)) == []
                 server.process.kill()
                 server.process.wait()
-                assert eventually(lambda: set(runtime_folder.stale_folders(place)) == mine)  # noqa: B023
+                assert eventually(lambda: set(stale_folders(place)) == mine)  # noqa: B023
                 left = mine
-        assert set(runtime_folder.remove_stale()) >= left
+        assert set(remove_stale()) >= left
         assert list(place.iterdir()) == []

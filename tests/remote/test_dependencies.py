@@ -24,7 +24,7 @@ from envhub_sandbox.errors import (
     RequirementError,
     ResolutionError,
 )
-from envhub_sandbox.sandboxes import server_facts
+from envhub_sandbox.sandboxes import remote
 from envhub_worker.access import package_program
 from envhub_worker.access import packages as server_side
 from envhub_worker.access.packages import Packages
@@ -83,7 +83,7 @@ def test_a_server_makes_what_the_repository_declares(
     [made] = (permitting.state / "packages").glob("*/environments/*/packages")
     assert (made / "wanted").is_dir()
     assert eventually(lambda: f"name={made.parent.name}" in permitting.said())
-    assert server_facts.ask(permitting.sandbox()).dependencies
+    assert remote.ask_facts(permitting.sandbox()).dependencies
 
 
 def test_an_environment_of_a_package_needs_no_repository(

@@ -14,12 +14,11 @@ from pathlib import Path
 from typing import Any, cast
 
 from envhub_sandbox.errors import SandboxUnavailableError, WorkerStartupError
-from envhub_sandbox.sandboxes import runtime_folder
 from envhub_sandbox.sandboxes.docker import attestation, run_arguments
 from envhub_sandbox.sandboxes.docker.engines import Engine, environment, explained, own_limits
 from envhub_sandbox.sandboxes.docker.run_arguments import Container
 from envhub_sandbox.sandboxes.pool import ServerPool, ServerUse, WorkerServer
-from envhub_sandbox.sandboxes.process import LocalServer
+from envhub_sandbox.sandboxes.process import CONTAINER, LocalServer
 from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.settings.policy import Policy
 from envhub_sandbox.system import processes
@@ -65,7 +64,7 @@ class ContainerServer(LocalServer):
     wanted: Container
 
     def __init__(self) -> None:
-        super().__init__(runtime_folder.CONTAINER, "sockets", _STOP_S)
+        super().__init__(CONTAINER, "sockets", _STOP_S)
         self.profile = self.python = ""
 
 

@@ -19,7 +19,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from envhub_sandbox.errors import SandboxUnavailableError
-from envhub_sandbox.sandboxes import runtime_folder
 from envhub_sandbox.sandboxes.docker.engines import (
     ENGINES,
     Engine,
@@ -28,6 +27,7 @@ from envhub_sandbox.sandboxes.docker.engines import (
     is_elsewhere,
 )
 from envhub_sandbox.sandboxes.docker.run_arguments import FOLDER_LABEL, USER_LABEL
+from envhub_sandbox.sandboxes.process import is_in_use, places, stale_folders
 from envhub_sandbox.system.locks import is_held, unheld
 from envhub_sandbox.system.platform import user_id
 
@@ -77,11 +77,7 @@ class Found(NamedTuple):
 def find() -> Found:
     """Look everywhere. Removes nothing."""
     containers, unasked = _containers()
-    folders = [
-        Leftover("folder", str(path))
-        for place in runtime_folder.places()
-        for path in runtime_folder.stale_folders(place)
-    ]
+    folders = [Leftover("folder", str(path)) for place in places() for path in stale_folders(place)]
     return Found([*containers, *folders, *stale_groups(_CGROUPS)], unasked)
 
 
@@ -119,7 +115,7 @@ def stale_containers(engine: Engine) -> Iterator[Leftover]:
 def _is_deserted_container(said: dict[str, Any]) -> bool:
     folder = Path(said["Config"]["Labels"][FOLDER_LABEL])
     try:
-        return not runtime_folder.is_in_use(folder)
+        return not is_in_use(folder)
     except FileNotFoundError:
         # an engine may be another machine's: its clients run there, or on a third one
         return said["State"]["Status"] in _ENDED

@@ -19,7 +19,6 @@ from time import monotonic
 from typing import Any, cast
 
 from envhub_sandbox.errors import SandboxUnavailableError, WorkerStartupError
-from envhub_sandbox.sandboxes import runtime_folder
 from envhub_sandbox.sandboxes.docker import attestation
 from envhub_sandbox.sandboxes.docker.container import (
     STARTUP_S,
@@ -34,10 +33,9 @@ from envhub_sandbox.sandboxes.docker.run_arguments import (
     seccomp_profile,
 )
 from envhub_sandbox.sandboxes.pool import WorkerServer
+from envhub_sandbox.sandboxes.process import CONTAINER, RuntimeFolder, remove_stale
 from envhub_sandbox.sandboxes.remote import RemoteServer
 from envhub_sandbox.sandboxes.remote_repository import UploadedRepository
-from envhub_sandbox.sandboxes.runtime_folder import RuntimeFolder
-from envhub_sandbox.system.log import WORKER
 from envhub_sandbox.system.platform import cores, own_group, run_after_fork
 from envhub_sandbox.system.processes import OwnerProcess
 from envhub_sandbox.transport.connection import WorkerConnection
@@ -71,8 +69,7 @@ class PublishedContainer(RepositoryContainer):
         return m.replace(order, confinement={**order.confinement, "profile": profile})
 
     def _start(self) -> WorkerServer:
-        for path in runtime_folder.remove_stale():
-            WORKER.info("removed %s, which a client that was killed had left", path)
+        remove_stale()
         container = EngineRun(self.engine)
         try:  # interruption.md, rule 4
             public, secret = new_keys()
@@ -147,7 +144,7 @@ class EngineRun:
         self._process: subprocess.Popen[bytes] | None = None
         self._announced: list[bytes] = []
         self._tail = b""
-        self.folder = RuntimeFolder(runtime_folder.CONTAINER)
+        self.folder = RuntimeFolder(CONTAINER)
         self.stopped = False
         _runs.add(self)
 

@@ -17,10 +17,10 @@ from pathlib import Path
 from time import monotonic
 
 from envhub_sandbox.errors import EnvHubError
-from envhub_sandbox.sandboxes import server_facts
+from envhub_sandbox.sandboxes import remote
 from envhub_sandbox.sandboxes.fleet.member import ForRepository, Member
 from envhub_sandbox.sandboxes.pool import ServerUse, WorkerServer
-from envhub_sandbox.sandboxes.remote import RemoteSandbox
+from envhub_sandbox.sandboxes.remote import RemoteSandbox, ServerFacts
 from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.settings.policy import Policy
 from envhub_sandbox.system.log import WORKER
@@ -57,7 +57,7 @@ class Rooms:
     def __init__(self, memory_bytes: int) -> None:
         self._memory_bytes = memory_bytes
         self._asking = threading.RLock()  # interruption.md, rule 12
-        self._pending: dict[Member, tuple[float, Call[server_facts.ServerFacts]]] = {}
+        self._pending: dict[Member, tuple[float, Call[ServerFacts]]] = {}
 
     def ask(self, members: Iterable[Member]) -> dict[Member, Room]:
         """The room of each, asked of all at the same time; of one that is not a server its own."""
@@ -66,7 +66,7 @@ class Rooms:
         with self._asking:  # who comes next finds the answers
             now = monotonic()
             stale = [one for one in servers if self._is_stale(one, now)]
-            calls = [partial(server_facts.ask, servers[one]) for one in stale]
+            calls = [partial(remote.ask_facts, servers[one]) for one in stale]
             asked = Calls(calls)
             asked.wait(_WAIT_S)
             self._pending.update({one: (now, p) for one, p in zip(stale, asked.each, strict=True)})

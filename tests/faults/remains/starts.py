@@ -15,7 +15,7 @@ import sys
 import time
 from pathlib import Path
 
-from envhub_sandbox.sandboxes import runtime_folder
+from envhub_sandbox.sandboxes.process import stale_folders
 from tests.faults.remains.clients import finish, left, line, start
 from tests.faults.remains.traces import Traces, temporary_root
 from tests.support.processes import eventually
@@ -70,7 +70,7 @@ def _round(folder: Path, chooser: random.Random) -> str:
     eventually(lambda: not left(folder), 5.0)
     before = left(folder)
     age(folder)
-    found = list(runtime_folder.stale_folders(folder))
+    found = list(stale_folders(folder))
     clean = is_removed_by_the_next(folder)
     return "" if not before else f"{number.name}: {before}, gc would find {found}, clean {clean}"
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from envhub_sandbox.sandboxes import runtime_folder
+from envhub_sandbox.sandboxes.process import stale_folders
 from tests.faults.remains.clients import finish, left
 from tests.faults.remains.starts import SIGNALS, age, halted, is_removed_by_the_next
 from tests.support.processes import eventually
@@ -43,10 +43,10 @@ def test_what_a_client_left_that_had_no_server_yet_goes_with_the_next(
     client, _ = halted(folder, when, what)
     age(folder)
     if when == "before":  # an empty folder says nothing of its client, but how old it is
-        assert list(runtime_folder.stale_folders(folder)) == []
+        assert list(stale_folders(folder)) == []
     client.kill()
     finish(client)
-    assert len(list(runtime_folder.stale_folders(folder))) == 1
+    assert len(list(stale_folders(folder))) == 1
     assert is_removed_by_the_next(folder), left(folder)
 
 
@@ -56,5 +56,5 @@ def test_what_is_left_when_both_are_killed_goes_with_the_next(folder: Path) -> N
     os.kill(server, signal.SIGKILL)
     client.kill()
     finish(client)
-    assert len(list(runtime_folder.stale_folders(folder))) == 1
+    assert len(list(stale_folders(folder))) == 1
     assert is_removed_by_the_next(folder), left(folder)

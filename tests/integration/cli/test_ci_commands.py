@@ -15,7 +15,7 @@ from envhub_sandbox import make_env
 from envhub_sandbox.cli import doctor
 from envhub_sandbox.cli.shared.console import guarded
 from envhub_sandbox.errors import WorkerDiedError
-from envhub_sandbox.sandboxes.server_facts import ServerFacts
+from envhub_sandbox.sandboxes.remote import ServerFacts
 from tests.support.output.ci import log_of, obeyed
 from tests.support.repositories import write_repository
 

@@ -21,7 +21,7 @@ from zmq.utils import z85
 
 from envhub_sandbox import RemoteSandbox, make_env
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError
-from envhub_sandbox.sandboxes import server_facts
+from envhub_sandbox.sandboxes import remote
 from envhub_worker.access import keys
 from envhub_worker.access.audit.log import CLIENT_LINES, LINES, Log
 from envhub_worker.access.keys import AuthorizedClients
@@ -172,7 +172,7 @@ def test_a_server_for_one_client_has_its_keys_in_memory_alone(
             assert jails
             wrong = dataclasses.replace(place, client_key=key_text(stranger.secret))
             with pytest.raises(SandboxUnavailableError, match="does not know our key"):
-                server_facts.ask(wrong)
+                remote.ask_facts(wrong)
             assert not list(tmp_path.rglob("*.key"))
             assert not (tmp_path / "state" / "endpoint").exists()
             # an own process stands for the one that started it: its end is the server's

@@ -17,9 +17,9 @@ import pytest
 from envhub_sandbox import Limits, Policy, Timeouts, make_env
 from envhub_sandbox.cli.app import whole_command
 from envhub_sandbox.errors import HubReferenceError, PolicyError, RepositoryUnavailableError
-from envhub_sandbox.factory import arguments
-from envhub_sandbox.factory.arguments import plain_config
+from envhub_sandbox.factory.make_env import interpreter
 from envhub_sandbox.hub import snapshot
+from envhub_sandbox.session.repository import plain_config
 from envhub_sandbox.settings.options import (
     OPTIONS,
     Options,
@@ -93,9 +93,9 @@ def test_what_is_given_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
     assert (made.n_envs, made.use_async_envs, made.num_workers) == (4, True, 2)
     assert [type(one) for one in (made.n_envs, made.use_async_envs)] == [int, bool]
     monkeypatch.setattr("shutil.which", lambda name: f"/somewhere/{name}")
-    assert arguments.interpreter("python3.12") == "/somewhere/python3.12"
-    assert arguments.interpreter("/a/../python3.12") == "/python3.12"
-    assert arguments.interpreter(None) == ""
+    assert interpreter("python3.12") == "/somewhere/python3.12"
+    assert interpreter("/a/../python3.12") == "/python3.12"
+    assert interpreter(None) == ""
 
 
 @dataclass

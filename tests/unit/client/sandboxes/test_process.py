@@ -11,8 +11,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from envhub_sandbox.sandboxes.process import LocalServer
-from envhub_sandbox.sandboxes.runtime_folder import SERVER
+from envhub_sandbox.sandboxes.process import SERVER, LocalServer
 from envhub_sandbox.system.processes import has_ended
 from tests.support.processes import eventually
 

@@ -25,8 +25,8 @@ from envhub_sandbox.errors import (
     WorkerTimeoutError,
 )
 from envhub_sandbox.sandboxes import remote, remote_keys, remote_repository
+from envhub_sandbox.sandboxes.remote import facts_of
 from envhub_sandbox.sandboxes.remote_repository import ServerPackages, order_of, request_packages
-from envhub_sandbox.sandboxes.server_facts import facts_of
 from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.tcp import TcpServer

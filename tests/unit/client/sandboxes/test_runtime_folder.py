@@ -10,9 +10,17 @@ from typing import Any
 import pytest
 
 from envhub_sandbox.errors import SandboxUnavailableError
-from envhub_sandbox.sandboxes import runtime_folder
 from envhub_sandbox.sandboxes.docker import leftovers
 from envhub_sandbox.sandboxes.docker.run_arguments import FOLDER_LABEL, USER_LABEL
+from envhub_sandbox.sandboxes.process import (
+    CONTAINER,
+    SERVER,
+    RuntimeFolder,
+    is_in_use,
+    places,
+    remove_stale,
+    stale_folders,
+)
 from envhub_sandbox.system.locks import LifeLock
 from envhub_worker.lockdown.limits.cgroups import Hierarchy, Tree
 from envhub_worker.lockdown.mechanisms.locked_folder import LockedFolder, remove_deserted
@@ -29,7 +37,7 @@ def folder(root: Path, name: str, files: dict[str, str], mode: int = 0o700) -> P
 
 def found(root: Path) -> set[str]:
     """Names of the folders that would be removed."""
-    return {path.name for path in runtime_folder.stale_folders(root)}
+    return {path.name for path in stale_folders(root)}
 
 
 def alive(root: Path, name: str) -> Path:
@@ -57,7 +65,7 @@ def test_a_containers_folder_is_left_behind_when_its_client_is(tmp_path: Path) -
     folder(tmp_path, "envhub-docker-not-ours-at-all", {"alive": ""})
     folder(tmp_path, "envhub-docker-open0000", {"alive": ""}, mode=0o755)
     there = set(tmp_path.iterdir())
-    [path] = runtime_folder.stale_folders(tmp_path)
+    [path] = stale_folders(tmp_path)
     assert path.name == "envhub-docker-dead0000"
     assert leftovers.Leftover("folder", str(path)).remove()
     assert set(tmp_path.iterdir()) == there - {path}
@@ -99,9 +107,9 @@ def test_what_may_be_another_machines_is_removed_by_hand_only(
     folder(tmp_path, "envhub-dead0000", {"alive": f"{boot} 7"})
     folder(tmp_path, "envhub-another0", {"alive": "another 7"})
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    monkeypatch.setattr(runtime_folder, "places", lambda: [tmp_path])
+    monkeypatch.setattr("envhub_sandbox.sandboxes.process.places", lambda: [tmp_path])
     assert found(tmp_path) == {"envhub-dead0000", "envhub-another0"}
-    assert [path.name for path in runtime_folder.remove_stale()] == ["envhub-dead0000"]
+    assert [path.name for path in remove_stale()] == ["envhub-dead0000"]
     assert [path.name for path in tmp_path.iterdir()] == ["envhub-another0"]
 
 
@@ -112,18 +120,18 @@ def test_a_folder_for_sockets_has_a_short_path(
     long = tmp_path / ("x" * 100)
     long.mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(long))
-    made = runtime_folder.RuntimeFolder(runtime_folder.CONTAINER)
+    made = RuntimeFolder(CONTAINER)
     try:
         assert len(os.fsencode(made.path / "sockets" / "server")) <= 107
         assert made.path.stat().st_mode & 0o777 == 0o700
-        assert made.path.parent in runtime_folder.places()
-        assert runtime_folder.is_in_use(made.path)
+        assert made.path.parent in places()
+        assert is_in_use(made.path)
     finally:
         made.remove()
     assert not made.path.exists()
-    monkeypatch.setattr(runtime_folder, "places", lambda: [long])
+    monkeypatch.setattr("envhub_sandbox.sandboxes.process.places", lambda: [long])
     with pytest.raises(SandboxUnavailableError, match="set TMPDIR to a shorter path"):
-        runtime_folder.RuntimeFolder(runtime_folder.SERVER)
+        RuntimeFolder(SERVER)
 
 
 def test_control_groups_of_ended_servers_are_left_behind(tmp_path: Path) -> None:

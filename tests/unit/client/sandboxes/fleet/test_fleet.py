@@ -21,7 +21,7 @@ from envhub_sandbox.errors import (
     WorkerStartupError,
     WorkerTimeoutError,
 )
-from envhub_sandbox.factory.arguments import sandbox_of
+from envhub_sandbox.factory.make_env import sandbox_of
 from envhub_sandbox.sandboxes.fleet import fleet
 from envhub_sandbox.sandboxes.fleet.fleet import Fleet, PlaceList, read_dns
 from envhub_sandbox.sandboxes.process import PROCESS

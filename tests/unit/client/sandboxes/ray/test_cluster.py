@@ -17,7 +17,7 @@ import pytest
 
 from envhub_sandbox import RaySandbox
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerStartupError
-from envhub_sandbox.factory.arguments import sandbox_of
+from envhub_sandbox.factory.make_env import sandbox_of
 from envhub_sandbox.sandboxes.ray import cluster, sandbox
 from envhub_sandbox.sandboxes.ray.actor import WorkerActor
 from envhub_sandbox.settings.policy import Policy

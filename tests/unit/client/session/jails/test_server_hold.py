@@ -12,7 +12,6 @@ import pytest
 
 from envhub_sandbox.sandboxes.pool import ServerHold, ServerPool, ServerUse
 from envhub_sandbox.session.jails.builder import JailSource, SharedJail
-
 from envhub_sandbox.transport.deadline import Deadline
 from tests.unit.client.sandboxes.test_pool import Server
 

@@ -18,8 +18,7 @@ from envhub_sandbox.errors import (
     WorkerError,
     WorkerTimeoutError,
 )
-from envhub_sandbox.session.parts.fleet_requests import FleetRequests
-from envhub_sandbox.session.parts.fleet_session import FleetSession
+from envhub_sandbox.session.parts.fleet_session import FleetRequests, FleetSession
 from envhub_sandbox.session.parts.in_flight import SENT, InFlight
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.lifecycle import State
