@@ -133,13 +133,6 @@ _Place = tuple[int, Hashable, Hashable]
 """The pid, the key and the group."""
 
 
-class _Start:
-    """The start of one server, which others who want it wait for: interruption.md, rule 12."""
-
-    def __init__(self) -> None:
-        self.lock = threading.RLock()
-
-
 class ServerPool(Generic[S]):
     """The servers of one kind. Thread-safe; a fork starts its own.
 
@@ -150,7 +143,9 @@ class ServerPool(Generic[S]):
 
     def __init__(self) -> None:
         self._changed = threading.Condition(threading.RLock())
-        self._starts: weakref.WeakValueDictionary[_Place, _Start] = weakref.WeakValueDictionary()
+        # who wants a server that is being started waits for its lock: interruption.md, rule 12
+        self._starts: weakref.WeakValueDictionary[_Place, threading.RLock]
+        self._starts = weakref.WeakValueDictionary()
         self._used: dict[_Place, _Entry[S]] = {}
         self._idle: list[_Entry[S]] = []
         self._thread: threading.Thread | None = None
@@ -174,8 +169,8 @@ class ServerPool(Generic[S]):
         """
         place = os.getpid(), key, group
         with self._changed:
-            starting = self._starts.setdefault(place, _Start())
-        with starting.lock:
+            starting = self._starts.setdefault(place, threading.RLock())
+        with starting:
             with self._changed:
                 entry = self._used.get(place)
                 if entry is not None:

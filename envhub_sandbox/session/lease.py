@@ -53,6 +53,7 @@ class Lease:
         loaded: The jail; None while there is none.
         lane: The way to its runners there.
         make_room: Asked to end what was started ahead, where a server has no place left.
+        depart: Says that the server is not needed again, at least not by this one. Idempotent.
     """
 
     def __init__(
@@ -80,8 +81,8 @@ class Lease:
         self._was_loaded = False
         self._startup: StartupDeadline | None = None
         self._release_server: Callable[[], None] = _nothing
-        self._departs = jails.launcher.server_hold.enter()
-        weakref.finalize(self, self._departs).atexit = False  # interruption.md, rule 13
+        self.depart = jails.launcher.server_hold.enter()
+        weakref.finalize(self, self.depart).atexit = False  # interruption.md, rule 13
 
     @property
     def shared(self) -> bool:
@@ -152,7 +153,7 @@ class Lease:
         ``WorkerError``: the jail did not come up, died, took too long, or was given up.
         """
         self.give_back()  # of an attempt that was interrupted when all was built
-        self._start(deadline, lambda: self._move_in(lambda: self._take(deadline), deadline))
+        self._start(deadline, lambda: self._move_in(partial(self._take, deadline), deadline))
 
     def adopt(self, loaded: LoadedJail, deadline: Deadline) -> None:
         """Use a jail that is already loaded, instead of taking one."""
@@ -161,7 +162,12 @@ class Lease:
 
     def replace(self, deadline: StartupDeadline) -> None:
         """Give the jail up, and take another in the same server; raises as ``acquire`` does."""
-        self._start(deadline, lambda: self._move(deadline))
+
+        def move() -> None:
+            self.leave()
+            self._move_in(partial(self._take, deadline), deadline)
+
+        self._start(deadline, move)
 
     def rebuild(self, dead: list[int], deadline: StartupDeadline) -> None:
         """Build some shards again, in fresh runners of this jail; raises as ``acquire`` does."""
@@ -189,8 +195,7 @@ class Lease:
         try:
             return self._jails.take(deadline)
         except (WorkerError, UnreachableError) as error:
-            # or of this very type: an older server's refusal, which may be for want of room
-            full = isinstance(error, ServerBusyError) or type(error) is WorkerError
+            full = _is_full(error)
             retry_s = self._patience_s(error)
             if deadline.unasked or not (full or retry_s):
                 raise
@@ -204,16 +209,11 @@ class Lease:
 
     def _patience_s(self, error: EnvHubError) -> float:
         """How long to wait: after a server that ended, where restarts are wanted, for another."""
-        full = type(error) is WorkerError or isinstance(error, ServerBusyError)
-        retry_s = self._launcher.retry_s if full else 0.0
+        retry_s = self._launcher.retry_s if _is_full(error) else 0.0
         if self.repository.policy.restart == "never":
             return retry_s
         lost = self._was_loaded and is_unanswered(error)
         return max(retry_s, _SUCCESSOR_S) if lost or is_draining(error) else retry_s
-
-    def _move(self, deadline: Deadline) -> None:
-        self.leave()
-        self._move_in(lambda: self._take(deadline), deadline)
 
     def _move_in(self, take: Callable[[], LoadedJail], deadline: Deadline) -> None:
         """Build the environment in a jail; a Ctrl-C leaves none behind: interruption.md, rule 4."""
@@ -292,10 +292,6 @@ class Lease:
             self._let_server_go()
             self.depart()
 
-    def depart(self) -> None:
-        """Say that the server is not needed again, at least not by this one. Idempotent."""
-        self._departs()
-
     def interrupt(self, close: Callable[[], None]) -> bool:
         """In another thread: ``close`` the environment, and end the jail that a request waits for.
 
@@ -327,6 +323,11 @@ class Lease:
     def _let_server_go(self) -> None:
         self._release_server()
         self._release_server = _nothing
+
+
+def _is_full(error: EnvHubError) -> bool:
+    """Whether it is a refusal for want of room; an older server's may be, of this very type."""
+    return isinstance(error, ServerBusyError) or type(error) is WorkerError
 
 
 def closed_during(operation: str) -> WorkerDiedError:

@@ -58,7 +58,7 @@ class Recovery:
         self._counters = lease.counters
         self._history = history
         self._seeds = SeedBook(manifest.num_envs, manifest.shardable)
-        self._settings = Settings()
+        self._settings: dict[str, list[list[bytes]]] = {}  # what was set, as shards were sent it
         self._setting: tuple[str, list[list[bytes]]] | None = None  # what is being set
         self._asked: Sequence[m.Message] = ()
         self.fresh: tuple[int, ...] = ()
@@ -82,7 +82,11 @@ class Recovery:
     def answered(self) -> None:
         """Every shard has answered it, and none has raised."""
         if self._setting is not None:
-            self._settings.remember(*self._setting)
+            name, sent = self._setting
+            self._settings.pop(name, None)  # the last one counts, in its place
+            self._settings[name] = sent
+            if len(self._settings) > _SETTINGS:
+                del self._settings[next(iter(self._settings))]
             self._setting = None
 
     # --- deaths --------------------------------------------------------------------------------
@@ -103,16 +107,13 @@ class Recovery:
         if self._lifecycle.request != "reset":
             self._lifecycle.answered()
             raise deaths.first
-        fresh = self._revive(deaths, "reset", self._resets, _reset_rows)
-        merged = [fresh.get(index, reply) for index, reply in enumerate(replies)]
-        return [reply for reply in merged if reply is not None]
+        return self._revive(replies, deaths, "reset", self._resets, _reset_rows)
 
     def survive_step(self, deaths: RunnersDiedError) -> list[m.StepDone]:
         """The replies to a step, with truncated rows in the place of the dead."""
         replies = self._of_survivors(deaths)
-        fresh = self._revive(deaths, "step", self._revivals, _step_rows)
-        merged = [fresh.get(index, reply) for index, reply in enumerate(replies)]
-        return [typed_reply(reply, m.StepDone) for reply in merged if reply is not None]
+        merged = self._revive(replies, deaths, "step", self._revivals, _step_rows)
+        return [typed_reply(reply, m.StepDone) for reply in merged]
 
     def mark(self, infos: dict[Any, Any]) -> dict[Any, Any]:
         """All infos of the last request, of which those of the fresh shards say that they are."""
@@ -135,16 +136,25 @@ class Recovery:
         return deaths.replies
 
     def _revive(
-        self, deaths: RunnersDiedError, operation: str, messages_for: MessagesFor, rows_of: RowsOf
-    ) -> dict[int, m.Message]:
-        """Have the dead shards brought back, and move on to the state that it leads to."""
+        self,
+        replies: list[m.Message | None],
+        deaths: RunnersDiedError,
+        operation: str,
+        messages_for: MessagesFor,
+        rows_of: RowsOf,
+    ) -> list[m.Message]:
+        """Have the dead shards brought back, and move on to the state that it leads to.
+
+        Returns:
+            ``replies``, with those of the fresh runners.
+        """
         lifecycle, failures = self._lifecycle, self._failures
         lifecycle.moved(Event.LOSS)
         failures.keep_crash(deaths.first)
         try:
-            replies = self._bring_back(deaths, operation, messages_for)
+            answers = self._bring_back(deaths, operation, messages_for)
             with UNTRUSTED:
-                fresh = {index: rows_of(one, self._size(index)) for index, one in replies.items()}
+                fresh = {index: rows_of(one, self._size(index)) for index, one in answers.items()}
         except WorkerTimeoutError as error:
             if lifecycle.closed:
                 raise failures.dead(error) from error
@@ -164,7 +174,8 @@ class Recovery:
         self._counters.deaths += len(fresh)
         self._history.revived()
         lifecycle.moved(Event.REVIVAL)
-        return fresh
+        merged = [fresh.get(index, reply) for index, reply in enumerate(replies)]
+        return [reply for reply in merged if reply is not None]
 
     def _bring_back(
         self, deaths: RunnersDiedError, operation: str, messages_for: MessagesFor
@@ -200,7 +211,7 @@ class Recovery:
 
     def _set_again(self, lane: Lane, dead: Sequence[int], deadline: Deadline) -> None:
         """Set attributes in fresh runners; what one's setter raises is only logged."""
-        for name, frames in self._settings.messages():
+        for name, frames in list(self._settings.items()):
             asked: list[tuple[int, list[Buffer]]] = [
                 (lane.runners[index], [*frames[index]]) for index in dead
             ]
@@ -275,7 +286,7 @@ def mark_revived(
     return {**info, RESTARTED: yes, f"_{RESTARTED}": yes.copy()}
 
 
-# --- seeds and attributes for the fresh runner of a dead shard -----------------------------------
+# --- seeds for the fresh runner of a dead shard --------------------------------------------------
 
 
 class SeedBook:
@@ -311,28 +322,6 @@ class SeedBook:
         if isinstance(self._own, list):
             return [derived_seed(seed, restart) for seed in self._own]
         return derived_seed(self._own, restart)
-
-
-class Settings:
-    """Attributes that the caller has set: the last message of each, as the shards were sent it."""
-
-    def __init__(self) -> None:
-        self._sent: dict[str, Sequence[list[bytes]]] = {}
-
-    def remember(self, name: str, sent: Sequence[list[bytes]]) -> None:
-        """Take note of what was set, given the frames for each shard."""
-        self._sent.pop(name, None)  # the last one counts, in its place
-        self._sent[name] = sent
-        if len(self._sent) > _SETTINGS:
-            del self._sent[next(iter(self._sent))]
-
-    def clear(self) -> None:
-        """There is a fresh jail, in which nothing has been set."""
-        self._sent.clear()
-
-    def messages(self) -> list[tuple[str, Sequence[list[bytes]]]]:
-        """Names, and the frames for each shard."""
-        return list(self._sent.items())
 
 
 def derived_seed(seed: int | None, restart: int) -> int | None:

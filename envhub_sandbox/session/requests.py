@@ -324,11 +324,7 @@ class Requests(RequestOrder):
         ``ClosedEnvironmentError``: a ``close`` in another thread came first.
         """
         try:
-            try:
-                replies = self._collect(deadline_of(timeout), kind)
-            except BaseException:
-                with self.use.judging("a request"):
-                    raise
+            replies = self._judged(lambda: self._collect(deadline_of(timeout), kind))
             if self.lifecycle.state is State.CLOSED:
                 self._lease.let_go()
         except BaseException as error:
@@ -353,11 +349,7 @@ class Requests(RequestOrder):
 
     def one_each(self, what: str, replies: list[m.Value] | list[m.WatchDone]) -> tuple[Any, ...]:
         """One value for each sub-environment, out of the shards' replies."""
-        try:
-            return self.results.one_each(what, replies)
-        except BaseException:
-            with self.use.judging("a request"):
-                raise
+        return self._judged(lambda: self.results.one_each(what, replies))
 
     def finish_reset(
         self, replies: list[m.ResetDone], timeout: float | Deadline | None
@@ -365,15 +357,14 @@ class Requests(RequestOrder):
         """What ``VectorEnv.reset`` returns, of the replies to one; raises as ``collect`` does."""
         try:
             return self.results.reset(replies)
-        except batches.Misfit:
-            with self.use.judging("a request"):
+        except BaseException as error:
+            with self.use.judging("a request"):  # on failure only: it costs some us
+                if not isinstance(error, batches.Misfit):
+                    raise
                 infos = self._infos_apart(deadline_of(timeout))
                 if self._recovery is not None:
                     infos = self._recovery.mark(infos)
                 return self.results.reset(replies, infos)
-        except BaseException:
-            with self.use.judging("a request"):
-                raise
 
     # --- steps ---------------------------------------------------------------------------------
 
@@ -496,6 +487,14 @@ class Requests(RequestOrder):
             return replies
 
     # --- out and back --------------------------------------------------------------------------
+
+    def _judged(self, handle: Callable[[], T]) -> T:
+        """What the handling of replies gives; what it raises is judged."""
+        try:
+            return handle()
+        except BaseException:
+            with self.use.judging("a request"):  # on failure only: it costs some us
+                raise
 
     def _make_ready(self, operation: str) -> None:
         state, restart = self.lifecycle.state, self._repository.policy.restart

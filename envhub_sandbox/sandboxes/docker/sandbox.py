@@ -10,13 +10,14 @@ down as it does on a host. What holds is read from inside before anything runs; 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError
-from envhub_sandbox.sandboxes.docker import packages, run_arguments
-from envhub_sandbox.sandboxes.docker import packages as images
+from envhub_sandbox.sandboxes.docker import run_arguments
 from envhub_sandbox.sandboxes.docker.container import ContainerOptions, RepositoryContainer
 from envhub_sandbox.sandboxes.docker.engines import Engine, find_engine, find_image
+from envhub_sandbox.sandboxes.docker.packages import BuiltImageTarget, ImageTarget
 from envhub_sandbox.sandboxes.docker.published import PublishedContainer
 from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.settings.options import option_name
@@ -87,8 +88,8 @@ class DockerSandbox(ContainerOptions, Sandbox):
         run_arguments.check_readable(policy.readable)
         engine = find_engine(self.engine)
         _check_users(engine)
-        image, packages = find_image(engine, self.image), runtime.packages
-        return RepositoryContainer(self, engine, image, snapshot, policy, packages, assets)
+        image = find_image(engine, self.image)
+        return RepositoryContainer(self, engine, image, snapshot, policy, runtime.packages, assets)
 
     def _published(
         self, snapshot: Path, policy: Policy, runtime: Runtime, assets: tuple[Path, ...]
@@ -104,13 +105,12 @@ class DockerSandbox(ContainerOptions, Sandbox):
         image = find_image(engine, runtime.packages or self.image)
         return PublishedContainer(self, engine, image, snapshot, policy, assets=assets)
 
-    def package_target(self) -> packages.ImageTarget:
+    def package_target(self) -> ImageTarget:
         """Packages are made for the image's Python: on this machine, or else as an image."""
+        engine = partial(find_engine, self.engine)
         if self.published:
-            return images.BuiltImageTarget(
-                lambda: find_engine(self.engine), self.image, self.build_network
-            )
-        return packages.ImageTarget(lambda: find_engine(self.engine), self.image)
+            return BuiltImageTarget(engine, self.image, self.build_network)
+        return ImageTarget(engine, self.image)
 
 
 def _check_users(engine: Engine) -> None:

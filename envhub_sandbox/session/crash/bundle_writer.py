@@ -22,7 +22,6 @@ import os
 import re
 import secrets
 import shutil
-import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -48,7 +47,6 @@ FORMAT = 1
 KEPT = 20
 """Bundles in one folder; older ones are removed."""
 _NAME = re.compile(r"\d{8}T\d{6}-[0-9a-f]{8}")
-_BUILDING = ".building-"
 _ABANDONED_AFTER_S = 3600.0
 _SHOWN_REQUESTS = 8
 _SHORTEST_SECRET = 6
@@ -61,8 +59,6 @@ class Crash:
 
     Attributes:
         error: What the user gets.
-        label: Repository, commit and entry file.
-        provenance: As ``provenance_of`` returns it.
         load: The arguments of the repository's ``make_env``.
         options: The other arguments of ours: plain data, ``Policy`` and ``Timeouts``.
         task: ``suite``, ``task``, ``num_envs``, ``shards``, ``lane``; None before ``make_env`` has
@@ -86,14 +82,10 @@ def write_bundle(folder: Path, crash: Crash) -> Path:
     Raises ``OSError``: it cannot be written; nothing is left of it.
     """
     folders.make(folder, folders.PRIVATE_MODE)
-    building = Path(tempfile.mkdtemp(prefix=_BUILDING, dir=folder))  # 0700
-    try:
+    with folders.draft(folder) as building:
         _write(building, crash)
         home = folder / f"{time.strftime('%Y%m%dT%H%M%S', time.gmtime())}-{secrets.token_hex(4)}"
         building.rename(home)
-    except BaseException:
-        shutil.rmtree(building, ignore_errors=True)
-        raise
     _remove_oldest(folder, home.name)
     return home
 
@@ -102,7 +94,9 @@ def _remove_oldest(folder: Path, newest: str) -> None:
     names = os.listdir(folder)
     # its name alone does not tell the newest from others of the same second
     bundles = sorted(filter(_NAME.fullmatch, names), key=lambda name: (name == newest, name))
-    abandoned = [name for name in names if name.startswith(_BUILDING) and _is_old(folder / name)]
+    abandoned = [
+        name for name in names if name.startswith(folders.BUILDING) and _is_old(folder / name)
+    ]
     for name in [*bundles[:-KEPT], *abandoned]:
         shutil.rmtree(folder / name, ignore_errors=True)
 
@@ -259,7 +253,7 @@ def _in_words(crash: Crash) -> str:
             f"Environment: suite {task['suite']!r}, task {task['task']!r}, {task['num_envs']} "
             f"sub-environments in {task['shards']} processes, steps by {task['lane']}."
         )
-    lines += [f"Seeded: {'yes' if recording.seeded else 'no, so chance may decide otherwise'}."]
+    lines.append(f"Seeded: {'yes' if recording.seeded else 'no, so chance may decide otherwise'}.")
     if recording.dropped:
         lines.append(f"{recording.dropped} requests were forgotten: a replay cannot be exact.")
     if crash.error.denied:

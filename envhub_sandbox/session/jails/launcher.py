@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable
 from dataclasses import asdict
 from functools import partial
@@ -443,12 +444,8 @@ class Launcher:
             server.silent_s = monotonic()
 
     def _ask(self, server: WorkerServer, message: m.Message, deadline: Deadline) -> m.Message:
-        client = self._client(server)
-        try:
-            client.hello(deadline)
+        with contextlib.closing(self._connected(server, deadline)) as client:
             return client.request(message, deadline=deadline)[0]
-        finally:
-            client.close()
 
 
 def _is_what(value: object, task: EnvManifest) -> bool:
