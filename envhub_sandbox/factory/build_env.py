@@ -35,11 +35,9 @@ class Build(gym.Env[Any, Any]):
 
     def build(self, order: Mapping[str, Any]) -> dict[str, Any]:
         """Build a wheel, or say what its backend needs besides.
-
-        Args:
-            order: ``source``, ``packages``, ``tools``: folders; ``python``: the interpreter;
-                ``backend``, ``backend_path``; ``known``: what the backend is known to need;
-                ``environment``: further variables.
+        ``order``: ``source``, ``packages``, ``tools``: folders; ``python``: the interpreter;
+        ``backend``, ``backend_path``; ``known``: what the backend is known to need;
+        ``environment``: further variables.
         """
         sys.path.insert(0, order["tools"])
         from pyproject_hooks import BuildBackendHookCaller, HookMissing

@@ -69,8 +69,7 @@ class LocalServer(WorkerServer):
         sockets: The part of the folder that its sockets lie in.
         stop_s: How long its process may take to end.
 
-    Attributes:
-        process: What was started: the server itself, or what ends it when it ends.
+    ``process``: what was started: the server itself, or what ends it when it ends.
     """
 
     fd_path: str

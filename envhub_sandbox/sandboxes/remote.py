@@ -102,10 +102,8 @@ class RemoteSandbox(Sandbox):
         self, snapshot: Path, policy: Policy, runtime: Runtime, assets: tuple[Path, ...] = ()
     ) -> RemoteRepository:
         """The sandbox for one repository. Connects to nothing.
-
-        Raises:
-            PolicyError: The policy names what a client on another host cannot have.
-            SandboxUnavailableError: A key is missing.
+        Raises ``PolicyError``: the policy names what a client on another host cannot have;
+        ``SandboxUnavailableError``: a key is missing.
         """
         check_policy(policy, runtime)
         order = self._orders[runtime.packages] if runtime.packages else None
@@ -117,11 +115,7 @@ class RemoteSandbox(Sandbox):
         return ServerPackages(lambda: _use_of(self.endpoint, self.far()), self._orders)
 
     def far(self) -> TcpServer:
-        """The server's key and ours.
-
-        Raises:
-            SandboxUnavailableError: One is missing.
-        """
+        """The server's key and ours. Raises ``SandboxUnavailableError``: one is missing."""
         if self.insecure_loopback:
             return TcpServer(None, None, self.heartbeat_s)
         server_key = remote_keys.server_key(self.endpoint, self.server_key)
@@ -182,9 +176,7 @@ class RemoteRepository(UploadedRepository):
 
 class RemoteServer(WorkerServer):
     """A server on another host that environments of this process use.
-
-    Attributes:
-        process_fd: Readable once we have given it up.
+    ``process_fd``: readable once we have given it up.
     """
 
     far: TcpServer

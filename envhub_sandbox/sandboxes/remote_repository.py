@@ -81,9 +81,8 @@ def upload(
     Returns:
         What the server calls the snapshot, and how many bytes had to travel.
 
-    Raises:
-        SnapshotIntegrityError: A file arrived as another than it left.
-        WorkerError: The server does not take them, or took too long.
+    Raises ``SnapshotIntegrityError``: a file arrived as another than it left; ``WorkerError``: the
+    server does not take them, or took too long.
     """
     wanted = _offer(client, files, deadline)
     by_hash = {file.sha256: file for file in files}
@@ -154,11 +153,9 @@ class ServerPackages:
 
     def make(self, request: PackageRequest, tell: Callable[[str], None]) -> PackageSet | None:
         """The packages that the server makes; None where its own are enough.
-
-        Raises:
-            DependencyError: They cannot be made; the text says what to change.
-            PolicyError: The server's operator does not permit it.
-            ServerBusyError: Others of the same key are at it.
+        Raises ``DependencyError``: they cannot be made; the text says what to change;
+        ``PolicyError``: the server's operator does not permit it; ``ServerBusyError``: others of
+        the same key are at it.
         """
         order = order_of(request)
         use = self.use()

@@ -105,15 +105,11 @@ class Sandbox:
         self, store: Path, runtime: Runtime = OWN, idle_s: float | None = 0.0
     ) -> ServerUse[WorkerServer]:
         """Use a server that may show snapshots below ``store`` to jails. Servers are shared.
-
-        Args:
-            runtime: What its first jail runs on. A hint: others may run on something else.
-            idle_s: For how long the server is kept for the next user, where this use is its last; 0
-                ends it at once, None keeps it for as long as this process lives.
-
-        Raises:
-            SandboxUnavailableError: There is no such place here.
-            WorkerStartupError: The server did not come up.
+        ``runtime``: what its first jail runs on. A hint: others may run on something else.
+        ``idle_s``: for how long the server is kept for the next user, where this use is its last; 0
+        ends it at once, None keeps it for as long as this process lives.
+        Raises ``SandboxUnavailableError``: there is no such place here; ``WorkerStartupError``: the
+        server did not come up.
         """
         raise SandboxUnavailableError(f"{self.name}: a server is started for one repository only")
 
@@ -121,13 +117,9 @@ class Sandbox:
         self, order: OpenJail, server: WorkerServer, client: WorkerConnection, deadline: Deadline
     ) -> OpenJail:
         """The order for a jail as a server of this place understands it.
-
-        Args:
-            order: In terms of this machine.
-            deadline: For what has to be brought there first.
-
-        Raises:
-            WorkerError: The server does not take it.
+        ``order``: in terms of this machine.
+        ``deadline``: for what has to be brought there first.
+        Raises ``WorkerError``: the server does not take it.
         """
         return order
 
@@ -170,13 +162,9 @@ def retry_while_busy(
 
     The server keeps the order of those who go on asking: so the second time is soon, and takes the
     place in the line. The time in the line does not count against the deadline.
-
-    Args:
-        deadline: For all else; once it is given up, the waiting ends.
-        refusal: The answer to an earlier try.
-
-    Raises:
-        ServerBusyError: There was no room in all that time.
+    ``deadline``: for all else; once it is given up, the waiting ends.
+    ``refusal``: the answer to an earlier try.
+    Raises ``ServerBusyError``: there was no room in all that time.
     """
     until, pause_s = monotonic() + retry_s, _SOON_S
     ends = refusal is not None and (is_draining(refusal) or is_unanswered(refusal))

@@ -25,10 +25,9 @@ from envhub_sandbox.errors import (
     WorkerError,
     WorkerTimeoutError,
 )
-from envhub_sandbox.session.attribute_cache import AttributeCache, FleetAttributes
 from envhub_sandbox.session.crash.history import History
 from envhub_sandbox.session.failures import Failures, refusal
-from envhub_sandbox.session.lease import Lease
+from envhub_sandbox.session.lease import AttributeCache, FleetAttributes, Lease
 from envhub_sandbox.session.prewarm import Prewarm
 from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.session.use_lock import FleetUse, UseLock

@@ -86,14 +86,10 @@ def why_distrusted(place: Path, ours: Path) -> str:
     a folder can put another one in the place of what is in it. In a sticky folder, such as /tmp,
     only its owner can, so there it counts whose the next step is. A POSIX access list shows in
     the group's bits, which are its mask.
-
-    Args:
-        place: An existing absolute path.
-        ours: Where the folders begin that we made: no other user may write there. Above,
-            the group may write if it is its user's own, as many systems set homes up.
-
-    Raises:
-        OSError: A step cannot be looked at.
+    ``place``: an existing absolute path.
+    ``ours``: where the folders begin that we made: no other user may write there. Above, the group
+    may write if it is its user's own, as many systems set homes up.
+    Raises ``OSError``: a step cannot be looked at.
     """
     if IS_WINDOWS:
         place.stat()
@@ -211,13 +207,9 @@ _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | open_flags("O_CLOEXEC")
 
 def write_whole_file(path: Path, data: bytes, *, mode: int = 0o600, durable: bool = False) -> None:
     """Write a file under another name, and rename it: meanwhile others read the old one.
-
-    Args:
-        mode: Its mode; the umask takes from it.
-        durable: Whether it is also whole after a loss of power.
-
-    Raises:
-        OSError: It cannot be written. Nothing is left of it.
+    ``mode``: its mode; the umask takes from it.
+    ``durable``: whether it is also whole after a loss of power.
+    Raises ``OSError``: it cannot be written. Nothing is left of it.
     """
     part = path.with_name(f".{path.name}-{secrets.token_hex(4)}")
     descriptor = os.open(part, _NEW, mode)
@@ -241,9 +233,7 @@ _MAX_TEXT_BYTES = 16 * 1024 * 1024
 
 def cache_root() -> Path:
     """``$ENVHUB_CACHE``, or the user's cache folder for ``envhub-sandbox``.
-
-    Raises:
-        SnapshotError: The user has none.
+    Raises ``SnapshotError``: the user has none.
     """
     chosen = os.environ.get(CACHE_VARIABLE)
     if chosen:

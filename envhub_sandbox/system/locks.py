@@ -84,9 +84,8 @@ def held(
         on_wait: Called once before the first wait.
         mode: That of a new file.
 
-    Raises:
-        TimeoutError: Another holds it.
-        OSError: It cannot be opened, or its file system has no locks.
+    Raises ``TimeoutError``: another holds it; ``OSError``: it cannot be opened, or its file system
+    has no locks.
     """
     until = time.monotonic() + wait_s
     waits = False

@@ -77,11 +77,9 @@ if not IS_LINUX:
 
 def end_with(parent: int, patience_s: float) -> None:
     """End this process as soon as another has ended, and with it the group that it leads.
-
-    Args:
-        parent: A pidfd of the other.
-        patience_s: For what SIGTERM does here, in the main thread, before all are killed; with none
-            they are killed at once.
+    ``parent``: a pidfd of the other.
+    ``patience_s``: for what SIGTERM does here, in the main thread, before all are killed; with none
+    they are killed at once.
     """
     os.set_inheritable(parent, False)
     threading.Thread(target=_watch, args=(parent, patience_s), daemon=True).start()

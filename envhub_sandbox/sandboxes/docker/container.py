@@ -174,10 +174,8 @@ class RepositoryContainer(Sandbox):
 
     def wanted(self, folder: Path, seccomp: dict[str, Any], cpus: int) -> Container:
         """The container, without what it is shown of this machine, as the image's own user.
-
-        Args:
-            folder: The client's runtime folder, where the system call profile is written.
-            cpus: How many processors there are for it.
+        ``folder``: the client's runtime folder, where the system call profile is written.
+        ``cpus``: how many processors there are for it.
         """
         options, policy = self.options, self.policy
         (folder / "seccomp.json").write_bytes(json.dumps(seccomp).encode())

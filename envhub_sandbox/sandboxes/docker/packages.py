@@ -239,9 +239,8 @@ def derived(
         system: Debian packages that it needs, too.
         network: That of the build, as engines call it.
 
-    Raises:
-        DependencyError: It cannot be made; the text says what to change.
-        SandboxUnavailableError: The base is no image of ours, or is not there.
+    Raises ``DependencyError``: it cannot be made; the text says what to change;
+    ``SandboxUnavailableError``: the base is no image of ours, or is not there.
     """
     identity, target = find_image(engine, base), target_of(engine, base)
     _check_python(request, target)

@@ -130,9 +130,7 @@ class PublishedServer(RemoteServer):
 
 class EngineRun:
     """The engine's attached ``run``, whose stdin keeps its container.
-
-    Attributes:
-        folder: Its runtime folder, which its container names: what is left of both can be found.
+    ``folder``: its runtime folder, which its container names: what is left of both can be found.
     """
 
     stopped = True  # until there is something to stop

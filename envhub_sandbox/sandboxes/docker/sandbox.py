@@ -60,10 +60,8 @@ class DockerSandbox(ContainerOptions, Sandbox):
         self, snapshot: Path, policy: Policy, runtime: Runtime, assets: tuple[Path, ...] = ()
     ) -> RepositoryContainer:
         """The container for one repository. Starts nothing, but asks for engine and image.
-
-        Raises:
-            PolicyError: A container cannot give what the policy permits.
-            SandboxUnavailableError: There is no engine, no image, or no permission.
+        Raises ``PolicyError``: a container cannot give what the policy permits;
+        ``SandboxUnavailableError``: there is no engine, no image, or no permission.
         """
         if runtime.python:
             raise PolicyError(

@@ -32,9 +32,7 @@ _FRESH_S = 2.0
 
 class PlaceList:
     """The places of a fleet, as they are named. Thread-safe.
-
-    Args:
-        source: A list; ``file:PATH`` or a path; ``dns://HOST:PORT``; or places with commas between.
+    ``source``: a list; ``file:PATH`` or a path; ``dns://HOST:PORT``; or places with commas between.
     """
 
     def __init__(self, source: str | os.PathLike[str] | Sequence[str | Sandbox]) -> None:
@@ -47,9 +45,7 @@ class PlaceList:
 
     def read(self) -> list[str | Sandbox]:
         """The places that there are now.
-
-        Raises:
-            PolicyError: There are none, at first. Later the last ones that there were hold.
+        Raises ``PolicyError``: there are none, at first. Later the last ones that there were hold.
         """
         by_name = isinstance(self._source, str) and self._source.startswith(DNS)
         if by_name and self._last and monotonic() - self._known_s < _FRESH_S:
@@ -157,10 +153,8 @@ class Fleet(Sandbox):
 
     def opened(self, resolve: Resolve, server_key: str | None) -> OpenFleet:
         """The fleet of one ``make_env``.
-
-        Args:
-            resolve: Makes a sandbox of a name that is no address.
-            server_key: Of places that are addresses, where they do not say another.
+        ``resolve``: makes a sandbox of a name that is no address.
+        ``server_key``: of places that are addresses, where they do not say another.
         """
 
         def sandbox_of(place: str | Sandbox) -> Sandbox:

@@ -115,9 +115,7 @@ class FleetPackages:
         """Have every place make them, at the same time.
 
         A place that cannot be reached now makes them when a worker is placed there.
-
-        Raises:
-            DependencyError: One of them cannot make any; the text says which.
+        Raises ``DependencyError``: one of them cannot make any; the text says which.
         """
         self._request = request
         members = self.members()

@@ -37,9 +37,7 @@ class WorkerActor:
 
     def start(self, client_key: str) -> bytes:
         """Start the server.
-
-        Args:
-            client_key: The public key of its one client, as text.
+        ``client_key``: the public key of its one client, as text.
 
         Returns:
             A JSON object: ``endpoint``, ``key`` (the server's public one), ``node`` (its id) and

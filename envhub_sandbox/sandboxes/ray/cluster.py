@@ -54,14 +54,10 @@ def name(address: str) -> str:
 
 def connect(address: str = "") -> None:
     """Use the Ray that this process is connected to, or connect it.
-
-    Args:
-        address: As ``ray.init`` takes it; without one a cluster that runs already, and else a local
-            one is started, with a warning that says so.
-
-    Raises:
-        PolicyError: The process is connected to another cluster.
-        SandboxUnavailableError: Ray does not come up, or no cluster is there.
+    ``address``: as ``ray.init`` takes it; without one a cluster that runs already, and else a local
+    one is started, with a warning that says so.
+    Raises ``PolicyError``: the process is connected to another cluster;
+    ``SandboxUnavailableError``: Ray does not come up, or no cluster is there.
     """
     check_installed()
     import ray
@@ -128,9 +124,7 @@ def job() -> str | None:
 
 class PlacedActor:
     """An actor with a worker server, of this process.
-
-    Args:
-        options: How Ray places it, as ``ActorClass.options`` takes them.
+    ``options``: how Ray places it, as ``ActorClass.options`` takes them.
     """
 
     def __init__(self, options: Mapping[str, Any]) -> None:
@@ -152,11 +146,8 @@ class PlacedActor:
 
     def start(self, client_key: str, within_s: float) -> dict[str, Any]:
         """Have it started, once Ray has placed it.
-
-        Raises:
-            ServerBusyError: Ray finds no place in time.
-            SandboxUnavailableError: A node cannot make the ``runtime_env``.
-            WorkerStartupError: The actor or the server has ended.
+        Raises ``ServerBusyError``: Ray finds no place in time; ``SandboxUnavailableError``: a node
+        cannot make the ``runtime_env``; ``WorkerStartupError``: the actor or the server has ended.
         """
         import ray
 

@@ -100,10 +100,8 @@ class RaySandbox(Sandbox):
         self, snapshot: Path, policy: Policy, runtime: Runtime, assets: tuple[Path, ...] = ()
     ) -> RayRepository:
         """The place for one repository. Starts nothing, and connects to nothing.
-
-        Raises:
-            PolicyError: The policy names what a client of another host cannot have.
-            SandboxUnavailableError: Ray is not installed.
+        Raises ``PolicyError``: the policy names what a client of another host cannot have;
+        ``SandboxUnavailableError``: Ray is not installed.
         """
         cluster.check_installed()
         remote.check_policy(policy, runtime)

@@ -35,8 +35,7 @@ class JailSource:
         forget_manifest: Drops the remembered manifest, when a jail contradicts it.
         expected: What such a jail is going to be.
 
-    Attributes:
-        shared: Whether several environments live in one jail.
+    ``shared``: whether several environments live in one jail.
     """
 
     shared = False

@@ -123,9 +123,7 @@ class LoadedJail:
 
 class Launcher:
     """Opens and ends the jails of one repository. Thread-safe.
-
-    Args:
-        store: The folder that snapshots lie in.
+    ``store``: the folder that snapshots lie in.
 
     Attributes:
         runs_on: What runs it where it runs; a remembered manifest holds for this only.
@@ -167,14 +165,10 @@ class Launcher:
 
     def open(self, deadline: Deadline, known: ExpectedManifest | None = None) -> LoadedJail:
         """Fork a jail and have its first runner call ``make_env``.
-
-        Args:
-            known: What that returns. It is then described no more, which for a suite means to build
-                an environment of each of its tasks; ``BuildDone`` is held against it instead.
-
-        Raises:
-            LoadError: The repository failed to load, or returned something unusable.
-            WorkerError: The jail did not come up, died, or took too long.
+        ``known``: what that returns. It is then described no more, which for a suite means to build
+        an environment of each of its tasks; ``BuildDone`` is held against it instead.
+        Raises ``LoadError``: the repository failed to load, or returned something unusable;
+        ``WorkerError``: the jail did not come up, died, or took too long.
         """
         failures: list[EnvHubError] = []
         for place in self._sandbox.candidates():

@@ -20,10 +20,10 @@ from time import perf_counter_ns
 from typing import Any, TypeVar
 
 from envhub_sandbox.errors import LocalProtocolError, WorkerError, WorkerTimeoutError
-from envhub_sandbox.session.attribute_cache import FleetAttributes
 from envhub_sandbox.session.counters import LEDGER, FleetCounters, Labels
 from envhub_sandbox.session.crash.history import History
 from envhub_sandbox.session.env_session import GRACE_S, EnvSession
+from envhub_sandbox.session.lease import FleetAttributes
 from envhub_sandbox.session.prewarm import FleetPrewarm
 from envhub_sandbox.session.recovery import mark_revived
 from envhub_sandbox.session.requests import (

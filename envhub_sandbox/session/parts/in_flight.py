@@ -93,10 +93,8 @@ class InFlight:
 
     def rows(self, env_ids: Any) -> Rows:
         """Those of these ids; of all for None.
-
-        Raises:
-            ActionError: There is no such sub-environment, one is named twice, or a worker has
-                another one beside these.
+        Raises ``ActionError``: there is no such sub-environment, one is named twice, or a worker
+        has another one beside these.
         """
         count = len(self._worker_of)
         if env_ids is None:
@@ -203,11 +201,9 @@ class InFlight:
 
     def recv(self, min_ready: int, timeout: float | Deadline | None) -> Received:
         """The results of the first sub-environments that are ready, of each at most one.
-
-        Raises:
-            NoAsyncCallError: Nothing was sent.
-            WorkerTimeoutError: ``timeout`` came first, and nothing is lost; or a worker's own
-                timeout did, as ``Requests.collect_step`` says.
+        Raises ``NoAsyncCallError``: nothing was sent; ``WorkerTimeoutError``: ``timeout`` came
+        first, and nothing is lost; or a worker's own timeout did, as ``Requests.collect_step``
+        says.
         """
         self._order.refuse_if_closed()
         if not self._is_pending():

@@ -89,9 +89,7 @@ class WorkerQueue:
 
     def prepare(self) -> None:
         """With the lock held, before ``step``; nothing is sent. Raises as ``Requests.submit`` does.
-
-        Raises:
-            AlreadyPendingCallError: It owes as many answers as it may.
+        Raises ``AlreadyPendingCallError``: it owes as many answers as it may.
         """
         if len(self._owed) + len(self._waiting) >= MAX_IN_FLIGHT:
             raise AlreadyPendingCallError(
@@ -108,9 +106,7 @@ class WorkerQueue:
 
     def prepare_reset(self) -> None:
         """Likewise before ``reset``: what has died or is late is brought back, as ``reset`` does.
-
-        Raises:
-            AlreadyPendingCallError: It owes an answer.
+        Raises ``AlreadyPendingCallError``: it owes an answer.
         """
         if self.busy:
             raise AlreadyPendingCallError(
