@@ -10,9 +10,9 @@ def main() -> None:
     import signal
     import sys
 
-    from envhub_sandbox.system import processes
+    from envhub_sandbox.system.platform import replace_missing_streams
 
-    processes.replace_missing_streams()
+    replace_missing_streams()
     # its bars would get into ours, and into the stderr of scripts
     os.environ.setdefault("HF_HUB_DISABLE_PROGRESS_BARS", "1")
     for stream in (sys.stdout, sys.stderr):

@@ -46,8 +46,7 @@ from envhub_worker.protocol.confinement import PROFILES
 from envhub_worker.protocol.text import size_text
 
 if TYPE_CHECKING:
-    from envhub_sandbox.sandboxes.remote import RemoteSandbox
-    from envhub_sandbox.sandboxes.remote import ServerFacts
+    from envhub_sandbox.sandboxes.remote import RemoteSandbox, ServerFacts
 
 _PROBE_S = 60.0
 _PROFILES = ("profile", "available", "first step", "enforces", "without")
@@ -116,7 +115,6 @@ def doctor(
 
     Policy(profile=profile)  # refuses a name that there is not, before anything is tried
     if server is not None:
-        from envhub_sandbox.sandboxes.remote import RemoteSandbox
 
         if insecure_loopback and server_key is not None:
             raise UsageError(

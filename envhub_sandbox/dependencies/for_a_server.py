@@ -40,8 +40,9 @@ from envhub_sandbox.dependencies.declared import WantedPackage, check_versions, 
 from envhub_sandbox.dependencies.modules import Guess
 from envhub_sandbox.dependencies.request import DATE, PackageRequest
 from envhub_sandbox.errors import DependencyError, PackagesTooLargeError, RequirementError
-from envhub_sandbox.system import locks, processes
+from envhub_sandbox.system import locks
 from envhub_sandbox.system.folders import CACHE_VARIABLE, remove_tree
+from envhub_sandbox.system.platform import end_with, pidfd
 from envhub_worker.protocol.text import printable
 
 BLOCK_BYTES = 4096
@@ -91,7 +92,7 @@ def _say(what: Mapping[str, Any]) -> None:
 
 def _made(order: Mapping[str, Any], ended: int | None) -> dict[str, Any]:
     if ended is not None:
-        processes.end_with(ended, 0.0)  # uv is in our group, too
+        end_with(ended, 0.0)  # uv is in our group, too
     os.nice(_NICE)
     _, most = resource.getrlimit(resource.RLIMIT_FSIZE)  # which a plain user cannot raise
     bound = order["bytes"] if most == resource.RLIM_INFINITY else min(order["bytes"], most)
@@ -157,7 +158,7 @@ def _watched(order: Mapping[str, Any], ended: int | None) -> dict[str, Any]:
     """Have it made, within bounds; empty where the process that made it has written the answer."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     if ended is not None:
-        processes.end_with(ended, _CLEANING_S)
+        end_with(ended, _CLEANING_S)
     with _alone(Path(order["folder"])) as held:
         unfinished = Path(order["folder"], "unfinished")
         if unfinished.exists():
@@ -179,7 +180,7 @@ def _watched(order: Mapping[str, Any], ended: int | None) -> dict[str, Any]:
 def _worked(order: Mapping[str, Any], held: int) -> bool:
     """Whether it has come to an end that leaves nothing half-made."""
     program = [sys.executable, "-I", "-m", "envhub_sandbox.dependencies.for_a_server"]
-    with processes.pidfd() as ourselves:
+    with pidfd() as ourselves:
         process = subprocess.Popen(
             [*program, "make", f"{_PIDFD}{ourselves}"],
             stdin=subprocess.PIPE,

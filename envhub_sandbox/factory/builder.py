@@ -25,8 +25,8 @@ from envhub_sandbox.sandboxes.process import PROCESS
 from envhub_sandbox.session.jails.launcher import Launcher
 from envhub_sandbox.session.repository import Recipe, Repository
 from envhub_sandbox.settings.policy import Limits, Policy, Timeouts
-from envhub_sandbox.system import processes
 from envhub_sandbox.system.folders import CACHE_VARIABLE, cache_root
+from envhub_sandbox.system.platform import end_with
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.runtime import Runtime
@@ -36,7 +36,7 @@ _PIECE = 16 * 2**20
 
 def main(folder: Path, ended: int) -> int:
     """Carry out the order that lies in a folder."""
-    processes.end_with(ended, 10.0)
+    end_with(ended, 10.0)
     order = json.loads((folder / "order.json").read_text())
     os.environ[CACHE_VARIABLE] = str(folder / "cache")  # it goes with the folder
     try:

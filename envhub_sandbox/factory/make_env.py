@@ -33,8 +33,8 @@ from envhub_sandbox.session.repository import (
 )
 from envhub_sandbox.settings.options import Options, option_name
 from envhub_sandbox.settings.policy import Limits, Policy, Timeouts, policy_from, timeouts_from
-from envhub_sandbox.system import processes
 from envhub_sandbox.system.folders import cache_root
+from envhub_sandbox.system.platform import occupy_streams
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_sandbox.vector.tracebacks import short_traceback
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
@@ -156,7 +156,7 @@ def _make(cfg: Any, given: Options) -> EnvSuites:
     options = given.checked()
     if options.sandbox is None:
         return _make_here(reference, config, options)
-    processes.occupy_streams()  # before anything of ours is opened
+    occupy_streams()  # before anything of ours is opened
     wanted = _wanted(options.sandbox, options)
     snapshot = snapshot_named(reference, **options.hub)
     locked = wanted.lock.assets if wanted.lock is not None else ()

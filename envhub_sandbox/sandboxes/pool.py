@@ -28,8 +28,7 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from time import monotonic
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
-from envhub_sandbox.system.platform import run_after_fork
-from envhub_sandbox.system.processes import OwnerProcess
+from envhub_sandbox.system.platform import OwnerProcess, run_after_fork
 
 if TYPE_CHECKING:
     from envhub_sandbox.transport.tcp import TcpServer

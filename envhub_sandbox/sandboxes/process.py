@@ -35,11 +35,18 @@ from envhub_sandbox.errors import SandboxUnavailableError, WorkerStartupError
 from envhub_sandbox.sandboxes.pool import ServerPool, ServerUse, WorkerServer
 from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.settings.options import option_name
-from envhub_sandbox.system import processes
 from envhub_sandbox.system.locks import LifeLock, is_held
 from envhub_sandbox.system.log import WORKER
-from envhub_sandbox.system.platform import IS_LINUX, IS_WINDOWS, NAME, boot_id, user_id
-from envhub_sandbox.system.processes import OwnerProcess, has_ended
+from envhub_sandbox.system.platform import (
+    IS_LINUX,
+    IS_WINDOWS,
+    NAME,
+    OwnerProcess,
+    boot_id,
+    has_ended,
+    pidfd,
+    user_id,
+)
 from envhub_worker.protocol.runtime import OWN, Runtime
 
 if TYPE_CHECKING:
@@ -224,7 +231,7 @@ def _execute(
         *("--readable-root", str(store)),
         *("--ahead", "--python", runtime.python, "--packages", runtime.packages),
     ]
-    with (server.folder / "server.log").open("wb") as log, processes.pidfd() as ourselves:
+    with (server.folder / "server.log").open("wb") as log, pidfd() as ourselves:
         return subprocess.Popen(
             [*arguments, "--ready-fd", str(ready), "--client-pidfd", str(ourselves)],
             stdin=subprocess.DEVNULL,

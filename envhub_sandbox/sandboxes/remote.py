@@ -26,7 +26,7 @@ from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.settings.policy import Policy
 from envhub_sandbox.system.log import WORKER
-from envhub_sandbox.system.processes import OwnerProcess
+from envhub_sandbox.system.platform import OwnerProcess
 from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.replies import expect_reply

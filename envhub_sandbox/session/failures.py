@@ -15,7 +15,7 @@ from envhub_sandbox.session.lease import Lease, closed_during
 from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.settings.policy import Policy
 from envhub_sandbox.system.log import WORKER
-from envhub_sandbox.system.processes import fork_error_text
+from envhub_sandbox.system.platform import fork_error_text
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_worker.protocol.lifecycle import Event, State
 

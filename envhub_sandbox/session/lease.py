@@ -22,7 +22,7 @@ from envhub_sandbox.session.counters import Counters
 from envhub_sandbox.session.jails.builder import Builder, JailSource
 from envhub_sandbox.session.jails.launcher import LoadedJail
 from envhub_sandbox.session.repository import Repository
-from envhub_sandbox.system.processes import OwnerProcess
+from envhub_sandbox.system.platform import OwnerProcess
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
 from envhub_sandbox.transport.replies import UnreachableError
 from envhub_sandbox.transport.results import Results

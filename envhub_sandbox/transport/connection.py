@@ -22,7 +22,7 @@ from envhub_sandbox.errors import (
     WorkerTimeoutError,
 )
 from envhub_sandbox.settings.options import option_name
-from envhub_sandbox.system.processes import OwnerProcess, fork_error_text
+from envhub_sandbox.system.platform import OwnerProcess, fork_error_text
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.replies import expect_reply
 from envhub_sandbox.transport.tcp import TcpLink, TcpServer

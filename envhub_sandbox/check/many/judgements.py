@@ -19,8 +19,7 @@ from pathlib import Path
 from typing import Generic, TypeVar
 
 from envhub_sandbox.errors import WorkerStartupError
-from envhub_sandbox.system import processes
-from envhub_sandbox.system.platform import kill_group, own_group
+from envhub_sandbox.system.platform import kill_group, own_group, pidfd
 from envhub_worker.protocol.text import printable, size_text
 
 _TICK_S = 0.1
@@ -65,7 +64,7 @@ class _Job(Generic[T]):
         with (
             self._file("out").open("xb") as out,
             self._file("err").open("xb") as err,
-            processes.pidfd() as ourselves,
+            pidfd() as ourselves,
         ):
             try:
                 self._process: subprocess.Popen[bytes] = subprocess.Popen(

@@ -9,12 +9,12 @@ from __future__ import annotations
 import sys
 
 from envhub_sandbox.check.many.judgements import PATIENCE_S
-from envhub_sandbox.system import processes
+from envhub_sandbox.system.platform import end_with
 
 
 def main() -> None:
     """Run the command line; never returns."""
-    processes.end_with(int(sys.argv.pop(1)), PATIENCE_S)
+    end_with(int(sys.argv.pop(1)), PATIENCE_S)
     from envhub_sandbox.cli import main as command_line
 
     command_line()

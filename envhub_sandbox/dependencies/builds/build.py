@@ -30,7 +30,7 @@ from envhub_sandbox.dependencies.request import PackageRequest, Tell
 from envhub_sandbox.dependencies.resolve import Lock
 from envhub_sandbox.errors import DependencyError, RequirementError, ResolutionError
 from envhub_sandbox.hub.logins import without_login
-from envhub_sandbox.system import processes
+from envhub_sandbox.system.platform import pidfd
 from envhub_worker.protocol.runtime import OWN
 from envhub_worker.protocol.text import printable
 
@@ -73,7 +73,7 @@ def _run(order: Mapping[str, Any], folder: Path) -> dict[str, Any]:
         "profile": os.environ.get(PROFILE_VARIABLE) or "strict",
     }
     (folder / "order.json").write_text(json.dumps(whole))
-    with processes.pidfd() as ourselves:
+    with pidfd() as ourselves:
         done = subprocess.run(
             [sys.executable, "-I", "-m", _PROGRAM, str(folder), str(ourselves)],
             stdin=subprocess.DEVNULL,

@@ -21,8 +21,7 @@ from envhub_sandbox.sandboxes.pool import ServerPool, ServerUse, WorkerServer
 from envhub_sandbox.sandboxes.process import CONTAINER, LocalServer
 from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.settings.policy import Policy
-from envhub_sandbox.system import processes
-from envhub_sandbox.system.platform import cores, user_id
+from envhub_sandbox.system.platform import cores, pidfd, user_id
 from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_worker.protocol import messages as m
@@ -141,7 +140,7 @@ class RepositoryContainer(Sandbox):
 
     def _execute(self, server: ContainerServer, ready: int) -> subprocess.Popen[bytes]:
         server.wanted = wanted = self._wanted(server.folder)
-        with processes.pidfd() as ourselves:
+        with pidfd() as ourselves:
             return subprocess.Popen(
                 [
                     *(sys.executable, "-I", "-S", str(_MONITOR), str(ourselves), str(ready)),

@@ -36,8 +36,7 @@ from envhub_sandbox.sandboxes.pool import WorkerServer
 from envhub_sandbox.sandboxes.process import CONTAINER, RuntimeFolder, remove_stale
 from envhub_sandbox.sandboxes.remote import RemoteServer
 from envhub_sandbox.sandboxes.remote_repository import UploadedRepository
-from envhub_sandbox.system.platform import cores, own_group, run_after_fork
-from envhub_sandbox.system.processes import OwnerProcess
+from envhub_sandbox.system.platform import OwnerProcess, cores, own_group, run_after_fork
 from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.tcp import TcpServer, new_keys

@@ -20,8 +20,8 @@ from typing import Any
 
 from envhub_sandbox.dependencies import index
 from envhub_sandbox.sandboxes.process import BOOTSTRAP
-from envhub_sandbox.system import processes
 from envhub_sandbox.system.folders import cache_root
+from envhub_sandbox.system.platform import pidfd
 
 STARTUP_S = 120.0
 _LINE_BYTES = 4096
@@ -80,7 +80,7 @@ class WorkerActor:
     def _executed(self, bind: str, client_key: str, ready: int) -> subprocess.Popen[bytes]:
         # whoever may start an actor may do anything here: there is nothing to forbid this client
         permitted = ("--weakest-profile=container", "--allow-network", "--allow-gpu")
-        with processes.pidfd() as ourselves:
+        with pidfd() as ourselves:
             return subprocess.Popen(
                 [
                     *(sys.executable, "-I", str(BOOTSTRAP), "worker", "listen", "--bind", bind),

@@ -23,7 +23,7 @@ from envhub_sandbox.session.error_text import name_denied, read_denials
 from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.system.log import WORKER
-from envhub_sandbox.system.processes import OwnerProcess
+from envhub_sandbox.system.platform import OwnerProcess
 from envhub_sandbox.transport.deadline import Deadline, PartDeadline
 from envhub_sandbox.transport.output import OutputFollower, OutputSinks
 from envhub_sandbox.transport.replies import expect_reply, typed_reply

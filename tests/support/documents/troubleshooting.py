@@ -59,7 +59,7 @@ _PARTS = (
         "Environments in use",
         (
             *("envhub_sandbox/session", "envhub_sandbox/vector", "envhub_sandbox/transport"),
-            "envhub_sandbox/system/processes.py",
+            "envhub_sandbox/system/platform.py",
         ),
         "faults.md",
     ),

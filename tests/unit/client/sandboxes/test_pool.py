@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from envhub_sandbox.sandboxes import pool as pool_module
 from envhub_sandbox.sandboxes.docker import container as docker
 from envhub_sandbox.sandboxes.docker.engines import Engine
 from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
-from envhub_sandbox.sandboxes.pool import ServerPool, ServerUse, WorkerServer
+from envhub_sandbox.sandboxes.pool import ServerHold, ServerPool, ServerUse, WorkerServer
 from envhub_sandbox.settings.policy import Policy
 from tests.support import inside
 from tests.support.in_process.interrupts import before_line
@@ -351,3 +352,115 @@ def test_a_container_changes_hands_only_when_it_is_idle(
     further = sandbox("/two").acquire(Path("/")), sandbox(network="loopback").acquire(Path("/"))
     assert other.server not in [use.server for use in further]
     assert sandbox().acquire(Path("/")).server is other.server
+
+
+# --- kept from a suite's first jail to its last environment --------------------------------------
+
+
+@pytest.fixture
+def use(pool: Pool) -> Callable[[], ServerUse[Server]]:
+    """Gives a use of the one server; a fresh one where it has died."""
+    return partial(pool.acquire, "key", Server)
+
+
+@pytest.fixture
+def events() -> list[str]:
+    return []
+
+
+@pytest.fixture
+def hold(use: Callable[[], ServerUse[Server]], events: list[str]) -> ServerHold:
+    return ServerHold(use, lambda: events.append("enter"), lambda: events.append("empty"))
+
+
+def test_it_lasts_from_the_first_jail_to_the_last_environment(
+    hold: ServerHold, use: Callable[[], ServerUse[Server]], events: list[str]
+) -> None:
+    """However many jails come and go in between; to leave twice is to leave once."""
+    leave_one, leave_two = hold.enter(), hold.enter()
+    taken = use()
+    server = taken.server
+    for _ in range(3):
+        hold.keep(server)
+    taken.release()
+    assert taken.users() == 1
+    for _ in range(2):
+        leave_one()
+    assert not server.ends
+    assert events == ["enter"] * 2
+    leave_two()
+    assert server.ends
+    assert events == ["enter"] * 2 + ["empty"]
+    hold.keep(server)  # there is no environment that could need it
+    assert taken.users() == 0
+
+
+def test_it_moves_on_from_a_server_that_has_died(
+    hold: ServerHold, use: Callable[[], ServerUse[Server]]
+) -> None:
+    leave = hold.enter()
+    dead = use()
+    hold.keep(dead.server)
+    dead.release()
+    dead.server.runs = False
+    fresh = use()
+    hold.keep(fresh.server)
+    assert dead.server.ends
+    assert fresh.users() == 2
+    fresh.release()
+    leave()
+    assert fresh.server.ends
+
+
+def test_an_interrupted_end_is_finished_by_the_next_leave(
+    hold: ServerHold, use: Callable[[], ServerUse[Server]], events: list[str]
+) -> None:
+    """A Ctrl-C came while it waited for a jail that was still ending, and another at the server."""
+    leave, further = hold.enter(), hold.enter()
+    taken = use()
+    server = taken.server
+    hold.keep(server)
+    taken.release()
+
+    def interrupted() -> None:
+        raise KeyboardInterrupt
+
+    assert hold.close_later(server, interrupted)
+    further()
+    server.stop = interrupted  # type: ignore[method-assign]
+    with pytest.raises(KeyboardInterrupt):
+        leave()
+    del server.stop
+    assert (server.ends, "empty" in events) == ([], False)
+    leave()
+    assert server.ends
+    assert events[-1] == "empty"
+
+
+def test_each_end_is_waited_for_once_by_the_next_or_the_last(
+    hold: ServerHold, use: Callable[[], ServerUse[Server]]
+) -> None:
+    """Never more than one is left; one that the garbage collector adds meanwhile is not lost."""
+    leave, further = hold.enter(), hold.enter()
+    server = use().server
+    waited: list[int] = []
+    assert not hold.close_later(server, lambda: waited.append(-1))  # it is not kept
+    taken = use()
+    hold.keep(taken.server)
+    for number in range(3):
+        assert hold.close_later(taken.server, partial(waited.append, number))
+        assert waited == list(range(number))
+    assert hold.settle()
+    assert waited == [0, 1, 2]
+    assert not hold.settle()
+
+    def collected() -> None:
+        assert hold.close_later(taken.server, partial(waited.append, 4))
+        waited.append(3)
+
+    assert hold.close_later(taken.server, collected)
+    assert hold.settle()
+    assert waited == [0, 1, 2, 3, 4]
+    further()
+    assert not hold.close_later(taken.server, lambda: waited.append(-1))  # no other is to come
+    leave()

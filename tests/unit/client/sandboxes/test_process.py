@@ -12,7 +12,7 @@ from collections.abc import Iterator
 import pytest
 
 from envhub_sandbox.sandboxes.process import SERVER, LocalServer
-from envhub_sandbox.system.processes import has_ended
+from envhub_sandbox.system.platform import has_ended
 from tests.support.processes import eventually
 
 DEAF = "import os, signal; signal.signal(15, signal.SIG_IGN); os.close(1); os.read(0, 1)"

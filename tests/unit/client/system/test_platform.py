@@ -88,8 +88,8 @@ for _ in range(2):
 """
 _STARTS = """
 import os, subprocess, sys, time
-from envhub_sandbox.system import processes
-with processes.pidfd() as ourselves:
+from envhub_sandbox.system.platform import end_with, pidfd
+with pidfd() as ourselves:
     command = [sys.executable, "-I", "-c", sys.argv[1], str(ourselves)]
     child = subprocess.Popen(command, pass_fds=(ourselves,), start_new_session=True)
 fork = os.fork()
@@ -101,8 +101,8 @@ time.sleep(3600)
 """
 _FOLLOWS = """
 import sys, time
-from envhub_sandbox.system import processes
-processes.end_with(int(sys.argv[1]), 0.0)
+from envhub_sandbox.system.platform import end_with, pidfd
+end_with(int(sys.argv[1]), 0.0)
 time.sleep(3600)
 """
 _ALARMED = """

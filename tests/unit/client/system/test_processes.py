@@ -14,18 +14,17 @@ from pathlib import Path
 import psutil
 import pytest
 
-from envhub_sandbox.system import processes
-from envhub_sandbox.system.processes import OwnerProcess, fork_error_text
+from envhub_sandbox.system.platform import OwnerProcess, fork_error_text, pidfd
 from envhub_sandbox.system.threads import Calls
 from tests.support.command_line import runs
 from tests.support.processes import eventually
 
 _PARENT = """
 import fcntl, resource, subprocess, sys, threading, time
-from envhub_sandbox.system import processes
+from envhub_sandbox.system.platform import end_with, pidfd
 
 def start():
-    with processes.pidfd() as ourselves:
+    with pidfd() as ourselves:
         number = ourselves
         if sys.argv[1] == "high":  # beyond what select() can wait for
             _, most = resource.getrlimit(resource.RLIMIT_NOFILE)
@@ -41,7 +40,7 @@ time.sleep(3600)
 """
 _CHILD = """
 import os, signal, subprocess, sys, time
-from envhub_sandbox.system import processes
+from envhub_sandbox.system.platform import end_with, pidfd
 
 def end(*_):
     open("ended", "x").close()
@@ -52,7 +51,7 @@ signal.signal(signal.SIGTERM, signal.SIG_IGN if how == "stubborn" else end)
 below = subprocess.Popen([sys.executable, "-I", "-c", "import time; time.sleep(3600)"])
 if how != "nobody":
     patience = {"at once": 0.0, "stubborn": 0.1}.get(how, 600.0)
-    processes.end_with(int(sys.argv[1]), patience)
+    end_with(int(sys.argv[1]), patience)
 print(os.getpid(), below.pid, flush=True)
 time.sleep(3600)
 """
@@ -96,7 +95,7 @@ def test_without_it_it_would_stay(tmp_path: Path) -> None:
 
 
 def test_a_fork_is_another_process() -> None:
-    with processes.pidfd() as ourselves:  # for one alone: not for who is started meanwhile
+    with pidfd() as ourselves:  # for one alone: not for who is started meanwhile
         assert not os.get_inheritable(ourselves)
     owner = OwnerProcess()
     assert owner.is_here

@@ -6,15 +6,17 @@ import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
+from unittest.mock import MagicMock
 
 import pytest
 
 from envhub_sandbox.errors import EnvHubError, ServerBusyError, WorkerDiedError, WorkerStartupError
 from envhub_sandbox.sandboxes import sandbox as module
 from envhub_sandbox.sandboxes.sandbox import Sandbox, retry_while_busy
+from envhub_sandbox.session.jails.builder import JailSource, SharedJail
 from envhub_sandbox.session.jails.launcher import Launcher, LoadedJail
 from envhub_sandbox.transport import connection
-from envhub_sandbox.transport.deadline import StartupDeadline
+from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.messages.server import DRAINING
 from tests.support.in_process.fake_lane import FakeLane, session_over
@@ -232,3 +234,57 @@ def test_the_line_ends_with_its_time(now: list[float]) -> None:
 def test_a_death_is_no_reason_to_wait(error: EnvHubError) -> None:
     with pytest.raises(WorkerDiedError):
         asked(error)
+
+
+# --- One jail for all environments of a repository: opened by the first, ended with the last
+
+
+class _Loaded(SimpleNamespace):
+    """A connection to the jail number 7; by identity."""
+
+    __hash__ = object.__hash__
+    __eq__ = object.__eq__
+
+
+def loaded() -> Any:
+    return _Loaded(jail=MagicMock(number=7))
+
+
+@pytest.fixture
+def opener() -> Any:
+    return MagicMock(open=MagicMock(side_effect=lambda *_: loaded()), connect=lambda *_: loaded())
+
+
+def test_it_is_opened_once_and_ends_with_its_last_user(opener: Any) -> None:
+    source = SharedJail(opener, lambda: None)
+    users = [source.take(Deadline(None)) for _ in range(3)]
+    assert opener.open.call_count == 1
+    for user in users:
+        assert not opener.close.called
+        source.give_back(user)
+    assert opener.close.call_count == 1
+    source.take(Deadline(None))
+    assert opener.open.call_count == 2
+
+
+def test_one_that_was_provided_and_never_taken_is_ended(opener: Any) -> None:
+    """By the close of its suite, once; while somebody uses it that ends nothing."""
+    source = SharedJail(opener, lambda: None)
+    source.provide(loaded())
+    user = source.take(Deadline(None))
+    assert not opener.open.called
+    source.close()
+    assert not opener.close.called
+    source.give_back(user)
+    source.close()
+    assert opener.close.call_count == 1
+
+
+def test_a_worker_that_is_given_up_is_given_up_for_all(opener: Any) -> None:
+    """They share its process; a jail of one's own is nobody else's."""
+    source = SharedJail(opener, lambda: None)
+    one, _ = source.take(Deadline(None)), source.take(Deadline(None))
+    source.end(one)
+    assert (opener.interrupt.call_count, opener.close.call_count) == (1, 1)
+    own = JailSource(opener, lambda: None)
+    assert own.take(Deadline(None)) is not own.take(Deadline(None))
