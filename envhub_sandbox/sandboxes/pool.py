@@ -28,7 +28,7 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from time import monotonic
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
-from envhub_sandbox.system.platform import OwnerProcess, run_after_fork
+from envhub_sandbox.system.platform import OwnerProcess, each_after_fork
 
 if TYPE_CHECKING:
     from envhub_sandbox.transport.tcp import TcpServer
@@ -415,10 +415,5 @@ def _stop_all() -> None:
             stack.callback(pool.stop_all)
 
 
-def _forked() -> None:
-    for pool in list(_pools):
-        pool.forked()
-
-
 atexit.register(_stop_all)
-run_after_fork(_forked)
+each_after_fork(_pools, ServerPool.forked)

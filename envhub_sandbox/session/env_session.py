@@ -31,7 +31,7 @@ from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.session.requests import Requests
 from envhub_sandbox.session.use_lock import UseLock
 from envhub_sandbox.system.log import WORKER
-from envhub_sandbox.system.platform import run_after_fork
+from envhub_sandbox.system.platform import each_after_fork
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.replies import RunnersDiedError
 from envhub_sandbox.transport.results import Results
@@ -77,6 +77,7 @@ class EnvSession:
         self.history = history = history if whole is None else PartHistory(manifest, whole)
         results = Results(manifest, self.bounds)
         self.lease = lease = Lease(jails, results, self.lifecycle, counters, trials)
+        self.report, self.denials = lease.report, lease.denials
         self._restarts = Restarts(policy, counters)
         self._failures = failures = Failures(lease, history)
         self.use = use = UseLock(lease, failures)
@@ -131,14 +132,6 @@ class EnvSession:
         counts = {name: status.get(name) for name in _USAGE}
         known = all(type(one) is int and 0 <= one < _MOST for one in counts.values())
         return cast("dict[str, int]", counts) if known else {}
-
-    def report(self) -> list[dict[str, Any]]:
-        """The layers of its jail; none where there is none."""
-        return self.lease.report()
-
-    def denials(self) -> tuple[str, ...] | None:
-        """What its jail was denied; None where it is not recorded."""
-        return self.lease.denials()
 
     def stats(self) -> dict[str, Any]:
         """Counters, and its state."""
@@ -251,9 +244,8 @@ class EnvSession:
             finally:
                 self.use.lock.release()
 
-    def finalize(self) -> None:
-        """Close it in a finalizer."""
-        self.close()
+    finalize = close
+    """What a finalizer calls."""
 
     def _finish(self) -> None:
         if self.use.lock.acquire(blocking=False):  # else another thread is closing it
@@ -299,11 +291,4 @@ class EnvSession:
 
 
 _living: weakref.WeakSet[EnvSession] = weakref.WeakSet()
-
-
-def _abandon_all() -> None:
-    for env in list(_living):
-        env.abandon()
-
-
-run_after_fork(_abandon_all)  # interruption.md, rule 14
+each_after_fork(_living, EnvSession.abandon)  # interruption.md, rule 14

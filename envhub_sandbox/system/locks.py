@@ -17,7 +17,7 @@ import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from envhub_sandbox.system.platform import open_flags, run_after_fork
+from envhub_sandbox.system.platform import each_after_fork, open_flags
 
 if sys.platform == "win32":
     import msvcrt
@@ -227,11 +227,4 @@ def _close(held: list[int]) -> None:
 
 # interruption.md, rules 14 and 15
 _locks: weakref.WeakSet[_HeldLock] = weakref.WeakSet()
-
-
-def _forked() -> None:
-    for lock in _locks:
-        lock.release()
-
-
-run_after_fork(_forked)
+each_after_fork(_locks, _HeldLock.release)

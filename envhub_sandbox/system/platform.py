@@ -30,11 +30,12 @@ import time
 import unicodedata
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
     import subprocess
 
+T = TypeVar("T")
 IS_LINUX: bool = sys.platform == "linux"
 IS_WINDOWS: bool = sys.platform == "win32"
 NAME: str = {"darwin": "macOS", "win32": "Windows"}.get(sys.platform, sys.platform)
@@ -88,6 +89,16 @@ def run_after_fork(function: Callable[[], object]) -> None:
     """Have each fork of this process call a function first; Windows forks none."""
     if sys.platform != "win32":
         os.register_at_fork(after_in_child=function)
+
+
+def each_after_fork(objects: Iterable[T], function: Callable[[T], object]) -> None:
+    """The same of each object that there is then."""
+
+    def forked() -> None:
+        for one in list(objects):
+            function(one)
+
+    run_after_fork(forked)
 
 
 def own_group() -> dict[str, Any]:

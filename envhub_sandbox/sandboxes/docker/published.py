@@ -36,7 +36,7 @@ from envhub_sandbox.sandboxes.pool import WorkerServer
 from envhub_sandbox.sandboxes.process import CONTAINER, RuntimeFolder, remove_stale
 from envhub_sandbox.sandboxes.remote import RemoteServer
 from envhub_sandbox.sandboxes.remote_repository import UploadedRepository
-from envhub_sandbox.system.platform import OwnerProcess, cores, own_group, run_after_fork
+from envhub_sandbox.system.platform import OwnerProcess, cores, each_after_fork, own_group
 from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.tcp import TcpServer, new_keys
@@ -230,11 +230,4 @@ class EngineRun:
 
 
 _runs: weakref.WeakSet[EngineRun] = weakref.WeakSet()
-
-
-def _forked() -> None:
-    for run in list(_runs):
-        run.let_go()
-
-
-run_after_fork(_forked)
+each_after_fork(_runs, EngineRun.let_go)

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import copy
 from collections import deque
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Any
 
@@ -97,12 +97,9 @@ class WorkerQueue:
                 "results were not received: call `recv` first",
                 "send",
             )
-        if not self.busy:
-            try:
+        if not self.busy and self.part.lifecycle.state is not State.READY:
+            with self._naming():
                 self._requests.make_ready("step")
-            except EnvHubError as error:
-                self._name(error)
-                raise
 
     def prepare_reset(self) -> None:
         """Likewise before ``reset``: what has died or is late is brought back, as ``reset`` does.
@@ -114,12 +111,9 @@ class WorkerQueue:
                 "received: call `recv` first, or `reset` for all",
                 "send",
             )
-        try:
+        with self._naming():
             self.part.recover()
             self._requests.make_ready("reset")
-        except EnvHubError as error:
-            self._name(error)
-            raise
 
     def step(self, actions: Any) -> None:
         """After ``prepare``, send it a step. Where that fails, ``take`` raises it."""
@@ -166,27 +160,29 @@ class WorkerQueue:
         if not self._owed:
             failure, self.failure = self.failure, None
             assert failure is not None
-            self._name(failure)
-            raise failure
+            with self._naming():
+                raise failure
         self.taking = True  # interruption.md, rule 1
         try:
             result = self._take()
             if self._sliced:
                 self._check(result)
             keep(result)
-        except EnvHubError as error:
+        except (EnvHubError, RemoteEnvWarning):
             self._go_on()
-            self._name(error)
-            raise
-        except RemoteEnvWarning:
-            self._go_on()
-            raise
+            with self._naming():
+                raise
         self._go_on()
 
-    def _name(self, error: EnvHubError) -> None:
-        """Have it say whose it is."""
-        self.part.name_in(error)
-        error.env_ids = tuple(range(*self.rows))
+    @contextmanager
+    def _naming(self) -> Iterator[None]:
+        """Have an error say whose it is."""
+        try:
+            yield
+        except EnvHubError as error:
+            self.part.name_in(error)
+            error.env_ids = tuple(range(*self.rows))
+            raise
 
     def _take(self) -> StepResult:
         if self._owed[0] == "step":
