@@ -22,7 +22,7 @@ from envhub_sandbox.factory import build_env
 from envhub_sandbox.factory.env_factory import EnvFactory
 from envhub_sandbox.hub.snapshot import local
 from envhub_sandbox.sandboxes.process import PROCESS
-from envhub_sandbox.session.jails.launcher import Launcher
+from envhub_sandbox.session.launcher import Launcher
 from envhub_sandbox.session.repository import Recipe, Repository
 from envhub_sandbox.settings.policy import Limits, Policy, Timeouts
 from envhub_sandbox.system.folders import CACHE_VARIABLE, cache_root

@@ -20,10 +20,10 @@ from typing import TYPE_CHECKING, Any
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.sandboxes.sandbox import retry_while_busy
+from envhub_sandbox.session.builder import JailSource, SharedJail
 from envhub_sandbox.session.crash.history import History
 from envhub_sandbox.session.env_session import EnvSession
-from envhub_sandbox.session.jails.builder import JailSource, SharedJail
-from envhub_sandbox.session.jails.launcher import ExpectedManifest, Launcher, LoadedJail
+from envhub_sandbox.session.launcher import ExpectedManifest, Launcher, LoadedJail
 from envhub_sandbox.session.prewarm import SuitePrewarm, TaskPrewarm
 from envhub_sandbox.settings.policy import Policy
 from envhub_sandbox.system import folders

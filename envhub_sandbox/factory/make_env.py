@@ -24,7 +24,7 @@ from envhub_sandbox.hub.snapshot import Snapshot, snapshot_named
 from envhub_sandbox.hub.sources.assets import with_assets
 from envhub_sandbox.sandboxes import inprocess
 from envhub_sandbox.sandboxes.sandbox import Sandbox, is_list
-from envhub_sandbox.session.jails.launcher import Launcher
+from envhub_sandbox.session.launcher import Launcher
 from envhub_sandbox.session.repository import (
     Recipe,
     Repository,

@@ -198,7 +198,7 @@ def check_platform() -> None:
 def _start(store: Path, runtime: Runtime) -> LocalServer:
     # The order matters. Until the server is ready there is nothing to do, so what takes time and is
     # not needed before belongs here, where it is free: that is why nothing which `make_env` imports
-    # imports ZeroMQ, or what speaks it. `session/jails` imports that where it is used. It has a
+    # imports ZeroMQ, or what speaks it: `session` imports that where it is used. The import has a
     # thread, which a Ctrl-C does not reach: an import of ZeroMQ that was interrupted can never be
     # repeated. Whatever fails here, or interrupts it, ends the server.
     importing = threading.Thread(target=_import_quietly, name="envhub-import", daemon=True)

@@ -21,10 +21,10 @@ from envhub_sandbox.errors import (
     WorkerError,
     WorkerTimeoutError,
 )
+from envhub_sandbox.session.builder import JailSource
 from envhub_sandbox.session.counters import LEDGER, Counters, Labels
 from envhub_sandbox.session.crash.history import History, PartHistory
 from envhub_sandbox.session.failures import Failures, Restarts, UseLock
-from envhub_sandbox.session.jails.builder import JailSource
 from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.session.prewarm import INTERRUPT_S, LOOK_S, Prewarm
 from envhub_sandbox.session.repository import Repository

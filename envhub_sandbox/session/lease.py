@@ -18,9 +18,9 @@ import numpy as np
 from envhub_sandbox.errors import EnvHubError, ServerBusyError, WorkerDiedError, WorkerError
 from envhub_sandbox.sandboxes.pool import WorkerServer
 from envhub_sandbox.sandboxes.sandbox import is_draining, is_unanswered, retry_while_busy
+from envhub_sandbox.session.builder import Builder, JailSource
 from envhub_sandbox.session.counters import Counters
-from envhub_sandbox.session.jails.builder import Builder, JailSource
-from envhub_sandbox.session.jails.launcher import LoadedJail
+from envhub_sandbox.session.launcher import LoadedJail
 from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.system.platform import OwnerProcess
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline

@@ -2,7 +2,7 @@
 
 There are three: ``RelayLane``, below; ``ServedLane``, which is the same with faster steps; and
 ``SharedMemoryLane``. Which of them an environment has is decided once, when it is built
-(``session/jails/builder``). What a request means does not depend on the lane.
+(``session/builder``). What a request means does not depend on the lane.
 """
 
 from __future__ import annotations

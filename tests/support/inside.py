@@ -25,11 +25,11 @@ from envhub_sandbox.sandboxes import remote
 from envhub_sandbox.sandboxes.docker import container
 from envhub_sandbox.sandboxes.fleet import fleet
 from envhub_sandbox.session import env_session
+from envhub_sandbox.session import launcher as launcher_module
 from envhub_sandbox.session.counters import Ledger
 from envhub_sandbox.session.crash import bundle_writer
 from envhub_sandbox.session.env_session import EnvSession
-from envhub_sandbox.session.jails import launcher as launcher_module
-from envhub_sandbox.session.jails.launcher import Launcher, LoadedJail
+from envhub_sandbox.session.launcher import Launcher, LoadedJail
 from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.session.repository import Recipe, Repository
 from envhub_sandbox.system import folders

@@ -15,8 +15,8 @@ from envhub_sandbox.errors import LoadError
 from envhub_sandbox.factory.build_env import mend
 from envhub_sandbox.factory.env_factory import EnvFactory
 from envhub_sandbox.hub.snapshot import local
-from envhub_sandbox.session.jails.builder import Builder, JailSource
-from envhub_sandbox.session.jails.launcher import Launcher
+from envhub_sandbox.session.builder import Builder, JailSource
+from envhub_sandbox.session.launcher import Launcher
 from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.settings.policy import Policy, Timeouts
 from envhub_sandbox.transport.deadline import Deadline

@@ -13,8 +13,8 @@ import pytest
 from envhub_sandbox.errors import EnvHubError, ServerBusyError, WorkerDiedError, WorkerStartupError
 from envhub_sandbox.sandboxes import sandbox as module
 from envhub_sandbox.sandboxes.sandbox import Sandbox, retry_while_busy
-from envhub_sandbox.session.jails.builder import JailSource, SharedJail
-from envhub_sandbox.session.jails.launcher import Launcher, LoadedJail
+from envhub_sandbox.session.builder import JailSource, SharedJail
+from envhub_sandbox.session.launcher import Launcher, LoadedJail
 from envhub_sandbox.transport import connection
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
 from envhub_worker.protocol import messages as m

@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, NoReturn
 
 from envhub_sandbox.errors import LoadError
-from envhub_sandbox.session.jails.launcher import ExpectedManifest, Launcher, LoadedJail
+from envhub_sandbox.session.launcher import ExpectedManifest, Launcher, LoadedJail
 from envhub_sandbox.system.platform import OwnerProcess
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.replies import typed_reply
