@@ -68,7 +68,7 @@ class WorkerServer(ABC):
     def stop(self) -> None:
         """End it and everything below it, in bounded time. A fork of its owner does nothing.
 
-        Idempotent. If interrupted, the next call finishes the work.
+        Idempotent. If interrupted, the next call finishes the work: interruption.md, rules 7, 14.
         """
 
 

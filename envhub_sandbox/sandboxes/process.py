@@ -137,11 +137,7 @@ class LocalServer(WorkerServer):
         return alive and self._runtime.has_sockets(*self._sockets)
 
     def stop(self) -> None:
-        """End it and everything below it, in bounded time. A fork of its owner does nothing.
-
-        Idempotent. If interrupted, the next call finishes the work: interruption.md,
-        rule 7.
-        """
+        """See ``WorkerServer``, and interruption.md, rule 7."""
         if self.stopped or not self._owner.is_here:
             return
         if self._process is not None:
@@ -331,12 +327,9 @@ def stale_folders(place: Path) -> Iterator[Path]:
 
 
 def remove_stale() -> list[Path]:
-    """Remove those that were not another machine's, or this one's before it started anew.
+    """Remove those that were not another machine's, or this one's before it started anew; which.
 
     These are for people to judge: a file system may be shared, and not pass locks on.
-
-    Returns:
-        What was removed.
     """
     found = [path for place in places() for path in stale_folders(place)]
     ours = [path for path in found if not _is_elsewhere(path)]

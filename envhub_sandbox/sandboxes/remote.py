@@ -241,11 +241,7 @@ class RemoteServer(WorkerServer):
         return True
 
     def stop(self) -> None:
-        """Close what is open there, and no longer say that we live.
-
-        A fork of its owner does nothing. Idempotent. If interrupted, the next call finishes the
-        work: interruption.md, rules 7 and 14.
-        """
+        """Close what is open there, and no longer say that we live; as ``WorkerServer``."""
         if self._ended or not self._owner.is_here:
             return
         self._close_jails()

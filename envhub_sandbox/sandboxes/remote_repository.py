@@ -76,11 +76,7 @@ def _sent(root: Path, path: Path) -> Sent:
 def upload(
     client: WorkerConnection, root: Path, files: tuple[Sent, ...], deadline: Deadline
 ) -> tuple[str, int]:
-    """Bring files to a server.
-
-    Returns:
-        What the server calls the snapshot, and how many bytes had to travel.
-
+    """Bring files to a server; what it calls the snapshot, and how many bytes had to travel.
     Raises ``SnapshotIntegrityError``: a file arrived as another than it left; ``WorkerError``: the
     server does not take them, or took too long.
     """

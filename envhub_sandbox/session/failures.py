@@ -196,10 +196,8 @@ class Failures:
         """The jail has died, or broke a rule of the protocol: the environment is DEAD.
 
         A jail that still lives is ended: after a broken rule, and where it goes on without the
-        runner that has died.
-
-        Returns:
-            The error for the caller; after a ``close`` it says that the environment was closed.
+        runner that has died. Returns the error for the caller; after a ``close`` it says that the
+        environment was closed.
         """
         lifecycle, lease = self._lease.lifecycle, self._lease
         operation = lifecycle.request or "a request"

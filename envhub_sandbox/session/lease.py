@@ -297,12 +297,8 @@ class Lease:
             self.depart()
 
     def interrupt(self, close: Callable[[], None]) -> bool:
-        """In another thread: ``close`` the environment, and end the jail that a request waits for.
-
-        See interruption.md, rule 11.
-
-        Returns:
-            Whether there was one; otherwise a thread that takes one sees that it is closed.
+        """In another thread: ``close`` the environment, and end the jail that a request waits for:
+        interruption.md, rule 11. Whether there was one; else who takes one sees that it is closed.
         """
         with self._ending:
             close()

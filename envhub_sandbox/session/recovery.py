@@ -143,10 +143,8 @@ class Recovery:
         messages_for: MessagesFor,
         rows_of: RowsOf,
     ) -> list[m.Message]:
-        """Have the dead shards brought back, and move on to the state that it leads to.
-
-        Returns:
-            ``replies``, with those of the fresh runners.
+        """Have the dead shards brought back, and move on to the state that it leads to; ``replies``
+        with those of the fresh runners.
         """
         lifecycle, failures = self._lifecycle, self._failures
         lifecycle.moved(Event.LOSS)
@@ -187,8 +185,11 @@ class Recovery:
             self._restarts.spend(operation)
         except WorkerDiedError as spent:
             raise deaths.first from spent
-        self._log(deaths)
         dead = sorted(deaths.deaths)
+        rows = [row for index in dead for row in range(*self._bounds[index])]
+        why, label = str(deaths.first).partition("\n")[0], self._lease.repository.label
+        # which the caller sees in the infos only
+        WORKER.info("%s: %s; sub-environments %s start again in new processes", label, why, rows)
         timeouts = self._lease.repository.timeouts
         deadline = StartupDeadline(timeouts.startup_s)
         if deaths.jail_gone:
@@ -202,12 +203,6 @@ class Recovery:
             return _ask_anew(lane, dead, messages_for, deadline_of_reset)
         except WorkerTimeoutError as error:
             raise self._failures.late("reset", deadline_of_reset) from error
-
-    def _log(self, deaths: RunnersDiedError) -> None:
-        """Log a death that the caller sees in the infos only."""
-        rows = [row for index in sorted(deaths.deaths) for row in range(*self._bounds[index])]
-        why, label = str(deaths.first).partition("\n")[0], self._lease.repository.label
-        WORKER.info("%s: %s; sub-environments %s start again in new processes", label, why, rows)
 
     def _set_again(self, lane: Lane, dead: Sequence[int], deadline: Deadline) -> None:
         """Set attributes in fresh runners; what one's setter raises is only logged."""

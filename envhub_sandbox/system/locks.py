@@ -195,10 +195,8 @@ class SharedLock(_HeldLock):
 
 
 def sharers(path: Path) -> dict[int, str]:
-    """The processes that hold the lock of a file, as far as they are seen from here.
-
-    Returns:
-        Pid to the first words of the command line; none where the kernel has no list of locks.
+    """The processes that hold the lock of a file, as far as they are seen from here: pid to the
+    first words of the command line; none where the kernel has no list of locks.
     """
     if sys.platform != "linux":
         return {}

@@ -201,10 +201,7 @@ class EngineRun:
         return self._process is not None and self._process.poll() is None
 
     def stop(self) -> None:
-        """End the container, in bounded time. A fork of its owner does nothing.
-
-        Idempotent. If interrupted, the next call finishes the work.
-        """
+        """End the container; as ``WorkerServer``."""
         if self.stopped or not self._owner.is_here:
             return
         if self._process is not None:

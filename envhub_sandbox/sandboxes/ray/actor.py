@@ -39,9 +39,8 @@ class WorkerActor:
         """Start the server.
         ``client_key``: the public key of its one client, as text.
 
-        Returns:
-            A JSON object: ``endpoint``, ``key`` (the server's public one), ``node`` (its id) and
-            ``gpus`` (those that Ray has assigned, by index); or ``error``, a text.
+        Returns a JSON object: ``endpoint``, ``key`` (the server's public one), ``node`` (its id)
+        and ``gpus`` (those that Ray has assigned, by index); or ``error``, a text.
         """
         try:
             return json.dumps(self._started(client_key)).encode()

@@ -215,10 +215,8 @@ class RayServer(remote.RemoteServer):
         return self._actor.runs
 
     def stop(self) -> None:
-        """Close what is open there, and end the actor, with which the server ends.
-
-        A fork of its owner does nothing. Idempotent. If interrupted, the next call finishes the
-        work.
+        """Close what is open there, and end the actor, with which the server ends; as
+        ``WorkerServer``.
         """
         if not self._owner.is_here:
             return

@@ -338,10 +338,8 @@ class FleetRequests(RequestOrder):
                     self._each[at].make_ready(operation, start)
 
     def _start(self, parts: Sequence[EnvSession]) -> list[Callable[[], None]]:
-        """Start parts side by side, for this thread, which holds their locks.
-
-        Returns:
-            For each what raises why it could not be started.
+        """Start parts side by side, for this thread, which holds their locks; for each what raises
+        why it could not be started.
         """
         self._wait_for_starts()
         parts[0].prewarm.note_use()  # already: the next task starts beside this
