@@ -15,7 +15,7 @@ from envhub_sandbox.session.crash.bundle_reader import load_bundle, replayed_arg
 from envhub_sandbox.session.crash.replay import replay
 from tests.fuzz.oracle import demand
 from tests.fuzz.targets import Dice
-from tests.unit.client.crash.test_bundle_reader import bundle as written
+from tests.unit.client.session.test_bundle_reader import bundle as written
 
 _MADE: list[Path] = []
 

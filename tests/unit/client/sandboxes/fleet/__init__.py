@@ -1,1 +1,0 @@
-"""The places of a fleet, one module at a time."""

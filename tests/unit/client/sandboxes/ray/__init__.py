@@ -1,1 +1,0 @@
-"""Ray as a place for workers, without Ray."""

@@ -1,1 +1,0 @@
-"""What joins the workers of a fleet, one module at a time."""
