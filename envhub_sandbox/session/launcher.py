@@ -159,9 +159,9 @@ class Launcher:
         """Keep the server between two jails; returns what gives it back."""
         return self._acquire().release
 
-    def _acquire(self) -> ServerUse[WorkerServer]:
+    def _acquire(self, place: Sandbox | None = None) -> ServerUse[WorkerServer]:
         idle_s = self.repository.timeouts.server_idle_s
-        return self._sandbox.acquire(self._store, self.repository.runtime, idle_s)
+        return (place or self._sandbox).acquire(self._store, self.repository.runtime, idle_s)
 
     def open(self, deadline: Deadline, known: ExpectedManifest | None = None) -> LoadedJail:
         """Fork a jail and have its first runner call ``make_env``.
@@ -184,9 +184,8 @@ class Launcher:
     def _open_at(
         self, place: Sandbox, deadline: Deadline, known: ExpectedManifest | None
     ) -> LoadedJail:
-        idle_s = self.repository.timeouts.server_idle_s
         began = monotonic()
-        use = place.acquire(self._store, self.repository.runtime, idle_s)
+        use = self._acquire(place)
         if use.server.far is not None:
             deadline.postpone(monotonic() - began)  # a cluster may have started a machine for it
         try:  # interruption.md, rule 4

@@ -312,11 +312,10 @@ class SeedBook:
 
     def derived(self, bounds: tuple[int, int], restart: int) -> Any:
         """Seeds for the sub-environments of a shard that comes back."""
-        if self._each:
-            return [derived_seed(seed, restart) for seed in self._last[slice(*bounds)]]
-        if isinstance(self._own, list):
-            return [derived_seed(seed, restart) for seed in self._own]
-        return derived_seed(self._own, restart)
+        seeds = self._last[slice(*bounds)] if self._each else self._own
+        if isinstance(seeds, list):
+            return [derived_seed(seed, restart) for seed in seeds]
+        return derived_seed(seeds, restart)
 
 
 def derived_seed(seed: int | None, restart: int) -> int | None:
