@@ -176,13 +176,13 @@ class EnvFactory:
             try:
                 loaded = retry_while_busy(ask, self._launcher.retry_s, deadline, repository.label)
             except BaseException:
-                repository.show_warnings()
+                repository.warnings.show(repository.label)
                 raise
         self._cache.save(loaded.value)
         try:
             self._agrees(loaded.manifest)
             suites = self._suites(loaded.manifest, loaded)
-            repository.show_warnings()
+            repository.warnings.show(repository.label)
             return suites
         except BaseException:
             self._launcher.close(loaded)

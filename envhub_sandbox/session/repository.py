@@ -241,10 +241,6 @@ class Repository:
         known = self.installed, self.latest_profile, self.places
         return provenance_of(self.snapshot, manifest, layers, *known)
 
-    def show_warnings(self) -> None:
-        """Show the caller its new warnings."""
-        self.warnings.show(self.label)
-
     @contextmanager
     def starting(self, deadline: Deadline) -> Iterator[None]:
         """Say what it was that took too long, and keep what led to a death that matters."""

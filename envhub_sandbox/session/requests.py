@@ -185,7 +185,7 @@ class RequestOrder(ABC):
         worker's fault, and must leave no reply owed.
         """
         if self._unshown:
-            self._repository.show_warnings()
+            self._repository.warnings.show(self._repository.label)
 
 
 class Packed(NamedTuple):
