@@ -24,11 +24,12 @@ from envhub_sandbox.errors import (
 from envhub_sandbox.session.builder import JailSource
 from envhub_sandbox.session.counters import LEDGER, Counters, Labels
 from envhub_sandbox.session.crash.history import History, PartHistory
-from envhub_sandbox.session.failures import Failures, Restarts, UseLock
+from envhub_sandbox.session.failures import Failures, Restarts
 from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.session.prewarm import INTERRUPT_S, LOOK_S, Prewarm
 from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.session.requests import Requests
+from envhub_sandbox.session.use_lock import UseLock
 from envhub_sandbox.system.log import WORKER
 from envhub_sandbox.system.platform import each_after_fork
 from envhub_sandbox.transport.deadline import Deadline

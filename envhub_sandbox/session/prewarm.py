@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING
 
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.session.crash.history import History
-from envhub_sandbox.session.failures import UseLock
 from envhub_sandbox.session.launcher import LoadedJail
 from envhub_sandbox.session.lease import Lease, closed_during
+from envhub_sandbox.session.use_lock import UseLock
 from envhub_sandbox.system.log import WORKER
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
 from envhub_worker.protocol.lifecycle import Event, State

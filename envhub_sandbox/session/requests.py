@@ -26,10 +26,11 @@ from envhub_sandbox.errors import (
     WorkerTimeoutError,
 )
 from envhub_sandbox.session.crash.history import History
-from envhub_sandbox.session.failures import Failures, FleetUse, UseLock, refusal
+from envhub_sandbox.session.failures import Failures, refusal
 from envhub_sandbox.session.lease import AttributeCache, FleetAttributes, Lease
 from envhub_sandbox.session.prewarm import Prewarm
 from envhub_sandbox.session.repository import Repository
+from envhub_sandbox.session.use_lock import FleetUse, UseLock
 from envhub_sandbox.transport.deadline import Deadline, StepDeadline, deadline_of
 from envhub_sandbox.transport.replies import RunnersDiedError, all_replies
 from envhub_sandbox.transport.results import Results, StepResult

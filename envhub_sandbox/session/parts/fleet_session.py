@@ -23,7 +23,6 @@ from envhub_sandbox.errors import LocalProtocolError, WorkerError, WorkerTimeout
 from envhub_sandbox.session.counters import LEDGER, FleetCounters, Labels
 from envhub_sandbox.session.crash.history import History
 from envhub_sandbox.session.env_session import GRACE_S, EnvSession
-from envhub_sandbox.session.failures import FleetUse
 from envhub_sandbox.session.lease import FleetAttributes
 from envhub_sandbox.session.prewarm import FleetPrewarm
 from envhub_sandbox.session.recovery import mark_revived
@@ -34,6 +33,7 @@ from envhub_sandbox.session.requests import (
     RequestOrder,
     Requests,
 )
+from envhub_sandbox.session.use_lock import FleetUse
 from envhub_sandbox.system.log import WORKER
 from envhub_sandbox.system.threads import Calls
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline, deadline_of

@@ -23,9 +23,10 @@ from gymnasium.error import NoAsyncCallError
 
 from envhub_sandbox.errors import ActionError, WorkerTimeoutError
 from envhub_sandbox.session.env_session import EnvSession
-from envhub_sandbox.session.failures import FleetUse, all_held, refusal
+from envhub_sandbox.session.failures import refusal
 from envhub_sandbox.session.parts.worker_queue import WorkerQueue
 from envhub_sandbox.session.requests import SENT, MessageFor, RequestOrder
+from envhub_sandbox.session.use_lock import FleetUse, all_held
 from envhub_sandbox.transport.deadline import Deadline, deadline_of
 from envhub_sandbox.transport.lane import answered_first
 from envhub_sandbox.transport.results import StepResult

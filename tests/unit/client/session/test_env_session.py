@@ -16,8 +16,8 @@ from envhub_sandbox.errors import (
     WorkerDiedError,
     remote_error,
 )
-from envhub_sandbox.session.failures import UseLock
 from envhub_sandbox.session.lease import AttributeCache
+from envhub_sandbox.session.use_lock import UseLock
 from envhub_worker.protocol.lifecycle import State
 from tests.attacks.client.lying_server import NUM_ENVS
 from tests.support.in_process.fake_lane import FakeLane, session_over

@@ -1,0 +1,171 @@
+"""One thread uses an environment at a time; the next one waits. ``close`` never waits for it.
+
+A thread holds the lock from before a request is sent until its replies are handled:
+docs/internals/interruption.md, rules 10 to 12.
+"""
+
+from __future__ import annotations
+
+import threading
+import warnings
+from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
+
+from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError
+from envhub_sandbox.session.failures import Failures
+from envhub_sandbox.session.lease import Lease, closed_during
+from envhub_sandbox.transport.remote_warnings import level_of_the_caller
+from envhub_worker.protocol.errors import blamed, is_fault
+from envhub_worker.protocol.lifecycle import State
+
+_AT_ONCE = 8
+"""Locks that one ``with`` takes."""
+
+
+@contextmanager
+def all_held(locks: Sequence[threading.RLock]) -> Iterator[None]:
+    """Hold several locks, taken in their order.
+
+    By statements, between whose taking and noting no Ctrl-C comes. Eight at a time, and these in a
+    tree: each level costs a microsecond, and nesting is bounded.
+    """
+    if len(locks) > _AT_ONCE:
+        middle = len(locks) // 2
+        with all_held(locks[:middle]), all_held(locks[middle:]):
+            yield
+        return
+    spare = threading.RLock()
+    a, b, c, d, e, f, g, h = (*locks, *[spare] * (_AT_ONCE - len(locks)))
+    with a, b, c, d, e, f, g, h:
+        yield
+
+
+class UseLock:
+    """The lock of one environment, and what is to be done when it is released.
+
+    Attributes:
+        lock: Held for as long as a use lasts; reentrant, for a signal handler may close what its
+            own thread waits for.
+        flight: Held in ``send``, ``recv`` and ``reset``, taken before ``lock``: a ``recv`` holds
+            only the locks of workers that owe something.
+        stepping: The thread that is in a step, as far as it was not interrupted there.
+    """
+
+    def __init__(self, lease: Lease, failures: Failures) -> None:
+        self.lock = threading.RLock()  # interruption.md, rule 12
+        self.flight = threading.RLock()
+        self.stepping: int | None = None
+        self._warned = False
+        self._lease = lease
+        self._failures = failures
+
+    @contextmanager
+    def hold(self, operation: str) -> Iterator[None]:
+        """Hold the lock. A ``close`` that came meanwhile did not wait: finish it here."""
+        with self.lock, self._lease.repository.named():
+            try:
+                yield
+            except BaseException as error:
+                self._after_close(operation, error)
+                raise
+            if self._lease.lifecycle.state is State.CLOSED:
+                self._lease.let_go()
+
+    def _after_close(self, operation: str, error: BaseException) -> None:
+        """What failed because of a ``close`` in its midst says so, and gives back what is left.
+        Raises ``WorkerDiedError``: it was closed, and the error does not say so.
+        """
+        if not self._lease.lifecycle.closed:
+            return
+        self._lease.let_go()
+        if isinstance(error, Exception) and not isinstance(error, WorkerDiedError):
+            raise closed_during(operation) from error
+
+    def warn_of_two(self, thread: int) -> None:
+        """Warn, once, where another thread is in a step: both get results, of one another's."""
+        if self.stepping in (None, thread) or self._warned:
+            return
+        self._warned = True
+        warnings.warn(
+            f"{self._lease.repository.label}: two threads step one environment at the same time. "
+            "The second waits for the first, and each continues the other's episodes: give each "
+            "thread an environment of its own, or hold a lock around reset and all its steps",
+            RuntimeWarning,
+            stacklevel=level_of_the_caller(),
+        )
+
+    @contextmanager
+    def judging(self, operation: str) -> Iterator[None]:
+        """Hold the lock to handle replies: a worker that breaks a rule in them is given up.
+        Raises ``RemoteProtocolError``: it did, whatever the handling raised; the environment is
+        then DEAD.
+        """
+        with self.hold(operation):
+            try:
+                yield
+            except Exception as error:
+                # in any other state the error has been dealt with already, or ended a wait
+                if self._lease.lifecycle.state is State.READY:
+                    self._judge(error)
+                raise
+
+    def _judge(self, error: Exception) -> None:
+        if is_fault(error):
+            broken = blamed(error)
+            self._failures.dead(broken)
+            raise broken from error
+        if isinstance(error, RemoteProtocolError):
+            self._failures.dead(error)
+
+    def abandon(self) -> None:
+        """In a fork, which has not the thread that held the lock: interruption.md, rule 14."""
+        self.lock = threading.RLock()
+        self.flight = threading.RLock()
+        self.stepping = None
+
+
+class FleetUse:
+    """The use of all parts at a time, by one thread: see ``UseLock``.
+    ``stepping``: likewise.
+    """
+
+    def __init__(self, parts: Sequence[UseLock]) -> None:
+        self.stepping: int | None = None
+        self._parts = parts
+        self._holder: int | None = None
+
+    @property
+    def lock(self) -> AbstractContextManager[None]:
+        """The locks of all parts, taken in their order: interruption.md, rule 16.
+
+        A fresh one for each ``with``: where a Ctrl-C comes into it, the locks are released with
+        that object at the latest.
+        """
+        return self.hold([part.lock for part in self._parts])
+
+    @property
+    def flight(self) -> threading.RLock:
+        """See ``UseLock``: that of the first part, which a fork replaces."""
+        return self._parts[0].flight
+
+    @property
+    def is_mine(self) -> bool:
+        """Whether this thread holds them."""
+        return self._holder == threading.get_ident()
+
+    @contextmanager
+    def hold(self, locks: Sequence[threading.RLock]) -> Iterator[None]:
+        """Hold these of the parts' locks."""
+        with all_held(locks):
+            before, self._holder = self._holder, threading.get_ident()
+            try:
+                yield
+            finally:
+                self._holder = before
+
+    def warn_of_two(self, thread: int) -> None:
+        """See ``UseLock``."""
+        first = self._parts[0]
+        first.stepping = self.stepping
+        first.warn_of_two(thread)
+        first.stepping = None
