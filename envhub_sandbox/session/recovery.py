@@ -25,7 +25,8 @@ from envhub_worker.protocol.errors import UNTRUSTED
 from envhub_worker.protocol.lifecycle import Event
 
 if TYPE_CHECKING:
-    from envhub_sandbox.transport.lane import Lane, Request
+    from envhub_sandbox.transport.jail import Request
+    from envhub_sandbox.transport.lane import Lane
 
 RESTARTED = "worker_restarted"
 """The key in the infos: whether a sub-environment was lost and came back reset."""

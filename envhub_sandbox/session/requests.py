@@ -32,8 +32,8 @@ from envhub_sandbox.session.prewarm import Prewarm
 from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.session.use_lock import FleetUse, UseLock
 from envhub_sandbox.transport.deadline import Deadline, StepDeadline, deadline_of
-from envhub_sandbox.transport.replies import RunnersDiedError, all_replies
-from envhub_sandbox.transport.results import Results, StepResult
+from envhub_sandbox.transport.replies import RunnersDiedError
+from envhub_sandbox.transport.results import Results, StepResult, all_replies
 from envhub_sandbox.transport.shard_trials import ENOUGH_STEPS
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.lifecycle import Event, State
@@ -41,7 +41,8 @@ from envhub_worker.protocol.spaces import batches
 
 if TYPE_CHECKING:
     from envhub_sandbox.session.recovery import Recovery
-    from envhub_sandbox.transport.lane import Lane, Request
+    from envhub_sandbox.transport.jail import Request
+    from envhub_sandbox.transport.lane import Lane
 
 Bounds = tuple[int, int]
 MessageFor = Callable[[int, Bounds], m.Message]
@@ -306,12 +307,13 @@ class Requests(RequestOrder):
 
     def _request(self, lane: Lane, operation: str, message_for: MessageFor) -> Request:
         bounds = self.results.bounds
-        return lane.request(operation, [message_for(lane.number, each) for each in bounds])
+        messages = [message_for(lane.number, each) for each in bounds]
+        return lane.jail.request(operation, messages, bounds)
 
     def refuse_whole(self, operation: str, message_for: MessageFor, count: int) -> None:
         """Raise what cannot be sent as it is called in the caller's arguments, not in a shard's."""
         lane = self._lane()
-        lane.request(operation, [message_for(lane.number, (0, count))])
+        lane.jail.request(operation, [message_for(lane.number, (0, count))], [(0, count)])
 
     def collect(
         self, timeout: float | Deadline | None, kind: type[m.M] | tuple[type[m.M], ...]

@@ -38,8 +38,45 @@ _UNSEEN_S = 5.0
 """For how long a Ctrl-C waits for the jail that it came before."""
 
 
-Unpack = Callable[[int, list[Buffer]], m.Message]
-"""Makes a message of the frames that came from the runner at a place of the request."""
+Frames = list[Buffer]
+Unpack = Callable[[int, Frames], Any]
+"""Reads the frames that came from the runner at a place of the request."""
+
+
+class Request:
+    """What each shard is sent: made and encoded once, for the lane, the history and a recovery.
+
+    Args:
+        operation: What the user called.
+        messages: One for each shard.
+        frames: Those of each message.
+        bounds: The slices of the sub-environments, one for each shard.
+        plain: Whether there is nothing in them that only pickle could carry.
+    """
+
+    __slots__ = ("_kept", "bounds", "frames", "messages", "operation", "plain")
+
+    def __init__(
+        self,
+        operation: str,
+        messages: Sequence[m.Message],
+        frames: Sequence[Frames],
+        bounds: list[tuple[int, int]],
+        *,
+        plain: bool,
+    ) -> None:
+        self.operation = operation
+        self.messages = messages
+        self.frames = frames
+        self.bounds = bounds
+        self.plain = plain
+        self._kept: list[list[bytes]] | None = None
+
+    def kept(self) -> list[list[bytes]]:
+        """The frames, copied: large values are sent from where they lie, and may change."""
+        if self._kept is None:
+            self._kept = [list(map(bytes, frames)) for frames in self.frames]
+        return self._kept
 
 
 class JailHandle:
@@ -106,10 +143,22 @@ class JailHandle:
         self.runners = [runner for runner in self.runners if runner not in dead]
         return self.start_runners(len(dead), deadline)
 
-    def pack(self, message: m.Message) -> list[Buffer]:
+    def pack(self, message: m.Message) -> Frames:
         """The frames of a message to a runner."""
         # the only way in for the caller's own objects; nothing is ever unpickled here
         return m.pack(message, pickler=framed, limits=self.limits)
+
+    def request(
+        self, operation: str, messages: Sequence[m.Message], bounds: list[tuple[int, int]]
+    ) -> Request:
+        """A request of a message for each shard, ready to be sent.
+
+        Raises:
+            LocalProtocolError: It cannot be sent.
+        """
+        pickler = _NotingPickler()
+        frames = [m.pack(message, pickler=pickler, limits=self.limits) for message in messages]
+        return Request(operation, messages, frames, bounds, plain=pickler.plain)
 
     def send(self, operation: str, requests: Sequence[tuple[int, m.Message]]) -> int:
         """Send one message to each of some runners, in one request; returns its id."""
@@ -118,7 +167,7 @@ class JailHandle:
     def relay(
         self,
         operation: str,
-        requests: Sequence[tuple[int, list[Buffer]]],
+        requests: Sequence[tuple[int, Frames]],
         *,
         deposited: bool = False,
     ) -> int:
@@ -135,8 +184,8 @@ class JailHandle:
 
     def receive(
         self, request_id: int, deadline: Deadline, unpack: Unpack | None = None
-    ) -> list[m.Message]:
-        """The runners' replies, in the order of the request; ``unpack`` makes messages of them.
+    ) -> list[Any]:
+        """The runners' replies, in the order of the request, or what ``unpack`` makes of them.
 
         Raises:
             WorkerTimeoutError: The deadline came first.
@@ -159,7 +208,7 @@ class JailHandle:
                 raise self._died(reply.dead, parts, unpack)
             return [unpack(index, part) for index, part in enumerate(parts)]
 
-    def arrived(self, request_id: int) -> list[list[Buffer]]:
+    def arrived(self, request_id: int) -> list[Frames]:
         """What has arrived of each runner, and is not taken yet; nothing where that is an error."""
         reply, payload = self.client.peek(request_id)
         if type(reply) is not m.RelayDone:
@@ -176,9 +225,7 @@ class JailHandle:
         self._asked.pop(request_id, None)
         self.client.forget(request_id)
 
-    def _died(
-        self, dead: Sequence[int], parts: list[list[Buffer]], unpack: Unpack
-    ) -> RunnersDiedError:
+    def _died(self, dead: Sequence[int], parts: list[Frames], unpack: Unpack) -> RunnersDiedError:
         """The server says which runners have died; a runner cannot."""
         if not dead or not set(dead) <= set(range(len(parts))):
             raise RemoteProtocolError("the worker names dead runners that were not asked")
@@ -190,7 +237,7 @@ class JailHandle:
     def _unpack(self, _: int, frames: Sequence[Buffer]) -> m.Message:
         if len(frames) > 1:  # with one frame there is nothing in front
             frames = self.warnings.take(self.watched.take(frames))
-        return unpacked(frames, self.limits)
+        return unpacked(frames, limits=self.limits)
 
     def exchange(
         self,
@@ -210,7 +257,7 @@ class JailHandle:
     def ask(
         self,
         operation: str,
-        requests: Sequence[tuple[int, list[Buffer]]],
+        requests: Sequence[tuple[int, Frames]],
         deadline: Deadline,
         *,
         deposited: bool = False,
@@ -273,7 +320,7 @@ class JailHandle:
         self.client.close()
 
 
-def _cut(payload: list[Buffer], counts: Sequence[int]) -> list[list[Buffer]]:
+def _cut(payload: Frames, counts: Sequence[int]) -> list[Frames]:
     """The frames of each part."""
     if len(counts) == 1 and type(counts[0]) is int and counts[0] == len(payload) > 0:
         return [payload]
@@ -281,6 +328,17 @@ def _cut(payload: list[Buffer], counts: Sequence[int]) -> list[list[Buffer]]:
         raise RemoteProtocolError("the worker's frames do not add up")
     frames = iter(payload)
     return [list(islice(frames, count)) for count in counts]
+
+
+class _NotingPickler:
+    """Pickles the caller's own objects, and notes that it has. Nothing is ever unpickled here."""
+
+    def __init__(self) -> None:
+        self.plain = True
+
+    def __call__(self, value: object) -> bytes | memoryview:
+        self.plain = False
+        return framed(value)
 
 
 def _nothing() -> None:

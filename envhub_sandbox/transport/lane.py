@@ -15,56 +15,17 @@ from typing import Any, Protocol
 from envhub_sandbox.errors import EnvHubError, WorkerError
 from envhub_sandbox.transport.connection import Source
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.jail import JailHandle, Unpack
-from envhub_sandbox.transport.replies import RunnersDiedError, all_replies
-from envhub_sandbox.transport.results import Results, StepResult
-from envhub_sandbox.transport.values import framed
+from envhub_sandbox.transport.jail import Frames, JailHandle, Request, Unpack
+from envhub_sandbox.transport.replies import RunnersDiedError
+from envhub_sandbox.transport.results import Results, StepResult, all_replies
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.codec.wire import Buffer
 from envhub_worker.protocol.spaces import batches
 
-Frames = list[Buffer]
 RECHECK_MS = 2
 """After how long to look once more where a doorbell may have crossed with our going to sleep."""
 LOOK_MS = 500
 """One wait for the first of several lanes: those over a network have to be asked in between whether
 they are still there."""
-
-
-class Request:
-    """What each shard is sent: made and encoded once, for the lane, the history and a recovery.
-
-    Args:
-        operation: What the user called.
-        messages: One for each shard.
-        frames: Those of each message.
-        bounds: The slices of the sub-environments, one for each shard.
-        plain: Whether there is nothing in them that only pickle could carry.
-    """
-
-    __slots__ = ("_kept", "bounds", "frames", "messages", "operation", "plain")
-
-    def __init__(
-        self,
-        operation: str,
-        messages: Sequence[m.Message],
-        frames: Sequence[Frames],
-        bounds: list[tuple[int, int]],
-        *,
-        plain: bool,
-    ) -> None:
-        self.operation = operation
-        self.messages = messages
-        self.frames = frames
-        self.bounds = bounds
-        self.plain = plain
-        self._kept: list[list[bytes]] | None = None
-
-    def kept(self) -> list[list[bytes]]:
-        """The frames, copied: large values are sent from where they lie, and may change."""
-        if self._kept is None:
-            self._kept = [list(map(bytes, frames)) for frames in self.frames]
-        return self._kept
 
 
 class Lane(Protocol):
@@ -126,13 +87,6 @@ class Lane(Protocol):
             Misfit: The shards' infos do not go together; ``send_for_infos`` asks for others.
             RemoteEnvError: The repository's code raised.
             RemoteProtocolError: A runner broke the rules.
-        """
-
-    def request(self, operation: str, messages: Sequence[m.Message]) -> Request:
-        """A request of a message for each shard, ready to be sent.
-
-        Raises:
-            LocalProtocolError: It cannot be sent.
         """
 
     def send(self, request: Request) -> None:
@@ -247,12 +201,6 @@ class RelayLane:
             self._answers = answers  # to be joined once more, with other infos
             raise
 
-    def request(self, operation: str, messages: Sequence[m.Message]) -> Request:
-        """See ``Lane``."""
-        pickler, limits = _NotingPickler(), self.jail.limits
-        frames = [m.pack(message, pickler=pickler, limits=limits) for message in messages]
-        return Request(operation, messages, frames, self._results.bounds, plain=pickler.plain)
-
     def send(self, request: Request) -> None:
         """See ``Lane``."""
         self._asked_ns = perf_counter_ns()
@@ -366,14 +314,3 @@ def _listen(lanes: Sequence[Lane]) -> dict[Source, list[int]]:
 
 def _answered(lanes: Sequence[Lane], places: Iterable[int]) -> list[int]:
     return [place for place in places if lanes[place].answered()]
-
-
-class _NotingPickler:
-    """Pickles the caller's own objects, and notes that it has. Nothing is ever unpickled here."""
-
-    def __init__(self) -> None:
-        self.plain = True
-
-    def __call__(self, value: object) -> bytes | memoryview:
-        self.plain = False
-        return framed(value)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import Any
 
 from envhub_sandbox.errors import (
     DependencyError,
@@ -113,21 +113,6 @@ def typed_reply(reply: m.Message, kind: type[m.M] | tuple[type[m.M], ...]) -> m.
     raise RemoteProtocolError(
         f"the worker answered with {type(reply).__name__} where {wanted} belongs"
     )
-
-
-def all_replies(replies: Sequence[m.Message], kind: type[m.M] | tuple[type[m.M], ...]) -> list[m.M]:
-    """The runners' replies, all of the kind, or of one of the kinds, that was asked for.
-
-    Raises:
-        EnvHubError: What the repository raised; that comes before a wrong message of another shard.
-        RemoteProtocolError: A message is another one.
-    """
-    others = [reply for reply in replies if type(reply) is not kind]
-    for reply in others:
-        check_reply(reply)
-    for reply in others:
-        typed_reply(reply, kind)
-    return cast("list[m.M]", replies)
 
 
 # --- what a server says ---------------------------------------------------------------------

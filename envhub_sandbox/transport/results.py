@@ -178,8 +178,10 @@ class Results:
         """
         if reply is None:
             return {}
-        check_reply(reply)
-        return self._info(typed_reply(reply, m.Value).value)
+        [said] = all_replies([reply], m.Value)
+        if type(said.value) is not dict:
+            raise RemoteProtocolError("the worker's infos are not a mapping")
+        return said.value
 
     def one_each(self, what: str, replies: Sequence[m.Value | m.WatchDone]) -> tuple[Any, ...]:
         """One value for each sub-environment."""
@@ -218,12 +220,6 @@ class Results:
         # several for each sub-environment are what AsyncVectorEnv permits
         return bool(part.ndim == 1 or not self.manifest.sync)
 
-    @staticmethod
-    def _info(part: Any) -> dict[Any, Any]:
-        if type(part) is not dict:
-            raise RemoteProtocolError("the worker's infos are not a mapping")
-        return part
-
 
 def _own_infos(value: Any, size: int) -> Sequence[tuple[int, dict[Any, Any]]]:
     """Trust: input from the worker."""
@@ -234,6 +230,21 @@ def _own_infos(value: Any, size: int) -> Sequence[tuple[int, dict[Any, Any]]]:
         if not 0 <= pair[0] < size:
             raise RemoteProtocolError("the worker's infos are of no sub-environment")
     return cast("Sequence[tuple[int, dict[Any, Any]]]", pairs)
+
+
+def all_replies(replies: Sequence[m.Message], kind: type[m.M] | tuple[type[m.M], ...]) -> list[m.M]:
+    """The shards' replies, all of the kind, or of one of the kinds, that was asked for.
+
+    Raises:
+        EnvHubError: What the repository raised; that comes before a wrong message of another shard.
+        RemoteProtocolError: A message is another one.
+    """
+    others = [reply for reply in replies if type(reply) is not kind]
+    for reply in others:
+        check_reply(reply)
+    for reply in others:
+        typed_reply(reply, kind)
+    return cast("list[m.M]", replies)
 
 
 def is_batch(part: Any) -> bool:

@@ -13,8 +13,8 @@ from __future__ import annotations
 import importlib.util
 import io
 import sys
-from collections.abc import Callable, Mapping, Sequence
-from functools import cache
+from collections.abc import Callable, Mapping
+from functools import cache, partial
 from types import FunctionType
 from typing import Any, NoReturn, Union
 
@@ -27,8 +27,8 @@ from envhub_sandbox.errors import RemoteProtocolError
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.arrays import INLINE_BYTES, widened_numpy
 from envhub_worker.protocol.codec.inert import RemoteObject, one_line
-from envhub_worker.protocol.codec.wire import GENERATOR, SPACE, SPEC, Buffer
-from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
+from envhub_worker.protocol.codec.wire import GENERATOR, SPACE, SPEC
+from envhub_worker.protocol.limits import WireLimits
 from envhub_worker.protocol.manifest.manifest import read_spec_facts
 from envhub_worker.protocol.spaces.reader import (
     ELEMENT_BYTES,
@@ -161,15 +161,6 @@ def to_tensor(array: npt.NDArray[Any], dtype: str) -> Any:
     return tensor.view(torch.bfloat16) if dtype == "bfloat16" else tensor
 
 
-def unpacked(frames: Sequence[Buffer], limits: WireLimits = DEFAULT_LIMITS) -> m.Message:
-    """A runner's message, with what it describes. Trust: input from the worker.
-
-    Raises:
-        RemoteProtocolError: It is none.
-    """
-    return m.unpack(frames, limits=limits, tensors=to_tensor, things=DescriptionReader)
-
-
 _REFUSAL = f"{__name__}:not_here"
 _SPEC_TYPE = "gymnasium.envs.registration.EnvSpec"
 _SHOWN = 200
@@ -200,6 +191,10 @@ class DescriptionReader:
             self._reader.spend(GENERATOR_BYTES)
             return generator(value)
         raise RemoteProtocolError(f"nothing is described by {code}")
+
+
+unpacked = partial(m.unpack, tensors=to_tensor, things=DescriptionReader)
+"""A runner's message, with what it describes; as ``m.unpack``. Trust: input from the worker."""
 
 
 def _spec(value: object) -> Any:

@@ -9,8 +9,7 @@ from unittest.mock import Mock
 import msgpack
 from gymnasium.vector.utils import batch_space
 
-from envhub_sandbox.transport.jail import JailHandle
-from envhub_sandbox.transport.lane import RelayLane, Request
+from envhub_sandbox.transport.jail import JailHandle, Request
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.wire import Buffer
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
@@ -74,4 +73,4 @@ def requested(*messages: m.Message) -> Request:
     """A request of a message for each shard of two sub-environments, as it is sent."""
     jail = JailHandle(Mock(version=m.VERSION), 1, [], [], DEFAULT_LIMITS)
     bounds = [(2 * index, 2 * index + 2) for index in range(len(messages))]
-    return RelayLane(jail, [], 1, Mock(bounds=bounds)).request("a test", messages)
+    return jail.request("a test", messages, bounds)

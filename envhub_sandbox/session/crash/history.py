@@ -21,7 +21,7 @@ from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES
 
 if TYPE_CHECKING:
-    from envhub_sandbox.transport.lane import Request
+    from envhub_sandbox.transport.jail import Request
 
 HISTORY_BYTES = 8 << 20
 """Memory that the history of one environment takes at most."""

@@ -16,7 +16,8 @@ import numpy as np
 from envhub_sandbox.errors import EnvHubError, RemoteProtocolError, WorkerDiedError
 from envhub_sandbox.transport.connection import Source
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.lane import Frames, RelayLane, Request
+from envhub_sandbox.transport.jail import Frames, Request
+from envhub_sandbox.transport.lane import RelayLane
 from envhub_sandbox.transport.replies import RunnersDiedError, typed_reply
 from envhub_sandbox.transport.results import Results, StepResult
 from envhub_sandbox.transport.shared_memory.attachment import Attachment
@@ -269,10 +270,6 @@ class SharedMemoryLane:
         self._relay.send_some(self._owed, [self.runners[index] for index in shards], packed)
 
     # --- messages ------------------------------------------------------------------------------
-
-    def request(self, operation: str, messages: Sequence[m.Message]) -> Request:
-        """See ``Lane``."""
-        return self._relay.request(operation, messages)
 
     def send(self, request: Request) -> None:
         """See ``Lane``."""

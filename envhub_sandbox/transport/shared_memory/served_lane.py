@@ -18,7 +18,8 @@ import numpy as np
 
 from envhub_sandbox.errors import EnvHubError, RemoteProtocolError, WorkerDiedError
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.lane import Frames, RelayLane
+from envhub_sandbox.transport.jail import Frames
+from envhub_sandbox.transport.lane import RelayLane
 from envhub_sandbox.transport.replies import RunnersDiedError, expect_reply, typed_reply
 from envhub_sandbox.transport.results import Results, StepResult
 from envhub_sandbox.transport.shared_memory.client_slabs import (

@@ -16,8 +16,7 @@ from envhub_sandbox.session.parts.fleet_session import FleetSession
 from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.settings.policy import Policy, Timeouts
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.jail import WatchedAttributes
-from envhub_sandbox.transport.lane import Request
+from envhub_sandbox.transport.jail import JailHandle, Request
 from envhub_sandbox.transport.remote_warnings import RemoteWarnings
 from envhub_sandbox.transport.results import StepResult
 from envhub_worker.protocol import messages as m
@@ -47,10 +46,9 @@ class FakeLane:
     takes_more = False
 
     def __init__(self, count: int = NUM_ENVS) -> None:
-        ignore = lambda *_: None  # noqa: E731
-        client = SimpleNamespace(torn=False)
-        watched = WatchedAttributes()
-        self.jail = SimpleNamespace(watched=watched, send=ignore, receive=ignore, client=client)
+        done = m.RelayDone((1,)), m.pack(m.Done())
+        client = SimpleNamespace(torn=False, send=lambda *_: 1, receive=lambda *_: done)
+        self.jail = JailHandle(cast("Any", client), 1, [1], [], DEFAULT_LIMITS)
         self.runners, self.number, self.elapsed_ns = [1], 7, 1
         self._count = count
         self.infos: dict[Any, Any] = {}
@@ -76,10 +74,6 @@ class FakeLane:
     def ring(self) -> None:
         self.sources()
         os.write(self._bell[1], b"!")
-
-    def request(self, operation: str, messages: Sequence[m.Message]) -> Request:
-        frames = [m.pack(message) for message in messages]
-        return Request(operation, messages, frames, [(0, NUM_ENVS)], plain=True)
 
     def send(self, request: Request) -> None:
         self._owe(request.messages[0])

@@ -1,0 +1,305 @@
+"""The requests of one environment whose sub-environments are spread over several workers.
+
+Each worker has a session of its own, a *part*, with its own jail, lane and lifecycle. A request
+goes to all parts before the first answer is waited for, and every part is waited for, also where
+another has failed: no part owes an answer afterwards.
+
+Docs/internals/interruption.md holds for each part. A Ctrl-C in the midst of several parts leaves
+some of them ``READY`` and some ``PENDING``: the next request is refused, and ``reset`` catches up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from itertools import chain
+from time import perf_counter_ns
+from typing import Any, TypeVar
+
+from envhub_sandbox.errors import LocalProtocolError, WorkerError, WorkerTimeoutError
+from envhub_sandbox.session.attribute_cache import FleetAttributes
+from envhub_sandbox.session.counters import FleetCounters
+from envhub_sandbox.session.crash.history import History
+from envhub_sandbox.session.env_session import EnvSession
+from envhub_sandbox.session.recovery import mark_revived
+from envhub_sandbox.session.requests import (
+    MessageFor,
+    OneMessageFor,
+    Packed,
+    RequestOrder,
+    Requests,
+)
+from envhub_sandbox.session.use_lock import FleetUse
+from envhub_sandbox.system.log import WORKER
+from envhub_sandbox.system.threads import Calls
+from envhub_sandbox.transport.deadline import Deadline, StartupDeadline, deadline_of
+from envhub_sandbox.transport.jail import Request
+from envhub_sandbox.transport.results import Results, StepResult
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.lifecycle import State
+from envhub_worker.protocol.shared_memory import slabs
+from envhub_worker.protocol.spaces import batches
+
+T = TypeVar("T")
+_ENDS_S = 10.0
+"""How long starts are waited for that were interrupted, and so given up."""
+
+
+class FleetRequests(RequestOrder):
+    """The requests of all parts as those of one environment: see ``Requests``.
+
+    Args:
+        parts: One for each worker, in the order of their sub-environments.
+        results: Joins what the parts give; its bounds are theirs.
+        history: That of the whole environment.
+        counters: Likewise.
+    """
+
+    use: FleetUse
+
+    def __init__(
+        self,
+        parts: Sequence[EnvSession],
+        results: Results,
+        history: History,
+        counters: FleetCounters,
+    ) -> None:
+        self._parts = parts
+        self._each: list[Requests] = [part.requests for part in parts]
+        use = FleetUse([part.use for part in parts])
+        attributes = FleetAttributes([one.attributes for one in self._each], results.bounds)
+        super().__init__(parts[0].repository, results, use, attributes)
+        self._history = history
+        self._counters = counters
+        self._space = results.manifest.single_action_space
+        self._may_not_fit = slabs.layout_of(self._space, 1) is None
+        self._unsent: dict[int, Exception] = {}
+        self._starting: Calls[None] = Calls([])
+        self._sent_ns = 0
+        self._first = 0
+
+    @property
+    def closed(self) -> bool:
+        """Whether the caller has called ``close``; each part knows it, for its own errors."""
+        return self._each[0].closed
+
+    @closed.setter
+    def closed(self, closed: bool) -> None:
+        for one in self._each:
+            one.closed = closed
+
+    def note_sent(self, actions: Any | None) -> None:
+        """See ``RequestOrder``."""
+        self._counters.requests += 1
+        if actions is None:
+            self._history.skip()
+        else:
+            self._history.step(actions)
+
+    def ask_one(self, name: str, index: int, message: OneMessageFor) -> m.Message:
+        """Ask the part that has the sub-environment; the others are not asked."""
+        with self.use.lock:
+            self.refuse_if_busy(f"envs[{index}].{name}")
+            at = next(i for i, (start, stop) in enumerate(self.results.bounds) if index < stop)
+            with self._parts[at].naming():
+                return self._each[at].ask_one(name, index, message)
+
+    # --- requests ------------------------------------------------------------------------------
+
+    def submit(
+        self, operation: str, message_for: MessageFor, instead: MessageFor | None = None
+    ) -> None:
+        """See ``Requests.submit``. Nothing is sent unless all parts are ready and all is packed."""
+        self._make_ready(operation)
+        try:
+            packed = [one.pack(operation, message_for, instead) for one in self._each]
+        except LocalProtocolError:
+            count = self.results.manifest.num_envs
+            self._each[0].refuse_whole(operation, message_for, count)
+            raise
+        self._send(lambda at: self._each[at].submit_packed(operation, packed[at]))
+        self._counters.requests += 1
+        self._history.requested(_joined(packed, self.results.bounds))
+
+    def collect(
+        self, timeout: float | Deadline | None, kind: type[m.M] | tuple[type[m.M], ...]
+    ) -> list[m.M]:
+        """See ``Requests.collect``: the replies of all parts, in order."""
+        deadline = deadline_of(timeout)
+        replies = self._of_all(lambda at: self._each[at].collect(deadline, kind))
+        return [reply for some in replies for reply in some]
+
+    def one_each(self, what: str, replies: list[m.Value] | list[m.WatchDone]) -> tuple[Any, ...]:
+        """One value for each sub-environment; a part whose reply is none of these is given up."""
+        parts: list[list[Any]] = [[reply] for reply in replies]
+        values = self._of_all(lambda at: self._each[at].one_each(what, parts[at]))
+        return tuple(value for some in values for value in some)
+
+    def finish_reset(
+        self, replies: list[m.ResetDone], timeout: float | Deadline | None
+    ) -> tuple[Any, dict[Any, Any]]:
+        """See ``Requests.finish_reset``."""
+        parts = self._of_all(lambda at: self._each[at].finish_reset([replies[at]], timeout))
+        try:
+            return self.results.joined_resets(parts)
+        except batches.Misfit:
+            return self.results.joined_resets(parts, self._infos_apart(deadline_of(timeout)))
+
+    # --- steps ---------------------------------------------------------------------------------
+
+    def submit_step(self, actions: Any) -> None:
+        """See ``Requests.submit_step``: to each part its rows."""
+        for part in self._parts:
+            if part.lifecycle.state is not State.READY:
+                self._make_ready("step")
+                break
+        rows = batches.split(self._space, actions, self.results.bounds)
+        packed = self._packed(actions, rows) if self._may_not_fit else [None] * len(rows)
+        self._sent_ns = perf_counter_ns()
+        self._send(lambda at: self._each[at].submit_step(rows[at], packed[at]))
+        self._counters.requests += 1
+        self._history.step(actions)
+
+    def _packed(self, actions: Any, rows: Sequence[Any]) -> Sequence[Packed | None]:
+        """Each worker's, before others are sent theirs.
+        Raises ``LocalProtocolError``, which names what cannot be sent by its place in ``actions``.
+        """
+        try:
+            pairs = zip(self._each, rows, strict=True)
+            return [one.pack("step", partial(_step, row)) for one, row in pairs]
+        except LocalProtocolError:
+            count = self.results.manifest.num_envs
+            self._each[0].refuse_whole("step", partial(_step, actions), count)
+            raise
+
+    def collect_step(self, timeout: float | Deadline | None) -> StepResult:
+        """See ``Requests.collect_step``."""
+        deadline: Deadline = self._step_deadline
+        if timeout is deadline.timeout_s:
+            self._step_deadline.running = False
+        else:
+            deadline = deadline_of(timeout)
+        # in turns, so that each worker is waited for as often before the others as after them
+        self._first = (self._first + 1) % len(self._each)
+        parts = self._of_all(partial(self._collect_step, deadline), self._first)
+        self._counters.stepped(perf_counter_ns() - self._sent_ns)
+        try:
+            return self.results.joined_steps(parts)
+        except batches.Misfit:
+            return self.results.joined_steps(parts, self._infos_apart(deadline))
+
+    def _collect_step(self, deadline: Deadline, at: int) -> StepResult:
+        begun_ns = perf_counter_ns()
+        try:
+            return self._each[at].collect_step(deadline)
+        finally:
+            self._counters.waited(at, perf_counter_ns() - begun_ns)
+
+    def _infos_apart(self, deadline: Deadline) -> dict[Any, Any]:
+        """The last infos once more, of all parts: theirs do not fit together."""
+        own = self._of_all(lambda at: self._each[at].checked_own_infos(deadline))
+        infos = self.results.joined_own([reply for some in own for reply in some])
+        pairs = zip(self._each, self.results.bounds, strict=True)
+        fresh = [bounds for one, bounds in pairs if one.came_back]
+        return mark_revived(infos, self.results.count, fresh) if fresh else infos
+
+    # --- to all parts, and of all --------------------------------------------------------------
+
+    def _make_ready(self, operation: str) -> None:
+        states = [one.lifecycle.state for one in self._each]
+        idle = [at for at, state in enumerate(states) if state is State.IDLE]
+        for at, one in enumerate(self._each):
+            if at not in idle:
+                with self._parts[at].naming():
+                    one.make_ready(operation)
+        if idle:
+            started = self._start([self._parts[at] for at in idle])
+            for at, start in zip(idle, started, strict=True):
+                with self._parts[at].naming():
+                    self._each[at].make_ready(operation, start)
+
+    def _start(self, parts: Sequence[EnvSession]) -> list[Callable[[], None]]:
+        """Start parts side by side, for this thread, which holds their locks.
+
+        Returns:
+            For each what raises why it could not be started.
+        """
+        self._wait_for_starts()
+        parts[0].prewarm.note_use()  # already: the next task starts beside this
+        startup_s = self._timeouts.startup_s
+        deadlines = [StartupDeadline(startup_s) for _ in parts]
+        pairs = zip(parts, deadlines, strict=True)
+        starts = [partial(part.prewarm.start_on_demand, deadline) for part, deadline in pairs]
+        self._starting = starting = Calls(starts)
+        try:
+            self._starting.wait()
+        except BaseException:  # interruption.md, rule 18
+            for deadline in deadlines:
+                deadline.give_up()
+            self._wait_for_starts()
+            raise
+        return [one.result for one in starting.each]
+
+    def _wait_for_starts(self) -> None:
+        if not self._starting.wait(_ENDS_S):
+            raise WorkerTimeoutError("processes are still being started; call reset() again")
+
+    def _send(self, send: Callable[[int], None]) -> None:
+        """Send each part its own. Where one fails after others were sent theirs, it is noted."""
+        self._unsent = {}
+        for at in range(len(self._parts)):
+            try:
+                send(at)
+            except Exception as error:
+                if at == 0:
+                    with self._parts[at].naming():
+                        raise
+                self._unsent[at] = error
+                self._each[at].fall_behind()
+
+    def _of_all(self, take: Callable[[int], T], first: int = 0) -> list[T]:
+        """What each part gives. Every one is waited for; then the first failure is raised.
+
+        See interruption.md, rule 17.
+        """
+        failures, self._unsent = self._unsent, {}
+        taken: dict[int, T] = {}
+        count = len(self._parts)
+        for at in chain(range(first, count), range(first)):
+            if at not in failures:
+                try:
+                    taken[at] = take(at)
+                except Exception as error:
+                    failures[at] = error
+        if failures:
+            self._fail(failures)
+        return [taken[at] for at in range(count)]
+
+    def _fail(self, failures: dict[int, Exception]) -> None:
+        # a death or a late reply first, as where the workers are processes of one jail
+        first = min(failures, key=lambda at: (not isinstance(failures[at], WorkerError), at))
+        for at, error in failures.items():
+            if at != first:
+                WORKER.info("%s: also: %s", self._repository.label, error)
+        error = failures[first]
+        try:
+            with self._parts[first].naming():
+                raise error
+        finally:
+            self.explain(error)
+
+
+def _step(actions: Any, number: int, bounds: tuple[int, int]) -> m.Message:
+    return m.Step(number, actions)
+
+
+def _joined(packed: Sequence[Packed], bounds: Sequence[tuple[int, int]]) -> Request:
+    """The parts' requests as one, for the history."""
+    requests = [one.request for one in packed]
+    return Request(
+        requests[0].operation,
+        [message for one in requests for message in one.messages],
+        [frames for one in requests for frames in one.frames],
+        list(bounds),
+        plain=all(one.plain for one in requests),
+    )
