@@ -20,7 +20,7 @@ from typing import Any
 from benchmarks.load import take_precedence
 from benchmarks.workloads import WORKLOADS, Workload, action_batches, makers
 from envhub_sandbox import make_env
-from envhub_sandbox.transport.shared_memory.spin import SpinChooser
+from envhub_sandbox.transport.deadline import SpinChooser
 from envhub_worker.runner.sync_envs import SubEnvs
 from tests.support import inside
 

@@ -1,7 +1,23 @@
-"""One deadline per operation, made once and passed down, asked for what is left at each wait."""
+"""How long to wait: one deadline per operation, and whether to wait awake for a reply.
+
+A deadline is made once and passed down, and asked for what is left at each wait.
+
+A wake-up costs some ten microseconds, so a reply that is nearly there is best waited for awake.
+With every core busy the same spinning takes the core from the runner that computes the reply. So
+both ways are tried in turn, seldom, and the faster one is used; the interval between trials doubles
+while the answer stays the same. One decision serves both sides: the client's wait for the reply
+and the runner's wait for the next request.
+
+One core is the client's. The shards that get cores of their own may wait for work awake; one that
+finds none sleeps until it is asked, and runs on the client's core while the client sleeps. Left
+alone, the kernel tends to wake shards on the core of the process that woke them, and they run one
+after the other. So each keeps to a core.
+"""
 
 from __future__ import annotations
 
+import ctypes
+import os
 from time import monotonic
 
 _LONGEST_WAIT_MS = 24 * 3600 * 1000
@@ -124,3 +140,128 @@ class StartupDeadline(Deadline):
         """Milliseconds until the next look; at most ``_LOOK_AGAIN_MS``."""
         left = super().left_ms()
         return _LOOK_AGAIN_MS if left is None else min(left, _LOOK_AGAIN_MS)
+
+
+# --- awake ----------------------------------------------------------------------------------------
+
+_TRIAL = 16
+"""Steps of one trial."""
+_FIRST_INTERVAL = 64
+_LONGEST_INTERVAL = 8192
+_MAX_BUDGET_NS = 400_000
+"""A reply that is further away than this is not worth waiting awake for."""
+_MIN_BUDGET_NS = 100_000
+_MISSES = 3
+"""Waits in vain, one after the other, that end spinning at once."""
+_ADVANTAGE = 0.97
+"""Spinning must be this much faster to be chosen: it burns a core."""
+
+
+class SpinChooser:
+    """The chooser. ``measured`` is called once a step.
+
+    Attributes:
+        budget_ns: How long each side may wait awake; 0 for not at all.
+    """
+
+    def __init__(self, allowed: bool) -> None:
+        self.budget_ns = 0
+        self._chosen = self._spinning = False
+        self._best = {False: 0, True: 0}
+        self._samples: list[int] = []
+        self._misses = 0
+        self._missed_at: float = 0
+        self._trials = 2 if allowed else 0
+        self._interval = _FIRST_INTERVAL
+        # steps until the next decision: none ever comes where spinning is not allowed
+        self._left: float = _TRIAL if allowed else float("inf")
+
+    def measured(self, elapsed_ns: int) -> None:
+        """Take note of how long a step took, and decide when it is time to."""
+        self._left -= 1
+        if self._trials:
+            self._samples.append(elapsed_ns)
+        if self._left > 0:
+            return
+        if self._samples:  # the median: one hiccup of the machine must not decide
+            self._best[self._spinning] = sorted(self._samples)[len(self._samples) // 2]
+            self._samples.clear()
+        self._decide()
+
+    def missed(self) -> None:
+        """A wait used its whole budget up: another process has the core. A few in a row end it."""
+        self._misses = self._misses + 1 if self._missed_at - self._left <= 1 else 1
+        self._missed_at = self._left
+        if self._misses >= _MISSES and self._spinning:
+            self._samples.clear()
+            self._trials = 0
+            self._chosen = False
+            self._interval = _FIRST_INTERVAL
+            self._use(False, _FIRST_INTERVAL)
+
+    def _decide(self) -> None:
+        if self._trials:
+            self._trials -= 1
+            if self._trials:
+                self._use(not self._spinning, _TRIAL)
+                return
+            better = self._best[True] < self._best[False] * _ADVANTAGE
+            same, self._chosen = better == self._chosen, better
+            self._interval = min(self._interval * 2, _LONGEST_INTERVAL) if same else _FIRST_INTERVAL
+            self._use(better, self._interval)
+            return
+        self._trials = 2
+        self._use(self._spinning, _TRIAL)
+
+    def _use(self, spinning: bool, steps: int) -> None:
+        self._spinning = spinning
+        self._left = steps
+        self._misses = 0
+        # a reply that takes much longer than awake ones usually do will not come soon
+        usual = 3 * self._best[True] or _MAX_BUDGET_NS
+        self.budget_ns = min(max(usual, _MIN_BUDGET_NS), _MAX_BUDGET_NS) if spinning else 0
+
+
+CPUS = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [0]
+"""The cores that this process may use."""
+_LOOK_EVERY = 64
+"""Steps between two looks at where the client runs."""
+
+
+class Cores:
+    """The cores of one environment's shards.
+
+    Args:
+        shards: How many there are.
+
+    Attributes:
+        awake: How many of them, the first ones, get a core that is not the client's.
+    """
+
+    def __init__(self, shards: int) -> None:
+        self.awake = min(shards, len(CPUS) - 1)
+        self._until_look = 0
+        self._client = -1
+        self._chosen = [0] * shards
+        self._getcpu = getattr(ctypes.CDLL(None), "sched_getcpu", None)
+
+    def of_shards(self) -> list[int]:
+        """One more than each shard's core; 0 where it does not matter."""
+        self._until_look -= 1
+        if self._until_look < 0:
+            self._until_look = _LOOK_EVERY
+            client = self._getcpu() if self._getcpu is not None else -1
+            if client != self._client and client in CPUS:
+                self._client = client
+                self._chosen = place(len(self._chosen), self.awake, client, CPUS)
+        return self._chosen
+
+
+def place(shards: int, awake: int, client: int, cpus: list[int]) -> list[int]:
+    """One more than each shard's core, the awake ones first."""
+    others = [cpu for cpu in cpus if cpu != client]
+    sleepers = [client, *others]
+    return [
+        1 + (others[index] if index < awake else sleepers[(index - awake) % len(sleepers)])
+        for index in range(shards)
+    ]

@@ -237,7 +237,7 @@ class RelayLane:
         packed = [self.jail.pack(m.FetchInfosApart(self.number))] * len(self.runners)
         self.send_some("step", self.runners, packed)
 
-    def replies(self, deadline: Deadline) -> list[m.Message]:
+    def replies(self, deadline: Deadline) -> list[Any]:
         """See ``Lane``."""
         try:
             sent, _, unpack = self._owed[0]

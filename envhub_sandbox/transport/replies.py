@@ -50,14 +50,15 @@ class RunnersDiedError(WorkerDiedError):
     Never seen by a user, who gets ``first``, or nothing.
 
     Attributes:
-        replies: In the order of the request; None where a runner has died.
+        replies: In the order of the request, or what was made of them; None where a runner has
+            died.
         deaths: How, by its place in the request.
         jail_gone: Whether the jail has ended, too.
     """
 
     def __init__(
         self,
-        replies: Sequence[m.Message | None],
+        replies: Sequence[Any],
         deaths: dict[int, WorkerDiedError],
         *,
         jail_gone: bool = False,

@@ -8,8 +8,11 @@ import numpy as np
 from gymnasium import spaces
 
 from envhub_sandbox.transport.results import Results
-from envhub_sandbox.transport.shared_memory.client_slabs import LaneShard, ObservationSlab
-from envhub_sandbox.transport.shared_memory.lane import infos_of
+from envhub_sandbox.transport.shared_memory.client_slabs import (
+    LaneShard,
+    ObservationSlab,
+    infos_of,
+)
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import UNTRUSTED
 from envhub_worker.protocol.shared_memory import slabs

@@ -17,6 +17,7 @@ that the jail can still write.
 from __future__ import annotations
 
 import mmap
+import operator
 import sys
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -26,11 +27,11 @@ from typing import TYPE_CHECKING, Any
 import gymnasium as gym
 import numpy as np
 
-from envhub_sandbox.errors import RemoteProtocolError, WorkerTimeoutError
+from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError, WorkerTimeoutError
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.lane import RECHECK_MS
+from envhub_sandbox.transport.replies import RunnersDiedError
 from envhub_sandbox.transport.results import Results
-from envhub_sandbox.transport.shared_memory.joined_columns import Schema
 from envhub_sandbox.transport.values import unpacked
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import UNTRUSTED
@@ -41,6 +42,8 @@ from envhub_worker.protocol.stream import read_packet
 if TYPE_CHECKING:
     from envhub_worker.protocol.shared_memory.descriptors import Watch
 
+Schema = list[tuple[slabs.Column, Any]]
+"""What columns infos have, and where each lies in a slab."""
 Outcome = tuple[int, m.Message | None]
 """``slabs.DONE``, ``RAISED``, ``FETCH`` or ``COLUMNS``, and what came encoded."""
 _OUTCOMES = frozenset({slabs.DONE, slabs.RAISED, slabs.FETCH, slabs.COLUMNS})
@@ -329,6 +332,58 @@ class LaneShard(ShardSlabs):
         self._runner_bell.close()
         self.bell.close()
         super().close()
+
+
+class JoinedColumns:
+    """The infos of all shards, where all of them came as the same columns: one copy each.
+
+    With many shards this is most of what is left of a step that has infos.
+
+    Args:
+        schemas: Each shard's.
+        bounds: The sub-environments of each, from and to.
+
+    Attributes:
+        columns: Name, shape, dtype and each shard's part; empty where the schemas differ, or one
+            does not have a value for each sub-environment.
+    """
+
+    def __init__(self, schemas: Sequence[Schema], bounds: Sequence[tuple[int, int]]) -> None:
+        self._schemas = schemas
+        self.columns: list[tuple[str, tuple[int, ...], Any, list[Any]]] = []
+        forms = [[(one.key, one.dtype, one.shape[1:]) for one, _ in schema] for schema in schemas]
+        rows = [{one.shape[0] if one.shape else 0 for one, _ in schema} for schema in schemas]
+        if forms and forms == [forms[0]] * len(forms) and rows == [{b - a} for a, b in bounds]:
+            for index, (key, dtype, tail) in enumerate(forms[0]):
+                parts = [schema[index][1] for schema in schemas]
+                self.columns.append((key, (bounds[-1][1], *tail), dtype, parts))
+
+    def is_of(self, schemas: Sequence[Schema]) -> bool:
+        """Whether it was made of these."""
+        known = self._schemas
+        return len(known) == len(schemas) and all(map(operator.is_, known, schemas))
+
+    def infos(self) -> dict[Any, Any]:
+        """Fresh arrays. Trust: each byte is read once; what is not 0 in a mask is true."""
+        return {
+            key: np.concatenate(parts, out=np.empty(shape, dtype), casting="unsafe")
+            for key, shape, dtype, parts in self.columns
+        }
+
+
+def infos_of(shard: ShardSlabs, outcome: Outcome, results: Results) -> dict[Any, Any]:
+    """A shard's infos of a step, all of which are here. Trust: input from the worker.
+
+    Raises:
+        RemoteEnvError: The environment raised.
+    """
+    kind, message = outcome
+    return shard.columns() if kind == slabs.COLUMNS else results.info(message)
+
+
+def by_shard(error: RunnersDiedError, asked: Sequence[int]) -> dict[int, WorkerDiedError]:
+    """The deaths of those that were asked, by their shards."""
+    return {asked[place]: death for place, death in error.deaths.items()}
 
 
 class ObservationSlab:

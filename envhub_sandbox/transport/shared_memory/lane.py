@@ -15,7 +15,7 @@ import numpy as np
 
 from envhub_sandbox.errors import EnvHubError, RemoteProtocolError, WorkerDiedError
 from envhub_sandbox.transport.connection import Source
-from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.deadline import CPUS, Cores, Deadline, SpinChooser
 from envhub_sandbox.transport.jail import Frames, Request
 from envhub_sandbox.transport.lane import RelayLane
 from envhub_sandbox.transport.replies import RunnersDiedError, typed_reply
@@ -23,14 +23,14 @@ from envhub_sandbox.transport.results import Results, StepResult
 from envhub_sandbox.transport.shared_memory.attachment import Attachment
 from envhub_sandbox.transport.shared_memory.client_slabs import (
     RING,
+    JoinedColumns,
     LaneShard,
     ObservationSlab,
     Outcome,
-    ShardSlabs,
     action_layouts,
+    by_shard,
+    infos_of,
 )
-from envhub_sandbox.transport.shared_memory.joined_columns import JoinedColumns
-from envhub_sandbox.transport.shared_memory.spin import CPUS, Cores, SpinChooser
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import UNTRUSTED
 from envhub_worker.protocol.shared_memory import slabs
@@ -253,7 +253,7 @@ class SharedMemoryLane:
         try:
             replies = self._fetch(missing, deadline)
         except RunnersDiedError as error:
-            raise self._died(_by_shard(error, missing), deadline) from None
+            raise self._died(by_shard(error, missing), deadline) from None
         for index, reply in zip(missing, replies, strict=True):
             outcomes[index] = slabs.DONE, reply
         return outcomes
@@ -442,7 +442,7 @@ class SharedMemoryLane:
         try:  # the server knows how, at the latest when they have been reaped
             self._fetch(dead, Deadline(_CAUSE_S))
         except RunnersDiedError as error:
-            return _by_shard(error, dead)
+            return by_shard(error, dead)
         raise RemoteProtocolError("the worker says that a process lives which has died")
 
     def _died(self, deaths: dict[int, WorkerDiedError], deadline: Deadline) -> RunnersDiedError:
@@ -496,18 +496,3 @@ class SharedMemoryLane:
 def _fits(frames: Frames) -> bool:
     """Whether the frames of a message fit a slab."""
     return sum(memoryview(frame).nbytes + _FRAME_BYTES for frame in frames) < _ROOM
-
-
-def infos_of(shard: ShardSlabs, outcome: Outcome, results: Results) -> dict[Any, Any]:
-    """A shard's infos of a step, all of which are here. Trust: input from the worker.
-
-    Raises:
-        RemoteEnvError: The environment raised.
-    """
-    kind, message = outcome
-    return shard.columns() if kind == slabs.COLUMNS else results.info(message)
-
-
-def _by_shard(error: RunnersDiedError, asked: Sequence[int]) -> dict[int, WorkerDiedError]:
-    """The deaths of those that were asked, by their shards."""
-    return {asked[place]: death for place, death in error.deaths.items()}

@@ -17,7 +17,7 @@ import gymnasium as gym
 import numpy as np
 
 from envhub_sandbox.errors import EnvHubError, RemoteProtocolError, WorkerDiedError
-from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.deadline import Deadline, SpinChooser
 from envhub_sandbox.transport.jail import Frames
 from envhub_sandbox.transport.lane import RelayLane
 from envhub_sandbox.transport.replies import RunnersDiedError, expect_reply, typed_reply
@@ -27,8 +27,9 @@ from envhub_sandbox.transport.shared_memory.client_slabs import (
     Outcome,
     ShardSlabs,
     action_layouts,
+    by_shard,
+    infos_of,
 )
-from envhub_sandbox.transport.shared_memory.spin import SpinChooser
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.wire import Buffer
 from envhub_worker.protocol.limits import LARGE_BYTES
@@ -38,6 +39,8 @@ _HEAD = struct.Struct("<QQ")
 _HEAD_AT = slabs.OUTCOME * 8
 _PLAIN = _HEAD.pack(slabs.DONE, 0)
 """Results and nothing else."""
+_NO_MORE: Outcome = (slabs.DONE, None)
+"""The same, read."""
 
 
 class ServedLane(RelayLane):
@@ -55,7 +58,8 @@ class ServedLane(RelayLane):
         leaves = shards[0].slabs.layout.actions
         self._flat_actions = len(leaves) == 1 and not leaves[0].path
         self._spin = SpinChooser(True)
-        self._by_message = self._more_wanted = self._checked = False
+        self._by_message = self._more_wanted = self._by_slabs = False
+        self._outcomes: list[Outcome] = []
         self._asked: Sequence[int] = ()  # shards, for infos that did not fit
 
     @classmethod
@@ -127,90 +131,84 @@ class ServedLane(RelayLane):
         else:
             rows = [[leaf[slice(*each)] for leaf in leaves] for each in self._results.slices]
             payload = [shard.ask(own, spin_ns) for shard, own in zip(shards, rows, strict=True)]
-        self._send(lambda: self.jail.send_relay(self._step, payload), self._step_done)
+        self._send(lambda: self.jail.send_relay(self._step, payload), self._outcome)
 
-    def _step_done(self, index: int, frames: Frames) -> m.Message:
-        """Trust: input from the worker."""
-        shard = self._shards[index]
-        kind, message = shard.read(frames)
-        if isinstance(message, m.RaisedException):
-            return message
-        if kind == slabs.FETCH:
-            infos = _UNSENT
-        elif kind == slabs.COLUMNS:
-            infos = shard.slabs.columns()
-        else:
-            infos = self._results.info(message)
-        return m.StepDone(shard.observation(), *shard.observations.results(), infos)
-
-    def result(self, infos: dict[Any, Any] | None = None) -> StepResult:
-        """See ``Lane``. Trust: input from the worker."""
-        done = self._answers[0]
-        if not self._checked or len(self._answers) != 1 or not isinstance(done, m.StepDone):
-            return super().result(infos)
-        # it was made here, of the spaces that are declared
-        self._answers = []
-        if infos is None:
-            infos = self._results.infos([done.info])
-        return done.observation, done.rewards, done.terminations, done.truncations, infos
+    def _outcome(self, index: int, frames: Frames) -> Outcome:
+        """Trust: input from the worker, which may call an exception something else."""
+        kind, message = self._shards[index].read(frames)
+        return slabs.RAISED if isinstance(message, m.RaisedException) else kind, message
 
     def wait(self, deadline: Deadline) -> None:
         """See ``Lane``."""
-        self._checked = self._owed[0][2] is not None
-        if not self._checked:
+        self._by_slabs = self._owed[0][2] is not None
+        if not self._by_slabs:
             super().wait(deadline)
             return
-        answers: list[m.Message | None]
+        outcomes: list[Outcome | None]
         deaths: dict[int, WorkerDiedError] = {}
         try:
-            answers = [*self.replies(deadline)]
+            outcomes = [*self.replies(deadline)]
         except RunnersDiedError as error:
-            answers, deaths = error.replies, error.deaths
+            outcomes, deaths = error.replies, error.deaths
         self.elapsed_ns = perf_counter_ns() - self._asked_ns
         if 0 < self._spin.budget_ns < self.elapsed_ns:
             self._spin.missed()  # the runner sleeps by now, far as it is or busy as its machine
         self._spin.measured(self.elapsed_ns)
         # what one has raised comes before the infos of others, unless a recovery needs these, or
         # they were asked for: warnings come with them
-        if deaths or self._owed or m.RaisedException not in map(type, answers):
-            self._fetch(answers, deaths, deadline)
+        said = [one[1] for one in outcomes if one is not None]
+        if deaths or self._owed or m.RaisedException not in map(type, said):
+            self._fetch(outcomes, deaths, deadline)
         if deaths:
-            raise RunnersDiedError(answers, deaths)
-        self._answers = [one for one in answers if one is not None]
+            raise RunnersDiedError(list(map(self._stepped, self._shards, outcomes)), deaths)
+        self._outcomes = [one for one in outcomes if one is not None]
+
+    def result(self, infos: dict[Any, Any] | None = None) -> StepResult:
+        """See ``Lane``. Trust: input from the worker."""
+        if not self._by_slabs:
+            return super().result(infos)
+        shards, outcomes = self._shards, self._outcomes
+        if infos is None:
+            infos = {}
+            if outcomes != [_NO_MORE] * len(shards):
+                infos = self._results.infos(list(map(self._infos_of, shards, outcomes)))
+        parts = [(*shard.rows(), infos) for shard in shards]
+        return parts[0] if len(parts) == 1 else self._results.joined_steps(parts, infos)
+
+    def _infos_of(self, shard: ServedShard, outcome: Outcome) -> dict[Any, Any]:
+        return infos_of(shard.slabs, outcome, self._results)
+
+    def _stepped(self, shard: ServedShard, outcome: Outcome | None) -> m.Message | None:
+        """What a shard that lives wrote, as the message that it stands for."""
+        if outcome is None:
+            return None
+        if isinstance(outcome[1], m.RaisedException):
+            return outcome[1]
+        return m.StepDone(*shard.rows(), self._infos_of(shard, outcome))
 
     def _fetch(
         self,
-        answers: list[m.Message | None],
+        outcomes: list[Outcome | None],
         deaths: dict[int, WorkerDiedError],
         deadline: Deadline,
     ) -> None:
         """Put infos in that did not fit the slabs. Who dies meanwhile is added to the deaths."""
-        missing = {
-            index: one
-            for index, one in enumerate(answers)
-            if isinstance(one, m.StepDone) and one.info is _UNSENT
-        }
+        missing = [i for i, one in enumerate(outcomes) if one is not None and one[0] == slabs.FETCH]
         if not self._owed:  # else ``answered`` has asked for them
             if not missing:
                 return
-            self._ask_for(list(missing))
+            self._ask_for(missing)
         fetched: Sequence[m.Message | None]
         try:
             fetched = self.replies(deadline)
         except RunnersDiedError as error:
             fetched = error.replies
-            deaths.update({self._asked[place]: death for place, death in error.deaths.items()})
+            deaths.update(by_shard(error, self._asked))
         for index, reply in zip(self._asked, fetched, strict=True):
             if reply is None:
-                answers[index] = None
+                outcomes[index] = None
             elif index in missing:
-                answers[index] = self._with_infos(missing[index], reply)
-
-    def _with_infos(self, done: m.StepDone, reply: m.Message) -> m.Message:
-        """Trust: input from the worker, which may not answer for the whole step once more."""
-        if isinstance(reply, m.RaisedException):
-            return reply
-        return m.replace(done, info=self._results.info(reply))
+                outcomes[index] = slabs.DONE, reply
 
     def _ask_for(self, shards: Sequence[int], *, ahead: bool = False) -> None:
         self._asked = shards
@@ -291,7 +289,8 @@ class ServedShard:
         first = memoryview(frames[0])
         if len(first) == self._plain_bytes and first[: _HEAD.size] == _PLAIN:
             self._received[:] = first[_HEAD.size :]
-            return slabs.DONE, None
+            self._pieces = []
+            return _NO_MORE
         if len(first) < _HEAD.size:
             raise RemoteProtocolError("the worker sent less than the outcome of a step")
         kind, length = _HEAD.unpack_from(first)
@@ -308,8 +307,11 @@ class ServedShard:
         _copy(pieces, start, self._received[start:])
         return self.slabs.outcome()
 
-    def observation(self) -> Any:
-        """The caller's own."""
+    def rows(self) -> tuple[Any, Any, Any, Any]:
+        """Observation, rewards, terminations and truncations; the caller's own."""
+        return self._observation(), *self.observations.results()
+
+    def _observation(self) -> Any:
         pieces, self._pieces = self._pieces, []
         if not pieces:
             return self.observations.take()
@@ -331,7 +333,3 @@ def _copy(pieces: Sequence[Buffer], start: int, into: memoryview) -> None:
         if begin < end:
             into[begin - start : end - start] = piece[begin - at : end - at]
         at += len(piece)
-
-
-_UNSENT: dict[Any, Any] = {}
-"""Infos that did not fit the slab."""

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from envhub_sandbox.transport.shared_memory.joined_columns import JoinedColumns, Schema
+from envhub_sandbox.transport.shared_memory.client_slabs import JoinedColumns, Schema
 from envhub_worker.protocol.shared_memory.slabs import columns_of
 from envhub_worker.protocol.spaces import batches
 

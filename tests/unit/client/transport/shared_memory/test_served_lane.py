@@ -92,8 +92,7 @@ def test_a_batch_is_what_the_runner_wrote(space: Any) -> None:
     both.ask(np.array([0, 1, 2]), np.ones((COUNT, 2), np.float64))
     both.memory[2][:] = wrote = os.urandom(both.observed.total_bytes)
     assert both.answer() == (slabs.DONE, None)
-    observation = both.shard.observation()
-    rewards, terminations, truncations = both.shard.observations.results()
+    observation, rewards, terminations, truncations = both.shard.rows()
     leaves = [observation] if space is SMALL else list(observation.values())
     for leaf, array in zip(both.observed.leaves, leaves, strict=True):
         raw = wrote[leaf.offset : leaf.offset + array.nbytes]
@@ -266,7 +265,7 @@ def test_infos_that_are_fetched_are_infos(ahead: bool) -> None:
         assert not ahead or not served.lane.answered()
         sent = _answering(served.server, lie)
         with pytest.raises(RemoteProtocolError):
-            served.lane.wait(Deadline(0))
+            served.reward()
         assert len(sent) == 2
     served = Served()
     served.step()

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import pytest
 
-from envhub_sandbox.transport.shared_memory import spin
-from envhub_sandbox.transport.shared_memory.spin import Cores, SpinChooser, place
+from envhub_sandbox.transport import deadline
+from envhub_sandbox.transport.deadline import Cores, SpinChooser, place
 
 
 def run(chooser: SpinChooser, steps: int, awake_ns: int, asleep_ns: int) -> int:
@@ -85,5 +85,5 @@ def test_one_core_is_the_clients(monkeypatch: pytest.MonkeyPatch, shards: int) -
     """Shards that find no other core sleep: the first of them shares the client's."""
     assert place(4, 1, 0, [0, 1]) == [2, 1, 2, 1]
     assert place(2, 0, 5, [5]) == [6, 6]
-    monkeypatch.setattr(spin, "CPUS", [0, 1])
+    monkeypatch.setattr(deadline, "CPUS", [0, 1])
     assert Cores(shards).awake == 1
