@@ -1,4 +1,4 @@
-"""Actions as the caller has them, made into the batch that the action space asks for.
+"""Actions as the caller has them, made into the batch that the action space asks for; and seeds.
 
 Arrays, lists, tuples, mappings and torch tensors are taken. Dtypes are kept as they are where
 the space could mean them (``float64`` for a ``float32`` Box), because that is what an environment
@@ -14,9 +14,11 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from gymnasium.error import CustomSpaceError
+from gymnasium.error import CustomSpaceError, Error
 
 from envhub_sandbox.errors import ActionError, ActionTypeError
+from envhub_sandbox.session.requests import Bounds, MessageFor
+from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest.manifest import EnvManifest
 from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES, BOX_DTYPES, OpaqueSpace
 
@@ -146,6 +148,63 @@ class ActionReader:
         ):
             return actions
         return batch_of(self._space, actions, self._count)
+
+
+# --- what a reset is given ------------------------------------------------------------------------
+
+
+def seeds_for_all(seed: Any, manifest: EnvManifest) -> Any:
+    """One seed or None per sub-environment, or None for none at all."""
+    count = manifest.num_envs
+    if isinstance(seed, (int, np.integer)):
+        return [int(seed) + index for index in range(count)] if manifest.shardable else int(seed)
+    if seed is None:
+        return None
+    seeds = [None if one is None else _seed(one) for one in seed]
+    if len(seeds) != count:
+        raise ValueError(
+            "If seeds are passed as a list the length must match "
+            f"num_envs={count} but got length={len(seeds)}."
+        )
+    return seeds
+
+
+def _seed(given: Any) -> int:
+    if not isinstance(given, (int, np.integer)):
+        raise Error(f"Seed must be a python integer, actual type: {type(given)}")
+    return int(given)
+
+
+def check_mask(mask: Any, num_envs: int) -> None:
+    """``SyncVectorEnv.reset``'s checks, in its words."""
+    if not isinstance(mask, np.ndarray):
+        raise TypeError(f"`options['reset_mask']` must be a numpy array, got {type(mask)}")
+    if mask.shape != (num_envs,):
+        raise ValueError(
+            f"`options['reset_mask']` must have shape `({num_envs},)`, got {mask.shape}"
+        )
+    if mask.dtype != np.bool_:
+        raise TypeError(f"`options['reset_mask']` must have `dtype=np.bool_`, got {mask.dtype}")
+    if not np.any(mask):
+        raise ValueError(
+            "`options['reset_mask']` must contain a boolean array with at least one True value, "
+            f"got reset_mask={mask}"
+        )
+
+
+def reset_message(manifest: EnvManifest, seeds: Any, options: Any, mask: Any = None) -> MessageFor:
+    """Makes a shard's part of a reset."""
+    sliced = manifest.shardable and seeds is not None
+
+    def message(number: int, bounds: Bounds) -> m.Message:  # is kept: it refers to no environment
+        start, stop = bounds
+        some = seeds[start:stop] if sliced else seeds
+        return m.Reset(number, some, options, None if mask is None else mask[start:stop])
+
+    return message
+
+
+# --- inside ---------------------------------------------------------------------------------------
 
 
 def _shape(space: gym.Space[Any], count: int | None) -> tuple[int, ...]:

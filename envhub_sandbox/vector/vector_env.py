@@ -15,20 +15,23 @@ from threading import get_ident
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import gymnasium as gym
-import numpy as np
-from gymnasium.error import Error
-from gymnasium.vector import VectorEnv
 
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.session.env_session import EnvSession
-from envhub_sandbox.session.requests import SENT, Bounds, MessageFor, OneMessageFor
+from envhub_sandbox.session.requests import SENT, MessageFor, OneMessageFor
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.remote_warnings import level_of_the_caller
 from envhub_sandbox.transport.replies import typed_reply
 from envhub_sandbox.transport.results import StepResult
 from envhub_sandbox.transport.values import generator, not_here, seeds, spec_of
-from envhub_sandbox.vector.actions import action_reader
+from envhub_sandbox.vector.actions import (
+    action_reader,
+    check_mask,
+    reset_message,
+    seeds_for_all,
+)
 from envhub_sandbox.vector.sandbox_view import SandboxView
+from envhub_sandbox.vector.send_recv import SendRecv
 from envhub_sandbox.vector.sub_environment import SubEnvironment
 from envhub_sandbox.vector.tracebacks import short_traceback, shortened
 from envhub_worker.protocol import messages as m
@@ -39,7 +42,6 @@ from envhub_worker.protocol.manifest.names import absent, is_servable
 
 if TYPE_CHECKING:
     from envhub_sandbox.session.parts.fleet_session import AnySession
-    from envhub_sandbox.session.parts.in_flight import InFlight, Received, Rows
 
 _NOT_CALLED = frozenset({"reset", "step", "close"})
 """What ``AsyncVectorEnv.call`` refuses: it would take one sub-environment from under the others."""
@@ -56,7 +58,7 @@ class VectorApart(NamedTuple):
     own: Callable[[dict[Any, Any]], tuple[list[dict[Any, Any]], Sequence[bool]]]
 
 
-class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
+class SandboxVectorEnv(SendRecv):
     """A vector environment whose code runs in a confined process.
 
     Everything that ``VectorEnv`` has, and ``AsyncVectorEnv``'s ``*_async`` and ``*_wait``. Arrays
@@ -72,17 +74,12 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
     """
 
     def __init__(self, session: AnySession) -> None:
-        manifest = session.manifest
-        self._session = session
-        self._requests = session.requests
+        super().__init__(session)
+        manifest = self._manifest
         self._requests.face = type(self).__name__
-        self._manifest = manifest
         self._timeouts = session.repository.timeouts
         self._read_actions = action_reader(manifest, manifest.num_envs)
-        self._readers: dict[int, Callable[[Any], Any]] = {}
-        self._flight: InFlight | None = None
         self._still: Any = None
-        self.num_envs = manifest.num_envs
         self.single_observation_space = manifest.single_observation_space
         self.single_action_space = manifest.single_action_space
         self.observation_space = manifest.observation_space
@@ -195,20 +192,10 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         if options is not None and "reset_mask" in options:
             options = copy(options)  # the caller's own keep theirs
             mask = options.pop("reset_mask")
-            _check_mask(mask, self.num_envs)
-        seeds = self._seeds(seed)
+            check_mask(mask, self.num_envs)
+        seeds = seeds_for_all(seed, self._manifest)
         self._recover()
-        self._requests.submit("reset", self._reset_message(seeds, options, mask))
-
-    def _reset_message(self, seeds: Any, options: Any, mask: Any) -> MessageFor:
-        sliced = self._manifest.shardable and seeds is not None
-
-        def message(number: int, bounds: Bounds) -> m.Message:  # is kept: it must not refer to self
-            start, stop = bounds
-            some = seeds[start:stop] if sliced else seeds
-            return m.Reset(number, some, options, None if mask is None else mask[start:stop])
-
-        return message
+        self._requests.submit("reset", reset_message(self._manifest, seeds, options, mask))
 
     def _recover(self) -> None:
         try:
@@ -287,130 +274,6 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
             timeout_s = self._timeouts.step_s if timeout is None else timeout
             *done, infos = self._requests.collect_step(timeout_s)
         return (*done, self._requests.results.joined(infos))
-
-    # --- send and recv -------------------------------------------------------------------------
-
-    @short_traceback
-    def send(self, actions: Any, env_ids: Any = None) -> None:
-        """Send actions to some sub-environments; ``recv`` returns the results.
-
-        A worker steps all of its sub-environments together, so ``env_ids`` must have all or none of
-        them. With ``make_env(..., min_ready=...)`` each sub-environment has a worker of its own.
-
-        May be called again before the results are received, up to sixteen times for each
-        sub-environment, which takes the actions one after the other.
-
-        Args:
-            actions: A batch of ``n`` actions, in the order of ``env_ids``.
-            env_ids: Numbers of sub-environments: integers ``(n,)``, each at most once; None for
-                all.
-
-        Raises:
-            ActionError: A wrong shape, dtype or id; nothing was sent.
-            AlreadyPendingCallError: Another request is pending, or sixteen steps are.
-            WorkerError: A worker has died or is late; nothing was sent. ``env_ids`` of the error
-                are its sub-environments: send to others, or restart it by ``send_reset``.
-        """
-        with self._requests.use.flight:
-            flight = self._in_flight()
-            rows = flight.rows(env_ids)
-            flight.send(rows, self._read_rows(rows, actions))
-
-    @short_traceback
-    def send_reset(
-        self,
-        env_ids: Any = None,
-        *,
-        seed: int | Sequence[int | None] | None = None,
-        options: dict[str, Any] | None = None,
-    ) -> None:
-        """Send a reset to some sub-environments; ``recv`` returns its results, with rewards of 0.
-
-        A worker that has died or is late is first restarted, as by ``reset``.
-
-        Args:
-            env_ids: As in ``send``; nothing may be pending for them.
-            seed: One seed (sub-environment ``i`` gets ``seed + i``), one for each of ``env_ids``,
-                or None.
-            options: Passed to each sub-environment.
-
-        Raises: As ``send``.
-        """
-        if "reset_mask" in (options or {}):
-            raise ValueError(
-                "`send_reset` takes no `reset_mask`: name sub-environments by `env_ids`"
-            )
-        with self._requests.use.flight:
-            flight = self._in_flight()
-            rows = flight.rows(env_ids)
-            flight.send_reset(rows, self._reset_message(self._seeds_of(rows, seed), options, None))
-
-    def _seeds_of(self, rows: Rows, seed: Any) -> Any:
-        """A seed or None for each sub-environment of all, of which those of ``rows`` count."""
-        if seed is None or isinstance(seed, (int, np.integer)):
-            return self._seeds(seed)
-        given = list(seed)
-        if len(given) != len(rows.named):
-            raise ValueError(
-                f"`seed` has {len(given)} entries for {len(rows.named)} sub-environments"
-            )
-        by_id = dict(zip(rows.named, given, strict=True))
-        return self._seeds([by_id.get(index) for index in range(self.num_envs)])
-
-    @short_traceback
-    def recv(self, min_ready: int | None = None, timeout: float | None = None) -> Received:
-        """The results of the first sub-environments that are ready.
-
-        Takes the results of whole workers, in the order in which they became ready, until there are
-        ``min_ready`` sub-environments, or no more results to come. Other results stay for the next
-        call. Infos and autoreset are as in ``step``.
-
-        Args:
-            min_ready: How many sub-environments to wait for; by default the value given to
-                ``make_env``, otherwise all.
-            timeout: Seconds to wait, also for another thread's ``recv``, or None for no limit. Each
-                step also has ``Timeouts.step_s``.
-
-        Returns:
-            ``observations, rewards, terminations, truncations, infos, env_ids``, each with ``n``
-            rows in the order of ``env_ids``: observations ``(n, *single_observation_space.shape)``,
-            rewards float64 ``(n,)``, both flags bool ``(n,)``, ``env_ids`` int64 ``(n,)`` and
-            ascending.
-
-        Raises:
-            NoAsyncCallError: Nothing was sent.
-            WorkerTimeoutError: ``timeout`` has passed, and nothing is lost; or the step of one
-                worker took longer than ``Timeouts.step_s``.
-            WorkerDiedError: The process of a worker ended.
-            RemoteEnvError: A sub-environment raised; it is still usable.
-
-        The last three have the worker's sub-environments in ``env_ids``, and no further result
-        comes for these. The others continue, and the next call has their results.
-        """
-        wanted = self._session.repository.min_ready if min_ready is None else min_ready
-        if wanted is not None and wanted < 1:
-            raise ValueError(f"`min_ready` is {wanted}, and must be at least 1")
-        from envhub_sandbox.session.parts.in_flight import held_in_time  # which few need
-
-        deadline = Deadline(timeout)
-        with held_in_time(self._requests.use.flight, deadline):
-            return self._in_flight().recv(self.num_envs if wanted is None else wanted, deadline)
-
-    def _in_flight(self) -> InFlight:
-        if self._flight is None:
-            from envhub_sandbox.session.parts.in_flight import InFlight  # which few need
-
-            session = self._session
-            parts = [session] if isinstance(session, EnvSession) else session.parts
-            self._flight = InFlight(self._requests, parts)
-        return self._flight
-
-    def _read_rows(self, rows: Rows, actions: Any) -> Any:
-        """The batch of actions for these, checked as those of all are."""
-        count = len(rows.named)
-        if count not in self._readers:
-            self._readers[count] = action_reader(self._manifest, count)
-        return self._readers[count](actions)
 
     # --- everything else -----------------------------------------------------------------------
 
@@ -615,22 +478,6 @@ class SandboxVectorEnv(VectorEnv[Any, Any, Any]):
         # a method of ours: a copy of a sub-environment then asks the copy of its vector environment
         return self._requests.ask_one(name, index, message)
 
-    def _seeds(self, seed: Any) -> Any:
-        """One seed or None per sub-environment, or None for none at all."""
-        if isinstance(seed, (int, np.integer)):
-            if not self._manifest.shardable:
-                return int(seed)
-            return [int(seed) + index for index in range(self.num_envs)]
-        if seed is None:
-            return None
-        seeds = [None if one is None else _seed(one) for one in seed]
-        if len(seeds) != self.num_envs:
-            raise ValueError(
-                "If seeds are passed as a list the length must match "
-                f"num_envs={self.num_envs} but got length={len(seeds)}."
-            )
-        return seeds
-
 
 def leave_suite(env: SandboxVectorEnv) -> None:
     """Have its first use start no other task of its suite: ``EnvSuites.map`` does that."""
@@ -647,30 +494,7 @@ def metadata_of(manifest: EnvManifest) -> dict[str, Any]:
     return {**manifest.metadata, "autoreset_mode": mode}
 
 
-def _check_mask(mask: Any, num_envs: int) -> None:
-    """``SyncVectorEnv.reset``'s checks, in its words."""
-    if not isinstance(mask, np.ndarray):
-        raise TypeError(f"`options['reset_mask']` must be a numpy array, got {type(mask)}")
-    if mask.shape != (num_envs,):
-        raise ValueError(
-            f"`options['reset_mask']` must have shape `({num_envs},)`, got {mask.shape}"
-        )
-    if mask.dtype != np.bool_:
-        raise TypeError(f"`options['reset_mask']` must have `dtype=np.bool_`, got {mask.dtype}")
-    if not np.any(mask):
-        raise ValueError(
-            "`options['reset_mask']` must contain a boolean array with at least one True value, "
-            f"got reset_mask={mask}"
-        )
-
-
 def _check_name(name: object) -> None:
     """In Python's words; nothing was sent."""
     if not isinstance(name, str):
         raise TypeError(f"attribute name must be string, not '{type(name).__name__}'")
-
-
-def _seed(given: Any) -> int:
-    if not isinstance(given, (int, np.integer)):
-        raise Error(f"Seed must be a python integer, actual type: {type(given)}")
-    return int(given)

@@ -37,7 +37,7 @@ from envhub_sandbox.session.use_lock import FleetUse
 from envhub_sandbox.system.log import WORKER
 from envhub_sandbox.system.threads import Calls
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline, deadline_of
-from envhub_sandbox.transport.lane import Request
+from envhub_sandbox.transport.jail import Request
 from envhub_sandbox.transport.results import Results, StepResult
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.lifecycle import State

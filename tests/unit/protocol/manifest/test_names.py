@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from envhub_sandbox.errors import RemoteEnvError, RemoteProtocolError, remote_error
 from envhub_sandbox.transport import values
 from envhub_sandbox.transport.values import spec_of
+from envhub_sandbox.vector.send_recv import SendRecv
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol.codec.encoder import encode
 from envhub_worker.protocol.codec.inert import RemoteEnum, RemoteObject
@@ -258,7 +259,8 @@ def test_remote_errors_keep_their_text(builtin: str) -> None:
 
 def test_the_proxys_own_names_are_never_served() -> None:
     """Its methods and properties are found in the class, and its fields mean nothing outside."""
-    public = [name for name in vars(SandboxVectorEnv) if not name.startswith("_")]
+    own = {**vars(SandboxVectorEnv), **vars(SendRecv)}
+    public = [name for name in own if not name.startswith("_")]
     beyond = {name for name in public if not hasattr(AsyncVectorEnv, name) and is_servable(name)}
     assert beyond == {"prewarm", "recv", "sandbox", "send", "send_reset"}
     for name in ("_session", "_requests", "_manifest", "_timeouts", "_read_actions"):
