@@ -23,7 +23,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest.manifest import EnvManifest, decode_env
 
 if TYPE_CHECKING:
-    from envhub_sandbox.transport.lane import Lane, RelayLane
+    from envhub_sandbox.transport.lane import Lane
 
 _numbers = itertools.count(1)
 
@@ -175,12 +175,12 @@ class Builder:
         self._build(relay, dead, deadline)
         lane.renew(dead, fresh, deadline)
 
-    def _relay(self, loaded: LoadedJail, runners: list[int]) -> RelayLane:
-        from envhub_sandbox.transport.lane import RelayLane  # sandboxes/process.py says why here
+    def _relay(self, loaded: LoadedJail, runners: list[int]) -> Lane:
+        from envhub_sandbox.transport.lane import Lane  # sandboxes/process.py says why here
 
-        return RelayLane(loaded.jail, runners, self._number, self._results)
+        return Lane(loaded.jail, runners, self._number, self._results)
 
-    def _build(self, relay: RelayLane, shards: Sequence[int], deadline: Deadline) -> None:
+    def _build(self, relay: Lane, shards: Sequence[int], deadline: Deadline) -> None:
         wanted = self._manifest
         builds: list[tuple[int, m.Message]] = [
             (
@@ -210,7 +210,7 @@ class Builder:
         if built.num_envs != count or _kind(built) != _kind(wanted):
             self._refuse()
 
-    def _fast_lane(self, relay: RelayLane, loaded: LoadedJail, deadline: Deadline) -> Lane:
+    def _fast_lane(self, relay: Lane, loaded: LoadedJail, deadline: Deadline) -> Lane:
         """Agree with the runners on slabs and doorbells; the relay where there can be none.
 
         This is the one place that decides which lane an environment has.

@@ -1,8 +1,9 @@
-"""The way of an environment's requests to its runners: one interface, and the way over the server.
+"""The way of an environment's requests to its runners: over the server, or a faster one.
 
-There are three: ``RelayLane``, below; ``ServedLane``, which is the same with faster steps; and
-``SharedMemoryLane``. Which of them an environment has is decided once, when it is built
-(``session/builder``). What a request means does not depend on the lane.
+There are three: ``Lane``, below; ``ServedLane``, which is the same with faster steps; and
+``SharedMemoryLane``, whose steps and small messages need no server. Which of them an environment
+has is decided once, when it is built (``session/builder``). What a request means does not depend
+on the lane.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Callable, Iterable, Sequence
 from time import perf_counter_ns
-from typing import Any, Protocol
+from typing import Any
 
 from envhub_sandbox.errors import EnvHubError, WorkerError
 from envhub_sandbox.transport.connection import Source
@@ -28,7 +29,7 @@ LOOK_MS = 500
 they are still there."""
 
 
-class Lane(Protocol):
+class Lane:
     """The way to the runners of one environment: one request at a time, and its answers; or
     several steps one after the other, where it ``takes_more``.
 
@@ -38,118 +39,19 @@ class Lane(Protocol):
     take it before anything else is sent: a step's answer would otherwise be taken for the next's.
     ``result`` waits for nothing, so that what it raises is never a signal handler's.
 
-    Attributes:
-        name: What a crash bundle calls it.
-        jail: Where its runners are.
-        runners: One for each shard.
-        number: What the environment is called there.
-        elapsed_ns: What the last step took, from its sending to the last answer.
-    """
-
-    name: str
-    jail: JailHandle
-    runners: list[int]
-    number: int
-    elapsed_ns: int
-
-    @property
-    def takes_more(self) -> bool:
-        """Whether a step can be sent while earlier ones are owed; answers come in that order."""
-
-    def expect_more(self) -> None:
-        """A step waits for the answer to the last. If the lane can, it ``takes_more`` next time."""
-
-    def send_step(self, actions: Any, *, ahead: bool = False) -> None:
-        """Send a validated batch of actions: to each shard its slice.
-
-        Args:
-            actions: The batch.
-            ahead: Whether answers to earlier steps are owed, which ``takes_more`` permits.
-
-        Raises:
-            EnvHubError: Nothing was sent.
-        """
-
-    def wait(self, deadline: Deadline) -> None:
-        """Until every shard has answered the step, with all that belongs to it.
-
-        Raises:
-            WorkerTimeoutError: The deadline came first.
-            WorkerDiedError: The jail has ended.
-            RunnersDiedError: Runners of a kept jail did; it has what the others answered.
-            RemoteProtocolError: A runner broke the rules.
-        """
-
-    def result(self, infos: dict[Any, Any] | None = None) -> StepResult:
-        """What ``VectorEnv.step`` returns; with these infos, if there are other ones.
-
-        Raises:
-            Misfit: The shards' infos do not go together; ``send_for_infos`` asks for others.
-            RemoteEnvError: The repository's code raised.
-            RemoteProtocolError: A runner broke the rules.
-        """
-
-    def send(self, request: Request) -> None:
-        """Send each shard its message.
-
-        Raises:
-            EnvHubError: Nothing was sent.
-        """
-
-    def send_for_infos(self) -> None:
-        """Ask for the last infos as each sub-environment gave them; ``replies`` has them.
-
-        Raises:
-            EnvHubError: Nothing was sent.
-        """
-
-    def replies(self, deadline: Deadline) -> list[m.Message]:
-        """Every shard's reply to what was sent; raises as ``wait`` does."""
-
-    def answered(self) -> bool:
-        """Whether ``wait``, or ``replies``, has nothing to wait for: it returns, or raises.
-
-        Never waits itself, and takes nothing away. Where it says no, it is asked again once one of
-        its ``sources`` is readable, and at least twice a second; an end may be seen only then.
-        """
-
-    def sources(self) -> list[Source]:
-        """What becomes readable, at the latest ``RECHECK_MS`` late, when ``answered`` may say yes.
-
-        For as long as what was sent is owed.
-        """
-
-    def catch_up(self, deadline: Deadline) -> None:
-        """Take what is owed and drop it; raises as ``wait`` does.
-
-        Raises:
-            WorkerError: The sending was interrupted: what was sent is not known.
-        """
-
-    def renew(self, dead: Sequence[int], fresh: Sequence[int], deadline: Deadline) -> None:
-        """Go to other runners in the place of those that have died.
-
-        Args:
-            dead: Their shards.
-            fresh: The runner of each, in which the environment is built already.
-            deadline: For all of it.
-        """
-
-    def traffic(self) -> tuple[int, int, int]:
-        """Stale replies, and bytes sent and received, so far."""
-
-    def close(self) -> None:
-        """Give back what is its own; the jail is not."""
-
-
-class RelayLane:
-    """Over ZeroMQ and the server, which passes frames on to the runners: see ``Lane``.
+    This one goes over ZeroMQ and the server, which passes frames on to the runners; those that are
+    derived of it have faster steps.
 
     Args:
         jail: Where the runners are.
         runners: One for each shard.
         number: What the environment is called there.
         results: What is declared of its answers.
+
+    Attributes:
+        name: What a crash bundle calls it.
+        jail, runners, number: As given.
+        elapsed_ns: What the last step took, from its sending to the last answer.
     """
 
     name = "frames"
@@ -169,14 +71,25 @@ class RelayLane:
 
     @property
     def takes_more(self) -> bool:
-        """See ``Lane``; what a fresh runner may have to repeat is the last request alone."""
+        """Whether a step can be sent while earlier ones are owed; answers come in that order.
+
+        What a fresh runner may have to repeat is the last request alone.
+        """
         return len(self.runners) == 1 and not self.jail.kept
 
     def expect_more(self) -> None:
-        """See ``Lane``."""
+        """A step waits for the answer to the last. If the lane can, it ``takes_more`` next time."""
 
     def send_step(self, actions: Any, *, ahead: bool = False) -> None:
-        """See ``Lane``."""
+        """Send a validated batch of actions: to each shard its slice.
+
+        Args:
+            actions: The batch.
+            ahead: Whether answers to earlier steps are owed, which ``takes_more`` permits.
+
+        Raises:
+            EnvHubError: Nothing was sent.
+        """
         self._asked_ns = perf_counter_ns()
         bounds = self._results.slices
         parts = [actions]
@@ -186,13 +99,28 @@ class RelayLane:
         self.send_some("step", self.runners, list(map(self.jail.pack, messages)), ahead=ahead)
 
     def wait(self, deadline: Deadline) -> None:
-        """See ``Lane``."""
+        """Until every shard has answered the step, with all that belongs to it.
+
+        Raises:
+            WorkerTimeoutError: The deadline came first.
+            WorkerDiedError: The jail has ended.
+            RunnersDiedError: Runners of a kept jail did; it has what the others answered.
+            RemoteProtocolError: A runner broke the rules.
+        """
         asked_ns = self._owed[0][1]
         self._answers = self.replies(deadline)
         self.elapsed_ns = perf_counter_ns() - asked_ns
 
     def result(self, infos: dict[Any, Any] | None = None) -> StepResult:
-        """See ``Lane``. Trust: input from the worker."""
+        """What ``VectorEnv.step`` returns; with these infos, if there are other ones.
+
+        Trust: input from the worker.
+
+        Raises:
+            Misfit: The shards' infos do not go together; ``send_for_infos`` asks for others.
+            RemoteEnvError: The repository's code raised.
+            RemoteProtocolError: A runner broke the rules.
+        """
         # not kept: a large batch that its owner has dropped is memory for the next
         answers, self._answers = self._answers, []
         try:
@@ -202,7 +130,11 @@ class RelayLane:
             raise
 
     def send(self, request: Request) -> None:
-        """See ``Lane``."""
+        """Send each shard its message.
+
+        Raises:
+            EnvHubError: Nothing was sent.
+        """
         self._asked_ns = perf_counter_ns()
         self.send_some(request.operation, self.runners, request.frames)
 
@@ -233,12 +165,16 @@ class RelayLane:
         self._sending = False
 
     def send_for_infos(self) -> None:
-        """See ``Lane``."""
+        """Ask for the last infos as each sub-environment gave them; ``replies`` has them.
+
+        Raises:
+            EnvHubError: Nothing was sent.
+        """
         packed = [self.jail.pack(m.FetchInfosApart(self.number))] * len(self.runners)
         self.send_some("step", self.runners, packed)
 
     def replies(self, deadline: Deadline) -> list[Any]:
-        """See ``Lane``."""
+        """Every shard's reply to what was sent; raises as ``wait`` does."""
         try:
             sent, _, unpack = self._owed[0]
             received = self.jail.receive(sent, deadline, unpack)
@@ -249,32 +185,49 @@ class RelayLane:
         return received
 
     def answered(self) -> bool:
-        """See ``Lane``."""
+        """Whether ``wait``, or ``replies``, has nothing to wait for: it returns, or raises.
+
+        Never waits itself, and takes nothing away. Where it says no, it is asked again once one of
+        its ``sources`` is readable, and at least twice a second; an end may be seen only then.
+        """
         return not self._owed or self.jail.client.arrived(self._owed[0][0])
 
     def sources(self) -> list[Source]:
-        """See ``Lane``."""
+        """What becomes readable, at the latest ``RECHECK_MS`` late, when ``answered`` may say yes.
+
+        For as long as what was sent is owed.
+        """
         return self.jail.client.sources()
 
     def catch_up(self, deadline: Deadline) -> None:
-        """See ``Lane``."""
+        """Take what is owed and drop it; raises as ``wait`` does.
+
+        Raises:
+            WorkerError: The sending was interrupted: what was sent is not known.
+        """
         if self._sending or self.jail.client.torn:
             raise WorkerError("the request was interrupted while it was sent, or its answer taken")
-        while self._owed:
-            self.replies(deadline)
+        while self._owed:  # by the server: a derived lane is owed other answers as well
+            Lane.replies(self, deadline)
 
     def renew(self, dead: Sequence[int], fresh: Sequence[int], deadline: Deadline) -> None:
-        """See ``Lane``."""
+        """Go to other runners in the place of those that have died.
+
+        Args:
+            dead: Their shards.
+            fresh: The runner of each, in which the environment is built already.
+            deadline: For all of it.
+        """
         for index, runner in zip(dead, fresh, strict=True):
             self.runners[index] = runner
 
     def traffic(self) -> tuple[int, int, int]:
-        """See ``Lane``."""
+        """Stale replies, and bytes sent and received, so far."""
         client = self.jail.client
         return client.stale_replies, client.sent_bytes, client.received_bytes
 
     def close(self) -> None:
-        """There is nothing but the jail."""
+        """Give back what is its own; the jail is not."""
 
 
 def answered_first(lanes: Sequence[Lane], deadline: Deadline) -> list[int]:

@@ -27,7 +27,7 @@ def start() -> None:
     """Print from now on."""
     # sandboxes/process.py says why they are imported late
     from envhub_sandbox.transport.connection import WorkerConnection
-    from envhub_sandbox.transport.lane import RelayLane
+    from envhub_sandbox.transport.lane import Lane
     from envhub_sandbox.transport.shared_memory.served_lane import ServedLane
 
     began = perf_counter()
@@ -36,14 +36,14 @@ def start() -> None:
         passed_s = perf_counter() - began
         sys.stderr.write(f"+{passed_s:.6f} {threading.current_thread().name} {text}\n")
 
-    lanes: list[type] = [RelayLane]
+    lanes: list[type] = [Lane]
     if sys.platform == "linux":
         from envhub_sandbox.transport.shared_memory.lane import SharedMemoryLane
 
         lanes.append(SharedMemoryLane)
     of: dict[type, tuple[tuple[str, ...], tuple[str, ...]]] = {
         WorkerConnection: (("send",), ("receive",)),
-        ServedLane: (("send_step",), ("wait",)),  # all else is RelayLane's
+        ServedLane: (("send_step",), ("wait",)),  # all else is Lane's
         **dict.fromkeys(lanes, (_SENDING, _WAITING)),
     }
     for cls, (sends, waits) in of.items():

@@ -1,7 +1,7 @@
 """The fast lane: steps, and small messages, over shared memory, straight to the jail's runners.
 
 A step costs one wake-up per shard and one copy out. What is large, what may have to be repeated in
-a fresh runner, and infos that did not fit go over the server, by the relay that this lane has.
+a fresh runner, and infos that did not fit go over the server, as on the lane that it derives from.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from envhub_sandbox.errors import EnvHubError, RemoteProtocolError, WorkerDiedEr
 from envhub_sandbox.transport.connection import Source
 from envhub_sandbox.transport.deadline import CPUS, Cores, Deadline, SpinChooser
 from envhub_sandbox.transport.jail import Frames, Request
-from envhub_sandbox.transport.lane import RelayLane
+from envhub_sandbox.transport.lane import Lane
 from envhub_sandbox.transport.replies import RunnersDiedError, typed_reply
 from envhub_sandbox.transport.results import Results, StepResult
 from envhub_sandbox.transport.shared_memory.attachment import Attachment
@@ -55,11 +55,11 @@ class _RunnerGoneError(Exception):
     """A runner has ended, or its jail, or the server; that one knows why, if it lives."""
 
 
-class SharedMemoryLane:
+class SharedMemoryLane(Lane):
     """Slabs and doorbells, over all shards of one environment: see ``Lane``.
 
     Args:
-        relay: The way over the server, to the same runners.
+        relay: A lane to the same runners.
         results: What is declared of its answers.
         observed: Where the observations lie.
         layouts: Where each shard's actions and infos lie.
@@ -67,31 +67,27 @@ class SharedMemoryLane:
     """
 
     name = "shared memory"
-    takes_more = False  # there is one slab for what is asked, and one for what is answered
 
     def __init__(
         self,
-        relay: RelayLane,
+        relay: Lane,
         results: Results,
         observed: slabs.ObservationLayout,
         layouts: Sequence[slabs.Layout],
         attachment: Attachment,
     ) -> None:
+        super().__init__(relay.jail, relay.runners, relay.number, results)
         manifest = results.manifest
-        self.jail, self.runners, self.number = relay.jail, relay.runners, relay.number
-        self.elapsed_ns = 0
         self.observations = ObservationSlab(manifest.single_observation_space, observed)
         self.shards = [self._shard(layout) for layout in layouts]
-        self._relay = relay
-        self._results = results
         self._attachment = attachment
         self._watch = attachment.watch
         self._bounds = results.slices
         self._action_space = manifest.single_action_space
         leaves = layouts[0].actions
         self._flat_actions = len(leaves) == 1 and not leaves[0].path
-        self._owed = _BY_SERVER
-        self._answers = _NOTHING
+        self._asked = _BY_SERVER
+        self._said = _NOTHING
         self._joined = JoinedColumns((), ())
         self._steps = 0
         self._step_bytes = sum(one.action_bytes for one in layouts), observed.batch_bytes
@@ -100,7 +96,6 @@ class SharedMemoryLane:
         may_spin = _ORDERED_STORES and workers < len(CPUS)
         self._spin = self._step_spin = SpinChooser(may_spin)
         self._talk_spin = SpinChooser(may_spin)  # messages take another time than steps
-        self._asked_ns = 0
         self._fetching: tuple[int, Sequence[int]] = 0, ()  # for which request, of which shards
         self._settled_ns = 0  # the request of which ``answered`` has found all answers
         self._listens = False
@@ -116,7 +111,7 @@ class SharedMemoryLane:
     @classmethod
     def open(
         cls,
-        relay: RelayLane,
+        relay: Lane,
         results: Results,
         attachment: Attachment,
         deadline: Deadline,
@@ -146,7 +141,7 @@ class SharedMemoryLane:
 
     def renew(self, dead: Sequence[int], fresh: Sequence[int], deadline: Deadline) -> None:
         """See ``Lane``; they get slabs that the dead never saw."""
-        self._relay.renew(dead, fresh, deadline)
+        super().renew(dead, fresh, deadline)
         for index in dead:
             old = self.shards[index]
             self._attachment.forget(index, old)
@@ -184,12 +179,14 @@ class SharedMemoryLane:
     def _shard(self, layout: slabs.Layout) -> LaneShard:
         return LaneShard(layout, self.observations.fd)
 
-    def expect_more(self) -> None:
-        """See ``Lane``."""
+    @property
+    def takes_more(self) -> bool:
+        """See ``Lane``: there is one slab for what is asked, and one for what is answered."""
+        return False
 
     def send_step(self, actions: Any, *, ahead: bool = False) -> None:
         """See ``Lane``."""
-        self._owed = _STEP  # interruption.md, rule 1: first
+        self._asked = _STEP  # interruption.md, rule 1: first
         self._steps += 1
         leaves = [actions] if self._flat_actions else slabs.flatten(self._action_space, actions)
         self._asked_ns = perf_counter_ns()
@@ -212,22 +209,22 @@ class SharedMemoryLane:
     def wait(self, deadline: Deadline) -> None:
         """See ``Lane``."""
         outcomes = self._outcomes(deadline)
-        self._answers = self._with_fetched(outcomes, deadline) if outcomes else _NOTHING
+        self._said = self._with_fetched(outcomes, deadline) if outcomes else _NOTHING
 
     def result(self, infos: dict[Any, Any] | None = None) -> StepResult:
         """See ``Lane``. Trust: input from the worker."""
         if infos is None:
-            infos = self._infos() if self._answers else {}
+            infos = self._infos() if self._said else {}
         return (self.observations.take(), *self.observations.results(), infos)
 
     def _infos(self) -> dict[Any, Any]:
-        if len(self.shards) > 1 and all(kind == slabs.COLUMNS for kind, _ in self._answers):
+        if len(self.shards) > 1 and all(kind == slabs.COLUMNS for kind, _ in self._said):
             schemas = [shard.schema for shard in self.shards]
             if not self._joined.is_of(schemas):
                 self._joined = JoinedColumns(schemas, self._bounds)
             if self._joined.columns:
                 return self._joined.infos()
-        shards = zip(self.shards, self._answers, strict=True)
+        shards = zip(self.shards, self._said, strict=True)
         parts = [infos_of(shard, outcome, self._results) for shard, outcome in shards]
         return self._results.infos(parts)
 
@@ -263,11 +260,11 @@ class SharedMemoryLane:
         if self._fetching != (self._asked_ns, shards):  # else ``answered`` has asked for it
             self._ask_for(shards)
         self._fetching = 0, ()
-        return self._relay.replies(deadline)
+        return super().replies(deadline)
 
     def _ask_for(self, shards: Sequence[int]) -> None:
         packed = [self.jail.pack(m.FetchInfos(self.number))] * len(shards)
-        self._relay.send_some(self._owed, [self.runners[index] for index in shards], packed)
+        super().send_some(self._asked, [self.runners[index] for index in shards], packed)
 
     # --- messages ------------------------------------------------------------------------------
 
@@ -276,12 +273,12 @@ class SharedMemoryLane:
         operation = request.operation
         # what may have to be repeated in a fresh runner goes by the server, who knows the dead
         if self.jail.kept or operation in _BULKY or not all(map(_fits, request.frames)):
-            self._owed = _BY_SERVER
+            self._asked = _BY_SERVER
             if operation == "reset":
                 self.observations.leave()
-            self._relay.send(request)
+            super().send(request)
             return
-        self._owed = operation  # interruption.md, rule 1: first
+        self._asked = operation  # interruption.md, rule 1: first
         self._asked_ns = perf_counter_ns()
         self._spin = self._talk_spin
         # a reset writes a batch, and what is written must not be held by anyone
@@ -295,18 +292,18 @@ class SharedMemoryLane:
 
     def send_for_infos(self) -> None:
         """See ``Lane``."""
-        self._owed = _BY_SERVER
-        self._relay.send_for_infos()
+        self._asked = _BY_SERVER
+        super().send_for_infos()
 
     def replies(self, deadline: Deadline) -> list[m.Message]:
         """See ``Lane``."""
-        operation = self._owed
+        operation = self._asked
         if operation == _BY_SERVER:
-            return self._relay.replies(deadline)
+            return super().replies(deadline)
         try:
             self._wait_for_all(deadline)
         except _RunnerGoneError:
-            raise self.jail.cause_of_death(self._owed) from None
+            raise self.jail.cause_of_death(self._asked) from None
         answers = [shard.answer() for shard in self.shards]
         missing = [index for index, answer in enumerate(answers) if answer is None]
         if missing:
@@ -333,8 +330,8 @@ class SharedMemoryLane:
 
     def answered(self) -> bool:
         """See ``Lane``. What has to be fetched is asked for here: a runner may never give it."""
-        if self._owed == _BY_SERVER:
-            return self._relay.answered()
+        if self._asked == _BY_SERVER:
+            return super().answered()
         if self._settled_ns == self._asked_ns:
             return True
         for shard in self.shards:
@@ -349,15 +346,15 @@ class SharedMemoryLane:
             except EnvHubError:  # whoever waits asks again, and meets the same
                 return True
             self._fetching = self._asked_ns, shards
-        if self._fetching[1] and not self._relay.answered():
+        if self._fetching[1] and not super().answered():
             return False
         self._settled_ns = self._asked_ns
         return True
 
     def sources(self) -> list[Source]:
         """See ``Lane``."""
-        if self._owed == _BY_SERVER or self._fetching[0] == self._asked_ns:
-            return self._relay.sources()
+        if self._asked == _BY_SERVER or self._fetching[0] == self._asked_ns:
+            return super().sources()
         if not self._listens:
             self._listen(True)
         return [self._watch.fileno()]
@@ -369,10 +366,10 @@ class SharedMemoryLane:
 
     def catch_up(self, deadline: Deadline) -> None:
         """See ``Lane``."""
-        self._relay.catch_up(deadline)
-        if self._owed == _STEP:
+        super().catch_up(deadline)
+        if self._asked == _STEP:
             self._outcomes(deadline)  # wanted or not: later columns are of the schema they bring
-        elif self._owed != _BY_SERVER:
+        elif self._asked != _BY_SERVER:
             self.replies(deadline)
 
     # --- waiting -------------------------------------------------------------------------------
@@ -391,8 +388,8 @@ class SharedMemoryLane:
         # later than that we sleep as well. Each wait looks at its shard's answer before it looks at
         # a death: a runner that answers and then dies has answered. All shards are waited for, also
         # after one has raised: an answer that is left in its slab would be taken for the answer to
-        # the next request (interruption.md, rule 1). An interrupt anywhere here leaves ``_owed`` as
-        # it was, and ``catch_up`` waits for the same answers again: to wait takes nothing away.
+        # the next request (interruption.md, rule 1). An interrupt anywhere here leaves ``_asked``
+        # as it was, and ``catch_up`` waits for the same answers again: to wait takes nothing away.
         # What ``answered`` has found is not waited for: a jail may take it back, and others would
         # wait for it as well.
         if self._settled_ns != self._asked_ns:
@@ -432,7 +429,7 @@ class SharedMemoryLane:
             WorkerTimeoutError: The deadline came before the answer of one that lives.
         """
         if not self.jail.kept:
-            raise self.jail.cause_of_death(self._owed) from None
+            raise self.jail.cause_of_death(self._asked) from None
         answers = self._attachment.answers
         dead = [i for i, shard in enumerate(self.shards) if not answers(i, shard, deadline)]
         if dead:
@@ -481,7 +478,7 @@ class SharedMemoryLane:
 
     def traffic(self) -> tuple[int, int, int]:
         """See ``Lane``; of what lies in shared memory, infos and messages are left out."""
-        stale, sent, received = self._relay.traffic()
+        stale, sent, received = super().traffic()
         there, back = self._step_bytes
         return stale, sent + there * self._steps, received + back * self._steps
 

@@ -2,7 +2,7 @@
 
 It is on another host, or the caller has chosen frames. A step is one message each way: the client's
 half of each shard's request slab, and what the runner wrote into the reply and the observations.
-All else goes as over ``RelayLane``, and so do steps of which several are on their way: a slab has
+All else goes as over ``Lane``, and so do steps of which several are on their way: a slab has
 room for one.
 """
 
@@ -19,7 +19,7 @@ import numpy as np
 from envhub_sandbox.errors import EnvHubError, RemoteProtocolError, WorkerDiedError
 from envhub_sandbox.transport.deadline import Deadline, SpinChooser
 from envhub_sandbox.transport.jail import Frames
-from envhub_sandbox.transport.lane import RelayLane
+from envhub_sandbox.transport.lane import Lane
 from envhub_sandbox.transport.replies import RunnersDiedError, expect_reply, typed_reply
 from envhub_sandbox.transport.results import Results, StepResult
 from envhub_sandbox.transport.shared_memory.client_slabs import (
@@ -43,7 +43,7 @@ _NO_MORE: Outcome = (slabs.DONE, None)
 """The same, read."""
 
 
-class ServedLane(RelayLane):
+class ServedLane(Lane):
     """See ``Lane``.
 
     Args:
@@ -51,7 +51,7 @@ class ServedLane(RelayLane):
         shards: The slabs of each.
     """
 
-    def __init__(self, relay: RelayLane, results: Results, shards: list[ServedShard]) -> None:
+    def __init__(self, relay: Lane, results: Results, shards: list[ServedShard]) -> None:
         super().__init__(relay.jail, relay.runners, relay.number, results)
         self._shards = shards
         self._action_space = results.manifest.single_action_space
@@ -63,7 +63,7 @@ class ServedLane(RelayLane):
         self._asked: Sequence[int] = ()  # shards, for infos that did not fit
 
     @classmethod
-    def open(cls, relay: RelayLane, results: Results, deadline: Deadline) -> RelayLane:
+    def open(cls, relay: Lane, results: Results, deadline: Deadline) -> Lane:
         """The lane; ``relay`` itself where the spaces have no fixed layout, or one side refuses.
 
         Raises:

@@ -16,7 +16,7 @@ from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError, WorkerTi
 from envhub_sandbox.transport import trace
 from envhub_sandbox.transport.connection import WorkerConnection, describe_exit
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.lane import RelayLane
+from envhub_sandbox.transport.lane import Lane
 from envhub_sandbox.transport.shared_memory.lane import SharedMemoryLane
 from envhub_sandbox.transport.shared_memory.served_lane import ServedLane
 from envhub_worker.protocol import messages as m
@@ -167,7 +167,7 @@ def test_the_end_of_a_server_has_arrived_as_well() -> None:
 
 
 NAMES = ("send", "receive", "send_step", "send_for_infos", "wait", "replies")
-CLASSES = (WorkerConnection, RelayLane, SharedMemoryLane, ServedLane)
+CLASSES = (WorkerConnection, Lane, SharedMemoryLane, ServedLane)
 
 
 @pytest.fixture

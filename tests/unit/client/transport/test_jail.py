@@ -12,7 +12,7 @@ import pytest
 
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import JailHandle, WatchedAttributes
-from envhub_sandbox.transport.lane import RelayLane, answered_first
+from envhub_sandbox.transport.lane import Lane, answered_first
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
 from envhub_worker.protocol.messages.prefix import CHANGES
@@ -73,7 +73,7 @@ def test_what_the_next_request_makes_useless_is_not_kept() -> None:
     server = FakeServer()
     jail = JailHandle(cast("Any", server), 1, [1], [], DEFAULT_LIMITS)
     results = Mock(slices=[(0, 1)])
-    lane = RelayLane(jail, [1], 7, results)
+    lane = Lane(jail, [1], 7, results)
     for _ in range(100):
         lane.send_some("step", [1], [REPLY])
         server.answer(REPLY)

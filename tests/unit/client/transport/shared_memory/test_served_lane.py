@@ -19,7 +19,7 @@ from envhub_sandbox.errors import (
 )
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import JailHandle
-from envhub_sandbox.transport.lane import RelayLane
+from envhub_sandbox.transport.lane import Lane
 from envhub_sandbox.transport.replies import RunnersDiedError
 from envhub_sandbox.transport.results import Results
 from envhub_sandbox.transport.shared_memory.served_lane import ServedLane, ServedShard
@@ -153,7 +153,7 @@ class Served:
             single_observation_space=SMALL, single_action_space=spaces.Discrete(99), num_envs=shards
         )
         results = Results(manifest, bounds)
-        lane = ServedLane.open(RelayLane(jail, runners, 7, results), results, Deadline(0))
+        lane = ServedLane.open(Lane(jail, runners, 7, results), results, Deadline(0))
         assert isinstance(lane, ServedLane)
         self.lane, self._shards = lane, shards
 
