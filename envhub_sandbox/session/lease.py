@@ -271,9 +271,9 @@ class Lease:
         lane, deadline = self.lane, Deadline(self.repository.timeouts.close_s)
         if lane is None:
             return
-        requests = [(runner, m.Close(lane.number)) for runner in lane.runners]
+        packed = lane.jail.pack(m.Close(lane.number))
         with contextlib.suppress(EnvHubError):
-            lane.jail.receive(lane.jail.send("close", requests), deadline)
+            lane.jail.ask("close", [(runner, packed) for runner in lane.runners], deadline)
 
     def note_steps(self) -> None:
         """Remember what a step took, for the next use of the pin."""

@@ -160,10 +160,6 @@ class JailHandle:
         frames = [m.pack(message, pickler=pickler, limits=self.limits) for message in messages]
         return Request(operation, messages, frames, bounds, plain=pickler.plain)
 
-    def send(self, operation: str, requests: Sequence[tuple[int, m.Message]]) -> int:
-        """Send one message to each of some runners, in one request; returns its id."""
-        return self.relay(operation, [(runner, self.pack(message)) for runner, message in requests])
-
     def relay(
         self,
         operation: str,
@@ -171,7 +167,9 @@ class JailHandle:
         *,
         deposited: bool = False,
     ) -> int:
-        """``send`` for messages that are packed; ``deposited`` as in ``Relay``."""
+        """Send a packed message to each of some runners, in one request; returns its id.
+        ``deposited``: as in ``Relay``.
+        """
         parts = tuple((runner, len(frames)) for runner, frames in requests)
         payload = [frame for _, frames in requests for frame in frames]
         return self.send_relay(m.Relay(self.number, operation, parts, deposited), payload)

@@ -128,10 +128,6 @@ class Results:
             start += size
         return pairs
 
-    def reset_done(self, observation: Any, reply: m.Message) -> m.ResetDone:
-        """A shard's reply to a reset, of which the observation has come another way."""
-        return m.ResetDone(observation, self.info(reply))
-
     def infos(self, parts: list[dict[Any, Any]]) -> dict[Any, Any]:
         """One mapping of the shards' infos."""
         whole = len(parts) == 1

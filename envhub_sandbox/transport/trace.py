@@ -18,8 +18,8 @@ from typing import Any
 
 from envhub_worker.protocol import messages as m
 
-_SENDING = ("send_step", "send", "send_for_infos")
-_WAITING = ("wait", "replies")
+_SENDING = frozenset({"send_step", "send", "send_for_infos"})
+_WAITING = frozenset({"wait", "replies", "receive"})
 
 
 @functools.cache
@@ -36,21 +36,17 @@ def start() -> None:
         passed_s = perf_counter() - began
         sys.stderr.write(f"+{passed_s:.6f} {threading.current_thread().name} {text}\n")
 
-    lanes: list[type] = [Lane]
+    classes: list[type] = [WorkerConnection, Lane, ServedLane]
     if sys.platform == "linux":
         from envhub_sandbox.transport.shared_memory.lane import SharedMemoryLane
 
-        lanes.append(SharedMemoryLane)
-    of: dict[type, tuple[tuple[str, ...], tuple[str, ...]]] = {
-        WorkerConnection: (("send",), ("receive",)),
-        ServedLane: (("send_step",), ("wait",)),  # all else is Lane's
-        **dict.fromkeys(lanes, (_SENDING, _WAITING)),
-    }
-    for cls, (sends, waits) in of.items():
-        for name in sends:
-            setattr(cls, name, _sending(getattr(cls, name), say))
-        for name in waits:
-            setattr(cls, name, _waiting(getattr(cls, name), say))
+        classes.append(SharedMemoryLane)
+    for cls in classes:
+        for name, method in list(vars(cls).items()):
+            if name in _SENDING:
+                setattr(cls, name, _sending(method, say))
+            elif name in _WAITING:
+                setattr(cls, name, _waiting(method, say))
 
 
 def _sending(method: Callable[..., Any], say: Callable[[str], None]) -> Callable[..., Any]:

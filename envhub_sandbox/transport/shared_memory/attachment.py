@@ -53,7 +53,8 @@ class Attachment:
         # died would look open, and every deposit would hold five descriptors of this process.
         self.watch.bell(shard.bell)
         try:
-            wait_s = _wait_s(deadline)
+            left_s = deadline.left_s()
+            wait_s = _ANSWER_S if left_s is None else min(_ANSWER_S, max(_LEAST_S, left_s))
             pidfd = deposit(self._path, SESSION, self._jail, runner, shard.fds, wait_s)
         except OSError as error:
             text = "the worker process died before its first request"
@@ -85,11 +86,6 @@ class Attachment:
         for index, pidfd in list(self._pidfds.items()):
             del self._pidfds[index]  # interruption.md, rule 4
             os.close(pidfd)
-
-
-def _wait_s(deadline: Deadline) -> float:
-    left = deadline.left_s()
-    return _ANSWER_S if left is None else min(_ANSWER_S, max(_LEAST_S, left))
 
 
 def deposit(

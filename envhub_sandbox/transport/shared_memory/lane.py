@@ -319,7 +319,7 @@ class SharedMemoryLane(Lane):
             return [
                 reply
                 if isinstance(reply, m.RaisedException)
-                else self._results.reset_done(part, reply)
+                else m.ResetDone(part, self._results.info(reply))
                 for part, reply in zip(self._observations(), replies, strict=True)
             ]
 
