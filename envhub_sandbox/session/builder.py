@@ -221,14 +221,14 @@ class Builder:
         if server.fd_path is None or self._repository.lane == "frames":
             from envhub_sandbox.transport.shared_memory.served_lane import ServedLane
 
-            return ServedLane.open(relay, self._results, deadline)
+            return ServedLane.open(relay, deadline)
         # late, for Linux alone has what they import
         from envhub_sandbox.transport.shared_memory.attachment import Attachment
         from envhub_sandbox.transport.shared_memory.lane import SharedMemoryLane
 
         attachment = Attachment(server.fd_path, loaded.jail.number, server.process_fd)
         copy = self._repository.copy
-        lane = SharedMemoryLane.open(relay, self._results, attachment, deadline, copy=copy)
+        lane = SharedMemoryLane.open(relay, attachment, deadline, copy=copy)
         return lane or relay
 
     def _check_manifest(self, loaded: LoadedJail) -> None:

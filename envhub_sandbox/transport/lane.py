@@ -46,24 +46,24 @@ class Lane:
         jail: Where the runners are.
         runners: One for each shard.
         number: What the environment is called there.
-        results: What is declared of its answers.
+        declared: What its answers are held against.
 
     Attributes:
         name: What a crash bundle calls it.
-        jail, runners, number: As given.
+        jail, runners, number, declared: As given.
         elapsed_ns: What the last step took, from its sending to the last answer.
     """
 
     name = "frames"
 
     def __init__(
-        self, jail: JailHandle, runners: Sequence[int], number: int, results: Results
+        self, jail: JailHandle, runners: Sequence[int], number: int, declared: Results
     ) -> None:
         self.jail = jail
         self.runners = list(runners)
         self.number = number
         self.elapsed_ns = 0
-        self._results = results
+        self.declared = declared
         self._asked_ns = 0
         self._answers: list[m.Message] = []
         self._owed: deque[tuple[int, int, Unpack | None]] = deque()  # requests, and since when
@@ -91,10 +91,10 @@ class Lane:
             EnvHubError: Nothing was sent.
         """
         self._asked_ns = perf_counter_ns()
-        bounds = self._results.slices
+        bounds = self.declared.slices
         parts = [actions]
         if len(bounds) > 1:
-            parts = batches.split(self._results.manifest.single_action_space, actions, bounds)
+            parts = batches.split(self.declared.manifest.single_action_space, actions, bounds)
         messages = [m.Step(self.number, part) for part in parts]
         self.send_some("step", self.runners, list(map(self.jail.pack, messages)), ahead=ahead)
 
@@ -124,7 +124,7 @@ class Lane:
         # not kept: a large batch that its owner has dropped is memory for the next
         answers, self._answers = self._answers, []
         try:
-            return self._results.step(all_replies(answers, m.StepDone), infos)
+            return self.declared.step(all_replies(answers, m.StepDone), infos)
         except batches.Misfit:
             self._answers = answers  # to be joined once more, with other infos
             raise

@@ -19,7 +19,7 @@ from envhub_sandbox.transport.deadline import CPUS, Cores, Deadline, SpinChooser
 from envhub_sandbox.transport.jail import Frames, Request
 from envhub_sandbox.transport.lane import Lane
 from envhub_sandbox.transport.replies import RunnersDiedError, typed_reply
-from envhub_sandbox.transport.results import Results, StepResult
+from envhub_sandbox.transport.results import StepResult
 from envhub_sandbox.transport.shared_memory.attachment import Attachment
 from envhub_sandbox.transport.shared_memory.client_slabs import (
     RING,
@@ -60,7 +60,6 @@ class SharedMemoryLane(Lane):
 
     Args:
         relay: A lane to the same runners.
-        results: What is declared of its answers.
         observed: Where the observations lie.
         layouts: Where each shard's actions and infos lie.
         attachment: The other ends of the slabs.
@@ -71,13 +70,12 @@ class SharedMemoryLane(Lane):
     def __init__(
         self,
         relay: Lane,
-        results: Results,
         observed: slabs.ObservationLayout,
         layouts: Sequence[slabs.Layout],
         attachment: Attachment,
     ) -> None:
-        super().__init__(relay.jail, relay.runners, relay.number, results)
-        manifest = results.manifest
+        super().__init__(relay.jail, relay.runners, relay.number, relay.declared)
+        results, manifest = relay.declared, relay.declared.manifest
         self.observations = ObservationSlab(manifest.single_observation_space, observed)
         self.shards = [self._shard(layout) for layout in layouts]
         self._attachment = attachment
@@ -110,27 +108,21 @@ class SharedMemoryLane(Lane):
 
     @classmethod
     def open(
-        cls,
-        relay: Lane,
-        results: Results,
-        attachment: Attachment,
-        deadline: Deadline,
-        *,
-        copy: bool,
+        cls, relay: Lane, attachment: Attachment, deadline: Deadline, *, copy: bool
     ) -> SharedMemoryLane | None:
         """A lane with fresh slabs; None where the spaces have no fixed layout, or a runner refuses.
 
         Raises:
             WorkerError: A runner died, or took too long.
         """
-        slots = 1 if copy else 1 + RING
+        results, slots = relay.declared, 1 if copy else 1 + RING
         space = results.manifest.single_observation_space
         observed = slabs.observation_layout(space, results.count, slots)
         layouts = action_layouts(results)
         if observed is None or layouts is None:
             attachment.close()
             return None
-        lane = cls(relay, results, observed, layouts, attachment)
+        lane = cls(relay, observed, layouts, attachment)
         agreed = False
         try:
             agreed = lane._attach(range(len(layouts)), deadline)
@@ -225,8 +217,8 @@ class SharedMemoryLane(Lane):
             if self._joined.columns:
                 return self._joined.infos()
         shards = zip(self.shards, self._said, strict=True)
-        parts = [infos_of(shard, outcome, self._results) for shard, outcome in shards]
-        return self._results.infos(parts)
+        parts = [infos_of(shard, outcome, self.declared) for shard, outcome in shards]
+        return self.declared.infos(parts)
 
     def _outcomes(self, deadline: Deadline) -> list[Outcome]:
         """Every shard's outcome; nothing at all if none says more than its results."""
@@ -319,13 +311,13 @@ class SharedMemoryLane(Lane):
             return [
                 reply
                 if isinstance(reply, m.RaisedException)
-                else m.ResetDone(part, self._results.info(reply))
+                else m.ResetDone(part, self.declared.info(reply))
                 for part, reply in zip(self._observations(), replies, strict=True)
             ]
 
     def _observations(self) -> list[Any]:
         """The rows of each shard."""
-        space = self._results.manifest.single_observation_space
+        space = self.declared.manifest.single_observation_space
         return list(batches.split(space, self.observations.take(), self._bounds))
 
     def answered(self) -> bool:
@@ -471,7 +463,7 @@ class SharedMemoryLane(Lane):
         if isinstance(outcome[1], m.RaisedException):
             return outcome[1]
         rewards, over, cut = (column[slice(*self._bounds[index])] for column in flags)
-        info = infos_of(self.shards[index], outcome, self._results)
+        info = infos_of(self.shards[index], outcome, self.declared)
         return m.StepDone(observation, rewards, over, cut, info)
 
     # --- the rest ------------------------------------------------------------------------------

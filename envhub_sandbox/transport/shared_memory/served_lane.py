@@ -21,7 +21,7 @@ from envhub_sandbox.transport.deadline import Deadline, SpinChooser
 from envhub_sandbox.transport.jail import Frames
 from envhub_sandbox.transport.lane import Lane
 from envhub_sandbox.transport.replies import RunnersDiedError, expect_reply, typed_reply
-from envhub_sandbox.transport.results import Results, StepResult
+from envhub_sandbox.transport.results import StepResult
 from envhub_sandbox.transport.shared_memory.client_slabs import (
     ObservationSlab,
     Outcome,
@@ -51,10 +51,10 @@ class ServedLane(Lane):
         shards: The slabs of each.
     """
 
-    def __init__(self, relay: Lane, results: Results, shards: list[ServedShard]) -> None:
-        super().__init__(relay.jail, relay.runners, relay.number, results)
+    def __init__(self, relay: Lane, shards: list[ServedShard]) -> None:
+        super().__init__(relay.jail, relay.runners, relay.number, relay.declared)
         self._shards = shards
-        self._action_space = results.manifest.single_action_space
+        self._action_space = self.declared.manifest.single_action_space
         leaves = shards[0].slabs.layout.actions
         self._flat_actions = len(leaves) == 1 and not leaves[0].path
         self._spin = SpinChooser(True)
@@ -63,12 +63,13 @@ class ServedLane(Lane):
         self._asked: Sequence[int] = ()  # shards, for infos that did not fit
 
     @classmethod
-    def open(cls, relay: Lane, results: Results, deadline: Deadline) -> Lane:
+    def open(cls, relay: Lane, deadline: Deadline) -> Lane:
         """The lane; ``relay`` itself where the spaces have no fixed layout, or one side refuses.
 
         Raises:
             WorkerError: A runner died, or took too long.
         """
+        results = relay.declared
         space = results.manifest.single_observation_space
         shards = [
             ServedShard(space, layout, observed)
@@ -77,7 +78,7 @@ class ServedLane(Lane):
         ]
         if len(shards) < len(results.slices):
             return relay
-        lane = cls(relay, results, shards)
+        lane = cls(relay, shards)
         return lane if lane._attach(range(len(shards)), deadline) else relay
 
     def renew(self, dead: Sequence[int], fresh: Sequence[int], deadline: Deadline) -> None:
@@ -129,7 +130,7 @@ class ServedLane(Lane):
         if len(shards) == 1:
             payload = [shards[0].ask(leaves, spin_ns)]
         else:
-            rows = [[leaf[slice(*each)] for leaf in leaves] for each in self._results.slices]
+            rows = [[leaf[slice(*each)] for leaf in leaves] for each in self.declared.slices]
             payload = [shard.ask(own, spin_ns) for shard, own in zip(shards, rows, strict=True)]
         self._send(lambda: self.jail.send_relay(self._step, payload), self._outcome)
 
@@ -171,12 +172,12 @@ class ServedLane(Lane):
         if infos is None:
             infos = {}
             if outcomes != [_NO_MORE] * len(shards):
-                infos = self._results.infos(list(map(self._infos_of, shards, outcomes)))
+                infos = self.declared.infos(list(map(self._infos_of, shards, outcomes)))
         parts = [(*shard.rows(), infos) for shard in shards]
-        return parts[0] if len(parts) == 1 else self._results.joined_steps(parts, infos)
+        return parts[0] if len(parts) == 1 else self.declared.joined_steps(parts, infos)
 
     def _infos_of(self, shard: ServedShard, outcome: Outcome) -> dict[Any, Any]:
-        return infos_of(shard.slabs, outcome, self._results)
+        return infos_of(shard.slabs, outcome, self.declared)
 
     def _stepped(self, shard: ServedShard, outcome: Outcome | None) -> m.Message | None:
         """What a shard that lives wrote, as the message that it stands for."""

@@ -153,7 +153,7 @@ class Served:
             single_observation_space=SMALL, single_action_space=spaces.Discrete(99), num_envs=shards
         )
         results = Results(manifest, bounds)
-        lane = ServedLane.open(Lane(jail, runners, 7, results), results, Deadline(0))
+        lane = ServedLane.open(Lane(jail, runners, 7, results), Deadline(0))
         assert isinstance(lane, ServedLane)
         self.lane, self._shards = lane, shards
 
