@@ -89,42 +89,41 @@ class ShardSlabs:
         self._codes = [_UNKNOWN] * len(layout.actions)
         self._wishes: Wishes | None = (0, 0, 0)
         self._told = False
-        self._rows: tuple[Any, Any] = None, None
-
-    def write_rows(self, rows: Any, wishes: Wishes) -> None:
-        """``write`` of actions that are one array, where nothing else is new: it usually is not."""
-        dtype, view = self._rows
-        if dtype is not rows.dtype or self._told:
-            self.write([rows], wishes)
-            self._rows = rows.dtype, self._views[0, rows.dtype][1]
-            return
-        view[...] = rows
-        if wishes != self._wishes:
-            self._wish(*wishes)
+        self._dtype: Any = None  # of the last actions, where these are one array
+        self._only: Any = None  # the slab as such an array
 
     def write(self, leaves: Sequence[Any], wishes: Wishes) -> None:
         """Write a shard's actions."""
+        only = leaves[0] if leaves else None  # of a space without members there is nothing
+        if type(only) is np.ndarray and only.dtype is self._dtype and not self._told:
+            self._only[...] = only  # as the last time, which it usually is
+        else:
+            self._write(leaves)
+        if wishes != self._wishes:
+            self._wish(*wishes)
+
+    def _write(self, leaves: Sequence[Any]) -> None:
         asks = self._asks
         if self._told:
             asks[slabs.MESSAGE] = 0
             self._told = False
         for index, leaf in enumerate(leaves):
             listed = type(leaf) is list
-            if listed:
-                leaf = np.asarray(leaf)
-            found = self._views.get((index, leaf.dtype))
+            array = np.asarray(leaf) if listed else leaf
+            found = self._views.get((index, array.dtype))
             if found is None:
-                found = self._view(index, leaf.dtype)
+                found = self._view(index, array.dtype)
             code = found[0] + slabs.LISTED if listed else found[0]
             if self._codes[index] != code:
                 self._codes[index] = _UNKNOWN
-                self._rows = None, None
+                self._dtype = None
                 asks[slabs.DTYPES + index] = code
                 asks[slabs.CHANGES] += 1
                 self._codes[index] = code
-            found[1][...] = leaf
-        if wishes != self._wishes:
-            self._wish(*wishes)
+            found[1][...] = array
+            if len(leaves) == 1 and not listed:
+                self._only = found[1]
+                self._dtype = array.dtype
 
     def write_message(self, packet: bytes, wishes: Wishes) -> None:
         """Write a message in the place of actions."""
@@ -265,11 +264,6 @@ class LaneShard(ShardSlabs):
     def ask(self, leaves: Sequence[Any], wishes: Wishes) -> None:
         """Write a shard's actions and announce them."""
         self.write(leaves, wishes)
-        self._announce()
-
-    def ask_rows(self, rows: Any, wishes: Wishes) -> None:
-        """The same, of actions that are one array."""
-        self.write_rows(rows, wishes)
         self._announce()
 
     def tell(self, packet: bytes, wishes: Wishes) -> None:

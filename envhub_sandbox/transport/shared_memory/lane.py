@@ -11,8 +11,6 @@ from collections.abc import Sequence
 from time import perf_counter_ns
 from typing import Any
 
-import numpy as np
-
 from envhub_sandbox.errors import EnvHubError, RemoteProtocolError, WorkerDiedError
 from envhub_sandbox.transport.connection import Source
 from envhub_sandbox.transport.deadline import CPUS, Cores, Deadline, SpinChooser
@@ -190,13 +188,11 @@ class SharedMemoryLane(Lane):
             return
         # the first ones start while the last ones are still asked: with many, each moment counts
         asked = zip(self.shards, self._bounds, self._cores.of_shards(), strict=True)
-        is_one_array = self._flat_actions and type(actions) is np.ndarray
+        flat = self._flat_actions
         for index, (shard, (start, stop), cpu) in enumerate(asked):
             wishes = slot, spin_ns if index < self._awake else 0, cpu
-            if is_one_array:
-                shard.ask_rows(actions[start:stop], wishes)
-            else:
-                shard.ask([leaf[start:stop] for leaf in leaves], wishes)
+            rows = [actions[start:stop]] if flat else [leaf[start:stop] for leaf in leaves]
+            shard.ask(rows, wishes)
 
     def wait(self, deadline: Deadline) -> None:
         """See ``Lane``."""

@@ -70,9 +70,9 @@ class _Runner:
         self._changes = 0
         self._wishes: tuple[int, int] = (0, 0)
 
-    def asked(self, dtype: str, slot: int, *, one_array: bool) -> tuple[int, int, int]:
+    def asked(self, dtype: str, slot: int) -> tuple[int, int, int]:
         """What it makes of a step: length of a message, code of the dtype, slot."""
-        ask(self.lane, dtype, slot, one_array=one_array)
+        ask(self.lane, dtype, slot)
         words = inside.request_words(self.lane)
         if words[slabs.CHANGES] != self._changes:
             self._changes = words[slabs.CHANGES]
@@ -80,21 +80,14 @@ class _Runner:
         return words[slabs.MESSAGE], *self._wishes
 
 
-def ask(lane: LaneShard, dtype: str, slot: int, *, one_array: bool) -> None:
-    """Ask for a step, in one of the two ways."""
-    actions, wishes = np.zeros(1, dtype), (slot, 0, 0)
-    if one_array:
-        lane.ask_rows(actions, wishes)
-    else:
-        lane.ask([actions], wishes)
+def ask(lane: LaneShard, dtype: str, slot: int) -> None:
+    """Ask for a step."""
+    lane.ask([np.zeros(1, dtype)], (slot, 0, 0))
 
 
-@pytest.mark.parametrize("one_array", [True, False])
 @pytest.mark.parametrize("afterwards", [("int64", 0), ("int32", 1)])
 @pytest.mark.parametrize("what", ["step", "message"])
-def test_a_runner_is_told_all_after_an_interrupt(
-    what: str, afterwards: tuple[str, int], one_array: bool
-) -> None:
+def test_a_runner_is_told_all_after_an_interrupt(what: str, afterwards: tuple[str, int]) -> None:
     """Whether the next step is like the interrupted one, or like the one before it."""
     dtype, slot = afterwards
     expected = (0, slabs.DTYPE_CODES[np.dtype(dtype)], slot)
@@ -102,16 +95,16 @@ def test_a_runner_is_told_all_after_an_interrupt(
     while True:
         runner = _Runner()
         lane = runner.lane
-        runner.asked("int64", 0, one_array=one_array)
+        runner.asked("int64", 0)
 
         def act(lane: LaneShard = lane) -> None:
             if what == "step":
-                ask(lane, "int32", 1, one_array=one_array)
+                ask(lane, "int32", 1)
             else:
                 lane.tell(b"packet", (1, 0, 0))
 
         came = before_line(client_slabs.__file__, line, act)
-        assert runner.asked(dtype, slot, one_array=one_array) == expected
+        assert runner.asked(dtype, slot) == expected
         lane.close()
         if not came:
             break

@@ -125,6 +125,13 @@ def test_actions_arrive_with_their_dtypes() -> None:
     assert changes[0] < changes[1] == changes[2]
 
 
+def test_a_space_without_members_has_no_actions_to_write() -> None:
+    layout, observed = slabs.layout_of(spaces.Dict({}), 1), slabs.observation_layout(SMALL, 1, 1)
+    assert layout is not None
+    assert observed is not None
+    assert ServedShard(SMALL, layout, observed).ask([], 0)
+
+
 def test_columns_follow_their_schema() -> None:
     both = Both(SMALL)
     infos = {"a": np.arange(COUNT), "_a": np.ones(COUNT, bool)}
