@@ -7,20 +7,17 @@ observation and the end of an episode of its own last step.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import gymnasium as gym
 
 from envhub_sandbox.errors import RemoteProtocolError
-from envhub_sandbox.session.requests import OneMessageFor
 from envhub_sandbox.transport.replies import typed_reply
 from envhub_sandbox.transport.values import seeds
 from envhub_sandbox.vector.tracebacks import short_traceback
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.inert import RemoteObject
 from envhub_worker.protocol.errors import UNTRUSTED
-from envhub_worker.protocol.manifest.manifest import EnvManifest
 from envhub_worker.protocol.manifest.names import is_servable
 from envhub_worker.protocol.spaces import batches
 
@@ -30,7 +27,7 @@ _SEARCHED = -1
 _MOST_WRAPPERS = 1000
 """Around one environment; otherwise a search for the innermost might never end. As many as Python's
 nested calls, which a step through the wrappers makes."""
-_OURS = frozenset({"_vector", "_manifest", "_ask", "_index", "_depth"})
+_OURS = frozenset({"_vector", "_index", "_depth"})
 
 
 class SubEnvironment(gym.Env[Any, Any]):
@@ -41,23 +38,12 @@ class SubEnvironment(gym.Env[Any, Any]):
 
     Args:
         vector: Its ``SandboxVectorEnv``.
-        manifest: What that was described as.
-        ask: Asks the worker about it.
         index: Which of the sub-environments it is.
         depth: How many wrappers are looked through; None for all.
     """
 
-    def __init__(
-        self,
-        vector: Any,
-        manifest: EnvManifest,
-        ask: Callable[[str, int, OneMessageFor], m.Message],
-        index: int,
-        depth: int | None = _OUTERMOST,
-    ) -> None:
+    def __init__(self, vector: Any, index: int, depth: int | None = _OUTERMOST) -> None:
         self._vector = vector
-        self._manifest = manifest
-        self._ask = ask
         self._index = index
         self._depth = depth
 
@@ -99,7 +85,7 @@ class SubEnvironment(gym.Env[Any, Any]):
         """The innermost environment."""
         if self._depth is None:
             return self
-        return SubEnvironment(self._vector, self._manifest, self._ask, self._index, None)
+        return SubEnvironment(self._vector, self._index, None)
 
     @property
     @short_traceback
@@ -115,7 +101,7 @@ class SubEnvironment(gym.Env[Any, Any]):
         found = self._get("env")
         if self._depth is None or not (callable(found) or isinstance(found, RemoteObject)):
             return found
-        return SubEnvironment(self._vector, self._manifest, self._ask, self._index, self._depth + 1)
+        return SubEnvironment(self._vector, self._index, self._depth + 1)
 
     @property
     def action_space(self) -> Any:  # type: ignore[override]
@@ -165,7 +151,7 @@ class SubEnvironment(gym.Env[Any, Any]):
     @property
     def _is_shown(self) -> bool:
         """Whether the vector environment shows this one's spaces and metadata as its own."""
-        return self._manifest.shardable and not self._index and self._depth == _OUTERMOST
+        return self._vector._manifest.shardable and not self._index and self._depth == _OUTERMOST
 
     # --- what this one has ---------------------------------------------------------------------
 
@@ -222,7 +208,7 @@ class SubEnvironment(gym.Env[Any, Any]):
 
     def _get(self, name: str, depth: int | None = None) -> Any:
         where = self._depth if depth is None else depth
-        reply = self._ask(
+        reply = self._vector._requests.ask_one(
             name, self._index, lambda number, place: m.GetOne(number, place, where, name)
         )
         if isinstance(reply, m.Value):
@@ -244,7 +230,8 @@ class SubEnvironment(gym.Env[Any, Any]):
             given = (args, kwargs) if place is not None else ((), {})
             return m.CallOne(number, place, where, name, *given)
 
-        return typed_reply(self._ask(name, self._index, message), m.Value).value
+        reply = self._vector._requests.ask_one(name, self._index, message)
+        return typed_reply(reply, m.Value).value
 
     def _restored(self, result: Any) -> Any:
         """The result of a reset or a step, with the classes that the space gives observations."""
@@ -255,7 +242,7 @@ class SubEnvironment(gym.Env[Any, Any]):
             return (batches.restore(space, result[0]), *result[1:])
 
     def _refuse_unless_sync(self, name: str) -> None:
-        if not self._manifest.sync:
+        if not self._vector._manifest.sync:
             raise ValueError(
                 f"cannot {name} one sub-environment of an AsyncVectorEnv: use `{name}` of the "
                 "vector environment, or have the repository return a SyncVectorEnv "

@@ -18,7 +18,7 @@ import gymnasium as gym
 
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.session.env_session import EnvSession
-from envhub_sandbox.session.requests import SENT, MessageFor, OneMessageFor
+from envhub_sandbox.session.requests import SENT, MessageFor
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.remote_warnings import level_of_the_caller
 from envhub_sandbox.transport.replies import typed_reply
@@ -392,8 +392,7 @@ class SandboxVectorEnv(SendRecv):
     @property
     def envs(self) -> tuple[SubEnvironment, ...]:
         """A handle on each sub-environment, to read, to call, and to drive it by itself."""
-        which = range(self.num_envs)
-        return tuple(SubEnvironment(self, self._manifest, self._ask_one, i) for i in which)
+        return tuple(SubEnvironment(self, index) for index in range(self.num_envs))
 
     @property
     def sandbox(self) -> SandboxView:
@@ -473,10 +472,6 @@ class SandboxVectorEnv(SendRecv):
             if not results.apart and (session.lease.lane is None or state is State.READY):
                 session.lease.take_apart(Deadline(self._timeouts.call_s))
         return VectorApart(self._reset, self._step, results.own) if results.apart else None
-
-    def _ask_one(self, name: str, index: int, message: OneMessageFor) -> m.Message:
-        # a method of ours: a copy of a sub-environment then asks the copy of its vector environment
-        return self._requests.ask_one(name, index, message)
 
 
 def leave_suite(env: SandboxVectorEnv) -> None:

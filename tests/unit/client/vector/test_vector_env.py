@@ -158,8 +158,9 @@ def one_of_two(value: object) -> SubEnvironment:
     """The first of two, of which everything is the same."""
     space = spaces.Discrete(2)
     vector: Any = SimpleNamespace(num_envs=2, single_observation_space=space)
-    manifest: Any = SimpleNamespace(sync=True, shardable=True)
-    return SubEnvironment(vector, manifest, lambda name, index, message: m.Value(value), 0)
+    vector._manifest = SimpleNamespace(sync=True, shardable=True)
+    vector._requests = SimpleNamespace(ask_one=lambda name, index, message: m.Value(value))
+    return SubEnvironment(vector, 0)
 
 
 def test_wrappers_without_end_are_refused() -> None:
