@@ -157,9 +157,10 @@ def test_it_is_not_copied(copied: Callable[[object], object]) -> None:
 def one_of_two(value: object) -> SubEnvironment:
     """The first of two, of which everything is the same."""
     space = spaces.Discrete(2)
-    vector: Any = SimpleNamespace(num_envs=2, single_observation_space=space)
-    vector._manifest = SimpleNamespace(sync=True, shardable=True)
-    vector._requests = SimpleNamespace(ask_one=lambda name, index, message: m.Value(value))
+    manifest = SimpleNamespace(sync=True, shardable=True)
+    asked = SimpleNamespace(ask_one=lambda name, index, message: m.Value(value))
+    fields = {"_manifest": manifest, "_requests": asked}
+    vector = SimpleNamespace(num_envs=2, single_observation_space=space, **fields)
     return SubEnvironment(vector, 0)
 
 
