@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import argparse
+import contextlib
+import io
 import json
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,6 +17,7 @@ import psutil
 
 import envhub_worker.protocol
 from envhub_sandbox import RemoteSandbox
+from envhub_worker.cli import status
 from tests.support.processes import eventually
 
 _BOOTSTRAP = Path(envhub_worker.protocol.__file__).parent.parent / "bootstrap.py"
@@ -103,9 +106,10 @@ class Listening:
 
     def status(self) -> dict[str, Any]:
         """What ``envhub-worker status`` says to its operator."""
-        done = worker("status", "--state-dir", self.state, "--json")
-        assert done.returncode == 0, done.stderr
-        found: dict[str, Any] = json.loads(done.stdout)
+        asked = argparse.Namespace(state_dir=self.state, endpoint=None, json=True)
+        with contextlib.redirect_stdout(io.StringIO()) as said:
+            assert status.run(asked) == 0
+        found: dict[str, Any] = json.loads(said.getvalue())
         return found
 
     def as_client(self) -> tuple[str, ...]:
@@ -121,7 +125,7 @@ class Listening:
         return {(one["session"], jail["jail"]) for one in self.sessions() for jail in one["jails"]}
 
 
-@contextmanager
+@contextlib.contextmanager
 def listening(
     folder: Path, *options: str, bind: str = "tcp://127.0.0.1:*", prefix: Sequence[str] = ()
 ) -> Iterator[Listening]:

@@ -28,7 +28,7 @@ TARGET = f"{KIT}:serve_source"
 
 def execute(source: str) -> dict[str, Any]:
     """Run ``source``; its ``result``, or the error's class, errno and text."""
-    names: dict[str, Any] = {"__name__": "probe"}
+    names = {"__name__": "probe"}
     try:
         exec(source, names)
     except BaseException as error:
@@ -50,14 +50,17 @@ def serve_source(stream: socket.socket, spec: JailSpec, fds: list[int]) -> int:
 
 def unconfined(source: str) -> dict[str, Any]:
     """The control: ``source`` in a plain interpreter as the current user."""
-    code = "import sys, confinement_kit as k, json; print(json.dumps(k.execute(sys.stdin.read())))"
+    import inspect  # not above, where each runner would import it, too
+
+    code = f"from __future__ import annotations\nimport json, sys\n{inspect.getsource(execute)}"
+    code += "\nprint(json.dumps(execute(sys.stdin.read())))"
     done = subprocess.run(
         [sys.executable, "-c", code],
         input=source,
         capture_output=True,
         text=True,
         check=True,
-        cwd=os.path.dirname(os.path.abspath(__file__)),
+        cwd=os.path.dirname(KIT),
         timeout=DEADLINE_S,
     )
     return json.loads(done.stdout.splitlines()[-1])
