@@ -23,10 +23,11 @@ def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Listening]:
         yield found
 
 
-@pytest.fixture
-def impatient(tmp_path: Path) -> Iterator[Listening]:
+@pytest.fixture(scope="package")
+def impatient(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Listening]:
     """One that soon ends what belongs to a silent client: later than a loaded machine is silent."""
-    with listening(tmp_path / "impatient", "--idle-s", str(IMPATIENT_S)) as found:
+    folder = tmp_path_factory.mktemp("impatient")
+    with listening(folder, "--idle-s", str(IMPATIENT_S)) as found:
         yield found
 
 

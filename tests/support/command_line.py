@@ -12,6 +12,9 @@ from typing import Any
 
 import psutil
 import pytest
+from typer.testing import CliRunner
+
+from envhub_sandbox.cli.app import app
 
 COMMAND = [sys.executable, "-I", "-m", "envhub_sandbox"]
 
@@ -50,6 +53,14 @@ def document(*arguments: str | Path, code: int = 0) -> dict[str, Any]:
     """The document of ``--json``, which is all that is on stdout."""
     done = envhub(*arguments, "--json")
     assert done.returncode == code, done.stderr
+    read: dict[str, Any] = json.loads(done.stdout, parse_constant=pytest.fail)
+    return read
+
+
+def document_here(*arguments: str | Path, code: int = 0) -> dict[str, Any]:
+    """The same of a command in this process, whose worker servers it uses."""
+    done = CliRunner().invoke(app, [*map(str, arguments), "--json"])
+    assert done.exit_code == code, done.output
     read: dict[str, Any] = json.loads(done.stdout, parse_constant=pytest.fail)
     return read
 

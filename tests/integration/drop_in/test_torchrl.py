@@ -1,11 +1,11 @@
-"""TorchRL's ``GymWrapper`` takes a sandboxed environment as it is."""
+"""TorchRL's ``GymWrapper`` takes a sandboxed environment as it is, also in the example."""
 
 from __future__ import annotations
 
 import pytest
 
 from tests.support.command_line import python
-from tests.support.samples import sample
+from tests.support.samples import EXAMPLES, sample
 
 pytestmark = pytest.mark.same_for("users")
 
@@ -14,6 +14,7 @@ pytest.importorskip("torchrl")
 
 # in a process of its own: importing it sets up warnings and logs for everybody
 _SCRIPT = """
+import runpy
 import sys
 import torch
 from torchrl.envs import GymWrapper
@@ -31,7 +32,8 @@ def check(env):
     return [*rollout.batch_size]
 
 if __name__ == "__main__":
-    folder = sys.argv[1]
+    folder, example = sys.argv[1:]
+    runpy.run_path(example, run_name="__main__")
     print("one", check(GymWrapper(SandboxEnv(folder))))
     for mode in ("SameStep", "Disabled"):
         suites = make_env(folder, n_envs=3, env_kwargs={"autoreset_mode": mode})
@@ -41,6 +43,7 @@ if __name__ == "__main__":
 
 def test_its_wrapper_passes_its_own_check() -> None:
     """One environment, and vector environments in the modes that it takes; episodes end."""
-    done = python("-c", _SCRIPT, sample("cartpole"))
+    done = python("-c", _SCRIPT, sample("cartpole"), EXAMPLES / "with_torchrl.py")
+    assert "a rollout of 40 steps" in done.stdout
     said = done.stdout.splitlines()  # it logs there, too
     assert {"one [120]", "SameStep [3, 120]", "Disabled [3, 120]"} <= set(said)

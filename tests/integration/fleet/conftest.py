@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 
 from tests.remote.listening import Listening, listening, worker
+from tests.support.processes import eventually
 from tests.support.repositories import write_repository
 
 ROWS = """
@@ -78,6 +79,13 @@ def servers(
     with ExitStack() as stack:
         folders = [tmp_path_factory.mktemp(f"server{number}") for number in range(3)]
         yield [stack.enter_context(serving(folder, client_key)) for folder in folders]
+
+
+@pytest.fixture
+def stays(servers: list[Listening]) -> Listening:
+    """One of them, with nothing of an earlier test's in it; for a fleet of which another goes."""
+    assert eventually(lambda: servers[0].jails() == 0)
+    return servers[0]
 
 
 @pytest.fixture

@@ -21,10 +21,7 @@ from tests.support.repositories import write_repository
 from tests.support.started import started
 
 STILL = np.zeros(6, np.int64)
-
-
-def _two(serve: Callable[..., Listening], **more: Any) -> tuple[Listening, Listening]:
-    return serve("stays", **more), serve("goes", **more)
+Serve = Callable[..., Listening]
 
 
 def _is_at(env: Any, server: Listening) -> np.ndarray:
@@ -34,9 +31,9 @@ def _is_at(env: Any, server: Listening) -> np.ndarray:
     return found
 
 
-def test_its_rows_come_back_elsewhere(rows: Path, serve: Callable[..., Listening]) -> None:
+def test_its_rows_come_back_elsewhere(rows: Path, stays: Listening, serve: Serve) -> None:
     """Truncated, and reset with seeds derived of theirs; the others' episodes go on."""
-    stays, goes = _two(serve)
+    goes = serve("goes")
     sandbox = [stays.sandbox(), goes.sandbox()]
     options: dict[str, Any] = {"n_envs": 6, "num_workers": 4, "policy": {"restart": "transparent"}}
     with started(rows, sandbox=sandbox, seed=7, **options) as env:
@@ -63,9 +60,9 @@ def test_its_rows_come_back_elsewhere(rows: Path, serve: Callable[..., Listening
     assert eventually(lambda: stays.jails() == 0)
 
 
-def test_reset_has_them_elsewhere(rows: Path, serve: Callable[..., Listening]) -> None:
+def test_reset_has_them_elsewhere(rows: Path, stays: Listening, serve: Serve) -> None:
     """``restart="on_reset"``: an error first, which names place and rows; then they are back."""
-    stays, goes = _two(serve)
+    goes = serve("goes")
     options: dict[str, Any] = {"n_envs": 6, "num_workers": 2, "policy": {"restart": "on_reset"}}
     with started(rows, sandbox=[stays.sandbox(), goes.sandbox()], **options) as env:
         expected = env.reset(seed=5)[0]
@@ -80,9 +77,9 @@ def test_reset_has_them_elsewhere(rows: Path, serve: Callable[..., Listening]) -
         env.step(STILL)
 
 
-def test_without_restarts_it_stays_dead(rows: Path, serve: Callable[..., Listening]) -> None:
+def test_without_restarts_it_stays_dead(rows: Path, stays: Listening, serve: Serve) -> None:
     """The text names the rows, the place and what to do; close() is quick and leaves nothing."""
-    stays, goes = _two(serve)
+    goes = serve("goes")
     with started(rows, n_envs=6, sandbox=[stays.sandbox(), goes.sandbox()]) as env:
         goes.process.kill()
         with pytest.raises(WorkerDiedError, match=rf"was lost .*on {goes.endpoint}"):
@@ -171,11 +168,10 @@ def test_all_workers_share_one_timeout(rows: Path, servers: list[Listening]) -> 
 
 
 def test_a_server_that_comes_back_gets_workers_again(
-    rows: Path, serve: Callable[..., Listening], monkeypatch: pytest.MonkeyPatch
+    rows: Path, stays: Listening, serve: Serve, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """At the same address, with the same key: the next workers that start go there, too."""
     monkeypatch.setattr("envhub_sandbox.transport.tcp.CONNECT_S", 2.0)
-    stays = serve("stays")
     bind = f"tcp://127.0.0.1:{lasting_port()}"
     goes = serve("goes", bind=bind)
     sandbox = [stays.sandbox(), goes.sandbox()]
@@ -200,13 +196,12 @@ def far() -> Iterator[OtherHost]:
 
 @pytest.mark.same_for("users")  # it needs root for a cable between namespaces
 def test_a_partition_moves_the_rows(
-    rows: Path, far: OtherHost, serve: Callable[..., Listening]
+    rows: Path, far: OtherHost, stays: Listening, serve: Serve
 ) -> None:
     """A cable is out: the heartbeat says so, and the rows come back here; there nothing remains."""
-    here = serve("here")
     bind = f"tcp://{far.address}:5555"
     there = serve("there", "--idle-s", "20", bind=bind, prefix=far.prefix)
-    sandbox = [here.sandbox(), there.sandbox(heartbeat_s=1.0)]
+    sandbox = [stays.sandbox(), there.sandbox(heartbeat_s=1.0)]
     options: dict[str, Any] = {"n_envs": 6, "policy": {"restart": "transparent"}}
     with started(rows, sandbox=sandbox, **options) as env:
         lost = _is_at(env, there)
@@ -214,7 +209,7 @@ def test_a_partition_moves_the_rows(
         observations, *_, truncations, _ = env.step(STILL)
         assert truncations.tolist() == lost.tolist()
         assert observations[:, 1].tolist() == np.where(lost, 0, 1).tolist()
-        assert set(places(env)) == {here.endpoint}
+        assert set(places(env)) == {stays.endpoint}
         far.plug()
         assert env.step(STILL)[0][:, 1].tolist() == np.where(lost, 0, 2).tolist()
         assert eventually(lambda: there.jails() == 0), "the client names its jails no longer"

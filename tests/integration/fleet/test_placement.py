@@ -76,10 +76,13 @@ def test_a_server_that_is_not_there_gets_no_worker(rows: Path, servers: list[Lis
 
 
 def test_a_server_that_opens_no_jail_leaves_time_for_the_next(
-    rows: Path, serve: Callable[..., Listening], monkeypatch: pytest.MonkeyPatch
+    rows: Path,
+    stays: Listening,
+    serve: Callable[..., Listening],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """It says that it has room, and what would make the jail does nothing."""
-    stuck, other = serve("stuck"), serve("other")
+    stuck = serve("stuck")
     with started(rows, sandbox=stuck.sandbox()):
         pass
     assert eventually(lambda: stuck.jails() == 0)
@@ -88,17 +91,17 @@ def test_a_server_that_opens_no_jail_leaves_time_for_the_next(
     with (
         halted(zygote.pid for zygote in server.children()),
         halted(one.pid for one in server.children(recursive=True)),  # what it has prepared
-        started(rows, sandbox=[stuck.sandbox(), other.sandbox()], n_envs=2) as env,
+        started(rows, sandbox=[stuck.sandbox(), stays.sandbox()], n_envs=2) as env,
     ):
-        assert places(env) == [other.endpoint] * 2
+        assert places(env) == [stays.endpoint] * 2
 
 
 def test_a_list_in_a_file_is_looked_at_again(
-    rows: Path, serve: Callable[..., Listening], client_key: Path, tmp_path: Path
+    rows: Path, servers: list[Listening], client_key: Path, tmp_path: Path
 ) -> None:
     """A server that is added gets workers that are brought back, one that has gone gets none."""
     listed = tmp_path / "places"
-    first, second = serve("first"), serve("second")
+    first, second = servers[:2]
 
     def write(*wanted: Listening) -> None:
         lines = [f"{server.endpoint} {server.public}  # a comment" for server in wanted]
@@ -177,13 +180,12 @@ def test_here_and_on_a_server(packages: Index, client_key: Path, tmp_path: Path)
         assert "listed==1.0" in suites.provenance["installed"]["packages"]
 
 
-def test_a_place_that_lacks_one(packages: Index, client_key: Path, tmp_path: Path) -> None:
+def test_a_place_that_lacks_one(packages: Index, stays: Listening, tmp_path: Path) -> None:
     """A server that makes none has its own packages: the error says which rows and which place."""
     folder = write_repository(tmp_path / "repository", ENV, requirements__txt="listed\n")
     with (
-        serving(tmp_path / "server", client_key) as server,
-        make_env(folder, n_envs=4, sandbox=["process", server.sandbox()]) as suites,
+        make_env(folder, n_envs=4, sandbox=["process", stays.sandbox()]) as suites,
         pytest.raises(MissingModuleError, match="No module named 'listed'") as caught,
     ):
         suites.env.reset()
-    assert f"of 4, on {server.endpoint}" in str(caught.value)
+    assert f"of 4, on {stays.endpoint}" in str(caught.value)

@@ -67,9 +67,11 @@ def test_they_are_really_on_the_way_at_once(rows: Path, servers: list[Listening]
         assert [env.recv().observations[0, 1] for _ in range(AHEAD)] == list(range(4, AHEAD + 4))
 
 
-def test_a_lost_server_is_its_own(rows: Path, serve: Callable[..., Listening]) -> None:
+def test_a_lost_server_is_its_own(
+    rows: Path, stays: Listening, serve: Callable[..., Listening]
+) -> None:
     """Those on the others go on, while it is found to be lost and after that."""
-    stays, goes = serve("stays"), serve("goes")
+    goes = serve("goes")
     places = [stays.sandbox(), goes.sandbox()]
     with started(rows, 4, sandbox=places, num_workers=4, min_ready=1) as env:
         workers = env.sandbox.stats()["workers"]
@@ -91,9 +93,11 @@ def test_a_lost_server_is_its_own(rows: Path, serve: Callable[..., Listening]) -
         assert errors == set(lost)
 
 
-def test_a_silent_server_keeps_nobody_waiting(rows: Path, serve: Callable[..., Listening]) -> None:
+def test_a_silent_server_keeps_nobody_waiting(
+    rows: Path, stays: Listening, serve: Callable[..., Listening]
+) -> None:
     """It takes what it is sent, and says nothing; its row alone is late."""
-    places = [serve("speaks").sandbox(), (silent := serve("silent")).sandbox()]
+    places = [stays.sandbox(), (silent := serve("silent")).sandbox()]
     with started(rows, 2, sandbox=places, num_workers=2, min_ready=1) as env:
         at = [worker["place"] for worker in env.sandbox.stats()["workers"]]
         quiet = at.index(silent.endpoint)
