@@ -58,7 +58,7 @@ def test_soak_would_notice_growth() -> None:
 
 
 def test_a_short_hour(capsys: pytest.CaptureFixture[str]) -> None:
-    code = monkey.main(["--operations", "30", "--kill-every", "3", "--environments", "3"])
+    code = monkey.main(["--operations", "20", "--kill-every", "2", "--environments", "2"])
     found = json.loads(capsys.readouterr().out)
     assert code == 0, found
     for place in monkey.PLACES:
@@ -100,7 +100,7 @@ def test_the_monkey_would_notice_growth() -> None:
 
 def test_short_clients_leave_nothing(capsys: pytest.CaptureFixture[str]) -> None:
     """Nor do those that are there at once; and a client may have several environments."""
-    code = clients.main(["--in-a-row", "3", "--at-once", "2", "--environments", "3"])
+    code = clients.main(["--in-a-row", "2", "--at-once", "2", "--environments", "3"])
     found = json.loads(capsys.readouterr().out)
     assert (code, found["grown"]) == (0, [])
     assert found["at_once"]["jails_pss_mib"] > 0

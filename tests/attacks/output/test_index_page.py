@@ -5,8 +5,13 @@ from __future__ import annotations
 import html
 from pathlib import Path
 
+import pytest
+
 from tests.support.command_line import envhub
 from tests.support.output.pages import Page
+
+# a page is made of text by the same code, whoever runs it
+pytestmark = pytest.mark.same_for("users")
 
 _SCRIPT = "<script>alert(1)<!--"
 _IMAGE = "<img src=x onerror='alert(1)'>.py"

@@ -10,6 +10,9 @@ from envhub_sandbox.errors import WorkerError
 from tests.support.processes import descendants, eventually
 from tests.support.samples import sample
 
+# when a jail is started and given up is up to the client, whoever that is
+pytestmark = pytest.mark.same_for("users")
+
 
 @pytest.fixture(autouse=True)
 def _known() -> None:

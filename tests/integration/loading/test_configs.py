@@ -14,7 +14,8 @@ import pytest
 from envhub_sandbox import make_env
 from tests.support.repositories import STILL, write_repository
 
-pytestmark = pytest.mark.short
+# what a config holds is copied by the same code, whoever runs it
+pytestmark = [pytest.mark.same_for("users"), pytest.mark.short]
 
 _PARTS = """
 from dataclasses import dataclass, field

@@ -12,7 +12,8 @@ from envhub_sandbox import make_env
 from envhub_sandbox.errors import ActionError, LoadError, ObservationError
 from tests.support.repositories import write_repository
 
-pytestmark = pytest.mark.short
+# whoever runs it, the same code describes spaces and takes steps
+pytestmark = [pytest.mark.same_for("users"), pytest.mark.short]
 
 _OWN = """
 import gymnasium as gym
