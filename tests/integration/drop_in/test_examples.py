@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from tests.support.command_line import python
-from tests.support.samples import EXAMPLES
+from tests.support.samples import EXAMPLES, sample
 
 pytestmark = pytest.mark.same_for("users")
 
@@ -16,9 +16,12 @@ PRINTED = {
     "with_cleanrl_async.py": "episodes: the first last",
     "with_sb3.py": "trained for 512 steps",
 }
-"""What each prints; that of TorchRL is in ``test_torchrl.py``."""
-# one after the other, since importing torch takes longer than to run them
-_RUN = "import runpy, sys\nfor path in sys.argv[1:]: runpy.run_path(path, run_name='__main__')"
+# one after the other in one process, since to import torch takes longer than to run them
+_RUN = """
+import runpy, sys
+for path in sys.argv[1:]:
+    runpy.run_path(path, run_name="__main__")
+"""
 
 
 def test_example_scripts(tmp_path: Path) -> None:
@@ -27,4 +30,41 @@ def test_example_scripts(tmp_path: Path) -> None:
         pytest.importorskip(needed)
     scripts = [EXAMPLES / name for name in PRINTED]
     done = python("-c", _RUN, *scripts, ENVHUB_CACHE=str(tmp_path / "cache"))
-    assert all(printed in done.stdout for printed in PRINTED.values()), done.stdout
+    assert [printed for printed in PRINTED.values() if printed not in done.stdout] == []
+
+
+# in another process: importing it sets up warnings and logs for everybody
+_TORCHRL = f"""{_RUN}
+import torch
+from torchrl.envs import GymWrapper
+from torchrl.envs.utils import check_env_specs
+from envhub_sandbox import SandboxEnv, make_env
+
+def check(env):
+    check_env_specs(env)
+    torch.manual_seed(0)
+    env.set_seed(0)
+    rollout = env.rollout(120, break_when_any_done=False)
+    assert torch.isfinite(rollout["observation"]).all()
+    assert rollout["next", "done"].sum() > 0
+    env.close()
+    return [*rollout.batch_size]
+
+if __name__ == "__main__":
+    folder = {str(sample("cartpole"))!r}
+    print("one", check(GymWrapper(SandboxEnv(folder))))
+    for mode in ("SameStep", "Disabled"):
+        suites = make_env(folder, n_envs=3, env_kwargs={{"autoreset_mode": mode}})
+        print(mode, check(GymWrapper(suites.env)))
+"""
+
+
+def test_the_wrapper_of_torchrl() -> None:
+    """The example runs. One environment, and vector environments in the modes that it takes, pass
+    its own check; episodes end."""
+    for needed in ("torch", "torchrl"):
+        pytest.importorskip(needed)
+    done = python("-c", _TORCHRL, EXAMPLES / "with_torchrl.py")
+    assert "a rollout of 40 steps" in done.stdout
+    said = done.stdout.splitlines()  # it logs there, too
+    assert {"one [120]", "SameStep [3, 120]", "Disabled [3, 120]"} <= set(said)

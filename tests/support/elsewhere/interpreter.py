@@ -44,94 +44,48 @@ LINUX_ALONE = (
 """Of the client, what a client elsewhere never imports; tests may."""
 
 # what asks for its platform while it is imported
-_BEFORE = (
-    *(
-        "asyncio",
-        "concurrent.futures",
-        "ctypes",
-        "multiprocessing",
-        "ssl",
-        "tempfile",
-        "webbrowser",
-    ),
-    *("click", "cloudpickle", "filelock", "gymnasium", "gymnasium.vector", "huggingface_hub"),
-    *("huggingface_hub.file_download", "huggingface_hub.hf_api", "msgpack", "numpy", "packaging"),
-    *("packaging.requirements", "packaging.tags", "rich.console", "rich.progress", "rich.table"),
-    *("typer.rich_utils", "typer.testing", "uv", "yaml", "zmq", "zmq.utils.monitor"),
-    *("shellingham", "rich.live", "rich.status", "pyproject_hooks", "psutil", "lz4.frame"),
-)
+_BEFORE = """
+    asyncio concurrent.futures ctypes multiprocessing ssl tempfile webbrowser click cloudpickle
+    filelock gymnasium gymnasium.vector huggingface_hub huggingface_hub.file_download
+    huggingface_hub.hf_api msgpack numpy packaging packaging.requirements packaging.tags
+    rich.console rich.progress rich.table typer.rich_utils typer.testing uv yaml zmq
+    zmq.utils.monitor shellingham rich.live rich.status pyproject_hooks psutil lz4.frame
+"""
 
 _LINUX_ALONE = {
-    "os": (
-        *("memfd_create", "MFD_CLOEXEC", "MFD_ALLOW_SEALING", "pidfd_open", "P_PIDFD", "waitid"),
-        *("eventfd", "eventfd_read", "eventfd_write", "EFD_CLOEXEC", "EFD_NONBLOCK", "pipe2"),
-        *("sched_getaffinity", "sched_setaffinity", "sched_setscheduler", "sched_getscheduler"),
-        *("getxattr", "setxattr", "listxattr", "removexattr", "O_PATH", "O_TMPFILE", "splice"),
-        *("posix_fadvise", "posix_fallocate", "copy_file_range", "getrandom", "getresuid"),
-        *("unshare", "setns"),
-    ),
-    "select": ("epoll", "EPOLLIN", "EPOLLET", "EPOLLOUT", "EPOLL_CLOEXEC"),
-    "signal": ("sigtimedwait", "sigwaitinfo", "pidfd_send_signal", "SIGPWR", "SIGRTMIN"),
-    "socket": ("SO_PEERCRED", "SOCK_CLOEXEC", "SOCK_NONBLOCK", "SOCK_SEQPACKET", "MSG_NOSIGNAL"),
-    "resource": ("prlimit", "RLIMIT_NICE", "RLIMIT_SIGPENDING"),
-    "time": ("CLOCK_BOOTTIME",),
-    "ctypes": ("CDLL", "PyDLL"),
+    "os": """
+        memfd_create MFD_CLOEXEC MFD_ALLOW_SEALING pidfd_open P_PIDFD waitid eventfd
+        eventfd_read eventfd_write EFD_CLOEXEC EFD_NONBLOCK pipe2 sched_getaffinity
+        sched_setaffinity sched_setscheduler sched_getscheduler getxattr setxattr listxattr
+        removexattr O_PATH O_TMPFILE splice posix_fadvise posix_fallocate copy_file_range
+        getrandom getresuid unshare setns
+    """,
+    "select": "epoll EPOLLIN EPOLLET EPOLLOUT EPOLL_CLOEXEC",
+    "signal": "sigtimedwait sigwaitinfo pidfd_send_signal SIGPWR SIGRTMIN",
+    "socket": """
+        SO_PEERCRED SOCK_CLOEXEC SOCK_NONBLOCK SOCK_SEQPACKET MSG_NOSIGNAL
+    """,
+    "resource": "prlimit RLIMIT_NICE RLIMIT_SIGPENDING",
+    "time": "CLOCK_BOOTTIME",
+    "ctypes": "CDLL PyDLL",
 }
 _UNIX_ALONE = {
-    "os": (
-        *(
-            "fork",
-            "forkpty",
-            "register_at_fork",
-            "getuid",
-            "geteuid",
-            "getgid",
-            "getegid",
-            "setuid",
-        ),
-        *("getgroups", "getpgrp", "getpgid", "setpgid", "setsid", "getsid", "killpg", "nice"),
-        *(
-            "chown",
-            "fchown",
-            "lchown",
-            "fchmod",
-            "mkfifo",
-            "mknod",
-            "statvfs",
-            "fstatvfs",
-            "ST_RDONLY",
-        ),
-        *("pread", "pwrite", "preadv", "pwritev", "uname", "sync", "fdatasync", "major", "minor"),
-        *("O_NOFOLLOW", "O_DIRECTORY", "O_NONBLOCK", "O_CLOEXEC", "O_SYNC", "O_NOCTTY"),
-        *(
-            "WNOHANG",
-            "WEXITED",
-            "WNOWAIT",
-            "WIFSIGNALED",
-            "WTERMSIG",
-            "wait",
-            "wait3",
-            "wait4",
-            "P_PID",
-        ),
-        *("CLD_EXITED", "CLD_KILLED", "CLD_DUMPED", "openpty", "ttyname", "tcgetpgrp", "confstr"),
-        *("sysconf", "getloadavg", "posix_spawn", "chroot", "fchdir", "lockf", "sendfile"),
-    ),
-    "select": ("poll", "POLLIN", "POLLOUT", "POLLHUP"),
-    "signal": (
-        *("SIGKILL", "SIGALRM", "SIGHUP", "SIGPROF", "SIGXFSZ", "SIGXCPU", "SIGUSR1", "SIGCHLD"),
-        *("SIGPIPE", "SIGSTOP", "SIGCONT", "SIGTSTP", "alarm", "setitimer", "getitimer", "pause"),
-        *(
-            "ITIMER_REAL",
-            "ITIMER_PROF",
-            "pthread_kill",
-            "pthread_sigmask",
-            "sigwait",
-            "siginterrupt",
-        ),
-    ),
-    "socket": ("AF_UNIX", "send_fds", "recv_fds", "MSG_DONTWAIT", "SCM_RIGHTS", "CMSG_LEN"),
-    "time": ("tzset", "clock_gettime", "CLOCK_REALTIME", "CLOCK_MONOTONIC"),
+    "os": """
+        fork forkpty register_at_fork getuid geteuid getgid getegid setuid getgroups getpgrp
+        getpgid setpgid setsid getsid killpg nice chown fchown lchown fchmod mkfifo mknod
+        statvfs fstatvfs ST_RDONLY pread pwrite preadv pwritev uname sync fdatasync major minor
+        O_NOFOLLOW O_DIRECTORY O_NONBLOCK O_CLOEXEC O_SYNC O_NOCTTY WNOHANG WEXITED WNOWAIT
+        WIFSIGNALED WTERMSIG wait wait3 wait4 P_PID CLD_EXITED CLD_KILLED CLD_DUMPED openpty
+        ttyname tcgetpgrp confstr sysconf getloadavg posix_spawn chroot fchdir lockf sendfile
+    """,
+    "select": "poll POLLIN POLLOUT POLLHUP",
+    "signal": """
+        SIGKILL SIGALRM SIGHUP SIGPROF SIGXFSZ SIGXCPU SIGUSR1 SIGCHLD SIGPIPE SIGSTOP SIGCONT
+        SIGTSTP alarm setitimer getitimer pause ITIMER_REAL ITIMER_PROF pthread_kill
+        pthread_sigmask sigwait siginterrupt
+    """,
+    "socket": "AF_UNIX send_fds recv_fds MSG_DONTWAIT SCM_RIGHTS CMSG_LEN",
+    "time": "tzset clock_gettime CLOCK_REALTIME CLOCK_MONOTONIC",
 }
 _NO_MODULES = {
     "darwin": {"spwd", "_posixshmem"},
@@ -148,7 +102,7 @@ def is_ours(frame: Any) -> bool:
 
 def become(system: str) -> None:
     """From here on this process is one of that system."""
-    for name in _BEFORE:
+    for name in _BEFORE.split():
         try:
             importlib.import_module(name)
         except ImportError:  # an extra, or another release of it
@@ -160,8 +114,8 @@ def become(system: str) -> None:
     platform.uname = lambda: platform.uname_result(called, "there", "1", "1", machine)
     platform.libc_ver = lambda *_, **__: ("", "")
     for module, names in _LINUX_ALONE.items():
-        gone = {*names, *(_UNIX_ALONE.get(module, ()) if system == "win32" else ())}
-        _hide(importlib.import_module(module), gone)
+        too = _UNIX_ALONE.get(module, "") if system == "win32" else ""
+        _hide(importlib.import_module(module), {*names.split(), *too.split()})
     _refuse_imports(_NO_MODULES[system])
     _hide_kernel_files()
     if system == "win32":
