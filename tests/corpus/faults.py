@@ -347,7 +347,7 @@ _LOADING = {
     "an empty dict": _returned("loads", "{}"),
     "spaces that differ": _returned(
         "loads",
-        "gym.vector.SyncVectorEnv([Env, Other][:n_envs])",
+        "gym.vector.SyncVectorEnv([Env, Other])",
         head="class Other(Env):\n    observation_space = gym.spaces.Discrete(2)\n",
     ),
     "one environment for all": Entry(
