@@ -68,7 +68,7 @@ def deep(levels: int) -> Frames:
     return [bytes(frame) for frame in value(document)]
 
 
-# some: test_spaces, test_names and test_seeds have all that a description may be
+# some: test_spaces, test_names and test_values have all that a description may be
 LIES: dict[str, Frames] = {
     "2^60 elements": frames_of(Lie(SPACE, box((HUGE, HUGE)))),
     "more than the budget together": frames_of(

@@ -1,26 +1,378 @@
-"""Processes that start before anybody asks for them."""
+"""Processes that start before anybody asks for them, and the next tasks of a suite, started while
+one plays: bounded, given up, and never felt.
+"""
 
 from __future__ import annotations
 
+import concurrent.futures
+import contextlib
+import gc
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
 import pytest
 from gymnasium.error import ClosedEnvironmentError
 
 from envhub_sandbox import make_env
-from envhub_sandbox.errors import WorkerError
+from envhub_sandbox.errors import RemoteEnvError, WorkerError
+from envhub_sandbox.sandboxes.pool import stop_idle
+from envhub_sandbox.system.folders import cache_root
+from tests.support import inside
 from tests.support.processes import descendants, eventually
+from tests.support.repositories import STILL, write_repository
 from tests.support.samples import sample
 
 # when a jail is started and given up is up to the client, whoever that is
 pytestmark = pytest.mark.same_for("users")
 
+# every task says when it was constructed; one fails, if it is told to
+SUITE = """
+import time
 
-@pytest.fixture(autouse=True)
+class Task(Still):
+    observation_space = gym.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+
+    def __init__(self, task, fails, number):
+        if task == fails and number:  # the first one is made to look at, for the manifest
+            raise ValueError(f"task {task} cannot be made")
+        self.task, self.made = task, time.monotonic()
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.array([self.task, self.np_random.random()]), {"made": self.made}
+
+    def step(self, action):
+        reward = float(self.np_random.random())
+        return np.array([self.task, reward]), reward, False, False, {}
+
+def make_env(n_envs=1, use_async_envs=False, tasks=5, fails=-1, suites=1):
+    vector = gym.vector.SyncVectorEnv
+    return {
+        f"suite{number}": {
+            task: vector([lambda t=task, n=n: Task(t, fails, n) for n in range(n_envs)])
+            for task in range(tasks)
+        }
+        for number in range(suites)
+    }
+"""
+Tasks = list[Any]
+
+
+@pytest.fixture
+def repository(tmp_path: Path) -> Path:
+    """A suite of tasks that are built when they are used."""
+    return write_repository(tmp_path / "repository", STILL + SUITE)
+
+
+@pytest.fixture
+def tasks(repository: Path) -> Iterator[Callable[..., Tasks]]:
+    """Makes the environments of a suite; nothing of them is left at the end."""
+    stop_idle()
+    before = descendants()
+    made = []
+
+    def make(count: int = 5, **options: Any) -> Tasks:
+        n_envs = options.pop("n_envs", 1)
+        kwargs = {"tasks": count, **options.pop("env_kwargs", {})}
+        with make_env(repository, n_envs, env_kwargs=kwargs):
+            pass  # its manifest is remembered
+        made.append(make_env(repository, n_envs, env_kwargs=kwargs, **options))
+        return _of(made[-1])
+
+    yield make
+    for suites in made:
+        suites.close()
+    # what is interrupted in its start gives the server back a moment later, and that lingers
+    assert eventually(lambda: stop_idle() is None and descendants() <= before)
+
+
+def states(tasks: Tasks) -> list[str]:
+    return [env.sandbox.stats()["state"] for env in tasks]
+
+
+def ahead(tasks: Tasks) -> list[int]:
+    """Which ones are up, and were never asked anything."""
+    found = [env.sandbox.stats() for env in tasks]
+    return [
+        index
+        for index, one in enumerate(found)
+        if one["state"] == "READY" and one["requests"] == one["steps"] == 0
+    ]
+
+
+def settled(tasks: Tasks, expected: list[int]) -> bool:
+    """Whether it comes to that, and stays there for a while."""
+    reached = eventually(lambda: ahead(tasks) == expected)
+    time.sleep(0.3)
+    return reached and ahead(tasks) == expected
+
+
+def test_the_next_task_is_up_and_built_before_anybody_asks(tasks: Callable[..., Tasks]) -> None:
+    first, second = envs = tasks(2, prewarm=1)
+    first.reset()
+    assert eventually(lambda: ahead(envs) == [1])
+    started, asked = descendants(), time.monotonic()
+    _, infos = second.reset()
+    assert infos["made"][0] < asked
+    assert descendants() <= started
+
+
+def test_without_it_nothing_is_started_ahead(tasks: Callable[..., Tasks]) -> None:
+    """The control: each task is made when it is asked."""
+    first, second = envs = tasks(2, prewarm=0)
+    first.reset()
+    first.close()
+    assert settled(envs, [])
+    asked = time.monotonic()
+    _, infos = second.reset()
+    assert infos["made"][0] > asked
+
+
+@pytest.mark.parametrize("closes", [False, True])
+def test_by_default_who_closes_each_task_finds_the_next_one_up(
+    tasks: Callable[..., Tasks], closes: bool
+) -> None:
+    """From the second on, and at most one; who uses one task, or all at once, pays nothing."""
+    envs = tasks(5)
+    envs[0].reset()
+    assert settled(envs, [])
+    for index in range(1, 4):
+        if closes:
+            envs[index - 1].close()
+        envs[index].reset()
+        assert settled(envs, [index + 1] if closes else [])
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_no_more_are_up_unused_than_was_said(tasks: Callable[..., Tasks], count: int) -> None:
+    """Whichever task is used next; what is not among the following is given up, and can return."""
+    envs = tasks(8, prewarm=count)
+    used: set[int] = set()
+    for index in (0, 4, 1):
+        assert envs[index].reset()[0][0][0] == index
+        used.add(index)
+        following = [at for at in range(index + 1, 8) if at not in used]
+        assert settled(envs, following[:count]), (index, states(envs))
+
+
+def test_one_task_outlives_the_suite_that_it_came_from(repository: Path) -> None:
+    """Whoever takes one, and lets the others go, can use it."""
+    env = make_env(repository, env_kwargs={"tasks": 3})["suite0"][1]
+    gc.collect()
+    try:
+        assert env.reset()[0][0][0] == 1.0
+    finally:
+        env.close()
+
+
+def test_closing_what_is_being_given_up_leaves_no_server(tasks: Callable[..., Tasks]) -> None:
+    """Whoever gives it up has its turn still, and nothing of it any more: neither waits."""
+    envs = tasks(2)
+    envs[0].reset()
+    owner, name = inside.use_lock(envs[1])
+    held, closed = threading.Event(), threading.Event()
+
+    def give_up() -> None:
+        with getattr(owner, name):
+            held.set()
+            closed.wait(60)
+
+    with concurrent.futures.ThreadPoolExecutor(1) as pool:
+        last = pool.submit(give_up)
+        assert held.wait(60)
+        envs[1].close()
+        closed.set()
+        last.result()
+    envs[0].close()  # that nothing is left, the fixture asks
+
+
+@pytest.fixture
+def gated(tmp_path: Path) -> tuple[Path, Path, dict[str, Any]]:
+    """A repository whose task 1 is made once there is a file; the file; the policy to see it.
+
+    Its manifest is remembered.
+    """
+    gate = tmp_path / "gate"
+    gate.mkdir()
+    gate.chmod(0o755)
+    opened = gate / "open"
+    held_up = f"        while task == 1 and not os.path.exists({str(opened)!r}):"
+    suite = SUITE.replace(
+        "        self.task, self.made", f"{held_up}\n            pass\n        self.task, self.made"
+    )
+    repository = write_repository(tmp_path / "repository", f"import os\n{STILL}{suite}")
+    opened.touch()
+    policy = {"readable": (str(gate),)}
+    with make_env(repository, policy=policy):
+        pass
+    opened.unlink()
+    stop_idle()
+    return repository, opened, policy
+
+
+@pytest.mark.parametrize("plays", [True, False])
+def test_while_one_is_waited_for_the_next_is_started(
+    gated: tuple[Path, Path, dict[str, Any]], plays: bool
+) -> None:
+    """Else, where starting takes longer than playing, nothing would be gained; or nothing is up."""
+    repository, opened, policy = gated
+    elsewhere = descendants()
+    with make_env(repository, policy=policy, prewarm=1) as suites:
+        envs = _of(suites)
+        if plays:
+            envs[0].reset()
+            # the server, its zygote's two, and two jails of two: the second one is at the gate
+            assert eventually(lambda: len(descendants() - elsewhere) == 7)
+        assert all(_begun_meanwhile(envs, opened))
+
+
+def _of(suites: Any) -> Tasks:
+    return [env for tasks in suites.values() for env in tasks.values()]
+
+
+def _begun_meanwhile(envs: Tasks, opened: Path) -> tuple[bool, bool]:
+    """Whether task 2 comes up, and task 1, at the gate until then, has not answered."""
+    with concurrent.futures.ThreadPoolExecutor(1) as pool:
+        asked = pool.submit(envs[1].reset)
+        begun = eventually(lambda: ahead(envs) == [2])
+        waited = not asked.done()
+        opened.touch()
+        assert asked.result()[0][0][0] == 1.0
+    return begun, waited
+
+
+def test_what_fails_is_raised_by_the_first_request_of_that_task(
+    tasks: Callable[..., Tasks],
+) -> None:
+    """Not by the task before, which goes on; and the one after it is unharmed."""
+    bundles = set(_bundles())
+    envs = tasks(3, n_envs=2, prewarm=1, env_kwargs={"fails": 1})
+    envs[0].reset()
+    for _ in range(50):
+        envs[0].step(np.zeros(2, int))
+    assert settled(envs, [])
+    with pytest.raises(RemoteEnvError, match="task 1 cannot be made"):
+        envs[1].reset()
+    observations, _ = envs[2].reset()
+    assert observations[0][0] == 2.0
+    assert set(_bundles()) == bundles
+
+
+def test_what_dies_unused_is_started_again(tasks: Callable[..., Tasks]) -> None:
+    """Although the policy restarts nothing: without prewarming it would not have died."""
+    elsewhere = descendants()  # other tests' Hubs, say
+    envs = tasks(2, prewarm=1)
+    # the server that lingers, its zygote's two
+    assert eventually(lambda: len(descendants() - elsewhere) == 3)
+    server = descendants()
+    envs[0].reset()
+    envs[0].close()
+    assert eventually(lambda: ahead(envs) == [1])
+    jail = descendants() - server
+    assert jail
+    for pid in jail:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+    assert eventually(lambda: descendants() == server)
+    observations, _ = envs[1].reset()
+    assert observations[0][0] == 1.0
+
+
+def test_closed_in_the_midst_it_leaves_nothing(repository: Path) -> None:
+    """Whenever that comes: no process, and no bundle of a crash that was none."""
+    stop_idle()
+    before, bundles = descendants(), set(_bundles())
+    for pause_s in (0.0, 0.05, 0.2):
+        suites = make_env(repository, prewarm=2, timeouts={"server_idle_s": 0})
+        envs = _of(suites)
+        envs[0].reset()
+        time.sleep(pause_s)
+        suites.close()
+        assert states(envs) == ["CLOSED"] * 5
+    assert eventually(lambda: descendants() <= before)
+    assert set(_bundles()) == bundles
+
+
+def test_the_last_close_waits_for_all(tasks: Callable[..., Tasks]) -> None:
+    """The others do not, and that is not left to chance: nothing of a jail is there after it."""
+    elsewhere = descendants()
+    envs = tasks(4, prewarm=0)
+    server = descendants()
+    for env in envs[:3]:
+        env.reset()
+    for env in envs:
+        env.close()
+    assert descendants() - elsewhere <= server - elsewhere
+
+
+def test_a_suite_that_nobody_holds_gives_up_what_it_started_ahead(repository: Path) -> None:
+    stop_idle()
+    before = descendants()
+    suites = make_env(repository, prewarm=1, timeouts={"server_idle_s": 0})
+    envs = _of(suites)
+    envs[0].reset()
+    assert eventually(lambda: ahead(envs) == [1])
+    envs.clear()
+    del suites
+    assert eventually(lambda: descendants() <= before)
+
+
+def test_suites_do_not_start_each_others_tasks(tasks: Callable[..., Tasks]) -> None:
+    envs = tasks(2, prewarm=2, env_kwargs={"suites": 2})
+    envs[1].reset()
+    assert settled(envs, [])
+
+
+def played(env: Any) -> list[Any]:
+    found = [env.reset(seed=7)[0].tolist()]
+    for _ in range(5):
+        found.append([part.tolist() for part in env.step(np.ones(1, int))[:4]])
+    return found
+
+
+def test_threads_may_play_tasks_at_once(tasks: Callable[..., Tasks]) -> None:
+    """A pool of threads, as ``max_parallel_tasks`` has; closed from the main one."""
+    envs = tasks(8, prewarm=2)
+    with concurrent.futures.ThreadPoolExecutor(3) as pool:
+        futures = {pool.submit(played, env): index for index, env in enumerate(envs)}
+        for future in concurrent.futures.as_completed(futures):
+            index = futures[future]
+            assert future.result()[0][0][0] == index
+            envs[index].close()
+    assert states(envs) == ["CLOSED"] * 8
+
+
+def test_it_takes_a_whole_number_or_none() -> None:
+    with pytest.raises(ValueError, match="`prewarm` is -1, and must be at least 0"):
+        make_env(sample("counter"), prewarm=-1)
+    with pytest.raises(TypeError, match="`prewarm` is 'one'"):
+        make_env(sample("counter"), prewarm="one")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="prewarm: for environments in a sandbox"):
+        make_env(sample("counter"), prewarm=1, sandbox=None, trust_remote_code=True)
+
+
+def _bundles() -> list[Path]:
+    folder = cache_root() / "crashes"
+    return list(folder.iterdir()) if folder.is_dir() else []
+
+
+# --- one environment ------------------------------------------------------------------------
+
+
+@pytest.fixture
 def _known() -> None:
     """Its manifest is remembered from here on, so that making it again starts nothing."""
     with make_env(sample("counter"), n_envs=2):
         pass
 
 
+@pytest.mark.usefixtures("_known")
 def test_the_first_reset_finds_what_was_started() -> None:
     """One start, before any request; to prewarm what is warm does nothing."""
     with make_env(sample("counter"), n_envs=2) as suites:
@@ -40,7 +392,8 @@ def test_the_first_reset_finds_what_was_started() -> None:
         assert suites.env.sandbox.stats()["state"] == "READY"
 
 
-def test_closed_in_the_midst_it_leaves_nothing() -> None:
+@pytest.mark.usefixtures("_known")
+def test_one_that_is_closed_in_the_midst_leaves_nothing() -> None:
     before = descendants()
     for _ in range(5):
         suites = make_env(sample("counter"), n_envs=2, timeouts={"server_idle_s": 0})
@@ -52,7 +405,8 @@ def test_closed_in_the_midst_it_leaves_nothing() -> None:
     assert eventually(lambda: descendants() <= before)
 
 
-def test_what_fails_is_raised_by_the_first_request() -> None:
+@pytest.mark.usefixtures("_known")
+def test_what_fails_ahead_is_raised_by_the_first_request() -> None:
     with make_env(sample("counter"), n_envs=2, timeouts={"startup_s": 0.001}) as suites:
         suites.env.prewarm()
         with pytest.raises(WorkerError):

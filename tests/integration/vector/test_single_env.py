@@ -1,19 +1,28 @@
-"""One environment of a repository as an ordinary ``gymnasium.Env``."""
+"""One environment of a repository as an ordinary ``gymnasium.Env``: it gives what the
+environment gives, type by type, and sets what is set.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import copy
+import json
 import warnings
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
+from gymnasium.wrappers import TimeAwareObservation
 
 from envhub_sandbox import SandboxEnv
-from envhub_sandbox.errors import LoadError
-from tests.support.samples import EXAMPLES
+from envhub_sandbox.errors import ActionError, LoadError
+from tests.support.compare import assert_same
+from tests.support.repositories import write_repository
+from tests.support.samples import EXAMPLES, make_env_of
 
 pytestmark = pytest.mark.same_for("users")
 
@@ -63,3 +72,195 @@ def test_a_task_is_chosen_by_name() -> None:
     assert env.step(env.action_space.sample())[0] in env.observation_space
     env.close()
     assert env.vector.closed
+
+
+# --- what it gives, and what is set ---------------------------------------------------------
+
+_ENV = '''
+import gymnasium as gym
+import numpy as np
+
+
+class Told(gym.Env):
+    """Infos that a vector environment would join, and attributes that matter."""
+
+    observation_space = gym.spaces.Dict(
+        a=gym.spaces.Discrete(100),
+        b=gym.spaces.Tuple([gym.spaces.Discrete(100), gym.spaces.Box(-1, 1, (2,))]),
+    )
+    action_space = gym.spaces.Discrete(4)
+    gravity = 10
+    shape = (1,)
+    _level = 1
+
+    def __init__(self):
+        self.steps = 0
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return self.seen(), {"begun": True, "level": self._level, **(options or {})}
+
+    def seen(self):
+        step = self.steps
+        return {"a": step, "b": (np.int64(step), np.full(2, step / 10, np.float32))}
+
+    def step(self, action):
+        self.steps += 1
+        infos = [
+            {"n": 1, "x": 0.5, "f": np.float32(2)},
+            {"n": 2, "x": 1.5, "f": np.float32(3)},
+            {"n": 2**80, "x": 0.5, "f": np.float32(2)},
+            {"_a": 1, "a": 2, "kind": type(action).__name__},
+            {"deep": {"x": {"y": [1, np.arange(3)]}}, "row": np.arange(2), 7: None},
+            {},
+            {"deep": 3, "gravity": self.gravity, 0: {"x": 1}, -1: (True,)},
+        ]
+        over = self.steps == len(infos)
+        return self.seen(), 1.0, over, False, infos[self.steps - 1]
+
+
+class Outer(gym.Wrapper):
+    colour = "red"
+
+
+def make_env(n_envs=1, use_async_envs=False, mode="NextStep"):
+    return gym.vector.SyncVectorEnv(
+        [lambda: Outer(Told())] * n_envs, autoreset_mode=gym.vector.AutoresetMode(mode)
+    )
+'''
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_repository(tmp_path_factory.mktemp("told"), _ENV)
+
+
+@pytest.fixture
+def here(folder: Path) -> gym.Env[Any, Any]:
+    env: gym.Env[Any, Any] = make_env_of(folder)().envs[0]
+    return env
+
+
+@pytest.fixture(params=["auto", "frames"])
+def env(folder: Path, request: pytest.FixtureRequest) -> Iterator[Any]:
+    made = SandboxEnv(folder, lane=request.param)
+    yield made
+    made.close()
+
+
+def _played(env: gym.Env[Any, Any]) -> list[Any]:
+    seen: list[Any] = [env.reset(seed=1)]
+    for _ in range(2):
+        for step in range(7):
+            seen.append(env.step(np.int64(1) if step % 2 else 1))
+        seen.append(env.reset(options={"episode": 2**70}))
+    return seen
+
+
+@pytest.mark.parametrize(
+    ("mode", "lane"),
+    [("NextStep", "auto"), ("SameStep", "auto"), ("Disabled", "auto"), ("NextStep", "frames")],
+)
+def test_what_it_gives_is_what_the_environment_gave(
+    folder: Path, here: gym.Env[Any, Any], mode: str, lane: str
+) -> None:
+    """Observations and infos have the same keys, classes and values, in each autoreset mode."""
+    env = SandboxEnv(folder, lane=lane, env_kwargs={"mode": mode})
+    try:
+        seen = _played(env)
+    finally:
+        env.close()
+    expected = _played(here)
+    if mode == "SameStep":  # the vector environment began the next episode by itself
+        expected[8][1].pop("episode")
+        expected[16][1].pop("episode")
+        seen[8][1].pop("episode"), seen[16][1].pop("episode")
+    assert_same(expected, seen)
+    assert type(seen[1][0]["a"]) is int
+    assert type(seen[1][0]["b"][0]) is np.int64
+    json.dumps(seen[1][4]["n"])
+
+
+def test_an_attribute_that_is_set_arrives(env: Any, folder: Path) -> None:
+    """By the environment itself, unwrapped, and through a wrapper; it is read from there. The error
+    for one that is not served names the method that sets it."""
+    for number, target in enumerate([env, env.unwrapped, gym.Wrapper(env)]):
+        if isinstance(target, gym.Wrapper):
+            target.set_wrapper_attr("gravity", number)
+        else:
+            target.gravity = number
+        assert env.gravity == number
+        env.reset()
+        assert [env.step(0) for _ in range(7)][-1][4]["gravity"] == number
+    env.colour = "blue"
+    assert env.vector.envs[0].colour == "blue"
+    env.fresh = 3
+    assert env.fresh == 3
+    assert env.set_wrapper_attr("nowhere", 1, force=False) is False
+    assert not env.has_wrapper_attr("nowhere")
+    env.action_space = gym.spaces.Discrete(3)
+    assert env.action_space == env.vector.call("action_space")[0] == gym.spaces.Discrete(3)
+    with pytest.raises(AttributeError, match=r"no setter|can't set"):  # a wrapper's, as here
+        env.render_mode = "human"
+    assert env.render_mode is None
+    for name, value in (("_level", 5), ("shape", (2,))):
+        with pytest.raises(AttributeError, match="set_wrapper_attr"):
+            setattr(env, name, value)
+        assert env.set_wrapper_attr(name, value)
+        assert env.get_wrapper_attr(name) == value
+    assert env.reset()[1]["level"] == 5
+
+
+class _Derived(SandboxEnv):
+    """Has attributes of its own."""
+
+    calls = 0
+
+    def __init__(self, *args: Any) -> None:
+        super().__init__(*args)
+        self._mine = 1
+        self.calls = 2
+
+
+def test_a_derived_class_keeps_its_own_attributes(folder: Path) -> None:
+    env = _Derived(folder)
+    try:
+        assert (vars(env)["_mine"], env.calls) == (1, 2)
+        assert not env.vector.envs[0].has_wrapper_attr("calls")
+    finally:
+        env.close()
+
+
+def test_its_actions_and_the_vector_environment_below(env: Any, folder: Path) -> None:
+    """Infos are joined there; an error has the shapes of one action, and a bool arrives as one."""
+    here = make_env_of(folder)()
+    assert_same(here.reset(seed=1), env.vector.reset(seed=1))
+    for _ in range(2):
+        assert_same(here.step(np.array([1])), env.vector.step(np.array([1])))
+    env.reset(seed=0)
+    with pytest.raises(ActionError, match=r"int64 of shape \(\) for Discrete\(4\), got .* \(1,\)"):
+        env.step([1])
+    for _ in range(3):
+        env.step(1)
+    assert env.step(True)[4]["kind"] == "bool"
+
+
+def test_its_spec_has_the_plain_fields(tmp_path: Path) -> None:
+    text = """
+import gymnasium as gym
+def make_env(n_envs=1, use_async_envs=False):
+    return gym.vector.SyncVectorEnv([lambda: gym.make("CartPole-v1")] * n_envs)
+"""
+    env = SandboxEnv(write_repository(tmp_path / "spec", text))
+    try:
+        assert env.spec is not None
+        assert (env.spec.id, env.spec.max_episode_steps) == ("CartPole-v1", 500)
+        assert env.spec.reward_threshold == 475.0
+        assert TimeAwareObservation(env).observation_space.shape == (5,)
+        with pytest.raises(gym.error.Error, match="sandbox"):
+            gym.make(env.spec)
+        env.spec = None
+        assert env.spec is None
+    finally:
+        env.close()
