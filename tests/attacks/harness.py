@@ -82,25 +82,15 @@ class StoppedNowError(AssertionError):
 
 
 class Attacks:
-    """Where a payload is run as a control and inside."""
+    """Where a payload is run as a control and inside.
 
-    @contextlib.contextmanager
-    def inside(self, payload: str, arguments: Mapping[str, Any], **place: Any) -> Iterator[Run]:
-        """Run a payload in a jail, which lives as long as the context."""
-        raise NotImplementedError
-        yield
+    Attributes:
+        inside: Runs a payload in a jail, which lives as long as the context.
+        judge: Notes what an attack did, and fails unless that is what is expected of this place.
+    """
 
-    def judge(
-        self,
-        title: str,
-        control: str,
-        through: bool,
-        detail: str,
-        impossible: str = "",
-        judged: str = OUTSIDE,
-    ) -> None:
-        """Note what an attack did, and fail unless that is what is expected of this place."""
-        raise NotImplementedError
+    inside: Callable[..., contextlib.AbstractContextManager[Run]]
+    judge: Callable[..., None]
 
     def attack(
         self,

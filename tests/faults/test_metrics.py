@@ -1,4 +1,4 @@
-"""What Prometheus reads is what has happened; read with its own parser."""
+"""The counters say what has happened, and so does what Prometheus reads, by its own parser."""
 
 from __future__ import annotations
 
@@ -9,18 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-prometheus_client = pytest.importorskip("prometheus_client")
-
-from prometheus_client.parser import text_string_to_metric_families  # noqa: E402
-
-from envhub_sandbox import errors  # noqa: E402
-from envhub_sandbox.integrations.metrics import EnvHubCollector  # noqa: E402
-from envhub_sandbox.session import counters  # noqa: E402
-from envhub_sandbox.session.counters import Counters, Labels, Ledger  # noqa: E402
-from envhub_worker.protocol.lifecycle import Lifecycle  # noqa: E402
-from tests.support import inside  # noqa: E402
-from tests.support.samples import sample  # noqa: E402
-from tests.support.started import started  # noqa: E402
+from envhub_sandbox import errors
+from envhub_sandbox.session import counters
+from envhub_sandbox.session.counters import KEPT, Counters, Labels, Ledger
+from envhub_worker.protocol.lifecycle import Lifecycle
+from tests.support import inside
+from tests.support.processes import halted
+from tests.support.samples import sample
+from tests.support.started import started
 
 pytestmark = pytest.mark.usefixtures("neighbour")
 
@@ -30,6 +26,9 @@ Key = tuple[str, frozenset[tuple[str, str]]]
 @pytest.fixture
 def registry() -> Any:
     """A registry of its own with our collector, as a user would make it."""
+    prometheus_client = pytest.importorskip("prometheus_client")
+    from envhub_sandbox.integrations.metrics import EnvHubCollector
+
     found = prometheus_client.CollectorRegistry(auto_describe=True)
     found.register(EnvHubCollector())
     return found
@@ -37,7 +36,10 @@ def registry() -> Any:
 
 def scraped(registry: Any, repository: str) -> dict[Key, float]:
     """The samples about one repository, out of the text that Prometheus would get."""
-    text = prometheus_client.generate_latest(registry).decode()
+    from prometheus_client import generate_latest
+    from prometheus_client.parser import text_string_to_metric_families
+
+    text = generate_latest(registry).decode()
     return {
         (one.name, frozenset(one.labels.items()) - {("repository", repository)}): one.value
         for family in text_string_to_metric_families(text)
@@ -155,3 +157,51 @@ def test_names_of_the_worker_cannot_break_the_exposition(
     suites = {dict(labels)["suite"] for _, labels in found}
     assert suites == {'a"b\\c\nd} 5\\x1b[31m'}
     assert counters.LEDGER is not ledger
+
+
+@pytest.mark.parametrize("lane", ["auto", "frames"])
+def test_counters_follow_what_happens(lane: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Steps, timeouts, deaths and restarts are counted once each, over both lanes."""
+    monkeypatch.setattr(*inside.LATE_REPLY_GRACE, 120.0)
+    policy = {"restart": "on_reset"}
+    with started(sample("echo"), lane=lane, policy=policy, seed=None) as env:
+        for _ in range(5):
+            env.step([[1.0, 0.0]])
+        with halted(inside.pids(env)):
+            env.step_async([[1.0, 0.0]])
+            with pytest.raises(errors.WorkerTimeoutError):
+                env.step_wait(timeout=0.02)
+        assert env.sandbox.stats()["state"] == "LATE"
+        env.reset()
+        with pytest.raises(errors.WorkerDiedError):
+            env.step([[1.0, -1.0]])
+        assert env.sandbox.stats()["state"] == "DEAD"
+        env.reset()
+        found = env.sandbox.stats()
+        latency = found.pop("step_latency_s")
+        assert found.pop("sent_bytes") > 6 * 8
+        assert found.pop("received_bytes") > 6 * (8 + 8 + 1 + 1)
+        assert found == {
+            "requests": 3 + 5 + 1 + 1,
+            "steps": 5,
+            "timeouts": 1,
+            "deaths": 1,
+            "restarts": 1,
+            "stale_replies": 0,
+            "state": "READY",
+        }
+        assert latency["total"] >= latency["max"]
+        assert 0 < latency["p50"] <= latency["p90"] <= latency["p99"] <= latency["max"]
+    assert env.sandbox.stats()["state"] == "CLOSED"
+
+
+def test_latencies_are_those_of_the_last_steps() -> None:
+    counters = Counters()
+    assert counters.snapshot()["step_latency_s"] == {"total": 0.0}
+    for _ in range(KEPT):
+        counters.stepped(10**9)
+    for _ in range(KEPT):
+        counters.stepped(2 * 10**9)
+    expected = {"p50": 2.0, "p90": 2.0, "p99": 2.0, "max": 2.0, "total": 3.0 * KEPT}
+    assert counters.snapshot()["step_latency_s"] == expected
+    assert counters.snapshot()["steps"] == 2 * KEPT
