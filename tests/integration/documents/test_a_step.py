@@ -22,11 +22,13 @@ pytestmark = pytest.mark.same_for("users")
 
 ACTIONS = np.zeros(2, np.int64)
 PLAY = f"""
+import sys
 import numpy as np
 from envhub_sandbox import make_env
-with make_env({str(SAMPLES / "cartpole")!r}, n_envs=2, lane=LANE) as suites:
-    suites.env.reset(seed=0)
-    suites.env.step(np.zeros(2, np.int64))
+for lane in sys.argv[1:]:
+    with make_env({str(SAMPLES / "cartpole")!r}, n_envs=2, lane=lane) as suites:
+        suites.env.reset(seed=0)
+        suites.env.step(np.zeros(2, np.int64))
 """
 
 
@@ -60,27 +62,26 @@ def test_the_page_lists_the_files_of_a_step(checkout: Path) -> None:
     assert always <= listed
 
 
-@pytest.mark.parametrize(
-    ("lane", "step"),
-    [
-        ("auto", "> SharedMemoryLane.send_step\n< SharedMemoryLane.wait"),
-        ("frames", "> ServedLane.send_step\n> WorkerConnection.send Relay step"),
-    ],
-)
-def test_a_trace_names_each_message(lane: str, step: str) -> None:
-    program = ("-c", f"LANE = {lane!r}{PLAY}")
-    traced = python(*program, ENVHUB_TRACE="1")
-    lines = [re.sub(r"^\+\d+\.\d{6} MainThread ", "", line) for line in traced.stderr.splitlines()]
-    said = "\n".join(re.sub(r" \([\d.]+ ms\)$", "", line) for line in lines)
-    order = [
-        "> WorkerConnection.send Hello",
-        "< WorkerConnection.receive JailOpened",
-        step,
-        "CloseJail",
-    ]
-    assert said == re.sub(r"[^\x20-\x7e\n]", "", said)
-    assert [said.index(one) for one in order] == sorted(said.index(one) for one in order)
-    assert python(*program).stderr == ""
+STEPS = {
+    "auto": "> SharedMemoryLane.send_step\n< SharedMemoryLane.wait",
+    "frames": "> ServedLane.send_step\n> WorkerConnection.send Relay step",
+}
+
+
+def test_a_trace_names_each_message() -> None:
+    for lane, step in STEPS.items():
+        traced = python("-c", PLAY, lane, ENVHUB_TRACE="1").stderr.splitlines()
+        lines = [re.sub(r"^\+\d+\.\d{6} MainThread ", "", line) for line in traced]
+        said = "\n".join(re.sub(r" \([\d.]+ ms\)$", "", line) for line in lines)
+        order = [
+            "> WorkerConnection.send Hello",
+            "< WorkerConnection.receive JailOpened",
+            step,
+            "CloseJail",
+        ]
+        assert said == re.sub(r"[^\x20-\x7e\n]", "", said)
+        assert [said.index(one) for one in order] == sorted(said.index(one) for one in order)
+    assert python("-c", PLAY, *STEPS).stderr == ""
 
 
 def test_a_runner_runs_here_for_a_debugger() -> None:
