@@ -22,7 +22,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
 ]
 
-_STARTS, _CLOSES = 61, 17
+_STARTS, _CLOSES = 83, 23
 """Calls between two moments: of some 500 in a start, and of some 120 in a close."""
 _WAYS: dict[str, dict[str, Any]] = {
     "auto": {"use_async_envs": True},

@@ -100,7 +100,7 @@ def test_many_times_open_and_closed_leaves_one_server_and_nothing_else() -> None
     assert eventually(lambda: len(started()) == _ONLY_SERVER)
     ours, its = _descriptors(os.getpid()), process.num_fds()
     threads = threading.active_count()
-    for _ in range(30):
+    for _ in range(12):
         used(600)
     assert _servers() == {server}
     assert eventually(lambda: threading.active_count() <= threads)
@@ -113,7 +113,7 @@ def test_many_times_open_and_closed_leaves_one_server_and_nothing_else() -> None
 
 def test_ever_new_policies_do_not_fill_it_with_zygotes(tmp_path: Path) -> None:
     """Each kind of policy has a warm interpreter; of those without a jail few stay."""
-    for number in range(6):
+    for number in range(5):
         folder = tmp_path / str(number)
         folder.mkdir()
         used(600, policy={"readable": (str(folder),)})
