@@ -53,7 +53,10 @@ def python_of(document: str) -> list[str]:
     return [text for text in texts if "import pytest" not in text]
 
 
-DOCUMENTS = ("async", "authors", "concepts", "observing", "quickstart")
+DOCUMENTS = (
+    *("docs/async.md", "docs/authors.md", "docs/concepts.md"),
+    *("docs/observing.md", "docs/quickstart.md"),
+)
 _RUN = f"""{_ANY_PORT}
 import json, sys
 for document, text in json.loads(sys.argv[1]).items():
@@ -64,7 +67,7 @@ for document, text in json.loads(sys.argv[1]).items():
 def test_the_python_of_the_documents_runs(tmp_path: Path) -> None:
     """That of each with names of its own, one after the other in one process."""
     pytest.importorskip("prometheus_client")
-    found = {name: python_of(f"docs/{name}.md") for name in DOCUMENTS}
+    found = {name: python_of(name) for name in DOCUMENTS}
     assert all(found.values())
     texts = {name: _IMPORTED + "\n".join(blocks_of) for name, blocks_of in found.items()}
     run(["-c", _RUN, json.dumps(texts)], tmp_path)
