@@ -115,7 +115,6 @@ def doctor(
 
     Policy(profile=profile)  # refuses a name that there is not, before anything is tried
     if server is not None:
-
         if insecure_loopback and server_key is not None:
             raise UsageError(
                 "--server-key is for a server with keys, and --insecure-loopback for one without: "
