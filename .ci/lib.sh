@@ -49,10 +49,14 @@ with_summary() {
 }
 
 # The attacks on jails, also those of a folder that is new, and the tests of what confines, is confined and
-# installed: for these it matters who runs them. What the client makes of hostile answers is the same for all.
+# installed: for these it matters who runs them. What the client makes of hostile answers, and both sides of
+# hostile bytes, is the same for all.
 differs_by_user=()
 for folder in tests/attacks/*/; do
-  [ "$folder" = tests/attacks/client/ ] || differs_by_user+=("${folder%/}")
+  case $folder in
+    tests/attacks/client/ | tests/attacks/protocol/) ;;
+    *) differs_by_user+=("${folder%/}") ;;
+  esac
 done
 differs_by_user+=(tests/integration/{confinement,lifecycle,loading,packages})
 
