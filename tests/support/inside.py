@@ -423,7 +423,7 @@ def step_aside(group: str) -> None:
 
 def gate_of(options: Any, folder: Path, identity: Identity) -> Any:
     """The gate that ``envhub-worker listen`` puts before a server."""
-    return listen._gate(options, folder, identity, Log())
+    return listen._gate(options, folder, identity, Log(), None)
 
 
 def public_key(gate: RemoteGate) -> bytes:

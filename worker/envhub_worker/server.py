@@ -16,7 +16,7 @@ from typing import Any
 import zmq
 
 from envhub_worker import __version__
-from envhub_worker.access.gate import ClientRequest, Gate, Incoming, LocalGate
+from envhub_worker.access.gate import Gate, Incoming, LocalGate
 from envhub_worker.access.sessions import Sessions
 from envhub_worker.lockdown.mechanisms.scratch import remove_tree
 from envhub_worker.loop import Loop, has_message, send
@@ -70,6 +70,7 @@ class Server:
             self._gate.witness,
             local=isinstance(self._gate, LocalGate),
         )
+        self._gate.begin(self._sessions, self._jails)
         self._loop.tick(self._tick)
         if client_pidfd is not None:
             self._loop.watch(client_pidfd, self.stop)
@@ -81,8 +82,8 @@ class Server:
 
     def _tick(self) -> None:
         self._jails.look()
-        self._gate.tick(self._sessions, self._jails)
-        if self._gate.drained(self._jails):
+        self._gate.tick()
+        if self._gate.drained():
             self.stop()
 
     def stop_on(self, *signals: int, gently: Sequence[int] = ()) -> None:
@@ -119,10 +120,10 @@ class Server:
         try:
             self._loop.run()
         finally:
-            if self._gate.drained(self._jails):  # those who were refused last shall hear it
+            if self._gate.drained():  # those who were refused last shall hear it
                 self._router.setsockopt(zmq.LINGER, _LAST_WORDS_MS)
             self._jails.close()
-            self._gate.close(self._sessions)
+            self._gate.close()
             self._router.close()
             self._context.term()
             remove_tree(str(self._runtime_dir))  # its owner may not be there any more
@@ -177,8 +178,7 @@ class Server:
         payload = arrived.frames[1:]
         if not asker.session:
             raise RefusedError("HelloError", "say Hello first")
-        asked = ClientRequest(asker, request, payload, self._sessions, self._jails)
-        request = self._gate.authorize(asked)
+        request = self._gate.authorize(asker, request, payload)
         if isinstance(request, m.Relay):
             self._jails.relay(asker, request, payload)
             return None
@@ -188,7 +188,7 @@ class Server:
         if handler := _HANDLERS.get(type(request)):
             return handler(self._jails, asker, request)
         if special := self._gate.handlers.get(type(request)):
-            return special(asked._replace(request=request), request)
+            return special(asker, request, payload)
         raise RefusedError("LocalProtocolError", f"{type(request).__name__} is no request")
 
     def reply(self, asker: Asker, message: m.Message, payload: Sequence[Buffer] = ()) -> None:
@@ -215,7 +215,7 @@ class Server:
             )
         if not request.session:
             raise RefusedError("LocalProtocolError", "a session has a name")
-        self._gate.greet(arrived, request.session, self._sessions, self._jails)
+        self._gate.greet(arrived, request.session)
         return m.Welcome(m.VERSION, __version__, os.getpid())
 
     def _agree(self, asker: Asker, request: m.Agree) -> None:

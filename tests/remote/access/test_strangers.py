@@ -22,7 +22,7 @@ from envhub_sandbox.transport.tcp import TcpLink
 from envhub_worker.access import keys
 from envhub_worker.access.audit.log import LINES, PERIOD_S, Log
 from envhub_worker.access.curve_port import ConnectionLimiter
-from envhub_worker.access.gate import ClientRequest, Incoming
+from envhub_worker.access.gate import Incoming
 from envhub_worker.access.keys import AuthorizedClients
 from envhub_worker.access.packages import Packages
 from envhub_worker.access.quotas import Permissions, Quotas
@@ -126,7 +126,9 @@ def _gate(folder: Path) -> RemoteGate:
         permissions=Permissions(),
         idle_s=0,
     )
-    return RemoteGate(rules, Uploads(folder, Quotas()), Packages(None, Quotas()), Log())
+    gate = RemoteGate(rules, Uploads(folder, Quotas()), Packages(None, Quotas()), Log())
+    gate.begin(Sessions(), None)  # type: ignore[arg-type]
+    return gate
 
 
 def test_nobody_comes_in_while_nobody_can_be_asked(tmp_path: Path) -> None:
@@ -136,7 +138,7 @@ def test_nobody_comes_in_while_nobody_can_be_asked(tmp_path: Path) -> None:
         with zmq.Context() as context:
             router, peer = context.socket(zmq.ROUTER), context.socket(zmq.DEALER)
             gate.secure(router, Loop(Witness().failed))
-            gate.close(Sessions())
+            gate.close()
             if not enforced:
                 router.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 0)
             port = router.bind_to_random_port("tcp://127.0.0.1")
@@ -153,12 +155,12 @@ def test_nobody_comes_in_while_nobody_can_be_asked(tmp_path: Path) -> None:
 
 def test_a_message_without_a_proved_key_is_refused(tmp_path: Path) -> None:
     """Where keys are needed an empty one is nobody's: neither a session nor a request."""
-    gate, sessions = _gate(tmp_path), Sessions()
+    gate = _gate(tmp_path)
     with pytest.raises(RefusedError, match="not authorised"):
-        gate.greet(Incoming(b"id", b"", []), b"name", sessions, None)  # type: ignore[arg-type]
+        gate.greet(Incoming(b"id", b"", []), b"name")
     asker = Asker(b"id", 1, b"x" * 40, b"")
     with pytest.raises(RefusedError, match="not authorised"):
-        gate.authorize(ClientRequest(asker, m.GetSessions(), (), sessions, None))  # type: ignore[arg-type]
+        gate.authorize(asker, m.GetSessions(), ())
 
 
 def test_a_flood_of_frames_without_keys_costs_no_memory(

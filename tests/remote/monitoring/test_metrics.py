@@ -23,7 +23,6 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import ServerBusyError, WorkerDiedError
-from envhub_worker.access.audit import figures, usage
 from envhub_worker.cli import http_port
 from envhub_worker.cli.http_port import MAX_CONNECTIONS, MAX_REQUEST_BYTES, HttpPort
 from envhub_worker.cli.metrics import STALE_S, MetricsPage
@@ -275,24 +274,3 @@ def test_a_page_that_fails_is_an_answer() -> None:
         port.close()
     assert len(said) == 1
     assert "on purpose" in said[0]
-
-
-# --- figures -----------------------------------------------------------------------------------
-
-
-def test_what_clients_say_cannot_make_a_label() -> None:
-    """Operations, reasons and names have their number; the rest is added up."""
-    tally = figures.Tally()
-    for number in range(1000):
-        tally.asked(f"client {number}", f"operation {number}")
-        tally.open(f"client {number}")
-        tally.refused(f"Error{number}", f"quota{number}")
-    assert len(tally.requests) == figures.MAX_CLIENTS + 1
-    assert {word for one in tally.requests.values() for word in one} == {"other"}
-    assert tally.requests[figures.OTHERS]["other"] == 1000 - figures.MAX_CLIENTS
-    assert tally.refusals == {"other": 1000}
-    clients = figures.ClientFigures()
-    clients.add_past(tally, usage.Usage(lambda _: None))
-    assert len(clients.plain()) <= figures.MAX_CLIENTS + 1
-    assert figures.client_name("a\n\x1b[2J" * 100, insecure=False).isprintable()
-    assert len(figures.client_name("a" * 1000, insecure=False)) == 64

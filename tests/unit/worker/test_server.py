@@ -14,7 +14,7 @@ import zmq
 
 from envhub_worker.access.audit.events import Events
 from envhub_worker.access.audit.log import Log, json_line
-from envhub_worker.access.gate import ClientRequest, LocalGate
+from envhub_worker.access.gate import LocalGate
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import RemoteProtocolError
 from envhub_worker.server import Server
@@ -36,7 +36,7 @@ class Failing(LocalGate):
         self.error = error
         self.witness = Events(log, lambda key: None, lambda key: None)
 
-    def authorize(self, asked: ClientRequest) -> m.Message:
+    def authorize(self, *request: object) -> m.Message:
         raise self.error
 
 
@@ -101,7 +101,7 @@ class Ticking(LocalGate):
         self.failed = threading.Event()
         self.witness = Events(log, lambda key: None, lambda key: None)
 
-    def tick(self, sessions: object, jails: object) -> None:
+    def tick(self) -> None:
         if self.failed.is_set():
             return
         self.failed.set()

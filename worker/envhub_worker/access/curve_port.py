@@ -1,8 +1,8 @@
 """A TCP port whose clients prove a key before they are heard; it bounds peers without rules.
 
-``Zap`` answers ZeroMQ's authentication protocol (https://rfc.zeromq.org/spec/27) in the server's
-own loop. pyzmq's authenticators have a thread or an event loop of their own; the server has one
-thread and one poll, so this asks for no lock.
+``CurvePort`` answers ZeroMQ's authentication protocol (ZAP, https://rfc.zeromq.org/spec/27) in the
+server's own loop. pyzmq's authenticators have a thread or an event loop of their own; the server
+has one thread and one poll, so this asks for no lock.
 
 ``ConnectionLimiter`` knows which connections are open, and lets no more in while there are too many
 of them. Strangers make them, too, and each takes a descriptor and memory before any key is asked
@@ -19,6 +19,7 @@ import socket
 import stat
 import struct
 from collections.abc import Callable
+from functools import partial
 
 import zmq
 
@@ -54,6 +55,7 @@ class CurvePort:
 
     Args:
         keys: The server's key pair; None only for ``--insecure-loopback``.
+        admits: Called with a client's public key and address; whether it may come in.
         max_connections: Of everybody together, strangers included.
     """
 
@@ -66,8 +68,8 @@ class CurvePort:
     ) -> None:
         self._keys, self._admits = keys, admits
         self._log, self._max_connections = log, max_connections
-        self._closers: list[Callable[[], None]] = []
         self._limiter: ConnectionLimiter | None = None
+        self._zap: zmq.Socket[bytes] | None = None
 
     def secure(self, router: zmq.Socket[bytes], loop: Loop) -> None:
         """CURVE, and what bounds a peer that keeps none of the rules."""
@@ -77,18 +79,38 @@ class CurvePort:
         router.setsockopt(zmq.BACKLOG, _BACKLOG)
         router.setsockopt(zmq.SNDHWM, _SNDHWM)
         self._limiter = ConnectionLimiter(router, loop, self._log, self._max_connections)
-        self._closers.append(self._limiter.close)
-        keys = self._keys
-        if keys is None:
+        if self._keys is None:
             return
-        zap = Zap(router.context, self._admits)
-        self._closers.append(zap.close)
-        loop.watch(zap.socket, zap.answer)
+        self._zap = router.context.socket(zmq.ROUTER)
+        self._zap.setsockopt(zmq.LINGER, 0)
+        self._zap.bind(_ENDPOINT)
+        loop.watch(self._zap, partial(self._answer, self._zap))
         router.setsockopt(zmq.CURVE_SERVER, 1)
-        router.setsockopt(zmq.CURVE_SECRETKEY, keys.secret)
+        router.setsockopt(zmq.CURVE_SECRETKEY, self._keys.secret)
         router.setsockopt(zmq.ZAP_DOMAIN, _DOMAIN)
         # without it libzmq lets everybody in whom no handler was there to ask about
         router.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 1)
+
+    def _answer(self, zap: zmq.Socket[bytes]) -> None:
+        """Answer every question of libzmq's about a handshake that is there."""
+        while True:
+            try:
+                frames = zap.recv_multipart(zmq.NOBLOCK)
+            except zmq.Again:
+                return
+            # return address, empty, version, id, domain, address, routing id, mechanism, key
+            key = self._admitted(frames)
+            status = [b"200", b"OK", key.hex().encode()] if key else [b"400", b"not known", b""]
+            # the last frame is metadata; the one before it becomes the messages' User-Id
+            zap.send_multipart([frames[0], b"", _VERSION, frames[3], *status, b""])
+
+    def _admitted(self, frames: list[bytes]) -> bytes:
+        if len(frames) != _FRAMES or frames[2] != _VERSION or frames[4] != _DOMAIN:
+            return b""
+        address, mechanism, key = frames[5], frames[7], frames[8]
+        if mechanism != b"CURVE" or not self._admits(key, address.decode("ascii", "replace")):
+            return b""
+        return key
 
     def receive(self, router: zmq.Socket[bytes]) -> Incoming:
         """The key is the one that was proved in the handshake, never what the peer claims."""
@@ -124,8 +146,10 @@ class CurvePort:
 
     def close(self) -> None:
         """Close the sockets of the handshakes."""
-        for close in self._closers:
-            close()
+        if self._limiter is not None:
+            self._limiter.close()
+        if self._zap is not None:
+            self._zap.close()
 
 
 def _descriptor_of(frame: zmq.Frame) -> int:
@@ -133,45 +157,6 @@ def _descriptor_of(frame: zmq.Frame) -> int:
         return int(frame.get(zmq.SRCFD))
     except (zmq.ZMQError, ValueError):
         return -1
-
-
-class Zap:
-    """Answers libzmq's questions about each handshake.
-    ``admits``: called with the client's public key and address; whether it may come in.
-    """
-
-    def __init__(
-        self, context: zmq.Context[zmq.Socket[bytes]], admits: Callable[[bytes, str], bool]
-    ) -> None:
-        self._admits = admits
-        self.socket = context.socket(zmq.ROUTER)
-        self.socket.setsockopt(zmq.LINGER, 0)
-        self.socket.bind(_ENDPOINT)
-
-    def answer(self) -> None:
-        """Answer every question that is there."""
-        while True:
-            try:
-                frames = self.socket.recv_multipart(zmq.NOBLOCK)
-            except zmq.Again:
-                return
-            # return address, empty, version, id, domain, address, routing id, mechanism, key
-            key = self._key(frames)
-            status = [b"200", b"OK", key.hex().encode()] if key else [b"400", b"not known", b""]
-            # the last frame is metadata; the one before it becomes the messages' User-Id
-            self.socket.send_multipart([frames[0], b"", _VERSION, frames[3], *status, b""])
-
-    def _key(self, frames: list[bytes]) -> bytes:
-        if len(frames) != _FRAMES or frames[2] != _VERSION or frames[4] != _DOMAIN:
-            return b""
-        address, mechanism, key = frames[5], frames[7], frames[8]
-        if mechanism != b"CURVE" or not self._admits(key, address.decode("ascii", "replace")):
-            return b""
-        return key
-
-    def close(self) -> None:
-        """Close the socket."""
-        self.socket.close()
 
 
 class ConnectionLimiter:

@@ -20,16 +20,6 @@ from envhub_worker.supervisor.jails import Jails
 from envhub_worker.supervisor.records import Asker, Witness
 
 
-class ClientRequest(NamedTuple):
-    """A request, who asks, and what it is asked of."""
-
-    asker: Asker
-    request: m.Message
-    payload: Sequence[bytes]
-    sessions: Sessions
-    jails: Jails
-
-
 class Incoming(NamedTuple):
     """A message as it came.
 
@@ -44,7 +34,7 @@ class Incoming(NamedTuple):
     fd: int = -1
 
 
-Handler = Callable[[ClientRequest, Any], m.Message]
+Handler = Callable[[Asker, Any, Sequence[bytes]], m.Message]
 """Carries a request out that is permitted; returns the reply."""
 
 
@@ -55,22 +45,29 @@ class Gate:
         handlers: The requests that only this gate knows.
         compresses: Whether frames are worth compressing.
         idle_s: How long the jails of a client that says nothing live on; 0 for ever.
+        sessions, jails: The server's, since ``begin``.
     """
 
+    sessions: Sessions
+    jails: Jails
     handlers: Mapping[type[m.Message], Handler] = {}
     compresses = False
     idle_s = 0
     witness = Witness()
 
+    def begin(self, sessions: Sessions, jails: Jails) -> None:
+        """The server is made."""
+        self.sessions, self.jails = sessions, jails
+
     def receive(self, router: zmq.Socket[bytes]) -> Incoming:
         """A message that is there."""
         raise NotImplementedError
 
-    def greet(self, arrived: Incoming, name: bytes, sessions: Sessions, jails: Jails) -> None:
+    def greet(self, arrived: Incoming, name: bytes) -> None:
         """A session of this name begins, or is found again; raises ``RefusedError``."""
         raise NotImplementedError
 
-    def authorize(self, asked: ClientRequest) -> m.Message:
+    def authorize(self, asker: Asker, request: m.Message, payload: Sequence[bytes]) -> m.Message:
         """The request as it may be carried out, never a reply; raises ``RefusedError``."""
         raise NotImplementedError
 
@@ -80,18 +77,18 @@ class Gate:
     def answered(self, asker: Asker, reply: m.Message) -> None:
         """A request is answered so."""
 
-    def tick(self, sessions: Sessions, jails: Jails) -> None:
+    def tick(self) -> None:
         """A second has passed."""
 
     def drain(self) -> bool:
         """Let nothing new in from now on; False if nothing that runs is waited for."""
         return False
 
-    def drained(self, jails: Jails) -> bool:
+    def drained(self) -> bool:
         """Whether that has been said, and nothing runs any more."""
         return False
 
-    def close(self, sessions: Sessions) -> None:
+    def close(self) -> None:
         """End all sessions; close what ``secure`` opened."""
 
 
@@ -103,10 +100,10 @@ class LocalGate(Gate):
         identity, *frames = receive(router)
         return Incoming(identity, b"", frames)
 
-    def greet(self, arrived: Incoming, name: bytes, sessions: Sessions, jails: Jails) -> None:
+    def greet(self, arrived: Incoming, name: bytes) -> None:
         """Every client is welcome."""
-        sessions.connect(arrived.identity, arrived.key, name)
+        self.sessions.connect(arrived.identity, arrived.key, name)
 
-    def authorize(self, asked: ClientRequest) -> m.Message:
+    def authorize(self, asker: Asker, request: m.Message, payload: Sequence[bytes]) -> m.Message:
         """Everything is permitted."""
-        return asked.request
+        return request

@@ -20,8 +20,7 @@ from typing import Any
 
 from envhub_worker.access.package_program import PackageProgram
 from envhub_worker.access.quotas import BusyError, Quotas
-from envhub_worker.access.store.blob_store import make_passable
-from envhub_worker.access.store.shared_use import SHARED
+from envhub_worker.access.store.blob_store import SHARED, make_passable
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.messages.server import Busy
 from envhub_worker.protocol.runtime import Runtime

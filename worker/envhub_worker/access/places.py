@@ -1,26 +1,32 @@
-"""Room for a client's sessions and jails, within the quotas of its key.
+"""Room for a client's sessions and jails, within the quotas of its key, and its end.
 
-First come, first served, among the processes of one key. The sessions of processes that have gone
-are ended where their place is needed.
+First come, first served, among the processes of one key. A session ends when nothing holds it any
+more; one whose process has gone also where its place is needed. A server that drains has no room.
 """
 
 from __future__ import annotations
 
 import time
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from envhub_worker.access.audit.events import Events
+from envhub_worker.access.audit.log import Log
 from envhub_worker.access.quotas import RETRY_S, BusyError, Quotas, Use, check_jail
-from envhub_worker.access.session_expiry import SessionExpiry, longest_gone
-from envhub_worker.access.sessions import WATCHER, Sessions
-from envhub_worker.protocol.messages.server import Busy
+from envhub_worker.access.sessions import WATCHER, Session, Sessions
+from envhub_worker.access.store.uploads import Uploads
+from envhub_worker.protocol.messages.server import DRAINING, Busy
 from envhub_worker.supervisor.jails import Jails
 from envhub_worker.supervisor.records import Asker
 
 _PATIENCE_S = 5.0
 _MAX_WAITING = 1024
 _PLACE_NEEDED = "its client is gone, and its key needed the place"
+_FORGOTTEN_S = 3600.0
+"""Where silent clients keep their jails, those without any are forgotten after so long."""
+_QUIET_S = 1.0
+"""Between the end of the last jail and the server's own: its client learns why from this one."""
 
 
 @dataclass
@@ -80,15 +86,35 @@ class Line:
 
 
 class Places:
-    """Finds a place, or raises ``BusyError``. ``lines``: the clients that wait, by quota."""
+    """Finds a place, or raises ``BusyError``, and ends what has no right to one any more.
 
-    def __init__(self, quotas: Quotas, expiry: SessionExpiry) -> None:
-        self._quotas, self._expiry = quotas, expiry
+    Args:
+        idle_s: How long the jails of a client that says nothing live on; 0 for ever.
+        open_wires: The connections that are there now; None if they are not counted.
+
+    Attributes:
+        lines: The clients that wait, by quota.
+    """
+
+    def __init__(
+        self,
+        quotas: Quotas,
+        idle_s: int,
+        sessions: Sessions,
+        jails: Jails,
+        uploads: Uploads,
+        events: Events,
+        open_wires: Callable[[], frozenset[int] | None],
+    ) -> None:
+        self._quotas, self._idle_s = quotas, idle_s
+        self._sessions, self._jails = sessions, jails
+        self._uploads, self._events, self._open_wires = uploads, events, open_wires
         self.lines = {"sessions": Line(), "jails": Line()}
 
-    def for_session(self, key: bytes, name: bytes, sessions: Sessions, jails: Jails) -> None:
+    def for_session(self, key: bytes, name: bytes) -> None:
         """Hold a session against the quota."""
-        others = [one for one in sessions.of_key(key) if one.name not in (name, WATCHER)]
+        of_key = self._sessions.of_key(key)
+        others = [one for one in of_key if one.name not in (name, WATCHER)]
         quota = self._quotas.sessions
         if name != WATCHER and len(others) >= quota:
             gone = longest_gone(others)
@@ -98,33 +124,39 @@ class Places:
                     Busy("sessions", len(others), quota, RETRY_S),
                     f"your key has {quota} sessions, which is the server's quota (--max-sessions)",
                 )
-            self._expiry.end(gone, sessions, jails, _PLACE_NEEDED)
-        elif name not in {one.name for one in sessions.of_key(key)}:
+            self.end(gone, _PLACE_NEEDED)
+        elif name not in {one.name for one in of_key}:
             self._refuse_behind("sessions", key, name, len(others), quota)
         self.lines["sessions"].leave(key, name)
 
-    def for_jail(self, asker: Asker, more: Use, sessions: Sessions, jails: Jails) -> None:
+    def for_jail(self, asker: Asker, more: Use) -> None:
         """Hold a jail, or further runners of one, against the quotas."""
         key = asker.key
         check_jail((), more, self._quotas)  # no session ends for what never fits
         while True:
             try:
-                check_jail(_uses(jails, key), more, self._quotas)
+                check_jail(self._uses(key), more, self._quotas)
                 break
             except BusyError:
-                self._expiry.disconnect(sessions)
+                self._disconnect()
                 # its own may look so, too: what it said last is read after it has gone
-                others = [one for one in sessions.of_key(key) if one.owner != asker.session]
+                others = [one for one in self._sessions.of_key(key) if one.owner != asker.session]
                 gone = longest_gone(others)
                 if gone is None:
                     if more.memory_bytes:
                         self.lines["jails"].wait(key, asker.session)
                     raise
-                self._expiry.end(gone, sessions, jails, _PLACE_NEEDED)
+                self.end(gone, _PLACE_NEEDED)
         if more.memory_bytes:
-            used, quota = len(_uses(jails, key)), self._quotas.jails
+            used, quota = len(self._uses(key)), self._quotas.jails
             self._refuse_behind("jails", key, asker.session, used, quota)
             self.lines["jails"].leave(key, asker.session)
+
+    def _uses(self, key: bytes) -> list[Use]:
+        return [
+            Use(entry.jail.spec.confinement.limits.memory_bytes, len(entry.links))
+            for entry in self._jails.open_ones(key)
+        ]
 
     def _refuse_behind(self, quota: str, key: bytes, owner: bytes, used: int, limit: int) -> None:
         """There is room, and others of the same key have waited for it."""
@@ -135,9 +167,96 @@ class Places:
             text = f"{ahead} other processes of your key wait for the server's {quota}"
             raise BusyError(Busy(quota, used, limit, RETRY_S), text)
 
+    # --- ends ----------------------------------------------------------------------------------
 
-def _uses(jails: Jails, key: bytes) -> list[Use]:
-    return [
-        Use(entry.jail.spec.confinement.limits.memory_bytes, len(entry.links))
-        for entry in jails.open_ones(key)
-    ]
+    def tick(self) -> None:
+        """End the jails of clients that are not heard from, and what clients no longer hold."""
+        self.end_deserted()
+        for session in self._sessions.idle(self._idle_s or _FORGOTTEN_S):
+            if self._idle_s:
+                self.end(session, f"its client has sent nothing for {self._idle_s} s")
+            elif not self._jails.open_ones(session.owner):
+                self.drop(session, "it has sent nothing for too long")
+        if self._idle_s:
+            self._end_unheld()
+
+    def end_deserted(self) -> None:
+        """Forget the connections that have gone, and the sessions that have nothing else.
+
+        A client that is only cut off loses nothing: what it had was a name. One that has jails
+        keeps them, for ``idle_s``, or until others of its key need the place.
+        """
+        self._disconnect()
+        for session in self._sessions.all():
+            if not session.connections and not self._jails.open_ones(session.owner):
+                self.drop(session, "its connections have ended")
+
+    def _disconnect(self) -> None:
+        wires = self._open_wires()
+        if wires is not None:
+            self._sessions.disconnect(wires)
+
+    def _end_unheld(self) -> None:
+        for session in self._sessions.all():
+            for entry in self._jails.open_ones(session.owner):
+                if self._sessions.unheld(session, entry.number, self._idle_s):
+                    self._jails.end(entry, "its client gave it up")
+
+    def end(self, session: Session, why: str) -> None:
+        """End a session and its jails."""
+        for entry in self._jails.open_ones(session.owner):
+            self._jails.end(entry, why)
+        self.drop(session, why)
+
+    def drop(self, session: Session, why: str) -> None:
+        """Forget a session."""
+        self._uploads.forget(session.owner)
+        self._sessions.drop(session)
+        self._events.left(session, why)
+
+
+def longest_gone(sessions: Sequence[Session]) -> Session | None:
+    """The session without a connection that was heard from the longest ago, if there is one."""
+    gone = [one for one in sessions if not one.connections]
+    return min(gone, key=lambda one: one.heard, default=None)
+
+
+class Drain:
+    """When a server was asked to end, and what that means for its clients.
+    ``drain_s``: how long what runs may go on; 0 waits for nothing.
+    """
+
+    def __init__(self, drain_s: float, clock: Callable[[], float] = time.monotonic) -> None:
+        self._drain_s = drain_s
+        self._clock = clock
+        self._until: float | None = None
+        self._quiet_since: float | None = None
+
+    @property
+    def left_s(self) -> float | None:
+        """How long what runs may go on; None before it begins."""
+        return None if self._until is None else max(0.0, self._until - self._clock())
+
+    def begin(self, log: Log) -> bool:
+        """Let nothing new in; False if there is no time to give, or it was said before."""
+        if not self._drain_s or self._until is not None:
+            return False
+        self._until = self._clock() + self._drain_s
+        log.say("draining", "info", seconds=self._drain_s)
+        return True
+
+    def quiet(self, busy: bool) -> bool:
+        """Whether no jail has been open for a moment; ``busy``: one is."""
+        now = self._clock()
+        if busy or self._quiet_since is None:
+            self._quiet_since = None if busy else now
+            return False
+        return now - self._quiet_since >= _QUIET_S
+
+    def refuse_new(self) -> None:
+        """Raise ``BusyError`` once it has begun."""
+        if self._until is not None:
+            raise BusyError(
+                Busy(DRAINING, 0, 0, RETRY_S),
+                "the server drains and accepts nothing new: try again when its replacement runs",
+            )

@@ -2,23 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from time import monotonic
 from typing import Any
 
 import zmq
 
 from envhub_worker.access.audit.events import Events
-from envhub_worker.access.audit.figures import ClientFigures, ServerFigures, Tally, client_name
+from envhub_worker.access.audit.figures import (
+    ClientFigures,
+    ServerFigures,
+    Tally,
+    Usage,
+    client_name,
+)
 from envhub_worker.access.audit.log import Log
-from envhub_worker.access.audit.usage import Usage
 from envhub_worker.access.curve_port import MAX_CONNECTIONS, CurvePort
-from envhub_worker.access.drain import Drain
-from envhub_worker.access.gate import ClientRequest, Gate, Incoming
+from envhub_worker.access.gate import Gate, Incoming
 from envhub_worker.access.keys import AuthorizedClients, KeyPair
 from envhub_worker.access.packages import Packages
-from envhub_worker.access.places import Places
+from envhub_worker.access.places import Drain, Places
 from envhub_worker.access.quotas import InFlight, Permissions, Quotas, Use, check_policy
-from envhub_worker.access.session_expiry import SessionExpiry
 from envhub_worker.access.sessions import WATCHER, Sessions
 from envhub_worker.access.store.uploads import PREFIX, Uploads, wrong_with_path
 from envhub_worker.lockdown.probe import own_runtime
@@ -73,7 +77,9 @@ class RemoteGate(Gate):
         self._uploads = uploads
         self._packages = packages
         self._log = log
-        self._events = self.witness = Events(log, self._name_of, self._count_opened)
+        self._events = self.witness = Events(
+            log, self._name_of, lambda key: self._tally.open(self._label_of(key))
+        )
         self._in_flight = InFlight()
         self._drain = Drain(rules.drain_s)
         self._publish = publish
@@ -87,8 +93,6 @@ class RemoteGate(Gate):
             max_connections=rules.max_connections,
         )
         self._port = CurvePort(rules.keys, self._admits, log, rules.max_connections)
-        self._expiry = SessionExpiry(rules.idle_s, uploads, self._events, self._port.open_wires)
-        self._places = Places(rules.quotas, self._expiry)
         self.handlers = {
             m.OfferSnapshot: self._offer,
             m.PutBlob: self._put,
@@ -96,6 +100,14 @@ class RemoteGate(Gate):
             m.GetSessions: self._list_sessions,
             m.NeedPackages: self._need,
         }
+
+    def begin(self, sessions: Sessions, jails: Jails) -> None:
+        """Clients find their places among these."""
+        super().begin(sessions, jails)
+        rules, wires = self._rules, self._port.open_wires
+        self._places = Places(
+            rules.quotas, rules.idle_s, sessions, jails, self._uploads, self._events, wires
+        )
 
     # --- the socket ----------------------------------------------------------------------------
 
@@ -108,7 +120,7 @@ class RemoteGate(Gate):
         return self._port.receive(router)
 
     def _admits(self, key: bytes, address: str) -> bool:
-        if self._rules.authorized.name_of(key) is not None or key in self._rules.operators:
+        if self._is_known(key):
             return True
         # a kind of its own: noise at the port must not count away the line that an operator needs
         self._log.say("unknown_key", key=key_text(key), address=address)
@@ -116,36 +128,35 @@ class RemoteGate(Gate):
 
     # --- requests ------------------------------------------------------------------------------
 
-    def greet(self, arrived: Incoming, name: bytes, sessions: Sessions, jails: Jails) -> None:
+    def greet(self, arrived: Incoming, name: bytes) -> None:
         """Refuse a sender without a key of ours, and more sessions than the quota."""
         key = arrived.key
         self._refuse_unless_authorized(key)
         if len(name) > 64:
             raise RefusedError("LocalProtocolError", "the name of a session is too long")
-        self._expiry.end_deserted(sessions, jails)
-        if name != WATCHER and name not in {one.name for one in sessions.of_key(key)}:
+        self._places.end_deserted()
+        is_new = name not in {one.name for one in self.sessions.of_key(key)}
+        if name != WATCHER and is_new:
             self._drain.refuse_new()
-        self._places.for_session(key, name, sessions, jails)
+        self._places.for_session(key, name)
         wire = self._port.wire(arrived.fd)
-        known = {one.name for one in sessions.of_key(key)}
-        session = sessions.connect(arrived.identity, key, name, wire)
-        if name not in known:
+        session = self.sessions.connect(arrived.identity, key, name, wire)
+        if is_new:
             self._events.came(session)
 
-    def authorize(self, asked: ClientRequest) -> m.Message:
+    def authorize(self, asker: Asker, request: m.Message, payload: Sequence[bytes]) -> m.Message:
         """Hold a request against keys and quotas."""
-        asker, request = asked.asker, asked.request
         self._refuse_unless_authorized(asker.key)
         if isinstance(request, (m.OpenJail, m.OfferSnapshot, m.NeedPackages)):
             self._drain.refuse_new()
         if isinstance(request, m.OpenJail):
-            return self._authorize_open(asked, request)
+            return self._authorize_open(asker, request)
         if isinstance(request, m.StartRunners):
-            self._places.for_jail(asker, Use(0, request.runners), asked.sessions, asked.jails)
+            self._places.for_jail(asker, Use(0, request.runners))
         elif isinstance(request, m.Relay):
-            asked.sessions.used(asker.identity, asker.key, request.jail)
+            self.sessions.used(asker.identity, asker.key, request.jail)
             self._tally.asked(self._label_of(asker.key), request.operation)
-            size = sum(map(len, asked.payload))
+            size = sum(map(len, payload))
             self._in_flight.add(asker.key, asker, size, self._rules.quotas.inflight_bytes)
         return request
 
@@ -163,8 +174,8 @@ class RemoteGate(Gate):
         if not self._is_known(key):
             raise RefusedError("WorkerError", "your key is not authorised any more")
 
-    def _authorize_open(self, asked: ClientRequest, request: m.OpenJail) -> m.OpenJail:
-        key = asked.asker.key
+    def _authorize_open(self, asker: Asker, request: m.OpenJail) -> m.OpenJail:
+        key = asker.key
         try:
             confinement = confinement_from_wire(request.confinement)
         except ProtocolError as error:
@@ -177,7 +188,7 @@ class RemoteGate(Gate):
         runtime = self._packages.runtime(key, packages) if packages else own_runtime()
         use = Use(confinement.limits.memory_bytes, request.runners)
         copies = self._hub_copies(key, request)
-        self._places.for_jail(asked.asker, use, asked.sessions, asked.jails)
+        self._places.for_jail(asker, use)
         return m.replace(
             request,
             name=request.name[:512],
@@ -195,13 +206,11 @@ class RemoteGate(Gate):
             raise RefusedError("LocalProtocolError", str(error)) from None
         return request.with_trees({one: self._uploads.tree(key, one) for one in wanted})
 
-    def _need(self, asked: ClientRequest, request: m.NeedPackages) -> m.Message:
-        asker = asked.asker
-        return self._packages.need(asker.key, request, asked.jails.packages, asker.session)
+    def _need(self, asker: Asker, request: m.NeedPackages, payload: Sequence[bytes]) -> m.Message:
+        return self._packages.need(asker.key, request, self.jails.packages, asker.session)
 
-    def _offer(self, asked: ClientRequest, request: m.OfferSnapshot) -> m.Message:
-        asker = asked.asker
-        specs = [entry.jail.spec for entry in asked.jails.open_ones()]
+    def _offer(self, asker: Asker, request: m.OfferSnapshot, payload: Sequence[bytes]) -> m.Message:
+        specs = [entry.jail.spec for entry in self.jails.open_ones()]
         in_use = {one.snapshot for one in specs}
         in_use |= {copy.tree for one in specs for copy in one.hub_copies}
         wanted = self._uploads.offer(asker.session, asker.key, request, in_use)
@@ -212,22 +221,22 @@ class RemoteGate(Gate):
             self._events.uploads(asker.session, digest, len(wanted.hashes), size)
         return wanted
 
-    def _put(self, asked: ClientRequest, request: m.PutBlob) -> m.Message:
-        if len(asked.payload) != 1:
+    def _put(self, asker: Asker, request: m.PutBlob, payload: Sequence[bytes]) -> m.Message:
+        if len(payload) != 1:
             raise RefusedError("LocalProtocolError", "PutBlob has one frame")
-        self._uploads.put(asked.asker.session, asked.asker.key, request, asked.payload[0])
+        self._uploads.put(asker.session, asker.key, request, payload[0])
         return m.Done()
 
-    def _keep(self, asked: ClientRequest, request: m.KeepAlive) -> m.Message:
-        session = asked.sessions.find(asked.asker.identity, asked.asker.key)
+    def _keep(self, asker: Asker, request: m.KeepAlive, payload: Sequence[bytes]) -> m.Message:
+        session = self.sessions.find(asker.identity, asker.key)
         if session is not None and all(type(jail) is int for jail in request.jails[:4096]):
-            asked.sessions.keep(session, request.jails[:4096])
+            self.sessions.keep(session, request.jails[:4096])
         return m.Done()
 
-    def _list_sessions(self, asked: ClientRequest, request: m.GetSessions) -> m.Message:
-        key = asked.asker.key
-        listed = self._sessions_of(key, asked.sessions, asked.jails)
-        return m.Sessions(tuple(listed), self.figures(asked.sessions, asked.jails, key))
+    def _list_sessions(
+        self, asker: Asker, request: m.GetSessions, payload: Sequence[bytes]
+    ) -> m.Message:
+        return m.Sessions(tuple(self._sessions_of(asker.key)), self.figures(asker.key))
 
     def answered(self, asker: Asker, reply: m.Message) -> None:
         """Its bytes are no longer in flight; a refusal is counted and written down."""
@@ -236,21 +245,18 @@ class RemoteGate(Gate):
             self._tally.refused(reply.error, reply.missing)
             self._events.refused(asker, reply)
 
-    def _count_opened(self, key: bytes) -> None:
-        self._tally.open(self._label_of(key))
-
     def _label_of(self, key: bytes) -> str:
         return client_name(self._rules.authorized.name_of(key), self._rules.keys is None)
 
-    def figures(self, sessions: Sessions, jails: Jails, key: bytes | None = None) -> dict[str, Any]:
+    def figures(self, key: bytes | None = None) -> dict[str, Any]:
         """What the server has to report: all for an operator, for any other key its own share."""
         clients = ClientFigures()
-        for one in sessions.all():
+        for one in self.sessions.all():
             if one.name != WATCHER:
                 clients.of(self._label_of(one.key)).sessions += 1
-        for entry in jails.open_ones():
+        for entry in self.jails.open_ones():
             clients.of(self._label_of(_key_of(entry))).add_jail(entry)
-        for known in {one.key for one in sessions.all() if one.name != WATCHER}:
+        for known in {one.key for one in self.sessions.all() if one.name != WATCHER}:
             share = clients.of(self._label_of(known))
             share.upload_bytes += self._uploads.used_bytes(known)
             share.inflight_bytes += self._in_flight.of(known)
@@ -258,20 +264,20 @@ class RemoteGate(Gate):
         found = {**self._own_figures.for_clients(), "draining_s": self._drain.left_s}
         if key is not None and key not in self._rules.operators:
             return {**found, "clients": clients.plain(self._label_of(key))}
-        looking = sum(len(one.connections) for one in sessions.all() if one.name == WATCHER)
+        looking = sum(len(one.connections) for one in self.sessions.all() if one.name == WATCHER)
         return {
             **found,
             **self._own_figures.for_operators(),
             "connections": max(0, len(self._port.open_wires() or ()) - looking),
             "waiting": {quota: line.waiting for quota, line in self._places.lines.items()},
             "refusals": dict(self._tally.refusals),
-            "deaths": dict(jails.deaths),
+            "deaths": dict(self.jails.deaths),
             "clients": clients.plain(),
         }
 
-    def _sessions_of(self, key: bytes, sessions: Sessions, jails: Jails) -> list[dict[str, Any]]:
-        self._expiry.end_deserted(sessions, jails)
-        found = sessions.all() if key in self._rules.operators else sessions.of_key(key)
+    def _sessions_of(self, key: bytes) -> list[dict[str, Any]]:
+        self._places.end_deserted()
+        found = self.sessions.all() if key in self._rules.operators else self.sessions.of_key(key)
         seen = [one for one in found if one.name != WATCHER]  # the one that asks, above all
         used = {key: self._uploads.used_bytes(key) for key in {one.key for one in seen}}
         return [
@@ -279,36 +285,38 @@ class RemoteGate(Gate):
                 "client": self._name_of(one.key) or "operator",
                 "key": key_text(one.key),
                 "session": one.name.hex()[:8],
-                "heard_s": sessions.age_s(one),
+                "heard_s": monotonic() - one.heard,
                 "connections": len(one.connections),
                 "upload_bytes": used[one.key],
-                "jails": tuple(jails.statuses(one.owner)),
+                "jails": tuple(self.jails.statuses(one.owner)),
             }
             for one in seen
         ]
 
     # --- time ----------------------------------------------------------------------------------
 
-    def tick(self, sessions: Sessions, jails: Jails) -> None:
+    def tick(self) -> None:
         """End the jails of clients that are not heard from, and what clients no longer hold."""
         self._log.tick()
         self._port.tick()
         self._read_clients()
-        for session in sessions.all():
+        for session in self.sessions.all():
             if not self._is_known(session.key):
-                self._expiry.end(session, sessions, jails, "its key is not authorised any more")
-        self._expiry.tick(sessions, jails)
-        self._packages.look(jails.packages)
+                self._places.end(session, "its key is not authorised any more")
+        self._places.tick()
+        self._packages.look(self.jails.packages)
         for news in self._packages.news():
             self._events.packages(*news)
         if self._publish is not None:
-            self._publish(self.figures(sessions, jails))
-        watched = {entry.jail.pid: self._label_of(_key_of(entry)) for entry in jails.open_ones()}
+            self._publish(self.figures())
+        watched = {
+            entry.jail.pid: self._label_of(_key_of(entry)) for entry in self.jails.open_ones()
+        }
         self._usage.watch({pid: label for pid, label in watched.items() if pid > 0})
-        if self._drain.over:
-            for entry in jails.open_ones():
+        if self._drain.left_s == 0.0:
+            for entry in self.jails.open_ones():
                 why = f"the server ends, {self._rules.drain_s} s after it was asked to"
-                jails.end(entry, why)
+                self.jails.end(entry, why)
 
     def _read_clients(self) -> None:
         """Once a second; what is wrong with the list is said once, until it is another."""
@@ -326,14 +334,14 @@ class RemoteGate(Gate):
         """Refuse new sessions and jails; those that run have ``drain_s``."""
         return self._drain.begin(self._log)
 
-    def drained(self, jails: Jails) -> bool:
+    def drained(self) -> bool:
         """Whether it may end: no jail is left, and every client had a moment to hear so."""
-        return self._drain.begun and self._drain.quiet(bool(jails.open_ones()))
+        return self._drain.left_s is not None and self._drain.quiet(bool(self.jails.open_ones()))
 
-    def close(self, sessions: Sessions) -> None:
+    def close(self) -> None:
         """End all sessions; close the sockets of the handshakes."""
-        for session in sessions.all():
-            self._expiry.drop(session, sessions, "the server ends")
+        for session in self.sessions.all():
+            self._places.drop(session, "the server ends")
         self._packages.close()
         self._usage.close()
         self._port.close()

@@ -127,10 +127,6 @@ class Sessions:
             self._disconnect(connection)
         self._sessions.pop(session.owner, None)
 
-    def age_s(self, session: Session) -> float:
-        """Seconds since it was heard from."""
-        return self._clock() - session.heard
-
     def keep(self, session: Session, jails: tuple[int, ...]) -> None:
         """Write down which jails the client holds."""
         now = self._clock()

@@ -194,18 +194,16 @@ def _gate(
     state: Path,
     identity: Identity,
     log: Log,
-    publish: Publish | None = None,
+    publish: Publish | None,
 ) -> RemoteGate:
     known = {} if identity.client is None else {identity.client.public: "the one client"}
-    pair = identity.keys
-    operators = frozenset[bytes]() if pair is None else frozenset({pair.public})
     quotas = quotas_of(arguments)
     # one, where nothing keeps a jail from the other clients' files
     single = arguments.weakest_profile == "container" and landlock.version() < 1
     rules = Rules(
         keys=identity.keys,
         authorized=AuthorizedClients(identity.authorized, known, 1 if single else None),
-        operators=operators,
+        operators=frozenset({identity.keys.public} if identity.keys else ()),
         quotas=quotas,
         permissions=Permissions(
             weakest_profile=arguments.weakest_profile,

@@ -148,14 +148,13 @@ def _add_quotas(parser: argparse.ArgumentParser) -> None:
 
 def quotas_of(arguments: argparse.Namespace) -> Quotas:
     """The quotas that were chosen."""
-    option = {
-        field: names[0].lstrip("-").replace("-", "_") for field, (names, *_) in _QUOTAS.items()
-    }
-    return Quotas(**{field: getattr(arguments, name) for field, name in option.items()})
-
-
-def _count(text: str) -> int:
-    return _at_least(1, text)
+    given = vars(arguments)
+    return Quotas(
+        **{
+            field: given[names[0].lstrip("-").replace("-", "_")]
+            for field, (names, *_) in _QUOTAS.items()
+        }
+    )
 
 
 def _key(text: str) -> bytes:
@@ -175,15 +174,14 @@ def _size(unit: str, text: str) -> int:
     return size
 
 
-def _seconds(text: str) -> int:
-    return _at_least(0, text)
-
-
 def _at_least(least: int, text: str) -> int:
     with contextlib.suppress(ValueError):
         if int(text) >= least:
             return int(text)
     raise argparse.ArgumentTypeError(f"takes a whole number, {least} or more, not {text!r}")
+
+
+_count, _seconds = partial(_at_least, 1), partial(_at_least, 0)
 
 
 def _weakest_profile() -> str:

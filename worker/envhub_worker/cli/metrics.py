@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 from envhub_worker.access.audit.figures import REFUSALS
+from envhub_worker.cli.http_port import Reply
 from envhub_worker.protocol.confinement import REASONS
 
 MISSING = (
@@ -20,10 +21,6 @@ MISSING = (
 STALE_S = 30.0
 """A server publishes every second. One that has not for so long is stuck."""
 _TEXT = "text/plain; charset=utf-8"
-
-
-Answer = tuple[int, str, bytes]
-"""To a request for a page: status, content type, body."""
 
 
 class MetricsPage:
@@ -39,13 +36,13 @@ class MetricsPage:
         self._render = render
         self._clock = clock
         self._published: tuple[float, Mapping[str, Any]] | None = None
-        self._rendered: tuple[Mapping[str, Any], Answer] | None = None
+        self._rendered: tuple[Mapping[str, Any], Reply] | None = None
 
     def publish(self, figures: Mapping[str, Any]) -> None:
         """Put figures in the place of the last ones; they do not change any more."""
         self._published = self._clock(), {**figures, "ready": self._usable and not _drains(figures)}
 
-    def answer(self, path: str) -> Answer:
+    def answer(self, path: str) -> Reply:
         """The page of that path."""
         published = self._published  # another thread replaces it
         wrong = self._wrong(published)
@@ -58,7 +55,7 @@ class MetricsPage:
             return 503 if wrong else 200, _TEXT, f"{wrong or 'ready'}\n".encode()
         return 404, _TEXT, b"/metrics, /healthz, /readyz\n"
 
-    def _metrics(self, figures: Mapping[str, Any]) -> Answer:
+    def _metrics(self, figures: Mapping[str, Any]) -> Reply:
         """Made once for each publication: to ask often costs the server nothing."""
         if self._rendered is None or self._rendered[0] is not figures:
             self._rendered = figures, (200, *self._render(figures))

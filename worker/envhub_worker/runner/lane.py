@@ -1,9 +1,9 @@
 """The jail's end of the fast lane: steps out of one slab into another, at the ring of a doorbell.
 
-Our doorbell is the other end of the client's socket, the client's an eventfd (an older client's are
-two of these): both are read and written with whole words. Followed: ``eventfd(2)``, ``unix(7)``,
-``memfd_create(2)``. The request slab is mapped read-only (the client has
-sealed it against our writes); the reply slab belongs to both.
+Our doorbell is the other end of the client's socket, the client's an eventfd: both are read and
+written with whole words. Followed: ``eventfd(2)``, ``unix(7)``, ``memfd_create(2)``. The request
+slab is mapped read-only (the client has sealed it against our writes); the reply slab belongs to
+both.
 """
 
 from __future__ import annotations
@@ -50,16 +50,16 @@ class Lane:
         answer: Callable[[Packet], list[Any]],
         pack: Callable[[m.Message], list[Any]],
         raised: Callable[[BaseException, str], m.RaisedException],
-        warned: Sequence[Any] = (),
-        watches: Watches | None = None,
+        warned: Sequence[Any],
+        watches: Watches,
     ) -> None:
         self.number = attach.env
         self.unsent: list[Any] = []
         self._answer = answer
         self._raised = raised
         self._warned = warned
-        self._watches = watches or Watches()
-        self._watched, self._changed = self._watches.readings, self._watches.changed
+        self._watches = watches
+        self._watched, self._changed = watches.readings, watches.changed
         layout = slabs.layout_of(env.single_action_space, env.num_envs)
         observed = slabs.observation_layout(
             env.single_observation_space, attach.count, attach.slots

@@ -62,8 +62,8 @@ def adapted(env: Any) -> Any:
 
 
 def adapted_vector(env: Any) -> Any:
-    """A vector environment of ``gym`` as one of Gymnasium; anything else as it is."""
-    return _warned(OldVectorEnv, env) if is_vector(env) else env
+    """A vector environment of ``gym`` as one of Gymnasium."""
+    return _warned(OldVectorEnv, env)
 
 
 def _warned(adapter: Callable[[Any], Any], env: Any) -> Any:

@@ -199,8 +199,8 @@ class Runner:
             return m.Value(False)
         reply = partial(self.reply, by_lane=True)
         fail = partial(raised, root=self._snapshot)
-        more = (self.warned.pending, self.watches)
-        self.lane = Lane(env, request, self.descriptors, reply, self._pack_infos, fail, *more)
+        fds, warned = self.descriptors, self.warned.pending
+        self.lane = Lane(env, request, fds, reply, self._pack_infos, fail, warned, self.watches)
         return m.Value(True)
 
     def fetch_infos(self, request: m.FetchInfos) -> m.Message:

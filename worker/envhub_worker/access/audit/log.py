@@ -55,8 +55,8 @@ FORMS: dict[str, Form] = {"text": text_line, "json": json_line}
 
 
 def _time(when: float) -> str:
-    moment = datetime.fromtimestamp(when, timezone.utc)
-    return f"{moment:%Y-%m-%dT%H:%M:%S}.{moment.microsecond // 1000:03d}Z"
+    moment = datetime.fromtimestamp(when, timezone.utc).replace(tzinfo=None)
+    return f"{moment.isoformat(timespec='milliseconds')}Z"
 
 
 def _bounded(name: str, value: object) -> bool | int | float | str:

@@ -1,9 +1,13 @@
-"""One client key's files on disk, and a running total of what they are charged."""
+"""One client key's files on disk, and a running total of what they are charged.
+
+Several servers of one machine may use a folder (``SharedUse``).
+"""
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import fcntl
 import operator
 import os
 import shutil
@@ -19,6 +23,8 @@ from envhub_worker.supervisor.records import RefusedError
 
 BLOCK_BYTES = 4096
 """What the smallest file and each entry of a tree are charged: they take disk, too."""
+SHARED = "shared"
+"""What stands for a client's key, where all clients are one user's."""
 
 
 @dataclass(frozen=True)
@@ -188,3 +194,27 @@ def _charge_on_disk(tree: Path) -> int:
             status = os.lstat(os.path.join(folder, name))
             charge += status.st_size if status.st_nlink == 1 else 0  # a copy
     return charge
+
+
+class SharedUse:
+    """This server's share of a folder's lock. The kernel gives it back when the server ends."""
+
+    def __init__(self, path: Path) -> None:
+        self._file = open(path, "a")  # noqa: SIM115, it goes with this object
+
+    @contextlib.contextmanager
+    def alone(self) -> Iterator[bool]:
+        """Whether no other server uses the folder, nor begins to in this context.
+
+        Where the file system has no locks, it is never known, and so False.
+        """
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            alone = True
+        except OSError:
+            alone = False
+        try:
+            yield alone
+        finally:
+            with contextlib.suppress(OSError):  # a try for more may have lost the share
+                fcntl.flock(self._file, fcntl.LOCK_SH)

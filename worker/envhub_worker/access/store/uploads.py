@@ -26,13 +26,14 @@ from typing import Any
 
 from envhub_worker.access.quotas import Quotas
 from envhub_worker.access.store.blob_store import (
+    SHARED,
     BlobStore,
     ListedFile,
+    SharedUse,
     blob_charge,
     make_passable,
     tree_charge,
 )
-from envhub_worker.access.store.shared_use import SHARED, SharedUse
 from envhub_worker.lockdown.mechanisms.scratch import remove_tree
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.text import size_text

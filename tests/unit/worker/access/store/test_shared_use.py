@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from envhub_worker.access.quotas import Quotas
-from envhub_worker.access.store import shared_use
+from envhub_worker.access.store.blob_store import SharedUse
 from envhub_worker.access.store.uploads import Uploads
 from envhub_worker.protocol import messages as m
 from envhub_worker.supervisor.records import RefusedError
@@ -80,7 +80,7 @@ def test_only_one_that_is_alone_makes_room(tmp_path: Path) -> None:
 
 
 def test_a_share_is_taken_back_after_a_vain_try(tmp_path: Path) -> None:
-    uses = [shared_use.SharedUse(tmp_path / "lock") for _ in range(2)]
+    uses = [SharedUse(tmp_path / "lock") for _ in range(2)]
     for use, expected in ((uses[0], True), (uses[1], False), (uses[0], False), (uses[1], False)):
         with use.alone() as alone:
             assert alone is expected

@@ -1,0 +1,113 @@
+"""Places on a server: the order in which clients wait, whose place ends, and a drain."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+from unittest.mock import MagicMock
+
+import pytest
+
+from envhub_worker.access.places import Drain, Line, Places, longest_gone
+from envhub_worker.access.quotas import BusyError, Quotas
+from envhub_worker.access.sessions import Sessions
+
+
+def test_who_has_asked_twice_stands_before_who_comes_later() -> None:
+    line = Line(lambda: 0.0)
+    line.wait(b"key", b"first")
+    assert (line.waiting, line.ahead(b"key", b"second")) == (0, 0)
+    line.wait(b"key", b"first")
+    line.wait(b"key", b"second")
+    assert (line.waiting, line.ahead(b"key", b"second")) == (1, 1)
+    assert line.ahead(b"key", b"first") == line.ahead(b"another key", b"second") == 0
+    line.leave(b"key", b"first")
+    assert (line.waiting, line.ahead(b"key", b"second")) == (0, 0)
+
+
+def test_who_asks_no_more_is_forgotten() -> None:
+    now = [0.0]
+    line = Line(lambda: now[0])
+    for _ in range(2):
+        line.wait(b"key", b"gone")
+    now[0] = 6.0
+    assert (line.waiting, line.ahead(b"key", b"other")) == (0, 0)
+    for number in range(5_000):
+        line.wait(b"crowd", str(number).encode())
+        line.wait(b"crowd", str(number).encode())
+    assert line.waiting == 1024
+
+
+class _Jails:
+    """The jails of each owner."""
+
+    def __init__(self, **of: int) -> None:
+        self.of = {owner.encode(): SimpleNamespace(number=number) for owner, number in of.items()}
+        self.ended: list[tuple[int, str]] = []
+
+    def open_ones(self, owner: bytes) -> list[Any]:
+        return [self.of[owner]] if owner in self.of else []
+
+    def end(self, entry: Any, why: str) -> None:
+        self.ended.append((entry.number, why))
+        self.of = {owner: one for owner, one in self.of.items() if one is not entry}
+
+
+def places(idle_s: int, sessions: Sessions, jails: Any, uploads: Any, wires: Any) -> Places:
+    """Those of a server that knows of these connections."""
+    return Places(Quotas(), idle_s, sessions, jails, uploads, MagicMock(), lambda: wires)
+
+
+@pytest.mark.parametrize(("idle_s", "ended"), [(120, [7]), (0, [])])
+def test_a_client_that_is_not_heard_of_loses_its_jails(idle_s: int, ended: list[int]) -> None:
+    """After the time that the operator has set, if he has; the other one is heard."""
+    now = [0.0]
+    sessions, jails, uploads = Sessions(lambda: now[0]), _Jails(keya=7, keyb=8), MagicMock()
+    sessions.connect(b"1", b"key", b"a")
+    now[0] = 200.0
+    sessions.connect(b"2", b"key", b"b")
+    places(idle_s, sessions, jails, uploads, None).tick()
+    assert [number for number, _ in jails.ended] == ended
+    assert [one.name for one in sessions.all()] == [b"b"] if ended else [b"a", b"b"]
+    assert uploads.forget.called == bool(ended)
+
+
+def test_a_session_without_connections_and_jails_is_forgotten() -> None:
+    sessions, jails = Sessions(), _Jails(keyb=8)
+    for number, name in enumerate((b"a", b"b", b"c"), start=1):
+        sessions.connect(b"id%d" % number, b"key", name, number)
+    places(120, sessions, jails, MagicMock(), frozenset({3})).tick()
+    assert [one.name for one in sessions.all()] == [b"b", b"c"]
+    assert jails.ended == []
+    gone = longest_gone(sessions.all())
+    assert gone is not None
+    assert gone.name == b"b"
+    assert longest_gone([]) is None
+
+
+def test_what_runs_has_its_time_and_nothing_new_comes_in() -> None:
+    now = [0.0]
+    drain = Drain(60.0, lambda: now[0])
+    drain.refuse_new()
+    assert drain.left_s is None
+    assert drain.begin(MagicMock())
+    now[0] = 59.0
+    assert not drain.begin(MagicMock())
+    assert drain.left_s == 1.0
+    with pytest.raises(BusyError):
+        drain.refuse_new()
+    now[0] = 61.0
+    assert drain.left_s == 0.0
+    assert not Drain(0.0).begin(MagicMock()), "there is no time to give"
+
+
+def test_the_last_client_has_a_moment_to_hear_why() -> None:
+    """It is quiet once no jail has been open for a while, and a new one begins that again."""
+    now = [0.0]
+    drain = Drain(60.0, lambda: now[0])
+    for busy, at, quiet in (
+        *((False, 0.0, False), (False, 0.9, False), (True, 1.0, False)),
+        *((False, 1.1, False), (False, 2.0, False), (False, 2.1, True)),
+    ):
+        now[0] = at
+        assert drain.quiet(busy) is quiet
