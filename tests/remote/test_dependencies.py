@@ -25,7 +25,6 @@ from envhub_sandbox.errors import (
     ResolutionError,
 )
 from envhub_sandbox.sandboxes import remote
-from envhub_worker.access import package_program
 from envhub_worker.access import packages as server_side
 from envhub_worker.access.packages import Packages
 from envhub_worker.access.quotas import BusyError, Quotas
@@ -148,8 +147,8 @@ def test_without_the_program_that_makes_them_it_does_not_start(tmp_path: Path) -
     """An interpreter that has the worker and not the client is told what to install."""
     lacking = tmp_path / "lacking.py"
     lacking.write_text(
-        "import runpy, sys\nfrom envhub_worker.access import package_program\n"
-        "package_program.PROGRAM = 'no_such_package'\n"
+        "import runpy, sys\nfrom envhub_worker.access import packages\n"
+        "packages.PROGRAM = 'no_such_package'\n"
         "from envhub_worker.__main__ import main\nsys.exit(main())\n"
     )
     words = ("listen", "--bind", "tcp://127.0.0.1:*", "--insecure-loopback", "--dependencies")
@@ -174,7 +173,7 @@ SLEEPING = [sys.executable, "-I", "-c", "import time; time.sleep(600)"]
 @pytest.fixture
 def idle(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Packages]:
     """A server's packages, whose program never says anything."""
-    monkeypatch.setattr(package_program, "command", lambda: SLEEPING)
+    monkeypatch.setattr(server_side, "command", lambda: SLEEPING)
     found = Packages(tmp_path / "packages", Quotas())
     yield found
     found.close()
@@ -223,13 +222,13 @@ def test_nobody_keeps_others_waiting_who_have_room(
 ) -> None:
     """A key has one program at work, all together a few; who waits hears how many are before."""
     monkeypatch.setattr(server_side, "MAX_AT_WORK", 2)
-    begun, command = [], package_program.command
+    begun, command = [], server_side.command
 
     def counted() -> list[str]:
         begun.append(True)
         return command()
 
-    monkeypatch.setattr(package_program, "command", counted)
+    monkeypatch.setattr(server_side, "command", counted)
 
     def progress(key: bytes, name: str) -> str:
         reply = idle.need(key, order(name), ())
@@ -247,7 +246,7 @@ def test_an_order_that_takes_too_long_is_ended(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Though somebody asks for it all the time: the operator says how long."""
-    monkeypatch.setattr(package_program, "command", lambda: SLEEPING)
+    monkeypatch.setattr(server_side, "command", lambda: SLEEPING)
     clock = [time.monotonic()]
     monkeypatch.setattr(server_side, "monotonic", lambda: clock[0])
     with contextlib.closing(Packages(tmp_path / "packages", Quotas(), make_s=120)) as found:
@@ -320,7 +319,7 @@ def test_a_program_that_cannot_be_started_is_not_tried_for_ever(
         tried.append(True)
         return ["/nowhere/at/all"]
 
-    monkeypatch.setattr(package_program, "command", missing)
+    monkeypatch.setattr(server_side, "command", missing)
     for _ in range(2):
         with pytest.raises(RefusedError, match="cannot be started"):
             idle.need(b"a", order("first"), ())

@@ -1,8 +1,10 @@
 """Packages that clients' repositories need, where the operator permits that (``--dependencies``).
 
-They are made by another program (``package_program.py``). Each client key has a folder of its own
-and one program at work at a time, all keys together a few; an order that is not asked for any more
-is given up, and so is one that takes too long: it delays the others only so far.
+They are made by another program: the client's own, which the operator has installed beside this
+one, with its bounds. It chooses versions, installs wheels by their hashes, runs nothing of them,
+and says what it did. Each client key has a folder of its own and one program at work at a time, all
+keys together a few; an order that is not asked for any more is given up, and so is one that takes
+too long: it delays the others only so far.
 """
 
 from __future__ import annotations
@@ -11,6 +13,10 @@ import contextlib
 import hashlib
 import json
 import os
+import signal
+import subprocess
+import sys
+import tempfile
 from collections import OrderedDict, deque
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
@@ -18,7 +24,6 @@ from pathlib import Path
 from time import monotonic
 from typing import Any
 
-from envhub_worker.access.package_program import PackageProgram
 from envhub_worker.access.quotas import BusyError, Quotas
 from envhub_worker.access.store.blob_store import SHARED, make_passable
 from envhub_worker.protocol import messages as m
@@ -26,6 +31,7 @@ from envhub_worker.protocol.messages.server import Busy
 from envhub_worker.protocol.runtime import Runtime
 from envhub_worker.supervisor.records import RefusedError
 
+PROGRAM = "envhub_sandbox.dependencies.for_a_server"
 MAX_REQUIREMENTS = 1000
 MAX_TEXT = 2000
 MAX_WAITING = 2
@@ -47,6 +53,8 @@ _FAILED_S = 30.0
 _HANDED_S = 600.0
 _RETRY_S = 10.0
 _STOP_S = 30.0
+_RESULT_BYTES = 1 << 20
+_CHECK_S = 60.0
 
 Place = tuple[str, str]
 """Whose an order is, and its hash."""
@@ -71,6 +79,91 @@ Outcome = tuple[Mapping[str, Any], float]
 """What became of an order: the program's own words, and when."""
 News = tuple[bytes, float, Mapping[str, Any]]
 """For the log: whose session ordered first, how long the program took, its last words."""
+
+
+class PackageProgram:
+    """The program, at work on one order.
+
+    Attributes:
+        place: Whose the order is, and its hash.
+        ended_at: When it was asked to end; None before.
+    """
+
+    def __init__(self, place: Place, order: Mapping[str, Any]) -> None:
+        self.place = place
+        self.since = monotonic()
+        self.ended_at: float | None = None
+        with contextlib.ExitStack() as undo:
+            self._said = undo.enter_context(tempfile.TemporaryFile())
+            with tempfile.TemporaryFile() as given:
+                given.write(json.dumps(order).encode())
+                given.seek(0)
+                ourselves = os.pidfd_open(os.getpid())  # it ends when we do, whatever ends us
+                try:
+                    self._process = subprocess.Popen(
+                        [*command(), f"--server-pidfd={ourselves}"],
+                        stdin=given,
+                        stdout=self._said,
+                        cwd="/",
+                        start_new_session=True,
+                        pass_fds=(ourselves,),
+                    )
+                finally:
+                    os.close(ourselves)
+            undo.pop_all()  # it lasts as long as the program
+
+    def said(self) -> Mapping[str, Any]:
+        """What the program has said; nothing while it writes."""
+        try:
+            found = json.loads(os.pread(self._said.fileno(), _RESULT_BYTES, 0))
+            return found if isinstance(found, dict) else {}
+        except ValueError:
+            return {}
+
+    @property
+    def code(self) -> int | None:
+        """Its exit code; None while it runs."""
+        return self._process.poll()
+
+    def terminate(self, now: float) -> None:
+        """Ask it to end."""
+        self._process.terminate()
+        self.ended_at = now
+
+    def kill(self, patience_s: float = 0.0) -> None:
+        """End it for certain, and what it started; give it so long to end by itself."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(patience_s)
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGKILL)
+        self._process.wait()
+
+    def close(self) -> None:
+        """It has ended: forget what it said."""
+        self._said.close()
+
+
+def command() -> list[str]:
+    """The program, in the interpreter that this one runs in."""
+    return [sys.executable, "-I", "-m", PROGRAM]
+
+
+def why_impossible() -> str:
+    """What hinders the program here; empty for nothing."""
+    try:
+        done = subprocess.run(
+            [*command(), "check"], stdin=subprocess.DEVNULL, capture_output=True, timeout=_CHECK_S
+        )
+    except subprocess.TimeoutExpired:
+        return f"the program that makes packages did not answer in {_CHECK_S:.0f} s"
+    if done.returncode == 0:
+        return ""
+    said = done.stderr.decode(errors="replace").strip().splitlines() or ["no word"]
+    return (
+        "packages are installed by envhub-sandbox, which does not work in this worker's "
+        f"interpreter ({sys.executable}): {said[-1][:500]}. Run: {sys.executable} -m pip install "
+        "envhub-sandbox"
+    )
 
 
 class Packages:

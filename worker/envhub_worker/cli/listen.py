@@ -25,8 +25,7 @@ import zmq
 from envhub_worker import __version__
 from envhub_worker.access.audit.log import FORMS, Log
 from envhub_worker.access.keys import AuthorizedClients
-from envhub_worker.access.package_program import why_impossible
-from envhub_worker.access.packages import Packages
+from envhub_worker.access.packages import Packages, why_impossible
 from envhub_worker.access.quotas import Permissions
 from envhub_worker.access.remote_gate import RemoteGate, Rules
 from envhub_worker.access.store.uploads import Uploads
@@ -89,57 +88,59 @@ def _serve(
 ) -> int:
     place = locked_folder.place_for_sockets()
     locked_folder.remove_deserted(place)
-    runtime = LockedFolder("envhub-", place)
-    try:
-        gate = _gate(arguments, state, identity, log, publish)
-        store = state / "store"
+    with contextlib.ExitStack() as ends:
+        runtime = LockedFolder("envhub-", place)
+        ends.callback(runtime.remove)
         ended = arguments.client_pidfd  # readable once that process has ended
         if arguments.until_eof:
             ended = 0  # stdin is readable at its end
-        server = Server(arguments.bind, runtime.path, [str(store)], ended, gate=gate)
-        key_file = (arguments.key or state / "server.key").absolute()
-        noted = ServerNote(server.endpoint, identity.public, str(key_file))
-        note = None if arguments.only_client else Note(state, noted)
-    except zmq.ZMQError as error:
-        runtime.remove()
-        raise UsageError(f"--bind {arguments.bind}: {error.strerror}") from None
-    except BaseException:
-        runtime.remove()
-        raise
-    # under ``nohup`` the end of a terminal does not end the server
-    ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
-    ends = [signal.SIGINT] if ignored else [signal.SIGINT, signal.SIGHUP]
-    server.stop_on(*ends, gently=(signal.SIGTERM,))
-    began = time.monotonic()
-    try:
-        if arguments.ready_fd is not None:
-            with contextlib.suppress(BrokenPipeError):  # who started us has gone: the loop sees it
-                os.write(arguments.ready_fd, f"{server.endpoint} {identity.public}\n".encode())
-            os.close(arguments.ready_fd)
-        elif around is not None:
-            print(probe.announcement(around, server_key=identity.public), flush=True)
-        elif arguments.log_format == "text" or identity.authorized is None:  # a client needs it
-            print(announcement(server.endpoint, identity), flush=True)
-        log.say(
-            "listening",
-            "info",
-            version=__version__,
-            endpoint=server.endpoint,
-            server_key=identity.public,
-            strongest_profile=identity.profile,
-            weakest_profile=arguments.weakest_profile,
-            pid=os.getpid(),
-        )
-        server.run()
-    except Exception as error:  # not an error of the arguments: those are for ``run``
-        gate.witness.failed(error)
-        return 1
-    finally:
-        log.say("stopped", "info", seconds=time.monotonic() - began)
-        if note is not None:
-            note.remove()
-        runtime.remove()
+        try:
+            gate = _gate(arguments, state, identity, log, publish)
+            roots = [str(state / "store")]
+            server = Server(arguments.bind, runtime.path, roots, ended, gate=gate)
+        except zmq.ZMQError as error:
+            raise UsageError(f"--bind {arguments.bind}: {error.strerror}") from None
+        if not arguments.only_client:
+            key_file = (arguments.key or state / "server.key").absolute()
+            noted = ServerNote(server.endpoint, identity.public, str(key_file))
+            ends.callback(Note(state, noted).remove)
+        began = time.monotonic()
+        ends.callback(lambda: log.say("stopped", "info", seconds=time.monotonic() - began))
+        # under ``nohup`` the end of a terminal does not end the server
+        ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+        hangs_up = [] if ignored else [signal.SIGHUP]
+        server.stop_on(signal.SIGINT, *hangs_up, gently=(signal.SIGTERM,))
+        try:
+            _announce(arguments, identity, server.endpoint, around)
+            log.say(
+                "listening",
+                "info",
+                version=__version__,
+                endpoint=server.endpoint,
+                server_key=identity.public,
+                strongest_profile=identity.profile,
+                weakest_profile=arguments.weakest_profile,
+                pid=os.getpid(),
+            )
+            server.run()
+        except Exception as error:  # not an error of the arguments: those are for ``run``
+            gate.witness.failed(error)
+            return 1
     return 0
+
+
+def _announce(
+    arguments: argparse.Namespace, identity: Identity, endpoint: str, around: Surroundings | None
+) -> None:
+    """Say where it listens, in the way that whoever started it reads."""
+    if arguments.ready_fd is not None:
+        with contextlib.suppress(BrokenPipeError):  # who started us has gone: the loop sees it
+            os.write(arguments.ready_fd, f"{endpoint} {identity.public}\n".encode())
+        os.close(arguments.ready_fd)
+    elif around is not None:
+        print(probe.announcement(around, server_key=identity.public), flush=True)
+    elif arguments.log_format == "text" or identity.authorized is None:  # a client needs it
+        print(announcement(endpoint, identity), flush=True)
 
 
 @contextmanager

@@ -16,7 +16,7 @@ What they lack is added here, so that no other module asks for a version:
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import gymnasium as gym
@@ -68,10 +68,8 @@ def mode_of(env: Any, stated: Any) -> Any:
     return DEFAULT_MODE if ours else None
 
 
-def renamed(info: Any) -> Any:
+def renamed(info: Mapping[Any, Any]) -> dict[Any, Any]:
     """The infos of a vector environment of old, under the names of today."""
-    if not isinstance(info, dict):
-        return info
     found: dict[Any, Any] = {}
     for key, value in info.items():
         is_mask = isinstance(key, str) and key.startswith("_") and key[1:] in info
@@ -94,10 +92,6 @@ def _entry(key: Any, values: Any, mask: Any) -> dict[Any, Any]:
     return {key: values, f"_{key}": mask}
 
 
-joined_infos: Callable[[Any], Any] = renamed if _BEFORE_1_0 else lambda info: info
-"""The infos of a vector environment with a ``step`` of its own, under the names of today."""
-
-
 def reset_result(env: Any, result: Any) -> tuple[Any, Any]:
     """What ``reset`` of a repository's own vector environment returned, as Gymnasium has it."""
     observation, infos = _parts(env, "reset", result, ("observations", "infos"))
@@ -110,7 +104,8 @@ def step_result(env: Any, result: Any) -> tuple[Any, ...]:
     observation, *columns, infos = _parts(env, "step", result, names)
     each = zip(names[1:-1], columns, (np.float64, np.bool_, np.bool_), strict=True)
     made = [_column(env, name, column, dtype) for name, column, dtype in each]
-    return (observation, *made, joined_infos(_own_infos(env, "step", infos)))
+    infos = _own_infos(env, "step", infos)
+    return (observation, *made, renamed(infos) if _BEFORE_1_0 else infos)
 
 
 def _parts(env: Any, method: str, result: Any, names: tuple[str, ...]) -> Any:

@@ -32,10 +32,10 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.step_api_compatibility import convert_to_terminated_truncated_step_api
 from gymnasium.vector.utils import batch_space, iterate
 
+from envhub_worker.protocol.spaces import batches
 from envhub_worker.runner import gymnasium_compat as compat
 from envhub_worker.runner.described import facts_of
 from envhub_worker.runner.gymnasium_compat import names, parameters_of, takes
-from envhub_worker.runner.infos import join
 
 _OPTIONAL = ("seed", "options", "return_info")
 _MODES = ("rgb_array", "ansi")
@@ -224,7 +224,8 @@ class OldVectorEnv:
         """Before 0.24 there is a list of them, one of each sub-environment."""
         if isinstance(infos, Mapping):
             return compat.renamed(infos)
-        return join([(index, info) for index, info in enumerate(infos) if info], self.num_envs)
+        pairs = [(index, info) for index, info in enumerate(infos) if info]
+        return batches.join_pairs(pairs, self.num_envs)
 
     def __getattr__(self, name: str) -> Any:
         if name == "env":

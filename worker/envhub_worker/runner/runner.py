@@ -26,11 +26,10 @@ from envhub_worker.protocol.stream import Packet, StreamReader, pack_packet
 from envhub_worker.runner import gymnasium_compat as compat
 from envhub_worker.runner import loader, manifest
 from envhub_worker.runner.described import described, raised
-from envhub_worker.runner.infos import Pairs
 from envhub_worker.runner.lane import Lane
 from envhub_worker.runner.prefixes import WarningLog, Watches
 from envhub_worker.runner.recording import standing_in
-from envhub_worker.runner.sync_envs import SubEnvs
+from envhub_worker.runner.sync_envs import Pairs, SubEnvs
 from envhub_worker.runner.tasks import ResultError, Task, tasks_of
 
 _ANCILLARY_BYTES = socket.CMSG_SPACE(8 * array("i").itemsize)

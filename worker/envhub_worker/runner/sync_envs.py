@@ -27,8 +27,9 @@ from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES
 from envhub_worker.runner import old_gym
 from envhub_worker.runner.gymnasium_compat import SyncBase
-from envhub_worker.runner.infos import Pairs, apart, join
 
+Pairs = list[tuple[int, dict[Any, Any]]]
+"""Infos with the index of their sub-environment, in the order in which they came."""
 NEW_ROLLOUT = "lerobot_new_rollout"
 DRIVES = frozenset({"reset", "step", "render"})
 """What a ``FreezingEnv`` has of an environment."""
@@ -302,10 +303,22 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         return getattr(self.driven[index], name) if freezes else None
 
     def joined(self, pairs: Pairs) -> dict[Any, Any]:
-        """Infos of these sub-environments as they are sent: as one, or apart."""
+        """Infos of these sub-environments as they are sent: as one, or apart.
+
+        What does not go together in a slice may do so elsewhere, where another sub-environment is
+        the first: then they have to be asked for one by one.
+        """
         if self.apart:
-            return apart(pairs, self.integers)
-        return join(pairs, self.num_envs, sliced=self.sliced)
+            infos: dict[Any, Any] = {place: info for place, (_, info) in enumerate(pairs)}
+            if any(self.integers):
+                infos[batches.APART_SCALARS] = tuple(self.integers)
+            return infos
+        try:
+            return batches.join_pairs(pairs, self.num_envs)
+        except Exception:
+            if not self.sliced:
+                raise
+            return dict(batches.APART)
 
     def _each(self, actions: Any) -> Iterator[Any]:
         if self._restores:

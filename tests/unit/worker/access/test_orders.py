@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from envhub_worker.access import package_program, packages
+from envhub_worker.access import packages
 from envhub_worker.access.quotas import Quotas
 from envhub_worker.access.store import uploads
 from envhub_worker.protocol import messages as m
@@ -103,7 +103,7 @@ def test_orders_without_bounds_are_refused(fields: dict[str, Any]) -> None:
 
 
 def test_the_program_is_of_this_interpreter() -> None:
-    command = package_program.command()
+    command = packages.command()
     assert command[0] == sys.executable
-    assert {"-I", package_program.PROGRAM} <= set(command)
-    assert package_program.why_impossible() == ""
+    assert {"-I", packages.PROGRAM} <= set(command)
+    assert packages.why_impossible() == ""
