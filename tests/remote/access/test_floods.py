@@ -55,7 +55,6 @@ def test_forged_hellos_are_refused_and_cost_nothing(server: Listening, good: Any
         assert all(map(ends, connections))
     assert server.memory() - before < 64 * _MIB
     assert server.open_jails() <= jails
-    assert server.said().count("a handshake failed") <= 10 * (1 + server.said().count("more in"))
 
 
 def test_replayed_beginnings_open_no_session(server: Listening, good: Any, captured: bytes) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -24,7 +23,6 @@ from envhub_worker.access.quotas import (
     check_policy,
 )
 from envhub_worker.access.sessions import MAX_HELD, Sessions
-from envhub_worker.cli import listen_options
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import Confinement
 from envhub_worker.protocol.runtime import Runtime
@@ -83,13 +81,6 @@ def test_the_sums_of_a_key_are_bounded() -> None:
     ):
         with pytest.raises(RefusedError, match=what):
             check_jail(uses, more, quotas)
-
-
-def test_the_quota_of_runners_has_its_former_name_too() -> None:
-    """Who wrote the option down when runners were called hosts is understood."""
-    parser = argparse.ArgumentParser()
-    listen_options.add_options(parser)
-    assert parser.parse_args(["--max-hosts", "3"]).max_runners == 3
 
 
 def test_bytes_in_flight_are_bounded_until_they_are_answered() -> None:

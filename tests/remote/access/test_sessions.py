@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -53,6 +52,16 @@ def program(server: Listening, repository: Path, end: str) -> subprocess.Popen[b
     )
 
 
+@contextmanager
+def at_work(server: Listening, repository: Path) -> Iterator[subprocess.Popen[bytes]]:
+    """A program that keeps its environment meanwhile, and ends after it."""
+    client = program(server, repository, "waits")
+    assert client.stdout is not None
+    assert client.stdout.readline() == b"ready\n"
+    yield client
+    client.communicate(timeout=120)
+
+
 @pytest.mark.parametrize("end", ["closes", "returns"])
 def test_the_place_of_a_program_that_ends_is_free_at_once(
     end: str, narrow: Listening, repository: Path
@@ -69,11 +78,8 @@ def test_the_place_of_a_killed_program_is_for_whoever_needs_it(
     narrow: Listening, repository: Path
 ) -> None:
     """Its jail stays, for it may be cut off only; the next of its key gets the place of both."""
-    killed = program(narrow, repository, "waits")
-    assert killed.stdout is not None
-    assert killed.stdout.readline() == b"ready\n"
-    os.kill(killed.pid, signal.SIGKILL)
-    killed.communicate()
+    with at_work(narrow, repository) as killed:
+        killed.kill()
     assert eventually(lambda: [one["connections"] for one in narrow.sessions()] == [0])
     assert narrow.jails() == 1
     said, _ = program(narrow, repository, "closes").communicate(timeout=120)
@@ -83,13 +89,10 @@ def test_the_place_of_a_killed_program_is_for_whoever_needs_it(
 
 def test_a_place_that_is_in_use_is_kept(narrow: Listening, repository: Path) -> None:
     """The control: nobody is pushed out who is still there."""
-    first = program(narrow, repository, "waits")
-    assert first.stdout is not None
-    assert first.stdout.readline() == b"ready\n"
-    said, _ = program(narrow, repository, "closes").communicate(timeout=120)
-    assert b"which is the server's quota" in said
-    assert narrow.jails() == 1
-    first.communicate(timeout=120)
+    with at_work(narrow, repository) as first:
+        said, _ = program(narrow, repository, "closes").communicate(timeout=120)
+        assert b"which is the server's quota" in said
+        assert narrow.jails() == 1
     assert first.returncode == 0
 
 
@@ -107,13 +110,10 @@ def test_connections_that_have_gone_take_no_session(narrow: Listening) -> None:
 
 def test_status_takes_no_place_of_a_client(narrow: Listening, repository: Path) -> None:
     """Asked with the client's own key, while its one place is in use; nor does it hold one then."""
-    client = program(narrow, repository, "waits")
-    assert client.stdout is not None
-    assert client.stdout.readline() == b"ready\n"
-    for _ in range(2):
-        asked = worker("status", *narrow.as_client())
-        assert asked.returncode == 0, asked.stderr
-        assert "1 jail" in asked.stdout
-    client.communicate(timeout=120)
+    with at_work(narrow, repository) as client:
+        for _ in range(2):
+            asked = worker("status", *narrow.as_client())
+            assert asked.returncode == 0, asked.stderr
+            assert "1 jail" in asked.stdout
     assert client.returncode == 0
     assert program(narrow, repository, "closes").communicate(timeout=120)[0] == b"ready\n"

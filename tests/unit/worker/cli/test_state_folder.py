@@ -59,3 +59,18 @@ def test_a_server_removes_its_own(tmp_path: Path) -> None:
     assert state_folder.read_note(tmp_path) == B
     second.remove()
     assert state_folder.read_note(tmp_path) is None
+
+
+def test_a_state_folder_of_somebody_else_is_not_used(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The temporary folder is everybody's: what others may write there is none of ours. Jails are
+    made elsewhere: a relative folder is where one stands."""
+    monkeypatch.setenv("XDG_STATE_HOME", "/proc/nowhere")
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    folder = tmp_path / f"envhub-worker-{os.getuid()}"
+    assert state_folder.state_dir(None, create=True) == folder
+    folder.chmod(0o777)
+    assert state_folder.state_dir(None, create=True) is None
+    monkeypatch.chdir(tmp_path)
+    assert state_folder.state_dir(Path("here"), create=True) == tmp_path / "here"
