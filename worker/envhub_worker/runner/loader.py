@@ -27,9 +27,6 @@ from typing import Any
 from envhub_worker.protocol.messages import CONFIG_CLASS, Load, LoadTask
 from envhub_worker.runner.gymnasium_compat import Parameters, parameters_of, takes
 
-Importer = Callable[[str, str], "type[Any] | None"]
-"""The class of a module's name and its own, if there is one here."""
-
 
 class ConfigMapping(dict[str, Any]):
     """A mapping that was no dict: ``cfg.camera["width"]`` and ``cfg.camera.width`` both work."""
@@ -39,13 +36,13 @@ class ConfigMapping(dict[str, Any]):
         self.__dict__ = self
 
 
-def config_of(value: object, imported: Importer) -> Any:
+def config_of(value: object) -> Any:
     """The object, or whatever else it is, that crossed as this plain value."""
     if isinstance(value, (list, tuple)):
-        return type(value)(config_of(item, imported) for item in value)
+        return type(value)(config_of(item) for item in value)
     if not isinstance(value, dict):
         return value
-    made = {key: config_of(item, imported) for key, item in value.items() if key != CONFIG_CLASS}
+    made = {key: config_of(item) for key, item in value.items() if key != CONFIG_CLASS}
     described: Any = value.get(CONFIG_CLASS)
     if described is None:
         return made
@@ -53,19 +50,17 @@ def config_of(value: object, imported: Importer) -> Any:
     if not names:
         return ConfigMapping(made)
     if field_names is None:  # an enum's member, or a path
-        cls = imported(*names[0])
+        cls = _class_named(*names[0])
         return made["value"] if cls is None else cls(made["value"])
-    return _instance(names, field_names, made, config_of(computed, imported), imported)
+    return _instance(names, field_names, made, config_of(computed))
 
 
-def _instance(
-    names: Any, field_names: Any, values: dict[str, Any], computed: Any, imported: Importer
-) -> Any:
-    cls = imported(*names[0])
+def _instance(names: Any, field_names: Any, values: dict[str, Any], computed: Any) -> Any:
+    cls = _class_named(*names[0])
     if cls is not None:
         with contextlib.suppress(Exception):  # it cannot be made without its arguments
             return _filled(cls, values)
-    found = (imported(*one) for one in names[1:])
+    found = (_class_named(*one) for one in names[1:])
     for base in (next(filter(None, found), None), None):
         with contextlib.suppress(Exception):  # of a kind that no dataclass can inherit from
             return _filled(_stand_in(names[0], base, field_names, computed), values)
@@ -148,7 +143,7 @@ def call_make_env(make_env: Callable[..., Any], request: Load | LoadTask) -> Any
         "use_async_envs": request.use_async_envs,
     }
     if request.cfg is not None:
-        offered["cfg"] = config_of(request.cfg, _class_named)
+        offered["cfg"] = config_of(request.cfg)
     parameters = parameters_of(make_env)
     if parameters is None:
         return make_env(**offered, **request.env_kwargs)

@@ -35,33 +35,32 @@ def describe(tasks: list[Task]) -> Manifest:
 
 def describe_task(task: Task) -> EnvManifest:
     """The manifest of one task."""
+    made = task.recording
+    if made is None:
+        return describe_vector(task, task.vector)
     source = task.learn_spaces()
-    if task.recording is None:
-        return describe_vector(task, source)
-    metadata = dict(getattr(source, "metadata", None) or {})
     return EnvManifest(
         suite=task.suite,
         task=task.task,
         num_envs=task.num_envs,
         shardable=True,
-        sync=task.recording.sync,
+        sync=made.sync,
         single_observation_space=source.observation_space,
         single_action_space=source.action_space,
         observation_space=batch_space(source.observation_space, task.num_envs),
         action_space=batch_space(source.action_space, task.num_envs),
-        autoreset_mode=task.recording.autoreset_mode,
-        metadata=_plain(metadata),
+        autoreset_mode=made.autoreset_mode,
+        metadata=_metadata(source),
         render_mode=getattr(source, "render_mode", None),
         spec=None,
         attributes=(),
-        type_name="gymnasium.vector." + ("Sync" if task.recording.sync else "Async") + "VectorEnv",
+        type_name=f"gymnasium.vector.{'Sync' if made.sync else 'Async'}VectorEnv",
     )
 
 
 def describe_vector(task: Task, env: Any) -> EnvManifest:
     """The manifest of a vector environment with a ``step`` of its own."""
-    metadata = dict(getattr(env, "metadata", None) or {})
-    mode = compat.mode_of(env, metadata.pop("autoreset_mode", None))
+    mode = compat.mode_of(env, dict(getattr(env, "metadata", None) or {}).get("autoreset_mode"))
     num_envs = int(env.num_envs)
     single_observation, observation = _spaces(env, "observation_space", num_envs)
     single_action, action = _spaces(env, "action_space", num_envs)
@@ -76,7 +75,7 @@ def describe_vector(task: Task, env: Any) -> EnvManifest:
         observation_space=observation,
         action_space=action,
         autoreset_mode=getattr(mode, "value", mode),
-        metadata=_plain(metadata),
+        metadata=_metadata(env),
         render_mode=getattr(env, "render_mode", None),
         spec=_spec(env),
         attributes=_attributes(env),
@@ -95,9 +94,7 @@ def _spaces(env: Any, name: str, num_envs: int) -> tuple[Any, Any]:
 
 def _spec(env: Any) -> dict[str, Any] | None:
     spec = getattr(env, "spec", None)
-    if getattr(spec, "id", None) is None:
-        return None
-    return facts_of(spec)
+    return None if getattr(spec, "id", None) is None else facts_of(spec)
 
 
 def _attributes(env: Any) -> tuple[str, ...]:
@@ -106,7 +103,8 @@ def _attributes(env: Any) -> tuple[str, ...]:
     return tuple(own[:MAX_NAMES])
 
 
-def _plain(metadata: dict[Any, Any]) -> dict[str, Any]:
+def _metadata(env: Any) -> dict[str, Any]:
+    metadata = dict(getattr(env, "metadata", None) or {})
     return {str(key): value for key, value in metadata.items() if key != "autoreset_mode"}
 
 

@@ -245,9 +245,8 @@ def _metadata_of(env: Any) -> dict[str, Any]:
 
 def _spec_of(env: Any) -> EnvSpec | None:
     spec = getattr(env, "spec", None)
-    if getattr(spec, "id", None) is None:
-        return None
-    return EnvSpec(entry_point="", **facts_of(spec))
+    named = getattr(spec, "id", None) is not None
+    return EnvSpec(entry_point="", **facts_of(spec)) if named else None
 
 
 def space_of(space: Any) -> Any:

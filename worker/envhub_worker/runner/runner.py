@@ -158,8 +158,7 @@ class Runner:
         """Build a slice of a task."""
         task = self._tasks[request.suite, request.task]
         env = self._envs[request.env] = task.build(request.start, request.stop)
-        live = Task(task.suite, task.task, vector=env)
-        return m.BuildDone(encode_env(manifest.describe_vector(live, env)))
+        return m.BuildDone(encode_env(manifest.describe_vector(task, env)))
 
     def reset(self, request: m.Reset) -> m.Message:
         """``VectorEnv.reset``."""

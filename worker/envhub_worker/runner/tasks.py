@@ -64,17 +64,15 @@ class Task:
         return SubEnvs(env_fns, self.recording.autoreset_mode, self.recording.sync, sliced=sliced)
 
     def learn_spaces(self) -> Any:
-        """A vector environment, or one sub-environment, to read spaces and metadata from."""
-        if self.recording is None:
-            return self.vector
+        """One sub-environment of a recording, to read spaces and metadata from."""
         if self.probe is None:
             self.probe = self._one(0)
         return self.probe
 
     def _one(self, index: int) -> Any:
         """A new sub-environment, as one of Gymnasium's."""
-        made = self.recording
-        return None if made is None else old_gym.adapted(made.env_fns[index]())
+        assert self.recording is not None
+        return old_gym.adapted(self.recording.env_fns[index]())
 
     def forget_probe(self) -> None:
         """Close the sub-environment that was built for its spaces."""

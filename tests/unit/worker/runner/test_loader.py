@@ -19,11 +19,6 @@ class Camera:
     name: str = "top"
 
 
-def here(module: str, name: str) -> type[Any] | None:
-    """Only the class above can be imported."""
-    return Camera if (module, name) == (__name__, "Camera") else None
-
-
 def described(*names: tuple[str, str], fields: Any, computed: Any = None, **values: Any) -> Any:
     """As it crosses: the values, and what is said of their class."""
     return {**values, CONFIG_CLASS: (names, fields, computed or {})}
@@ -31,7 +26,7 @@ def described(*names: tuple[str, str], fields: Any, computed: Any = None, **valu
 
 def test_the_class_itself_is_used_where_it_is_here() -> None:
     """No code of it decides: a missing field has its default, and no argument is required."""
-    made = config_of(described((__name__, "Camera"), fields=("width", "name"), width=3), here)
+    made = config_of(described((__name__, "Camera"), fields=("width", "name"), width=3))
     assert made == Camera(3)
     assert type(made) is Camera
 
@@ -47,7 +42,7 @@ def test_elsewhere_a_dataclass_of_the_same_name_stands_in() -> None:
         name="wrist",
         focus=0.5,
     )
-    made = config_of(said, here)
+    made = config_of(said)
     assert (type(made).__name__, type(made).__module__) == ("ArmCamera", "arena.configs")
     assert isinstance(made, Camera)
     assert dataclasses.asdict(made) == {"width": 3, "name": "wrist", "focus": 0.5}
@@ -57,14 +52,14 @@ def test_elsewhere_a_dataclass_of_the_same_name_stands_in() -> None:
 
 @pytest.mark.parametrize("value", [5, "text", None, [1, {"a": 2}], (1, 2), {"a": {"b": [3]}}])
 def test_plain_values_stay_what_they_are(value: Any) -> None:
-    assert config_of(value, here) == value
-    assert type(config_of(value, here)) is type(value)
+    assert config_of(value) == value
+    assert type(config_of(value)) is type(value)
 
 
 def test_nested_objects_are_made_too() -> None:
     camera = described((__name__, "Camera"), fields=("width", "name"), width=3, name="top")
     said = {"cameras": [camera], "more": described(fields=None, left=camera)}
-    made = config_of(said, here)
+    made = config_of(said)
     assert made["cameras"] == [Camera(3)]
     assert type(made["more"]) is ConfigMapping
     assert made["more"]["left"] == made["more"].left == Camera(3)
@@ -73,4 +68,4 @@ def test_nested_objects_are_made_too() -> None:
 def test_what_cannot_be_made_is_named() -> None:
     said = described(("arena", "Bad"), fields=("not a name",), **{"not a name": 1})
     with pytest.raises(TypeError, match=r"no Bad can be made of not a name"):
-        config_of(said, here)
+        config_of(said)

@@ -137,24 +137,17 @@ class BlobStore:
             for folder, _, _ in os.walk(building, topdown=False):
                 if folder != str(building):
                     os.chmod(folder, 0o555)
-            with _another_is_faster():
+            try:
                 os.rename(building, tree)
+            except OSError as error:  # another server that shares the store may be faster
+                if error.errno not in (errno.EEXIST, errno.ENOTEMPTY):
+                    raise
             os.chmod(tree, 0o555)  # not before: a folder that cannot be written cannot be moved
         finally:
             if building.exists():
                 remove_tree(str(building))
         self._trees[digest] = _charge_on_disk(tree)
         self.held += self._trees[digest]
-
-
-@contextlib.contextmanager
-def _another_is_faster() -> Iterator[None]:
-    """Another server that shares the store may have laid out the same tree meanwhile."""
-    try:
-        yield
-    except OSError as error:
-        if error.errno not in (errno.EEXIST, errno.ENOTEMPTY):
-            raise
 
 
 def _is_there(path: Path, size: int) -> bool:
