@@ -25,8 +25,8 @@ from envhub_worker.access.curve_port import ConnectionLimiter
 from envhub_worker.access.gate import Incoming
 from envhub_worker.access.keys import AuthorizedClients
 from envhub_worker.access.packages import Packages
-from envhub_worker.access.quotas import Permissions, Quotas
-from envhub_worker.access.remote_gate import RemoteGate, Rules
+from envhub_worker.access.quotas import Permissions, Quotas, Rules
+from envhub_worker.access.remote_gate import RemoteGate
 from envhub_worker.access.sessions import Sessions
 from envhub_worker.access.store.uploads import Uploads
 from envhub_worker.loop import Loop

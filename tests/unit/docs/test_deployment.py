@@ -14,8 +14,9 @@ from typing import Any
 
 import pytest
 
-from envhub_worker.access.audit.figures import Client, ServerFigures
-from envhub_worker.access.quotas import Permissions, Quotas
+from envhub_worker.access.audit.figures import Client, facts_for_clients, facts_for_operators
+from envhub_worker.access.keys import AuthorizedClients
+from envhub_worker.access.quotas import Permissions, Quotas, Rules
 from envhub_worker.cli import identity, listen_options, metrics
 
 pytestmark = pytest.mark.same_for("users", "versions")
@@ -34,13 +35,19 @@ needs_systemd = pytest.mark.skipif(
 def exported() -> dict[str, set[str]]:
     """Every sample that a server with a client exports, and its labels."""
     parser = pytest.importorskip("prometheus_client.parser", reason="prometheus-client is missing")
-    facts = ServerFigures(
-        profile="strict", permissions=Permissions(), quotas=Quotas(), state="/", max_connections=1
+    rules = Rules(
+        keys=None,
+        authorized=AuthorizedClients(None, {}),
+        operators=frozenset(),
+        quotas=Quotas(),
+        permissions=Permissions(),
+        idle_s=0,
     )
     share = vars(Client(requests={"step": 1}))
     told = {
-        **facts.for_clients(),
-        **facts.for_operators(),
+        **facts_for_clients(rules),
+        **facts_for_operators(rules, "/"),
+        "started": 0.0,
         "draining_s": None,
         "ready": True,
         "connections": 0,

@@ -41,7 +41,6 @@ _DOMAIN = b"envhub"
 ANYBODY = bytes(KEY_BYTES)
 """The key of clients that have none, behind ``--insecure-loopback``."""
 
-MAX_CONNECTIONS = 1024
 _FAILED = zmq.EVENT_HANDSHAKE_FAILED_PROTOCOL | zmq.EVENT_HANDSHAKE_FAILED_NO_DETAIL
 _EVENTS = _FAILED | zmq.EVENT_ACCEPTED | zmq.EVENT_DISCONNECTED
 _EVENT = struct.Struct("=HI")  # a monitor's first frame: what, and a number (zmq_socket_monitor(3))

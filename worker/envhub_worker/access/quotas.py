@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass as mutable_dataclass
 from dataclasses import field
 
+from envhub_worker.access.keys import AuthorizedClients, KeyPair
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import GIB, MIB, PROFILES, Confinement
 from envhub_worker.protocol.messages.server import BUSY_ERROR, Busy
@@ -13,6 +14,7 @@ from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.text import size_text
 from envhub_worker.supervisor.records import Asker, RefusedError
 
+MAX_CONNECTIONS = 1024
 RETRY_S = 1.0
 """When to ask again. A client that does not keeps no other waiting."""
 
@@ -63,6 +65,29 @@ class Permissions:
     network: bool = False
     gpu: bool = False
     dependencies: bool = False
+
+
+@dataclass(frozen=True, kw_only=True)
+class Rules:
+    """How a ``RemoteGate`` is set up.
+
+    Attributes:
+        keys: The server's key pair; None only for ``--insecure-loopback``.
+        operators: Keys that see everybody's sessions: the server's own.
+        idle_s: How long the jails of a client that says nothing live on.
+        drain_s: How long what runs may go on once nothing new is let in.
+        profile: The strongest that jails can have here.
+    """
+
+    keys: KeyPair | None
+    authorized: AuthorizedClients
+    operators: frozenset[bytes]
+    quotas: Quotas
+    permissions: Permissions
+    idle_s: int
+    max_connections: int = MAX_CONNECTIONS
+    drain_s: int = 0
+    profile: str = "strict"
 
 
 @dataclass(frozen=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from time import monotonic
+from time import monotonic, time
 from typing import Any
 
 import zmq
@@ -11,18 +11,18 @@ import zmq
 from envhub_worker.access.audit.events import Events
 from envhub_worker.access.audit.figures import (
     ClientFigures,
-    ServerFigures,
     Tally,
     Usage,
     client_name,
+    facts_for_clients,
+    facts_for_operators,
 )
 from envhub_worker.access.audit.log import Log
-from envhub_worker.access.curve_port import MAX_CONNECTIONS, CurvePort
+from envhub_worker.access.curve_port import CurvePort
 from envhub_worker.access.gate import Gate, Incoming
-from envhub_worker.access.keys import AuthorizedClients, KeyPair
 from envhub_worker.access.packages import Packages
 from envhub_worker.access.places import Drain, Places
-from envhub_worker.access.quotas import InFlight, Permissions, Quotas, Use, check_policy
+from envhub_worker.access.quotas import InFlight, Rules, Use, check_policy
 from envhub_worker.access.sessions import WATCHER, Sessions
 from envhub_worker.access.store.uploads import PREFIX, Uploads, wrong_with_path
 from envhub_worker.lockdown.probe import own_runtime
@@ -31,32 +31,8 @@ from envhub_worker.loop import Loop
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import ProtocolError
 from envhub_worker.protocol.keys import KEY_BYTES, key_text
-from envhub_worker.protocol.records import dataclass
 from envhub_worker.supervisor.jails import Jails
 from envhub_worker.supervisor.records import Asker, JailRecord, RefusedError
-
-
-@dataclass(frozen=True, kw_only=True)
-class Rules:
-    """How a ``RemoteGate`` is set up.
-
-    Attributes:
-        keys: The server's key pair; None only for ``--insecure-loopback``.
-        operators: Keys that see everybody's sessions: the server's own.
-        idle_s: How long the jails of a client that says nothing live on.
-        drain_s: How long what runs may go on once nothing new is let in.
-        profile: The strongest that jails can have here.
-    """
-
-    keys: KeyPair | None
-    authorized: AuthorizedClients
-    operators: frozenset[bytes]
-    quotas: Quotas
-    permissions: Permissions
-    idle_s: int
-    max_connections: int = MAX_CONNECTIONS
-    drain_s: int = 0
-    profile: str = "strict"
 
 
 class RemoteGate(Gate):
@@ -85,13 +61,7 @@ class RemoteGate(Gate):
         self._publish = publish
         self._unread = ""
         self._tally, self._usage = Tally(), Usage(self._events.failed)
-        self._own_figures = ServerFigures(
-            profile=rules.profile,
-            permissions=rules.permissions,
-            quotas=rules.quotas,
-            state=str(uploads.folder),
-            max_connections=rules.max_connections,
-        )
+        self._started = time()
         self._port = CurvePort(rules.keys, self._admits, log, rules.max_connections)
         self.handlers = {
             m.OfferSnapshot: self._offer,
@@ -261,13 +231,14 @@ class RemoteGate(Gate):
             share.upload_bytes += self._uploads.used_bytes(known)
             share.inflight_bytes += self._in_flight.of(known)
         clients.add_past(self._tally, self._usage)
-        found = {**self._own_figures.for_clients(), "draining_s": self._drain.left_s}
+        found = {**facts_for_clients(self._rules), "draining_s": self._drain.left_s}
         if key is not None and key not in self._rules.operators:
             return {**found, "clients": clients.plain(self._label_of(key))}
         looking = sum(len(one.connections) for one in self.sessions.all() if one.name == WATCHER)
         return {
             **found,
-            **self._own_figures.for_operators(),
+            **facts_for_operators(self._rules, str(self._uploads.folder)),
+            "started": self._started,
             "connections": max(0, len(self._port.open_wires() or ()) - looking),
             "waiting": {quota: line.waiting for quota, line in self._places.lines.items()},
             "refusals": dict(self._tally.refusals),

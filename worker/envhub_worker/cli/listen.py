@@ -26,8 +26,8 @@ from envhub_worker import __version__
 from envhub_worker.access.audit.log import FORMS, Log
 from envhub_worker.access.keys import AuthorizedClients
 from envhub_worker.access.packages import Packages, why_impossible
-from envhub_worker.access.quotas import Permissions
-from envhub_worker.access.remote_gate import RemoteGate, Rules
+from envhub_worker.access.quotas import Permissions, Rules
+from envhub_worker.access.remote_gate import RemoteGate
 from envhub_worker.access.store.uploads import Uploads
 from envhub_worker.cli.identity import (
     Identity,

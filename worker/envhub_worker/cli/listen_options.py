@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from envhub_worker.access.audit.log import FORMS, LEVELS
-from envhub_worker.access.curve_port import MAX_CONNECTIONS
 from envhub_worker.access.packages import MAKE_S
-from envhub_worker.access.quotas import Quotas
+from envhub_worker.access.quotas import MAX_CONNECTIONS, Quotas
 from envhub_worker.lockdown.mechanisms import landlock
 from envhub_worker.protocol.confinement import PROFILES
 from envhub_worker.protocol.keys import parse_key

@@ -12,14 +12,13 @@ import os
 import platform
 import shutil
 import threading
-import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from envhub_worker import __version__
-from envhub_worker.access.quotas import Permissions, Quotas
+from envhub_worker.access.quotas import Rules
 from envhub_worker.lockdown.mechanisms import procfs
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.text import printable
@@ -73,44 +72,31 @@ class Tally:
         return OTHERS if many and client not in (*self.requests, *self.opened) else client
 
 
-@dataclass(frozen=True, kw_only=True)
-class ServerFigures:
-    """What does not change while a server runs.
-    ``state``: a path on the disk that keys and snapshots lie on.
-    """
+def facts_for_clients(rules: Rules) -> dict[str, Any]:
+    """What a client may know of a server."""
+    return {
+        "version": __version__,
+        "protocol": m.VERSION,
+        "python": platform.python_version(),
+        "profile": rules.profile,
+        **asdict(rules.permissions),
+        "quotas": asdict(rules.quotas),
+    }
 
-    profile: str
-    permissions: Permissions
-    quotas: Quotas
-    state: str
-    max_connections: int
-    started: float = field(default_factory=time.time)
 
-    def for_clients(self) -> dict[str, Any]:
-        """What a client may know."""
-        return {
-            "version": __version__,
-            "protocol": m.VERSION,
-            "python": platform.python_version(),
-            "profile": self.profile,
-            **asdict(self.permissions),
-            "quotas": asdict(self.quotas),
-        }
-
-    def for_operators(self) -> dict[str, Any]:
-        """What is the operator's own business."""
-        try:
-            disk = shutil.disk_usage(self.state)
-            size, free = disk.total, disk.free
-        except OSError:
-            size = free = 0
-        return {
-            "pid": os.getpid(),
-            "pid_namespace": pid_namespace(),
-            "started": self.started,
-            "max_connections": self.max_connections,
-            "disk": {"size_bytes": size, "free_bytes": free},
-        }
+def facts_for_operators(rules: Rules, state: str) -> dict[str, Any]:
+    """What is the operator's own business; keys and snapshots lie below ``state``."""
+    try:
+        disk = shutil.disk_usage(state)
+        size, free = disk.total, disk.free
+    except OSError:
+        size = free = 0
+    return {
+        "pid": os.getpid(),
+        "pid_namespace": pid_namespace(),
+        "max_connections": rules.max_connections,
+        "disk": {"size_bytes": size, "free_bytes": free},
+    }
 
 
 def pid_namespace() -> str:
