@@ -5,7 +5,6 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.vector import VectorEnv
@@ -15,10 +14,8 @@ from hypothesis import strategies as st
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.shared_memory.slabs import columns_of
-from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.spaces.batches import join_pairs
 from envhub_worker.runner.lane import InfoWriter
-from envhub_worker.runner.sync_envs import SubEnvs
 from tests.support.compare import assert_same
 
 SCALARS = st.one_of(
@@ -64,15 +61,6 @@ def test_infos_are_joined_as_gymnasium_joins_them(infos: list[dict[str, Any]]) -
             join_pairs(pairs, len(infos))
         return
     assert_same(expected, join_pairs(pairs, len(infos)))
-
-
-def test_a_slice_says_what_it_cannot_join() -> None:
-    """What is no array by itself may be one among others: those are to be asked apart."""
-    pairs: list[tuple[int, dict[Any, Any]]] = [(0, {"a": 1}), (1, {"a": "text"})]
-    make = [lambda: gym.make("CartPole-v1")] * 2
-    with pytest.raises(ValueError, match="info 'a' of sub-environment 1"):
-        SubEnvs(make, "NextStep", sync=True).joined(pairs)
-    assert SubEnvs(make, "NextStep", sync=True, sliced=True).joined(pairs) == batches.APART
 
 
 class Slab:

@@ -19,9 +19,9 @@ class Camera:
     name: str = "top"
 
 
-def described(*names: tuple[str, str], fields: Any, computed: Any = None, **values: Any) -> Any:
+def described(*names: tuple[str, str], fields: Any, **values: Any) -> Any:
     """As it crosses: the values, and what is said of their class."""
-    return {**values, CONFIG_CLASS: (names, fields, computed or {})}
+    return {**values, CONFIG_CLASS: (names, fields, {})}
 
 
 def test_the_class_itself_is_used_where_it_is_here() -> None:
@@ -29,25 +29,6 @@ def test_the_class_itself_is_used_where_it_is_here() -> None:
     made = config_of(described((__name__, "Camera"), fields=("width", "name"), width=3))
     assert made == Camera(3)
     assert type(made) is Camera
-
-
-def test_elsewhere_a_dataclass_of_the_same_name_stands_in() -> None:
-    """With the caller's fields and what was computed there; its base is the nearest known one."""
-    said = described(
-        ("arena.configs", "Outer.ArmCamera"),
-        (__name__, "Camera"),
-        fields=("width", "name", "focus"),
-        computed={"pixels": 12},
-        width=3,
-        name="wrist",
-        focus=0.5,
-    )
-    made = config_of(said)
-    assert (type(made).__name__, type(made).__module__) == ("ArmCamera", "arena.configs")
-    assert isinstance(made, Camera)
-    assert dataclasses.asdict(made) == {"width": 3, "name": "wrist", "focus": 0.5}
-    assert dataclasses.replace(made, width=4).width == 4
-    assert made.pixels == 12
 
 
 @pytest.mark.parametrize("value", [5, "text", None, [1, {"a": 2}], (1, 2), {"a": {"b": [3]}}])

@@ -18,7 +18,7 @@ import pytest
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
 from envhub_worker.protocol.messages.prefix import CHANGES, WARNINGS
-from envhub_worker.runner.prefixes import WarningLog, Watches, is_alone
+from envhub_worker.runner.prefixes import WarningLog, Watches
 from envhub_worker.runner.sync_envs import SubEnvs
 
 REPLY = m.pack(m.Value(1))
@@ -43,11 +43,6 @@ def test_each_text_is_heard_once(heard: WarningLog) -> None:
     other.start()
     other.join()
     assert heard.pending == [("UserWarning", "slow"), ("RuntimeWarning", "slow")]
-
-
-def test_gymnasiums_logger_is_heard_without_its_colors(heard: WarningLog) -> None:
-    gym.logger.warn("too %s", "slow")
-    assert heard.pending == [("UserWarning", "WARN: too slow")]
 
 
 def test_what_is_shown_is_shown_still() -> None:
@@ -179,32 +174,6 @@ def test_a_process_with_threads_is_not_watched() -> None:
     assert begun(envs, "task", watches)
     alone[0] = False
     assert noticed(watches) == ["task"]
-
-
-def test_threads_are_seen() -> None:
-    end = threading.Event()
-    other = threading.Thread(target=end.wait)
-    other.start()
-    try:
-        assert not is_alone()
-    finally:
-        end.set()
-        other.join()
-
-
-def test_changes_are_noticed_once() -> None:
-    envs, watches = envs_of(), watching()
-    assert begun(envs, "task", watches)
-    assert begun(envs, "number", watches)
-    assert noticed(watches) == []
-    envs.envs[1].task = "".join(["re", "ach"])
-    assert noticed(watches) == []
-    envs.envs[1].task = "lift"
-    assert noticed(watches) == ["task"]
-    assert noticed(watches) == []
-    envs.envs[0].number = 1001
-    assert noticed(watches) == ["number"]
-    assert not watches.readings
 
 
 @pytest.mark.parametrize(
