@@ -34,7 +34,8 @@ class Incoming(NamedTuple):
     fd: int = -1
 
 
-Handler = Callable[[Asker, Any, Sequence[bytes]], m.Message]
+Payload = Sequence[bytes]
+Handler = Callable[[Asker, Any, Payload], m.Message]
 """Carries a request out that is permitted; returns the reply."""
 
 
@@ -67,7 +68,7 @@ class Gate:
         """A session of this name begins, or is found again; raises ``RefusedError``."""
         raise NotImplementedError
 
-    def authorize(self, asker: Asker, request: m.Message, payload: Sequence[bytes]) -> m.Message:
+    def authorize(self, asker: Asker, request: m.Message, payload: Payload) -> m.Message:
         """The request as it may be carried out, never a reply; raises ``RefusedError``."""
         raise NotImplementedError
 
@@ -104,6 +105,6 @@ class LocalGate(Gate):
         """Every client is welcome."""
         self.sessions.connect(arrived.identity, arrived.key, name)
 
-    def authorize(self, asker: Asker, request: m.Message, payload: Sequence[bytes]) -> m.Message:
+    def authorize(self, asker: Asker, request: m.Message, payload: Payload) -> m.Message:
         """Everything is permitted."""
         return request

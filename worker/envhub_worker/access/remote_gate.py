@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from time import monotonic, time
 from typing import Any
 
@@ -19,7 +19,7 @@ from envhub_worker.access.audit.figures import (
 )
 from envhub_worker.access.audit.log import Log
 from envhub_worker.access.curve_port import CurvePort
-from envhub_worker.access.gate import Gate, Incoming
+from envhub_worker.access.gate import Gate, Incoming, Payload
 from envhub_worker.access.packages import Packages
 from envhub_worker.access.places import Drain, Places
 from envhub_worker.access.quotas import InFlight, Rules, Use, check_policy
@@ -114,7 +114,7 @@ class RemoteGate(Gate):
         if is_new:
             self._events.came(session)
 
-    def authorize(self, asker: Asker, request: m.Message, payload: Sequence[bytes]) -> m.Message:
+    def authorize(self, asker: Asker, request: m.Message, payload: Payload) -> m.Message:
         """Hold a request against keys and quotas."""
         self._refuse_unless_authorized(asker.key)
         if isinstance(request, (m.OpenJail, m.OfferSnapshot, m.NeedPackages)):
@@ -176,10 +176,10 @@ class RemoteGate(Gate):
             raise RefusedError("LocalProtocolError", str(error)) from None
         return request.with_trees({one: self._uploads.tree(key, one) for one in wanted})
 
-    def _need(self, asker: Asker, request: m.NeedPackages, payload: Sequence[bytes]) -> m.Message:
+    def _need(self, asker: Asker, request: m.NeedPackages, payload: Payload) -> m.Message:
         return self._packages.need(asker.key, request, self.jails.packages, asker.session)
 
-    def _offer(self, asker: Asker, request: m.OfferSnapshot, payload: Sequence[bytes]) -> m.Message:
+    def _offer(self, asker: Asker, request: m.OfferSnapshot, payload: Payload) -> m.Message:
         specs = [entry.jail.spec for entry in self.jails.open_ones()]
         in_use = {one.snapshot for one in specs}
         in_use |= {copy.tree for one in specs for copy in one.hub_copies}
@@ -191,21 +191,19 @@ class RemoteGate(Gate):
             self._events.uploads(asker.session, digest, len(wanted.hashes), size)
         return wanted
 
-    def _put(self, asker: Asker, request: m.PutBlob, payload: Sequence[bytes]) -> m.Message:
+    def _put(self, asker: Asker, request: m.PutBlob, payload: Payload) -> m.Message:
         if len(payload) != 1:
             raise RefusedError("LocalProtocolError", "PutBlob has one frame")
         self._uploads.put(asker.session, asker.key, request, payload[0])
         return m.Done()
 
-    def _keep(self, asker: Asker, request: m.KeepAlive, payload: Sequence[bytes]) -> m.Message:
+    def _keep(self, asker: Asker, request: m.KeepAlive, payload: Payload) -> m.Message:
         session = self.sessions.find(asker.identity, asker.key)
         if session is not None and all(type(jail) is int for jail in request.jails[:4096]):
             self.sessions.keep(session, request.jails[:4096])
         return m.Done()
 
-    def _list_sessions(
-        self, asker: Asker, request: m.GetSessions, payload: Sequence[bytes]
-    ) -> m.Message:
+    def _list_sessions(self, asker: Asker, request: m.GetSessions, payload: Payload) -> m.Message:
         return m.Sessions(tuple(self._sessions_of(asker.key)), self.figures(asker.key))
 
     def answered(self, asker: Asker, reply: m.Message) -> None:
