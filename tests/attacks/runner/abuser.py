@@ -83,23 +83,28 @@ def push(fd):
             while True:
                 socket.send_fds(ours, [ONE], [0] * 200)
 """
-ENV = """
-import signal, time
+KEEP = """
+import os
 from envhub_worker.runner import runner
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.shared_memory import slabs
 
-ABUSE_AND_ANSWER, ABUSE_AND_HANG, DIE = 1, 2, 3
-lanes, kept, order = [], [], {}
-honest = runner.Runner.attach
+honest, kept, lanes = runner.Runner.attach, [], []
 
-def remember(self, request):
+def keep(self, request):
     kept.extend(map(os.dup, self.descriptors))
     reply = honest(self, request)
     lanes.append(self.lane)
     return reply
 
-runner._HANDLERS[m.Attach] = remember
+runner._HANDLERS[m.Attach] = keep
+"""
+"""Keeps what it is given when its steps begin: the lane, and copies of the descriptors."""
+ENV = """
+import signal, time
+from envhub_worker.protocol.shared_memory import slabs
+
+ABUSE_AND_ANSWER, ABUSE_AND_HANG, DIE = 1, 2, 3
+order = {}
 
 def answer(lane):
     lane._told[slabs.OUTCOME], lane._told[slabs.LENGTH] = slabs.DONE, 0
@@ -148,7 +153,7 @@ ANSWERS, HANGS, DIES = 1, 2, 3
 
 def abuser(folder: Path) -> Path:
     """The repository; the options of a reset name a function of ``ABUSE``, and for what it is."""
-    return write_environment(folder / "abuser", ABUSE + ENV)
+    return write_environment(folder / "abuser", ABUSE + KEEP + ENV)
 
 
 def watched(

@@ -34,24 +34,16 @@ from tests.attacks.harness import (
     token,
 )
 from tests.attacks.repositories import write_environment
-from tests.attacks.runner.abuser import watched
+from tests.attacks.runner.abuser import KEEP, watched
 from tests.support.processes import eventually, most_grown, resident
 
 FAMILY = "Open files"
 PATIENCE = 3000
 """Requests in which the server must have noticed the noise."""
-KEEPER = """
-import ctypes, os
-from envhub_worker.runner import runner
-from envhub_worker.protocol import messages as m
-
-honest, kept = runner.Runner.attach, []
-
-def keep(self, request):
-    kept.extend(map(os.dup, self.descriptors))
-    return honest(self, request)
-
-runner._HANDLERS[m.Attach] = keep
+KEEPER = (
+    KEEP
+    + """
+import ctypes
 
 class Keeper(Plain):
     def name(self, alias):
@@ -63,6 +55,7 @@ NAMES = (
     "what it hears: socket", "what it rings: eventfd",
 )
 """
+)
 _KCMP = {"x86_64": 312, "aarch64": 272}
 _KCMP_FILE = 0
 

@@ -9,7 +9,7 @@ from unittest.mock import MagicMock
 import pytest
 
 from envhub_worker.access.places import Drain, Line, Places, longest_gone
-from envhub_worker.access.quotas import BusyError, Quotas
+from envhub_worker.access.quotas import Quotas
 from envhub_worker.access.sessions import Sessions
 
 
@@ -83,22 +83,6 @@ def test_a_session_without_connections_and_jails_is_forgotten() -> None:
     assert gone is not None
     assert gone.name == b"b"
     assert longest_gone([]) is None
-
-
-def test_what_runs_has_its_time_and_nothing_new_comes_in() -> None:
-    now = [0.0]
-    drain = Drain(60.0, lambda: now[0])
-    drain.refuse_new()
-    assert drain.left_s is None
-    assert drain.begin(MagicMock())
-    now[0] = 59.0
-    assert not drain.begin(MagicMock())
-    assert drain.left_s == 1.0
-    with pytest.raises(BusyError):
-        drain.refuse_new()
-    now[0] = 61.0
-    assert drain.left_s == 0.0
-    assert not Drain(0.0).begin(MagicMock()), "there is no time to give"
 
 
 def test_the_last_client_has_a_moment_to_hear_why() -> None:
