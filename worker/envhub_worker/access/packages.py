@@ -62,12 +62,7 @@ Place = tuple[str, str]
 
 @dataclass
 class Order:
-    """An order that a client waits for.
-
-    Attributes:
-        asked: When it was asked for last.
-        progress: What the program has said last.
-    """
+    """An order that a client waits for: when it was asked for last, what the program said last."""
 
     plain: dict[str, Any]
     owner: bytes = b""
@@ -197,12 +192,8 @@ class Packages:
     ) -> m.Packages:
         """How far they are; begins, or goes on, to make them.
 
-        Args:
-            request: Trust: input from a client.
-            in_use: Folders of packages that must stay.
-
-        Raises:
-            RefusedError: They cannot be made, or not now.
+        ``in_use``: folders of packages that must stay. Trust: the request is a client's.
+        Raises ``RefusedError``: they cannot be made, or not now.
         """
         if self._folder is None:
             return _not_here(request)

@@ -19,11 +19,8 @@ MAX_HELD = 8192
 
 @dataclass
 class Connection:
-    """One of a session's.
-
-    Attributes:
-        wire: Its number, by which it is known whether it is still there; None if it is not counted.
-        compression: What was agreed on; empty for none.
+    """One of a session's: its number, by which it is known whether it is still there (None if that
+    is not counted), and the compression that was agreed on.
     """
 
     wire: int | None = None

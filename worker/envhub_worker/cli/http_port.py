@@ -40,14 +40,10 @@ class _Connection:
 
 
 class HttpPort:
-    """Listens until it is closed.
+    """Listens until it is closed; on any port that is free if that is 0.
 
-    Args:
-        port: 0 for any that is free.
-        answer: The page of a path. What it raises is a 500.
-
-    Raises:
-        OSError: The address is not to be had.
+    ``answer`` gives the page of a path; what it raises is a 500, and ``failed`` gets the traceback.
+    Raises ``OSError``: the address is not to be had.
     """
 
     def __init__(

@@ -56,9 +56,7 @@ _IMPORTING = ("<frozen importlib.", f"{os.path.dirname(os.__file__)}{os.sep}impo
 
 def raised(error: BaseException, stage: str, root: str = "") -> RaisedException:
     """The message for an exception: its nearest builtin ancestor, its text, its traceback.
-
-    Args:
-        root: The repository's folder: its files are named relative to it.
+    ``root``: the repository's folder, to which its files are named relative.
     """
     # a package that may not be read is imported all the same, as one without a file of its own
     why = ""

@@ -56,9 +56,7 @@ def mode_named(mode: Any) -> str:
 
 def mode_of(env: Any, stated: Any) -> Any:
     """The autoreset mode of a vector environment with a ``step`` of its own.
-
-    Args:
-        stated: What its metadata says, or None.
+    ``stated``: what its metadata says, or None.
     """
     if stated is not None or _MODES is not None:
         return stated

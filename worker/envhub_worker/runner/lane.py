@@ -108,9 +108,7 @@ class Lane:
 
     def wake(self) -> bool:
         """After the doorbell: silence it, and serve while requests keep coming quickly.
-
-        Returns:
-            Whether it can ring again: no, once the client has closed its end.
+        Returns whether it can ring again: no, once the client has closed its end.
         """
         rung = True
         with contextlib.suppress(BlockingIOError):
@@ -233,10 +231,7 @@ def _raised_frame(message: m.RaisedException) -> Any:
 
 class InfoWriter:
     """Writes infos into a slab: as columns while their schema stays the same, else encoded.
-
-    Args:
-        start: Offset of its info area.
-        joined: Joins infos as they are sent.
+    ``start``: offset of its info area; ``joined``: joins infos as they are sent.
     """
 
     def __init__(
@@ -260,13 +255,8 @@ class InfoWriter:
         self._fresh = False
 
     def write(self, pairs: Pairs, integers: Sequence[bool] = ()) -> tuple[int, int]:
-        """The outcome and the length for the reply's header.
-
-        Args:
-            integers: What ``joined`` says of the observation; part of the schema.
-
-        Raises:
-            ProtocolError: They cannot cross.
+        """The outcome and the length for the reply's header. Raises ``ProtocolError``.
+        ``integers``: what ``joined`` says of the observation, which is part of the schema.
         """
         if self._keys is not None and integers == self._integers and self._write_columns(pairs):
             return slabs.COLUMNS, 0

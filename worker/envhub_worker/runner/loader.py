@@ -108,14 +108,9 @@ class ArgumentsError(TypeError):
 
 
 def import_entry(snapshot: str, entry: str, scratch: str) -> Callable[..., Any]:
-    """Import the entry file and give its ``make_env``.
+    """Import the entry file and give its ``make_env``; ``scratch`` is a folder that lasts.
 
-    Args:
-        scratch: A writable folder that outlives this call.
-
-    Raises:
-        EntryError: There is no ``make_env``, or it is not callable.
-        BaseException: Whatever the repository raises.
+    Raises ``EntryError``, if there is none that can be called, and whatever the repository raises.
     """
     path = PurePosixPath(entry)
     root = Path(snapshot)
@@ -134,9 +129,7 @@ def import_entry(snapshot: str, entry: str, scratch: str) -> Callable[..., Any]:
 
 def call_make_env(make_env: Callable[..., Any], request: Load | LoadTask) -> Any:
     """Call ``make_env`` with those of our arguments that it takes.
-
-    Raises:
-        ArgumentsError: It needs others, or does not take the caller's ``env_kwargs``.
+    Raises ``ArgumentsError``: it needs others, or does not take the caller's ``env_kwargs``.
     """
     offered: dict[str, Any] = {
         "n_envs": request.n_envs,

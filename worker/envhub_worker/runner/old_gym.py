@@ -251,9 +251,7 @@ def _spec_of(env: Any) -> EnvSpec | None:
 
 def space_of(space: Any) -> Any:
     """The same space, of Gymnasium's class; a subclass becomes what it is derived from.
-
-    Raises:
-        OldSpaceError: It is of none of the classes that are known.
+    Raises ``OldSpaceError``: it is of none of the classes that are known.
     """
     if isinstance(space, gym.Space):
         return space
@@ -286,9 +284,7 @@ _RETURNS = {
 
 def explained(error: Exception, env: Any, method: str) -> Exception:
     """The error itself, or one that says that the environment's ``method`` is as before 0.26.
-
-    Args:
-        error: What calling it as of today, and taking its result apart, has raised.
+    ``error``: what calling it as of today, and taking its result apart, has raised.
     """
     text = str(error)
     keyword = "unexpected keyword argument 'seed'" in text or "argument 'options'" in text

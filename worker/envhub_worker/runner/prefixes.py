@@ -46,11 +46,7 @@ _COLORS = re.compile("\x1b\\[[0-9;]*m")
 
 
 class WarningLog:
-    """What has been warned of.
-
-    Attributes:
-        pending: What no reply has taken along yet. Always the same list.
-    """
+    """What has been warned of. ``pending``, always the same list: what no reply has taken along."""
 
     def __init__(self) -> None:
         self.pending: list[RemoteWarning] = []
@@ -118,11 +114,8 @@ _Reading = tuple[Callable[[str], Any], Any]
 
 
 class Watches:
-    """What is watched of the environments of one runner.
-
-    Attributes:
-        readings: Of each attribute; empty if nothing is watched. Always the same dict.
-        changed: What the client is to learn, likewise.
+    """What is watched of the environments of one runner: readings of each attribute.
+    ``changed``: what the client is to learn. Both are always the same dict.
     """
 
     def __init__(self, alone: Callable[[], bool] = is_alone) -> None:

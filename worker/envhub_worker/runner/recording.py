@@ -93,9 +93,7 @@ def _record(
     if any(arguments.get(name) is not None for name in _FOREIGN_ARGUMENTS):
         return None
     if arguments.get("observation_mode", "same") != "same":
-        return (
-            None  # the sub-environments' spaces differ, and only all of them make the batched one
-        )
+        return None  # the spaces differ, and only all of them make the batched one
     env_fns = arguments["env_fns"] = list(arguments["env_fns"])
     return Recording(
         env_fns=env_fns,

@@ -185,10 +185,8 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
     def run_reset(self, seeds: Any, options: Any, mask: Any) -> Pairs:
         """Reset the sub-environments that the mask names, or all; returns the infos.
 
-        Args:
-            seeds: One seed or None each, or None.
-            options: The same object for each.
-            mask: bool ``(num_envs,)`` or None. A shard's part of it may be all False.
+        Each gets its seed, if there are any, and the same options object. The mask is bool
+        ``(num_envs,)`` or None; a shard's part of it may be all False.
         """
         chosen = range(self.num_envs) if mask is None else np.flatnonzero(mask).tolist()
         for index in chosen:
@@ -230,9 +228,7 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
 
     def run_step(self, actions: Any) -> Pairs:
         """Step every sub-environment, or reset it where its episode is over; returns the infos.
-
-        Args:
-            actions: A batch for the action space; rows are handed out as they are.
+        Rows of the batch of actions are handed out as they are.
         """
         if self._mode == "Disabled" and any(self._done):
             raise AssertionError(f"self._autoreset_envs={np.array(self._done)!r}")

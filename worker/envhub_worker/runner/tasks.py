@@ -84,11 +84,8 @@ class Task:
 def tasks_of(result: Any, n_envs: int, use_async_envs: bool, again: EnvFn) -> list[Task]:
     """The tasks in ``make_env``'s result.
 
-    Args:
-        again: Calls ``make_env`` with ``n_envs=1``, for one more single ``Env``.
-
-    Raises:
-        ResultError: The result, or something in it, is not an environment.
+    ``again`` calls ``make_env`` with ``n_envs=1``, for one more single ``Env``.
+    Raises ``ResultError``: the result, or something in it, is not an environment.
     """
     make = _Maker(n_envs, use_async_envs, again)
     if not isinstance(result, Mapping):
@@ -202,10 +199,9 @@ def _has_single_spaces(env: Any) -> bool:
 
 
 def _refuse_batched(env: Any) -> None:
-    """A vector of it would have a dimension too many, and neither library would say so.
+    """Raise ``ResultError`` if it steps several environments at once.
 
-    Raises:
-        ResultError: It steps several environments at once.
+    A vector of it would have a dimension too many, and neither library would say so.
     """
     count = getattr(env, "num_envs", None)
     spaces = (env.observation_space, env.action_space)
@@ -239,9 +235,7 @@ _KEY = "_envhub_spaces"
 
 def derive_spaces(env: Any) -> str:
     """Find spaces of one sub-environment where a vector environment names none.
-
-    Returns:
-        The attribute that has to be added, or nothing.
+    Returns the attribute that has to be added, or nothing.
     """
     found: dict[str, gym.Space[Any]] = {}
     batched = False  # which of the two, its observation says
