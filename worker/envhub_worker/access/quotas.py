@@ -52,13 +52,8 @@ class Quotas:
 
 @dataclass(frozen=True, kw_only=True)
 class Permissions:
-    """What a client's policy may ask of this host.
-
-    Attributes:
-        weakest_profile: ``"strict"``, ``"no-userns"`` or ``"container"``.
-        network: Whether jails may have this host's network.
-        gpu: Whether jails may have its GPU.
-        dependencies: Whether packages that repositories declare are installed here.
+    """What a client's policy may ask of this host: its network, its GPU, a weaker profile.
+    ``dependencies``: whether packages that repositories declare are installed here.
     """
 
     weakest_profile: str = "strict"
