@@ -12,8 +12,7 @@ from pathlib import Path
 import pytest
 import zmq
 
-from envhub_worker.access.audit.events import Events
-from envhub_worker.access.audit.log import Log, json_line
+from envhub_worker.access.audit.log import Events, Log, json_line
 from envhub_worker.access.gate import LocalGate
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import RemoteProtocolError

@@ -11,8 +11,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from envhub_worker.access.audit.events import Events
-from envhub_worker.access.audit.log import Log
+from envhub_worker.access.audit.log import Events, Log
 from envhub_worker.access.quotas import RETRY_S, BusyError, Quotas, Use, check_jail
 from envhub_worker.access.sessions import WATCHER, Session, Sessions
 from envhub_worker.access.store.uploads import Uploads

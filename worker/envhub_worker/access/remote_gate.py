@@ -8,7 +8,6 @@ from typing import Any
 
 import zmq
 
-from envhub_worker.access.audit.events import Events
 from envhub_worker.access.audit.figures import (
     ClientFigures,
     Tally,
@@ -17,7 +16,7 @@ from envhub_worker.access.audit.figures import (
     facts_for_clients,
     facts_for_operators,
 )
-from envhub_worker.access.audit.log import Log
+from envhub_worker.access.audit.log import Events, Log
 from envhub_worker.access.curve_port import CurvePort
 from envhub_worker.access.gate import Gate, Incoming, Payload
 from envhub_worker.access.packages import Packages
