@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass as mutable_dataclass
 from dataclasses import field
@@ -125,42 +126,38 @@ def check_jail(open_jails: Iterable[Use], more: Use, quotas: Quotas) -> None:
     Raises ``RefusedError``: with the quota that it would break.
     """
     uses = list(open_jails)
-    jails = len(uses) + (more.memory_bytes > 0)
-    memory = sum(use.memory_bytes for use in uses) + more.memory_bytes
-    runners = sum(use.runners for use in uses) + more.runners
-    for name, what, number, quota, option in (
-        ("jails", "jails", jails, quotas.jails, "--max-jails"),
-        ("runners", "runners", runners, quotas.runners, "--max-runners"),
-        ("memory", "of memory limits", memory, quotas.memory_bytes, "--max-memory"),
+    memory, limit = sum(use.memory_bytes for use in uses), quotas.memory_bytes
+    runners = sum(use.runners for use in uses)
+    for name, what, used, added, quota, option in (
+        ("jails", "jails", len(uses), int(more.memory_bytes > 0), quotas.jails, "--max-jails"),
+        ("runners", "runners", runners, more.runners, quotas.runners, "--max-runners"),
+        ("memory", "of memory limits", memory, more.memory_bytes, limit, "--max-memory"),
     ):
-        if number > quota:
+        if used + added > quota:
             shown = size_text if name == "memory" else str
             text = (
-                f"this would make {shown(number)} {what} of your key, over the server's quota of "
-                f"{shown(quota)} "
-                f"({option}); close environments, or lower their limits"
+                f"this would make {shown(used + added)} {what} of your key, over the server's "
+                f"quota of {shown(quota)} ({option}); close environments, or lower their limits"
             )
             if not uses:
                 raise RefusedError("WorkerError", text)  # no waiting makes it fit
-            used = {"jails": len(uses), "memory": memory - more.memory_bytes}
-            used["runners"] = runners - more.runners
-            raise BusyError(Busy(name, used[name], quota, RETRY_S), text)
+            raise BusyError(Busy(name, used, quota, RETRY_S), text)
 
 
 @mutable_dataclass
 class InFlight:
     """Bytes that clients have sent and that are not answered yet."""
 
-    _of: dict[bytes, int] = field(default_factory=dict)
+    _of: Counter[bytes] = field(default_factory=Counter)
     _requests: dict[tuple[bytes, int], tuple[Asker, bytes, int]] = field(default_factory=dict)
 
     def of(self, key: bytes) -> int:
         """How many there are of a key."""
-        return self._of.get(key, 0)
+        return self._of[key]
 
     def add(self, key: bytes, asker: Asker, size: int, quota: int) -> None:
         """Count a request until it is answered. Raises ``RefusedError``."""
-        taken = self._of.get(key, 0)
+        taken = self._of[key]
         if (asker.identity, asker.request_id) in self._requests:
             raise RefusedError("LocalProtocolError", "a request with this id is not answered yet")
         if taken + size > quota:
@@ -182,8 +179,6 @@ class InFlight:
         if counted is not asker:
             return
         del self._requests[place]
-        left = self._of[key] - size
-        if left > 0:
-            self._of[key] = left
-        else:
-            self._of.pop(key)
+        self._of[key] -= size
+        if not self._of[key]:
+            del self._of[key]
