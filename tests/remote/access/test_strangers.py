@@ -34,6 +34,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.keys import key_text
 from envhub_worker.supervisor.records import Asker, RefusedError, Witness
 from tests.remote.listening import Listening, listening
+from tests.remote.peers import peer
 from tests.remote.strangers import greeting, knock
 from tests.support import inside
 from tests.support.processes import eventually
@@ -98,22 +99,14 @@ def test_another_servers_key_is_refused_at_once(server: Listening, repository: P
 
 def test_a_peer_without_keys_hears_nothing(server: Listening) -> None:
     """A plain ZeroMQ socket gets no reply; the control, with keys, does."""
-    with zmq.Context() as context:
-        assert not _greets(context, server, with_keys=False)
-        assert _greets(context, server, with_keys=True)
-
-
-def _greets(context: zmq.Context[Any], server: Listening, *, with_keys: bool) -> bool:
-    with context.socket(zmq.DEALER) as peer:
-        peer.setsockopt(zmq.LINGER, 0)
-        if with_keys:
-            pair = keys.load(server.state / "client.key")
-            peer.setsockopt(zmq.CURVE_SERVERKEY, bytes.fromhex(server.public))
-            peer.setsockopt(zmq.CURVE_SECRETKEY, pair.secret)
-            peer.setsockopt(zmq.CURVE_PUBLICKEY, pair.public)
-        peer.connect(server.endpoint)
-        peer.send_multipart(m.pack_header(m.Hello(m.VERSION, b"stranger"), 1))
-        return bool(peer.poll(60_000 if with_keys else 1_000))
+    hello = m.Hello(m.VERSION, b"stranger")
+    with zmq.Context() as context, context.socket(zmq.DEALER) as plain:
+        plain.setsockopt(zmq.LINGER, 0)
+        plain.connect(server.endpoint)
+        plain.send_multipart(m.pack_header(hello, 1))
+        assert not plain.poll(1_000)
+    with peer(server, keys.load(server.state / "client.key")) as known:
+        assert isinstance(known.ask(hello), m.Welcome)
 
 
 def _gate(folder: Path) -> RemoteGate:
@@ -136,20 +129,20 @@ def test_nobody_comes_in_while_nobody_can_be_asked(tmp_path: Path) -> None:
     for enforced in (True, False):
         gate, pair = _gate(tmp_path), keys.generate()
         with zmq.Context() as context:
-            router, peer = context.socket(zmq.ROUTER), context.socket(zmq.DEALER)
+            router, client = context.socket(zmq.ROUTER), context.socket(zmq.DEALER)
             gate.secure(router, Loop(Witness().failed))
             gate.close()
             if not enforced:
                 router.setsockopt(zmq.ZAP_ENFORCE_DOMAIN, 0)
             port = router.bind_to_random_port("tcp://127.0.0.1")
-            peer.setsockopt(zmq.LINGER, 0)
-            peer.setsockopt(zmq.CURVE_SERVERKEY, inside.public_key(gate))
-            peer.setsockopt(zmq.CURVE_SECRETKEY, pair.secret)
-            peer.setsockopt(zmq.CURVE_PUBLICKEY, pair.public)
-            peer.connect(f"tcp://127.0.0.1:{port}")
-            peer.send(b"hello")
+            client.setsockopt(zmq.LINGER, 0)
+            client.setsockopt(zmq.CURVE_SERVERKEY, inside.public_key(gate))
+            client.setsockopt(zmq.CURVE_SECRETKEY, pair.secret)
+            client.setsockopt(zmq.CURVE_PUBLICKEY, pair.public)
+            client.connect(f"tcp://127.0.0.1:{port}")
+            client.send(b"hello")
             assert bool(router.poll(500 if enforced else 60_000)) is not enforced
-            peer.close()
+            client.close()
             router.close(0)
 
 
