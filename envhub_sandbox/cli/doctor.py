@@ -115,6 +115,8 @@ def doctor(
 
     Policy(profile=profile)  # refuses a name that there is not, before anything is tried
     if server is not None:
+        from envhub_sandbox.sandboxes.remote import RemoteSandbox
+
         if insecure_loopback and server_key is not None:
             raise UsageError(
                 "--server-key is for a server with keys, and --insecure-loopback for one without: "

@@ -15,6 +15,8 @@ from typing import Any
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import EnvHubError
+from envhub_sandbox.transport import jail
+from envhub_sandbox.transport.shared_memory import client_slabs
 from envhub_worker.protocol import messages as m
 from tests.support.samples import SAMPLES
 
@@ -27,7 +29,7 @@ _LARGEST = 1 << 16
 @contextmanager
 def recording(found: dict[tuple[object, ...], Frames]) -> Iterator[None]:
     """Every message that is unpacked here meanwhile, one of each kind and size."""
-    unpack, unpack_header = m.unpack, m.unpack_header
+    unpack, unpack_header = jail.unpacked, m.unpack_header
 
     def listen(frames: Sequence[Any], **options: Any) -> Any:
         copied = [bytes(frame) for frame in frames]
@@ -42,11 +44,13 @@ def recording(found: dict[tuple[object, ...], Frames]) -> Iterator[None]:
         listen(m.pack(message))
         return number, message
 
-    m.unpack, m.unpack_header = listen, listen_to_header
+    jail.unpacked = client_slabs.unpacked = listen
+    m.unpack_header = listen_to_header
     try:
         yield
     finally:
-        m.unpack, m.unpack_header = unpack, unpack_header
+        jail.unpacked = client_slabs.unpacked = unpack
+        m.unpack_header = unpack_header
 
 
 def record() -> list[Frames]:

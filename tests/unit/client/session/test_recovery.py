@@ -51,11 +51,15 @@ def jail(reply: m.Message, *parts: m.Message, kept: bool = True) -> JailHandle:
     return made
 
 
+def sent(said: JailHandle) -> int:
+    return said.relay("step", [(runner, said.pack(message)) for runner, message in ASKED])
+
+
 def test_deaths_come_with_the_answers_of_the_others() -> None:
     """Each in its place: what lived has answered, and of the dead one knows how."""
     said = jail(m.RelayDonePartly((1, 1), (1,)), m.Value(7), DIED)
     with pytest.raises(RunnersDiedError) as caught:
-        said.receive(said.send("step", ASKED), Deadline(1))
+        said.receive(sent(said), Deadline(1))
     assert caught.value.replies == [m.Value(7), None]
     assert list(caught.value.deaths) == [1]
     assert (caught.value.first.exit_code, caught.value.first.log_tail) == (3, "last words")
@@ -68,7 +72,7 @@ def test_a_runners_word_is_no_death() -> None:
     """A ``Death`` in the place of a living runner is an answer, and an illegal one."""
     said = jail(m.RelayDonePartly((1, 1), (1,)), DIED, DIED)
     with pytest.raises(RunnersDiedError) as caught:
-        said.receive(said.send("step", ASKED), Deadline(1))
+        said.receive(sent(said), Deadline(1))
     assert list(caught.value.deaths) == [1]
     with pytest.raises(RemoteProtocolError, match="a runner sent Death"):
         jail(m.RelayDone((1, 1)), m.Value(7), DIED).exchange("step", ASKED, Deadline(1))
@@ -91,10 +95,10 @@ def test_deaths_that_do_not_add_up_are_refused(
     """Nobody dead, nobody asked, no ``Death``, frames too many or too few."""
     said = jail(reply, *parts)
     with pytest.raises(RemoteProtocolError):
-        said.receive(said.send("step", ASKED), Deadline(1))
+        said.receive(sent(said), Deadline(1))
     said = jail(m.RelayDonePartly((1, 1), (1,)), m.Value(7), DIED, kept=False)
     with pytest.raises(RemoteProtocolError, match="RelayDonePartly"):  # it was not asked for
-        said.receive(said.send("step", ASKED), Deadline(1))
+        said.receive(sent(said), Deadline(1))
 
 
 def test_derived_seeds_are_documented_and_all_different() -> None:
