@@ -60,10 +60,10 @@ for folder in tests/attacks/*/; do
 done
 differs_by_user+=(tests/integration/{confinement,lifecycle,loading,packages})
 
-# processes: for tests that start much and wait for it: half as many again as there are cores, which
-# one process each leaves idle for a third of the time. Not beyond eight, as in ./test.
+# processes: for tests that start much and wait for it: twice as many as there are cores, which three
+# processes for two still leave idle for a third of the time. Not beyond eight, as in ./test.
 processes() {
-  local wanted=$((($(nproc) * 3 + 1) / 2))
+  local wanted=$(($(nproc) * 2))
   echo $((wanted < 8 ? wanted : 8))
 }
 
