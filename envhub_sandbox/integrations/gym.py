@@ -27,10 +27,15 @@ class SandboxEnv(SingleEnv):
     """One environment of a repository, in a sandbox of its own.
 
     Args:
-        ref: What ``make_env`` takes, and raises for; so ``options``.
-        suite, task: Needed where there are several; ``ValueError``: there is none of these, or no
-            only one.
+        ref: What ``make_env`` takes: a hub reference, a folder, a config with ``hub_path``.
+        suite: Which suite of the repository; needed where there are several.
+        task: Which task of it; likewise.
         render_mode: Handed to the repository's ``make_env``, if given.
+        options: ``make_env``'s.
+
+    Raises:
+        ValueError: The repository has several environments, or not the one that is named.
+        EnvHubError: As ``make_env``.
     """
 
     @short_traceback
@@ -58,8 +63,15 @@ def make_vector(
     render_mode: str | None = None,
     **options: Any,
 ) -> VectorEnv[Any, Any, Any]:
-    """What ``gymnasium.make_vec`` calls: the vector environment of a repository; the arguments are
-    those of ``SandboxEnv``.
+    """What ``gymnasium.make_vec`` calls: the vector environment of a repository.
+
+    Args:
+        ref: What ``envhub_sandbox.make_env`` takes.
+        num_envs: Number of sub-environments.
+        suite: Which suite of the repository; needed where there are several.
+        task: Which task of it; likewise.
+        render_mode: Handed to the repository's ``make_env``, if given.
+        options: ``make_env``'s.
     """
     suites = make_env(ref, n_envs=num_envs, **_with_render_mode(options, render_mode))
     with closed_if_it_fails(suites):

@@ -32,8 +32,11 @@ class SandboxVecEnv(VecEnv):
     ``info["terminal_observation"]``. Where the vector environment does not do so itself
     (``AutoresetMode.SAME_STEP``), those that have ended are reset here, by ``reset_mask``.
 
+    Args:
+        vector: What ``make_env`` made.
+
     Attributes:
-        vector: What ``make_env`` made, for ``sandbox`` and the rest.
+        vector: The same, for ``sandbox`` and the rest.
     """
 
     def __init__(self, vector: VectorEnv[Any, Any, Any]) -> None:
@@ -59,9 +62,15 @@ class SandboxVecEnv(VecEnv):
         """The environments of a repository.
 
         Args:
-            ref, n_envs: What ``make_env`` takes, and raises for; so ``options``.
-            suite, task: Needed where there are several; ``ValueError``: there is none of these, or
-                no only one.
+            ref: What ``make_env`` takes.
+            n_envs: Number of sub-environments.
+            suite: Which suite of the repository; needed where there are several.
+            task: Which task of it; likewise.
+            options: ``make_env``'s.
+
+        Raises:
+            ValueError: The repository has several environments, or not the one that is named.
+            EnvHubError: As ``make_env``.
         """
         with closed_if_it_fails(make_env(ref, n_envs=n_envs, **options)) as suites:
             return cls(choose(suites, suite, task))
