@@ -231,3 +231,12 @@ def test_what_a_page_loads_from_elsewhere_is_found(
     (tmp_path / name).write_text(text)
     [line] = loads.foreign(tmp_path)
     assert line.startswith(f"{name}: ")
+
+
+def test_the_steps_of_ci_name_tests_that_there_are(checkout: Path) -> None:
+    """A step that names a folder which was moved runs no test of it."""
+    named: set[str] = set()
+    for path in [*(checkout / ".ci" / "steps").iterdir(), checkout / ".ci" / "lib.sh"]:
+        named |= set(re.findall(r"(?<![\w/$])tests/[\w/.]*\w", path.read_text()))
+    assert "tests/remote/ray" in named
+    assert [one for one in sorted(named) if not (checkout / one).exists()] == []
