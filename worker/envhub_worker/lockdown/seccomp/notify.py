@@ -61,7 +61,9 @@ class Request:
         return [c_int(word) for word in self.words[:3]]
 
 
-_PROCEED: int | None = None  # instead of an errno, or 0: the kernel shall make the call itself
+_PROCEED = -1
+"""In the place of an errno: the kernel makes the call itself. Not None, which is what a path would
+answer that forgets to."""
 _Inside = Callable[[], Collection[int]]
 _SIGNALS = ("kill", "tkill", "tgkill")
 _NETLINKS = (0, 15)
@@ -94,9 +96,9 @@ def serve(listener: int, permitted: Collection[str], note: Callable[[Request], N
         answer = decide(request, lambda: procfs.descendants(os.getpid()))
     else:
         answer = refusal(call)
-    flags = _CONTINUE if answer is _PROCEED else 0
+    result, flags = (0, _CONTINUE) if answer == _PROCEED else (-answer, 0)
     with contextlib.suppress(OSError):
-        fcntl.ioctl(listener, _SEND, _ANSWER.pack(identity, 0, -(answer or 0), flags))
+        fcntl.ioctl(listener, _SEND, _ANSWER.pack(identity, 0, result, flags))
     return True
 
 
@@ -133,7 +135,7 @@ def _has_callers(listener: int) -> bool:
     return not any(events & select.POLLHUP for _, events in poller.poll(0))
 
 
-def decide(request: Request, inside: _Inside) -> int | None:
+def decide(request: Request, inside: _Inside) -> int:
     """Send the signal that ``request`` asks for, where that is permitted; 0, an errno, or
     ``_PROCEED``.
     ``inside``: gives the pids of the jail's processes, without init.
@@ -152,7 +154,7 @@ def decide(request: Request, inside: _Inside) -> int | None:
     return _send_to_thread(first, second, third, inside)
 
 
-def _kill(caller: int, target: int, signum: int, inside: _Inside) -> int | None:
+def _kill(caller: int, target: int, signum: int, inside: _Inside) -> int:
     group = _group_of(caller)
     if group < 0:
         return errno.ESRCH  # it has gone since: no caller waits for the answer
