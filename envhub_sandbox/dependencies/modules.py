@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from envhub_sandbox.dependencies.declared import DeclaredPackages, WantedPackage
 
 _FORMAT = 1
+_READ: dict[tuple[Path, str], tuple[tuple[str, str, int], ...]] = {}
 _MOST = 64
 _SHOWN = 20
 _MISSING = r"No module named '([\w.]+)'"
@@ -73,18 +74,21 @@ class Guess:
         return not set(self.brought_by).isdisjoint(names)
 
 
-@lru_cache(maxsize=64)
 def guessed(snapshot: Snapshot) -> tuple[Guess, ...]:
     """What a repository imports, as far as it is known what brings it.
 
     What its declared packages bring is among it: that is known once versions are chosen.
     """
-    rows = read(snapshot)
+    return _guessed(snapshot.root, read(snapshot))
+
+
+@lru_cache(maxsize=64)
+def _guessed(root: Path, rows: tuple[tuple[str, str, int], ...]) -> tuple[Guess, ...]:
     if not rows:
         return ()
     from envhub_sandbox.dependencies.declared import optional, parse_requirement
 
-    extras = optional(snapshot.root)
+    extras = optional(root)
     found: dict[str, Guess] = {}
     for name, file, line in rows:
         known = _of_id(name) if "-" in name else _of_module(name, extras)
@@ -123,12 +127,21 @@ def is_here(guess: Guess) -> bool:
     return PathFinder.find_spec(guess.module, here) is not None
 
 
-@lru_cache(maxsize=64)
 def read(snapshot: Snapshot) -> tuple[tuple[str, str, int], ...]:
     """Modules that a repository imports and does not have, and ids of environments; file and line.
 
-    A commit's are remembered: they are read in a process of their own.
+    A commit's are remembered: they are read in a process of their own. Not by the snapshot, which
+    lists its files: of many thousands, to be hashed and held.
     """
+    place = snapshot.root, snapshot.path  # a root holds one commit
+    if place not in _READ:
+        if len(_READ) >= _MOST:
+            _READ.clear()
+        _READ[place] = _recalled(snapshot)
+    return _READ[place]
+
+
+def _recalled(snapshot: Snapshot) -> tuple[tuple[str, str, int], ...]:
     folder = cache_root() / "imports"
     facts = json.dumps([_FORMAT, sys.version_info[:2], snapshot.commit, snapshot.path])
     key = hashlib.sha256(facts.encode()).hexdigest()

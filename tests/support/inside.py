@@ -19,7 +19,7 @@ from typing import Any
 import zmq
 
 from envhub_sandbox.check.play import confinement
-from envhub_sandbox.dependencies import environments, interpreters, resolutions
+from envhub_sandbox.dependencies import environments, interpreters, modules, resolutions
 from envhub_sandbox.factory import make_env
 from envhub_sandbox.sandboxes import remote
 from envhub_sandbox.sandboxes.docker import container
@@ -449,6 +449,11 @@ def door_is_shut(doorman: ConnectionLimiter) -> bool:
 def making_an_environment(step: str) -> Spot:
     """A step of it: ``install``, ``size``, ``compile``, ``close`` or ``publish``."""
     return environments, f"_{step}"
+
+
+def imports_in_memory() -> Spot:
+    """What was read of repositories in this process."""
+    return modules, "_READ"
 
 
 def finding_interpreters() -> Spot:

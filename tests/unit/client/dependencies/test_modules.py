@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from envhub_sandbox.dependencies import interpreters, modules, resolutions
+from envhub_sandbox.dependencies import interpreters, resolutions
 from envhub_sandbox.dependencies import resolve as resolving
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.dependencies.modules import MissingModule, guessed
@@ -76,8 +76,7 @@ def test_a_commit_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     found = snapshot(tmp_path / "r", "import chess" + MAKE)
     assert requirements(found) == ["chess"]
     monkeypatch.setattr(parsing, "read", lambda snapshot: pytest.fail("read again"))
-    for remembers in (modules.read, modules.guessed):
-        remembers.cache_clear()
+    monkeypatch.setattr(*inside.imports_in_memory(), {})
     assert requirements(found) == ["chess"]
 
 
