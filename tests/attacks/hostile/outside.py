@@ -10,6 +10,7 @@ import os
 import sys
 import traceback
 
+sys.dont_write_bytecode = True  # another test may be reading this folder as a repository
 secret = bytearray(sys.stdin.readline().strip(), "ascii")
 sys.path.insert(0, os.path.dirname(os.path.abspath(__file__)))
 
