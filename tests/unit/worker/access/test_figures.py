@@ -17,8 +17,10 @@ def test_what_processes_use_is_added_up_by_client(monkeypatch: pytest.MonkeyPatc
     with subprocess.Popen(shell, stdin=subprocess.PIPE) as process:
         taken = figures.Usage(pytest.fail)
         assert eventually(lambda: len(figures.children(process.pid)) == 1)
-        found = figures.look_at(process.pid)
+        found, again = (figures.look_at(process.pid) for _ in range(2))
         assert found is not None
+        assert again is not None
+        assert again.started == found.started, "it would be taken for another, and counted anew"
         assert (found.pid, found.memory_bytes > 0, found.cpu_s >= 0) == (process.pid, True, True)
         taken.watch({process.pid: "client"})
         taken.look()
