@@ -69,9 +69,9 @@ def _groups(process: Path) -> Iterator[Path]:
     own = {name: line[2] for line in lines if len(line) == 3 for name in line[1].split(",")}
     for kind, root, top in _mounts(process / "mountinfo"):
         group = PurePosixPath(own.get(kind, "/"))
-        # of a container it may be out of sight
-        is_seen = group.is_relative_to(root) and ".." not in group.parts
-        folder = top / (group.relative_to(root) if is_seen else "")
+        below = group.relative_to(root) if group.is_relative_to(root) else PurePosixPath("..")
+        # of a container it may be out of sight; both paths begin with .. where it was moved
+        folder = top / ("" if ".." in below.parts else below)
         yield from (one for one in (folder, *folder.parents) if one.is_relative_to(top))
 
 

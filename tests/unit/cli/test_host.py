@@ -75,6 +75,8 @@ _V1 = {"c": "/ cgroup rw,cpu", "g": "/ cgroup rw,memory"}
         ("0::/docker/x/in\n", {"g": "/docker/x cgroup2 rw"}, {"g__in": v2(9 * _MIB)}, 9),
         ("0::/docker/x\n", _V2, {"g": v2(300 * _MIB)}, 300),
         ("0::/../../y\n", _V2, {"g": v2(300 * _MIB), "y": v2(1)}, 300),
+        # moved out of the group that its namespace begins with, which the mount is above
+        ("0::/../y\n", {"g": "/.. cgroup2 rw"}, {"g": v2(300 * _MIB), "g__y": v2(9 * _MIB)}, 9),
         ("0::/a\n", {"with space": "/ cgroup2 rw"}, {"with space__a": v2(7 * _MIB)}, 7),
         # the first version
         ("4:memory:/a\n1:cpu:/b\n0::/\n", _V1, {"g__a": v1(_NO_LIMIT), "g": v1(_NO_LIMIT)}, 1000),
