@@ -53,7 +53,11 @@ class HubRef:
 
     @classmethod
     def parse(cls, text: str) -> HubRef:
-        """Read a reference, a Hub URL or an ``hf://`` path; an error says what to write instead."""
+        """Read a reference, a Hub URL or an ``hf://`` path.
+
+        Raises:
+            HubReferenceError: The text names the reference and what to write instead.
+        """
         if not isinstance(text, str):
             raise HubReferenceError(f"a hub reference is a str ({grammar.GRAMMAR}), got {text!r}")
         try:
