@@ -142,9 +142,10 @@ class _Judge:
         found = survey(self._snapshot, self._files).findings
         for finding in found:
             self._report.add(finding)
-        read = [check for check in CHECKS if check.startswith(("licence", "card", "source-"))]
-        for check in set(read) - {one.id for one in found}:
-            self._report.judged(check, [])
+        wrong = {one.id for one in found}
+        for check in CHECKS:
+            if check.startswith(("licence", "card", "source-")) and check not in wrong:
+                self._report.judged(check, [])
 
     def _resolve(self) -> None:
         self._asked.tell("reading and installing what it declares")

@@ -357,10 +357,11 @@ def test_copy_is_what_the_record_says_or_an_error(tmp_path: Path, kind: str) -> 
     copy_verified(source, tmp_path / "good", record)
     assert (tmp_path / "good").read_bytes() == data
     flipped = bytes([data[0] ^ 1]) + data[1:]
-    for number, other in enumerate([data + b"1", data[:-1], flipped]):
+    for number, other in enumerate([data * 2, data[:-1], flipped]):
         source.write_bytes(other)
         with pytest.raises(HashMismatch):
             copy_verified(source, tmp_path / str(number), record)
+        assert (tmp_path / str(number)).stat().st_size <= len(data) + 1, "it copied what it refuses"
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(HashMismatch, match="not a regular file"):
         copy_verified(tmp_path / "pipe", tmp_path / "x", record)

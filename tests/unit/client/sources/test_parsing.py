@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import os
 import subprocess
 from dataclasses import replace
 from pathlib import Path
@@ -149,6 +150,14 @@ def test_children_that_are_lost_are_counted(
     monkeypatch.setattr(subprocess, "run", lambda *a, **k: (began.append(a), run(*a, **k))[1])
     assert set(parsing.parsed({f"{number}.py": b"" for number in range(1000)}).values()) == {None}
     assert len(began) == parsing.MOST_LOST
+
+
+def test_only_a_regular_file_is_read(tmp_path: Path) -> None:
+    """A pipe reads as an empty file while nothing writes into it, and as anything once it does."""
+    os.mkfifo(tmp_path / "env.py")
+    assert parsing.content(tmp_path / "env.py", 100) is None
+    (tmp_path / "other.py").touch()
+    assert parsing.content(tmp_path / "other.py", 100) == b""
 
 
 def test_a_link_is_not_followed(tmp_path: Path) -> None:
