@@ -188,6 +188,7 @@ def _oracle(n_envs: int) -> Any:
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
+    sys.dont_write_bytecode = True  # a repository in which bytecode lies is another one
     spec.loader.exec_module(module)
     return module.make_env(n_envs)
 

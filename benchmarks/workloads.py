@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
@@ -80,6 +81,7 @@ def module(folder: Path) -> ModuleType:
     assert spec is not None
     assert spec.loader is not None
     loaded = importlib.util.module_from_spec(spec)
+    sys.dont_write_bytecode = True  # a repository in which bytecode lies is another one
     spec.loader.exec_module(loaded)
     return loaded
 

@@ -154,6 +154,7 @@ def make_env_of(repository: Path, entry: str) -> Any:
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules["hub_env"] = module
+    sys.dont_write_bytecode = True  # a repository in which bytecode lies is another one
     spec.loader.exec_module(module)
     return module.make_env
 
