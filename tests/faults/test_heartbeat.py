@@ -35,6 +35,7 @@ def test_timeout_tells_what_the_worker_does(
         sample("faulty"), n_envs=2, env_kwargs=fails, lane=lane, policy=policy, seed=None
     ) as env:
         [runner] = inside.pids(env)
+        inside.asks_patiently(env)
         env.step_async([0, 1])
         assert eventually(lambda: f"about to {fault}" in output.read_text())
         assert eventually(lambda: psutil.Process(runner).status() in there)

@@ -13,6 +13,7 @@ import contextlib
 import os
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -153,24 +154,32 @@ def launcher(env: Any) -> Launcher:
 
 
 @contextlib.contextmanager
-def hurried_parts(env: Any, **timeouts: float) -> Iterator[None]:
-    """``hurried``, for what its workers are sent one by one."""
-    found = parts(env)
-    before = found[0].repository.timeouts
-    now = replace(before, **timeouts)
-    queues = env._in_flight()._queues
+def hurried_part(env: Any, worker: int, **timeouts: float) -> Iterator[None]:
+    """``hurried``, for what one of its workers is sent; the others may be as slow as ever."""
+    part, queue = parts(env)[worker], env._in_flight()._queues[worker]
+    before = part.repository.timeouts
+    owners = part.requests, queue
     try:
-        for owner in (*(part.requests for part in found), *queues):
-            owner._timeouts = now
+        for owner in owners:
+            owner._timeouts = replace(before, **timeouts)
         yield
     finally:
-        for owner in (*(part.requests for part in found), *queues):
+        for owner in owners:
             owner._timeouts = before
 
 
 def part_pids(part: EnvSession) -> list[int]:
     """The processes of one worker's jail; asked over a connection of its own."""
-    return list(part.lease.status()["pids"])
+    at = part.lease._at()
+    assert at is not None
+    return list(part.lease._launcher.status(*at, 60.0)["pids"])
+
+
+def asks_patiently(env: Any) -> None:
+    """Its server has a minute to say what a late worker does: a loaded one needs more than one
+    second at times, and the error then says nothing of it."""
+    found: Any = launcher(env)
+    found.status = partial(found.status, timeout_s=60.0)
 
 
 def written_later(lane: Any, word: int, value: int) -> Callable[[], bool]:

@@ -203,8 +203,7 @@ def among(strict: Arena, folder: str, lane: str, **options: Any) -> Iterator[Any
             given["sandbox"] = with_keys.sandbox()
         else:
             given["lane"] = lane
-        timeouts = {**TIMEOUTS, "step_s": PATIENCE_S}
-        yield stack.enter_context(make_env(folder, COUNT, timeouts=timeouts, **given))
+        yield stack.enter_context(make_env(folder, COUNT, timeouts=TIMEOUTS, **given))
 
 
 NEVER = [
@@ -222,11 +221,12 @@ def test_who_is_never_ready_holds_nobody_up(
     folder = liar(home, mode)
     with among(strict, folder, lane) as suites:
         found = Among(suites.env)
-        late = found.others_go_on()  # unless they took longer than a step may
-        if not late:
-            with pytest.raises(WorkerTimeoutError) as caught:
-                found.env.recv(COUNT)
-            late = [_of_the_hostile(caught.value)]
+        with inside.hurried_part(suites.env, HOSTILE, step_s=PATIENCE_S):
+            late = found.others_go_on()  # unless they took longer than a step of it may
+            if not late:
+                with pytest.raises(WorkerTimeoutError) as caught:
+                    found.env.recv(COUNT)
+                late = [_of_the_hostile(caught.value)]
         assert [type(one) for one in late] == [WorkerTimeoutError]
     with among(strict, folder, lane, min_ready=None, num_workers=COUNT) as suites:
         suites.env.reset(seed=1)

@@ -88,7 +88,7 @@ def test_events_of_the_hosts_devices_are_not_told(jail: OpenJail) -> None:
             "device_events",
             lambda run: mark in run.text,
             group=1,
-            seconds=5,
+            seconds=60,
             inside={"seconds": 1},
             impossible=impossible,
         )

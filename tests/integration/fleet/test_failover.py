@@ -154,11 +154,10 @@ def test_what_has_no_fixed_layout_is_packed_once(
 def test_all_workers_share_one_timeout(rows: Path, servers: list[Listening]) -> None:
     """Three that are late are no later than one; reset() catches up with them all."""
     sandbox = [server.sandbox() for server in servers]
-    options: dict[str, Any] = {"n_envs": 6, "timeouts": {"step_s": 0.5}}
-    with started(rows, sandbox=sandbox, **options) as env:
+    with started(rows, n_envs=6, sandbox=sandbox) as env:
         expected = env.reset(seed=2)[0]
         late = r"step has not finished after 0.5 s .*sub-environments \d to \d of 6, on tcp"
-        with pytest.raises(WorkerTimeoutError, match=late):
+        with inside.hurried(env, step_s=0.5), pytest.raises(WorkerTimeoutError, match=late):
             env.step(np.full(6, 60))
         assert {part.lifecycle.state.name for part in inside.parts(env)} == {"LATE"}
         with pytest.raises(WorkerTimeoutError, match="call reset"):
@@ -201,7 +200,7 @@ def test_a_partition_moves_the_rows(
     """A cable is out: the heartbeat says so, and the rows come back here; there nothing remains."""
     bind = f"tcp://{far.address}:5555"
     there = serve("there", "--idle-s", "20", bind=bind, prefix=far.prefix)
-    sandbox = [stays.sandbox(), there.sandbox(heartbeat_s=1.0)]
+    sandbox = [stays.sandbox(), there.sandbox(heartbeat_s=5.0)]
     options: dict[str, Any] = {"n_envs": 6, "policy": {"restart": "transparent"}}
     with started(rows, sandbox=sandbox, **options) as env:
         lost = _is_at(env, there)

@@ -19,9 +19,10 @@ import pytest
 from gymnasium.error import ClosedEnvironmentError
 
 from envhub_sandbox.errors import EnvHubError, WorkerTimeoutError
+from envhub_worker.protocol.lifecycle import State
 from tests.support import inside
 from tests.support.in_process.interrupts import at_call
-from tests.support.processes import eventually
+from tests.support.processes import eventually, halted
 from tests.support.started import started
 
 pytestmark = [
@@ -62,19 +63,30 @@ def test_no_answer_is_taken_for_another(rows: Path, lane: str) -> None:
 
 def test_a_ctrl_c_while_one_computes(rows: Path) -> None:
     """The others have answered; the next step is refused, and reset() catches up."""
-    actions = STILL.copy()
-    actions[3] = 90
     with started(rows, **_options("frames")) as env:
         expected = env.reset(seed=3)[0]
-        timer = threading.Timer(0.3, os.kill, (os.getpid(), signal.SIGINT))
-        timer.start()
-        with pytest.raises(KeyboardInterrupt):
-            env.step(actions)
-        timer.join()
+        last = inside.parts(env)[-1]
+
+        def interrupt() -> None:
+            assert eventually(lambda: last.lifecycle.state is State.PENDING)
+            os.kill(os.getpid(), signal.SIGINT)
+
+        interrupting = threading.Thread(target=interrupt)
+        with halted(inside.part_pids(last)):
+            interrupting.start()
+            with pytest.raises(KeyboardInterrupt):
+                env.step(STILL)
+        interrupting.join()
         with pytest.raises(WorkerTimeoutError, match="the last step was interrupted"):
             env.step(STILL)
         assert np.array_equal(env.reset(seed=3)[0], expected)
         assert env.step(STILL)[0][:, 1].tolist() == [1] * len(STILL)
+
+
+def _step_on(env: Any) -> None:
+    """Until something ends that, however late it comes."""
+    while True:
+        env.step(np.full(len(STILL), 98))
 
 
 def test_close_comes_into_a_step(rows: Path) -> None:
@@ -90,7 +102,7 @@ def test_close_comes_into_a_step(rows: Path) -> None:
             closer.start()
             try:
                 with pytest.raises((ClosedEnvironmentError, EnvHubError)):
-                    env.step(np.full(len(STILL), 98))
+                    _step_on(env)
             finally:
                 closer.join(DEADLINE_S)
                 if how == "signal":

@@ -136,8 +136,9 @@ def test_a_step_may_take_too_long(gates: Gates) -> None:
     Who has answered in time is not late, however long a learner thinks before it takes that.
     """
     env = gates.env(2)
-    with inside.hurried_parts(env, step_s=2.0):
+    with inside.hurried_part(env, 1, step_s=2.0):
         send(env, 0, 0)
+        assert eventually(lambda: all(part.lease.lane.answered() for part in inside.parts(env)))
         threading.Event().wait(2.5)
         assert ids(env.recv(2)) == [0, 1]
         send(env, 0, 1)

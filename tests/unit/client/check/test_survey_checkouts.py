@@ -111,7 +111,7 @@ def test_attributes_that_cannot_be_read_are_an_error(
     """A pattern can take git for ever, and what it says then is not known."""
     (repository.folder / ("a" * 200 + "1")).write_text("")
     (repository.folder / ".gitattributes").write_text(f"{'*a' * 60}b ident\n")
-    monkeypatch.setattr(checkout, "TIMEOUT_S", 1.0)
+    monkeypatch.setattr(checkout, "TIMEOUT_S", 5.0)
     with pytest.raises(SnapshotError, match=r"cannot read its \.gitattributes"):
         found(repository.folder)
 
