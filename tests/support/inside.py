@@ -44,6 +44,7 @@ from envhub_worker.access.audit.log import Log
 from envhub_worker.access.curve_port import ConnectionLimiter
 from envhub_worker.access.remote_gate import RemoteGate
 from envhub_worker.cli import listen, listen_options
+from envhub_worker.cli import status as status_command
 from envhub_worker.cli.identity import Identity
 from envhub_worker.lockdown.limits import cgroups
 from envhub_worker.protocol import messages as m
@@ -332,6 +333,8 @@ CLOSE_PATIENCE: Spot = (env_session, "INTERRUPT_S")
 """For how long ``close`` waits for another thread."""
 WAITS_FOR_A_SERVER: tuple[Spot, Spot] = ((launcher_module, "_CLOSE_S"), (remote, "_CLOSE_S"))
 """For how long a close waits for a server's word, also where it has gone."""
+STATUS_WAIT_MS: Spot = (status_command, "_WAIT_MS")
+"""For how long ``envhub-worker status`` waits for its server."""
 MAKER: Spot = (make_env, "EnvFactory")
 """What ``make_env`` starts to work with when its arguments have been checked."""
 CONTAINER_MARKS: Spot = (listen_options, "_CONTAINER_MARKS")

@@ -133,6 +133,8 @@ def test_what_has_ended_is_not_asked_again(counted: Path, way: str) -> None:
         env.reset(seed=1, options=NEW)
         env.step(np.zeros((3, 2), np.float32))
         assert [count["step"] for count in env.get_attr("count")] == [4, 7, 8]
+        for frame, last in zip(env.call("render"), frames[-1], strict=True):
+            assert not np.array_equal(frame, last)
         assert env.get_attr("given")[0] == [NEW, NEW]
 
 
