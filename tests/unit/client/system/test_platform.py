@@ -119,8 +119,8 @@ try:
 except DeadlineReached:
     print("reached")
 with deadline_alarm(60):
-    threading.Timer(0.2, _thread.interrupt_main).start()
     try:
+        threading.Timer(0.2, _thread.interrupt_main).start()
         wait()
     except DeadlineReached:
         print("wrong")
@@ -130,7 +130,7 @@ with deadline_alarm(60):
 _PARSES = """
 import time
 from envhub_sandbox.hub.sources import parser
-parser.CPU_S = 0.5
+parser.CPU_S = 5.0
 whole = parser.described
 parser.described = lambda data: time.sleep(60) if b"slow" in data else whole(data)
 parser.main()

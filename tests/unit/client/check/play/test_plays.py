@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from envhub_sandbox.check.play import plays, traces
-from envhub_sandbox.check.play.plays import facts_of, film
+from envhub_sandbox.check.play.plays import Play, facts_of, film
 from envhub_sandbox.errors import RemoteEnvError
 
 pytest.importorskip("imageio_ffmpeg")
@@ -96,6 +96,13 @@ def test_what_an_environment_says_is_printable_and_bounded() -> None:
     assert told["actions"] == "Discrete(2)"
     assert told["autoreset"] == "NEXT_STEP"
     assert all(len(value) < 8_000 and value.isascii() for value in told.values())
+
+
+def test_memory_is_noted_where_a_server_counts_it() -> None:
+    play = Play()
+    for used in ({"memory_bytes": 3}, {}):
+        assert play.count(used) is used
+    assert play.memory == [3]
 
 
 def test_a_play_counts_episodes_until_rewards_cannot_be_counted() -> None:
