@@ -80,7 +80,8 @@ def runtimes() -> Iterator[Any]:
 def by_hand(runtime: Runtime, kind: str, seed: int, actions: list[Any]) -> Any:
     """What the environment gives to those who use ``gym``."""
     task = json.dumps([kind, seed, actions])
-    command = [runtime.python, "-W", "ignore", "-c", BY_HAND, str(REPOSITORY), runtime.packages]
+    options = ["-B", "-W", "ignore"]  # another test may be reading this folder as a repository
+    command = [runtime.python, *options, "-c", BY_HAND, str(REPOSITORY), runtime.packages]
     done = subprocess.run([*command, task], capture_output=True, text=True, timeout=300)
     if done.returncode:
         raise RuntimeError(done.stderr)

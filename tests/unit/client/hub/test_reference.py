@@ -206,7 +206,7 @@ def test_something_else_than_text_is_refused() -> None:
     assert issubclass(HubReferenceError, ValueError)
 
 
-@pytest.mark.parametrize("revision", [None, "main", COMMIT[:12], COMMIT + "0"])
+@pytest.mark.parametrize("revision", [None, "main", COMMIT[:12], COMMIT + "0", COMMIT.upper()])
 def test_only_a_full_commit_is_pinned(revision: str | None) -> None:
     """Branches, tags and short hashes can move or clash; 40 hexadecimal digits cannot."""
     assert HubRef("org/repo", COMMIT).is_pinned

@@ -20,6 +20,7 @@ from envhub_worker.protocol.limits import DEFAULT_LIMITS
 from envhub_worker.protocol.messages.prefix import CHANGES, WARNINGS
 from envhub_worker.runner.prefixes import WarningLog, Watches
 from envhub_worker.runner.sync_envs import SubEnvs
+from tests.support.command_line import python
 
 REPLY = m.pack(m.Value(1))
 
@@ -165,6 +166,20 @@ def test_other_values_are_not(name: str) -> None:
 def test_who_has_a_say_is_not_watched(wrapper: Any) -> None:
     assert not begun(envs_of(lambda: wrapper(Told())), "task")
     assert not begun(envs_of(lambda: gym.Wrapper(wrapper(Told()))), "task")
+
+
+_WITH_A_THREAD = """
+import threading
+from envhub_worker.runner.prefixes import is_alone
+print(is_alone())
+threading.Thread(target=threading.Event().wait, daemon=True).start()
+print(is_alone())
+"""
+
+
+def test_threads_are_seen() -> None:
+    """In a process of its own: that of a test has threads and handlers of signals."""
+    assert python("-c", _WITH_A_THREAD).stdout.split() == ["True", "False"]
 
 
 def test_a_process_with_threads_is_not_watched() -> None:
