@@ -22,6 +22,7 @@ from tests.remote.hosts import OtherHost, other_host
 from tests.remote.listening import Listening, counting, listening
 from tests.remote.relay import relay
 from tests.support import inside
+from tests.support.ports import lasting_port
 from tests.support.processes import eventually
 from tests.support.started import started
 
@@ -90,8 +91,7 @@ def test_nobody_at_the_other_end_is_said_to_be_so(
 ) -> None:
     """A port where nobody listens is an error in bounded time, not a wait for ever."""
     monkeypatch.setattr("envhub_sandbox.transport.tcp.CONNECT_S", 2.0)
-    with relay(server.port) as wire:
-        endpoint = wire.endpoint
+    endpoint = f"tcp://127.0.0.1:{lasting_port()}"
     with pytest.raises(SandboxUnavailableError, match="nothing answers at"):
         make_env(repository, sandbox=server.sandbox(endpoint=endpoint))
 
@@ -145,10 +145,11 @@ def test_a_client_that_was_silent_for_too_long_is_told_so(
 def test_a_restarted_server_says_that_the_jail_is_gone(tmp_path: Path) -> None:
     """Same keys, same port, another process: it knows nothing of the jail, and says so."""
     repository = counting(tmp_path / "repository")
-    with listening(tmp_path / "one") as first:
+    bind = f"tcp://127.0.0.1:{lasting_port()}"  # which nobody gets in between
+    with listening(tmp_path / "one", bind=bind) as first:
         suites = make_env(repository, sandbox=first.sandbox(), policy={"restart": "on_reset"})
         suites.env.reset(seed=1)
-    with listening(tmp_path / "one", bind=first.endpoint):
+    with listening(tmp_path / "one", bind=bind):
         with pytest.raises(WorkerDiedError, match="it has been closed"):
             suites.env.step(np.array([0]))
         suites.env.reset(seed=1)
