@@ -208,3 +208,21 @@ def test_a_field_itself_is_never_a_description() -> None:
     with pytest.raises(LocalProtocolError, match="items"):
         encode([71, infos], reduces=True)
     assert type(unsendable.reduced([71, {}], lambda _: None, DEFAULT_LIMITS)[1]) is dict
+
+
+class _UntoldError(Exception):
+    def __str__(self) -> str:
+        raise RuntimeError
+
+
+class _Untold:
+    __dlpack__ = None
+
+    def __array__(self) -> Any:
+        raise _UntoldError
+
+
+def test_a_part_whose_error_has_no_text_does_not_lose_the_rest() -> None:
+    found = cast("list[Any]", decode(encode([71, {"part": _Untold(), "z": 1}], reduces=True)))
+    assert type(found[1].pop("part")) is RemoteObject
+    assert found[1] == {"z": 1}

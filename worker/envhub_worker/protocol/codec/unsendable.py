@@ -312,8 +312,12 @@ class _Walk:
         return self.members(value, depth)
 
     def is_sent(self, value: object) -> bool:
-        """Whether it can be sent as it is."""
-        return _refusal(value, self._send) is None
+        """Whether it can be sent as it is. Its error is not asked: that may fail, too."""
+        try:
+            self._send(value)
+        except Exception:
+            return False
+        return True
 
     def members(self, value: Any, depth: int) -> Any:
         """A container of what is sent of its members."""
