@@ -222,10 +222,13 @@ class SpinChooser:
         self.budget_ns = min(max(usual, _MIN_BUDGET_NS), _MAX_BUDGET_NS) if spinning else 0
 
 
-CPUS = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [0]
-"""The cores that this process may use."""
 _LOOK_EVERY = 64
 """Steps between two looks at where the client runs."""
+
+
+def own_cpus() -> list[int]:
+    """The cores that this process may use now: it may keep to fewer of them after its imports."""
+    return sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else [0]
 
 
 class Cores:
@@ -239,7 +242,8 @@ class Cores:
     """
 
     def __init__(self, shards: int) -> None:
-        self.awake = min(shards, len(CPUS) - 1)
+        self._cpus = own_cpus()
+        self.awake = min(shards, len(self._cpus) - 1)
         self._until_look = 0
         self._client = -1
         self._chosen = [0] * shards
@@ -251,9 +255,9 @@ class Cores:
         if self._until_look < 0:
             self._until_look = _LOOK_EVERY
             client = self._getcpu() if self._getcpu is not None else -1
-            if client != self._client and client in CPUS:
+            if client != self._client and client in self._cpus:
                 self._client = client
-                self._chosen = place(len(self._chosen), self.awake, client, CPUS)
+                self._chosen = place(len(self._chosen), self.awake, client, self._cpus)
         return self._chosen
 
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from envhub_sandbox.errors import EnvHubError, RemoteProtocolError, WorkerDiedError
 from envhub_sandbox.transport.connection import Source
-from envhub_sandbox.transport.deadline import CPUS, Cores, Deadline, SpinChooser
+from envhub_sandbox.transport.deadline import Cores, Deadline, SpinChooser, own_cpus
 from envhub_sandbox.transport.jail import Frames, Request
 from envhub_sandbox.transport.lane import Lane
 from envhub_sandbox.transport.replies import RunnersDiedError, typed_reply
@@ -89,7 +89,7 @@ class SharedMemoryLane(Lane):
         self._step_bytes = sum(one.action_bytes for one in layouts), observed.batch_bytes
         # as many workers of the same environment are on this machine, or may be
         workers = -(-manifest.num_envs // results.count)
-        may_spin = _ORDERED_STORES and workers < len(CPUS)
+        may_spin = _ORDERED_STORES and workers < len(own_cpus())
         self._spin = self._step_spin = SpinChooser(may_spin)
         self._talk_spin = SpinChooser(may_spin)  # messages take another time than steps
         self._fetching: tuple[int, Sequence[int]] = 0, ()  # for which request, of which shards

@@ -6,6 +6,7 @@ Which shard runs on which core.
 from __future__ import annotations
 
 import math
+import os
 
 import pytest
 
@@ -87,8 +88,17 @@ def test_one_core_is_the_clients(monkeypatch: pytest.MonkeyPatch, shards: int) -
     """Shards that find no other core sleep: the first of them shares the client's."""
     assert place(4, 1, 0, [0, 1]) == [2, 1, 2, 1]
     assert place(2, 0, 5, [5]) == [6, 6]
-    monkeypatch.setattr(module, "CPUS", [0, 1])
+    monkeypatch.setattr(module, "own_cpus", lambda: [0, 1])
     assert Cores(shards).awake == 1
+
+
+@pytest.mark.parametrize("count", [1, 4])
+def test_a_program_may_keep_to_fewer_cores_after_its_imports(
+    monkeypatch: pytest.MonkeyPatch, count: int
+) -> None:
+    """As a trainer does with each of its processes: an environment uses those that there are."""
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: set(range(count)))
+    assert Cores(9).awake == count - 1
 
 
 # --- Deadlines: asked for what is left, in any unit, for any length
