@@ -355,6 +355,8 @@ class SharedMemoryLane(Lane):
     def catch_up(self, deadline: Deadline) -> None:
         """See ``Lane``."""
         super().catch_up(deadline)
+        # with what ``answered`` has asked for besides: it is asked for anew
+        self._settled_ns, self._fetching = 0, (0, ())
         if self._asked == _STEP:
             self._outcomes(deadline)  # wanted or not: later columns are of the schema they bring
         elif self._asked != _BY_SERVER:

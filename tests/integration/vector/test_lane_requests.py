@@ -10,12 +10,14 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import RemoteEnvError, RemoteProtocolError
+from envhub_sandbox.session.parts import worker_queue
 from envhub_sandbox.transport.deadline import Deadline, StepDeadline
 from envhub_sandbox.transport.shared_memory.served_lane import ServedLane
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, limits_for
 from envhub_worker.protocol.shared_memory import slabs
 from tests.support import inside
 from tests.support.compare import assert_same
+from tests.support.in_process.interrupts import before_line
 from tests.support.objects.pipelines import changing, one_by_one, several_at_once
 from tests.support.repositories import STILL, write_repository
 from tests.support.started import started
@@ -94,6 +96,24 @@ def test_large_and_small_answers_are_not_mixed_up(talker: Path, num_workers: int
     """Whatever did not fit the lane is fetched for the request that it belongs to."""
     by_lane = conversation(talker, "auto", num_workers)
     assert_same(conversation(talker, "frames", num_workers), by_lane)
+
+
+@pytest.mark.parametrize("lane", ["auto", "frames"])
+def test_ctrl_c_while_a_large_answer_is_taken_leaves_the_next_reset_its_own(
+    talker: Path, lane: str
+) -> None:
+    """What did not fit has been asked for by then: it is dropped with the answer, and the same
+    process goes on."""
+    with make_env(talker, 2, lane=lane) as suites:
+        env = suites.env
+        asked, moment, came = 0, 0, True
+        while came:
+            env.send_reset(options={"large": True})
+            came = before_line(worker_queue.__file__, moment, env.recv)
+            asked += 2
+            assert env.reset()[0].tolist() == [[asked] * 2] * 2, moment
+            moment += 1
+        assert moment > 5
 
 
 @pytest.mark.parametrize(("lane", "restart"), [("auto", "on_reset"), ("frames", "transparent")])
