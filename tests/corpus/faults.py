@@ -286,8 +286,8 @@ _ENDS = {
         "a step without an end": _STEP + "time.sleep(3600)",
         "a reset without an end": _RESET + "time.sleep(3600)",
     },
-    "slow-steps": {"a step that takes long": _STEP + "time.sleep(0.03)" + _STEPPED},
-    "slow-resets": {"a reset that takes long": _RESET + "time.sleep(0.05)" + _RESULT},
+    "slow-steps": {"a step that takes long": _STEP + "time.sleep(0.06)" + _STEPPED},
+    "slow-resets": {"a reset that takes long": _RESET + "time.sleep(0.3)" + _RESULT},
 }
 _RENDERS = {
     "render": {
@@ -425,8 +425,9 @@ _PARTICULAR: dict[str, dict[str, Any]] = {
     "no end": {"settings": {"episode_steps": 300}},
     "a step without an end": {"arguments": _SHORT},
     "a reset without an end": {"arguments": _SHORT},
-    "a step that takes long": {"settings": {"slow_step_s": 0.01, "steps": 4}},
-    "a reset that takes long": {"settings": {"slow_step_s": 0.01, "steps": 4}},
+    # what does not sleep takes less than half of that where ten tests share a core
+    "a step that takes long": {"settings": {"slow_step_s": 0.05, "steps": 4}},
+    "a reset that takes long": {"settings": {"slow_step_s": 0.05, "steps": 4}},
     "a program in each reset": {"also": frozenset({"source-process"})},
     "a fork in each reset": {"also": frozenset({"source-process"})},
     "sockets in each reset": {"also": frozenset({"source-network"})},
