@@ -72,6 +72,9 @@ def test_a_snapshot_is_a_real_read_only_tree(uploads: Uploads) -> None:
     for path in [tree, *tree.rglob("*")]:
         assert not path.is_symlink()
         assert not path.stat().st_mode & 0o222
+    home = tree.parents[1]
+    for path in (uploads.folder, home, *home.iterdir()):
+        assert not path.stat().st_mode & 0o066, "another user of the machine can find it"
 
 
 def test_bytes_with_another_hash_are_refused(uploads: Uploads) -> None:
@@ -199,7 +202,8 @@ def test_copies_are_charged(uploads: Uploads, monkeypatch: pytest.MonkeyPatch) -
     with pytest.raises(RefusedError, match="--max-upload"):
         bring(uploads, *files)
     assert brought(uploads) == 2 * BLOCK_BYTES
-    bring(uploads, *files[:2])
+    tree = Path(uploads.tree(ALICE, bring(uploads, *files[:2])))
+    assert [path.stat().st_mode & 0o777 for path in tree.iterdir()] == [0o444] * 2
     assert uploads.used_bytes(ALICE) == (2 + 2 + 2 * 2) * BLOCK_BYTES
     assert Uploads(uploads.folder, Quotas()).used_bytes(ALICE) == uploads.used_bytes(ALICE)
 
@@ -238,6 +242,7 @@ def test_what_is_half_deleted_is_made_again(uploads: Uploads) -> None:
     assert (tree / "env.py").read_bytes() == b"one"
     (tree / "sub").chmod(0o755)
     (tree / "sub" / "more.py").unlink()
+    (tree / "sub" / "more.py").write_bytes(b"half")
     for blob in uploads.folder.glob("*/blobs/*"):
         blob.unlink()
     assert bring(uploads, *files) == snapshot

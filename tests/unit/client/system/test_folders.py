@@ -57,6 +57,16 @@ def test_modes_do_not_follow_the_umask(tmp_path: Path, mask: int) -> None:
     assert [mode(tmp_path / name) for name in ("c/file", "cache/manifests/key")] == [0o600] * 2
 
 
+def test_nobody_gets_into_a_folder_before_it_has_its_mode(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before: list[int] = []
+    monkeypatch.setattr(os, "chmod", lambda path, _: before.append(mode(Path(path))))
+    with umask(0):
+        folders.make(tmp_path / "a" / "b")
+    assert before == [0o700] * 2
+
+
 def test_folder_that_is_there_keeps_its_mode_unless_it_is_private(tmp_path: Path) -> None:
     """What the user made stays as it is; what is ours alone is closed again."""
     (tmp_path / "his").mkdir()
