@@ -9,6 +9,7 @@ import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -116,6 +117,41 @@ def test_folder_that_others_can_write_is_named_and_mended(
     assert command in str(caught.value)
     subprocess.run(command, shell=True, check=True)
     assert store.load(slot) is not None
+
+
+@pytest.mark.parametrize(
+    ("why", "user", "members", "group_of_another", "access_lists"),
+    [
+        ("", 1000, ["me"], 8, []),
+        ("root", 0, ["me"], 8, []),
+        ("a member", 1000, ["me", "another"], 8, []),
+        ("another user of that group", 1000, [], 7, []),
+        ("an access list", 1000, [], 8, ["system.posix_acl_access"]),
+    ],
+)
+def test_a_users_own_group_has_nobody_else(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    why: str,
+    user: int,
+    members: list[str],
+    group_of_another: int,
+    access_lists: list[str],
+) -> None:
+    """Above the store it may write, as many systems set homes up; any other may not."""
+    me = SimpleNamespace(pw_name="me", pw_uid=user, pw_gid=7)
+    another = SimpleNamespace(pw_name="another", pw_uid=1001, pw_gid=group_of_another)
+    group = SimpleNamespace(gr_name="mine", gr_gid=7, gr_mem=members)
+    monkeypatch.setattr("pwd.getpwuid", lambda _: me)
+    monkeypatch.setattr("pwd.getpwall", lambda: [me, another])
+    monkeypatch.setattr("grp.getgrgid", lambda _: group)
+    monkeypatch.setattr("os.listxattr", lambda _: access_lists)
+    monkeypatch.setattr(folders, "user_id", lambda: user)
+    monkeypatch.setattr(folders, "is_trusted", lambda _: True)
+    ours = tmp_path / "above" / "ours"
+    ours.mkdir(parents=True)
+    ours.parent.chmod(0o770)
+    assert bool(folders.why_distrusted(ours, ours)) == bool(why)
 
 
 def test_sticky_folder_above_the_store_is_no_reason(snapshot_store: Path, slot: store.Slot) -> None:

@@ -188,6 +188,12 @@ def test_slabs_have_sizes_that_are_served(ours: Jails) -> None:
     for slabs in ((1, -1, *SLABS[1:]), (1, *SLABS[:2], 0), (1, *SLABS[:2], 1 << 40), (1, 0, 1, 64)):
         with pytest.raises(RefusedError, match="no slabs are made"):
             ours.share(MINE, m.ShareSlabs(entry.number, (slabs,)))
+    for refused, why in ((((1, *SLABS),) * 2, "named twice"), (((2, *SLABS),), "no runner 2")):
+        with pytest.raises(RefusedError, match=why):
+            ours.share(MINE, m.ShareSlabs(entry.number, refused))
+    small = opened(ours, limits=Limits(memory_bytes=sum(SLABS) - 1))
+    with pytest.raises(RefusedError, match="more than memory_bytes"):
+        ours.share(MINE, m.ShareSlabs(small.number, ((1, *SLABS),)))
 
 
 def test_another_hosts_client_chooses_no_larger_messages(ours: Jails, tmp_path: Path) -> None:
