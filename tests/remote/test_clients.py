@@ -125,6 +125,7 @@ def test_what_breaks_a_rule_is_refused(alice: Any, mallory: Peer) -> None:
     replies = m.Done(), m.Welcome(2, "", 1), m.Sessions(({"client": "nobody"},), {})
     for message in (*replies, m.Deposit(b"", 1, 1), m.Close(1)):
         assert "is no request" in mallory.refused(message).message
+    assert "too long" in mallory.refused(m.Hello(m.VERSION, b"n" * 65)).message
     shown = mallory.ask(m.GetSessions())
     assert isinstance(shown, m.Sessions)
     assert {one["client"] for one in shown.sessions if isinstance(one, dict)} == {"mallory"}

@@ -296,6 +296,20 @@ def test_a_text_is_kept_and_recalled(tmp_path: Path) -> None:
     assert (tmp_path / "file").read_text() == ""
 
 
+def test_no_link_is_followed_when_a_tree_is_removed(tmp_path: Path) -> None:
+    tree, elsewhere, link = (tmp_path / name for name in ("tree", "elsewhere", "link"))
+    for folder in (tree / "sub", elsewhere):
+        folder.mkdir(parents=True)
+    (elsewhere / "kept").write_text("")
+    for one in (tree / "sub" / "link", link):
+        one.symlink_to(elsewhere)
+    (tree / "sub").chmod(0o555)
+    for path in (tree, link):
+        folders.remove_tree(path)
+    assert not tree.exists()
+    assert (elsewhere / "kept").exists()
+
+
 def test_a_draft_is_private_and_goes_unless_it_is_moved(tmp_path: Path) -> None:
     with pytest.raises(KeyboardInterrupt), folders.draft(tmp_path) as made:
         interrupted(made)
