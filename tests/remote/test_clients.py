@@ -132,6 +132,9 @@ def test_what_breaks_a_rule_is_refused(alice: Any, mallory: Peer) -> None:
     shown = mallory.ask(m.GetSessions())
     assert isinstance(shown, m.Sessions)
     assert {one["client"] for one in shown.sessions if isinstance(one, dict)} == {"mallory"}
+    assert set(shown.server["clients"]) == {"mallory"}
+    assert shown.server.keys().isdisjoint({"pid", "disk", "connections"}), "the operator's"
+    assert isinstance(mallory.ask(m.KeepAlive(({},))), m.Done)
 
 
 def test_noise_with_a_key_is_dropped(shared: Listening, alice: Any) -> None:
