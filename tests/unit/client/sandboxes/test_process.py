@@ -285,7 +285,7 @@ class OneContainer:
     ],
 )
 def test_what_runs_for_a_client_of_another_machine_is_left_alone(
-    tmp_path: Path, client: str, status: str, stale: bool
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, client: str, status: str, stale: bool
 ) -> None:
     """An engine may be reached from many machines: whether their processes live is unknown here."""
     if client == "dead":
@@ -297,3 +297,5 @@ def test_what_runs_for_a_client_of_another_machine_is_left_alone(
         name = folder(tmp_path, "data", {"alive": ""}).name
     engine: Any = OneContainer(tmp_path / name, status)
     assert [one.name for one in leftovers.stale_containers(engine)] == ["it"] * stale
+    monkeypatch.setattr(leftovers, "user_id", lambda: os.geteuid() + 1)
+    assert not list(leftovers.stale_containers(engine)), "another user's"
