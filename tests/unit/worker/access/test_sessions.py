@@ -29,3 +29,5 @@ def test_a_session_has_so_many_connections() -> None:
         assert sessions.find(b"0", b"key") is session
     assert len(session.connections) == CONNECTIONS_OF_ONE
     assert sessions.find(b"1", b"key") is None
+    sessions.drop(session)
+    assert sessions.find(b"0", b"key") is None, "who is still connected has to say Hello again"
