@@ -253,7 +253,6 @@ def draft(folder: Path, prefix: str = BUILDING) -> Iterator[Path]:
     """A new folder (0700) to be filled and then renamed into place; otherwise it is removed."""
     made = Path(tempfile.mkdtemp(prefix=prefix, dir=folder))
     try:
-        made.chmod(PRIVATE_MODE)
         yield made
     finally:
         remove_tree(made)

@@ -117,17 +117,24 @@ def test_another_repository_is_a_snapshot_that_the_client_has_brought(
 
 
 def test_what_breaks_a_rule_is_refused(alice: Any, mallory: Peer) -> None:
-    """More bytes than may be in flight, of one request, too: nothing of it stays. Replies,
+    """More bytes or runners than the quotas; of one request, too: nothing of it stays. Replies,
     descriptors, and messages for runners are no requests; she is shown her own sessions only."""
     reply = mallory.refused(m.Relay(1, "step", ((1, 1),)), bytes(2 << 20))
     assert "not answered yet" in reply.message
-    assert "there is no jail" in mallory.refused(m.Relay(1, "s", ((1, 1),)), b"x").message
+    for _ in range(2):  # of what is answered neither: it takes more than half each time
+        reply = mallory.refused(m.Relay(1, "s", ((1, 1),)), bytes(600 << 10))
+        assert "there is no jail" in reply.message
+    assert "--max-runners" in mallory.refused(m.StartRunners(1, 10_000)).message
     replies = m.Done(), m.Welcome(2, "", 1), m.Sessions(({"client": "nobody"},), {})
     for message in (*replies, m.Deposit(b"", 1, 1), m.Close(1)):
         assert "is no request" in mallory.refused(message).message
+    assert "too long" in mallory.refused(m.Hello(m.VERSION, b"n" * 65)).message
     shown = mallory.ask(m.GetSessions())
     assert isinstance(shown, m.Sessions)
     assert {one["client"] for one in shown.sessions if isinstance(one, dict)} == {"mallory"}
+    assert set(shown.server["clients"]) == {"mallory"}
+    assert shown.server.keys().isdisjoint({"pid", "disk", "connections"}), "the operator's"
+    assert isinstance(mallory.ask(m.KeepAlive(({},))), m.Done)
 
 
 def test_noise_with_a_key_is_dropped(shared: Listening, alice: Any) -> None:

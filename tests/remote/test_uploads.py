@@ -15,7 +15,7 @@ from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_worker.access.quotas import Quotas
 from envhub_worker.access.store.blob_store import BLOCK_BYTES
-from envhub_worker.access.store.uploads import PREFIX, Uploads
+from envhub_worker.access.store.uploads import MAX_PIECE_BYTES, PREFIX, Uploads
 from envhub_worker.protocol import messages as m
 from envhub_worker.supervisor.records import RefusedError
 from tests.remote.listening import Listening, counting
@@ -72,6 +72,9 @@ def test_a_snapshot_is_a_real_read_only_tree(uploads: Uploads) -> None:
     for path in [tree, *tree.rglob("*")]:
         assert not path.is_symlink()
         assert not path.stat().st_mode & 0o222
+    home = tree.parents[1]
+    for path in (uploads.folder, home, *home.iterdir()):
+        assert not path.stat().st_mode & 0o066, "another user of the machine can find it"
 
 
 def test_bytes_with_another_hash_are_refused(uploads: Uploads) -> None:
@@ -84,7 +87,7 @@ def test_bytes_with_another_hash_are_refused(uploads: Uploads) -> None:
 
 
 def test_what_was_not_asked_for_is_refused(uploads: Uploads) -> None:
-    """Not asked for, out of order, or longer than it was said to be."""
+    """Not asked for, out of order, longer than it was said to be, or than one piece may be."""
     with pytest.raises(RefusedError, match="not asked for"):
         put(uploads, b"unasked")
     uploads.offer(OWNER, ALICE, offer(("a", b"12345678")), ())
@@ -93,6 +96,20 @@ def test_what_was_not_asked_for_is_refused(uploads: Uploads) -> None:
         uploads.put(OWNER, ALICE, m.PutBlob(sha256, 4), b"5678")
     with pytest.raises(RefusedError, match="larger"):
         uploads.put(OWNER, ALICE, m.PutBlob(sha256, 0), b"123456789")
+    with pytest.raises(RefusedError, match="too large"):
+        uploads.put(OWNER, ALICE, m.PutBlob(sha256, 0), bytes(MAX_PIECE_BYTES + 1))
+
+
+def test_few_files_are_on_their_way_at_once(
+    uploads: Uploads, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each that is begun is a file on disk and a running hash."""
+    monkeypatch.setattr(f"{Uploads.__module__}.MAX_PARTIAL", 1)
+    uploads.offer(OWNER, ALICE, offer(("a", b"12345"), ("b", b"54321")), ())
+    first, second = (m.PutBlob(hashlib.sha256(data).digest(), 0) for data in (b"12345", b"54321"))
+    uploads.put(OWNER, ALICE, first, b"1234")
+    with pytest.raises(RefusedError, match="on their way already"):
+        uploads.put(OWNER, ALICE, second, b"5432")
 
 
 def test_another_clients_files_cannot_be_had_by_their_hash(uploads: Uploads) -> None:
@@ -119,6 +136,7 @@ def test_the_longest_unused_make_room_and_those_in_use_stay(uploads: Uploads) ->
     os.utime(first, (1, 1))
     with pytest.raises(RefusedError, match="--max-upload"):
         uploads.offer(OWNER, ALICE, offer(("env.py", b"2" * SIX)), {first})
+    assert uploads.used_bytes(ALICE) == SIX + BLOCK_BYTES  # nothing is kept for what was refused
     bring(uploads, ("env.py", b"2" * SIX))
     assert not Path(first).exists()
     assert uploads.used_bytes(ALICE) == SIX + BLOCK_BYTES
@@ -184,7 +202,8 @@ def test_copies_are_charged(uploads: Uploads, monkeypatch: pytest.MonkeyPatch) -
     with pytest.raises(RefusedError, match="--max-upload"):
         bring(uploads, *files)
     assert brought(uploads) == 2 * BLOCK_BYTES
-    bring(uploads, *files[:2])
+    tree = Path(uploads.tree(ALICE, bring(uploads, *files[:2])))
+    assert [path.stat().st_mode & 0o777 for path in tree.iterdir()] == [0o444] * 2
     assert uploads.used_bytes(ALICE) == (2 + 2 + 2 * 2) * BLOCK_BYTES
     assert Uploads(uploads.folder, Quotas()).used_bytes(ALICE) == uploads.used_bytes(ALICE)
 
@@ -223,6 +242,7 @@ def test_what_is_half_deleted_is_made_again(uploads: Uploads) -> None:
     assert (tree / "env.py").read_bytes() == b"one"
     (tree / "sub").chmod(0o755)
     (tree / "sub" / "more.py").unlink()
+    (tree / "sub" / "more.py").write_bytes(b"half")
     for blob in uploads.folder.glob("*/blobs/*"):
         blob.unlink()
     assert bring(uploads, *files) == snapshot

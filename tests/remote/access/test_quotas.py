@@ -44,6 +44,7 @@ def order(python: str = "", **policy: Any) -> tuple[m.OpenJail, Confinement]:
         ({"readable": ("/etc",)}, None),
         ({"network": "host"}, {"network": True}),
         ({"gpu": True}, {"gpu": True}),
+        ({"gpu": (0,)}, {"gpu": True}),
         ({"profile": "no-userns"}, {"weakest_profile": "no-userns"}),
         ({"profile": "container"}, {"weakest_profile": "container"}),
     ],

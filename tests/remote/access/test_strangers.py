@@ -15,6 +15,7 @@ import numpy as np
 import psutil
 import pytest
 import zmq
+from zmq.utils.monitor import parse_monitor_message
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerError
@@ -139,9 +140,12 @@ def test_nobody_comes_in_while_nobody_can_be_asked(tmp_path: Path) -> None:
             client.setsockopt(zmq.CURVE_SERVERKEY, inside.public_key(gate))
             client.setsockopt(zmq.CURVE_SECRETKEY, pair.secret)
             client.setsockopt(zmq.CURVE_PUBLICKEY, pair.public)
+            ends = client.get_monitor_socket(zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_DISCONNECTED)
             client.connect(f"tcp://127.0.0.1:{port}")
-            client.send(b"hello")
-            assert bool(router.poll(500 if enforced else 60_000)) is not enforced
+            assert ends.poll(60_000)
+            let_in = parse_monitor_message(ends.recv_multipart())["event"] != zmq.EVENT_DISCONNECTED
+            assert let_in is not enforced
+            client.disable_monitor()
             client.close()
             router.close(0)
 

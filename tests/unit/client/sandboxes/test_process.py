@@ -153,7 +153,9 @@ def alive(root: Path, name: str) -> Path:
 locks: list[LifeLock] = []
 
 
-def test_a_containers_folder_is_left_behind_when_its_client_is(tmp_path: Path) -> None:
+def test_a_containers_folder_is_left_behind_when_its_client_is(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """No process holds the lock of its client; without one nothing can be told.
 
     A name in a folder that everybody may write proves nothing: no link is followed.
@@ -170,6 +172,9 @@ def test_a_containers_folder_is_left_behind_when_its_client_is(tmp_path: Path) -
     there = set(tmp_path.iterdir())
     [path] = stale_folders(tmp_path)
     assert path.name == "envhub-docker-dead0000"
+    with monkeypatch.context() as patch:
+        patch.setattr("envhub_sandbox.sandboxes.process.user_id", lambda: os.geteuid() + 1)
+        assert found(tmp_path) == set()  # nor is what belongs to another user
     assert leftovers.Leftover("folder", str(path)).remove()
     assert set(tmp_path.iterdir()) == there - {path}
 
@@ -276,15 +281,21 @@ class OneContainer:
         ("another machine's", "created", False),
         ("another machine's", "paused", False),
         ("another machine's", "exited", True),
+        ("no folder of ours", "running", False),
     ],
 )
 def test_what_runs_for_a_client_of_another_machine_is_left_alone(
-    tmp_path: Path, client: str, status: str, stale: bool
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, client: str, status: str, stale: bool
 ) -> None:
     """An engine may be reached from many machines: whether their processes live is unknown here."""
     if client == "dead":
         folder(tmp_path, "envhub-docker-client00", {"alive": ""})
     elif client == "alive":
         alive(tmp_path, "envhub-docker-client00")
-    engine: Any = OneContainer(tmp_path / "envhub-docker-client00", status)
+    name = "envhub-docker-client00"
+    if client == "no folder of ours":  # whatever a label says
+        name = folder(tmp_path, "data", {"alive": ""}).name
+    engine: Any = OneContainer(tmp_path / name, status)
     assert [one.name for one in leftovers.stale_containers(engine)] == ["it"] * stale
+    monkeypatch.setattr(leftovers, "user_id", lambda: os.geteuid() + 1)
+    assert not list(leftovers.stale_containers(engine)), "another user's"

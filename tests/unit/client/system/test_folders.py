@@ -9,6 +9,7 @@ import subprocess
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -55,6 +56,16 @@ def test_modes_do_not_follow_the_umask(tmp_path: Path, mask: int) -> None:
     assert [mode(tmp_path / name) for name in ("a", "a/b", "c", "cache")] == [0o755] * 4
     assert [mode(tmp_path / name) for name in ("c/d", "cache/manifests")] == [0o700] * 2
     assert [mode(tmp_path / name) for name in ("c/file", "cache/manifests/key")] == [0o600] * 2
+
+
+def test_nobody_gets_into_a_folder_before_it_has_its_mode(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before: list[int] = []
+    monkeypatch.setattr(os, "chmod", lambda path, _: before.append(mode(Path(path))))
+    with umask(0):
+        folders.make(tmp_path / "a" / "b")
+    assert before == [0o700] * 2
 
 
 def test_folder_that_is_there_keeps_its_mode_unless_it_is_private(tmp_path: Path) -> None:
@@ -106,6 +117,41 @@ def test_folder_that_others_can_write_is_named_and_mended(
     assert command in str(caught.value)
     subprocess.run(command, shell=True, check=True)
     assert store.load(slot) is not None
+
+
+@pytest.mark.parametrize(
+    ("why", "user", "members", "group_of_another", "access_lists"),
+    [
+        ("", 1000, ["me"], 8, []),
+        ("root", 0, ["me"], 8, []),
+        ("a member", 1000, ["me", "another"], 8, []),
+        ("another user of that group", 1000, [], 7, []),
+        ("an access list", 1000, [], 8, ["system.posix_acl_access"]),
+    ],
+)
+def test_a_users_own_group_has_nobody_else(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    why: str,
+    user: int,
+    members: list[str],
+    group_of_another: int,
+    access_lists: list[str],
+) -> None:
+    """Above the store it may write, as many systems set homes up; any other may not."""
+    me = SimpleNamespace(pw_name="me", pw_uid=user, pw_gid=7)
+    another = SimpleNamespace(pw_name="another", pw_uid=1001, pw_gid=group_of_another)
+    group = SimpleNamespace(gr_name="mine", gr_gid=7, gr_mem=members)
+    monkeypatch.setattr("pwd.getpwuid", lambda _: me)
+    monkeypatch.setattr("pwd.getpwall", lambda: [me, another])
+    monkeypatch.setattr("grp.getgrgid", lambda _: group)
+    monkeypatch.setattr("os.listxattr", lambda _: access_lists)
+    monkeypatch.setattr(folders, "user_id", lambda: user)
+    monkeypatch.setattr(folders, "is_trusted", lambda _: True)
+    ours = tmp_path / "above" / "ours"
+    ours.mkdir(parents=True)
+    ours.parent.chmod(0o770)
+    assert bool(folders.why_distrusted(ours, ours)) == bool(why)
 
 
 def test_sticky_folder_above_the_store_is_no_reason(snapshot_store: Path, slot: store.Slot) -> None:
@@ -248,6 +294,20 @@ def test_a_text_is_kept_and_recalled(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     folders.keep(tmp_path / "file", "key", "text")  # which is no error: a cache is a favour
     assert (tmp_path / "file").read_text() == ""
+
+
+def test_no_link_is_followed_when_a_tree_is_removed(tmp_path: Path) -> None:
+    tree, elsewhere, link = (tmp_path / name for name in ("tree", "elsewhere", "link"))
+    for folder in (tree / "sub", elsewhere):
+        folder.mkdir(parents=True)
+    (elsewhere / "kept").write_text("")
+    for one in (tree / "sub" / "link", link):
+        one.symlink_to(elsewhere)
+    (tree / "sub").chmod(0o555)
+    for path in (tree, link):
+        folders.remove_tree(path)
+    assert not tree.exists()
+    assert (elsewhere / "kept").exists()
 
 
 def test_a_draft_is_private_and_goes_unless_it_is_moved(tmp_path: Path) -> None:

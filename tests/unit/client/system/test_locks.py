@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from envhub_sandbox.system.locks import LifeLock, SharedLock, held, is_held, sharers
+from envhub_sandbox.system.locks import LifeLock, SharedLock, held, is_held, lock, sharers
 
 SHARE = """
 import sys, time
@@ -45,6 +45,24 @@ def test_a_lock_is_held_until_its_context_ends(tmp_path: Path) -> None:
     assert not is_held(tmp_path / "life")
     SharedLock(tmp_path / "record").release()
     assert not (tmp_path / "record").exists(), "no file is made, and none is needed"
+
+
+def test_the_lock_of_a_file_that_was_replaced_is_none(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever comes next would have one as well: of the file that has the name now."""
+    path, taken = tmp_path / "lock", []
+
+    def take(descriptor: int, **how: bool) -> None:
+        lock(descriptor, **how)
+        if not taken:  # its holder has removed it, and another has made it anew
+            path.unlink()
+            path.touch()
+        taken.append(descriptor)
+
+    monkeypatch.setattr("envhub_sandbox.system.locks.lock", take)
+    with held(path, wait_s=60):
+        assert is_held(path)
 
 
 def test_an_interrupted_wait_leaves_no_descriptor(tmp_path: Path) -> None:

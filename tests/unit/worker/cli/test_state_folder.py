@@ -71,6 +71,33 @@ def test_a_state_folder_of_somebody_else_is_not_used(
     folder = tmp_path / f"envhub-worker-{os.getuid()}"
     assert state_folder.state_dir(None, create=True) == folder
     folder.chmod(0o777)
+    for create in (True, False):
+        assert state_folder.state_dir(None, create=create) is None
+    folder.rename(tmp_path / "elsewhere")
+    (tmp_path / "elsewhere").chmod(0o700)
+    folder.symlink_to("elsewhere")
     assert state_folder.state_dir(None, create=True) is None
     monkeypatch.chdir(tmp_path)
     assert state_folder.state_dir(Path("here"), create=True) == tmp_path / "here"
+
+
+def test_keys_are_kept_where_others_can_change_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whether it was chosen, or is where a server's note is looked for."""
+    chosen = tmp_path / "chosen"
+    chosen.mkdir(mode=0o700)
+    assert state_folder.state_dir(chosen, create=True) == chosen
+    chosen.chmod(0o720)
+    with pytest.raises(PermissionError, match="mode 0720"):
+        state_folder.state_dir(chosen, create=True)
+    chosen.chmod(0o700)
+    (tmp_path / "envhub-worker").mkdir(mode=0o700)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path))
+    monkeypatch.setattr("tempfile.tempdir", "/proc/nowhere")
+    assert state_folder.state_dir(None, create=False) == tmp_path / "envhub-worker"
+    another = os.getuid() + 1
+    monkeypatch.setattr("os.getuid", lambda: another)
+    with pytest.raises(PermissionError, match="it belongs to uid"):
+        state_folder.state_dir(chosen, create=True)
+    assert state_folder.state_dir(None, create=False) is None

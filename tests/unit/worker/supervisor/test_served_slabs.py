@@ -143,6 +143,13 @@ def test_a_server_sleeps_when_an_answer_takes_long(served: Served) -> None:
     assert len(taken) == 1
 
 
+def test_no_client_keeps_a_server_awake(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It may ask for that, up to a bound: the server is others', too."""
+    monkeypatch.setattr(served_slabs, "perf_counter_ns", itertools.count(0, 15_000).__next__)
+    served.ask(spin_ns=2**64 - 1)
+    assert any(served.steps.look() != 0 for _ in range(1000))
+
+
 def test_both_sides_sleep_where_waiting_awake_is_not_permitted(
     served: Served, monkeypatch: pytest.MonkeyPatch
 ) -> None:

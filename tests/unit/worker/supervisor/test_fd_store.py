@@ -1,0 +1,45 @@
+"""What a server keeps of descriptors that are brought: five of a known runner's, and no others."""
+
+from __future__ import annotations
+
+import os
+import socket
+from pathlib import Path
+
+import pytest
+
+from envhub_worker.protocol import messages as m
+from envhub_worker.supervisor.fd_store import FDS, FdStore
+
+DEPOSIT = b"".join(m.pack(m.Deposit(b"mine", 1, 1)))
+
+
+@pytest.mark.parametrize(
+    ("said", "count", "pidfd", "reply"),
+    [
+        (DEPOSIT, FDS, 0, m.TAKEN),
+        (DEPOSIT, FDS, -1, m.NOT_YET),
+        (DEPOSIT, FDS, None, b""),
+        (DEPOSIT, FDS - 1, 0, b""),
+        (DEPOSIT, 0, 0, b""),
+        (b"noise", FDS, 0, b""),
+        (b"".join(m.pack(m.Done())), FDS, 0, b""),
+        (None, 0, 0, b""),  # it says nothing, and keeps nobody waiting for long
+    ],
+)
+def test_what_is_not_taken_is_closed(
+    tmp_path: Path, said: bytes | None, count: int, pidfd: int | None, reply: bytes
+) -> None:
+    store = FdStore(str(tmp_path / "fds"), lambda _: pidfd)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as client:
+        client.connect(str(tmp_path / "fds"))
+        if said is not None:
+            socket.send_fds(client, [said], [0] * count)
+        before = len(os.listdir("/proc/self/fd"))
+        store.accept()
+        kept = FDS if reply == m.TAKEN else 0
+        assert len(os.listdir("/proc/self/fd")) == before + kept
+        answer, given, _, _ = socket.recv_fds(client, 64, 1)
+        assert (answer, len(given)) == (reply, int(reply == m.TAKEN))
+        assert len(store.take(1, 1)) == kept
+    store.close()
