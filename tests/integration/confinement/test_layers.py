@@ -83,6 +83,7 @@ SECRETS = [
     ("open('{store}/other/env.py').read()", "theirs"),
     ("open('/proc/{server}/environ').read()", "PATH"),
     ("open('/proc/{process}/cmdline').read()", "sleep"),
+    ("open('/etc/profile').read()", "PATH"),
 ]
 """How each is read, and what is in it. Programs are given secrets as arguments."""
 
@@ -392,6 +393,12 @@ result["uid"] = os.getuid()
     assert status["uid"] != 0
     if os.geteuid() == 0:
         assert os.stat(f"/proc/{cell.wait_for(RunnerStarted).pid}").st_uid > 60000
+
+
+def test_the_kernel_ends_a_jail_before_anything_else_of_the_host(cell: Cell) -> None:
+    """Where the host itself has no memory left."""
+    runner = cell.wait_for(RunnerStarted).pid
+    assert Path(f"/proc/{runner}/oom_score_adj").read_text() == "1000\n"
 
 
 def test_command_line_of_a_runner_tells_nothing(cell: Cell) -> None:

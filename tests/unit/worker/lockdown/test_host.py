@@ -71,6 +71,14 @@ def test_roots_jails_get_a_user_that_nobody_is() -> None:
     owners = {os.stat(one).st_uid for one in Path("/proc").glob("[0-9]*") if one.exists()}
     assert user.unused_uid() not in owners
 
+    def groups() -> str:
+        os.setgroups([4, 27])
+        user.become(chosen)
+        return f"{os.getresuid()} {os.getresgid()} {os.getgroups()}"
+
+    alone = (chosen, chosen, chosen)
+    assert probe.try_layer("user", groups)["detail"] == f"{alone} {alone} []"
+
 
 def test_a_layer_is_tried_in_a_child() -> None:
     def dies() -> str:
