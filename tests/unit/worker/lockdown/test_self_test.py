@@ -1,4 +1,4 @@
-"""What a runner tries before a stranger's code: where nothing confines, none of it is found true."""
+"""What a runner tries before a stranger's code: where nothing confines, all of it goes through."""
 
 from __future__ import annotations
 

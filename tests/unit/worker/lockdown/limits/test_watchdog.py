@@ -296,6 +296,10 @@ def test_tree_of_any_depth_and_mode_is_removed(tmp_path: Path) -> None:
     (tree / "locked").chmod(0)
     remove_tree(str(tree))
     assert not tree.exists()
+    tree.symlink_to(outside)
+    with pytest.raises(OSError, match="Not a directory"):
+        remove_tree(str(tree))
+    tree.unlink()
     assert (outside / "kept").exists()
     remove_tree(str(tree))  # what is not there is no error
 
