@@ -391,6 +391,19 @@ def test_strict_store_shows_one_snapshot_and_no_mount_permits_more_than_it_must(
 
 
 @pytest.mark.short
+def test_strict_jails_of_one_zygote_share_no_namespace(cells: dict[str, Cell]) -> None:
+    """Nor with the host; the name of the host, which none can change, is their zygote's."""
+    first = cells["strict"]
+    second = new_cell(first.spawner, first.jail.spec.snapshot, Confinement())
+    second.start()
+    pids = [cell.wait_for(RunnerStarted).pid for cell in (first, second)]
+    for name in ("cgroup", "ipc", "mnt", "net", "pid", "user", "uts"):
+        found = {os.readlink(f"/proc/{pid}/ns/{name}") for pid in (*pids, os.getpid())}
+        assert len(found) == (2 if name == "uts" else 3), name
+    second.jail.kill()
+
+
+@pytest.mark.short
 def test_strict_forbids_what_the_kernel_counts_for_the_user(cells: dict[str, Cell]) -> None:
     """Namespaces and watches, should the filter let them by."""
     names = "os.listdir('/proc/sys/user')"

@@ -113,6 +113,7 @@ def test_network_is_reported_as_chosen() -> None:
         (replace(STRICT, profile="no-userns"), {**USER, "landlock_abi": 2}, "landlock"),
         (replace(STRICT, profile="no-userns", network="loopback"), USER, "network-namespace"),
         (replace(STRICT, profile="container", network="loopback"), USER, "network-namespace"),
+        (replace(STRICT, profile="no-userns", display="virtual"), USER, "display"),
         (STRICT, {**USER, "machine": "riscv64"}, "seccomp"),
         (replace(STRICT, profile="lax"), USER, "profile"),
         (replace(STRICT, network="lan"), USER, "network"),
