@@ -150,9 +150,9 @@ def with_kit(confinement: Confinement) -> Confinement:
 
 
 @contextmanager
-def open_folder() -> Iterator[Path]:
+def open_folder(place: str | None = None) -> Iterator[Path]:
     """A folder that other users may cross, unlike pytest's: under root a jail is another user."""
-    with tempfile.TemporaryDirectory(prefix="confinement-") as name:
+    with tempfile.TemporaryDirectory(prefix="confinement-", dir=place) as name:
         os.chmod(name, 0o755)
         yield Path(name)
 

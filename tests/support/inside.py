@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -47,6 +47,7 @@ from envhub_worker.cli import listen, listen_options
 from envhub_worker.cli import status as status_command
 from envhub_worker.cli.identity import Identity
 from envhub_worker.lockdown.limits import cgroups
+from envhub_worker.lockdown.stages import runner as stages_runner
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.wire import Buffer
 from envhub_worker.protocol.lifecycle import Lifecycle, State
@@ -426,6 +427,16 @@ def zygote_pid(spawner: Spawner) -> int:
 def runtime_folder(spawner: Spawner) -> Path:
     """Where a spawner keeps its own files."""
     return spawner._folder
+
+
+#: Says whether an attempt of a runner's test of itself was denied, and takes what it found.
+DENIED: Spot = (stages_runner, "_denied")
+HOLD: Spot = (stages_runner, "_hold")
+
+
+def self_test(jail: Any, descriptors: Iterable[int]) -> None:
+    """What a runner tries at the end of its confinement."""
+    stages_runner._self_test(jail, descriptors)
 
 
 def step_aside(group: str) -> None:

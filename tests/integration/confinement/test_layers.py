@@ -15,6 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 
 from envhub_worker.protocol.confinement import Confinement
@@ -83,6 +84,7 @@ SECRETS = [
     ("open('{store}/other/env.py').read()", "theirs"),
     ("open('/proc/{server}/environ').read()", "PATH"),
     ("open('/proc/{process}/cmdline').read()", "sleep"),
+    ("open('/etc/profile').read()", "PATH"),
 ]
 """How each is read, and what is in it. Programs are given secrets as arguments."""
 
@@ -351,7 +353,7 @@ result = {
     "dev": sorted(os.listdir("/dev")),
     "net": [line.split(":")[0].strip() for line in open("/proc/net/dev").readlines()[2:]],
     "pids": [int(name) for name in os.listdir("/proc") if name.isdigit()],
-    "there": [p for p in ("/.scratch/upper", "/etc/shadow", "/etc/machine-id", "/sys/kernel")
+    "there": [p for p in ("/.scratch/home", "/etc/shadow", "/etc/machine-id", "/sys/kernel")
               if os.path.exists(p)],
     "writable": [p for p in ("/", "/usr", "/usr/bin", "/etc", "/dev", "/proc", "/sandbox", "/sys")
                  if os.access(p, os.W_OK)],
@@ -371,8 +373,48 @@ result = {
 
 
 @pytest.mark.short
+def test_strict_store_shows_one_snapshot_and_no_mount_permits_more_than_it_must() -> None:
+    """Where the store does not lie below /tmp, which each jail covers anyway."""
+    with open_folder("/var/tmp") as folder, cell_in(folder, Confinement()) as cell:
+        (folder / "other").mkdir()
+        source = f"import os; result = os.path.exists({str(folder / 'other')!r})"
+        assert (unconfined(source), cell.run(source)) == ({"result": True}, {"result": False})
+        lines = Path(f"/proc/{cell.wait_for(RunnerStarted).pid}/mountinfo").read_text().splitlines()
+    # of several at one place the last one is seen
+    options = {line.split()[4]: set(line.split()[5].split(",")) for line in lines}
+    nodes = {path for path in options if "nodev" not in options[path]}
+    assert all(path.startswith(("/dev/", "/proc/")) for path in nodes)
+    assert all("noexec" in options[path] for path in nodes)
+    assert all("nosuid" in one for one in options.values())
+    own = {"/sandbox/home", "/sandbox/work", "/tmp", "/dev/shm", "/proc", cell.jail.spec.snapshot}
+    assert {path for path in options if "ro" not in options[path]} - nodes <= own
+
+
+@pytest.mark.short
+def test_strict_jails_of_one_zygote_share_no_namespace(cells: dict[str, Cell]) -> None:
+    """Nor with the host; the name of the host, which none can change, is their zygote's."""
+    first = cells["strict"]
+    second = new_cell(first.spawner, first.jail.spec.snapshot, Confinement())
+    second.start()
+    pids = [cell.wait_for(RunnerStarted).pid for cell in (first, second)]
+    for name in ("cgroup", "ipc", "mnt", "net", "pid", "user", "uts"):
+        found = {os.readlink(f"/proc/{pid}/ns/{name}") for pid in (*pids, os.getpid())}
+        assert len(found) == (2 if name == "uts" else 3), name
+    second.jail.kill()
+
+
+@pytest.mark.short
+def test_strict_forbids_what_the_kernel_counts_for_the_user(cells: dict[str, Cell]) -> None:
+    """Namespaces and watches, should the filter let them by."""
+    names = "os.listdir('/proc/sys/user')"
+    source = f"import os; result = [open('/proc/sys/user/' + n).read() for n in {names}]"
+    assert set(unconfined(source)["result"]) != {"0\n"}
+    assert set(cells["strict"].run(source)["result"]) == {"0\n"}
+
+
+@pytest.mark.short
 def test_capabilities_and_privileges_are_gone(cell: Cell) -> None:
-    """As the kernel says it of the runner; an exec brings nothing back.
+    """As the kernel says it of the runner; an exec brings nothing back. Init has none either.
 
     As root, the jail runs as a user that owns and runs nothing; never as uid 0.
     """
@@ -390,8 +432,18 @@ result["uid"] = os.getuid()
     assert {int(status[name], 16) for name in sets} == {0}
     assert (status["NoNewPrivs"], status["Seccomp"]) == ("1", "2")
     assert status["uid"] != 0
+    init = psutil.Process(cell.wait_for(RunnerStarted).pid).ppid()
+    held = Path(f"/proc/{init}/status").read_text().split()
+    assert {held[held.index(f"{name}:") + 1] for name in sets} == {"0" * 16}
+    assert held[held.index("NoNewPrivs:") + 1] == "1"
     if os.geteuid() == 0:
         assert os.stat(f"/proc/{cell.wait_for(RunnerStarted).pid}").st_uid > 60000
+
+
+def test_the_kernel_ends_a_jail_before_anything_else_of_the_host(cell: Cell) -> None:
+    """Where the host itself has no memory left."""
+    runner = cell.wait_for(RunnerStarted).pid
+    assert Path(f"/proc/{runner}/oom_score_adj").read_text() == "1000\n"
 
 
 def test_command_line_of_a_runner_tells_nothing(cell: Cell) -> None:
@@ -537,7 +589,9 @@ BROKERED = (
     + """
 import subprocess
 victim = subprocess.Popen(["sleep", "1000"])
-with open_folder() as folder, cell_in(folder, Confinement(profile="container")) as cell:
+with open_folder() as folder, cell_in(
+    folder, Confinement(profile="container", record_denials=RECORDED)
+) as cell:
     print(cell.run(f"victim = {victim.pid}" + SOURCE))
     print(cell.run("import os; os.abort()"))
     print(cell.wait_for(RunnerExited).signal)
@@ -553,11 +607,13 @@ victim.wait()
 
 
 @needs("container")
-def test_init_sends_signals_where_landlock_does_not_keep_them_inside() -> None:
-    """To the jail's own processes in every way, and to none outside."""
+@pytest.mark.parametrize("recorded", [False, True])
+def test_init_sends_signals_where_landlock_does_not_keep_them_inside(recorded: bool) -> None:
+    """To the jail's own processes in every way, and to none outside; also where it is seen."""
     kit = os.path.dirname(KIT)
     head = RESTRICTED.partition("with open_folder")[0]
     source = head.format(kit=kit, restrict=BROKERED.replace("SOURCE", repr(SIGNALS)))
+    source = source.replace("RECORDED", str(recorded))
     done = python("-c", source)
     assert done.stderr == ""
     assert done.stdout.splitlines() == [

@@ -13,7 +13,7 @@ import pytest
 
 from envhub_worker.lockdown import probe
 from envhub_worker.lockdown.context import ZygoteConfig
-from envhub_worker.lockdown.mechanisms import mounts, user
+from envhub_worker.lockdown.mechanisms import mounts, process, user
 from envhub_worker.lockdown.stages import jail, zygote
 from envhub_worker.protocol.confinement import Limits
 
@@ -70,6 +70,19 @@ def test_roots_jails_get_a_user_that_nobody_is() -> None:
         pwd.getpwuid(chosen)
     owners = {os.stat(one).st_uid for one in Path("/proc").glob("[0-9]*") if one.exists()}
     assert user.unused_uid() not in owners
+
+    def groups() -> str:
+        os.setgroups([4, 27])
+        user.become(chosen)
+        return f"{os.getresuid()} {os.getresgid()} {os.getgroups()}"
+
+    def without_rights() -> str:
+        process.drop_capabilities()
+        return str(user.choose())
+
+    assert "no capability" in probe.try_layer("user", without_rights)["detail"]
+    alone = (chosen, chosen, chosen)
+    assert probe.try_layer("user", groups)["detail"] == f"{alone} {alone} []"
 
 
 def test_a_layer_is_tried_in_a_child() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import resource
 from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -11,9 +12,11 @@ import pytest
 from envhub_worker.lockdown.layers import LayerUnavailableError
 from envhub_worker.lockdown.mechanisms import landlock
 from envhub_worker.lockdown.mechanisms.landlock import Ruleset
+from envhub_worker.lockdown.mechanisms.mounts import View
 from envhub_worker.lockdown.mechanisms.namespaces import user_namespace_unavailable
+from envhub_worker.lockdown.mechanisms.scratch import Scratch
 from envhub_worker.lockdown.plan import plan
-from envhub_worker.lockdown.stages.runner import resource_limits
+from envhub_worker.lockdown.stages.runner import resource_limits, rules
 from envhub_worker.protocol.confinement import GIB, MIB, Confinement, Limits
 
 USER = {"machine": "x86_64", "root": False, "landlock_abi": 7, "memory": "watchdog"}
@@ -110,6 +113,7 @@ def test_network_is_reported_as_chosen() -> None:
         (replace(STRICT, profile="no-userns"), {**USER, "landlock_abi": 2}, "landlock"),
         (replace(STRICT, profile="no-userns", network="loopback"), USER, "network-namespace"),
         (replace(STRICT, profile="container", network="loopback"), USER, "network-namespace"),
+        (replace(STRICT, profile="no-userns", display="virtual"), USER, "display"),
         (STRICT, {**USER, "machine": "riscv64"}, "seccomp"),
         (replace(STRICT, profile="lax"), USER, "profile"),
         (replace(STRICT, network="lan"), USER, "network"),
@@ -164,6 +168,32 @@ def test_landlock_write_includes_neither_devices_nor_more_than_abi_one_to_five()
     assert landlock.WRITE & (landlock.MAKE_CHAR | landlock.MAKE_BLOCK | landlock.IOCTL_DEV) == 0
     assert landlock.WRITE < 2**16
     assert landlock.READ == landlock.EXECUTE | landlock.READ_FILE | landlock.READ_DIR
+
+
+@pytest.mark.parametrize("namespaced", [True, False])
+@pytest.mark.parametrize("gpu", [False, (0,)])
+def test_landlock_permits_writing_in_the_scratch_alone(
+    gpu: bool | tuple[int, ...], namespaced: bool
+) -> None:
+    """And to devices; with a GPU also the names of threads. Of processes a jail reads its own."""
+    jail: Any = SimpleNamespace(
+        common=SimpleNamespace(
+            root=SimpleNamespace(trees=("/usr",), devices=("/dev/null",)),
+            namespaced=namespaced,
+            config=SimpleNamespace(gpu=gpu),
+        ),
+        spec=SimpleNamespace(snapshot="/snapshot"),
+        scratch=Scratch.on_host("/jail"),
+        view=View({}, {"/snapshot": "no overlay"}),
+    )
+    permitted = {(rule.path, rule.access) for rule in rules(jail, 7)}
+    written = {(path, access) for path, access in permitted if access & ~landlock.READ}
+    scratch = {(f"/jail/{name}", landlock.WRITE) for name in ("home", "tmp", "work")}
+    threads = ("/proc" if namespaced else "/proc/7/task", landlock.WRITE_FILE | landlock.TRUNCATE)
+    assert written - scratch == {("/dev/null", landlock.DEVICE), *([threads] if gpu else [])}
+    shared = {"/", "/etc", "/proc", "/sys", "/dev", "/run"} & {path for path, _ in permitted}
+    assert shared == ({"/etc", "/proc", "/dev"} if namespaced else set())
+    assert namespaced or ("/proc/7", landlock.READ_DIR) in permitted
 
 
 def test_rlimits_follow_the_limits() -> None:

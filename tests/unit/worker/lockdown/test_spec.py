@@ -33,7 +33,8 @@ def test_an_ordinary_one_is_what_it_was() -> None:
         *({"readable": lie} for lie in ("/etc", [b"/etc"], ["/a"] * 65)),
         *({"environment": {"A": lie}} for lie in (b"b", "b" * (64 << 10), "b\0c")),
         *({"environment": ["A"]}, {"record_denials": 1}, {"display": ":0"}),
-        *({"limits": lie} for lie in (None, {"unknown": 1}, {"output_bytes": 1 << 30})),
+        *({"limits": lie} for lie in (None, {"unknown": 1}, {"memory_bytes": None})),
+        {"limits": {"output_bytes": 1 << 30}},
     ],
     ids=lambda changes: next(iter(changes)),
 )

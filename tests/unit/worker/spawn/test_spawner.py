@@ -102,17 +102,22 @@ def test_runner_holds_only_the_named_descriptors(cell: Cell) -> None:
 
 
 def test_runner_has_private_home_and_shows_the_snapshot(cell: Cell) -> None:
-    """HOME, TMPDIR and the working directory are the jail's own; the snapshot shows through."""
+    """HOME, TMPDIR and the working directory are the jail's own; the snapshot shows through.
+
+    No other user of the host may enter them, where they lie in its folders, or put others there.
+    """
     source = """
 import os, tempfile
 open('new.txt', 'w').write('x')
 home = os.path.expanduser('~')
 open(home + '/.config-file', 'w').write('x')
 result = [os.listdir(home), tempfile.gettempdir() == os.environ['TMPDIR'],
-          open('assets/a.txt').read(), open('env.py').read()]
+          open('assets/a.txt').read(), open('env.py').read(),
+          [os.stat(path).st_mode & 0o777 for path in (home, os.environ['TMPDIR'])],
+          os.stat(home + '/../..').st_mode & 0o022]
 """
     result = cell.run(source)["result"]
-    assert result == [[".config-file"], True, "asset", "VALUE = 7\n"]
+    assert result == [[".config-file"], True, "asset", "VALUE = 7\n", [0o700, 0o700], 0]
     assert not (Path(cell.jail.spec.snapshot) / "new.txt").exists()
 
 
@@ -132,16 +137,22 @@ def test_output_of_all_runners_arrives(cell: Cell) -> None:
         cell.wait_for_output(text)
 
 
-def test_killed_runner_takes_its_children_along(cell: Cell, folder: Path) -> None:
-    """kill_runner ends the runner and a child in a session of its own; others go on."""
+@pytest.mark.parametrize("killed", [True, False])
+def test_a_runner_that_ends_takes_its_children_along(
+    cell: Cell, folder: Path, killed: bool
+) -> None:
+    """Those of its session, and when it is killed all; others of its jail go on."""
     second = cell.start()
     mark = str(folder / "mark")
-    child = f"['/bin/sh', '-c', 'sleep 1000; : {mark}']"
-    cell.run(f"import subprocess; subprocess.Popen({child}, start_new_session=True)")
+    child = f"['/bin/sh', '-c', 'sleep 1000; : {mark}'], start_new_session={killed}"
+    cell.run(f"import subprocess; subprocess.Popen({child})")
     wait_until(lambda: processes_that_mention(mark), "the child never came")
-    cell.jail.kill_runner(1)
+    if killed:
+        cell.jail.kill_runner(1)
+    else:
+        cell.hang_up()
     exited = cell.wait_for(RunnerExited)
-    assert (exited.runner, exited.reason) == (1, "killed")
+    assert (exited.runner, exited.reason) == (1, "killed" if killed else "exit")
     wait_until(lambda: not processes_that_mention(mark), "the child lived on")
     assert cell.run("result = 1", second) == {"result": 1}
 

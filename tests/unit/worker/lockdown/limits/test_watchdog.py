@@ -7,6 +7,7 @@ import os
 import socket
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -100,17 +101,20 @@ def test_v2_processes_in_the_way_move_to_a_leaf(tmp_path: Path) -> None:
     assert moved == [(leaf, "7"), (leaf, "8")]
 
 
-def test_group_that_cannot_be_limited_is_not_left_behind(tmp_path: Path) -> None:
-    taken = tmp_path / "jail"
+@pytest.mark.parametrize("refused", ["memory.limit_in_bytes", "memory.max", "pids.max"])
+def test_group_that_cannot_be_limited_is_not_left_behind(tmp_path: Path, refused: str) -> None:
+    """Whichever of its limits the kernel refuses."""
+
+    def write(path: str, text: str) -> None:
+        if path.endswith(f"/{refused}"):
+            raise PermissionError(path)
+
+    kind = "cgroup-v2" if refused == "memory.max" else "cgroup-v1"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(*inside.CGROUP_WRITE, _refuse)
+        patch.setattr(*inside.CGROUP_WRITE, write)
         with pytest.raises(PermissionError):
-            Group("cgroup-v1", [str(taken), str(tmp_path / "pids")], Limits())
+            Group(kind, [str(tmp_path / "jail"), str(tmp_path / "pids")], Limits())
     assert list(tmp_path.iterdir()) == []
-
-
-def _refuse(path: str, text: str) -> None:
-    raise PermissionError(path)
 
 
 @pytest.mark.parametrize(
@@ -251,6 +255,15 @@ def test_sockets_that_nobody_has_count_in_a_network_of_their_own() -> None:
     assert done.returncode == 0, done.stderr
 
 
+def test_files_in_a_scratch_of_memory_are_measured() -> None:
+    watch = MemoryWatch(2**62, "/dev/shm")
+    before = watch.look([])[0]
+    with tempfile.TemporaryFile(dir="/dev/shm") as file:
+        file.write(bytes(32 * MIB))
+        file.flush()
+        assert watch.look([])[0] - before >= 24 * MIB
+
+
 def test_open_files_without_a_name_are_found(tmp_path: Path) -> None:
     device = os.stat(tmp_path).st_dev
     before = unlinked_bytes([os.getpid()], device)
@@ -296,6 +309,10 @@ def test_tree_of_any_depth_and_mode_is_removed(tmp_path: Path) -> None:
     (tree / "locked").chmod(0)
     remove_tree(str(tree))
     assert not tree.exists()
+    tree.symlink_to(outside)
+    with pytest.raises(OSError, match="Not a directory"):
+        remove_tree(str(tree))
+    tree.unlink()
     assert (outside / "kept").exists()
     remove_tree(str(tree))  # what is not there is no error
 

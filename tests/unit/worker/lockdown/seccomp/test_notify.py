@@ -112,3 +112,20 @@ def test_a_caller_that_has_gone_since_ends_nobody(to: str) -> None:
     target = -gone.pid if to == "its group" else 1
     asked = notify.Request(gone.pid, gone.pid, "kill", (target, 15, 0))
     assert notify.decide(asked, list) == errno.ESRCH
+
+
+@pytest.mark.parametrize("way", ["kill", "kill its group", "tkill", "tgkill"])
+def test_a_signal_goes_to_processes_of_the_jail_only(way: str) -> None:
+    """Init sends it, or refuses: the kernel goes on with what a caller sends to itself alone."""
+    one, other = (subprocess.Popen(["/bin/sleep", "99"], start_new_session=True) for _ in range(2))
+    call, pid = way.partition(" ")[0], one.pid
+    words = {"kill": (pid if way == "kill" else -pid, 15, 0), "tkill": (pid, 15, 0)}
+    asked = notify.Request(os.getpid(), os.getpid(), call, words.get(call, (pid, pid, 15)))
+    refused = errno.ESRCH if way == "kill its group" else errno.EPERM
+    assert notify.decide(asked, lambda: [other.pid]) == refused
+    assert [one.poll(), other.poll()] == [None, None]
+    assert notify.decide(asked, lambda: [one.pid, other.pid]) == 0
+    assert one.wait(20) == -signal.SIGTERM
+    assert other.poll() is None
+    other.kill()
+    other.wait()
