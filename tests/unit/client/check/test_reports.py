@@ -19,9 +19,9 @@ from tests.support.output.pages import HOSTILE
 
 def report(text: str) -> Report:
     """One in which a repository chose every word that it can."""
-    made = Report("./walk:env.py")
+    made = Report(text)
     made.add(Finding("runs", text, task=text, file=text, line=3))
-    made.judged("loads", [])
+    made.judged("loads", [], text)
     return made
 
 

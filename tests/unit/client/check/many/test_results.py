@@ -92,6 +92,8 @@ def test_what_was_judged_is_known_again(folder: Path) -> None:
         lambda json_, page: json_.write_text("[1]"),
         lambda json_, page: edit(json_, '"passed": false', '"passed": true'),
         lambda json_, page: edit(json_, '"runs"', '"nothing"'),
+        lambda json_, page: edit(json_, '"loads"', '"nothing"'),
+        lambda json_, page: edit(json_, '"checks": []', '"checks": ["nothing"]'),
         lambda json_, page: edit(json_, "1.5", "NaN"),
         lambda json_, page: edit(json_, "repo@main", "other@main"),
         lambda json_, page: (json_.unlink(), json_.symlink_to(page)),
