@@ -25,20 +25,22 @@ def report(text: str) -> Report:
     return made
 
 
-@pytest.mark.parametrize("text", HOSTILE)
+@pytest.mark.parametrize("text", [*HOSTILE, "x,col=9"])
 def test_what_a_stranger_writes_is_text_in_every_form(text: str) -> None:
     made = report(text)
     [line] = reports.workflow_commands(made)
     assert len(line.splitlines()) == 1, "the control is the text, which has a line of its own"
     head = line.split("title=")[0]
     assert head.startswith("::error file=")
-    assert ("\n" in head, head.count("::")) == (False, 1)
+    assert ("\n" in head, head.count("::"), head.count(",")) == (False, 1, 2)
+    told = line.split("::", 2)[2].replace("%0A", "\n").replace("%25", "%")  # as GitHub reads it
+    assert told.startswith(f"{made.findings[0].message}\n")
     assert line.count("::") == 2 + text.replace("\r", "").count("::")
 
     table = reports.summary(made, made.findings).splitlines()
     [row] = [line for line in table if line.startswith("| **fails**")]
     assert row.count("|") == 5, "one row of four cells"
-    assert not set("<>[]!`") & set(row), "nothing is a tag, a link or an image"
+    assert not set("<>[]!`") & set("".join(table)), "nothing is a tag, a link or an image"
 
     suite = ElementTree.fromstring(reports.junit(made, made.findings))
     assert (suite.attrib["tests"], suite.attrib["failures"]) == ("2", "1")

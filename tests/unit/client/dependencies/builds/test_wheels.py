@@ -68,6 +68,7 @@ def add(name: str, mode: int = 0o100644) -> Callable[[zipfile.ZipFile], None]:
         (add("../out/", stat.S_IFDIR | 0o755), "'..' step"),
         (add("/etc/out"), "absolute name"),
         (add("link", stat.S_IFLNK | 0o777), "link or a device"),
+        (add("pipe", stat.S_IFIFO | 0o644), "link or a device"),
         (add("unrecorded.py"), "lists other files"),
         (add("another-1.0.dist-info/METADATA"), "2 folders .dist-info"),
         (add("some_name/__init__.py"), "listed twice"),
