@@ -324,7 +324,7 @@ def test_secrets_are_in_no_traceback(
     caplog: pytest.LogCaptureFixture,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A token that the Hub echoes, also one that is stored, and a login in the endpoint's address."""
+    """A token that the Hub echoes, given or stored, and a login in the endpoint's address."""
     soon = {"Retry-After": "0"}  # else huggingface_hub asks again later each time
     endpoint = stub_hub.endpoint.replace("//", "//jane:hunter2@")
     token = "_".join(["hf", "secret"])

@@ -171,6 +171,7 @@ def test_a_verdict_is_a_sentence(found: list[str], allowed: list[str], says: str
     assert made.verdict(failures) == says
     assert says in reports.summary(made, failures)
     assert says in page(made, failures)
+    assert ('class="badge warning"' in page(made, failures)) == made.is_unjudged(failures)
 
 
 @pytest.mark.parametrize(
