@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import signal
 import threading
 from dataclasses import fields
@@ -10,6 +11,8 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
+from envhub_sandbox.check import reports
+from envhub_sandbox.check.findings import Report
 from envhub_sandbox.check.many.entries import ListEntry
 from envhub_sandbox.check.many.judgements import Outcome
 from envhub_sandbox.check.many.results import Result as Judgement
@@ -25,14 +28,18 @@ _RUNNER = CliRunner()
 
 @pytest.fixture
 def started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, list[str]]]:
-    """How many may run at once, and what would be run; each could not be judged."""
+    """How many may run at once, and what would be run; each could not be judged, by its exit code:
+    the report and the page that it has say that it passed.
+    """
     found: list[tuple[int, list[str]]] = []
+    passed = json.dumps(reports.document(Report("org/repo@abc"), [])).encode()
 
     def judgements(orders, command, *, folder, jobs, **_):  # type: ignore[no-untyped-def]
         for number, order in enumerate(orders):
             found.append((jobs, command(order, folder / str(number), 7)))
+            (folder / "page.html").touch()
             yield Outcome(
-                order=order, folder=folder, code=3, seconds=1.0, out=b"", said="Error: not there"
+                order=order, folder=folder, code=3, seconds=1.0, out=passed, said="Error: not there"
             )
 
     monkeypatch.setattr(list_run, "judgements", judgements)

@@ -70,7 +70,7 @@ def test_names_and_messages_make_no_links() -> None:
 def test_what_confined_it_is_text(text: str) -> None:
     """Of a server on another host: a line is one, a command is one, and a flood is cut."""
     made = Report("./walk:env.py")
-    layers = [{"layer": text, "enforced": False, "detail": text}] * 1_000
+    layers = [{"layer": text, "enforced": text, "detail": text}] * 1_000  # True alone holds
     held = {"layer": "seccomp", "enforced": True, "detail": ""}
     provenance = {"profile": "container", "layers": [held, *layers]}
     made.confinement = Confinement.of("strict", provenance, text * 1_000)
@@ -97,6 +97,11 @@ def test_all_that_there_can_be_is_a_line_and_no_notice() -> None:
         assert line.startswith("confined by: strict")
         assert list(reports.workflow_commands(made)) == []
         assert made.confinement.document()["recorded"] is True
+    for asked, profile, unrecorded in (
+        *(("strict", "no-userns", ""), ("no-userns", "", ""), ("strict", "strict", "no kernel")),
+    ):
+        made.confinement = Confinement.of(asked, {"profile": profile, "layers": []}, unrecorded)
+        assert len(list(reports.workflow_commands(made))) == 1
 
 
 def test_findings_are_bounded() -> None:

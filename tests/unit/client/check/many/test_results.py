@@ -137,6 +137,9 @@ def test_what_is_no_report_is_not_kept(spoilt: dict[str, Any], folder: Path) -> 
     with kept.held() as running, pytest.raises(ForeignResultError):
         keep(kept, running, {**told(), **spoilt})
     assert kept.kept(_ONE) is None
+    with pytest.raises(ForeignResultError, match="no page"):
+        kept.keep(_ONE, told(), folder / "nowhere", seconds=1.5, ended="")
+    assert kept.kept(_ONE) is None
 
 
 def test_one_run_has_a_folder(folder: Path) -> None:

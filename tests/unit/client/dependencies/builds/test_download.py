@@ -225,7 +225,7 @@ def test_downloads_are_bounded_and_verified(
         url = index.url.replace("/simple", "/files/x-1.tar.gz")
         download.download(url, known, target)
         assert target.read_bytes() == b"data"
-        index.replaced["x-1.tar.gz"] = b"tada"
+        index.replaced["x-1.tar.gz"] = b"tada" * 9
         with pytest.raises(PackageIntegrityError, match="it was replaced"):
             download.download(url, known, target)
         with pytest.raises(IndexUnavailableError, match="404"):
@@ -233,6 +233,7 @@ def test_downloads_are_bounded_and_verified(
         monkeypatch.setattr(download, "MAX_BYTES", 3)
         with pytest.raises(PackagesTooLargeError):
             download.download(url, known, target)
+        assert target.stat().st_size == 4, "it writes what it refuses"
     for other in ("ftp://127.0.0.1/x", "http://127.0.0.1:1/x", "file:///dev/zero"):
         with pytest.raises(IndexUnavailableError):
             download.download(other, known, target)

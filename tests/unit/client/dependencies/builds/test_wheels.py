@@ -105,6 +105,7 @@ def test_what_its_files_say_is_held_against_them(tmp_path: Path) -> None:
         (("/METADATA", b"Name: ", b"Name: x"), "its metadata name the package"),
         (("/METADATA", b"Version: 1", b"Version: 2"), "its metadata name the version"),
         (("/RECORD", b"some_name", b"gone.py,,\nsome_name"), "lists other files"),
+        (("/RECORD", b"some_name", b"x" * 200_000), "field larger than"),
     ):
         with pytest.raises(PackageIntegrityError, match=said):
             check(rewritten(wheel, edit=edit))
