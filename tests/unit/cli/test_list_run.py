@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import signal
 import threading
@@ -12,6 +13,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from envhub_sandbox.check import reports
+from envhub_sandbox.check.checks import CHECKS, Severity
 from envhub_sandbox.check.findings import Report
 from envhub_sandbox.check.many.entries import ListEntry
 from envhub_sandbox.check.many.judgements import Outcome
@@ -101,6 +103,39 @@ def test_a_file_says_what_one_may_type_about_a_list(
     ]
     alone = called("./nothing", "--settings", "settings.toml")
     assert "there is no such folder" in alone.output
+
+
+def test_a_result_counts_for_the_same_commit_judged_in_the_same_way(
+    started: list[tuple[int, list[str]]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    commit, judged = ["abc"], list[ListEntry]()
+    passed = json.dumps(reports.document(Report("x", commit="abc"), [])).encode()
+    (folder := Path("made")).mkdir()
+    (folder / "page.html").touch()
+
+    def judgements(orders, *_, **__):  # type: ignore[no-untyped-def]
+        for one in orders:
+            judged.append(one)
+            yield Outcome(order=one, folder=folder, code=0, seconds=1.0, out=passed, said="")
+
+    def again(*more: str) -> int:
+        judged.clear()
+        words = ("--all", "list", "--output", "out", "--policy", "policy.toml", *more)
+        assert called(*words).exit_code == Exit.OK
+        return len(judged)
+
+    monkeypatch.setattr(list_run, "judgements", judgements)
+    monkeypatch.setattr(list_run, "commit_of", lambda *_, **__: commit[0])
+    Path("policy.toml").write_text('network = "loopback"')
+    assert (again(), again(), again("--again")) == (2, 0, 2)
+    assert (again("--steps", "9"), again("--steps", "9"), again()) == (2, 0, 2)
+    Path("policy.toml").write_text('network = "none"')
+    assert (again(), again()) == (2, 0)
+    other = dataclasses.replace(CHECKS["card"], severity=Severity.ERROR)
+    monkeypatch.setitem(CHECKS, "card", other)
+    assert (again(), again()) == (2, 0)
+    commit[0] = "another"
+    assert again() == 2
 
 
 def test_every_option_is_handed_on_or_about_the_list() -> None:
