@@ -162,7 +162,7 @@ def _git(
     settings = [word for one in _SETTINGS for word in ("-c", one)]
     try:
         done = subprocess.run(
-            [program, "--literal-pathspecs", *settings, *arguments],
+            [program, *settings, *arguments],
             input=given,
             capture_output=True,
             cwd=folder,

@@ -69,6 +69,7 @@ def test_each_is_told_what_holds_here(started: list[tuple[int, list[str]]]) -> N
     assert [jobs for jobs, _ in started] == [1, 1]
     for (_, command), reference in zip(started, ("org/repo", "./env"), strict=True):
         assert command[-2:] == ["--", reference]
+        assert command[1:3] == ["-I", "-m"], "no module of the folder that one is in"
         words = {word for word in command if word.startswith("--")}
         assert words > {"--steps=7", "--allow=card", "--allow=licence", "--resets=0", "--async"}
         assert not any(word.startswith(("--all=", "--out", "--jobs", "--set")) for word in words)
