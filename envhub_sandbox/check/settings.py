@@ -85,14 +85,44 @@ def read_settings(path: Path, known: Collection[str]) -> dict[str, Any]:
 
 
 def is_judged(path: Path, reference: str) -> bool:
-    """Whether a file lies in what is judged, by whatever links one gets there."""
-    if not is_here(reference):
+    """Whether a file lies in what is judged, by whatever links one gets there; or is named so, and
+    a link in there leads out.
+    """
+    folder = _folder_of(reference)
+    if folder is None:
         return False
+    is_in_it = Path(os.path.realpath(path)).is_relative_to(folder)
+    return is_in_it or _named_in(path, folder) is not None
+
+
+def _folder_of(reference: str) -> str | None:
+    """Where what is judged lies, without links; None for what is not of this machine."""
+    if not is_here(reference):
+        return None
     try:
-        folder, _ = split_local(reference)
+        return os.path.realpath(split_local(reference)[0])
     except EnvHubError:
-        return False  # nothing is judged: what reads it says why
-    return Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
+        return None  # nothing is judged: what reads it says why
+
+
+def _named_in(path: Path, folder: str) -> Path | None:
+    """Where a path below a folder leads, if none of the links in there is followed."""
+    whole = Path(os.path.abspath(path))
+    tops = [one for one in whole.parents if os.path.realpath(one) == folder]
+    return Path(folder, whole.relative_to(tops[-1])) if tops else None
+
+
+def refuse_link_of_the_judged(path: Path, reference: str) -> None:
+    """No repository says where a report goes: a link that it has there could lead to any file of
+    the user's. Raises ``PolicyError``: there is one.
+    """
+    folder = _folder_of(reference)
+    named = None if folder is None else _named_in(path, folder)
+    if named is not None and Path(os.path.realpath(path)) != named:
+        raise PolicyError(
+            f"{path} is, or lies behind, a link in the repository that is checked, {reference}, "
+            "which could lead to any file: take a place outside"
+        )
 
 
 def refuse_files_of_the_judged(

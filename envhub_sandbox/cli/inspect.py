@@ -138,7 +138,8 @@ def inspect_static(
         read = static(make.snapshot(ref))
     failures = [one for one in read.findings if least and one.check.severity.reaches(least)]
     if sarif is not None:
-        write_report(sarif, reports.sarif(Report(read.reference, read.findings), failures))
+        report = Report(read.reference, read.findings)
+        write_report(sarif, reports.sarif(report, failures), [read.reference])
     if as_json:
         print_json(document(read))
     else:

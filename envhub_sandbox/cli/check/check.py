@@ -330,7 +330,7 @@ def _write(report: Report, failures: list[Finding], *files: Path | None) -> None
 
     for path, form in zip(files, (reports.junit, reports.sarif, page.page), strict=True):
         if path is not None:
-            write_report(path, form(report, failures))
+            write_report(path, form(report, failures), [report.reference])
 
 
 def _print_confinement(report: Report) -> None:

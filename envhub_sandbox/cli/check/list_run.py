@@ -170,7 +170,8 @@ class ListRun:
         """
         results = list(self.of.values())
         if junit is not None:
-            write_report(junit, index.junit(results, self._results.report))
+            text = index.junit(results, self._results.report)
+            write_report(junit, text, (one.reference for one in self.of))
         if github:
             annotate(index.workflow_commands(results), index.summary(results))
         if json:

@@ -47,8 +47,14 @@ def level(name: str) -> Severity:
     return Severity(name)
 
 
-def write_report(path: Path, text: str) -> None:
-    """Write a report, in UTF-8 whatever the locale. Raises ``UsageError``: it cannot be written."""
+def write_report(path: Path, text: str, references: Iterable[str]) -> None:
+    """Write a report about these, in UTF-8 whatever the locale.
+    Raises ``UsageError``: it cannot be written; ``PolicyError``: one of them has put a link there.
+    """
+    from envhub_sandbox.check.settings import refuse_link_of_the_judged
+
+    for reference in references:
+        refuse_link_of_the_judged(path, reference)
     try:
         path.write_text(text, encoding="utf-8")
     except OSError as error:

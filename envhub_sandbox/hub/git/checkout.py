@@ -90,7 +90,8 @@ class Checkout:
 
 def read_checkout(folder: Path) -> Checkout | None:
     """What git says of a folder (an absolute path without links); None where it is in no checkout,
-    or git cannot tell.
+    or git cannot tell. Raises ``SnapshotError`` where a pattern keeps git from it: a commit can
+    have one, and would hide by it what ``converted`` finds.
 
     Git runs no program and writes nothing. A folder that the checkout around it ignores as a whole
     is in none. A ``.git`` counts only where it belongs to root, to us or to the folder's owner: in
@@ -152,14 +153,16 @@ def _text_of(file: Path) -> str:
 def _git(
     repository: _Repository, folder: Path, *arguments: str, given: bytes = b""
 ) -> bytes | None:
-    """What git says; None where there is no git, or it fails."""
+    """What git says; None where there is no git, or it fails. Raises ``SnapshotError``: it takes
+    too long.
+    """
     program = _program()
     if program is None:
         return None
     settings = [word for one in _SETTINGS for word in ("-c", one)]
     try:
         done = subprocess.run(
-            [program, "--literal-pathspecs", *settings, *arguments],
+            [program, *settings, *arguments],
             input=given,
             capture_output=True,
             cwd=folder,
@@ -167,6 +170,11 @@ def _git(
             timeout=TIMEOUT_S,
             check=True,
         )
+    except subprocess.TimeoutExpired as error:
+        raise SnapshotError(
+            f"local folder {folder}: git cannot read its .gitattributes and .gitignore in "
+            f"{TIMEOUT_S:g} s. Mend or remove these files"
+        ) from error
     except (OSError, subprocess.SubprocessError) as error:
         said = getattr(error, "stderr", None) or b""
         SNAPSHOT.warning("git cannot read the checkout %s: %s %r", folder, error, said[-300:])

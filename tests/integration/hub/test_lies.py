@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import os
 import traceback
 import zlib
@@ -18,6 +19,7 @@ from envhub_sandbox.errors import (
     SnapshotIntegrityError,
     SnapshotTooLargeError,
 )
+from envhub_sandbox.hub.logins import authorization
 from envhub_sandbox.hub.reference import HubRef
 from envhub_sandbox.hub.snapshot import SnapshotLimits, fetch
 from envhub_sandbox.system.folders import remove_tree
@@ -80,6 +82,15 @@ def test_other_commit_than_the_pinned_one_is_refused(stub_hub: StubHub, get: Fet
     with pytest.raises(SnapshotIntegrityError, match=r"another commit, b{40}"):
         fetch(ref, token=False, endpoint=stub_hub.endpoint)
     assert pinned != repository.commit
+
+
+@pytest.mark.parametrize("sha", ["../../../evil", "main", None, "A" * 40])
+def test_a_revision_that_is_no_commit_is_refused(stub_hub: StubHub, get: Fetch, sha: Any) -> None:
+    """It would be the name of a folder here."""
+    stub_hub.fail("/revision/", 200, pieces=lambda: [json.dumps({"sha": sha}).encode()])
+    with pytest.raises(RepositoryUnavailableError, match="ValueError"):
+        fetch(HubRef.parse("models/org/repo"), token=False, endpoint=stub_hub.endpoint)
+    assert not [request for request in stub_hub.requests if "/tree/" in request]
 
 
 def test_damaged_hub_cache_is_repaired_from_the_hub(
@@ -307,19 +318,25 @@ def test_names_that_differ_little_are_different_files(
 
 @pytest.mark.parametrize("what", ["/revision/", "/resolve/", "nothing listens"])
 def test_secrets_are_in_no_traceback(
-    stub_hub: StubHub, get: Fetch, what: str, caplog: pytest.LogCaptureFixture
+    stub_hub: StubHub,
+    get: Fetch,
+    what: str,
+    caplog: pytest.LogCaptureFixture,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """A token that the Hub echoes, and a login in the endpoint's address."""
+    """A token that the Hub echoes, given or stored, and a login in the endpoint's address."""
     soon = {"Retry-After": "0"}  # else huggingface_hub asks again later each time
     endpoint = stub_hub.endpoint.replace("//", "//jane:hunter2@")
     token = "_".join(["hf", "secret"])
-    stub_hub.fail(what, 500, headers={"X-Error-Message": f"no {token}, hunter2", **soon})
+    sent = authorization(("jane", "hunter2"))
+    echo = {"X-Error-Message": f"no {token}, hunter2, {sent}"}
+    stub_hub.fail(what, 500, headers={**echo, **soon})
+    monkeypatch.setenv("HF_TOKEN", token)
     if what == "nothing listens":
         stub_hub.stop()
     with caplog.at_level("DEBUG"), pytest.raises(SnapshotError) as caught:
-        get(token=token, endpoint=endpoint)
+        get(token=None if what == "/resolve/" else token, endpoint=endpoint)
     said = "".join(traceback.format_exception(caught.value)) + repr(caught.value)
     ours = [record for record in caplog.records if record.name.startswith("envhub")]
     said += "".join(record.getMessage() for record in ours)
-    assert token not in said
-    assert "hunter2" not in said
+    assert not [one for one in (token, "hunter2", sent) if one in said]

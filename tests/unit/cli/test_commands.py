@@ -6,6 +6,7 @@ import ast
 import json
 import os
 import shlex
+import shutil
 import warnings
 from collections.abc import Callable, Iterator
 from importlib import metadata
@@ -21,6 +22,7 @@ from envhub_sandbox.cli.app import app
 from envhub_sandbox.cli.shared import exits, findings, host
 from envhub_sandbox.cli.shared.console import guarded
 from envhub_sandbox.cli.shared.exits import Exit
+from envhub_sandbox.hub.git.checkout import make_checkout
 from envhub_sandbox.sandboxes.remote import RemoteSandbox
 from envhub_worker.protocol import messages as m
 from tests.attacks.client.lying_server import LyingServer, lying
@@ -123,10 +125,28 @@ def test_init_writes_all_or_nothing() -> None:
 
 
 def test_reports_are_written_in_utf_8() -> None:
-    findings.write_report(Path("report"), "ü")
+    findings.write_report(Path("report"), "ü", ["org/repo"])
     assert Path("report").read_bytes() == "ü".encode()
     with pytest.raises(exits.UsageError, match="the report cannot be written"):
-        findings.write_report(Path("no/report"), "")
+        findings.write_report(Path("no/report"), "", ["org/repo"])
+
+
+@pytest.mark.skipif(shutil.which("git") is None, reason="needs git")
+def test_a_report_is_not_written_through_a_link_of_the_repository() -> None:
+    """``./`` is a checkout in CI, where the report's usual name can be a link of its author's."""
+    Path("env").mkdir()
+    Path("env/env.py").touch()
+    make_checkout(Path("env"))
+    Path("victim").write_text("mine")
+    for words in ("inspect ./env --static", "check ./env --deadline 1"):
+        said(*words.split(), "--sarif", "env/new")
+        assert Path("env/new").read_text().startswith("{")
+        Path("env/new").unlink()
+        Path("env/link").symlink_to(Path("victim").absolute())
+        code, text = said(*words.split(), "--sarif", "env/link")
+        Path("env/link").unlink()
+        assert (code, "env/link is, or lies behind, a link in" in text) == (2, True), text
+    assert Path("victim").read_text() == "mine"
 
 
 def test_annotations_are_for_the_job_and_its_summary(

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import signal
 import threading
 from dataclasses import fields
@@ -10,6 +12,9 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner, Result
 
+from envhub_sandbox.check import reports
+from envhub_sandbox.check.checks import CHECKS, Severity
+from envhub_sandbox.check.findings import Report
 from envhub_sandbox.check.many.entries import ListEntry
 from envhub_sandbox.check.many.judgements import Outcome
 from envhub_sandbox.check.many.results import Result as Judgement
@@ -25,14 +30,18 @@ _RUNNER = CliRunner()
 
 @pytest.fixture
 def started(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> list[tuple[int, list[str]]]:
-    """How many may run at once, and what would be run; each could not be judged."""
+    """How many may run at once, and what would be run; each could not be judged, by its exit code:
+    the report and the page that it has say that it passed.
+    """
     found: list[tuple[int, list[str]]] = []
+    passed = json.dumps(reports.document(Report("org/repo@abc"), [])).encode()
 
     def judgements(orders, command, *, folder, jobs, **_):  # type: ignore[no-untyped-def]
         for number, order in enumerate(orders):
             found.append((jobs, command(order, folder / str(number), 7)))
+            (folder / "page.html").touch()
             yield Outcome(
-                order=order, folder=folder, code=3, seconds=1.0, out=b"", said="Error: not there"
+                order=order, folder=folder, code=3, seconds=1.0, out=passed, said="Error: not there"
             )
 
     monkeypatch.setattr(list_run, "judgements", judgements)
@@ -60,6 +69,7 @@ def test_each_is_told_what_holds_here(started: list[tuple[int, list[str]]]) -> N
     assert [jobs for jobs, _ in started] == [1, 1]
     for (_, command), reference in zip(started, ("org/repo", "./env"), strict=True):
         assert command[-2:] == ["--", reference]
+        assert command[1:3] == ["-I", "-m"], "no module of the folder that one is in"
         words = {word for word in command if word.startswith("--")}
         assert words > {"--steps=7", "--allow=card", "--allow=licence", "--resets=0", "--async"}
         assert not any(word.startswith(("--all=", "--out", "--jobs", "--set")) for word in words)
@@ -94,6 +104,39 @@ def test_a_file_says_what_one_may_type_about_a_list(
     ]
     alone = called("./nothing", "--settings", "settings.toml")
     assert "there is no such folder" in alone.output
+
+
+def test_a_result_counts_for_the_same_commit_judged_in_the_same_way(
+    started: list[tuple[int, list[str]]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    commit, judged = ["abc"], list[ListEntry]()
+    passed = json.dumps(reports.document(Report("x", commit="abc"), [])).encode()
+    (folder := Path("made")).mkdir()
+    (folder / "page.html").touch()
+
+    def judgements(orders, *_, **__):  # type: ignore[no-untyped-def]
+        for one in orders:
+            judged.append(one)
+            yield Outcome(order=one, folder=folder, code=0, seconds=1.0, out=passed, said="")
+
+    def again(*more: str) -> int:
+        judged.clear()
+        words = ("--all", "list", "--output", "out", "--policy", "policy.toml", *more)
+        assert called(*words).exit_code == Exit.OK
+        return len(judged)
+
+    monkeypatch.setattr(list_run, "judgements", judgements)
+    monkeypatch.setattr(list_run, "commit_of", lambda *_, **__: commit[0])
+    Path("policy.toml").write_text('network = "loopback"')
+    assert (again(), again(), again("--again")) == (2, 0, 2)
+    assert (again("--steps", "9"), again("--steps", "9"), again()) == (2, 0, 2)
+    Path("policy.toml").write_text('network = "none"')
+    assert (again(), again()) == (2, 0)
+    other = dataclasses.replace(CHECKS["card"], severity=Severity.ERROR)
+    monkeypatch.setitem(CHECKS, "card", other)
+    assert (again(), again()) == (2, 0)
+    commit[0] = "another"
+    assert again() == 2
 
 
 def test_every_option_is_handed_on_or_about_the_list() -> None:

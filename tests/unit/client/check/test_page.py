@@ -53,7 +53,7 @@ def test_a_page_needs_and_runs_nothing() -> None:
         source = dict(attrs).get("src")
         assert source is None or source.startswith(("data:image/png;base64,", "data:video/mp4;"))
     [policy] = [dict(attrs)["content"] for _, attrs in found.tags if ("http-equiv" in dict(attrs))]
-    assert policy.startswith("default-src 'none'")
+    assert {"default-src 'none'", "base-uri 'none'", "form-action 'none'"} < set(policy.split("; "))
     assert "script" not in policy
     assert "unsafe" not in policy, "nor does it look as a stranger's style says"
     [style] = re.findall("<style>(.*)</style>", page(made, []), re.DOTALL)
@@ -95,7 +95,10 @@ def test_a_page_is_bounded() -> None:
         made.judged("runs", ["x" * 100_000], f"{number}")
         made.judged("loads", [], "t" * 1_000)
     made.provenance = {"packages": {str(number): "x" * 1_000 for number in range(10_000)}}
-    assert len(page(made, made.findings)) < 2_000_000
+    made.plays = {str(number): Play() for number in range(50)}
+    words = page(made, made.findings)
+    assert (words.count("<section"), "10 more have a line below" in words) == (40, True)
+    assert len(words) < 2_000_000
 
 
 @pytest.mark.parametrize(

@@ -19,26 +19,28 @@ from tests.support.output.pages import HOSTILE
 
 def report(text: str) -> Report:
     """One in which a repository chose every word that it can."""
-    made = Report("./walk:env.py")
+    made = Report(text)
     made.add(Finding("runs", text, task=text, file=text, line=3))
-    made.judged("loads", [])
+    made.judged("loads", [], text)
     return made
 
 
-@pytest.mark.parametrize("text", HOSTILE)
+@pytest.mark.parametrize("text", [*HOSTILE, "x,col=9"])
 def test_what_a_stranger_writes_is_text_in_every_form(text: str) -> None:
     made = report(text)
     [line] = reports.workflow_commands(made)
     assert len(line.splitlines()) == 1, "the control is the text, which has a line of its own"
     head = line.split("title=")[0]
     assert head.startswith("::error file=")
-    assert ("\n" in head, head.count("::")) == (False, 1)
+    assert ("\n" in head, head.count("::"), head.count(",")) == (False, 1, 2)
+    told = line.split("::", 2)[2].replace("%0A", "\n").replace("%25", "%")  # as GitHub reads it
+    assert told.startswith(f"{made.findings[0].message}\n")
     assert line.count("::") == 2 + text.replace("\r", "").count("::")
 
     table = reports.summary(made, made.findings).splitlines()
     [row] = [line for line in table if line.startswith("| **fails**")]
     assert row.count("|") == 5, "one row of four cells"
-    assert not set("<>[]!`") & set(row), "nothing is a tag, a link or an image"
+    assert not set("<>[]!`") & set("".join(table)), "nothing is a tag, a link or an image"
 
     suite = ElementTree.fromstring(reports.junit(made, made.findings))
     assert (suite.attrib["tests"], suite.attrib["failures"]) == ("2", "1")
@@ -68,7 +70,7 @@ def test_names_and_messages_make_no_links() -> None:
 def test_what_confined_it_is_text(text: str) -> None:
     """Of a server on another host: a line is one, a command is one, and a flood is cut."""
     made = Report("./walk:env.py")
-    layers = [{"layer": text, "enforced": False, "detail": text}] * 1_000
+    layers = [{"layer": text, "enforced": text, "detail": text}] * 1_000  # True alone holds
     held = {"layer": "seccomp", "enforced": True, "detail": ""}
     provenance = {"profile": "container", "layers": [held, *layers]}
     made.confinement = Confinement.of("strict", provenance, text * 1_000)
@@ -95,6 +97,11 @@ def test_all_that_there_can_be_is_a_line_and_no_notice() -> None:
         assert line.startswith("confined by: strict")
         assert list(reports.workflow_commands(made)) == []
         assert made.confinement.document()["recorded"] is True
+    for asked, profile, unrecorded in (
+        *(("strict", "no-userns", ""), ("no-userns", "", ""), ("strict", "strict", "no kernel")),
+    ):
+        made.confinement = Confinement.of(asked, {"profile": profile, "layers": []}, unrecorded)
+        assert len(list(reports.workflow_commands(made))) == 1
 
 
 def test_findings_are_bounded() -> None:
@@ -169,6 +176,7 @@ def test_a_verdict_is_a_sentence(found: list[str], allowed: list[str], says: str
     assert made.verdict(failures) == says
     assert says in reports.summary(made, failures)
     assert says in page(made, failures)
+    assert ('class="badge warning"' in page(made, failures)) == made.is_unjudged(failures)
 
 
 @pytest.mark.parametrize(

@@ -84,8 +84,29 @@ def test_what_is_judged_has_no_say(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     (tmp_path / "with:colon").mkdir()
     for reference in (str(tmp_path / "with:colon"), f"{tmp_path / 'with:colon'}:env.py"):
         assert settings.is_judged(tmp_path / "with:colon" / "envhub.toml", reference)
+    (judged / "out.toml").symlink_to(tmp_path / "envhub.toml")
+    (judged / "up").symlink_to(tmp_path)
+    assert settings.is_judged(judged / "out.toml", str(judged)), "it chooses a file elsewhere"
+    assert settings.is_judged(link / "up" / "envhub.toml", str(judged))
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
     assert not settings.is_judged(tmp_path / "loop", str(judged))
     assert not settings.is_judged(judged / "envhub.toml", str(tmp_path / "nowhere"))
     assert not settings.is_judged(tmp_path / "envhub.toml", str(judged))
     assert not settings.is_judged(judged / "envhub.toml", "org/repo@0123")
+
+
+def test_no_report_goes_where_a_link_of_the_judged_leads(tmp_path: Path) -> None:
+    """Links of the caller's own may lead into it; a file of it is written, as it always was."""
+    judged, mine = tmp_path / "judged", tmp_path / "mine"
+    judged.mkdir()
+    mine.symlink_to(judged)
+    (judged / "report").symlink_to(tmp_path / "victim")
+    (judged / "up").symlink_to(tmp_path)
+    for path in (judged / "report", mine / "report", judged / "up/victim", judged / "up/judged/x"):
+        with pytest.raises(PolicyError, match="a link in the repository"):
+            settings.refuse_link_of_the_judged(path, f"{mine}:env.py")
+    for path, reference in (
+        *((one, str(judged)) for one in (judged / "new", mine / "new", tmp_path / "victim")),
+        *((judged / "report", one) for one in ("org/repo", str(tmp_path / "nowhere"))),
+    ):
+        settings.refuse_link_of_the_judged(path, reference)

@@ -105,12 +105,15 @@ def test_attributes_cannot_hide_themselves(repository: GitRepository, tmp_path: 
     assert failing(clone) == {".gitattributes", "env.py", "odd.py"}
 
 
-def test_attributes_that_cannot_be_read_are_an_error(
-    repository: GitRepository, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("name", "rest"), [(".gitattributes", " ident"), (".gitignore", "")], ids=["convert", "ignore"]
+)
+def test_patterns_that_cannot_be_read_are_an_error(
+    repository: GitRepository, monkeypatch: pytest.MonkeyPatch, name: str, rest: str
 ) -> None:
-    """A pattern can take git for ever, and what it says then is not known."""
+    """One can take git for ever, and what it says then is not known: which files it converts."""
     (repository.folder / ("a" * 200 + "1")).write_text("")
-    (repository.folder / ".gitattributes").write_text(f"{'*a' * 60}b ident\n")
+    (repository.folder / name).write_text(f"{'*a' * 60}b{rest}\n")
     monkeypatch.setattr(checkout, "TIMEOUT_S", 5.0)
     with pytest.raises(SnapshotError, match=r"cannot read its \.gitattributes"):
         found(repository.folder)

@@ -84,6 +84,10 @@ def test_nor_in_the_other_files(tmp_path: Path, line: str) -> None:
     project = f"[project]\nname = 'x'\ndependencies = ['{line}']\n"
     with pytest.raises(RequirementError, match=r"in \[project\] of pyproject\.toml"):
         repository(tmp_path, env__py="", pyproject__toml=project)
+    for end in (r"\n", r"\r", r"\u2028"):  # which TOML reads before we do
+        text = f"""[project]\ndependencies = ["a; os_name == 'x{end}-e .{end}y'"]\n"""
+        with pytest.raises(RequirementError, match=r"in \[project\] of pyproject\.toml"):
+            repository(tmp_path, env__py="", pyproject__toml=text)
     with pytest.raises(RequirementError, match="2 blocks"):
         repository(tmp_path, env__py=script("dependencies = []") + script("dependencies = []"))
 

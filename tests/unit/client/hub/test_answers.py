@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import itertools
 from types import SimpleNamespace
 from typing import Any
 
@@ -53,6 +54,7 @@ def test_a_secret_that_is_echoed_is_in_no_text() -> None:
     error = answered(403, X_Error_Message="hf_secret may not")
     assert "hf_secret" not in failed(error, "hf_secret").what
     inner = ValueError("hf_secret", 3)
+    assert len(failed(answered(403, X_Error_Message="x" * 10_000)).what) < 1_000
     outer = RuntimeError("with hf_secret")
     outer.__cause__, inner.__context__ = inner, outer  # a cycle ends, too
     answers.conceal(outer, ("hf_secret",))
@@ -92,6 +94,7 @@ def sessions() -> list[tuple[Any, list[Any]]]:
     ("name", "good", "bad"),
     [
         ("ETag", '"0123abc"', '"../../etc/x"'),
+        ("ETag", "0123abc", '".."'),
         ("X-Linked-ETag", 'W/"0123abc"', "a/b"),
         ("X-Repo-Commit", "0" * 40, "../" * 10),
         ("X-Xet-Hash", "0a", "."),
@@ -121,3 +124,7 @@ def test_a_body_is_read_to_its_bound(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(HostileAnswerError, match="over 10 bytes"):
         bounded_body(SimpleNamespace(iter_content=lambda size: chunks()))
     assert len(read) == 4
+    clock = SimpleNamespace(monotonic=iter(range(0, 9_000, 100)).__next__)
+    monkeypatch.setattr(answers, "time", clock)
+    with pytest.raises(HostileAnswerError, match="has not ended"):
+        bounded_body(SimpleNamespace(iter_bytes=lambda: itertools.repeat(b"", 9)))

@@ -60,6 +60,7 @@ def test_limit_stops_reading_the_listing() -> None:
         *("a\x1b[2J", "a\u202eb", "x" * 256),
         "/".join("x" * 5 for _ in range(200)),
         "/".join("x" for _ in range(65)),
+        *("/".join(["x" * 200] * 6), "\u00e9" * 128),
     ],
 )
 def test_hostile_name_is_refused(path: str) -> None:

@@ -143,11 +143,12 @@ DAMAGE: dict[str, Damage] = {
             ),
             r"'env\.py' is not a regular file",
         ),
+        (lambda slot: (slot.tree / "pkg").chmod(0o777), "others can write in 'pkg'"),
         (DAMAGE["lose the record"], r"record\.json is missing"),
         (lambda slot: slot.record.write_text('{"format": 1, "files": [[1]]}'), "cannot be read"),
         (lambda slot: slot.record.write_text('{"format": 99, "files": []}'), "cannot be read"),
     ],
-    ids=range(9),
+    ids=range(10),
 )
 def test_damage_is_refused_with_the_command_that_repairs(
     published: store.Slot, damage: Damage, said: str

@@ -108,7 +108,8 @@ def test_folder_that_others_can_write_is_named_and_mended(
     if which == 0 and bits != 0o777 and inside.is_own_group(wrong):
         assert store.load(slot) is not None  # above the store a plain user's own group may write
         return
-    for use in (store.load, lambda slot: _publish(slot, GOOD)):
+    other = store.Slot(slot.folder, "d" * 40, "x")
+    for use in (store.load, lambda _: _publish(other, GOOD)):
         with pytest.raises(SnapshotError, match="ENVHUB_CACHE") as caught:
             use(slot)
         assert str(wrong) in str(caught.value)
@@ -187,10 +188,10 @@ def test_links_are_followed_step_by_step(
 
 
 @needs_root
-@pytest.mark.parametrize("which", range(6))
+@pytest.mark.parametrize("which", range(7))
 def test_root_trusts_no_users_folder(snapshot_store: Path, slot: store.Slot, which: int) -> None:
     """What belongs to somebody else can be changed by him, whoever asks."""
-    places = [*_above(snapshot_store), slot.home, slot.record]
+    places = [*_above(snapshot_store), slot.home, slot.record, slot.tree]
     os.chown(places[which], SOMEBODY, -1)
     with pytest.raises(SnapshotError, match=f"belongs to uid {SOMEBODY}") as caught:
         store.load(slot)

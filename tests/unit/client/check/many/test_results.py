@@ -92,6 +92,8 @@ def test_what_was_judged_is_known_again(folder: Path) -> None:
         lambda json_, page: json_.write_text("[1]"),
         lambda json_, page: edit(json_, '"passed": false', '"passed": true'),
         lambda json_, page: edit(json_, '"runs"', '"nothing"'),
+        lambda json_, page: edit(json_, '"loads"', '"nothing"'),
+        lambda json_, page: edit(json_, '"checks": []', '"checks": ["nothing"]'),
         lambda json_, page: edit(json_, "1.5", "NaN"),
         lambda json_, page: edit(json_, "repo@main", "other@main"),
         lambda json_, page: (json_.unlink(), json_.symlink_to(page)),
@@ -134,6 +136,9 @@ def test_what_is_no_report_is_not_kept(spoilt: dict[str, Any], folder: Path) -> 
     kept = Results(folder, "as ever")
     with kept.held() as running, pytest.raises(ForeignResultError):
         keep(kept, running, {**told(), **spoilt})
+    assert kept.kept(_ONE) is None
+    with pytest.raises(ForeignResultError, match="no page"):
+        kept.keep(_ONE, told(), folder / "nowhere", seconds=1.5, ended="")
     assert kept.kept(_ONE) is None
 
 

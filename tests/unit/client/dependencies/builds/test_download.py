@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,9 +18,11 @@ from envhub_sandbox.errors import (
     RequirementError,
 )
 from envhub_sandbox.hub.git import address, commits
+from envhub_sandbox.hub.logins import authorization
 from tests.support.packages.git_server import commit, git_served, make_repository
 from tests.support.packages.git_server import git as run_git
 from tests.support.packages.wheels import served
+from tests.support.ports import QuietHandler, serving
 
 pytestmark = pytest.mark.same_for("versions")
 
@@ -141,6 +144,21 @@ def test_trees_that_hold_each_other(
     assert listed.count("\n") == 10**5 - 1
 
 
+def test_what_git_writes_is_bounded(
+    url: str, repository: Path, target: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By what it lists; and by the kernel while it fetches, before there is a list."""
+    monkeypatch.setattr(commits, "MAX_BYTES", 3 << 20)
+    for number in range(4):
+        (repository / f"zeros{number}").write_bytes(bytes(1 << 20))
+    with pytest.raises(PackagesTooLargeError, match="of files"):
+        download.check_out(url, commit(repository), target, print)
+    (repository / "random").write_bytes(os.urandom(4 << 20))
+    with pytest.raises(IndexUnavailableError, match="git fetch failed"):
+        download.check_out(url, commit(repository), target, print)
+    assert not list(target.iterdir())
+
+
 # --- What sources say of their build, what a build lacked, and downloads: all of it is data
 
 
@@ -225,7 +243,7 @@ def test_downloads_are_bounded_and_verified(
         url = index.url.replace("/simple", "/files/x-1.tar.gz")
         download.download(url, known, target)
         assert target.read_bytes() == b"data"
-        index.replaced["x-1.tar.gz"] = b"tada"
+        index.replaced["x-1.tar.gz"] = b"tada" * 9
         with pytest.raises(PackageIntegrityError, match="it was replaced"):
             download.download(url, known, target)
         with pytest.raises(IndexUnavailableError, match="404"):
@@ -233,6 +251,7 @@ def test_downloads_are_bounded_and_verified(
         monkeypatch.setattr(download, "MAX_BYTES", 3)
         with pytest.raises(PackagesTooLargeError):
             download.download(url, known, target)
+        assert target.stat().st_size == 4, "it writes what it refuses"
     for other in ("ftp://127.0.0.1/x", "http://127.0.0.1:1/x", "file:///dev/zero"):
         with pytest.raises(IndexUnavailableError):
             download.download(other, known, target)
@@ -248,3 +267,26 @@ def test_a_login_goes_to_the_host_of_its_index_alone(
     with pytest.raises(IndexUnavailableError) as caught:
         download.download("http://me:secret@127.0.0.1:1/x", "", tmp_path / "x")
     assert "secret" not in str(caught.value)
+
+
+def test_a_login_is_not_sent_to_where_a_host_redirects(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("NO_PROXY", "no_proxy"):
+        monkeypatch.setenv(name, "127.0.0.1,localhost")
+    sent: list[str | None] = []
+
+    class Handler(QuietHandler):
+        def do_GET(self) -> None:
+            sent.append(self.headers["Authorization"])
+            self.send_response(302 if self.path == "/x" else 200)
+            self.send_header("Location", f"{elsewhere}/y")
+            self.send_header("Content-Length", "4")
+            self.end_headers()
+            self.wfile.write(b"data")
+
+    with serving(Handler) as where:
+        elsewhere = where.replace("127.0.0.1", "localhost")
+        url = f"{where.replace('//', '//me:secret@')}/x"
+        download.download(url, hashlib.sha256(b"data").hexdigest(), tmp_path / "x")
+    assert sent == [authorization(("me", "secret")), None]

@@ -20,9 +20,11 @@ from envhub_sandbox.errors import DependencyError, PackageIntegrityError, Packag
 from tests.support.packages.sdists import add, make_sdist
 
 
-def packed(tmp_path: Path, *members: tuple[str, bytes, bytes], **options: Any) -> Path:
+def packed(
+    tmp_path: Path, *members: tuple[str, bytes, bytes], name: str = "x-1.0.tar.gz", **options: Any
+) -> Path:
     """An archive of these: name, content and kind."""
-    path = tmp_path / "x-1.0.tar.gz"
+    path = tmp_path / name
     with tarfile.open(path, "w:gz", format=tarfile.PAX_FORMAT, **options) as archive:
         for name, data, kind in members:
             add(archive, name, data, kind)
@@ -62,6 +64,11 @@ def test_a_zip_and_what_may_be_executed(tmp_path: Path) -> None:
     link = zipped(tmp_path, "x-1.0/link", stat.S_IFLNK | 0o777, "/etc/passwd")
     with pytest.raises(PackageIntegrityError, match="link"):
         trees.unpack_tree(link, tmp_path, "x")
+    data = bytearray(zipped(tmp_path, "x-1.0/y", 0, "").read_bytes())
+    data[6] = data[data.rindex(b"PK\1\2") + 8] = 1
+    link.write_bytes(data)
+    with pytest.raises(PackageIntegrityError, match="encrypted"):
+        trees.unpack_tree(link, tmp_path, "x")
 
 
 @pytest.mark.parametrize(
@@ -84,24 +91,50 @@ def test_what_could_lead_out_is_refused(tmp_path: Path, name: str, kind: bytes) 
     assert not list((tmp_path / "tree").iterdir())
 
 
-@pytest.mark.parametrize("names", [("x/a", "x/a"), ("x/a", "y/a")])
+@pytest.mark.parametrize("names", [("x/a", "x/a"), ("x/a", "y/a"), ("x",)])
 def test_more_than_one_of_its_kind(tmp_path: Path, names: tuple[str, ...]) -> None:
-    """A name twice: two programs could read two files; two tops: which of them is the source?"""
-    with pytest.raises(PackageIntegrityError, match=r"twice|2 entries"):
+    """A name twice: two programs could read two files; two tops, or a file: which is the source?"""
+    with pytest.raises(PackageIntegrityError, match=r"twice|[12] entries"):
         unpacked(packed(tmp_path, *((name, b"", b"0") for name in names)))
 
 
 def test_bounds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of all files together, of their number, and of headers for all of them."""
     archive = packed(tmp_path, ("x/a", b"1" * 100, b"0"), ("x/b", b"1" * 100, b"0"))
-    for bound, value in (("MAX_BYTES", 150), ("MAX_FILES", 1)):
+    folders = packed(tmp_path, *((f"x/{n}", b"", b"5") for n in range(4)), name="folders.tar.gz")
+    for bound, value, one in (
+        *(("MAX_BYTES", 150, archive), ("MAX_FILES", 1, archive), ("MAX_FILES", 1, folders)),
+    ):
         with monkeypatch.context() as patch:
             patch.setattr(trees, bound, value)
             with pytest.raises(PackagesTooLargeError):
-                trees.unpack_tree(archive, tmp_path, "x")
+                trees.unpack_tree(one, tmp_path, "x")
     headers = {f"key{number}": "x" for number in range(2000)}
     with pytest.raises(PackagesTooLargeError, match="headers"):
         unpacked(packed(tmp_path, ("x-1.0/a", b"", b"0"), pax_headers=headers))
+
+
+def test_a_stream_is_read_neither_far_nor_much_at_once() -> None:
+    """An archive says its own lengths and places; what is compressed is unpacked up to there."""
+
+    class Endless(io.BytesIO):
+        at = 0
+
+        def read(self, size: int | None = -1) -> bytes:
+            return bytes(size or 0)  # of less than nothing: a ValueError
+
+        def tell(self) -> int:
+            return self.at
+
+    source = Endless()
+    stream = trees.BoundedStream(source, "x", 10)
+    assert len(stream.read(10)) == 10
+    for read in (partial(stream.read, 11), stream.read, partial(stream.seek, 1 << 40)):
+        with pytest.raises(PackagesTooLargeError):
+            read()
+    source.at = 1 << 40
+    with pytest.raises(PackagesTooLargeError):
+        stream.read(1)
 
 
 def test_a_header_that_is_a_bomb(tmp_path: Path) -> None:
@@ -148,10 +181,11 @@ def test_headers_for_all_files_are_kept_once(tmp_path: Path) -> None:
 
 
 def test_a_file_that_is_not_as_long_as_it_says(tmp_path: Path) -> None:
-    for data in (b"12", b"1234"):
+    for data in (b"12", b"1" * 99):
         member = trees.Member(f"{len(data)}", 3, False, partial(io.BytesIO, data))
         with pytest.raises(PackageIntegrityError, match="size"):
             trees.write_tree([member], tmp_path, "x")
+        assert (tmp_path / member.path).stat().st_size <= 4
 
 
 @pytest.mark.parametrize("data", [b"", b"no archive", gzip.compress(b"neither", mtime=0)])

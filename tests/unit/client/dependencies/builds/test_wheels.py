@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import stat
+import tracemalloc
 import zipfile
 from collections.abc import Callable
 from dataclasses import replace
@@ -68,6 +69,7 @@ def add(name: str, mode: int = 0o100644) -> Callable[[zipfile.ZipFile], None]:
         (add("../out/", stat.S_IFDIR | 0o755), "'..' step"),
         (add("/etc/out"), "absolute name"),
         (add("link", stat.S_IFLNK | 0o777), "link or a device"),
+        (add("pipe", stat.S_IFIFO | 0o644), "link or a device"),
         (add("unrecorded.py"), "lists other files"),
         (add("another-1.0.dist-info/METADATA"), "2 folders .dist-info"),
         (add("some_name/__init__.py"), "listed twice"),
@@ -94,23 +96,40 @@ def test_what_its_files_say_is_held_against_them(tmp_path: Path) -> None:
     for packing in (zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA):
         with pytest.raises(PackageIntegrityError, match="packed in another way"):
             check(rewritten(wheel, packing=packing))
-    another = make_wheel(tmp_path, "another").rename(wheel)
-    with pytest.raises(PackageIntegrityError, match=r"its metadata are those of 'another-1\.0"):
-        check(another)
+    for name, version in (("another", "1.0"), ("some-name", "2.0")):
+        another = make_wheel(tmp_path, name, version).rename(wheel)
+        with pytest.raises(PackageIntegrityError, match="its metadata are those of"):
+            check(another)
+    make_wheel(tmp_path, "some-name")
+    for edit, said in (
+        (("/METADATA", b"Name: ", b"Name: x"), "its metadata name the package"),
+        (("/METADATA", b"Version: 1", b"Version: 2"), "its metadata name the version"),
+        (("/RECORD", b"some_name", b"gone.py,,\nsome_name"), "lists other files"),
+        (("/RECORD", b"some_name", b"x" * 200_000), "field larger than"),
+    ):
+        with pytest.raises(PackageIntegrityError, match=said):
+            check(rewritten(wheel, edit=edit))
     for data in (b"", b"PK\5\6" + bytes(18), b"no zip"):
         wheel.write_bytes(data)
         with pytest.raises(PackageIntegrityError, match="is not taken"):
             check(wheel)
 
 
-def rewritten(wheel: Path, changed: bytes = b"", packing: int = zipfile.ZIP_STORED) -> Path:
-    """The same in another packing, or with other code."""
+def rewritten(
+    wheel: Path,
+    changed: bytes = b"",
+    packing: int = zipfile.ZIP_STORED,
+    edit: tuple[str, bytes, bytes] = ("", b"", b""),
+) -> Path:
+    """The same in another packing, with other code, or with a text replaced in one of its files."""
     other = wheel.parent / "other" / wheel.name
     other.parent.mkdir(exist_ok=True)
     with zipfile.ZipFile(wheel) as old, zipfile.ZipFile(other, "w", packing) as new:
         for member in old.infolist():
             is_code = member.filename.endswith("__init__.py")
-            new.writestr(member.filename, (is_code and changed) or old.read(member))
+            data = (is_code and changed) or old.read(member)
+            data = data.replace(*edit[1:], 1) if member.filename.endswith(edit[0]) else data
+            new.writestr(member.filename, data)
     return other
 
 
@@ -125,6 +144,19 @@ def test_bounds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bound: str, val
     monkeypatch.setattr(wheels, bound, value)
     with pytest.raises(PackageIntegrityError, match="too large" if value > 1 else None):
         check(wheel)
+
+
+def test_metadata_are_read_to_their_bound(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(wheels, "MAX_TABLE", 1 << 20)
+    wheel = make_wheel(tmp_path, "some-name")
+    bomb = rewritten(wheel, b"", zipfile.ZIP_DEFLATED, ("/METADATA", b"Name", bytes(32 << 20)))
+    tracemalloc.start()
+    try:
+        with pytest.raises(PackageIntegrityError, match="more than 1 MiB"):
+            check(bomb)
+        assert tracemalloc.get_traced_memory()[1] < 16 << 20
+    finally:
+        tracemalloc.stop()
 
 
 SOURCE = Source("toy", "1.0", "https://user:secret@index/toy-1.0.tar.gz", "a" * 64, where="line 3")
