@@ -142,6 +142,7 @@ WRONG: dict[str, dict[str, Any]] = {
     "rewards of no dimension": {"rewards": np.float64(0)},
     "rewards of objects": {"rewards": np.array([{}, []], object)},
     "rewards of text": {"rewards": np.array(["a", "b"])},
+    "rewards of two dimensions": {"rewards": np.zeros((NUM_ENVS, 2))},
     "rewards is a list": {"rewards": [0.0] * NUM_ENVS},
     "terminations of objects": {"terminations": np.array([None, {}], object)},
     "terminations of numbers": {"terminations": np.array([0.5, 2.0])},
@@ -431,12 +432,13 @@ def test_flood_of_unasked_answers_is_bounded(liar: LyingServer, folder: str) -> 
 def test_parts_that_do_not_add_up_are_refused(
     liar: LyingServer, folder: str, parts: tuple[int, ...]
 ) -> None:
-    frames = m.pack(step_done())
+    """Nor more answers than runners were asked, each of which would do."""
+    frames = m.pack(step_done()) * len(parts)
     liar.lies[m.Step] = lambda asked: [
         [*m.pack_header(m.RelayDone(parts), asked.request_id), *frames]
     ]
     with started(liar, folder) as env:
-        refuses(lambda: env.step(ACTIONS))
+        assert isinstance(refuses(lambda: env.step(ACTIONS)), RemoteProtocolError)
 
 
 @pytest.mark.parametrize(
