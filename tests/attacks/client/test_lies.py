@@ -448,9 +448,14 @@ def test_parts_that_do_not_add_up_are_refused(
         m.Refusal("VersionMismatchError", "\x1b[2J", "", ""),
         m.Refusal("os.system", "\x1b[2J", "", ""),
         m.JailOpened(1, (), ()),
+        m.JailOpened(1, ("1",), ()),  # type: ignore[arg-type]
+        m.Death(-1, "exit", None, "\x1b[2J", "\x1b[2J", "\x1b[2J", "\x1b[2J"),
         m.Value(None),
     ],
-    ids=["version", "painted-refusal", "unknown-refusal", "no-runners", "other"],
+    ids=[
+        *("version", "painted-refusal", "unknown-refusal", "no-runners", "no-numbers"),
+        *("painted-death", "other"),
+    ],
 )
 @pytest.mark.parametrize("request_kind", [m.Hello, m.OpenJail], ids=lambda kind: kind.__name__)
 def test_handshake_lies_are_refused(

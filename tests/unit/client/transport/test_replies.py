@@ -231,6 +231,7 @@ def test_deaths_say_how(reply: m.Death, text: str) -> None:
         ("ResolutionError", errors.ResolutionError),
         ("PackagesTooLargeError", errors.PackagesTooLargeError),
         ("SystemExit", errors.WorkerError),
+        ("LoadError", errors.WorkerError),
     ],
 )
 def test_refusals_come_from_a_table(name: str, expected: type[Exception]) -> None:
