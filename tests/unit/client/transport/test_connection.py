@@ -20,6 +20,7 @@ from envhub_sandbox.transport.lane import Lane
 from envhub_sandbox.transport.shared_memory.lane import SharedMemoryLane
 from envhub_sandbox.transport.shared_memory.served_lane import ServedLane
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.limits import WireLimits
 from tests.attacks.client.lying_server import Asked, Frames, LyingServer, lying
 from tests.support.processes import eventually
 
@@ -105,6 +106,19 @@ def test_a_reply_is_there_once_it_has_arrived() -> None:
         assert eventually(lambda: connection.arrived(third))
         connection.forget(third)
         assert not connection.arrived(third)
+
+
+def test_a_frame_over_the_limit_does_not_arrive() -> None:
+    """It is refused by its length, before libzmq takes memory for it."""
+    with lying() as server:
+        server.lies[m.ReadOutput] = lambda asked: [asked.answer(m.Output("x" * 20_000))]
+        limits = WireLimits(frame_bytes=10_000)
+        connection = WorkerConnection(server.endpoint, server.process_fd, limits)
+        try:
+            with pytest.raises(WorkerTimeoutError):
+                connection.request(m.ReadOutput(1, ""), deadline=Deadline(1))
+        finally:
+            connection.close()
 
 
 def test_other_replies_are_dropped_while_one_is_looked_for() -> None:
