@@ -9,6 +9,7 @@ import select
 import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import pairwise
 
 import pytest
 
@@ -122,7 +123,11 @@ def test_a_frame_over_the_limit_does_not_arrive() -> None:
 
 
 def test_other_replies_are_dropped_while_one_is_looked_for() -> None:
-    """As many as there are, and counted; the one that follows them is found."""
+    """As many as there are, and counted; the one that follows them is found.
+
+    At each look one of them at most: a flood has no end, and a deadline holds in it.
+    """
+    dropped = [0]
 
     def flood(asked: Asked) -> list[Frames]:
         stale = [asked.answer(m.Output("stale"), asked.request_id + 1000 + i) for i in range(50)]
@@ -131,8 +136,15 @@ def test_other_replies_are_dropped_while_one_is_looked_for() -> None:
     with connected() as (server, connection):
         server.lies[m.ReadOutput] = flood
         sent = connection.send(m.ReadOutput(1, ""))
-        assert eventually(lambda: connection.arrived(sent))
-        assert connection.stale_replies == 50
+
+        def look() -> bool:
+            there = connection.arrived(sent)
+            dropped.append(connection.stale_replies)
+            return there
+
+        assert eventually(look)
+        assert dropped[-1] == 50
+        assert max(later - before for before, later in pairwise(dropped)) == 1
         assert connection.receive(sent, Deadline(0))[0] == m.Output("")
 
 
