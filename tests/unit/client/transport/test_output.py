@@ -97,9 +97,8 @@ def test_a_follower_gets_every_byte_that_is_kept(
     tail.close()
 
 
-def test_a_follower_ends_though_a_server_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_follower_ends_though_a_server_does_not() -> None:
     """It has more at each request, for ever; who stops following is not kept busy."""
-    monkeypatch.setattr(output, "_ASK_S", 0.05)
     ended = threading.Event()
 
     def more(request: m.FollowOutput, **_: object) -> tuple[m.Message, list[object]]:
