@@ -28,6 +28,7 @@ from envhub_sandbox.transport.replies import UnreachableError
 from envhub_sandbox.transport.results import Results
 from envhub_sandbox.transport.shard_trials import LEAST_STEPS, ShardTrials
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.codec.inert import one_line
 from envhub_worker.protocol.lifecycle import Lifecycle, State
 
 if TYPE_CHECKING:
@@ -43,6 +44,8 @@ _SUCCESSOR_S = 60.0
 """For how long a restart waits for the server that comes in the place of one that ends."""
 _MOST_READ = 64
 """Names of one environment that are remembered."""
+_MOST_STATES, _STATE_CHARS = 64, 40
+"""Words about runners, of which a server permits as many, and characters of each."""
 _NEVER = 1 << 62
 
 
@@ -106,10 +109,10 @@ class Lease:
         return loaded.jail.report
 
     def states(self) -> tuple[str, ...]:
-        """What its runners are doing, one word each."""
+        """What its runners are doing, one word each. Trust: text from the worker."""
         states = self.status().get("states")
-        words = states if isinstance(states, tuple) else ()
-        return tuple(word for word in words if isinstance(word, str))
+        words = states[:_MOST_STATES] if isinstance(states, tuple) else ()
+        return tuple(one_line(word, _STATE_CHARS) for word in words if isinstance(word, str))
 
     def status(self) -> dict[str, Any]:
         """What its server says of its jail: see ``Launcher.status``."""

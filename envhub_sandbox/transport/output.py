@@ -153,7 +153,8 @@ class OutputFollower:
             try:
                 while not self._stopped.wait(_PERIOD_S):
                     self._ask(client)
-                while self._ask(client):
+                rest = Deadline(_ASK_S)  # as long as stop() waits: a server may never end
+                while self._ask(client) and not rest.passed:
                     pass
             finally:
                 client.close()

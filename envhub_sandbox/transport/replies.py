@@ -37,6 +37,8 @@ from envhub_worker.protocol.codec.inert import one_line
 from envhub_worker.protocol.confinement import Reason
 from envhub_worker.protocol.text import continued, printable, quoted
 
+_WORD_CHARS = 100
+"""Of an operation, a signal, or a reason."""
 _PROFILE = 'profile "(strict|no-userns|container)"'
 
 
@@ -165,23 +167,28 @@ _REASONS: dict[Reason, str] = {
 
 
 def death(reply: m.Death) -> WorkerDiedError:
-    """The error for a jail that ended."""
-    how = _REASONS.get(reply.reason, reply.reason)
-    if reply.signal:
-        how += f" ({reply.signal})"
+    """The error for a jail that ended. Trust: text from the worker."""
+    reason: Any = one_line(reply.reason, _WORD_CHARS)
+    signal = None if reply.signal is None else one_line(reply.signal, _WORD_CHARS)
+    operation = one_line(reply.operation, _WORD_CHARS)
+    why = printable(reply.detail)
+    last = printable(reply.tail, len(reply.tail))  # as much as the policy's output_bytes
+    how = _REASONS.get(reason, reason)
+    if signal:
+        how += f" ({signal})"
     elif reply.exit_code is not None:
         how += f" (exit code {reply.exit_code})"
-    during = f" during {reply.operation}" if reply.operation else ""
-    detail = f"\n{reply.detail}" if reply.detail else ""
-    tail = f"\nIts last output:\n{quoted(reply.tail)}" if reply.tail else ""
+    during = f" during {operation}" if operation else ""
+    detail = f"\n{why}" if why else ""
+    tail = f"\nIts last output:\n{quoted(last)}" if last else ""
     return WorkerDiedError(
         f"the worker process died{during}: {how}{detail}{tail}",
         exit_code=reply.exit_code,
-        signal=reply.signal,
-        reason=reply.reason,
-        log_tail=reply.tail,
-        request=reply.operation or None,
-        detail=reply.detail,
+        signal=signal,
+        reason=reason,
+        log_tail=last,
+        request=operation or None,
+        detail=why,
     )
 
 

@@ -62,6 +62,13 @@ def test_a_lie_about_a_size_is_refused(frames: list[bytes], error: type[Exceptio
         compression.unpack_frames(frames, LIMITS)
 
 
+def test_no_size_makes_the_others_seem_small() -> None:
+    """All are looked at before the first is unpacked: a negative one would lessen their sum."""
+    frames = packed_by_hand((1 << 20, 1 << 20, 1 << 20, -(1 << 20)), *[b"x"] * 4)
+    with pytest.raises(RemoteProtocolError, match="a size that is none"):
+        compression.unpack_frames(frames, LIMITS)
+
+
 def test_images_take_less_of_a_wire_than_they_hold(server: Listening, tmp_path: Path) -> None:
     with (
         relay(server.port) as wire,

@@ -15,7 +15,13 @@ import pytest
 from gymnasium import spaces
 
 from envhub_sandbox import make_env
-from envhub_sandbox.errors import EnvHubError, LoadError, RemoteProtocolError
+from envhub_sandbox.errors import (
+    EnvHubError,
+    LoadError,
+    MessageTooLargeError,
+    RemoteEnvError,
+    RemoteProtocolError,
+)
 from envhub_sandbox.transport.results import Results
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest.manifest import Manifest, encode_env, encode_manifest
@@ -175,6 +181,27 @@ def test_infos_that_would_take_too_much_are_joined_one_by_one() -> None:
         joins.joined_steps(parts)
     with pytest.raises(batches.Misfit):
         joins.joined_resets([(part[0], part[4]) for part in parts])
+
+
+def test_own_infos_that_would_take_too_much_are_refused() -> None:
+    """Joined here, one row's makes a column for all; and what does not fit is told in short."""
+    joins = Results(wire.env_manifest(OBSERVATION, ACTION, 64, sync=True), [(0, 64)])
+    assert joins.joined_own([m.Value(((0, {"a": np.zeros(1000)}),))])["a"].shape == (64, 1000)
+    with pytest.raises(MessageTooLargeError):
+        joins.joined_own([m.Value(((0, {"a": np.zeros(1 << 20)}),))])
+    name = "x" * 100_000
+    with pytest.raises(RemoteEnvError) as caught:
+        joins.joined_own([m.Value(((0, {name: 1.0}), (1, {name: "text"})))])
+    assert len(str(caught.value)) < 1000
+
+
+def test_rewards_of_different_shapes_are_not_joined() -> None:
+    """Several for each sub-environment are permitted, and a worker may lie about how many."""
+    joins = Results(wire.env_manifest(OBSERVATION, ACTION, 2, sync=False), [(0, 1), (1, 2)])
+    over = np.zeros(1, bool)
+    parts: list[Any] = [(_zeros(1, 3), _zeros(1, several), over, over, {}) for several in (2, 3)]
+    with pytest.raises(RemoteProtocolError, match="different shapes"):
+        joins.joined_steps(parts)
 
 
 def test_another_space_is_refused_before_the_first_step(

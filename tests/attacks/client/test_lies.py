@@ -142,6 +142,7 @@ WRONG: dict[str, dict[str, Any]] = {
     "rewards of no dimension": {"rewards": np.float64(0)},
     "rewards of objects": {"rewards": np.array([{}, []], object)},
     "rewards of text": {"rewards": np.array(["a", "b"])},
+    "rewards of two dimensions": {"rewards": np.zeros((NUM_ENVS, 2))},
     "rewards is a list": {"rewards": [0.0] * NUM_ENVS},
     "terminations of objects": {"terminations": np.array([None, {}], object)},
     "terminations of numbers": {"terminations": np.array([0.5, 2.0])},
@@ -431,12 +432,13 @@ def test_flood_of_unasked_answers_is_bounded(liar: LyingServer, folder: str) -> 
 def test_parts_that_do_not_add_up_are_refused(
     liar: LyingServer, folder: str, parts: tuple[int, ...]
 ) -> None:
-    frames = m.pack(step_done())
+    """Nor more answers than runners were asked, each of which would do."""
+    frames = m.pack(step_done()) * len(parts)
     liar.lies[m.Step] = lambda asked: [
         [*m.pack_header(m.RelayDone(parts), asked.request_id), *frames]
     ]
     with started(liar, folder) as env:
-        refuses(lambda: env.step(ACTIONS))
+        assert isinstance(refuses(lambda: env.step(ACTIONS)), RemoteProtocolError)
 
 
 @pytest.mark.parametrize(
@@ -446,9 +448,14 @@ def test_parts_that_do_not_add_up_are_refused(
         m.Refusal("VersionMismatchError", "\x1b[2J", "", ""),
         m.Refusal("os.system", "\x1b[2J", "", ""),
         m.JailOpened(1, (), ()),
+        m.JailOpened(1, ("1",), ()),  # type: ignore[arg-type]
+        m.Death(-1, "exit", None, "\x1b[2J", "\x1b[2J", "\x1b[2J", "\x1b[2J"),
         m.Value(None),
     ],
-    ids=["version", "painted-refusal", "unknown-refusal", "no-runners", "other"],
+    ids=[
+        *("version", "painted-refusal", "unknown-refusal", "no-runners", "no-numbers"),
+        *("painted-death", "other"),
+    ],
 )
 @pytest.mark.parametrize("request_kind", [m.Hello, m.OpenJail], ids=lambda kind: kind.__name__)
 def test_handshake_lies_are_refused(

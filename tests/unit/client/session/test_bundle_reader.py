@@ -94,6 +94,10 @@ def test_a_bundle_comes_back(tmp_path: Path) -> None:
         (("provenance", "repo_type"), "trap"),
         (("provenance", "path"), "/etc/passwd"),
         (("provenance", "files"), {"env.py": 5}),
+        (
+            ("provenance",),
+            {"repository": "x", "repo_type": "local", "commit": "", "path": "env.py", "files": {}},
+        ),
         (("death", "reason"), None),
         (("task", "task"), 1.5),
         (("history", "requests", 0), "reset"),
@@ -135,7 +139,9 @@ HARM: dict[str, Callable[[Path], object]] = {
     "lists": lambda folder: (folder / "bundle.json").write_text(
         "[" + "[]," * (MAX_DOCUMENT_BYTES // 3) + "[]]"
     ),
-    "huge": lambda folder: os.truncate(folder / "requests.bin", bundle_reader.MAX_FILE_BYTES + 1),
+    "another dtype": lambda folder: np.save(
+        folder / "actions-int64.npy", np.zeros((3, 2), np.int32)
+    ),
     "noise": lambda folder: (folder / "requests.bin").write_bytes(bytes(range(256))),
 }
 
@@ -145,6 +151,22 @@ def test_a_hostile_file_is_refused(tmp_path: Path, harm: Callable[[Path], object
     folder = bundle(tmp_path)
     harm(folder)
     with pytest.raises(BundleError):
+        load_bundle(folder)
+
+
+@pytest.mark.parametrize(
+    ("name", "most"),
+    [
+        ("bundle.json", MAX_DOCUMENT_BYTES),
+        ("arguments.bin", bundle_reader.MAX_FILE_BYTES),
+        ("requests.bin", bundle_reader.MAX_FILE_BYTES),
+        ("actions-int64.npy", bundle_reader.MAX_FILE_BYTES),
+    ],
+)
+def test_a_huge_file_is_not_read(tmp_path: Path, name: str, most: int) -> None:
+    folder = bundle(tmp_path)
+    os.truncate(folder / name, most + 1)
+    with pytest.raises(BundleError, match=f"at most {most} are read"):
         load_bundle(folder)
 
 
@@ -234,6 +256,16 @@ def test_what_a_bundle_chooses_is_a_wish(
     assert wishes(load_bundle(bundle(tmp_path / "b", **{name: nothing}))) == []
 
 
+@pytest.mark.parametrize("limit", ["999G", [1 << 60], {}, 1 << 60, 1e30])
+def test_a_limit_that_is_no_small_number_is_a_wish(tmp_path: Path, limit: object) -> None:
+    """``Limits`` reads texts as well: what cannot be compared here is asked for."""
+    folder = bundle(tmp_path)
+    edit(folder, "make_env", "policy", value={"limits": {"memory_bytes": limit}})
+    found = load_bundle(folder)
+    assert wishes(found) == [f"limits.memory_bytes={limit!r}"]
+    assert replayed_arguments(found, granted=False)["policy"]["limits"] == {}
+
+
 def test_the_whole_of_a_wish_is_shown(tmp_path: Path) -> None:
     """What stands behind many others is granted with them; where all cannot be shown, none is."""
     many = [f"org/{'x' * 80}{number}" for number in range(15)] + ["me/private"]
@@ -278,13 +310,16 @@ def test_a_bundle_says_nothing_in_lines_of_its_own(tmp_path: Path) -> None:
     forged = "memory_bytes\nError: run this as root\x1b[2J"
     edit(folder, "make_env", "policy", value={"limits": {forged: 1 << 60}})
     edit(folder, "label", value=f"org/repo{forged}")
-    edit(folder, "death", "signal", value="\x1b]0;title\x07")
+    for name in ("signal", "reason", "request", "message"):
+        edit(folder, "death", name, value="\x1b]0;title\x07")
     found = load_bundle(folder)
     [wish] = wishes(found)
     assert wish.startswith("limits.memory_bytes")
     assert wish.isprintable()
     assert found.label.isprintable()
-    assert "\x1b" not in found.label + found.death["signal"] + safe_line(found.label)
+    assert "\x1b" not in found.label + "".join(map(str, found.death.values())) + safe_line(
+        found.label
+    )
     with_login = bundle(tmp_path / "b", endpoint="https://me@there:hf_secret@hub.example/x")
     assert all(b"hf_secret" not in file.read_bytes() for file in with_login.iterdir())
     assert load_bundle(with_login).arguments["endpoint"] == "https://hub.example/x"

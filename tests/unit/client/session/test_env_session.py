@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from typing import Any
-from unittest.mock import MagicMock
+from unittest.mock import MagicMock, Mock
 
 import pytest
 
@@ -50,6 +50,15 @@ def test_errors_of_others_keep_their_text() -> None:
         before = error.args
         part.name_in(error)
         assert error.args == before
+
+
+@pytest.mark.parametrize("lie", [{}, {"files": -1}, {"threads": 1.5}, {"processes": 1 << 63}])
+def test_only_counts_are_taken_for_usage(lie: dict[str, object]) -> None:
+    """A server says what a jail uses, and it may be anybody's."""
+    true = {"processes": 1, "threads": 2, "files": 3, "memory_bytes": 4}
+    session = session_over(FakeLane(1))
+    session.lease = Mock(status=lambda: {**true, **lie, "more": "words"})
+    assert session.usage() == ({} if lie else true)
 
 
 # --- An attribute that is read after each step is watched, and then needs no request

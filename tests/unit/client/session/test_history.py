@@ -31,6 +31,17 @@ def reset(kept: History, seeds: Any = None, mask: Any = None) -> None:
     ask(kept, m.Reset(0, seeds, None, mask))
 
 
+def test_what_outlives_a_reset_is_bounded() -> None:
+    """A program that calls with another argument after each step fills nothing."""
+    kept = made(limit=10_000)
+    for number in range(1000):
+        ask(kept, m.Call(0, "f", (number,), {}))
+    reset(kept, [1, 2])
+    recording = kept.recording()
+    assert len(recording.requests) == 257
+    assert recording.dropped == 744
+
+
 def test_what_shards_were_sent_is_kept_as_it_was_asked() -> None:
     """Each was sent its slice; the recording has the whole, as it was then."""
     kept, values = made(num_envs=3), [np.zeros(2), np.ones(2), np.full(2, 7.0)]

@@ -75,7 +75,13 @@ def acquire(lease: Lease) -> None:
 
 @pytest.mark.parametrize(
     ("said", "words"),
-    [(("steps", "waits"), ("steps", "waits")), (("steps", 5, None), ("steps",)), ("text", ())],
+    [
+        (("steps", "waits"), ("steps", "waits")),
+        (("steps", 5, None), ("steps",)),
+        ("text", ()),
+        (("\x1b[2J",) * 99, ("\\x1b[2J",) * 64),
+        (("x" * 99,), ("x" * 40 + "...",)),
+    ],
 )
 def test_only_words_are_taken_of_a_status(
     taken: tuple[Lease, _Jails], said: object, words: tuple[str, ...]

@@ -9,6 +9,7 @@ import select
 import subprocess
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import pairwise
 
 import pytest
 
@@ -20,6 +21,7 @@ from envhub_sandbox.transport.lane import Lane
 from envhub_sandbox.transport.shared_memory.lane import SharedMemoryLane
 from envhub_sandbox.transport.shared_memory.served_lane import ServedLane
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.limits import WireLimits
 from tests.attacks.client.lying_server import Asked, Frames, LyingServer, lying
 from tests.support.processes import eventually
 
@@ -107,8 +109,25 @@ def test_a_reply_is_there_once_it_has_arrived() -> None:
         assert not connection.arrived(third)
 
 
+def test_a_frame_over_the_limit_does_not_arrive() -> None:
+    """It is refused by its length, before libzmq takes memory for it."""
+    with lying() as server:
+        server.lies[m.ReadOutput] = lambda asked: [asked.answer(m.Output("x" * 20_000))]
+        limits = WireLimits(frame_bytes=10_000)
+        connection = WorkerConnection(server.endpoint, server.process_fd, limits)
+        try:
+            with pytest.raises(WorkerTimeoutError):
+                connection.request(m.ReadOutput(1, ""), deadline=Deadline(1))
+        finally:
+            connection.close()
+
+
 def test_other_replies_are_dropped_while_one_is_looked_for() -> None:
-    """As many as there are, and counted; the one that follows them is found."""
+    """As many as there are, and counted; the one that follows them is found.
+
+    At each look one of them at most: a flood has no end, and a deadline holds in it.
+    """
+    dropped = [0]
 
     def flood(asked: Asked) -> list[Frames]:
         stale = [asked.answer(m.Output("stale"), asked.request_id + 1000 + i) for i in range(50)]
@@ -117,8 +136,15 @@ def test_other_replies_are_dropped_while_one_is_looked_for() -> None:
     with connected() as (server, connection):
         server.lies[m.ReadOutput] = flood
         sent = connection.send(m.ReadOutput(1, ""))
-        assert eventually(lambda: connection.arrived(sent))
-        assert connection.stale_replies == 50
+
+        def look() -> bool:
+            there = connection.arrived(sent)
+            dropped.append(connection.stale_replies)
+            return there
+
+        assert eventually(look)
+        assert dropped[-1] == 50
+        assert max(later - before for before, later in pairwise(dropped)) == 1
         assert connection.receive(sent, Deadline(0))[0] == m.Output("")
 
 

@@ -10,6 +10,7 @@ from unittest.mock import Mock
 
 import pytest
 
+from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.jail import JailHandle, WatchedAttributes
 from envhub_sandbox.transport.lane import Lane, answered_first
@@ -58,8 +59,10 @@ def test_what_has_arrived_is_shown_and_stays() -> None:
     for reply in wrong:
         sent = jail.relay("step", [(1, REPLY), (2, REPLY)])
         assert jail.arrived(sent) == []
-        server.reply(reply, REPLY, [b"a", b"b"], to=sent)
+        server.reply(reply, REPLY, REPLY, REPLY, to=sent)
         assert jail.arrived(sent) == []
+        with pytest.raises(EnvHubError):
+            jail.receive(sent, Deadline(0))
     sent = jail.relay("step", [(1, REPLY), (2, REPLY)])
     server.answer(REPLY, REPLY)
     for _ in range(2):

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import os
+import threading
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from envhub_sandbox.transport import output
-from envhub_sandbox.transport.output import Lines, OutputSinks
+from envhub_sandbox.transport.output import Lines, OutputFollower, OutputSinks
+from envhub_worker.protocol import messages as m
 from envhub_worker.supervisor.records import OutputTail
 
 
@@ -92,6 +95,18 @@ def test_a_follower_gets_every_byte_that_is_kept(
     assert tail.ended
     tail.read()  # after its end: nothing happens
     tail.close()
+
+
+def test_a_follower_ends_though_a_server_does_not() -> None:
+    """It has more at each request, for ever; who stops following is not kept busy."""
+    ended = threading.Event()
+
+    def more(request: m.FollowOutput, **_: object) -> tuple[m.Message, list[object]]:
+        return m.OutputBytes(request.offset, b"x\n"), []
+
+    server = Mock(request=more, close=ended.set)
+    OutputFollower(lambda: server, 1, OutputSinks("label", None)).stop()
+    assert ended.wait(60)
 
 
 def test_stderr_gets_lines_as_it_is_now(

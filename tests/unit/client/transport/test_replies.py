@@ -148,8 +148,27 @@ def test_escape_sequences_are_not_obeyed(field: str, stage: str) -> None:
         for text in (str(error), *map(str, vars(error).values())):
             assert not {"\x1b", "\r"} & set(text)
         error = error.__cause__
-    long = raised(a_raised(stage=stage, **{field: "x" * 3_000_000}))
-    assert len(str(long)) < 20_000
+    error = raised(a_raised(stage=stage, **{field: "x" * 3_000_000}))
+    assert len(str(error)) < 20_000
+    while error is not None:
+        assert max(map(len, map(str, vars(error).values())), default=0) < 40_000
+        error = error.__cause__
+
+
+@pytest.mark.parametrize("field", ["reason", "signal", "detail", "tail", "operation"])
+@pytest.mark.parametrize("said", [f"a{ESCAPE}b", "x" * 3_000_000])
+def test_a_server_cannot_paint_a_death(field: str, said: str) -> None:
+    """Nor fill a screen, but with what a jail has printed; the server may be anybody's."""
+    error = death(m.replace(m.Death(1, "exit"), **{field: said}))
+    for text in (str(error), *map(str, vars(error).values())):
+        assert not {"\x1b", "\r"} & set(text)
+        assert field == "tail" or len(text) < 20_000
+
+
+@pytest.mark.parametrize("field", ["message", "missing", "fix"])
+def test_a_server_cannot_paint_a_refusal(field: str) -> None:
+    told = {"message": "no", "missing": "", "fix": "", field: ESCAPE}
+    assert not {"\x1b", "\r"} & set(str(refusal(m.Refusal("SandboxUnavailableError", **told))))
 
 
 def test_a_repository_that_cannot_be_had_is_an_os_error() -> None:
@@ -212,6 +231,7 @@ def test_deaths_say_how(reply: m.Death, text: str) -> None:
         ("ResolutionError", errors.ResolutionError),
         ("PackagesTooLargeError", errors.PackagesTooLargeError),
         ("SystemExit", errors.WorkerError),
+        ("LoadError", errors.WorkerError),
     ],
 )
 def test_refusals_come_from_a_table(name: str, expected: type[Exception]) -> None:

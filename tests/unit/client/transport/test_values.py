@@ -19,11 +19,13 @@ from envhub_sandbox.transport.remote_warnings import MOST, RemoteWarnings
 from envhub_sandbox.transport.values import DescriptionReader
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.inert import RemoteObject
-from envhub_worker.protocol.limits import WireLimits
+from envhub_worker.protocol.codec.wire import SPACE
+from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 from envhub_worker.protocol.messages.prefix import WARNINGS
 from envhub_worker.protocol.spaces.spaces import OpaqueSpace
 from envhub_worker.runner.described import described
 from tests.support.compare import assert_same, assert_same_space
+from tests.support.wire import ext, packed
 
 SPACES: list[gym.Space[Any]] = [
     spaces.Box(-1, np.inf, (2, 3), np.float16),
@@ -39,10 +41,10 @@ SPACES: list[gym.Space[Any]] = [
 BITS = ("PCG64", "PCG64DXSM", "MT19937", "Philox", "SFC64")
 
 
-def arrived(value: object) -> Any:
+def arrived(value: object, limits: WireLimits = DEFAULT_LIMITS) -> Any:
     """What a client makes of a worker's answer."""
     frames = m.pack(m.Value(value), describer=described)
-    message = m.unpack(frames, things=DescriptionReader)
+    message = m.unpack(frames, limits=limits, things=DescriptionReader)
     assert isinstance(message, m.Value)
     return message.value
 
@@ -99,19 +101,23 @@ def test_a_message_has_one_budget() -> None:
     """Each space would do; together they cost more than the message may hold."""
     limits = WireLimits(message_bytes=48 << 10)
     space = spaces.Box(0, 1, (3000,))
-    for values, fits in (((space,), True), ((space, spaces.Box(0, 2, (3000,)), space), False)):
-        frames = m.pack(m.Value(values), describer=described)
-        if fits:
-            assert m.unpack(frames, limits=limits, things=DescriptionReader) == m.Value(values)
-            continue
+    assert arrived((space,), limits) == (space,)
+    bits = np.random.default_rng(1)
+    for values in (
+        (space, spaces.Box(0, 2, (3000,)), space),
+        (EnvSpec("A-v0"),) * 49,
+        (bits,) * 13,
+    ):
         with pytest.raises(RemoteProtocolError, match="cost more"):
-            m.unpack(frames, limits=limits, things=DescriptionReader)
+            arrived(values, limits)
 
 
 def test_nobody_else_makes_anything_of_descriptions() -> None:
     """Whoever was not given what makes them refuses them: a server, a runner, an older client."""
     with pytest.raises(RemoteProtocolError, match="not made here"):
         m.unpack(m.pack(m.Value(spaces.Discrete(2)), describer=described))
+    with pytest.raises(RemoteProtocolError, match="not made here"):
+        m.unpack(packed([m.Value.kind, [ext(SPACE), {}, "more"]]), things=DescriptionReader)
     plain = m.unpack(m.pack(m.Value(spaces.Discrete(2))), things=DescriptionReader)
     assert isinstance(plain, m.Value)
     assert isinstance(plain.value, RemoteObject)

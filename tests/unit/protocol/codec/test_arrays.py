@@ -143,7 +143,7 @@ def test_more_than_32_dimensions_are_refused_before_sending() -> None:
         arrays.pack_shape((1,) * 33)
 
 
-F4, BOOL, TEXT_CODE, BYTES_CODE, TIME_CODE = 10, 0, 14, 15, 16
+F4, BOOL, TEXT_CODE, BYTES_CODE, TIME_CODE, TIMEDELTA_CODE = 10, 0, 14, 15, 16, 17
 
 
 def test_hand_made_descriptor_is_understood() -> None:
@@ -184,7 +184,7 @@ def test_hand_made_descriptor_is_understood() -> None:
         (descriptor(TEXT_CODE, 1, parameter=1), struct.pack("<I", 0xD800), ()),
         (descriptor(TIME_CODE, 1, parameter=0x0000_0001), bytes(8), ()),
         (descriptor(TIME_CODE, 1, parameter=0x0000_01FF), bytes(8), ()),
-        (descriptor(TIME_CODE, 1, parameter=0x0000_0200), bytes(8), ()),
+        (descriptor(TIMEDELTA_CODE, 1, parameter=0x0000_0200), bytes(8), ()),
         (descriptor(BOOL, 2), b"\1\2", ()),
         (descriptor(BOOL, 2000), bytes(1999) + b"\xff", ()),
     ],

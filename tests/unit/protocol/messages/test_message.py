@@ -5,10 +5,12 @@ Messages that recur are packed and unpacked by their form: nobody may notice.
 
 from __future__ import annotations
 
+import tracemalloc
 from typing import Any
 from unittest.mock import Mock
 
 import cloudpickle
+import msgpack
 import numpy as np
 import pytest
 from hypothesis import given
@@ -25,7 +27,7 @@ from envhub_worker.protocol.errors import (
 )
 from envhub_worker.protocol.limits import WireLimits
 from envhub_worker.protocol.messages import message
-from tests.support import inside
+from tests.support import inside, wire
 from tests.support.compare import assert_same
 from tests.support.decode import decode
 from tests.support.values import values
@@ -173,6 +175,21 @@ def test_a_peer_that_never_repeats_itself_fills_nothing() -> None:
         m.unpack(m.pack(m.Value(f"{number}")))
     assert not inside.forms(INCOMING)
     assert not inside.forms(OUTGOING)
+
+
+@pytest.mark.parametrize(
+    ("number", "size", "times"), [(10_000, 5, 1), (5_000, 5, 2), (20, 1 << 17, 2)]
+)
+def test_what_is_kept_of_a_peers_messages_has_a_bound(number: int, size: int, times: int) -> None:
+    """However many of them come, come again, or are large."""
+    tracemalloc.start()
+    for index in range(number):
+        frames = wire.value(msgpack.packb(f"{index:{size}}"))
+        for _ in range(times):
+            m.unpack(frames)
+    kept, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert kept < 600_000
 
 
 def test_memory_that_is_not_there_is_the_peers_fault(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -59,6 +59,7 @@ def test_other_frames_are_a_reply(prefix: Prefix[Any], frames: list[Buffer]) -> 
         warned(("UserWarning", 1)),
         warned((None, "slow")),
         warned(["UserWarning", "slow"]),
+        warned((["UserWarning"], ["slow"])),
         warned(("x" * (MAX_CATEGORY + 1), "slow")),
         warned(("UserWarning", "x" * (MAX_TEXT + 1))),
         warned()[:-1],

@@ -6,6 +6,8 @@
 from __future__ import annotations
 
 import os
+import select
+import socket
 from collections.abc import Iterator
 
 import pytest
@@ -72,3 +74,17 @@ def test_a_death_is_seen_for_as_long_as_it_lasts(watch: Watch) -> None:
     assert watch.wait(0) is False
     os.close(read)
     bell.close()
+
+
+def test_a_ring_wakes_once_and_nothing_reaches_our_end() -> None:
+    """A jail that rings and is not answered keeps nobody awake; what it sends fails there."""
+    own, theirs, watch = OwnBell(), RunnerBell(), Watch()
+    watch.bell(own)
+    os.eventfd_write(own.fileno(), 1)
+    for readable in (True, False):
+        assert bool(select.select([watch.fileno()], [], [], 0)[0]) == readable
+        watch.wait(0)
+    with socket.socket(fileno=os.dup(theirs.theirs)) as end, pytest.raises(BrokenPipeError):
+        end.send(b"x")
+    for one in (watch, own, theirs):
+        one.close()

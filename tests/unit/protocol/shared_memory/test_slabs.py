@@ -106,3 +106,10 @@ def test_a_step_is_its_arrays() -> None:
     assert observed is not None
     assert layout.action_bytes == 4 * 3 * 4
     assert observed.batch_bytes == 4 * (60 + 8 + 7 + 8 + 8 + 1 + 1)
+
+
+@pytest.mark.parametrize("kind", ["O", "U3", "S3", "M8[s]", "V8"])
+def test_only_numbers_have_columns(kind: str) -> None:
+    """An array of objects over memory that a jail writes would be pointers of its choice."""
+    assert slabs.columns_of({"a": np.zeros(2)})
+    assert slabs.columns_of({"a": np.zeros(2), "b": np.zeros(2, kind)}) is None

@@ -206,6 +206,16 @@ def test_shards_that_do_not_agree_are_to_be_asked_apart(other: Any) -> None:
             batches.join_infos(parts, [1, 1])
 
 
+@pytest.mark.parametrize(
+    "lie", [{0: {"a": np.zeros(2)}}, {"a": np.zeros(1)}, {"a": np.zeros((0, 1 << 40))}]
+)
+def test_what_no_shard_says_is_not_joined(lie: dict[Any, Any]) -> None:
+    """Infos by place, which only one that is alone has; and columns of too few rows."""
+    for parts in ([lie, {}], [{}, lie]):
+        with pytest.raises(batches.Misfit):
+            batches.join_infos(parts, [2, 2])
+
+
 def test_one_row_makes_no_endless_column() -> None:
     """What all shards have sent is joined, whatever it takes; what one has sent is bounded."""
     row = {"a": np.zeros((1, 1000), np.uint8), "_a": np.ones(1, bool)}

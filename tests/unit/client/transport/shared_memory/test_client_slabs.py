@@ -253,7 +253,7 @@ def test_what_is_no_boolean_in_a_mask_is_true() -> None:
     schemas = [schema(infos(3, 0)), schema(infos(2, 0))]
     for column, view in schemas[1]:
         if column.key == "_speed":
-            view[...] = (2, 0)
+            view.view(np.uint8)[...] = (2, 0)
     found = JoinedColumns(schemas, BOUNDS).infos()["_speed"]
     assert found.view(np.uint8).tolist() == [1, 1, 1, 1, 0]
 
