@@ -122,6 +122,7 @@ def own(stub_hub: StubHub, hub: dict[str, Any], *declared: str) -> Snapshot:
         ("org/../data@" + "a" * 40, "holds"),
         ("/etc", "a repository of the Hub"),
         (f"git+https://127.0.0.1:9/org/data@{COMMIT}", "a repository of the Hub"),
+        (f"https://github.com/org/data@{COMMIT}", "a repository of the Hub"),
         ("data", "owner is missing"),
         ("ORG/repo", "own repository"),
         (f"models/org/repo@{COMMIT}", "own repository"),
