@@ -28,11 +28,17 @@ DEPOSIT = b"".join(m.pack(m.Deposit(b"mine", 1, 1)))
     ],
 )
 def test_what_is_not_taken_is_closed(
-    tmp_path: Path, said: bytes | None, count: int, pidfd: int | None, reply: bytes
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    said: bytes | None,
+    count: int,
+    pidfd: int | None,
+    reply: bytes,
 ) -> None:
-    store = FdStore(str(tmp_path / "fds"), lambda _: pidfd)
+    monkeypatch.chdir(tmp_path)  # the path of a socket has 107 bytes at most
+    store = FdStore("fds", lambda _: pidfd)
     with socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET) as client:
-        client.connect(str(tmp_path / "fds"))
+        client.connect("fds")
         if said is not None:
             socket.send_fds(client, [said], [0] * count)
         before = len(os.listdir("/proc/self/fd"))

@@ -78,14 +78,15 @@ def served(folder: Path, *, local: bool) -> Jails:
 
 
 @pytest.fixture(autouse=True)
-def _nothing_is_executed(monkeypatch: pytest.MonkeyPatch) -> None:
+def _nothing_is_executed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)  # the path of a socket has 107 bytes at most
     _Spawner.alive = []
     monkeypatch.setattr(jails, "Spawner", _Spawner)
 
 
 @pytest.fixture
-def ours(tmp_path: Path) -> Iterator[Jails]:
-    found = served(tmp_path / "ours", local=True)
+def ours() -> Iterator[Jails]:
+    found = served(Path("ours"), local=True)
     yield found
     found.close()
 
@@ -196,9 +197,9 @@ def test_slabs_have_sizes_that_are_served(ours: Jails) -> None:
         ours.share(MINE, m.ShareSlabs(small.number, ((1, *SLABS),)))
 
 
-def test_another_hosts_client_chooses_no_larger_messages(ours: Jails, tmp_path: Path) -> None:
+def test_another_hosts_client_chooses_no_larger_messages(ours: Jails) -> None:
     """What a runner says is held in the server's memory, which is many clients'."""
-    theirs = served(tmp_path / "theirs", local=False)
+    theirs = served(Path("theirs"), local=False)
     wanted = 2 * DEFAULT_LIMITS.message_bytes
     for of, most in ((ours, wanted), (theirs, DEFAULT_LIMITS.message_bytes)):
         entry = opened(of, limits=Limits(message_bytes=wanted))
