@@ -19,7 +19,6 @@ import argparse
 import contextlib
 import faulthandler
 import gc
-import importlib.util
 import json
 import os
 import signal
@@ -38,11 +37,12 @@ import psutil
 
 from benchmarks import clients
 from benchmarks.soak import EXIT, HANG, LIVE, MIB, SLOW, SLOW_S, same
+from benchmarks.workloads import REPOSITORIES, module
 from envhub_sandbox import errors, make_env
 from tests.support import inside
 
 PLACES = ("process", "tcp", "fleet")
-REPOSITORIES = Path(__file__).parent / "repositories"
+
 NAMES = ("walk", "cartpole")
 _WARM_UP = 0.1
 _SETTLE_S = 60.0
@@ -483,14 +483,7 @@ def _play(monkey: Monkey, arguments: argparse.Namespace, begun: float, part: flo
 
 
 def _model(name: str, n_envs: int) -> Any:
-    path = REPOSITORIES / name / "env.py"
-    spec = importlib.util.spec_from_file_location(f"model_{name}", path)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.dont_write_bytecode = True  # a repository in which bytecode lies is another one
-    spec.loader.exec_module(module)
-    return module.make_env(n_envs)
+    return module(REPOSITORIES / name).make_env(n_envs)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -16,23 +16,22 @@ from __future__ import annotations
 
 import argparse
 import gc
-import importlib.util
 import json
 import os
 import signal
 import sys
 import time
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import psutil
 
+from benchmarks.workloads import REPOSITORIES, module
 from envhub_sandbox import errors, make_env
 from envhub_sandbox.session.recovery import RESTARTED, derived_seed
 from tests.support import inside
 
-REPOSITORY = Path(__file__).parent / "repositories" / "walk"
+REPOSITORY = REPOSITORIES / "walk"
 LANES = ("auto", "frames")
 MIB = 1 << 20
 LIVE, SLOW, HANG, EXIT = 0, 4, 5, 6
@@ -184,13 +183,7 @@ class Soak:
 
 
 def _oracle(n_envs: int) -> Any:
-    spec = importlib.util.spec_from_file_location("soak_oracle", REPOSITORY / "env.py")
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.dont_write_bytecode = True  # a repository in which bytecode lies is another one
-    spec.loader.exec_module(module)
-    return module.make_env(n_envs)
+    return module(REPOSITORY).make_env(n_envs)
 
 
 def same(got: Any, expected: Any) -> bool:
