@@ -142,12 +142,25 @@ def test_nobody_comes_in_while_nobody_can_be_asked(tmp_path: Path) -> None:
             client.setsockopt(zmq.CURVE_PUBLICKEY, pair.public)
             ends = client.get_monitor_socket(zmq.EVENT_HANDSHAKE_SUCCEEDED | zmq.EVENT_DISCONNECTED)
             client.connect(f"tcp://127.0.0.1:{port}")
-            assert ends.poll(60_000)
-            let_in = parse_monitor_message(ends.recv_multipart())["event"] != zmq.EVENT_DISCONNECTED
-            assert let_in is not enforced
+            assert _handshakes(ends) == ([False] * _REFUSALS if enforced else [True])
             client.disable_monitor()
             client.close()
             router.close(0)
+
+
+_REFUSALS = 3
+
+
+def _handshakes(ends: zmq.Socket[bytes]) -> list[bool]:
+    """Whether it was let in: once, or in none of several tries.
+
+    A handler's socket is closed by a thread of libzmq's. A handshake that still finds it fails.
+    """
+    for _ in range(_REFUSALS):
+        assert ends.poll(60_000)
+        if parse_monitor_message(ends.recv_multipart())["event"] != zmq.EVENT_DISCONNECTED:
+            return [True]
+    return [False] * _REFUSALS
 
 
 def test_a_message_without_a_proved_key_is_refused(tmp_path: Path) -> None:
