@@ -101,6 +101,7 @@ class StubHub:
         self.created: list[dict[str, Any]] = []
         self.ignored: set[str] = set()
         self.stopped = threading.Event()
+        self.noting = threading.Lock()
         hub = self
 
         class Handler(_Handler):
@@ -176,9 +177,10 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _answer(self) -> None:
         request = f"{self.command} {self.path}"
-        self.stub.requests.append(request)
-        self.stub.authorizations.append(self.headers.get("authorization"))
-        fault = self.stub.fault_for(request)
+        with self.stub.noting:  # clients ask for several things at once; who asked with what?
+            self.stub.requests.append(request)
+            self.stub.authorizations.append(self.headers.get("authorization"))
+            fault = self.stub.fault_for(request)
         if fault is not None:
             self._misbehave(fault)
             return
