@@ -51,7 +51,7 @@ class Traces:
             zombies=frozenset(_zombies(pids)),
             files=frozenset(_files(folder)),
             descriptors=Counter(_descriptors(pids)),
-            sockets=frozenset(_lines("/proc/net/unix", str(folder))),
+            sockets=frozenset(_sockets(str(folder))),
             mounts=frozenset(_lines("/proc/self/mountinfo", str(folder))),
             cgroups=frozenset(_cgroups()),
         )
@@ -139,6 +139,12 @@ def _descriptors(pids: set[int]) -> Iterator[tuple[int, str]]:
 
 def _lines(path: str, marker: str) -> list[str]:
     return [line for line in _read(path).splitlines() if marker in line]
+
+
+def _sockets(marker: str) -> Iterator[str]:
+    """Number and path: how many hold one, and its state, change from one moment to the next."""
+    for line in _lines("/proc/net/unix", marker):
+        yield " ".join(line.split()[6:])
 
 
 def _cgroups() -> Iterator[str]:
