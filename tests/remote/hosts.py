@@ -14,7 +14,7 @@ import pytest
 
 
 def _run(*words: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(words, capture_output=True, text=True, timeout=30, check=False)
+    return subprocess.run(words, capture_output=True, text=True, timeout=120, check=False)
 
 
 @dataclass
@@ -69,15 +69,17 @@ def other_host() -> Iterator[OtherHost]:
     if reason:
         pytest.skip(reason)
     tag = secrets.token_hex(3)
-    net = f"10.213.{secrets.randbelow(256)}"
+    # others make hosts at the same time: each has a few addresses of many
+    net, low = f"10.213.{secrets.randbelow(256)}", 4 * secrets.randbelow(64)
+    ours, theirs = f"{net}.{low + 1}", f"{net}.{low + 2}"
     namespace, near, far = f"envhub-{tag}", f"eh{tag}a", f"eh{tag}b"
     try:
         for line in (
             f"ip netns add {namespace}",
             f"ip link add {near} type veth peer name {far} netns {namespace}",
-            f"ip addr add {net}.1/24 dev {near}",
+            f"ip addr add {ours}/30 dev {near}",
             f"ip link set {near} up",
-            f"ip -n {namespace} addr add {net}.2/24 dev {far}",
+            f"ip -n {namespace} addr add {theirs}/30 dev {far}",
             f"ip -n {namespace} link set {far} up",
             f"ip -n {namespace} link set lo up",
         ):
@@ -86,7 +88,7 @@ def other_host() -> Iterator[OtherHost]:
                 pytest.skip(f"cannot make another host ({line}): {done.stderr.strip()}")
         # not 'ip netns exec', which would hide the control groups
         prefix = ("nsenter", f"--net=/run/netns/{namespace}", "--")
-        yield OtherHost(namespace, near, f"{net}.2", prefix)
+        yield OtherHost(namespace, near, theirs, prefix)
     finally:
         _run("ip", "link", "del", near)
         _run("ip", "netns", "del", namespace)

@@ -63,7 +63,7 @@ def test_a_partition_ends_a_step_and_a_reset_begins_anew(
     sandbox = far_server.sandbox(heartbeat_s=HEARTBEAT_S)
     options = {"timeouts": {"step_s": 120.0}, "policy": {"restart": "on_reset"}}
     with started(repository, sandbox=sandbox, **options) as env:
-        env.step_async(np.array([50]))
+        env.step_async(np.array([99]))  # it takes longer than to pull the cable
         far.unplug()
         with pytest.raises(WorkerDiedError, match=r"connection to tcp://.* was lost") as caught:
             env.step_wait()
