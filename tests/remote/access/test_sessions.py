@@ -52,9 +52,15 @@ def program(server: Listening, repository: Path, end: str) -> subprocess.Popen[b
     )
 
 
+def connected(server: Listening) -> bool:
+    """Whether anybody is, as far as the server has noticed."""
+    return any(one["connections"] for one in server.sessions())
+
+
 @contextmanager
 def at_work(server: Listening, repository: Path) -> Iterator[subprocess.Popen[bytes]]:
     """A program that keeps its environment meanwhile, and ends after it."""
+    assert eventually(lambda: not connected(server))  # whoever was there before is known to be gone
     client = program(server, repository, "waits")
     assert client.stdout is not None
     assert client.stdout.readline() == b"ready\n"
@@ -116,4 +122,5 @@ def test_status_takes_no_place_of_a_client(narrow: Listening, repository: Path) 
             assert asked.returncode == 0, asked.stderr
             assert "1 jail" in asked.stdout
     assert client.returncode == 0
+    assert eventually(lambda: not connected(narrow))
     assert program(narrow, repository, "closes").communicate(timeout=120)[0] == b"ready\n"
