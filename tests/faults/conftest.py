@@ -12,6 +12,7 @@ import pytest
 
 from envhub_sandbox.sandboxes.pool import stop_idle
 from tests.faults.remains.traces import Traces, temporary_root
+from tests.support import inside
 from tests.support.processes import eventually
 from tests.support.samples import sample
 from tests.support.started import started
@@ -39,6 +40,15 @@ def place() -> Iterator[Path]:
         stop_idle()  # servers that linger; they are all that a closed environment leaves
         gone = eventually(lambda: not _left(folder, before))
         assert gone, _left(folder, before)
+
+
+@pytest.fixture(scope="package", autouse=True)
+def _patient() -> Iterator[None]:
+    """What a jail prints is followed however long a loaded server takes to say it."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(*inside.WAIT_FOR_OUTPUT, 60.0)
+        patch.setattr(*inside.WAITS_FOR_A_SERVER[0], 60.0)
+        yield
 
 
 def _left(folder: Path, before: Traces) -> list[str]:

@@ -16,6 +16,19 @@ from tests.support.started import started
 IMPATIENT_S = 8
 
 
+@pytest.fixture(scope="package", autouse=True)
+def _patient() -> Iterator[None]:
+    """Who is slow is not gone: a loaded machine takes the core from a server for a long time.
+
+    A test of how soon a server counts as gone says by itself how soon.
+    """
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("envhub_sandbox.transport.tcp.CONNECT_S", 60.0)
+        for spot in (*inside.WAITS_FOR_A_SERVER, inside.WAIT_FOR_OUTPUT):
+            patch.setattr(*spot, 60.0)
+        yield
+
+
 @pytest.fixture(scope="package")
 def server(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Listening]:
     """A server on loopback, with keys; as patient as by default."""

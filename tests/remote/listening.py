@@ -151,4 +151,4 @@ def listening(
         yield server
     finally:
         process.terminate()
-        process.wait(30)
+        process.wait(120)

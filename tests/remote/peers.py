@@ -26,7 +26,7 @@ class Peer:
 
     def ask(self, message: m.Message, *payload: bytes) -> m.Message:
         self.tell(message, *payload)
-        assert self.socket.poll(30_000)
+        assert self.socket.poll(60_000)
         return m.unpack_header(self.socket.recv_multipart()[0])[1]
 
     def refused(self, message: m.Message, *payload: bytes) -> m.Refusal:

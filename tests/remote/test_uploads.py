@@ -261,11 +261,11 @@ def test_only_the_edited_file_travels_to_a_real_server(server: Listening, tmp_pa
         env.step(np.array([0]))
         remote = inside.server(env)
         client = WorkerConnection(remote.endpoint, remote.process_fd, far=remote.far)
-        client.hello(Deadline(30))
+        client.hello(Deadline(60))
         (repository / "empty").write_bytes(b"no more")
         files = remote_repository.listing(repository)
-        assert remote_repository.upload(client, repository, files, Deadline(30))[1] == len(
+        assert remote_repository.upload(client, repository, files, Deadline(60))[1] == len(
             b"no more"
         )
-        assert remote_repository.upload(client, repository, files, Deadline(30))[1] == 0
+        assert remote_repository.upload(client, repository, files, Deadline(60))[1] == 0
         client.close()

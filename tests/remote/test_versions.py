@@ -26,7 +26,7 @@ def test_a_server_refuses_a_client_of_another_version(tmp_path: Path, version: i
     server = use.server
     client = WorkerConnection(server.endpoint, server.process_fd)
     try:
-        reply, _ = client.request(m.Hello(version, b"x"), deadline=Deadline(30))
+        reply, _ = client.request(m.Hello(version, b"x"), deadline=Deadline(60))
     finally:
         client.close()
         use.release()
@@ -70,6 +70,6 @@ def test_a_client_refuses_a_worker_of_another_version(tmp_path: Path) -> None:
         try:
             text = f"protocol {m.VERSION}, the worker {ANOTHER}: install the same release"
             with pytest.raises(VersionMismatchError, match=text):
-                client.hello(Deadline(30))
+                client.hello(Deadline(60))
         finally:
             client.close()

@@ -39,7 +39,7 @@ SCRIPT = "<script>steal()</script>"
 
 def opened(liar: LyingServer, folder: str, **options: Any) -> EnvSuites:
     """``make_env`` by way of the liar."""
-    timeouts = {"startup_s": 20.0, "step_s": 20.0, "reset_s": 20.0, "call_s": 20.0, "close_s": 1.0}
+    timeouts = {"startup_s": 60.0, "step_s": 60.0, "reset_s": 60.0, "call_s": 60.0, "close_s": 1.0}
     options = {"timeouts": timeouts, "n_envs": NUM_ENVS, **options}
     return make_env(folder, sandbox=LyingSandbox(liar), **options)
 

@@ -67,7 +67,7 @@ def fleet(liar: LyingServer, honest: LyingServer, folder: str, **policy: Any) ->
         server.lies[m.Step] = relayed(step_done(**TRUE, info=INFO))
         server.lies[m.Call] = relayed(m.Value(("true",) * NUM_ENVS))
     options: dict[str, Any] = {
-        "timeouts": {"startup_s": 20.0, "step_s": 20.0, "reset_s": 20.0, "close_s": 1.0},
+        "timeouts": {"startup_s": 60.0, "step_s": 60.0, "reset_s": 60.0, "close_s": 1.0},
         "policy": policy,
     }
     places = [LyingSandbox(liar), LyingSandbox(honest)]

@@ -335,7 +335,7 @@ def test_malformed_answers_of_the_server_are_refused(
     """The same where the server's own message belongs; some of them only make the client wait."""
     frames = DOCUMENTS[what]()
     liar.lies[m.Reset] = lambda asked: [frames]
-    timeouts = {"startup_s": 20.0, "reset_s": 1.0, "close_s": 1.0}
+    timeouts = {"startup_s": 60.0, "reset_s": 1.0, "close_s": 1.0}
     with opened(liar, folder, timeouts=timeouts) as suites:
         refuses(suites.env.reset)
 

@@ -184,9 +184,8 @@ def has_socket(run: Run, name: str) -> bool:
     """Whether a process of the run holds a socket of a protocol, as /proc shows it from here."""
     found = []
     for pid in run.pids():
-        for fd in os.listdir(f"/proc/{pid}/fd"):
-            try:
-                found.append(os.getxattr(f"/proc/{pid}/fd/{fd}", "system.sockprotoname"))
-            except OSError:
-                continue
+        with contextlib.suppress(OSError):  # it may end just now
+            for fd in os.listdir(f"/proc/{pid}/fd"):
+                with contextlib.suppress(OSError):
+                    found.append(os.getxattr(f"/proc/{pid}/fd/{fd}", "system.sockprotoname"))
     return any(name.encode() == protocol.rstrip(b"\0") for protocol in found)

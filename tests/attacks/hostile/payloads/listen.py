@@ -12,7 +12,7 @@ def attack(port, message):
     kept["listener"] = socket.create_server(("127.0.0.1", port))
     threading.Thread(target=_serve, daemon=True).start()
     port = kept["listener"].getsockname()[1]
-    with socket.create_connection(("127.0.0.1", port), timeout=5) as connection:
+    with socket.create_connection(("127.0.0.1", port), timeout=60) as connection:
         connection.sendall(message.encode())
         connection.shutdown(socket.SHUT_WR)
         connection.recv(1)  # the end, when it has been read
