@@ -145,6 +145,7 @@ def _provoke(row: Row, suites: Any) -> tuple[Exception | None, float]:
 def _step_that_stops(env: Any) -> Any:
     """Its time begins when somebody has been stopped: how that is told is what is asked here."""
     runners = inside.pids(env)
+    inside.asks_patiently(env)
     env.step_async([0, 1])
     assert eventually(lambda: any(map(is_stopped, runners)))
     return env.step_wait()
