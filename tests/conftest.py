@@ -26,6 +26,10 @@ settings.register_profile("ci", settings.get_profile("local"), derandomize=True)
 settings.load_profile("ci" if "ENVHUB_CI" in os.environ else "local")
 
 
+# A Hub of ours is on this machine, and a loaded one may take longer than ten seconds to answer.
+for _name in ("HF_HUB_ETAG_TIMEOUT", "HF_HUB_DOWNLOAD_TIMEOUT"):
+    os.environ.setdefault(_name, "60")
+
 # A store is trusted only where nobody else can move it: not in a /tmp that is not sticky.
 if folders.why_distrusted(Path(tempfile.gettempdir()), Path("/nowhere")):
     os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", "/var/tmp")
