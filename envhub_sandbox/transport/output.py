@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
-from envhub_sandbox.errors import EnvHubError, PolicyError
+from envhub_sandbox.errors import EnvHubError, PolicyError, WorkerTimeoutError
 from envhub_sandbox.system.log import OUTPUT
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.replies import expect_reply
@@ -152,7 +152,8 @@ class OutputFollower:
             client = self._connect()
             try:
                 while not self._stopped.wait(_PERIOD_S):
-                    self._ask(client)
+                    with contextlib.suppress(WorkerTimeoutError):  # a busy one is asked again
+                        self._ask(client)
                 rest = Deadline(_ASK_S)  # as long as stop() waits: a server may never end
                 while self._ask(client) and not rest.passed:
                     pass

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from envhub_sandbox import errors, make_env
-from tests.support.processes import eventually
+from tests.support import inside
+from tests.support.processes import eventually, halted
 from tests.support.repositories import write_repository
 from tests.support.samples import sample
 from tests.support.started import started
@@ -95,6 +97,23 @@ class Chatty(gym.Env):
 def make_env(n_envs=1, use_async_envs=False, how=""):
     return gym.vector.SyncVectorEnv([lambda: Chatty(how)] * n_envs)
 """
+
+
+def test_a_server_that_says_nothing_for_a_while_is_asked_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As one of a machine that stands still: what comes later is in the file all the same."""
+    monkeypatch.setattr(*inside.WAIT_FOR_OUTPUT, 0.1)
+    path = tmp_path / "worker.log"
+    with made(path, "hang") as suites:
+        suites.env.reset()
+        with halted([inside.server(suites.env).process.pid]):
+            time.sleep(1.5)  # it is asked a few times a second
+        suites.env.step_async([0, 1])
+        assert eventually(lambda: "about to hang" in path.read_text())
+        with pytest.raises(errors.WorkerTimeoutError):
+            suites.env.step_wait(timeout=0.1)
+    assert eventually(lambda: followers() == [])  # a close waits for it as long as it asks
 
 
 def test_output_of_loading_and_closing_is_there(tmp_path: Path) -> None:
