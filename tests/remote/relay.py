@@ -30,7 +30,9 @@ class Relay:
         self._sockets: list[socket.socket] = []
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.port = int(self._listener.getsockname()[1])
-        threading.Thread(target=self._accept, daemon=True).start()
+        self._pumps: list[threading.Thread] = []
+        self._accepting = threading.Thread(target=self._accept, daemon=True)
+        self._accepting.start()
 
     @property
     def endpoint(self) -> str:
@@ -44,8 +46,9 @@ class Relay:
                 self._sockets += [client, server]
                 kept = bytearray()
                 self.captured.append(kept)
-                threading.Thread(target=self._pump, args=(client, server, kept)).start()
-                threading.Thread(target=self._pump, args=(server, client, None)).start()
+                for ends in ((client, server, kept), (server, client, None)):
+                    self._pumps.append(threading.Thread(target=self._pump, args=ends))
+                    self._pumps[-1].start()
 
     def _pump(self, source: socket.socket, target: socket.socket, kept: bytearray | None) -> None:
         with contextlib.suppress(OSError):
@@ -68,8 +71,11 @@ class Relay:
 
     def close(self) -> None:
         self._listener.shutdown(socket.SHUT_RDWR)
+        self._accepting.join()
         self._listener.close()
         self.cut()
+        for pump in self._pumps:  # a number that is closed under one may be another socket's
+            pump.join()
         for one in self._sockets:
             one.close()
 
