@@ -75,9 +75,9 @@ import numpy as np, time
 with make_env(sys.argv[4], n_envs=20, sandbox=sandbox) as suites:
     env = suites.env
     env.reset()
-    print("steps", flush=True)
     begun = time.monotonic()
     try:
+        print("steps", flush=True)
         env.step(np.full(20, 99))
     except KeyboardInterrupt:
         print("interrupted", time.monotonic() - begun < 100, flush=True)
