@@ -6,7 +6,6 @@ table; run it as root and as a plain user for all of them.
 
 from __future__ import annotations
 
-import fcntl
 import shutil
 import tempfile
 from collections.abc import Iterator
@@ -19,6 +18,7 @@ from envhub_sandbox.system.folders import cache_root
 from tests.attacks import table
 from tests.attacks.harness import Arena, LastingJail, OpenJail
 from tests.support.interpreter import profiles
+from tests.support.turns import turn
 
 _TABLE = table.Collected("attack", "ENVHUB_ATTACK_TABLE")
 
@@ -103,6 +103,5 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
 @pytest.fixture
 def broadcasting() -> Iterator[None]:
     """What is sent to everybody is sent by one test at a time, whichever process runs it."""
-    with open(__file__) as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
+    with turn("broadcasting"):
         yield

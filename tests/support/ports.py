@@ -9,14 +9,24 @@ import threading
 from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
+_given: list[socket.socket] = []
+"""A name for each port that was given away: no other test gets it while this process lives."""
+
 
 def lasting_port() -> int:
     """A port below those that the kernel gives to anybody: it is still free a while later."""
     while True:
         number = random.randrange(20_000, 32_000)
-        with contextlib.suppress(OSError), socket.socket() as sock:
-            sock.bind(("127.0.0.1", number))
-            return number
+        name = socket.socket(socket.AF_UNIX)
+        try:
+            name.bind(f"\0envhub-test-port-{number}")
+            with socket.socket() as sock:
+                sock.bind(("127.0.0.1", number))
+        except OSError:
+            name.close()
+            continue
+        _given.append(name)
+        return number
 
 
 class QuietHandler(BaseHTTPRequestHandler):

@@ -72,6 +72,23 @@ def most_grown(before: dict[int, int]) -> int:
     return max(now[pid] - bytes_ for pid, bytes_ in before.items() if pid in now)
 
 
+@contextlib.contextmanager
+def unless_ended(pid: int) -> Iterator[None]:
+    """What is asked of a process that may end meanwhile is left unanswered once it has.
+
+    As long as nobody has asked for its end, its entry in ``/proc`` is there, and is root's: a plain
+    user is refused what was his a moment ago.
+    """
+    try:
+        yield
+    except (FileNotFoundError, ProcessLookupError):
+        return
+    except PermissionError:
+        with contextlib.suppress(psutil.NoSuchProcess):
+            if psutil.Process(pid).status() not in (psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD):
+                raise
+
+
 def is_stopped(pid: int) -> bool:
     """Whether a process has been stopped by a signal."""
     return bool(psutil.Process(pid).status() == psutil.STATUS_STOPPED)

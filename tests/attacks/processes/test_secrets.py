@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,6 +13,7 @@ from envhub_sandbox.sandboxes.process import PROCESS
 from tests.attacks.harness import Arena, OpenJail, token
 from tests.attacks.hostile.payloads import kernel
 from tests.attacks.processes.victim import victim
+from tests.support.processes import unless_ended
 
 FAMILY = "Secrets in memory, environments and keyrings"
 
@@ -39,7 +39,7 @@ def test_nothing_of_ours_has_the_token(arena: Arena, hub_token: str) -> None:
     assert hub_token in os.environ.values()
     read = 0
     for process in psutil.Process().children(recursive=True):
-        with contextlib.suppress(FileNotFoundError, ProcessLookupError):  # it has ended meanwhile
+        with unless_ended(process.pid):
             assert hub_token not in Path(f"/proc/{process.pid}/environ").read_text()
             read += 1
     assert read >= 2  # of the fresh server and its zygote, at least

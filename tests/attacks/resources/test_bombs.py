@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
-import fcntl
 import os
 import subprocess
 import time
@@ -30,6 +29,7 @@ from tests.attacks.harness import (
 )
 from tests.attacks.resources.accounts import figure, in_pipes, of_processes, tasks
 from tests.support.processes import eventually, most_grown, resident
+from tests.support.turns import LONGEST_S, turn
 
 FAMILY = "Bombs"
 
@@ -110,12 +110,12 @@ KINDS: dict[str, str | Callable[[Run], int]] = {
 @pytest.fixture
 def _machine() -> Iterator[None]:
     """The machine's account belongs to one bomb at a time, whichever process tests it."""
-    with open(__file__) as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
+    with turn("memory"):
         yield
 
 
 @pytest.mark.short("strict-heap")
+@pytest.mark.timeout(LONGEST_S + 300)
 @pytest.mark.usefixtures("_machine")
 @pytest.mark.parametrize("kind", KINDS)
 def test_memory_bomb_stops_at_the_limit(arena: Arena, kind: str) -> None:

@@ -18,6 +18,7 @@ from pathlib import Path
 import pytest
 
 from tests.attacks.harness import ANSWER, USER, Arena, Run, token
+from tests.support.turns import LONGEST_S, turn_of_user
 
 FAMILY = "What others share"
 
@@ -132,7 +133,7 @@ libc.mq_unlink(name)
 sys.exit(made < 0)
 """,
     "descriptors in flight": """
-resource.setrlimit(resource.RLIMIT_NOFILE, (1024, 1024))
+resource.setrlimit(resource.RLIMIT_NOFILE, (256, 256))
 ours, theirs = socket.socketpair()
 try:
     socket.send_fds(ours, [b"x"], [0])
@@ -154,6 +155,15 @@ def used_up(kind: str) -> bool:
     return done.returncode == 1
 
 
+@pytest.fixture
+def _quotas() -> Iterator[None]:
+    """They are one user's: what one test uses up, another one would find used up."""
+    with turn_of_user("quotas"):
+        yield
+
+
+@pytest.mark.timeout(LONGEST_S + 300)
+@pytest.mark.usefixtures("_quotas")
 @pytest.mark.parametrize("kind", PROBES)
 def test_the_users_quotas_are_left_to_others(arena: Arena, kind: str) -> None:
     assert not used_up(kind), "this user's other programs have used it up before"

@@ -19,7 +19,7 @@ WATCHDOG_S = 240
 """Far more than all timeouts of the client together."""
 
 ABUSE = """
-import contextlib, os, socket, stat, threading
+import contextlib, os, resource, socket, stat, threading
 
 ONE = (1).to_bytes(8, "little")
 MANY = 100_000  # more than any pipe or socket holds; /dev/null is never full
@@ -77,6 +77,8 @@ def shut(fd):
             ours.shutdown(socket.SHUT_RDWR)
 
 def push(fd):
+    # what is on its way counts for all programs of a user: the others keep theirs
+    resource.setrlimit(resource.RLIMIT_NOFILE, (512, resource.getrlimit(resource.RLIMIT_NOFILE)[1]))
     if ours := a_socket(fd):
         ours.setblocking(False)
         with contextlib.suppress(OSError):

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import errno
 import os
 import socket
 import time
@@ -35,7 +36,7 @@ from tests.attacks.harness import (
 )
 from tests.attacks.repositories import write_environment
 from tests.attacks.runner.abuser import KEEP, watched
-from tests.support.processes import eventually, most_grown, resident
+from tests.support.processes import eventually, most_grown, resident, unless_ended
 
 FAMILY = "Open files"
 PATIENCE = 3000
@@ -120,7 +121,7 @@ def open_files(pid: int) -> list[str]:
 
 def descriptors(pid: int) -> list[int]:
     """What a process has open; nothing, if it has ended, as a server does that has lingered."""
-    with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+    with unless_ended(pid):
         return sorted(map(int, os.listdir(f"/proc/{pid}/fd")))
     return []
 
@@ -162,7 +163,9 @@ def same(pid: int, fd: int, other: int, theirs: int) -> bool:
     libc = ctypes.CDLL(None, use_errno=True)
     found = libc.syscall(_KCMP[os.uname().machine], pid, other, _KCMP_FILE, fd, theirs)
     if found < 0:
-        raise OSError(ctypes.get_errno(), "kcmp")
+        error = ctypes.get_errno()
+        kind = FileNotFoundError if error == errno.EBADF else OSError  # it is closed by now
+        raise kind(error, "kcmp")
     return bool(found == 0)
 
 
@@ -184,7 +187,7 @@ def sharers(runner: int, fd: int, kind: str) -> set[str]:
 
 def shares(runner: int, fd: int, kind: str, pid: int, theirs: int) -> bool:
     """Whether another process has the same; not if it has closed it meanwhile."""
-    with contextlib.suppress(FileNotFoundError, ProcessLookupError):
+    with unless_ended(pid), contextlib.suppress(FileNotFoundError):
         return open_file(pid, theirs) == kind and same(runner, fd, pid, theirs)
     return False
 

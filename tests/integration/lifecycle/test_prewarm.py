@@ -279,7 +279,7 @@ def test_what_dies_unused_is_started_again(tasks: Callable[..., Tasks]) -> None:
     for pid in jail:
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
-    assert eventually(lambda: descendants() == server)
+    assert eventually(lambda: descendants() <= server)  # others' may end meanwhile
     observations, _ = envs[1].reset()
     assert observations[0][0] == 1.0
 

@@ -12,6 +12,8 @@ from typing import Any
 import psutil
 import pytest
 
+from tests.support.processes import eventually
+
 _SOON = {"health_check_period_ms": 1000, "health_check_failure_threshold": 4}
 """For Ray to see that a node has gone; by itself it takes three times as long."""
 MEMORY = 80 * 2**20
@@ -68,6 +70,15 @@ def servers() -> list[psutil.Process]:
         if "--only-client" in words and state in words:
             found.append(process)
     return found
+
+
+def only_server() -> psutil.Process:
+    """The one server that there is, once those of earlier tests have ended: Ray ends an actor in
+    its own time, and the server ends after that.
+    """
+    assert eventually(lambda: len(servers()) == 1), servers()
+    [server] = servers()
+    return server
 
 
 def node_of(server: psutil.Process) -> str:

@@ -17,7 +17,7 @@ import pytest
 from envhub_sandbox import RaySandbox, make_env
 from envhub_sandbox.errors import WorkerDiedError
 from tests.remote.listening import counting
-from tests.remote.ray.clusters import add_node, cluster_of, node_of, servers
+from tests.remote.ray.clusters import add_node, cluster_of, node_of, only_server, servers
 from tests.support.command_line import below, gone
 from tests.support.processes import eventually
 from tests.support.started import started
@@ -55,8 +55,7 @@ def repository(tmp_path: Path) -> Path:
 
 def server_alone() -> tuple[psutil.Process, list[psutil.Process]]:
     """The one server that there is, and all that is below it."""
-    assert eventually(lambda: len(servers()) == 1), servers()
-    [server] = servers()
+    server = only_server()
     jails = below(server.pid)
     assert len(jails) > 1
     return server, jails

@@ -79,4 +79,4 @@ def test_a_killed_actor_of_a_fleet_is_named(cluster: Any) -> None:
                 env.step([LIVE] * 6)
         env.reset(seed=0)
         assert env.step([LIVE] * 6)[0][:, 1].tolist() == [1.0] * 6
-        assert len(servers()) == 3
+        assert eventually(lambda: len(servers()) == 3)

@@ -21,6 +21,6 @@ def attack(alias):
             call_me(alias)
             os.write(write, b"x")
             os.closerange(0, 256)
-            time.sleep(120)
+            time.sleep(300)
         os._exit(0)
     os.read(read, 1)

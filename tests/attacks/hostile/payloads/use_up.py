@@ -10,12 +10,17 @@ import socket
 kept = []
 _LIBC = ctypes.CDLL(None, use_errno=True)
 _MOST = 1 << 20
+_IN_FLIGHT = 512
+"""Far above what is judged by, and below what this user's other programs are allowed by default:
+above that none of them could send any, and what they want to send is lost."""
 
 
 def attack(kind, name):
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if kind == "pages of pipes":
         resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
+    if kind == "descriptors in flight":
+        resource.setrlimit(resource.RLIMIT_NOFILE, (_IN_FLIGHT, hard))
     return {
         "inotify instances": _inotify,
         "queued signals": _signals,
