@@ -109,6 +109,20 @@ def test_each_mode_that_is_declared_is_rendered(tmp_path: Path) -> None:
     assert {ansi.message.split(":")[0], rgb.message.split(":")[0]} == {"ansi", "rgb_array_list"}
 
 
+@pytest.mark.parametrize(
+    ("suite", "found"),
+    [("'a'", set()), ("render_mode", {"loads"}), ("str(np.random.random())", {"loads"})],
+)
+def test_other_suites_each_time_are_told(suite: str, found: set[str], tmp_path: Path) -> None:
+    """And end no judgement without a report; the first is the control."""
+    text = HONEST["several modes of rendering"].source()
+    made, _, vector = text.strip().rpartition("return ")
+    folder = repository(tmp_path / "walk", f"{made}return {{{suite}: {{0: {vector}}}}}\n")
+    failures = judged(folder, 2, resets=0).failures(Severity.ERROR)
+    assert {one.id for one in failures} == found
+    assert all("another result than the first time" in one.message for one in failures)
+
+
 _TRYING = """
 os = gym.vector.async_vector_env.sys.modules["os"]
 libc = gym.vector.async_vector_env.sys.modules["ctypes"].CDLL(None)
