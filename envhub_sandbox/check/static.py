@@ -200,8 +200,11 @@ def _in_front(snapshot: Snapshot) -> Iterator[Finding]:
     there = {record.path for record in snapshot.files}
     for path in sorted(path for path in there if path.endswith(".so")):
         folder, slash, name = path.rpartition("/")
-        source = f"{folder}{slash}{name.partition('.')[0]}.py"
-        if source in there:
+        module = name.partition(".")[0]
+        sources = [f"{folder}{slash}{module}.py"]
+        if folder and module == "__init__":  # a package comes before a module of its name
+            sources.append(f"{folder}.py")
+        for source in filter(there.__contains__, sources):
             message = f"machine code that runs in place of {source}"
             yield Finding("source-compiled", message, file=path)
 

@@ -239,8 +239,12 @@ def test_machine_code_in_place_of_a_source_fails(tmp_path: Path) -> None:
     (folder / "lib/fast.py").write_text("x = 1")
     (folder / "env.abi3.so").write_bytes(b"\x7fELF")
     (folder / "other.so").write_bytes(b"\x7fELF")
+    for package in ("lib", "native"):
+        (folder / package).mkdir(exist_ok=True)
+        (folder / package / "__init__.abi3.so").write_bytes(b"\x7fELF")
+    (folder / "lib.py").write_text("x = 1")
     told = surveyed(from_the_hub(folder)).findings
-    compiled = {"env.abi3.so", "lib/fast.cpython-311-x86_64-linux-gnu.so"}
+    compiled = {"env.abi3.so", "lib/__init__.abi3.so", "lib/fast.cpython-311-x86_64-linux-gnu.so"}
     assert {one.file for one in told if one.id == "source-compiled"} == compiled
 
 
