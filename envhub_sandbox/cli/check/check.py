@@ -238,23 +238,24 @@ def check(
         raise UsageError("name a repository, or a list of them: --all FILE --output DIR")
     if any(opt.is_typed(ctx, name) for name in OF_A_LIST):
         raise UsageError("--output, --jobs, --max-memory and --again are for --all FILE")
-    from envhub_sandbox.check.settings import refuse_files_of_the_judged
+    from envhub_sandbox.check.settings import no_report_but_ours, refuse_files_of_the_judged
 
     refuse_files_of_the_judged({"--settings": settings, "--policy": policy}, ref)
-    report = _judge(
-        make,
-        policy,
-        deadline,
-        quiet=json or github,
-        seed=seed,
-        steps=steps,
-        resets=resets,
-        slow_step_s=slow_step,
-        tasks=lambda envs: [one[:2] for one in opt.select_envs(envs, suite, task)],
-        pictures=html is not None,
-    )
-    failures = report.failures(least, allowed)
-    _write(report, failures, junit, sarif, html)
+    with no_report_but_ours((junit, sarif, html), ref):
+        report = _judge(
+            make,
+            policy,
+            deadline,
+            quiet=json or github,
+            seed=seed,
+            steps=steps,
+            resets=resets,
+            slow_step_s=slow_step,
+            tasks=lambda envs: [one[:2] for one in opt.select_envs(envs, suite, task)],
+            pictures=html is not None,
+        )
+        failures = report.failures(least, allowed)
+        _write(report, failures, junit, sarif, html)
     from envhub_sandbox.check import reports
 
     if github:
