@@ -17,6 +17,8 @@ import pytest
 from typer.testing import CliRunner
 
 from envhub_sandbox import __version__
+from envhub_sandbox.check import reports
+from envhub_sandbox.check.findings import Finding, Report
 from envhub_sandbox.cli import cache, doctor, init, inspect
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.cli.shared import exits, findings, host
@@ -179,6 +181,13 @@ def test_annotations_are_for_the_job_and_its_summary(
         findings.annotate(["::notice::one", "::error::two"], "after\n")
     assert capsys.readouterr().out == "::notice::one\n::error::two\n"
     assert summary.read_text() == "before\nafter\n"
+    flood = [Finding("runs", "(" * 1_000, f"a / {number}") for number in range(500)]
+    summary.unlink()
+    with guarded():
+        findings.annotate([], reports.summary(Report("org/repo", flood), flood))
+    lines = summary.read_text().splitlines()
+    assert summary.stat().st_size <= 1 << 20, "or GitHub shows nothing of it"
+    assert lines[-1] == f"{500 - sum(' runs ' in line for line in lines)} more are left out."
 
 
 def test_a_warning_is_a_line(capsys: pytest.CaptureFixture[str]) -> None:
