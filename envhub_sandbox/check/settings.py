@@ -125,6 +125,11 @@ def _named_in_checkout(path: Path, reference: str) -> Path | None:
     )
 
 
+def is_in_its_checkout(path: Path, reference: str) -> bool:
+    """Whether a place lies in what is judged, or in the checkout of git around that."""
+    return _named_in_checkout(Path(os.path.realpath(path)), reference) is not None
+
+
 def refuse_link_of_the_judged(path: Path, reference: str) -> None:
     """No repository says where a report goes: a link that it has there, or that its checkout has,
     could lead to any file of the user's. Raises ``PolicyError``: there is one.
