@@ -158,6 +158,7 @@ def test_honest_code_is_not_named(tmp_path: Path) -> None:
         ("long.txt", ("\u5f3a" * 5_000).encode(), "text", ""),
         ("turned.md", "a\u2066b".encode(), "text", "source-hidden"),
         ("mixed.md", "p\u0430ss".encode(), "text", ""),
+        ("m\u0430th.txt", b"a", "text", "source-hidden"),
         ("a.md", b"\xff\xfe", "binary", ""),
         ("a.md", b"a\0b", "binary", ""),
     ],
@@ -257,6 +258,7 @@ def test_no_flood_hides_what_weighs_more(tmp_path: Path) -> None:
         (folder / f"b{number}.txt").write_text("a b\n" * (1 << 18))
     told = surveyed(from_the_hub(folder)).findings
     assert len(told) > 20_000
+    assert told[-1].message == "there is more to find than is kept"
     weighs_more = {one.id for one in told if one.file.startswith("z/")}
     assert weighs_more == {"source-encoding", "source-hidden"}
 

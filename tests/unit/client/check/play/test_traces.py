@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from typing import Any
 
@@ -9,10 +10,11 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from envhub_sandbox.check.play.traces import Trace, _masks, digest, play
+from envhub_sandbox.check.play.traces import Trace, _bytes_of, _masks, digest, play
 
 _MORE = (0.0, False)
 _END = (0.0, True)
+_TIMES = itertools.count()
 
 
 class _Scripted:
@@ -30,7 +32,8 @@ class _Scripted:
 
     def step(self, _: Any) -> Any:
         reward, ended = next(self._steps)
-        return np.zeros(1), np.array([reward]), np.array([ended]), np.zeros(1, bool), {}
+        infos = {"took": np.array([next(_TIMES)])}  # which no two plays have in common
+        return np.zeros(1), np.array([reward]), np.array([ended]), np.zeros(1, bool), infos
 
 
 def played(mode: str, begun: Sequence[float], *steps: tuple[float, bool]) -> Trace:
@@ -75,6 +78,11 @@ _BOTH = np.ones(2, bool)
 )
 def test_masks_are_of_all_sub_environments(infos: dict[str, Any], wrong: str) -> None:
     assert [*_masks(infos, 2)] == ([f"{wrong}, of 2 sub-environments"] if wrong else [])
+
+
+def test_the_last_observations_are_no_large_infos() -> None:
+    last = {name: np.zeros(1000) for name in ("final_obs", "final_observation")}
+    assert _bytes_of({"at": np.zeros(2), "of": {"text": "four"}, **last}) == 20
 
 
 _SAME = [
