@@ -25,7 +25,7 @@ from envhub_sandbox.dependencies import interpreters
 from envhub_sandbox.dependencies.declared import DeclaredPackages, declared
 from envhub_sandbox.dependencies.resolve import WORKERS
 from envhub_sandbox.errors import RequirementError, SnapshotError
-from envhub_sandbox.hub.git.checkout import Checkout
+from envhub_sandbox.hub.git.checkout import Checkout, is_unread
 from envhub_sandbox.hub.listing import FileRecord
 from envhub_sandbox.hub.local import LocalFolder
 from envhub_sandbox.hub.snapshot import Snapshot
@@ -145,6 +145,9 @@ def _in_place(snapshot: Snapshot) -> Iterator[Finding]:
         here = LocalFolder.at(snapshot.repo_id)
         if here.checkout is None:
             yield from _links_of_folder(here)
+            if is_unread(here.root):
+                message = "git cannot say what its commit has: is it installed? Are its ids SHA-1?"
+                yield Finding("source-uncommitted", message)
         else:
             yield from _links(snapshot)
             yield from _uncommitted(here.checkout, snapshot)
