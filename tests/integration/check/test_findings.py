@@ -73,6 +73,7 @@ def test_an_honest_repository_passes(tmp_path: Path) -> None:
     assert report.findings == []
     unasked = set(CHECKS) - {check for check, _ in report.passed}
     assert unasked == set(), "every check is made"
+    assert (report.waiting, report.unmade) == ([], []), "of every task"
     assert report.figures["hub_env / 0"]["steps"] == 25
     assert report.figures["hub_env / 0"]["episodes"] == 4
     assert report.provenance is not None
