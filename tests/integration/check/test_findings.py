@@ -168,6 +168,15 @@ def test_a_machine_that_is_slow_for_a_while_fails_nobody(
     assert "endless" not in {check for check, _ in report.passed}
 
 
+def test_actions_that_nobody_here_can_make_are_told(tmp_path: Path) -> None:
+    """Of a space whose code stays in the jail; no bug of ours ends the judgement."""
+    own = "class Own(gym.Space):\n    def sample(self, *_, **__):\n        return 1.0\n\n\nclass Walk"
+    text = _HONEST.replace("class Walk", own, 1)
+    text = text.replace("gym.spaces.Box(0.0, 2.5, (1,), np.float32)", "Own()")
+    [finding] = judged(repository(tmp_path / "walk", text), 2).failures(Severity.ERROR)
+    assert finding.id == "runs"
+
+
 _TRYING = """
 os = gym.vector.async_vector_env.sys.modules["os"]
 libc = gym.vector.async_vector_env.sys.modules["ctypes"].CDLL(None)
