@@ -31,7 +31,7 @@ from envhub_sandbox.hub.local import LocalFolder
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.hub.sources import parsing
 from envhub_sandbox.hub.sources.parsing import MOST_BYTES, Import, ParsedFile, imports
-from envhub_worker.protocol.text import printable
+from envhub_worker.protocol.text import counted, printable
 
 _LONGEST = 500
 _MOST_BYTES_OF_TEXT = 1 << 20
@@ -76,7 +76,7 @@ def survey(snapshot: Snapshot, parsed: Mapping[str, ParsedFile | None]) -> Surve
         found.add(_papers(snapshot))
     found.add(_in_place(snapshot))
     found.add(_in_front(snapshot))
-    left = _MOST_BYTES_IN_ALL
+    left, unread = _MOST_BYTES_IN_ALL, 0
     for record in sorted(snapshot.files, key=lambda one: one.path):
         path = snapshot.root / record.path
         ending = bytes_of(path, contents.ENDING, max(record.size - contents.ENDING, 0))
@@ -92,6 +92,12 @@ def survey(snapshot: Snapshot, parsed: Mapping[str, ParsedFile | None]) -> Surve
         elif kind in ("Python", "text") and record.size <= min(left, _MOST_BYTES_OF_TEXT):
             left -= record.size
             found.add(_in_text(record, path, is_code=kind == "Python"))
+        else:
+            unread += kind == "text"
+    if unread:
+        texts = counted(unread, "text is", "texts are")
+        message = f"{texts} more than is read: 1 MiB of a file, and 32 MiB in all"
+        found.findings.append(Finding("source-unread", message))
     if len(found.findings) >= _MOST:
         found.findings.append(Finding("source-unread", "there is more to find than is kept"))
     return found

@@ -178,14 +178,17 @@ class ListRun:
         finally:
             self._write_index()
 
-    def show(self, *, json: bool, junit: Path | None, github: bool) -> None:
-        """Print what has come of it, and end with its code.
-        Raises ``UsageError``: a file cannot be written; ``Exit``: not all passed.
+    def write(self, junit: Path | None) -> None:
+        """Write the file of ``--junit``. Raises ``UsageError``: it cannot be written;
+        ``PolicyError``: a repository of the list has put a link there.
         """
-        results = list(self.of.values())
         if junit is not None:
-            text = index.junit(results, self._results.report)
+            text = index.junit(list(self.of.values()), self._results.report)
             write_report(junit, text, (one.reference for one in self.of))
+
+    def show(self, *, json: bool, github: bool) -> None:
+        """Print what has come of it, and end with its code. Raises ``Exit``: not all passed."""
+        results = list(self.of.values())
         if github:
             annotate(index.workflow_commands(results), index.summary(results))
         if json:

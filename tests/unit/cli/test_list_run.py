@@ -151,8 +151,10 @@ def test_no_commit_has_results_of_what_it_has(started: list[tuple[int, list[str]
     make_checkout(Path.cwd())
     assert called(*words).exit_code == Exit.UNJUDGED
     git(Path.cwd(), "add", "--force", "out")
-    refused = called(*words)
+    Path("junit").write_text("all passed")
+    refused = called(*words, "--junit", "junit")
     assert refused.exit_code == Exit.USAGE
+    assert not Path("junit").exists(), "nor is a file of its own taken for the report"
     assert "--output out has files of the commit that is judged" in refused.output
     assert called(*words, "--again").exit_code == Exit.UNJUDGED
     Path("list").write_text("org/repo\n")
