@@ -170,7 +170,7 @@ def test_a_machine_that_is_slow_for_a_while_fails_nobody(
 
 def test_actions_that_nobody_here_can_make_are_told(tmp_path: Path) -> None:
     """Of a space whose code stays in the jail; no bug of ours ends the judgement."""
-    own = "class Own(gym.Space):\n    def sample(self, *_, **__):\n        return 1.0\n\n\nclass Walk"
+    own = "class Own(gym.Space):\n    def sample(self, *_, **__):\n        return 1.0\n\nclass Walk"
     text = _HONEST.replace("class Walk", own, 1)
     text = text.replace("gym.spaces.Box(0.0, 2.5, (1,), np.float32)", "Own()")
     [finding] = judged(repository(tmp_path / "walk", text), 2).failures(Severity.ERROR)
