@@ -168,6 +168,27 @@ def test_a_machine_that_is_slow_for_a_while_fails_nobody(
     assert "endless" not in {check for check, _ in report.passed}
 
 
+def test_one_task_is_closed_before_the_next(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else each would keep its jail, and there is room for two."""
+    made, seen = list[Any](), list[str]()
+
+    def making(**given: Any) -> Any:
+        made.append(make_env(**given))
+        return made[-1]
+
+    def tell(what: str) -> None:
+        if what == "a / 1":
+            seen.append(f"{made[0]['a'][0].closed}")
+
+    monkeypatch.setattr(judging, "make_env", making)
+    text, _, vector = _HONEST.strip().rpartition("return ")
+    both = f"{text}return {{'a': {{0: {vector}, 1: {vector}}}}}\n"
+    judged(repository(tmp_path / "walk", both), 2, resets=0, tell=tell)
+    assert seen == ["True"]
+
+
 def test_actions_that_nobody_here_can_make_are_told(tmp_path: Path) -> None:
     """Of a space whose code stays in the jail; no bug of ours ends the judgement."""
     own = "class Own(gym.Space):\n    def sample(self, *_, **__):\n        return 1.0\n\nclass Walk"
