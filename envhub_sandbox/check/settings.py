@@ -16,12 +16,13 @@ from envhub_sandbox.errors import EnvHubError, PolicyError
 from envhub_sandbox.hub.local import split_local
 from envhub_sandbox.hub.snapshot import is_here
 from envhub_sandbox.hub.sources import toml
-from envhub_worker.protocol.text import size_text
+from envhub_worker.protocol.text import printable, size_text
 
 if TYPE_CHECKING:
     from envhub_sandbox.vector.suites import EnvSuites
 
 _MOST_BYTES = 16 << 10
+_LONGEST = 500
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -104,6 +105,16 @@ def _folder_of(reference: str) -> str | None:
         return os.path.realpath(split_local(reference)[0])
     except EnvHubError:
         return None  # nothing is judged: what reads it says why
+
+
+def folder_below_here(reference: str) -> str:
+    """Where what is judged lies below the current folder, with a slash at its end; empty where it
+    is that folder, or lies elsewhere.
+    """
+    folder, here = _folder_of(reference), Path(os.path.realpath(os.curdir))
+    if folder is None or here not in Path(folder).parents:
+        return ""
+    return f"{printable(Path(folder).relative_to(here).as_posix(), _LONGEST)}/"
 
 
 def _named_in(path: Path, folder: str) -> Path | None:

@@ -129,7 +129,7 @@ def inspect_static(
 ) -> None:
     """Read a repository, and say what is in it."""
     least = None if fail_on is None else level(fail_on)
-    from envhub_sandbox.check.settings import no_report_but_ours
+    from envhub_sandbox.check.settings import folder_below_here, no_report_but_ours
 
     with no_report_but_ours([sarif], ref):
         with ProgressBar(quiet=as_json) as bar:
@@ -141,7 +141,7 @@ def inspect_static(
             read = static(make.snapshot(ref))
         failures = [one for one in read.findings if least and one.check.severity.reaches(least)]
         if sarif is not None:
-            report = Report(read.reference, read.findings)
+            report = Report(read.reference, read.findings, folder=folder_below_here(ref))
             write_report(sarif, reports.sarif(report, failures), [read.reference])
     if as_json:
         print_json(document(read))

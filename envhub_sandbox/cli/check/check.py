@@ -311,7 +311,7 @@ def _judge(
             settings.read_file(policy), arguments["policy"]
         )
 
-    report, doing = Report(make.ref), ["starting"]
+    report, doing = Report(make.ref, folder=settings.folder_below_here(make.ref)), ["starting"]
     with ProgressBar(quiet=quiet, long_s=_LONG_S) as bar:
 
         def tell(what: str) -> None:
