@@ -1,14 +1,15 @@
 """What is different between two commits, in terms of what a repository would do.
 
 A finding is the same where it stands in the same file, in a line that reads the same: lines that
-move are no change, and what stands in a changed line is a new finding.
+move are no change, and what stands in a changed line is a new finding. So is what is about a whole
+file that was changed: a pickle, an archive, or source of which not all was read.
 """
 
 from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -50,13 +51,14 @@ class Change:
 
 def changes(then: Static, now: Static) -> list[Change]:
     """What differs, in the order of ``Change.what``."""
+    other = _other(then, now)
     return [
-        *_files(then, now),
+        *_files(then, now, other),
         *_value("entry", _entry(then), _entry(now)),
         *_value("python", _python(then), _python(now)),
         *_named("package", _packages(then), _packages(now)),
         *_named("import", _imports(then), _imports(now)),
-        *sorted(_findings(then, now), key=_rank),
+        *sorted(_findings(then, now, other), key=_rank),
     ]
 
 
@@ -64,9 +66,18 @@ def _rank(change: Change) -> int:
     return 0 if change.finding is None else change.finding.check.severity.rank
 
 
-def _files(then: Static, now: Static) -> Iterator[Change]:
-    before, after = ({one.record.path: one.record for one in read.files} for read in (then, now))
-    other = set(differing(now.snapshot.root, after.values(), before.values())) & set(before)
+def _records(read: Static) -> dict[str, FileRecord]:
+    return {one.record.path: one.record for one in read.files}
+
+
+def _other(then: Static, now: Static) -> set[str]:
+    """The files of both that have other bytes."""
+    before, after = _records(then), _records(now)
+    return set(differing(now.snapshot.root, after.values(), before.values())) & set(before)
+
+
+def _files(then: Static, now: Static, other: Collection[str]) -> Iterator[Change]:
+    before, after = _records(then), _records(now)
     gone = {path: one.digest for path, one in before.items() if path not in after}
     was = {digest: path for path, digest in gone.items()}
     moved = {was.get(one.digest) for path, one in after.items() if path not in before}
@@ -125,8 +136,8 @@ def _named(what: str, then: Mapping[str, str], now: Mapping[str, str]) -> Iterat
             yield from _value(what, then[name], now[name])
 
 
-def _findings(then: Static, now: Static) -> Iterator[Change]:
-    before, after = _by_line(then), _by_line(now)
+def _findings(then: Static, now: Static, other: Collection[str]) -> Iterator[Change]:
+    before, after = _by_line(then, other), _by_line(now, other)
     for how, mine, others in (("new", after, before), ("gone", before, after)):
         known = Counter({key: len(found) for key, found in others.items()})
         for key, found in mine.items():
@@ -134,16 +145,25 @@ def _findings(then: Static, now: Static) -> Iterator[Change]:
                 yield Change("finding", how, one.text, one)
 
 
-def _by_line(read: Static) -> dict[tuple[str, ...], list[Finding]]:
-    """Findings by what they say and by the line that they stand in, whatever its number."""
+def _by_line(read: Static, other: Collection[str]) -> dict[tuple[str, ...], list[Finding]]:
+    """Findings by what they say and by the line that they stand in, whatever its number; or by the
+    bytes of their file, where that has ``other`` ones and no line is named, or none can be found:
+    findings have the names of files as far as they are printed.
+    """
     lines: dict[str, list[str]] = {}
     found: dict[tuple[str, ...], list[Finding]] = {}
+    records = _records(read)
+    digests: dict[str, list[str]] = {}
+    for path in other:
+        digests.setdefault(printable(path, _LONGEST), []).append(records[path].digest)
     for one in read.findings:
-        if one.line and one.file not in lines:
-            data = bytes_of(read.snapshot.root / one.file, _MOST_BYTES)
-            split = re.split("\r\n|\r|\n", data.decode("utf-8", "replace"))
-            lines[one.file] = [line.strip() for line in split]
-        text = lines[one.file][one.line - 1 : one.line] if one.line else []
+        text = sorted(digests.get(one.file, ()))
+        if one.line and one.file in records:
+            if one.file not in lines:
+                data = bytes_of(read.snapshot.root / one.file, _MOST_BYTES)
+                split = re.split("\r\n|\r|\n", data.decode("utf-8", "replace"))
+                lines[one.file] = [line.strip() for line in split]
+            text = lines[one.file][one.line - 1 : one.line]
         found.setdefault((one.id, one.file, one.message, *text), []).append(one)
     return found
 

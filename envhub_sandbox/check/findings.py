@@ -84,6 +84,8 @@ class Report:
         confinement: What confined it; None where nothing of it ran.
         waiting: Tasks that have not been judged to their end.
         unmade: Checks that were not made of anything, where a deadline ended it.
+        folder: Where it lies below the current folder, which in CI is the checkout whose files are
+            annotated; ends with a slash, empty where it is that folder or lies elsewhere.
     """
 
     reference: str
@@ -98,6 +100,7 @@ class Report:
     confinement: Confinement | None = None
     waiting: list[str] = field(default_factory=list)
     unmade: list[str] = field(default_factory=list)
+    folder: str = ""
     _kept: Counter[str] = field(default_factory=Counter, repr=False)
 
     def judged(self, check: str, found: Iterable[str], task: str = "", *, cause: str = "") -> None:

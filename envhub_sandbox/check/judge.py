@@ -98,6 +98,16 @@ def _limit(name: str, value: int) -> str:
     return f"{words} {value:,}"
 
 
+def is_moving(reference: str, snapshot: Snapshot) -> bool:
+    """Whether it need not mean this commit, or version, for ever; a repository's name can read like
+    a commit.
+    """
+    if snapshot.repo_type == "local":
+        return False
+    revision = HubRef.parse(reference).revision
+    return revision is None if snapshot.repo_type == "pypi" else revision != snapshot.commit
+
+
 class _Judge:
     def __init__(self, asked: JudgeOptions, snapshot: Snapshot, report: Report) -> None:
         self._asked, self._snapshot, self._report = asked, snapshot, report
@@ -133,12 +143,9 @@ class _Judge:
         self._load()
 
     def _read(self) -> None:
-        reference, snapshot = self._asked.reference, self._snapshot
-        is_moving = snapshot.repo_type != "local" and snapshot.commit not in reference
-        if snapshot.repo_type == "pypi":
-            is_moving = HubRef.parse(reference).revision is None
+        reference = self._asked.reference
         moving = f"{reference} can mean another commit or version tomorrow"
-        self._report.judged("pinned", [moving] if is_moving else [])
+        self._report.judged("pinned", [moving] if is_moving(reference, self._snapshot) else [])
         found = survey(self._snapshot, self._files).findings
         for finding in found:
             self._report.add(finding)

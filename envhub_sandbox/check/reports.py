@@ -127,16 +127,16 @@ def sarif(report: Report, failures: Sequence[Finding]) -> str:
     ]
     run = {
         "tool": {"driver": {"name": "envhub check", "rules": rules}},
-        "results": [_result(one, failures) for one in report.findings],
+        "results": [_result(one, failures, report.folder) for one in report.findings],
         "invocations": [{"executionSuccessful": not (report.unmade or report.waiting)}],
         "columnKind": "unicodeCodePoints",
     }
     return json.dumps({"$schema": _SCHEMA, "version": "2.1.0", "runs": [run]}, indent=2) + "\n"
 
 
-def _result(one: Finding, failures: Sequence[Finding]) -> dict[str, Any]:
+def _result(one: Finding, failures: Sequence[Finding], folder: str) -> dict[str, Any]:
     where = f"{one.task}: " if one.task else ""
-    place: dict[str, Any] = {"artifactLocation": {"uri": quote(one.file or "env.py")}}
+    place: dict[str, Any] = {"artifactLocation": {"uri": quote(folder + (one.file or "env.py"))}}
     if one.line:
         place["region"] = {"startLine": one.line}
     return {
@@ -157,7 +157,7 @@ def _sarif_text(text: str) -> str:
 def workflow_commands(report: Report) -> Iterator[str]:
     """GitHub's workflow commands, one a line: a stranger's text cannot begin another."""
     for one in report.findings:
-        place = f"file={_property(one.file)}," if one.file else ""
+        place = f"file={_property(report.folder + one.file)}," if one.file else ""
         place += f"line={one.line}," if one.line else ""
         title = f"envhub check: {one.id}" + (f" ({one.task})" if one.task else "")
         text = f"{one.message}\n{one.cure}"

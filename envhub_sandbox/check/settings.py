@@ -5,8 +5,9 @@ Nothing of the repository that is judged is read here: it has no say in how it i
 
 from __future__ import annotations
 
+import contextlib
 import os
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,12 +16,13 @@ from envhub_sandbox.errors import EnvHubError, PolicyError
 from envhub_sandbox.hub.local import split_local
 from envhub_sandbox.hub.snapshot import is_here
 from envhub_sandbox.hub.sources import toml
-from envhub_worker.protocol.text import size_text
+from envhub_worker.protocol.text import printable, size_text
 
 if TYPE_CHECKING:
     from envhub_sandbox.vector.suites import EnvSuites
 
 _MOST_BYTES = 16 << 10
+_LONGEST = 500
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,6 +107,16 @@ def _folder_of(reference: str) -> str | None:
         return None  # nothing is judged: what reads it says why
 
 
+def folder_below_here(reference: str) -> str:
+    """Where what is judged lies below the current folder, with a slash at its end; empty where it
+    is that folder, or lies elsewhere.
+    """
+    folder, here = _folder_of(reference), Path(os.path.realpath(os.curdir))
+    if folder is None or here not in Path(folder).parents:
+        return ""
+    return f"{printable(Path(folder).relative_to(here).as_posix(), _LONGEST)}/"
+
+
 def _named_in(path: Path, folder: str) -> Path | None:
     """Where a path below a folder leads, if none of the links in there is followed."""
     whole = Path(os.path.abspath(path))
@@ -112,17 +124,50 @@ def _named_in(path: Path, folder: str) -> Path | None:
     return Path(folder, whole.relative_to(tops[-1])) if tops else None
 
 
+def _named_in_checkout(path: Path, reference: str) -> Path | None:
+    """``_named_in`` of the checkout of git that the judged folder lies in, or of the folder."""
+    if not is_here(reference):
+        return None
+    # a checkout need not have the folder any more
+    folder = Path(_folder_of(reference) or os.path.realpath(os.path.expanduser(reference)))
+    around = (folder, *folder.parents)
+    return _named_in(
+        path, str(next((one for one in around if os.path.lexists(one / ".git")), folder))
+    )
+
+
+def is_in_its_checkout(path: Path, reference: str) -> bool:
+    """Whether a place lies in what is judged, or in the checkout of git around that."""
+    return _named_in_checkout(Path(os.path.realpath(path)), reference) is not None
+
+
 def refuse_link_of_the_judged(path: Path, reference: str) -> None:
-    """No repository says where a report goes: a link that it has there could lead to any file of
-    the user's. Raises ``PolicyError``: there is one.
+    """No repository says where a report goes: a link that it has there, or that its checkout has,
+    could lead to any file of the user's. Raises ``PolicyError``: there is one.
     """
-    folder = _folder_of(reference)
-    named = None if folder is None else _named_in(path, folder)
+    named = _named_in_checkout(path, reference)
     if named is not None and Path(os.path.realpath(path)) != named:
         raise PolicyError(
             f"{path} is, or lies behind, a link in the repository that is checked, {reference}, "
             "which could lead to any file: take a place outside"
         )
+
+
+@contextlib.contextmanager
+def no_report_but_ours(places: Collection[Path | None], reference: str) -> Iterator[None]:
+    """Where a judgement ends without its reports, let none of the repository's own stand there:
+    CI would show as a result what its author has written.
+    """
+    try:
+        yield
+    except BaseException:
+        for path in filter(None, places):
+            named = _named_in_checkout(path, reference)
+            # a link there goes, too; behind a link lies what is not the repository's
+            if named is not None and Path(os.path.realpath(path.parent)) == named.parent:
+                with contextlib.suppress(OSError):
+                    path.unlink(missing_ok=True)
+        raise
 
 
 def refuse_files_of_the_judged(

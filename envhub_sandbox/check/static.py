@@ -25,13 +25,13 @@ from envhub_sandbox.dependencies import interpreters
 from envhub_sandbox.dependencies.declared import DeclaredPackages, declared
 from envhub_sandbox.dependencies.resolve import WORKERS
 from envhub_sandbox.errors import RequirementError, SnapshotError
-from envhub_sandbox.hub.git.checkout import Checkout
+from envhub_sandbox.hub.git.checkout import Checkout, is_unread
 from envhub_sandbox.hub.listing import FileRecord
 from envhub_sandbox.hub.local import LocalFolder
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.hub.sources import parsing
 from envhub_sandbox.hub.sources.parsing import MOST_BYTES, Import, ParsedFile, imports
-from envhub_worker.protocol.text import printable
+from envhub_worker.protocol.text import counted, printable
 
 _LONGEST = 500
 _MOST_BYTES_OF_TEXT = 1 << 20
@@ -76,7 +76,7 @@ def survey(snapshot: Snapshot, parsed: Mapping[str, ParsedFile | None]) -> Surve
         found.add(_papers(snapshot))
     found.add(_in_place(snapshot))
     found.add(_in_front(snapshot))
-    left = _MOST_BYTES_IN_ALL
+    left, unread = _MOST_BYTES_IN_ALL, 0
     for record in sorted(snapshot.files, key=lambda one: one.path):
         path = snapshot.root / record.path
         ending = bytes_of(path, contents.ENDING, max(record.size - contents.ENDING, 0))
@@ -92,6 +92,12 @@ def survey(snapshot: Snapshot, parsed: Mapping[str, ParsedFile | None]) -> Surve
         elif kind in ("Python", "text") and record.size <= min(left, _MOST_BYTES_OF_TEXT):
             left -= record.size
             found.add(_in_text(record, path, is_code=kind == "Python"))
+        else:
+            unread += kind == "text"
+    if unread:
+        texts = counted(unread, "text is", "texts are")
+        message = f"{texts} more than is read: 1 MiB of a file, and 32 MiB in all"
+        found.findings.append(Finding("source-unread", message))
     if len(found.findings) >= _MOST:
         found.findings.append(Finding("source-unread", "there is more to find than is kept"))
     return found
@@ -145,6 +151,9 @@ def _in_place(snapshot: Snapshot) -> Iterator[Finding]:
         here = LocalFolder.at(snapshot.repo_id)
         if here.checkout is None:
             yield from _links_of_folder(here)
+            if is_unread(here.root):
+                message = "git cannot say what its commit has: is it installed? Are its ids SHA-1?"
+                yield Finding("source-uncommitted", message)
         else:
             yield from _links(snapshot)
             yield from _uncommitted(here.checkout, snapshot)
@@ -200,8 +209,11 @@ def _in_front(snapshot: Snapshot) -> Iterator[Finding]:
     there = {record.path for record in snapshot.files}
     for path in sorted(path for path in there if path.endswith(".so")):
         folder, slash, name = path.rpartition("/")
-        source = f"{folder}{slash}{name.partition('.')[0]}.py"
-        if source in there:
+        module = name.partition(".")[0]
+        sources = [f"{folder}{slash}{module}.py"]
+        if folder and module == "__init__":  # a package comes before a module of its name
+            sources.append(f"{folder}.py")
+        for source in filter(there.__contains__, sources):
             message = f"machine code that runs in place of {source}"
             yield Finding("source-compiled", message, file=path)
 

@@ -129,17 +129,20 @@ def inspect_static(
 ) -> None:
     """Read a repository, and say what is in it."""
     least = None if fail_on is None else level(fail_on)
-    with ProgressBar(quiet=as_json) as bar:
-        bar.begin(f"reading {ref}")
-        from envhub_sandbox.check import reports
-        from envhub_sandbox.check.findings import Report
-        from envhub_sandbox.check.static import document, static
+    from envhub_sandbox.check.settings import folder_below_here, no_report_but_ours
 
-        read = static(make.snapshot(ref))
-    failures = [one for one in read.findings if least and one.check.severity.reaches(least)]
-    if sarif is not None:
-        report = Report(read.reference, read.findings)
-        write_report(sarif, reports.sarif(report, failures), [read.reference])
+    with no_report_but_ours([sarif], ref):
+        with ProgressBar(quiet=as_json) as bar:
+            bar.begin(f"reading {ref}")
+            from envhub_sandbox.check import reports
+            from envhub_sandbox.check.findings import Report
+            from envhub_sandbox.check.static import document, static
+
+            read = static(make.snapshot(ref))
+        failures = [one for one in read.findings if least and one.check.severity.reaches(least)]
+        if sarif is not None:
+            report = Report(read.reference, read.findings, folder=folder_below_here(ref))
+            write_report(sarif, reports.sarif(report, failures), [read.reference])
     if as_json:
         print_json(document(read))
     else:

@@ -151,7 +151,7 @@ def _of_display(text: str, policy: Policy) -> str:
 # --- what it was denied --------------------------------------------------------------------------
 
 _DENIAL = r"[a-z0-9_]{1,40}( [A-Z0-9_]{1,40}| /.{0,400})?"
-_MOST_DENIALS = 64
+_MOST_DENIALS = 128
 _NAMED_DENIALS, _SHOWN = 8, 200
 """Denials in the text of an error, and characters of each."""
 

@@ -378,7 +378,10 @@ HONEST: dict[str, Entry] = {
         def move(self, action):
             self.at += int(action) - 1
     """),
-    "one step": _env("length = 1"),
+    "one step": _env(
+        "length = 1\n\ndef move(self, action):\n    assert not self.count, 'it has ended'\n"
+        "    super().move(action)"
+    ),
     "a time limit": _vector(
         "gym.vector.SyncVectorEnv([lambda: gym.wrappers.TimeLimit(Env(), 8)] * n_envs)"
     ),

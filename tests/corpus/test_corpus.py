@@ -21,7 +21,7 @@ _ELSEWHERE = {
     "lerobot": "test_findings.py",
     "licence": "test_findings.py",
     "limits-reached": "test_findings.py",
-    "pinned": "test_survey_checkouts.py",
+    "pinned": "test_judge.py",
     "source-ignored": "test_survey_checkouts.py",
     "source-link": "test_survey.py",
     "source-uncommitted": "test_survey_checkouts.py",

@@ -18,7 +18,7 @@ from envhub_sandbox.check.play import probes, traces
 from envhub_sandbox.check.play.plays import Play, facts_of, film
 from envhub_sandbox.check.play.traces import Env, Trace
 from envhub_sandbox.check.settings import JudgeOptions
-from envhub_sandbox.errors import EnvHubError, RemoteEnvError
+from envhub_sandbox.errors import EnvHubError, LoadError, RemoteEnvError
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol.text import printable, size_text
@@ -131,11 +131,18 @@ class TaskJudge:
 
     # --- in fresh processes --------------------------------------------------------------------
 
+    def _of(self, suites: EnvSuites) -> Env:
+        """The one of these names. Raises ``LoadError``: its make_env has others each time."""
+        found: Mapping[Any, Env] = suites.get(self._suite, {})
+        if self._task not in found:
+            raise LoadError(f"there is no {self._name} any more")
+        return found[self._task]
+
     def _compare(self, first: Trace, mode: str | None) -> None:
         """In another process, in the same one again, and spread over two."""
         self._tell("the same play in another process")
         with self._make(num_workers=1) as suites:
-            env = suites[self._suite][self._task]
+            env = self._of(suites)
             second = self._played(env, mode)
             self._note_times(second)
             at = first.differs_from(second)
@@ -145,7 +152,7 @@ class TaskJudge:
         if at is None and self._env.num_envs > 1:
             self._tell("the same play, spread over two processes")
             with self._make(num_workers=2) as suites:
-                spread = self._played(suites[self._suite][self._task], mode, like=second)
+                spread = self._played(self._of(suites), mode, like=second)
             self._same("workers", first.differs_from(spread), "with one worker and with two")
 
     def _same(self, check: str, at: int | None, where: str) -> None:
@@ -280,7 +287,7 @@ class TaskJudge:
         for mode in probes.other_modes(self._env) if self._takes_render_mode else ():
             asked = {**given, "render_mode": mode}
             with self._make(env_kwargs=asked, num_workers=1) as suites:
-                env = suites[self._suite][self._task]
+                env = self._of(suites)
                 env.reset(seed=self._asked.seed)
                 if env.render_mode != mode:
                     yield f"{mode}: it is declared and asked for, and is {env.render_mode!r}"

@@ -214,6 +214,8 @@ def check(
     if not math.isfinite(deadline):
         raise UsageError(f"--deadline is {deadline}; it takes seconds, such as 900")
     least, allowed = level(str(fail_on)), _known(allow or ())
+    from envhub_sandbox.check.settings import no_report_but_ours, refuse_files_of_the_judged
+
     if listed is not None:
         _refuse_beside_a_list(ref=ref, sarif=sarif, html=html)
         from envhub_sandbox.cli.check import list_run
@@ -231,30 +233,31 @@ def check(
             arguments=list_run.handed_on(ctx),
             debug=debug,
         )
-        run.judge()
-        run.show(json=json, junit=junit, github=github)
+        with no_report_but_ours([junit], "./"):
+            run.judge()
+            run.write(junit)
+        run.show(json=json, github=github)
         return
     if ref is None:
         raise UsageError("name a repository, or a list of them: --all FILE --output DIR")
     if any(opt.is_typed(ctx, name) for name in OF_A_LIST):
         raise UsageError("--output, --jobs, --max-memory and --again are for --all FILE")
-    from envhub_sandbox.check.settings import refuse_files_of_the_judged
-
     refuse_files_of_the_judged({"--settings": settings, "--policy": policy}, ref)
-    report = _judge(
-        make,
-        policy,
-        deadline,
-        quiet=json or github,
-        seed=seed,
-        steps=steps,
-        resets=resets,
-        slow_step_s=slow_step,
-        tasks=lambda envs: [one[:2] for one in opt.select_envs(envs, suite, task)],
-        pictures=html is not None,
-    )
-    failures = report.failures(least, allowed)
-    _write(report, failures, junit, sarif, html)
+    with no_report_but_ours((junit, sarif, html), ref):
+        report = _judge(
+            make,
+            policy,
+            deadline,
+            quiet=json or github,
+            seed=seed,
+            steps=steps,
+            resets=resets,
+            slow_step_s=slow_step,
+            tasks=lambda envs: [one[:2] for one in opt.select_envs(envs, suite, task)],
+            pictures=html is not None,
+        )
+        failures = report.failures(least, allowed)
+        _write(report, failures, junit, sarif, html)
     from envhub_sandbox.check import reports
 
     if github:
@@ -308,7 +311,7 @@ def _judge(
             settings.read_file(policy), arguments["policy"]
         )
 
-    report, doing = Report(make.ref), ["starting"]
+    report, doing = Report(make.ref, folder=settings.folder_below_here(make.ref)), ["starting"]
     with ProgressBar(quiet=quiet, long_s=_LONG_S) as bar:
 
         def tell(what: str) -> None:

@@ -25,6 +25,7 @@ from envhub_sandbox.check.many.results import (
     Verdict,
 )
 from envhub_sandbox.check.settings import (
+    is_in_its_checkout,
     merged_settings,
     read_file,
     refuse_files_of_the_judged,
@@ -43,6 +44,7 @@ from envhub_sandbox.cli.shared.exits import Exit, UsageError
 from envhub_sandbox.cli.shared.findings import annotate, write_report
 from envhub_sandbox.cli.shared.host import free_memory_bytes, versions
 from envhub_sandbox.errors import EnvHubError
+from envhub_sandbox.hub.git.checkout import read_checkout
 from envhub_sandbox.hub.snapshot import commit_of
 from envhub_sandbox.sandboxes.ray import cluster
 from envhub_sandbox.settings.policy import policy_from
@@ -124,6 +126,7 @@ class ListRun:
         places = {"--settings": self.settings, "--policy": self.policy, "--output": self.output}
         for one in self.of:
             refuse_files_of_the_judged(places, one.reference, f" (line {one.line} of {self.file})")
+        self._refuse_committed_results(self.output)
         try:
             policy = b"" if self.policy is None else self.policy.read_bytes()
         except OSError as error:
@@ -137,6 +140,17 @@ class ListRun:
                 self._judge_in(running, jobs, copy)
         except FolderError as error:
             raise UsageError(f"--output {error}") from error
+
+    def _refuse_committed_results(self, output: Path) -> None:
+        """Who commits a repository beside results of it could say there that it has passed."""
+        if self.again or not any(is_in_its_checkout(output, one.reference) for one in self.of):
+            return
+        checkout = read_checkout(output.resolve())
+        if checkout is not None and checkout.files - checkout.untracked:
+            raise UsageError(
+                f"--output {output} has files of the commit that is judged, which could say that "
+                "anything has passed: name another folder, or judge everything with --again"
+            )
 
     def _judge_in(self, running: Path, jobs: int, policy: Path) -> None:
         for one in list(self.of):
@@ -164,14 +178,17 @@ class ListRun:
         finally:
             self._write_index()
 
-    def show(self, *, json: bool, junit: Path | None, github: bool) -> None:
-        """Print what has come of it, and end with its code.
-        Raises ``UsageError``: a file cannot be written; ``Exit``: not all passed.
+    def write(self, junit: Path | None) -> None:
+        """Write the file of ``--junit``. Raises ``UsageError``: it cannot be written;
+        ``PolicyError``: a repository of the list has put a link there.
         """
-        results = list(self.of.values())
         if junit is not None:
-            text = index.junit(results, self._results.report)
+            text = index.junit(list(self.of.values()), self._results.report)
             write_report(junit, text, (one.reference for one in self.of))
+
+    def show(self, *, json: bool, github: bool) -> None:
+        """Print what has come of it, and end with its code. Raises ``Exit``: not all passed."""
+        results = list(self.of.values())
         if github:
             annotate(index.workflow_commands(results), index.summary(results))
         if json:

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
     from envhub_sandbox.check.checks import Severity
     from envhub_sandbox.check.findings import Finding
 
+_MOST_OF_A_SUMMARY = 1_000_000
+"""Characters, all of them ASCII: GitHub takes 1 MiB for each step."""
 STYLES = {"error": "red", "warning": "yellow", "note": "dim"}
 
 FailOn = Annotated[
@@ -62,9 +64,15 @@ def write_report(path: Path, text: str, references: Iterable[str]) -> None:
 
 
 def annotate(commands: Iterable[str], summary: str) -> None:
-    """Print GitHub's workflow commands, and append to its step's summary."""
+    """Print GitHub's workflow commands, and append to its step's summary, of which it shows nothing
+    where it is too long: then the last lines are left out.
+    """
     for line in commands:
         command(line)
     if path := os.environ.get("GITHUB_STEP_SUMMARY"):
+        end = len(summary)
+        if end > _MOST_OF_A_SUMMARY:
+            end = summary.rfind("\n", 0, _MOST_OF_A_SUMMARY) + 1
+        left_out = summary.count("\n", end)
         with Path(path).open("a", encoding="utf-8") as file:
-            file.write(summary)
+            file.write(summary[:end] + f"\n{left_out} more are left out.\n" * bool(left_out))

@@ -42,6 +42,7 @@ class _Repository(NamedTuple):
     top: Path
     own: Path
     common: Path
+    is_sha256: bool
 
 
 @dataclass(frozen=True)
@@ -98,7 +99,7 @@ def read_checkout(folder: Path) -> Checkout | None:
     ``/tmp`` every user of the machine can make one.
     """
     repository = _repository_of(folder)
-    if repository is None:
+    if repository is None or repository.is_sha256:
         return None
     # what the checkout's user has git ignore, beside what the commit says
     exclude = repository.common / "info/exclude"
@@ -113,6 +114,16 @@ def read_checkout(folder: Path) -> Checkout | None:
     held_back = tuple(sorted({row[2:] for row in rows if row[0] == "S" or row[0].islower()}))
     untracked = frozenset(row[2:] for row in rows if row[0] == "?")
     return Checkout(folder, names, folders, untracked, held_back, repository)
+
+
+def is_unread(folder: Path) -> bool:
+    """Whether a folder lies in a checkout of which git says nothing: so nobody knows what its
+    commit has. There is no git, it fails, or the object ids are SHA-256.
+    """
+    repository = _repository_of(folder)
+    if repository is None:
+        return False
+    return repository.is_sha256 or _git(repository, folder, "ls-files", "-z", "--cached") is None
 
 
 def make_checkout(folder: Path) -> None:
@@ -135,12 +146,12 @@ def _repository_of(folder: Path) -> _Repository | None:
             own = top / path.strip() if kind == "gitdir" else own
         common = own / _text_of(own / "commondir").strip()
         is_one = (own / "HEAD").is_file() and (common / "objects").is_dir()
-        is_one = is_one and not re.search(_SHA256, _text_of(common / "config"))
+        is_sha256 = re.search(_SHA256, _text_of(common / "config")) is not None
         owners = (folder.stat().st_uid, user_id(), 0)
         is_trusted = (top / ".git").lstat().st_uid in owners
     except (OSError, ValueError):  # also a path with a null byte
         return None
-    return _Repository(top, own, common) if is_one and is_trusted else None
+    return _Repository(top, own, common, is_sha256) if is_one and is_trusted else None
 
 
 def _text_of(file: Path) -> str:

@@ -203,7 +203,7 @@ def test_limits_that_are_used_up_are_told(home: Path, profile: str) -> None:
 
 
 _FILES = """
-import ctypes, os, threading
+import ctypes, os, socket, threading
 
 LIBC = ctypes.CDLL(None, use_errno=True)
 
@@ -252,6 +252,9 @@ class Files(Plain):
     def flood(self, folder):
         for number in range(200):
             answer(lambda: open(f"{folder}/{number}", "a"))
+        for family in range(3, 46):
+            answer(lambda: socket.socket(family))
+            answer(lambda: socket.socketpair(family))
         LIBC.unshare(0x10000000)
 
     def race(self, folder, rounds):
@@ -260,7 +263,7 @@ class Files(Plain):
 
 
 def test_files_that_are_asked_for_are_told(tmp_path: Path) -> None:
-    """As they are refused anyway; of a flood a few, and it hides nothing else.
+    """As they are refused anyway; of a flood of files or sockets a few, and it hides nothing else.
 
     The controls are the jail that records nothing, and what the repository does with its own.
     """
@@ -287,6 +290,7 @@ def test_files_that_are_asked_for_are_told(tmp_path: Path) -> None:
     assert after is not None
     assert "unshare" in after
     assert len([one for one in after if "/" in one]) == 32
+    assert len([one for one in after if " AF_" in one]) == 32
 
 
 _ENDINGS = {

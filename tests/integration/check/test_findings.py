@@ -16,10 +16,13 @@ from envhub_sandbox.check import judge as judging
 from envhub_sandbox.check.checks import CHECKS, Severity
 from envhub_sandbox.check.findings import Report
 from envhub_sandbox.check.judge import judge
+from envhub_sandbox.check.play import task, traces
+from envhub_sandbox.check.play.probes import LEAK_CHECKS
 from envhub_sandbox.check.settings import JudgeOptions
 from envhub_sandbox.errors import SandboxUnavailableError, SnapshotError
 from envhub_sandbox.vector.pictures import png
 from tests.corpus.entries import Entry
+from tests.corpus.faults import FAULTS
 from tests.corpus.honest import HONEST
 from tests.support import judged as corpus
 from tests.support.command_line import envhub, python
@@ -70,6 +73,7 @@ def test_an_honest_repository_passes(tmp_path: Path) -> None:
     assert report.findings == []
     unasked = set(CHECKS) - {check for check, _ in report.passed}
     assert unasked == set(), "every check is made"
+    assert (report.waiting, report.unmade) == ([], []), "of every task"
     assert report.figures["hub_env / 0"]["steps"] == 25
     assert report.figures["hub_env / 0"]["episodes"] == 4
     assert report.provenance is not None
@@ -107,6 +111,91 @@ def test_each_mode_that_is_declared_is_rendered(tmp_path: Path) -> None:
     [ansi, rgb] = report.failures(Severity.ERROR)
     assert (ansi.id, rgb.id) == ("render", "render")
     assert {ansi.message.split(":")[0], rgb.message.split(":")[0]} == {"ansi", "rgb_array_list"}
+    text = HONEST["several modes of rendering"].source().replace("Env(render_mode)", "Env('ansi')")
+    folder = repository(
+        tmp_path / "deaf", text.replace('render_mode="rgb_array")', "render_mode='')")
+    )
+    [one, other] = judged(folder, 2, resets=0).failures(Severity.ERROR)
+    for finding in (one, other):
+        assert finding.message.endswith("it is declared and asked for, and is 'ansi'")
+
+
+def test_what_was_not_asked_does_not_hold(tmp_path: Path) -> None:
+    """Nor is it a finding; the honest one above is the control."""
+    text = FAULTS["a mode that is not stated"].source()
+    report = judged(repository(tmp_path / "walk", text), 2, resets=0)
+    told = {check for check, _ in report.passed} | {one.id for one in report.findings}
+    assert {"autoreset", *LEAK_CHECKS} & told == set()
+
+
+@pytest.mark.parametrize(
+    ("suite", "found"),
+    [("'a'", set()), ("render_mode", {"loads"}), ("str(np.random.random())", {"loads"})],
+)
+def test_other_suites_each_time_are_told(suite: str, found: set[str], tmp_path: Path) -> None:
+    """And end no judgement without a report; the first is the control."""
+    text = HONEST["several modes of rendering"].source()
+    made, _, vector = text.strip().rpartition("return ")
+    folder = repository(tmp_path / "walk", f"{made}return {{{suite}: {{0: {vector}}}}}\n")
+    failures = judged(folder, 2, resets=0).failures(Severity.ERROR)
+    assert {one.id for one in failures} == found
+    assert all("another result than the first time" in one.message for one in failures)
+
+
+@pytest.mark.parametrize("is_slow_for_ever", [False, True])
+def test_a_machine_that_is_slow_for_a_while_fails_nobody(
+    is_slow_for_ever: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nor is an end looked for without one: by then there is no finding, and no check that holds.
+    The controls: each reset is slow, and there is time to look.
+    """
+    play, plays = traces.play, list[str]()
+
+    def slow(*given: Any, **more: Any) -> traces.Trace:
+        trace = play(*given, **more)
+        plays.append("played")
+        if is_slow_for_ever or len(plays) != 4:
+            trace.times["reset_s"] = 100.0
+        return trace
+
+    monkeypatch.setattr(traces, "play", slow)
+    monkeypatch.setattr(task, "_EPISODE_S", 1e9 if is_slow_for_ever else -1.0)
+    text = _HONEST.replace("length = _max_episode_steps = 10", "length = _max_episode_steps = 1e9")
+    report = judged(repository(tmp_path / "walk", text), 5, resets=0, episode_steps=50)
+    assert len(plays) == 6
+    found = {"slow-resets", "endless"} if is_slow_for_ever else set()
+    assert {one.id for one in report.findings} == found
+    assert "endless" not in {check for check, _ in report.passed}
+
+
+def test_one_task_is_closed_before_the_next(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else each would keep its jail, and there is room for two."""
+    made, seen = list[Any](), list[str]()
+
+    def making(**given: Any) -> Any:
+        made.append(make_env(**given))
+        return made[-1]
+
+    def tell(what: str) -> None:
+        if what == "a / 1":
+            seen.append(f"{made[0]['a'][0].closed}")
+
+    monkeypatch.setattr(judging, "make_env", making)
+    text, _, vector = _HONEST.strip().rpartition("return ")
+    both = f"{text}return {{'a': {{0: {vector}, 1: {vector}}}}}\n"
+    judged(repository(tmp_path / "walk", both), 2, resets=0, tell=tell)
+    assert seen == ["True"]
+
+
+def test_actions_that_nobody_here_can_make_are_told(tmp_path: Path) -> None:
+    """Of a space whose code stays in the jail; no bug of ours ends the judgement."""
+    own = "class Own(gym.Space):\n    def sample(self, *_, **__):\n        return 1.0\n\nclass Walk"
+    text = _HONEST.replace("class Walk", own, 1)
+    text = text.replace("gym.spaces.Box(0.0, 2.5, (1,), np.float32)", "Own()")
+    [finding] = judged(repository(tmp_path / "walk", text), 2).failures(Severity.ERROR)
+    assert finding.id == "runs"
 
 
 _TRYING = """

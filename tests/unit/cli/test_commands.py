@@ -17,6 +17,8 @@ import pytest
 from typer.testing import CliRunner
 
 from envhub_sandbox import __version__
+from envhub_sandbox.check import reports
+from envhub_sandbox.check.findings import Finding, Report
 from envhub_sandbox.cli import cache, doctor, init, inspect
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.cli.shared import exits, findings, host
@@ -137,16 +139,36 @@ def test_a_report_is_not_written_through_a_link_of_the_repository() -> None:
     Path("env").mkdir()
     Path("env/env.py").touch()
     make_checkout(Path("env"))
+    Path("env/sub").mkdir()
+    Path("env/sub/env.py").touch()
     Path("victim").write_text("mine")
-    for words in ("inspect ./env --static", "check ./env --deadline 1"):
+    for words in (
+        *("inspect ./env --static", "check ./env --deadline 1"),
+        *("inspect ./env/sub --static", "check ./env/sub --deadline 1"),
+    ):
         said(*words.split(), "--sarif", "env/new")
         assert Path("env/new").read_text().startswith("{")
         Path("env/new").unlink()
         Path("env/link").symlink_to(Path("victim").absolute())
         code, text = said(*words.split(), "--sarif", "env/link")
-        Path("env/link").unlink()
         assert (code, "env/link is, or lies behind, a link in" in text) == (2, True), text
+        assert not Path("env/link").is_symlink(), "and no other file is taken for a report"
     assert Path("victim").read_text() == "mine"
+
+
+@pytest.mark.skipif(shutil.which("git") is None, reason="needs git")
+@pytest.mark.parametrize("words", ["inspect {} --static", "check {}"])
+@pytest.mark.parametrize("folder", ["./env", "./env/gone"])
+def test_where_there_is_no_report_none_of_the_repository_stands(words: str, folder: str) -> None:
+    """CI would show what its author has written; the controls are files that are not his."""
+    Path("env").mkdir()
+    make_checkout(Path("env"))
+    Path("env/a\\b").touch()  # no repository has such a name
+    Path("env/up").symlink_to(Path.cwd())
+    for place, is_left in (("env/report", False), ("env/up/mine", True), ("mine", True)):
+        Path(place).write_text("all passed")
+        code, text = said(*words.format(folder).split(), "--sarif", place)
+        assert (code, Path(place).exists()) == (3, is_left), text
 
 
 def test_annotations_are_for_the_job_and_its_summary(
@@ -159,6 +181,13 @@ def test_annotations_are_for_the_job_and_its_summary(
         findings.annotate(["::notice::one", "::error::two"], "after\n")
     assert capsys.readouterr().out == "::notice::one\n::error::two\n"
     assert summary.read_text() == "before\nafter\n"
+    flood = [Finding("runs", "(" * 1_000, f"a / {number}") for number in range(500)]
+    summary.unlink()
+    with guarded():
+        findings.annotate([], reports.summary(Report("org/repo", flood), flood))
+    lines = summary.read_text().splitlines()
+    assert summary.stat().st_size <= 1 << 20, "or GitHub shows nothing of it"
+    assert lines[-1] == f"{500 - sum(' runs ' in line for line in lines)} more are left out."
 
 
 def test_a_warning_is_a_line(capsys: pytest.CaptureFixture[str]) -> None:

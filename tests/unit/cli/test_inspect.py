@@ -12,6 +12,7 @@ import pytest
 from typer.testing import CliRunner, Result
 
 from envhub_sandbox.check.changes import changes
+from envhub_sandbox.check.checks import Severity
 from envhub_sandbox.check.static import static
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.hub.listing import GIT_SHA1, FileRecord, Snapshot, digest_of
@@ -164,6 +165,31 @@ def test_each_change_is_told_as_what_it_is(tmp_path: Path) -> None:
     assert "numpy>=1, now numpy>=2" in texts
     assert "env.py:2: imports socket" in texts
     assert texts.count("env.py:5: calls eval") == 2, "the line was changed: it is told again"
+
+
+@pytest.mark.parametrize(
+    ("name", "then", "now"),
+    [
+        ("weights.pkl", "one", "other"),
+        ("many.py", "eval(x)\n" * 101, "eval(x)\n" * 101 + "eval(y)"),
+        ("large.py", "x = 1\n" * 50_000, "x = 2\n" * 50_000),
+        (f"{'a' * 240}/{'b' * 240}/{'c' * 40}.py", "eval(x)", "eval(y)"),
+    ],
+)
+def test_what_cannot_be_held_against_a_line_is_new_in_a_changed_file(
+    name: str, then: str, now: str, tmp_path: Path
+) -> None:
+    """A pickle, code beyond what is read, a name too long to be printed; the control is no change,
+    and a change of another file."""
+    both = repository(tmp_path / "old"), repository(tmp_path / "new")
+    for folder in both:
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_text(then)
+    (both[1] / "README.md").write_text("# y")
+    assert [row.what for row in changes(*(static(local(one)) for one in both))] == ["file"]
+    (both[1] / name).write_text(now)
+    found = changes(*(static(local(one)) for one in both))
+    assert any(row.weighs(Severity.NOTE) for row in found)
 
 
 def test_a_folder_is_held_against_what_the_hub_has(tmp_path: Path) -> None:

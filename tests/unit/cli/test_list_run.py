@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 import signal
 import threading
 from dataclasses import fields
@@ -24,6 +25,8 @@ from envhub_sandbox.cli.check import list_run
 from envhub_sandbox.cli.check.check import OF_A_LIST, SETTINGS, check
 from envhub_sandbox.cli.check.deadline import DeadlineReached, deadline_alarm
 from envhub_sandbox.cli.shared.exits import Exit
+from envhub_sandbox.hub.git.checkout import make_checkout
+from tests.hub.olah_server import git
 
 _RUNNER = CliRunner()
 
@@ -137,6 +140,25 @@ def test_a_result_counts_for_the_same_commit_judged_in_the_same_way(
     assert (again(), again()) == (2, 0)
     commit[0] = "another"
     assert again() == 2
+
+
+@pytest.mark.skipif(shutil.which("git") is None, reason="needs git")
+def test_no_commit_has_results_of_what_it_has(started: list[tuple[int, list[str]]]) -> None:
+    """Its author could write that he has passed; the controls are results that are not his, and
+    those of somebody else's repository."""
+    words = ("--all", "list", "--output", "out")
+    assert called(*words).exit_code == Exit.UNJUDGED
+    make_checkout(Path.cwd())
+    assert called(*words).exit_code == Exit.UNJUDGED
+    git(Path.cwd(), "add", "--force", "out")
+    Path("junit").write_text("all passed")
+    refused = called(*words, "--junit", "junit")
+    assert refused.exit_code == Exit.USAGE
+    assert not Path("junit").exists(), "nor is a file of its own taken for the report"
+    assert "--output out has files of the commit that is judged" in refused.output
+    assert called(*words, "--again").exit_code == Exit.UNJUDGED
+    Path("list").write_text("org/repo\n")
+    assert called(*words).exit_code == Exit.UNJUDGED
 
 
 def test_every_option_is_handed_on_or_about_the_list() -> None:

@@ -29,15 +29,20 @@ for one in "$@"; do echo "<$one>"; done
 exit ${ENVHUB_CODE:-0}
 """
 
+_INSTALLERS = ("venv", "pip")
+
 
 def loaded(checkout: Path, name: str) -> Any:
     return yaml.safe_load((checkout / name).read_text())
 
 
-def run(script: str, **variables: str) -> subprocess.CompletedProcess[str]:
-    """Run a script as GitHub's runner and GitLab's do."""
+def run(
+    script: str, where: Path | None = None, **variables: str
+) -> subprocess.CompletedProcess[str]:
+    """Run a script as GitHub's runner and GitLab's do; ``where``: the checkout that it judges."""
     return subprocess.run(
         ["bash", "--noprofile", "--norc", "-eo", "pipefail", "-c", script],
+        cwd=where,
         env={"PATH": os.environ["PATH"], **variables},
         capture_output=True,
         text=True,
@@ -122,9 +127,30 @@ def test_the_action_installs_itself(checkout: Path, tmp_path: Path) -> None:
     for package, installed in (("", "/the/action"), ("envhub-sandbox==1", "envhub-sandbox==1")):
         env = {"ENVHUB_PACKAGE": package, "ENVHUB_ACTION": "/the/action"}
         done = run(step["run"], **env | {"PATH": path, "RUNNER_TEMP": str(tmp_path)})
-        venv = ["<-m>", "<venv>", f"<{tmp_path}/envhub>"]
-        pip = ["<-m>", "<pip>", "<install>", "<--quiet>", f"<{installed}>"]
+        venv = ["<-I>", "<-m>", "<venv>", f"<{tmp_path}/envhub>"]
+        pip = ["<-I>", "<-m>", "<pip>", "<install>", "<--quiet>", f"<{installed}>"]
         assert done.stdout.split() == [*venv, *pip]
+
+
+def test_nothing_of_the_checkout_runs_while_envhub_is_installed(
+    checkout: Path, tmp_path: Path
+) -> None:
+    """Python's own ``-m`` looks in the current folder first; the control is a line without -I."""
+    repository = tmp_path / "repository"
+    write_repository(repository, "", **{f"{name}__py": "print('unjudged')" for name in _INSTALLERS})
+    help_only = f'#!/bin/sh\nexec {sys.executable} "$@" --help\n'  # of the real ones, and no more
+    program(tmp_path / "bin" / "python3", help_only)
+    program(tmp_path / "envhub" / "bin" / "python", help_only)
+    path = f"{tmp_path / 'bin'}:{os.environ['PATH']}"
+    given = {"PATH": path, "RUNNER_TEMP": str(tmp_path), "ENVHUB_VENV": f"{tmp_path}/envhub"}
+    action = loaded(checkout, "action.yml")["runs"]["steps"][0]["run"].splitlines()
+    lines = [*action, *loaded(checkout, "examples/ci/gitlab.yml")["envhub-check"]["script"]]
+    named = [line for line in lines if any(f"-m {name}" in line for name in _INSTALLERS)]
+    assert len(named) == 4
+    for line in named:
+        assert "unjudged" not in run(line, repository, ENVHUB_ACTION="/the/action", **given).stdout
+        control = run(line.replace(" -I", ""), repository, ENVHUB_ACTION="/the/action", **given)
+        assert control.stdout == "unjudged\n"
 
 
 def test_the_job_for_gitlab_judges_with_its_variables(checkout: Path, tmp_path: Path) -> None:

@@ -226,13 +226,12 @@ class Init:
         mine = runner_paths(self._jail, request.caller, request.thread)
         waits = request.still_waits
         for deed, path in evidence.asked(call, request.words, request.thread, mine, waits):
-            known = sum(text.startswith("/") for _, text in self._denials)
-            if known < notify.MOST_FILES:
-                self._report_denied(deed, path)
+            self._report_denied(deed, path)
 
     def _report_denied(self, call: str, detail: str) -> None:
-        denial = (call, detail)
-        if denial not in self._denials and len(self._denials) < notify.MOST_DENIALS:
+        denial, kind = (call, detail), notify.kind(detail)
+        known = sum(notify.kind(one) == kind for _, one in self._denials)
+        if denial not in self._denials and known < notify.MOST_OF_A_KIND:
             self._denials.add(denial)
             self._channel.send({"event": "denied", "call": call, "detail": detail})
 

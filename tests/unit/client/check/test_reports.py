@@ -56,6 +56,17 @@ def test_what_a_stranger_writes_is_text_in_every_form(text: str) -> None:
     assert place["region"] == {"startLine": 3}
 
 
+def test_files_are_named_from_the_folder_that_ci_is_in() -> None:
+    """It has another file of the same name, perhaps."""
+    made = Report("./a b:env.py", folder="a b/")
+    made.add(Finding("runs", "x", file="env.py", line=3))
+    [line] = reports.workflow_commands(made)
+    assert line.startswith("::error file=a b/env.py,line=3,")
+    [result] = json.loads(reports.sarif(made, []))["runs"][0]["results"]
+    place = result["locations"][0]["physicalLocation"]["artifactLocation"]
+    assert place == {"uri": "a%20b/env.py"}
+
+
 def test_names_and_messages_make_no_links() -> None:
     """In a summary a host's name is one without markup; SARIF has placeholders, too."""
     made = report("[Approve](https://example.com) {0} \\ www.example.com/x __bold__")

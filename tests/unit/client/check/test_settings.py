@@ -110,3 +110,17 @@ def test_no_report_goes_where_a_link_of_the_judged_leads(tmp_path: Path) -> None
         *((judged / "report", one) for one in ("org/repo", str(tmp_path / "nowhere"))),
     ):
         settings.refuse_link_of_the_judged(path, reference)
+
+
+def test_where_it_lies_below_the_current_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "here/a/b").mkdir(parents=True)
+    (tmp_path / "here/a/b/env.py").touch()
+    (tmp_path / "link").symlink_to(tmp_path / "here/a")
+    monkeypatch.chdir(tmp_path / "here")
+    below = {"./a": "a/", "./a/b": "a/b/", "./a/b/env.py": "a/b/", "./a:b/env.py": "a/"}
+    below |= {str(tmp_path / "here/a"): "a/", "../link/b": "a/b/"}
+    elsewhere = ("./", "../", "../here", "a/b", "org/repo@main", "./nowhere")
+    for reference, folder in {**below, **dict.fromkeys(elsewhere, "")}.items():
+        assert settings.folder_below_here(reference) == folder, reference

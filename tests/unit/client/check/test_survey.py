@@ -158,6 +158,7 @@ def test_honest_code_is_not_named(tmp_path: Path) -> None:
         ("long.txt", ("\u5f3a" * 5_000).encode(), "text", ""),
         ("turned.md", "a\u2066b".encode(), "text", "source-hidden"),
         ("mixed.md", "p\u0430ss".encode(), "text", ""),
+        ("m\u0430th.txt", b"a", "text", "source-hidden"),
         ("a.md", b"\xff\xfe", "binary", ""),
         ("a.md", b"a\0b", "binary", ""),
     ],
@@ -239,8 +240,12 @@ def test_machine_code_in_place_of_a_source_fails(tmp_path: Path) -> None:
     (folder / "lib/fast.py").write_text("x = 1")
     (folder / "env.abi3.so").write_bytes(b"\x7fELF")
     (folder / "other.so").write_bytes(b"\x7fELF")
+    for package in ("lib", "native"):
+        (folder / package).mkdir(exist_ok=True)
+        (folder / package / "__init__.abi3.so").write_bytes(b"\x7fELF")
+    (folder / "lib.py").write_text("x = 1")
     told = surveyed(from_the_hub(folder)).findings
-    compiled = {"env.abi3.so", "lib/fast.cpython-311-x86_64-linux-gnu.so"}
+    compiled = {"env.abi3.so", "lib/__init__.abi3.so", "lib/fast.cpython-311-x86_64-linux-gnu.so"}
     assert {one.file for one in told if one.id == "source-compiled"} == compiled
 
 
@@ -253,6 +258,10 @@ def test_no_flood_hides_what_weighs_more(tmp_path: Path) -> None:
         (folder / f"b{number}.txt").write_text("a b\n" * (1 << 18))
     told = surveyed(from_the_hub(folder)).findings
     assert len(told) > 20_000
+    assert [one.message for one in told[-2:]] == [
+        "2 texts are more than is read: 1 MiB of a file, and 32 MiB in all",
+        "there is more to find than is kept",
+    ]
     weighs_more = {one.id for one in told if one.file.startswith("z/")}
     assert weighs_more == {"source-encoding", "source-hidden"}
 

@@ -51,6 +51,24 @@ def test_an_honest_checkout_has_no_findings(repository: GitRepository) -> None:
     assert found(repository.folder) == []
 
 
+@pytest.mark.parametrize("why", ["not installed", "fails", "SHA-256", "no checkout"])
+def test_where_git_says_nothing_that_is_found(
+    why: str, repository: GitRepository, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As nobody knows what its commit has; a folder in no checkout, the last, is the control."""
+    if why == "fails":
+        (repository.folder / ".git/index").write_text("none")
+    elif why == "SHA-256":
+        with (repository.folder / ".git/config").open("a") as config:
+            config.write("[extensions]\nobjectFormat = sha256\n")
+    else:
+        monkeypatch.setattr(checkout, "_program", lambda: None)
+    if why == "no checkout":
+        shutil.rmtree(repository.folder / ".git")
+    ids = [one.id for one in found(repository.folder)]
+    assert ids == ([] if why == "no checkout" else ["source-uncommitted"])
+
+
 def test_what_git_ignores_is_a_note(repository: GitRepository) -> None:
     """One for all of it: it is in no commit, in no jail, and nowhere on the Hub."""
     repository.commit({".gitignore": "*.pyc\n.venv/\n"})

@@ -102,10 +102,14 @@ def serve(listener: int, permitted: Collection[str], note: Callable[[Request], N
     return True
 
 
-MOST_DENIALS = 64
-"""Different ones that are reported of a jail."""
-MOST_FILES = 32
-"""Of these, files: a flood of names hides no other attempt."""
+MOST_OF_A_KIND = 32
+"""Different denials that are reported of a jail, of files, of sockets and of other calls each: a
+flood of one kind hides no attempt of another."""
+
+
+def kind(detail: str) -> str:
+    """The kind of what was denied, by its detail."""
+    return next((begin for begin in ("/", "AF_") if detail.startswith(begin)), "")
 
 
 def detail(request: Request) -> str:

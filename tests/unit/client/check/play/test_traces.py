@@ -1,0 +1,116 @@
+"""What a play notices, of an environment that does what a script says."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pytest
+from gymnasium import spaces
+
+from envhub_sandbox.check.play.traces import Trace, _bytes_of, _masks, digest, play
+
+_MORE = (0.0, False)
+_END = (0.0, True)
+_TIMES = itertools.count()
+
+
+class _Scripted:
+    """One sub-environment: ``begun`` are the observations of its resets; steps are a reward, and
+    whether they end it."""
+
+    num_envs = 1
+
+    def __init__(self, begun: Sequence[float], steps: Sequence[tuple[float, bool]]) -> None:
+        self.action_space = spaces.MultiDiscrete([2])
+        self._begun, self._steps = iter(begun), iter(steps)
+
+    def reset(self, **_: Any) -> Any:
+        return np.array([next(self._begun)]), {}
+
+    def step(self, _: Any) -> Any:
+        reward, ended = next(self._steps)
+        infos = {"took": np.array([next(_TIMES)])}  # which no two plays have in common
+        return np.zeros(1), np.array([reward]), np.array([ended]), np.zeros(1, bool), infos
+
+
+def played(mode: str, begun: Sequence[float], *steps: tuple[float, bool]) -> Trace:
+    env: Any = _Scripted(begun, steps)
+    return play(env, mode, seed=0, steps=len(steps))
+
+
+@pytest.mark.parametrize(
+    ("after", "noted"),
+    [(_MORE, False), ((1.0, False), True), (_END, True), ((1.0, True), True)],
+)
+def test_the_step_that_resets_gives_nothing_and_ends_nothing(
+    after: tuple[float, bool], noted: bool
+) -> None:
+    """The control is the mode in which there is no such step."""
+    assert bool(played("NextStep", [0.0], _END, after).notes["autoreset"]) is noted
+    assert not played("Disabled", [0.0, 0.0], _END, after).notes["autoreset"]
+
+
+def test_what_a_reset_between_gives_is_compared() -> None:
+    """Of who has to reset it himself; the step after it is the same."""
+    first = played("Disabled", [0.0, 1.0], _MORE, _END, _MORE)
+    assert first.differs_from(played("Disabled", [0.0, 1.0], _MORE, _END, _MORE)) is None
+    assert first.differs_from(played("Disabled", [0.0, 2.0], _MORE, _END, _MORE)) == 3
+
+
+_BOTH = np.ones(2, bool)
+
+
+@pytest.mark.parametrize(
+    ("infos", "wrong"),
+    [
+        ({"at": np.zeros(2), "_at": _BOTH}, ""),
+        ({"at": np.zeros(3)}, ""),  # about all of them
+        ({"_at": np.zeros(3)}, ""),
+        ({"at": np.zeros(3), "_at": _BOTH}, "'at' is (3,)"),
+        ({"at": np.zeros(2), "_at": np.ones(3, bool)}, "'_at' is bool (3,)"),
+        ({"at": np.zeros(2), "_at": np.ones(2)}, "'_at' is float64 (2,)"),
+        ({"of": {"at": np.zeros(2), "_at": _BOTH}, "_of": _BOTH}, ""),
+        ({"of": {"at": np.zeros(3), "_at": _BOTH}, "_of": _BOTH}, "'at' is (3,)"),
+    ],
+)
+def test_masks_are_of_all_sub_environments(infos: dict[str, Any], wrong: str) -> None:
+    assert [*_masks(infos, 2)] == ([f"{wrong}, of 2 sub-environments"] if wrong else [])
+
+
+def test_the_last_observations_are_no_large_infos() -> None:
+    last = {name: np.zeros(1000) for name in ("final_obs", "final_observation")}
+    assert _bytes_of({"at": np.zeros(2), "of": {"text": "four"}, **last}) == 20
+
+
+_SAME = [
+    ({"a": 1, "b": 2.0}, {"b": 2.0, "a": 1}),
+    ((1, "x"), [1, "x"]),
+    (np.array(["x", None], object), ["x", None]),
+    (np.zeros((4, 4))[::2], np.zeros((2, 4))),
+    (float("nan"), float("nan")),
+]
+_OTHER = [
+    (np.zeros(2, np.float32), np.zeros(1, np.float64)),
+    (np.zeros(2, np.float32), np.zeros(2, np.int32)),
+    (np.zeros((1, 2)), np.zeros((2, 1))),
+    (0.0, -0.0),
+    (np.zeros(1), -np.zeros(1)),
+    (1, True),
+    ("1", 1),
+    ({"a": 1}, {"b": 1}),
+    ({}, []),
+    ([[], 1], [[1]]),
+]
+
+
+@pytest.mark.parametrize(("one", "two"), _SAME)
+def test_a_digest_is_of_values(one: Any, two: Any) -> None:
+    assert digest(one) == digest(two)
+
+
+@pytest.mark.parametrize(("one", "two"), _OTHER)
+def test_other_values_have_another_digest(one: Any, two: Any) -> None:
+    assert digest(one) != digest(two)
