@@ -6,6 +6,8 @@ import json
 import os
 import pickle
 import struct
+import sys
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -234,6 +236,27 @@ def test_repetition_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     edit(folder, "history", "requests", value=[{"operation": "reset"}, *[again] * 34])
     with pytest.raises(BundleError, match="more than 100 requests"):
         load_bundle(folder)
+
+
+@pytest.mark.parametrize("name", ["requests.bin", "arguments.bin"])
+def test_requests_are_not_decoded_all_at_once(name: str, tmp_path: Path) -> None:
+    """Each may have as many empty lists as a message may, which take seventy times their bytes."""
+    folder, most = bundle(tmp_path), 20
+    lists: list[list[int]] = [[] for _ in range(20_000)]
+    frames = m.pack(m.Load(1, False, None, {"a": lists}))
+    (folder / name).write_bytes(inside.packet(frames) * most)
+    edit(folder, "history", "requests", value=[{"operation": "load"}] * most)
+    one = sum(map(sys.getsizeof, [lists, *lists]))
+    tracemalloc.start()
+    try:
+        if name == "requests.bin":
+            assert len(load_bundle(folder).requests) == most
+        else:
+            with pytest.raises(BundleError, match="not those of make_env"):
+                load_bundle(folder)
+        assert tracemalloc.get_traced_memory()[1] < 5 * one
+    finally:
+        tracemalloc.stop()
 
 
 @pytest.mark.parametrize(
