@@ -350,4 +350,5 @@ def _timeouts(bundle: Bundle) -> dict[str, Any]:
     timeouts = bundle.arguments.get("timeouts")
     names = ("startup_s", "reset_s", "step_s", "call_s")
     found = timeouts if isinstance(timeouts, dict) else {}
-    return {name: found[name] for name in names if isinstance(found.get(name), (int, float))}
+    given = {name: found[name] for name in names if isinstance(found.get(name), (int, float))}
+    return {name: seconds for name, seconds in given.items() if seconds < float("inf")}
