@@ -258,7 +258,7 @@ def test_a_crowd_of_readers_does_not_hold_the_clients(one: Watched, good: Any) -
 
 
 def test_a_newcomer_takes_the_place_of_the_oldest(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Also of one that says something at that moment."""
+    """Also of one that says something at that moment; one that will say no more is not kept."""
     monkeypatch.setattr(http_port, "PATIENCE_S", float("inf"))
     asked, both_came = threading.Event(), threading.Event()
 
@@ -281,6 +281,8 @@ def test_a_newcomer_takes_the_place_of_the_oldest(monkeypatch: pytest.MonkeyPatc
             both_came.set()
             newcomer.sendall(b"GET / HTTP/1.1\r\n\r\n")
             assert hears(newcomer).endswith(b"right")
+            found[3].shutdown(socket.SHUT_WR)
+            assert hears(found[3]) == b""
     finally:
         port.close()
 
