@@ -83,6 +83,9 @@ class TcpLink:
         self._cut_since = 0.0
         self._set_options(socket, far)
         self.monitor = socket.get_monitor_socket(_EVENTS)
+        # a server that ends every connection makes a dozen events a second; where they have no
+        # room, libzmq's thread waits, and with it all connections of this process
+        self.monitor.setsockopt(zmq.RCVHWM, 0)
 
     def _set_options(self, socket: zmq.Socket[bytes], far: TcpServer) -> None:
         heartbeat_ms = max(1, int(far.heartbeat_s * 1000))

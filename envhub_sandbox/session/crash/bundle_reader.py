@@ -10,8 +10,10 @@ from __future__ import annotations
 import json
 import os
 import stat
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -41,6 +43,23 @@ _UNREADABLE: tuple[type[Exception], ...] = (OSError, EnvHubError, *FAULTS)
 T = TypeVar("T")
 
 
+class Requests:
+    """Requests, decoded anew each time: all at once may take seventy times their bytes in memory.
+    ``decode``: decodes all, one at a time; it is done once here, and raises as it does.
+    """
+
+    def __init__(self, decode: Callable[[], Iterator[m.Message]]) -> None:
+        self._decode = decode
+        kinds = Counter(map(type, decode()))
+        self._count, self.steps = kinds.total(), kinds[m.Step]
+
+    def __iter__(self) -> Iterator[m.Message]:
+        return self._decode()
+
+    def __len__(self) -> int:
+        return self._count
+
+
 @dataclass(frozen=True, kw_only=True)
 class Bundle:
     """A crash bundle, checked.
@@ -66,12 +85,12 @@ class Bundle:
     arguments: dict[str, Any]
     task: dict[str, Any] | None
     doubts: tuple[str, ...]
-    requests: tuple[m.Message, ...]
+    requests: Requests
 
     @property
     def steps(self) -> int:
         """How many of the requests are steps."""
-        return sum(isinstance(request, m.Step) for request in self.requests)
+        return self.requests.steps
 
 
 def load_bundle(folder: Path) -> Bundle:
@@ -86,7 +105,7 @@ def load_bundle(folder: Path) -> Bundle:
 
 
 def _bundle(folder: Path, document: dict[str, Any]) -> Bundle:
-    provenance = _member(document, "provenance", dict)
+    provenance, requests = _member(document, "provenance", dict), _read(folder, "requests.bin")
     history = _member(document, "history", dict)
     arguments = _member(document, "make_env", dict)
     task = document.get("task")
@@ -99,7 +118,7 @@ def _bundle(folder: Path, document: dict[str, Any]) -> Bundle:
         arguments=arguments,
         task=None if task is None else _task(task),
         doubts=tuple(_doubts(document, history, arguments)),
-        requests=tuple(_requests(folder, _member(history, "requests", list))),
+        requests=Requests(partial(_requests, folder, requests, _member(history, "requests", list))),
     )
 
 
@@ -162,19 +181,20 @@ def _task(task: Any) -> dict[str, Any]:
 
 
 def _load(folder: Path) -> m.Load:
-    [message] = list(_packets(folder, "arguments.bin"))
-    if not isinstance(message, m.Load):
+    messages = _packets(_read(folder, "arguments.bin"))
+    message = next(messages, None)
+    if not isinstance(message, m.Load) or next(messages, None) is not None:
         raise BundleError("its arguments are not those of make_env")
     return message
 
 
-def _packets(folder: Path, name: str) -> Iterator[m.Message]:
-    for packet in StreamReader().feed(_read(folder, name)):
+def _packets(data: bytes) -> Iterator[m.Message]:
+    for packet in StreamReader().feed(data):
         yield m.unpack(packet.frames, tensors=to_tensor)
 
 
-def _requests(folder: Path, index: list[Any]) -> Iterator[m.Message]:
-    packets = _packets(folder, "requests.bin")
+def _requests(folder: Path, data: bytes, index: list[Any]) -> Iterator[m.Message]:
+    packets = _packets(data)
     arrays: dict[str, Any] = {}
     left = MAX_REQUESTS
     for entry in index:
@@ -330,4 +350,5 @@ def _timeouts(bundle: Bundle) -> dict[str, Any]:
     timeouts = bundle.arguments.get("timeouts")
     names = ("startup_s", "reset_s", "step_s", "call_s")
     found = timeouts if isinstance(timeouts, dict) else {}
-    return {name: found[name] for name in names if isinstance(found.get(name), (int, float))}
+    given = {name: found[name] for name in names if isinstance(found.get(name), (int, float))}
+    return {name: seconds for name, seconds in given.items() if seconds < float("inf")}

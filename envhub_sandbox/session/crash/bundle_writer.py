@@ -142,13 +142,25 @@ def _write(folder: Path, crash: Crash) -> None:
 
 def _concealed(value: Any, crash: Crash) -> Any:
     """A text without the values of variables that the jail was granted and may have printed."""
-    policy = crash.options.get("policy")
-    if isinstance(value, str) and isinstance(policy, Policy):
-        for name in policy.environment:
-            secret = os.environ.get(name, "")
-            if len(secret) >= _SHORTEST_SECRET:
-                value = value.replace(secret, f"<the value of {name}>")
+    if isinstance(value, str):
+        for secret, name in _secrets(crash.options.get("policy")):
+            value = value.replace(secret, f"<the value of {name}>")
     return value
+
+
+def _secrets(policy: Any) -> list[tuple[str, str]]:
+    """What is looked for, as it is printed, with the name of its variable.
+
+    Lines of a value too: a printed one has a margin before each. The longest first, which may
+    begin with another.
+    """
+    found: dict[str, str] = {}
+    for name in policy.environment if isinstance(policy, Policy) else ():
+        value = os.environ.get(name, "")
+        for text in (value, *map(str.strip, value.splitlines())):
+            if len(text) >= _SHORTEST_SECRET:
+                found |= {text: name, printable(text, len(text)): name}
+    return sorted(found.items(), key=lambda one: len(one[0]), reverse=True)
 
 
 def _array_file(rows: list[Any]) -> bytes:

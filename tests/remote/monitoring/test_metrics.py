@@ -216,6 +216,7 @@ def test_a_huge_request_is_not_kept(one: Watched, good: Any) -> None:
         (b"\x16\x03\x01\x02\x00\x01\x00\n\n", 400),
         (b"GET /\xff\x00\x1b HTTP/1.1\r\n\r\n", 404),
         (b"GET / HTTP/1.1\r\n" + b"a: b\r\n" * MAX_REQUEST_BYTES, 431),
+        (b"x" * (MAX_REQUEST_BYTES + 1), 431),
     ],
 )
 def test_only_whole_requests_for_a_page_are_answered(
@@ -226,7 +227,7 @@ def test_only_whole_requests_for_a_page_are_answered(
         with contextlib.suppress(ConnectionError):
             connection.sendall(request_)
         heard = hears(connection)
-    if status == 431:
+    if len(request_) > 2 * MAX_REQUEST_BYTES:
         assert heard == b"" or b" 431 " in heard  # what was not read may take the answer along
         return
     head, _, body = heard.partition(b"\r\n\r\n")
@@ -254,6 +255,36 @@ def test_a_crowd_of_readers_does_not_hold_the_clients(one: Watched, good: Any) -
         stop.set()
         for reader in readers:
             reader.join()
+
+
+def test_a_newcomer_takes_the_place_of_the_oldest(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also of one that says something at that moment; one that will say no more is not kept."""
+    monkeypatch.setattr(http_port, "PATIENCE_S", float("inf"))
+    asked, both_came = threading.Event(), threading.Event()
+
+    def answer(path: str) -> http_port.Reply:
+        if path == "/large":
+            asked.set()
+            both_came.wait(60)
+        return 200, "text/plain", bytes(_MIB * 16) if path == "/large" else b"right"
+
+    port = HttpPort("127.0.0.1", 0, answer, print)
+    number = int(port.address.rpartition(":")[2])
+    try:
+        with contextlib.ExitStack() as crowd:
+            found = [crowd.enter_context(knock(number)) for _ in range(MAX_CONNECTIONS + 1)]
+            assert hears(found[0]) == b""
+            found[2].sendall(b"GET /large HTTP/1.1\r\n\r\n")  # and does not read it
+            assert asked.wait(60)
+            newcomer = crowd.enter_context(knock(number))
+            found[1].sendall(b"GET / HTTP/1.1\r\n\r\n")
+            both_came.set()
+            newcomer.sendall(b"GET / HTTP/1.1\r\n\r\n")
+            assert hears(newcomer).endswith(b"right")
+            found[3].shutdown(socket.SHUT_WR)
+            assert hears(found[3]) == b""
+    finally:
+        port.close()
 
 
 def test_a_page_that_fails_is_an_answer() -> None:

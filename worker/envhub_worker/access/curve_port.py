@@ -236,6 +236,8 @@ class ConnectionLimiter:
 
     def close(self) -> None:
         """Stop watching."""
+        # libzmq waits where many events are not read, and holds what ``disable_monitor`` asks for
+        self._drain()
         if self._shut_listener is not None:
             self._shut_listener.close()
         # in this order: a context does not end while the monitor's other end is open

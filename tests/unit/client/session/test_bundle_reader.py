@@ -6,6 +6,8 @@ import json
 import os
 import pickle
 import struct
+import sys
+import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -236,12 +238,35 @@ def test_repetition_is_bounded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
         load_bundle(folder)
 
 
+@pytest.mark.parametrize("name", ["requests.bin", "arguments.bin"])
+def test_requests_are_not_decoded_all_at_once(name: str, tmp_path: Path) -> None:
+    """Each may have as many empty lists as a message may, which take seventy times their bytes."""
+    folder, most = bundle(tmp_path), 20
+    lists: list[list[int]] = [[] for _ in range(20_000)]
+    frames = m.pack(m.Load(1, False, None, {"a": lists}))
+    (folder / name).write_bytes(inside.packet(frames) * most)
+    edit(folder, "history", "requests", value=[{"operation": "load"}] * most)
+    one = sum(map(sys.getsizeof, [lists, *lists]))
+    tracemalloc.start()
+    try:
+        if name == "requests.bin":
+            assert len(load_bundle(folder).requests) == most
+        else:
+            with pytest.raises(BundleError, match="not those of make_env"):
+                load_bundle(folder)
+        assert tracemalloc.get_traced_memory()[1] < 5 * one
+    finally:
+        tracemalloc.stop()
+
+
 @pytest.mark.parametrize(
     ("name", "given", "nothing"),
     [
         ("dependencies", {"extra": ["scipy"], "python": "/tmp/python"}, "auto"),
         ("dependencies", "host", "auto"),
         ("assets", ["me/private"], []),
+        ("lock", "/tmp/pylock.toml", None),
+        ("hub_cache_dir", "/tmp/cache", None),
     ],
 )
 def test_what_a_bundle_chooses_is_a_wish(
@@ -256,7 +281,7 @@ def test_what_a_bundle_chooses_is_a_wish(
     assert wishes(load_bundle(bundle(tmp_path / "b", **{name: nothing}))) == []
 
 
-@pytest.mark.parametrize("limit", ["999G", [1 << 60], {}, 1 << 60, 1e30])
+@pytest.mark.parametrize("limit", ["999G", [1 << 60], {}, 1 << 60, 1e30, None])
 def test_a_limit_that_is_no_small_number_is_a_wish(tmp_path: Path, limit: object) -> None:
     """``Limits`` reads texts as well: what cannot be compared here is asked for."""
     folder = bundle(tmp_path)
@@ -280,7 +305,9 @@ def test_wishes_beyond_an_ordinary_run_are_told(tmp_path: Path) -> None:
     policy = Policy(
         profile="no-userns",
         network="host",
+        display="virtual",
         readable=("/data",),
+        gpu=True,
         environment=("SECRET",),
         limits=Limits(memory_bytes=64 << 30, processes=7, cpu_time_s=5),
     )
@@ -288,8 +315,8 @@ def test_wishes_beyond_an_ordinary_run_are_told(tmp_path: Path) -> None:
         bundle(tmp_path, policy=policy, python="/tmp/python", endpoint="https://evil.example")
     )
     assert [wish.partition("=")[0] for wish in wishes(found)] == [
-        *("profile", "network", "readable", "environment", "limits.memory_bytes"),
-        *("endpoint", "python"),
+        *("profile", "network", "display", "readable", "gpu", "environment"),
+        *("limits.memory_bytes", "endpoint", "python"),
     ]
     refused = replayed_arguments(found, granted=False)
     assert set(refused["policy"]) == {"limits", "crash_history"}
@@ -302,6 +329,14 @@ def test_wishes_beyond_an_ordinary_run_are_told(tmp_path: Path) -> None:
     assert granted["policy"]["limits"]["memory_bytes"] == 64 << 30
     assert granted["python"] == "/tmp/python"
     assert Policy(**{**granted["policy"], "limits": Limits(**granted["policy"]["limits"])})
+
+
+def test_a_replay_is_not_waited_for_without_end(tmp_path: Path) -> None:
+    folder = bundle(tmp_path)
+    endless = {"reset_s": None, "step_s": float("inf"), "startup_s": "1", "call_s": 5}
+    edit(folder, "make_env", "timeouts", value=endless)
+    made = replayed_arguments(load_bundle(folder), granted=True)
+    assert made["timeouts"] == {"call_s": 5}
 
 
 def test_a_bundle_says_nothing_in_lines_of_its_own(tmp_path: Path) -> None:
@@ -344,6 +379,17 @@ class Recorder:
         self.asked.append("close")
 
 
+class Open(Recorder):
+    """One that has whatever it is asked for, and so have its sub-environments."""
+
+    @property
+    def envs(self) -> list[Open]:
+        return [self, self]
+
+    def __getattr__(self, name: str) -> Callable[[], None]:
+        return lambda: self.asked.append(name)
+
+
 def test_a_replay_asks_the_same(tmp_path: Path) -> None:
     env = Recorder()
     found = replay(lambda: env, load_bundle(bundle(tmp_path)))
@@ -352,15 +398,20 @@ def test_a_replay_asks_the_same(tmp_path: Path) -> None:
 
 
 def test_a_bundle_cannot_call_the_proxy_itself(tmp_path: Path) -> None:
-    """Only names that the repository's environment has beyond ours."""
+    """Only names that the repository's environment has beyond ours, of those that there are."""
     folder = bundle(tmp_path)
-    calls: list[m.Message] = [m.CallOwn(0, "close", (), {}), m.GetOwn(0, "__dict__")]
+    calls: list[m.Message] = [
+        *(m.CallOwn(0, "close", (), {}), m.GetOwn(0, "__dict__"), m.CallOwn(0, "_own", (), {})),
+        *(m.CallOne(0, index, 0, "close", (), {}) for index in (-1, 2)),
+        m.CallOne(0, 0, 0, "_own", (), {}),
+        m.CallOne(0, 0, 0, "allowed", (), {}),  # the control
+    ]
     packets = b"".join(inside.packet(m.pack(call)) for call in calls)
     (folder / "requests.bin").write_bytes(packets)
-    edit(folder, "history", "requests", value=[{"operation": "callown"}] * 2)
-    env = Recorder()
+    edit(folder, "history", "requests", value=[{"operation": "call"}] * len(calls))
+    env = Open()
     assert replay(lambda: env, load_bundle(folder)).verdict is Verdict.SURVIVED
-    assert env.asked == []
+    assert env.asked == ["allowed"]
 
 
 def test_a_request_that_does_not_fit_is_said(tmp_path: Path) -> None:

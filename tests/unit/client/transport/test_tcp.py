@@ -12,6 +12,7 @@ import zmq
 from zmq.utils import z85
 
 from envhub_sandbox.errors import SandboxUnavailableError
+from envhub_sandbox.transport import tcp
 from envhub_sandbox.transport.replies import UnreachableError
 from envhub_sandbox.transport.tcp import TcpLink, TcpServer
 from tests.support import inside
@@ -74,3 +75,26 @@ def test_one_that_ends_every_handshake_is_refused(
             with pytest.raises(error, match=said):
                 eventually(lambda: link.drain() is not None)
         listener.shutdown(socket.SHUT_RDWR)
+
+
+def test_one_that_ends_every_connection_holds_up_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    """libzmq has one thread for all of them, which waits for room where nobody reads its news."""
+    monkeypatch.setattr(tcp, "_RECONNECT_MS", 1)
+    monkeypatch.setattr(tcp, "_RECONNECT_MAX_MS", 1)
+    ended = list[int]()
+
+    def end_all() -> None:
+        with contextlib.suppress(OSError):
+            while True:
+                listener.accept()[0].close()
+                ended.append(1)
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        threading.Thread(target=end_all, daemon=True).start()
+        far = TcpServer(_PUBLIC, z85.decode(_SECRET))
+        with linked(listener.getsockname()[1], far) as link:
+            is_held_up = not eventually(lambda: len(ended) > 1_500, 60)  # of two events each
+            listener.shutdown(socket.SHUT_RDWR)
+            while is_held_up and link.monitor.poll(1_000):  # or ``close`` would wait, too
+                link.monitor.recv_multipart()
+    assert not is_held_up

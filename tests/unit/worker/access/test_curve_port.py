@@ -1,7 +1,9 @@
-"""Which connections a server knows to be there."""
+"""Which connections a server knows to be there, and how it stops to look."""
 
 from __future__ import annotations
 
+import multiprocessing
+import socket
 from collections.abc import Iterator
 
 import pytest
@@ -11,6 +13,7 @@ from envhub_worker.access.audit.log import Log
 from envhub_worker.access.curve_port import CurvePort
 from envhub_worker.access.sessions import Sessions
 from envhub_worker.loop import Loop
+from tests.remote.strangers import greeting, knock, say
 from tests.support.processes import eventually
 
 
@@ -42,3 +45,38 @@ def test_who_has_gone_before_its_greeting_is_read_holds_no_session(
         sessions.disconnect(port.open_wires() or ())
         assert bool(session.connections) is not goes
         port.close()
+
+
+def test_a_flood_that_nobody_has_read_does_not_keep_a_port_open() -> None:
+    """A server that ends reads nothing meanwhile, and libzmq's thread waits with what it holds."""
+    process = multiprocessing.get_context("spawn").Process(target=_flood_and_close)
+    process.start()
+    process.join(60)
+    process.kill()
+    process.join()
+    assert process.exitcode == 0
+
+
+def _flood_and_close() -> None:
+    port = CurvePort(None, lambda key, address: True, Log(lambda line: None), 10)
+    with zmq.Context() as context, context.socket(zmq.ROUTER) as router:
+        port.secure(router, Loop(lambda error: None))
+        number = router.bind_to_random_port("tcp://127.0.0.1")
+        for _ in range(2_000):
+            with knock(number) as stranger:
+                say(stranger, greeting(b"CURVE"))
+                if not _is_ended(stranger):  # the control: it waits now
+                    break
+        port.close()
+
+
+def _is_ended(stranger: socket.socket) -> bool:
+    stranger.settimeout(2)
+    try:
+        while stranger.recv(1 << 16):
+            pass
+    except TimeoutError:
+        return False
+    except ConnectionError:
+        pass
+    return True
