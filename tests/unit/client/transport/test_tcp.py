@@ -93,7 +93,7 @@ def test_one_that_ends_every_connection_holds_up_no_other(monkeypatch: pytest.Mo
         threading.Thread(target=end_all, daemon=True).start()
         far = TcpServer(_PUBLIC, z85.decode(_SECRET))
         with linked(listener.getsockname()[1], far) as link:
-            is_held_up = not eventually(lambda: len(ended) > 1_500, 60)  # of two events each
+            is_held_up = not eventually(lambda: len(ended) > 1_500, 240)  # of two events each
             listener.shutdown(socket.SHUT_RDWR)
             while is_held_up and link.monitor.poll(1_000):  # or ``close`` would wait, too
                 link.monitor.recv_multipart()
