@@ -19,7 +19,7 @@ from typing import Any
 
 import zmq
 
-from envhub_sandbox.check.play import confinement
+from envhub_sandbox.check.play import confinement, task, traces
 from envhub_sandbox.dependencies import environments, interpreters, modules, resolutions
 from envhub_sandbox.factory import make_env
 from envhub_sandbox.sandboxes import remote
@@ -291,6 +291,11 @@ def _running(env: Any) -> LoadedJail:
 
 HARMLESS_DENIALS = confinement._HARMLESS
 """What a recorded jail is denied that is no attempt of the repository's."""
+PATIENCE_FOR_AN_END: Spot = (task, "_EPISODE_S")
+"""Seconds in which the judge looks for the end of an episode."""
+wrong_types = task._untyped
+wrong_masks = traces._masks
+info_bytes = traces._bytes_of
 
 # --- the connection to another host ------------------------------------------------------------
 

@@ -16,7 +16,7 @@ from envhub_sandbox.check import judge as judging
 from envhub_sandbox.check.checks import CHECKS, Severity
 from envhub_sandbox.check.findings import Report
 from envhub_sandbox.check.judge import judge
-from envhub_sandbox.check.play import task, traces
+from envhub_sandbox.check.play import traces
 from envhub_sandbox.check.play.probes import LEAK_CHECKS
 from envhub_sandbox.check.settings import JudgeOptions
 from envhub_sandbox.errors import SandboxUnavailableError, SnapshotError
@@ -24,6 +24,7 @@ from envhub_sandbox.vector.pictures import png
 from tests.corpus.entries import Entry
 from tests.corpus.faults import FAULTS
 from tests.corpus.honest import HONEST
+from tests.support import inside
 from tests.support import judged as corpus
 from tests.support.command_line import envhub, python
 from tests.support.documents import checks
@@ -159,7 +160,7 @@ def test_a_machine_that_is_slow_for_a_while_fails_nobody(
         return trace
 
     monkeypatch.setattr(traces, "play", slow)
-    monkeypatch.setattr(task, "_EPISODE_S", 1e9 if is_slow_for_ever else -1.0)
+    monkeypatch.setattr(*inside.PATIENCE_FOR_AN_END, 1e9 if is_slow_for_ever else -1.0)
     text = _HONEST.replace("length = _max_episode_steps = 10", "length = _max_episode_steps = 1e9")
     report = judged(repository(tmp_path / "walk", text), 5, resets=0, episode_steps=50)
     assert len(plays) == 6

@@ -62,7 +62,7 @@ def test_where_git_says_nothing_that_is_found(
         with (repository.folder / ".git/config").open("a") as config:
             config.write("[extensions]\nobjectFormat = sha256\n")
     else:
-        monkeypatch.setattr(checkout, "_program", lambda: None)
+        monkeypatch.setenv("PATH", "")
     if why == "no checkout":
         shutil.rmtree(repository.folder / ".git")
     ids = [one.id for one in found(repository.folder)]

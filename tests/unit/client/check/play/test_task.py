@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from envhub_sandbox.check.play.task import _untyped
+from tests.support import inside
 
 
 @pytest.mark.parametrize(
@@ -25,6 +25,6 @@ from envhub_sandbox.check.play.task import _untyped
     ],
 )
 def test_a_step_has_the_types_of_gymnasium(result: tuple[Any, ...], wrong: str) -> None:
-    found = " ".join(_untyped(*result))
+    found = " ".join(inside.wrong_types(*result))
     assert found.startswith(wrong)
     assert bool(found) is bool(wrong)

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from envhub_sandbox.check.play.traces import Trace, _bytes_of, _masks, digest, play
+from envhub_sandbox.check.play.traces import Trace, digest, play
+from tests.support import inside
 
 _MORE = (0.0, False)
 _END = (0.0, True)
@@ -77,12 +78,12 @@ _BOTH = np.ones(2, bool)
     ],
 )
 def test_masks_are_of_all_sub_environments(infos: dict[str, Any], wrong: str) -> None:
-    assert [*_masks(infos, 2)] == ([f"{wrong}, of 2 sub-environments"] if wrong else [])
+    assert [*inside.wrong_masks(infos, 2)] == ([f"{wrong}, of 2 sub-environments"] if wrong else [])
 
 
 def test_the_last_observations_are_no_large_infos() -> None:
     last = {name: np.zeros(1000) for name in ("final_obs", "final_observation")}
-    assert _bytes_of({"at": np.zeros(2), "of": {"text": "four"}, **last}) == 20
+    assert inside.info_bytes({"at": np.zeros(2), "of": {"text": "four"}, **last}) == 20
 
 
 _SAME = [
