@@ -219,6 +219,22 @@ def test_without_a_uv_that_can_be_used_the_error_says_how_to_get_one(
         uv.command()
 
 
+def test_what_uv_prints_is_escaped(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """It quotes names of packages, which strangers choose."""
+    monkeypatch.setitem(sys.modules, "uv", None)
+    monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+    (tmp_path / "uv").write_text(
+        "#!/bin/sh\n[ $1 = --version ] && exec echo 'uv 99.0.0'\n"
+        "printf 'no \\033[2Jname\\n' >&2; exit 1\n"
+    )
+    (tmp_path / "uv").chmod(0o755)
+    told = list[str]()
+    with pytest.raises(DependencyError) as caught:
+        uv.run(["pip"], what="no", timeout_s=60, tell=told.append)
+    assert told == ["no \\x1b[2Jname"]
+    assert "\x1b" not in str(caught.value)
+
+
 def test_the_project_asks_for_the_oldest_uv_that_is_taken(project: dict[str, Any]) -> None:
     oldest = ".".join(map(str, uv.OLDEST))
     assert f"uv>={oldest}" in project["project"]["dependencies"]
