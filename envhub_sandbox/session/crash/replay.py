@@ -111,7 +111,9 @@ def _get_own(env: Any, message: m.GetOwn) -> None:
 def _call_one(env: Any, message: m.CallOne) -> None:
     if message.name == "__setattr__":
         name, value = message.args
-        setattr(_one(env, message), str(name), value)
+        one = _one(env, message)
+        if one is not None and str(name) not in vars(one):  # those are the proxy's own
+            setattr(one, str(name), value)
         return
     method = _one(env, message, message.name)
     if method is not None:

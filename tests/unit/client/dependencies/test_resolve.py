@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 import tempfile
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -217,6 +218,37 @@ def test_without_a_uv_that_can_be_used_the_error_says_how_to_get_one(
         (tmp_path / "uv").chmod(0o755)
     with pytest.raises(DependencyError, match=said):
         uv.command()
+
+
+@pytest.fixture
+def another_uv(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[str], None]:
+    """Puts a script of these lines of Python in uv's place."""
+
+    def replace(lines: str) -> None:
+        version = "if sys.argv[1] == '--version': sys.exit(print('uv 99.0.0'))"
+        (tmp_path / "uv").write_text(f"#!{sys.executable}\nimport sys, time\n{version}\n{lines}\n")
+        (tmp_path / "uv").chmod(0o755)
+        monkeypatch.setitem(sys.modules, "uv", None)
+        monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
+
+    return replace
+
+
+def test_a_uv_that_is_late_is_ended(another_uv: Callable[[str], None], tmp_path: Path) -> None:
+    another_uv(f"time.sleep(30)\nopen({str(tmp_path / 'went on')!r}, 'w')")
+    with pytest.raises(IndexUnavailableError, match="uv was not done after"):
+        uv.run(["pip"], what="no", timeout_s=0.1)
+    assert not (tmp_path / "went on").exists()
+
+
+def test_what_uv_prints_is_escaped(another_uv: Callable[[str], None]) -> None:
+    """It quotes names of packages, which strangers choose."""
+    another_uv(r"sys.exit('no \x1b[2Jname')")
+    told = list[str]()
+    with pytest.raises(DependencyError) as caught:
+        uv.run(["pip"], what="no", timeout_s=60, tell=told.append)
+    assert told == ["no \\x1b[2Jname"]
+    assert "\x1b" not in str(caught.value)
 
 
 def test_the_project_asks_for_the_oldest_uv_that_is_taken(project: dict[str, Any]) -> None:

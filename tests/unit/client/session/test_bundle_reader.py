@@ -404,14 +404,19 @@ def test_a_bundle_cannot_call_the_proxy_itself(tmp_path: Path) -> None:
         *(m.CallOwn(0, "close", (), {}), m.GetOwn(0, "__dict__"), m.CallOwn(0, "_own", (), {})),
         *(m.CallOne(0, index, 0, "close", (), {}) for index in (-1, 2)),
         m.CallOne(0, 0, 0, "_own", (), {}),
-        m.CallOne(0, 0, 0, "allowed", (), {}),  # the control
+        m.CallOne(0, 0, 0, "__setattr__", ("asked", []), {}),
+        m.CallOne(0, 0, 0, "__setattr__", ("further", 1), {}),  # a control
+        m.CallOne(0, 0, 0, "allowed", (), {}),  # another
     ]
     packets = b"".join(inside.packet(m.pack(call)) for call in calls)
     (folder / "requests.bin").write_bytes(packets)
     edit(folder, "history", "requests", value=[{"operation": "call"}] * len(calls))
     env = Open()
+    asked = env.asked
     assert replay(lambda: env, load_bundle(folder)).verdict is Verdict.SURVIVED
-    assert env.asked == ["allowed"]
+    assert env.asked is asked
+    assert asked == ["allowed"]
+    assert vars(env)["further"] == 1
 
 
 def test_a_request_that_does_not_fit_is_said(tmp_path: Path) -> None:

@@ -11,7 +11,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from envhub_sandbox.session.crash import history
-from envhub_sandbox.session.crash.history import History, RecordedRequest, Recording, Steps
+from envhub_sandbox.session.crash.history import (
+    History,
+    PartHistory,
+    RecordedRequest,
+    Recording,
+    Steps,
+)
 from envhub_worker.protocol import messages as m
 from tests.support.compare import assert_same
 from tests.support.wire import env_manifest, requested
@@ -223,12 +229,17 @@ def test_memory_is_bounded(monkeypatch: pytest.MonkeyPatch, space: Any) -> None:
     assert len(kept.recording().requests) <= 3
 
 
-def test_after_a_transparent_restart_nobody_knows_before_all_are_seeded() -> None:
+@pytest.mark.parametrize("of_a_fleet", ["", "started", "revived"])
+def test_after_a_transparent_restart_nobody_knows_before_all_are_seeded(of_a_fleet: str) -> None:
     """Then it is exact again, unless attributes had been set that only some still have."""
     kept = made()
+    part = PartHistory(env_manifest(spaces.Discrete(2), spaces.Discrete(5), 1), kept)
     reset(kept, [1, 2])
     kept.step(np.array([1, 1]))
-    kept.revived()
+    if of_a_fleet:  # one of its workers is fresh
+        getattr(part, of_a_fleet)()
+    else:
+        kept.revived()
     kept.step(np.array([2, 2]))
     assert not kept.recording().seeded
     assert actions_of(kept.recording()) == [[2, 2]]

@@ -12,7 +12,6 @@ import zmq
 from zmq.utils import z85
 
 from envhub_sandbox.errors import SandboxUnavailableError
-from envhub_sandbox.transport import tcp
 from envhub_sandbox.transport.replies import UnreachableError
 from envhub_sandbox.transport.tcp import TcpLink, TcpServer
 from tests.support import inside
@@ -22,11 +21,13 @@ _PUBLIC, _SECRET = zmq.curve_keypair()
 
 
 @contextlib.contextmanager
-def linked(port: int, far: TcpServer) -> Iterator[TcpLink]:
+def linked(port: int, far: TcpServer, **options: int) -> Iterator[TcpLink]:
     with zmq.Context() as context, context.socket(zmq.DEALER) as client:
         client.linger = 0
         endpoint = f"tcp://127.0.0.1:{port}"
         link = TcpLink(client, endpoint, far)
+        for name, value in options.items():
+            setattr(client, name, value)
         client.connect(endpoint)
         try:
             yield link
@@ -77,10 +78,8 @@ def test_one_that_ends_every_handshake_is_refused(
         listener.shutdown(socket.SHUT_RDWR)
 
 
-def test_one_that_ends_every_connection_holds_up_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_that_ends_every_connection_holds_up_no_other() -> None:
     """libzmq has one thread for all of them, which waits for room where nobody reads its news."""
-    monkeypatch.setattr(tcp, "_RECONNECT_MS", 1)
-    monkeypatch.setattr(tcp, "_RECONNECT_MAX_MS", 1)
     ended = list[int]()
 
     def end_all() -> None:
@@ -92,7 +91,8 @@ def test_one_that_ends_every_connection_holds_up_no_other(monkeypatch: pytest.Mo
     with socket.create_server(("127.0.0.1", 0)) as listener:
         threading.Thread(target=end_all, daemon=True).start()
         far = TcpServer(_PUBLIC, z85.decode(_SECRET))
-        with linked(listener.getsockname()[1], far) as link:
+        often = {"reconnect_ivl": 1, "reconnect_ivl_max": 1}
+        with linked(listener.getsockname()[1], far, **often) as link:
             is_held_up = not eventually(lambda: len(ended) > 1_500, 240)  # of two events each
             listener.shutdown(socket.SHUT_RDWR)
             while is_held_up and link.monitor.poll(1_000):  # or ``close`` would wait, too
