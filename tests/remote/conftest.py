@@ -16,7 +16,7 @@ from tests.support.started import started
 IMPATIENT_S = 8
 
 
-@pytest.fixture(scope="package", autouse=True)
+@pytest.fixture(autouse=True)
 def _patient() -> Iterator[None]:
     """Who is slow is not gone: a loaded machine takes the core from a server for a long time.
 

@@ -10,6 +10,11 @@ import pytest
 from tests.remote.ray.clusters import cluster_of
 
 
+@pytest.fixture(autouse=True)
+def _patient() -> None:
+    """Here servers are killed: how soon one counts as gone is as for a user."""
+
+
 @pytest.fixture(scope="package")
 def cluster() -> Iterator[Any]:
     """This process is connected to it. Each node has two CPUs and a resource of its own."""
