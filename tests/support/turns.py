@@ -2,43 +2,26 @@
 
 from __future__ import annotations
 
-import contextlib
-import errno
+import fcntl
 import os
-import socket
 from collections.abc import Iterator
+from contextlib import contextmanager
 
-from tests.support.processes import eventually
-
-LONGEST_S = 600.0
+_PLACES = {"broadcasting": "/usr", "memory": "/usr/bin", "quotas": "/usr/lib"}
+"""What is locked for each: a folder that is there, that every user may read, and that nobody else
+locks. A file of the checkout would do for one run; a machine may have several, of several users.
+"""
+LONGEST_S = 600
 """A test that may wait for so long has a timeout to match."""
 
 
-@contextlib.contextmanager
+@contextmanager
 def turn(name: str) -> Iterator[None]:
-    """While it lasts no other process of this machine has the turn of this name.
-
-    A lock of a file in the checkout would hold for one run of the tests, and the machine may have
-    several, of several users. This is a name that the kernel gives to one socket at a time, and
-    takes back however its process ends.
-    """
-    with socket.socket(socket.AF_UNIX) as held:
-
-        def taken() -> bool:
-            try:
-                held.bind(f"\0envhub-test-turn-{name}")
-            except OSError as error:
-                if error.errno != errno.EADDRINUSE:
-                    raise
-                return False
-            return True
-
-        assert eventually(taken, LONGEST_S), f"the turn {name!r} did not come"
+    """While it lasts no other process of this machine has this turn; who waits has it in turn."""
+    place = os.open(_PLACES[name], os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        fcntl.flock(place, fcntl.LOCK_EX)
         yield
-
-
-@contextlib.contextmanager
-def turn_of_user(name: str) -> Iterator[None]:
-    """The same for one user's tests: what the kernel counts for each user."""
-    with turn(f"{name}-{os.geteuid()}"):
-        yield
+    finally:
+        fcntl.flock(place, fcntl.LOCK_UN)  # a child that was forked meanwhile has it open, too
+        os.close(place)

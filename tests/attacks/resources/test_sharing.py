@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 
 from tests.attacks.harness import ANSWER, USER, Arena, Run, token
-from tests.support.turns import LONGEST_S, turn_of_user
+from tests.support.turns import LONGEST_S, turn
 
 FAMILY = "What others share"
 
@@ -158,7 +158,7 @@ def used_up(kind: str) -> bool:
 @pytest.fixture
 def _quotas() -> Iterator[None]:
     """They are one user's: what one test uses up, another one would find used up."""
-    with turn_of_user("quotas"):
+    with turn("quotas"):
         yield
 
 

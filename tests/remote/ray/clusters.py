@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import shutil
 import tempfile
@@ -16,6 +17,7 @@ from tests.support.processes import eventually
 
 _SOON = {"health_check_period_ms": 1000, "health_check_failure_threshold": 4}
 """For Ray to see that a node has gone; by itself it takes three times as long."""
+_TRIES = 8
 MEMORY = 80 * 2**20
 """Of a node's object store, the least that Ray takes."""
 
@@ -51,13 +53,20 @@ def add_node(cluster: Any, num_cpus: float = 2, **resources: float) -> Any:
 
 
 def _started(cluster: Any, **arguments: Any) -> Any:
-    """A node; Ray gives it 30 s, which a machine whose cores are taken away may not have."""
-    for left in (2, 1, 0):
+    """A node. Ray gives it 30 s, and it gives its own agents half of that, which a machine whose
+    cores are taken away may not have. What a try has left is ended: it would slow the next one.
+    """
+    for left in reversed(range(_TRIES)):
+        before = psutil.Process().children(recursive=True)
         try:
             return cluster.add_node(object_store_memory=MEMORY, **arguments)
         except Exception as error:
             if "timed out during startup" not in str(error) or not left:
                 raise
+        for process in psutil.Process().children(recursive=True):
+            if process not in before:
+                with contextlib.suppress(psutil.NoSuchProcess):
+                    process.kill()
     raise AssertionError
 
 
