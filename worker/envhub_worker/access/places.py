@@ -17,7 +17,7 @@ from envhub_worker.access.sessions import WATCHER, Session, Sessions
 from envhub_worker.access.store.uploads import Uploads
 from envhub_worker.protocol.messages.server import DRAINING, Busy
 from envhub_worker.supervisor.jails import Jails
-from envhub_worker.supervisor.records import Asker
+from envhub_worker.supervisor.records import Asker, JailRecord
 
 _PATIENCE_S = 5.0
 _MAX_WAITING = 1024
@@ -171,13 +171,16 @@ class Places:
     def tick(self) -> None:
         """End the jails of clients that are not heard from, and what clients no longer hold."""
         self.end_deserted()
+        # Before the silent clients are looked for: time passes meanwhile, and it would be said of
+        # one of them that it gave up what it held when it was last heard.
+        given_up = self._given_up() if self._idle_s else []
         for session in self._sessions.idle(self._idle_s or _FORGOTTEN_S):
             if self._idle_s:
                 self.end(session, f"its client has sent nothing for {self._idle_s} s")
             elif not self._jails.open_ones(session.owner):
                 self.drop(session, "it has sent nothing for too long")
-        if self._idle_s:
-            self._end_unheld()
+        for entry in given_up:
+            self._jails.end(entry, "its client gave it up")
 
     def end_deserted(self) -> None:
         """Forget the connections that have gone, and the sessions that have nothing else.
@@ -195,11 +198,13 @@ class Places:
         if wires is not None:
             self._sessions.disconnect(wires)
 
-    def _end_unheld(self) -> None:
-        for session in self._sessions.all():
-            for entry in self._jails.open_ones(session.owner):
-                if self._sessions.unheld(session, entry.number, self._idle_s):
-                    self._jails.end(entry, "its client gave it up")
+    def _given_up(self) -> list[JailRecord]:
+        return [
+            entry
+            for session in self._sessions.all()
+            for entry in self._jails.open_ones(session.owner)
+            if self._sessions.unheld(session, entry.number, self._idle_s)
+        ]
 
     def end(self, session: Session, why: str) -> None:
         """End a session and its jails."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from itertools import count, repeat
 from types import SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock
@@ -49,6 +51,8 @@ class _Jails:
         return [self.of[owner]] if owner in self.of else []
 
     def end(self, entry: Any, why: str) -> None:
+        if entry not in self.of.values():
+            return
         self.ended.append((entry.number, why))
         self.of = {owner: one for owner, one in self.of.items() if one is not entry}
 
@@ -70,6 +74,19 @@ def test_a_client_that_is_not_heard_of_loses_its_jails(idle_s: int, ended: list[
     assert [number for number, _ in jails.ended] == ended
     assert [one.name for one in sessions.all()] == [b"b"] if ended else [b"a", b"b"]
     assert uploads.forget.called == bool(ended)
+
+
+@pytest.mark.parametrize("idle_s", range(1, 9))
+def test_a_client_that_fell_silent_gave_nothing_up(idle_s: int) -> None:
+    """Also where time passes between two looks."""
+    times: Iterator[int] = repeat(0)
+    sessions, jails = Sessions(lambda: next(times)), _Jails(keya=7)
+    session = sessions.connect(b"1", b"key", b"a")
+    sessions.keep(session, (7,))
+    times = count(1)
+    for _ in range(10):
+        places(idle_s, sessions, jails, MagicMock(), None).tick()
+    assert jails.ended == [(7, f"its client has sent nothing for {idle_s} s")]
 
 
 def test_a_session_without_connections_and_jails_is_forgotten() -> None:
