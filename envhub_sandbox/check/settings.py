@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from envhub_sandbox.errors import EnvHubError, PolicyError
+from envhub_sandbox.hub.git.checkout import top_of
 from envhub_sandbox.hub.local import split_local
 from envhub_sandbox.hub.snapshot import is_here
 from envhub_sandbox.hub.sources import toml
@@ -130,10 +131,7 @@ def _named_in_checkout(path: Path, reference: str) -> Path | None:
         return None
     # a checkout need not have the folder any more
     folder = Path(_folder_of(reference) or os.path.realpath(os.path.expanduser(reference)))
-    around = (folder, *folder.parents)
-    return _named_in(
-        path, str(next((one for one in around if os.path.lexists(one / ".git")), folder))
-    )
+    return _named_in(path, str(top_of(folder) or folder))
 
 
 def is_in_its_checkout(path: Path, reference: str) -> bool:

@@ -135,8 +135,14 @@ def make_checkout(folder: Path) -> None:
     subprocess.run(command, env=_environment(None), capture_output=True, check=False)
 
 
+def top_of(folder: Path) -> Path | None:
+    """The folder, or the nearest one above it, that has a ``.git`` of any kind."""
+    around = (folder, *folder.parents)
+    return next((one for one in around if os.path.lexists(one / ".git")), None)
+
+
 def _repository_of(folder: Path) -> _Repository | None:
-    top = next((one for one in (folder, *folder.parents) if os.path.lexists(one / ".git")), None)
+    top = top_of(folder)
     if top is None:
         return None
     try:

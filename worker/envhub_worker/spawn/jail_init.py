@@ -230,8 +230,9 @@ class Init:
 
     def _report_denied(self, call: str, detail: str) -> None:
         denial, kind = (call, detail), notify.kind(detail)
-        known = sum(notify.kind(one) == kind for _, one in self._denials)
-        if denial not in self._denials and known < notify.MOST_OF_A_KIND:
+        if denial in self._denials:
+            return
+        if sum(notify.kind(one) == kind for _, one in self._denials) < notify.MOST_OF_A_KIND:
             self._denials.add(denial)
             self._channel.send({"event": "denied", "call": call, "detail": detail})
 
