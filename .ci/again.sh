@@ -1,20 +1,34 @@
-# again.sh COMMAND...: pytest; where one test of thousands has failed, or two, these are tried once
-# more, each alone and with nothing beside it. A machine whose cores are taken away for seconds may
-# fail one of them; a fault does so again. What failed is printed whole, and named in the last lines
-# of the run: it is to be looked into. An attack that succeeds once has succeeded,
-# and a result that is wrong once is wrong.
+# again.sh COMMAND...: pytest; each test that failed is run again, alone, three times, each time in a
+# process of its own and with nothing beside it. If one of these runs fails, the command has failed.
+# A machine whose cores are taken away for seconds may fail a test once; a fault fails again. What
+# failed is printed whole, and named in the last lines of the run: it is to be mended.
+# More than twenty are not run again: a slow moment fails a few tests of thousands, and twenty
+# already cost some ten minutes.
 set -uo pipefail
+times=3 most=20
 "$@"
 code=$?
-[ "$code" = 1 ] || exit "$code"
+[ "$code" = 1 ] || exit "$code"  # 2 and above: interrupted, or it could not begin
 failed=.pytest_cache/v/cache/lastfailed
-names=$(sed -n 's/^ *"\(.*\)": true,*$/\1/p' "$failed" | grep -v '^$')
-attacks='attack|lies|stranger|hostile|attribution'
-if [ -z "$names" ] || [ "$(wc -l <<<"$names")" -gt 2 ] || grep -qE "$attacks" <<<"$names"; then
+mapfile -t names < <(sed -n 's/^ *"\(..*\)": true,*$/\1/p' "$failed")
+[ "${#names[@]}" -gt 0 ] || exit 1
+if [ "${#names[@]}" -gt "$most" ]; then
+  printf '\n======== %s failed, which is too many to run them again\n' "${#names[@]}"
   exit 1
 fi
-printf '\n======== failed, and tried again:\n%s\n' "$names"
-"$@" -n 0 --last-failed || exit 1
-while IFS= read -r name; do
-  printf 'FAILED ONCE, passed alone: %s\n' "$name"
-done <<<"$names"
+printf '\n======== failed, and run again alone:\n'
+printf '%s\n' "${names[@]}"
+lines=() code=0
+for name in "${names[@]}"; do
+  line="FAILED ONCE, passed alone three times: $name"
+  for _ in $(seq "$times"); do
+    # pytest's own list of what failed, as JSON: the same command then runs this test and no other
+    printf '{"%s": true}' "$name" >"$failed"
+    "$@" -n 0 --last-failed && continue
+    line="FAILED AGAIN: $name" code=1
+    break
+  done
+  lines+=("$line")
+done
+printf '%s\n' "${lines[@]}"
+exit $code

@@ -266,3 +266,54 @@ def test_the_steps_of_ci_name_tests_that_there_are(checkout: Path) -> None:
         named |= set(re.findall(r"(?<![\w/$])tests/[\w/.]*\w", path.read_text()))
     assert "tests/remote/ray" in named
     assert [one for one in sorted(named) if not (checkout / one).exists()] == []
+
+
+# --- What failed is run again, alone
+
+_FAILS = """
+from pathlib import Path
+import pytest
+
+def runs(name):
+    path = Path(name)
+    path.write_text(path.read_text() + "." if path.exists() else ".")
+    return len(path.read_text())
+
+@pytest.mark.parametrize("text", ['an \\u00e9 and a "'])
+def test_fails_in_its_first_run(text): assert runs("first") != 1
+def test_an_attack_fails_in_its_first_run(): assert runs("attack") != 1
+def test_fails_in_its_fourth_run_too(): assert runs("fourth") not in {1, 4}
+@pytest.mark.parametrize("number", range(%d))
+def test_always(number): assert runs(f"always{number}") == 0
+"""
+
+
+@pytest.mark.parametrize(("others", "runs"), [(0, 4), (20, 1)])
+def test_what_failed_is_run_again_alone_three_times(
+    checkout: Path, tmp_path: Path, others: int, runs: int
+) -> None:
+    """Attacks too; what fails once more fails the run, and more than twenty are not run again."""
+    (tmp_path / "test_it.py").write_text(_FAILS % others)
+    # only the plugin that is named: each of these processes would load all that are installed
+    pytest_again = f"bash {checkout}/.ci/again.sh {sys.executable} -m pytest -q -p xdist.plugin"
+    done = run(pytest_again, tmp_path, PYTEST_DISABLE_PLUGIN_AUTOLOAD="1")
+    assert done.returncode == 1
+    ran = [len((tmp_path / name).read_text()) for name in ("first", "attack", "fourth")]
+    assert ran == [runs, runs, runs]
+    if others:
+        assert "23 failed, which is too many" in done.stdout
+        return
+    once = "FAILED ONCE, passed alone three times: test_it.py::test"
+    assert [line.partition("[")[0] for line in done.stdout.splitlines()[-3:]] == [
+        f"{once}_fails_in_its_first_run",
+        f"{once}_an_attack_fails_in_its_first_run",
+        "FAILED AGAIN: test_it.py::test_fails_in_its_fourth_run_too",
+    ]
+
+
+def test_a_run_whose_failures_pass_alone_has_passed(checkout: Path, tmp_path: Path) -> None:
+    (tmp_path / "test_it.py").write_text(_FAILS % 0)
+    (tmp_path / "fourth").write_text("....")
+    pytest_again = f"bash {checkout}/.ci/again.sh {sys.executable} -m pytest -q -p xdist.plugin"
+    done = run(pytest_again, tmp_path, PYTEST_DISABLE_PLUGIN_AUTOLOAD="1")
+    assert (done.returncode, done.stdout.count("FAILED ONCE")) == (0, 2)
