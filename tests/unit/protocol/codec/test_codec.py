@@ -7,6 +7,7 @@ import dataclasses
 import enum
 import pickle
 import sys
+import types
 from collections.abc import Callable
 from typing import Any
 
@@ -32,10 +33,14 @@ class Colour(enum.Enum):
     RED = (1, "r")
 
 
-class Level(enum.IntEnum):
-    """An enumeration that is also an int."""
-
-    LOW = 1
+MEMBERS: tuple[Any, ...] = (
+    *(enum.IntEnum("Low", {"A": 1}), enum.IntFlag("Flag", {"A": 1})),
+    *(enum.Enum("Huge", {"A": 1 << 80}, type=int), enum.Enum("Text", {"A": "a"}, type=str)),
+    *(enum.Enum("Real", {"A": 1.5}, type=float), enum.Enum("Byte", {"A": b"a"}, type=bytes)),
+    *(enum.Enum("Int8", {"A": np.int8(3)}, type=np.int8),),
+    enum.Enum("NumpyText", {"A": np.str_("b")}, type=np.str_),
+)
+"""Enumerations whose members are numbers or texts, and equal them in one process."""
 
 
 @dataclasses.dataclass
@@ -102,6 +107,10 @@ def test_corner_values_arrive_with_their_types(value: object) -> None:
         (type("Z", (frozenset,), {})([1]), frozenset([1])),
         (bytearray(b"x"), b"x"),
         (memoryview(b"x"), b"x"),
+        (types.MappingProxyType({"a": 1}), {"a": 1}),
+        (collections.deque([1]), [1]),
+        *((members.A, members.A.value) for members in MEMBERS),
+        *(({members.A: [members.A]}, {members.A.value: [members.A.value]}) for members in MEMBERS),
     ],
     ids=lambda value: type(value).__name__,
 )
@@ -137,7 +146,7 @@ def test_enum_member_arrives_as_inert_name_and_value() -> None:
     assert isinstance(red, RemoteEnum)
     assert (red.type_name, red.text) == (f"{__name__}.Colour", "RED")
     assert red.value == (1, "r")
-    assert through({Level.LOW: 1}) == {through(Level.LOW): 1}
+    assert through({Colour.RED: 1}) == {red: 1}
 
 
 @pytest.mark.parametrize("value", [object(), Point(1), lambda: 0, sys, int, {}.keys()])

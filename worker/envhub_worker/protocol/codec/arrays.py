@@ -330,7 +330,7 @@ def _write_scalar(encoder: Encoder, scalar: np.generic) -> object:
 
 
 def _write_text_scalar(encoder: Encoder, value: np.str_ | np.bytes_) -> object:
-    plain = str(value) if isinstance(value, np.str_) else bytes(value)
+    plain = str.__str__(value) if isinstance(value, np.str_) else bytes(value)
     return [msgpack.ExtType(wire.TEXT_SCALAR, b""), plain]
 
 
@@ -347,6 +347,8 @@ def _write_tensor(encoder: Encoder, tensor: Any) -> object:
 
 def write_numpy(encoder: Encoder, value: Any) -> object:
     """The form of a subclass, or of another library's array; NotImplemented of all else."""
+    if isinstance(value, (np.str_, np.bytes_)):
+        return _write_text_scalar(encoder, value)
     if isinstance(value, np.generic):
         return _write_scalar(encoder, value)
     if isinstance(value, np.ma.MaskedArray):

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import contextlib
 import sys
+from collections import deque
 from collections.abc import Callable, Sequence
 from enum import Enum
 from functools import cache
 from operator import attrgetter
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any
 
 import msgpack  # type: ignore[import-untyped]
@@ -104,19 +106,19 @@ def _write_pickled(encoder: Encoder, pickled: PickledValue) -> object:
 
 def _write_other(encoder: Encoder, value: Any) -> object:
     """Handles subclasses, arrays and tensors of other libraries, and the unknown."""
-    if isinstance(value, Enum):
-        return [_HEADS[wire.ENUM], *inert_enum(value), value.value]
     if "numpy" in sys.modules:
         form = _numpy_writer()(encoder, value)
         if form is not NotImplemented:
             return form
-    # Subclasses cross as the type that they extend.
+    # Subclasses cross as the type that they extend, which they equal: an IntEnum's member as int.
     for base, plain in _PLAIN.items():
         if isinstance(value, base):
             return plain(value)
     for base in _BASES:
         if isinstance(value, base):
             return _WRITERS[base](encoder, value)
+    if isinstance(value, Enum):
+        return [_HEADS[wire.ENUM], *inert_enum(value), value.value]
     return encoder.unknown(value)
 
 
@@ -157,6 +159,8 @@ _PLAIN: dict[type, Callable[[Any], object]] = {
     dict: dict,
     list: list,
     bytes: bytes,
+    MappingProxyType: dict,
+    deque: list,
 }
 _BASES = (int, tuple, complex, set, frozenset)
 

@@ -131,7 +131,7 @@ APART_SCALARS = -1
 def integers(space: gym.Space[Any], member: Any) -> list[bool]:
     """Whether each discrete member of this member of the space is an integer of Python's."""
     if isinstance(space, spaces.Discrete):
-        return [type(member) is int]
+        return [isinstance(member, int)]
     if isinstance(space, spaces.Dict):
         found = [integers(sub, member[key]) for key, sub in space.spaces.items()]
     elif isinstance(space, spaces.Tuple):
