@@ -8,10 +8,12 @@ from __future__ import annotations
 import contextlib
 import ctypes
 import os
+import shutil
 import subprocess
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
@@ -104,6 +106,9 @@ KINDS: dict[str, str | Callable[[Run], int]] = {
     "sockets in flight": KERNEL,
     "epoll watches": KERNEL,
     "file locks": KERNEL,
+    "empty folders": KERNEL,
+    "attributes of files": KERNEL,
+    "access lists": KERNEL,
 }
 
 
@@ -139,7 +144,12 @@ def test_memory_bomb_stops_at_the_limit(arena: Arena, kind: str) -> None:
             "memory_bomb",
             over,
             before=begin,
-            limits={"memory_bytes": most, "processes": 128, "open_files": 65536},
+            limits={
+                "memory_bytes": most,
+                "processes": 128,
+                "open_files": 65536,
+                "disk_files": 1_000_000,
+            },
             impossible=no_pipes if kind == "pipes" and USER == "user" else "",
             kind=kind,
             size=size,
@@ -159,11 +169,13 @@ def test_memory_bomb_stops_at_the_limit(arena: Arena, kind: str) -> None:
                 remove(kind, run.value)
 
 
-def remove(kind: str, numbers: list[int]) -> None:
-    """End what outlives a control: System V objects."""
+def remove(kind: str, left: list[Any]) -> None:
+    """End what outlives a control: System V objects, and folders."""
     libc = ctypes.CDLL(None)
-    for number in numbers:
-        if kind == "messages":
+    for number in left:
+        if isinstance(number, str):
+            shutil.rmtree(number)
+        elif kind == "messages":
             libc.msgctl(number, 0, None)
         else:
             libc.semctl(number, 0, 0)

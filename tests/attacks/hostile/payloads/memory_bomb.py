@@ -7,6 +7,7 @@ import mmap
 import os
 import select
 import socket
+import struct
 import tempfile
 import time
 
@@ -23,6 +24,8 @@ _LIBC = ctypes.CDLL(None, use_errno=True)
 def attack(kind, size):
     taken = [_TAKERS[kind]() for _ in range(size // _PIECE)]
     kept.append(taken)
+    if kind in _FOLDERS:
+        return taken
     return [number for piece in taken for number in piece] if kind in _LEFT_BEHIND else None
 
 
@@ -184,6 +187,43 @@ def _file_locks():
     return files
 
 
+_LONG_NAME = "n" * 200
+
+
+def _in_memory():
+    """A folder of its own in a file system of memory, where there is one."""
+    return tempfile.mkdtemp(dir="/dev/shm" if os.access("/dev/shm", os.W_OK) else None)
+
+
+def _empty_folders():
+    """They hold no block: all that they take is the kernel's own memory."""
+    folder = _in_memory()
+    for number in range(_PIECE // 800):
+        os.mkdir(f"{folder}/{number}{_LONG_NAME}")
+    return folder
+
+
+def _attributes_of_files():
+    return _attributed("user.bomb", b"x" * 60000)
+
+
+def _access_lists():
+    """As many entries as a list may have, all for one user."""
+    named = [(2, 7, os.getuid())] * 8180
+    entries = [(1, 7, 0xFFFFFFFF), *named, *((tag, 5, 0xFFFFFFFF) for tag in (4, 16, 32))]
+    packed = b"".join(struct.pack("<HHI", *entry) for entry in entries)
+    return _attributed("system.posix_acl_access", struct.pack("<I", 2) + packed)
+
+
+def _attributed(name, value):
+    folder = _in_memory()
+    for number in range(_PIECE // 60000):
+        path = f"{folder}/{number}"
+        os.close(os.open(path, os.O_CREAT | os.O_WRONLY, 0o600))
+        os.setxattr(path, name, value)
+    return folder
+
+
 def _memfd_in_flight():
     """A file that nobody has open or mapped: it waits in a socket."""
     ours, theirs = socket.socketpair()
@@ -251,9 +291,13 @@ _TAKERS = {
     "sockets in flight": _sockets_in_flight,
     "epoll watches": _epoll_watches,
     "file locks": _file_locks,
+    "empty folders": _empty_folders,
+    "attributes of files": _attributes_of_files,
+    "access lists": _access_lists,
     "System V": _system_v,
     "children": _children,
     "pipes": _pipes,
 }
-#: Their numbers are needed to remove them.
+#: Their numbers, or paths, are needed to remove them.
+_FOLDERS = ("empty folders", "attributes of files", "access lists")
 _LEFT_BEHIND = ("semaphores", "messages")

@@ -35,6 +35,9 @@ _SHARED = re.compile(
 
 # Of the kernel's own memory, generously: a mapping with what reverses it, and an open file.
 _MAPPING, _DESCRIPTOR = 512, 1024
+# Of an entry of a tmpfs that holds no block: inode, names, and what lists them in their folder. It
+# also counts attributes as so many entries, of 1 KiB each.
+_ENTRY = 2048
 # The filter keeps pipes, and buffers of sockets, at the size that they are made with.
 _PIPE = 64 * 1024
 # Of a socket, where the host does not say.
@@ -129,7 +132,8 @@ class MemoryWatch:
         if self._tmpfs is None:
             return 0
         status = os.statvfs(self._tmpfs)
-        return (status.f_blocks - status.f_bfree) * status.f_frsize
+        entries = (status.f_files - status.f_ffree) * _ENTRY
+        return (status.f_blocks - status.f_bfree) * status.f_frsize + entries
 
 
 def _add_process(usage: Usage, pid: int) -> None:

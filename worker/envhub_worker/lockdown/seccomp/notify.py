@@ -22,7 +22,7 @@ from collections.abc import Callable, Collection
 
 from envhub_worker.lockdown.mechanisms import kernel, procfs
 from envhub_worker.lockdown.seccomp.evidence import NAMING, OTHER, PRETENDED, is_another_target
-from envhub_worker.lockdown.seccomp.policy import refusal
+from envhub_worker.lockdown.seccomp.policy import WITHOUT_ATTRIBUTES, refusal
 from envhub_worker.lockdown.seccomp.syscalls import c_int, syscall_name
 from envhub_worker.protocol.records import dataclass
 
@@ -74,7 +74,8 @@ def serve(listener: int, permitted: Collection[str], note: Callable[[Request], N
     """Answer one request that waits at ``listener``; False when no caller is left.
 
     The kernel goes on with the calls of ``permitted``, which the policy allows whatever their
-    arguments: they only ask to be seen. What is neither one of these nor a signal is denied.
+    arguments: they only ask to be seen. What is neither one of these nor a signal is denied, and
+    so is what sets attributes.
     """
     buffer = bytearray(_REQUEST.size)
     try:
@@ -90,7 +91,7 @@ def serve(listener: int, permitted: Collection[str], note: Callable[[Request], N
     call, caller = syscall_name(number), procfs.process_of(thread)
     request = Request(thread, caller, call, tuple(words), still_waits)
     note(request)  # before the caller goes on: what it did is known when it is looked for
-    if call in permitted:
+    if call in permitted and call not in WITHOUT_ATTRIBUTES:
         answer = _PROCEED
     elif call in _SIGNALS:
         answer = decide(request, lambda: procfs.descendants(os.getpid()))

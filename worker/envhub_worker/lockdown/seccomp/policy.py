@@ -82,9 +82,11 @@ _OTHER_SOCKETS = "bind listen accept accept4 connect"
 # These reach beyond what Landlock guards, so they need a mount and an IPC namespace.
 _MODES_AND_TIMES = "chmod fchmod fchmodat fchmodat2 chown fchown lchown fchownat utimensat"
 _NAMESPACED = f"""
-    {_MODES_AND_TIMES} sched_setaffinity
-    setxattr lsetxattr fsetxattr removexattr lremovexattr fremovexattr
+    {_MODES_AND_TIMES} sched_setaffinity removexattr lremovexattr fremovexattr
 """
+#: As of a file system without attributes. Access lists are memory of the kernel's own, 128 KiB a
+#: file, that no control group counts; programs that copy a file go on without them.
+WITHOUT_ATTRIBUTES = frozenset(("setxattr", "lsetxattr", "fsetxattr"))
 # These succeed and do nothing: a jail has one user, libzmq aborts if it cannot set the scheduler,
 # and syncing stalls the host's disks. The last three are what there was before utimensat.
 _WITHOUT_EFFECT = """
@@ -113,6 +115,7 @@ _SOCK_STREAM, _SOCK_DGRAM, _SOCK_RAW, _SOCK_SEQPACKET, _SOCK_TYPE = 1, 2, 3, 5, 
 _EAFNOSUPPORT = _ERRNO | errno.EAFNOSUPPORT
 _ENOTTY = _ERRNO | errno.ENOTTY
 _ENOMEM = _ERRNO | errno.ENOMEM
+_ENOTSUP = _ERRNO | errno.ENOTSUP
 _TIOCSTI, _TIOCLINUX, _TIOCCONS, _TIOCSETD = 0x5412, 0x541C, 0x541D, 0x5423
 _FIOSETOWN, _SIOCSPGRP = 0x8901, 0x8902
 # Duplicates, flags, locks, whose signals they are, the size of a pipe, seals, hints to be read.
@@ -163,6 +166,7 @@ def policy_table(
     own = namespaced and network != "host"
     verdicts |= _sockets(own or (namespaced and scoped), network, own=own)
     verdicts |= dict.fromkeys(_NAMESPACED.split(), ALLOW) if namespaced else _without_namespaces()
+    verdicts |= dict.fromkeys(WITHOUT_ATTRIBUTES, _ENOTSUP)
     if brokered:
         verdicts |= dict.fromkeys(("kill", "tkill", "tgkill"), ASK)
         verdicts["pidfd_send_signal"] = ENOSYS
@@ -185,11 +189,13 @@ def recorded_calls(verdicts: Mapping[str, Verdict], names: Iterable[str]) -> dic
 
 
 def watched_calls(verdicts: Mapping[str, Verdict]) -> frozenset[str]:
-    """What names files and processes, where nothing of it is denied: init lets the kernel go on.
+    """What names files and processes, and is denied for no file's or process's sake.
 
-    Not so where arguments decide: the kernel would make the call without looking at them again.
+    Init lets the kernel go on, but for ``WITHOUT_ATTRIBUTES``. Not so where arguments decide: the
+    kernel would make the call without looking at them again.
     """
-    return frozenset(name for name in (*NAMED, *NAMING) if verdicts.get(name) == ALLOW)
+    seen = (ALLOW, _ENOTSUP)
+    return frozenset(name for name in (*NAMED, *NAMING) if verdicts.get(name) in seen)
 
 
 def _asking(name: str, verdict: Verdict) -> Verdict:
@@ -204,6 +210,8 @@ def refusal(call: str) -> int:
     """The errno with which a call that is denied answers; 0: it seems to work."""
     if call in PRETENDED:
         return 0
+    if call in WITHOUT_ATTRIBUTES:
+        return errno.ENOTSUP
     return errno.EAFNOSUPPORT if call in ("socket", "socketpair") else errno.EPERM
 
 

@@ -264,6 +264,16 @@ def test_files_in_a_scratch_of_memory_are_measured() -> None:
         assert watch.look([])[0] - before >= 24 * MIB
 
 
+def test_empty_folders_in_a_scratch_of_memory_are_measured() -> None:
+    """The kernel keeps about 1 KiB of its own for each, which no block shows."""
+    watch = MemoryWatch(2**62, "/dev/shm")
+    before = watch.look([])[0]
+    with tempfile.TemporaryDirectory(dir="/dev/shm") as folder:
+        for number in range(8000):
+            os.mkdir(f"{folder}/{number}")
+        assert watch.look([])[0] - before >= 7 * MIB
+
+
 def test_open_files_without_a_name_are_found(tmp_path: Path) -> None:
     device = os.stat(tmp_path).st_dev
     before = unlinked_bytes([os.getpid()], device)

@@ -21,6 +21,7 @@ from envhub_worker.lockdown.seccomp.policy import (
     KILL_PROCESS,
     PRETEND,
     SHARED_BYTES,
+    WITHOUT_ATTRIBUTES,
     ByArguments,
     policy_table,
     recorded_calls,
@@ -36,6 +37,7 @@ GOLDEN = Path(__file__).parents[3] / "golden"
 ARCH = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}
 I386 = 0x40000003
 NOT_SUPPORTED = 0x00050000 | errno.EAFNOSUPPORT
+NO_ATTRIBUTES = 0x00050000 | errno.ENOTSUP
 NO_MEMORY = 0x00050000 | errno.ENOMEM
 NOT_A_TTY = 0x00050000 | errno.ENOTTY
 VARIANTS = [(True, "none"), (True, "loopback"), (True, "host"), (False, "none"), (False, "host")]
@@ -133,7 +135,7 @@ TCP_AND_UDP = ((1, 0), (1, 6), (2, 0), (2, 17), (1 | 0o2000000, 0))
 OTHERS = ((1, 262), (3, 0), (3, 1), (2, 1), (5, 0), (1, 132))  # MPTCP, raw, SCTP
 PATH, TIMES = 0x7F00_0000_0010, 0x7F00_0000_0020
 MODES = ("fchmod", "fchmodat", "fchmodat2", "fchown", "fchownat", "utimensat")
-XATTRS = ("setxattr", "fsetxattr", "lremovexattr")
+REMOVING = ("removexattr", "lremovexattr")
 TO_AN_ADDRESS = [("sendto", 3, 0, 0, 0, 0x1000), ("sendto", 3, 0, 0, 0, 1 << 32)]
 
 
@@ -209,8 +211,8 @@ CLAIMS: dict[str, list[Row]] = {
     ],
     "modes and times are pretended without a mount namespace, where Landlock cannot stop them": [
         under(PRETEND, [(name,) for name in MODES], False),
-        under(ALLOW, [(name,) for name in (*MODES, *XATTRS)], True),
-        under(EPERM, [(name,) for name in XATTRS], False),
+        under(ALLOW, [(name,) for name in (*MODES, *REMOVING)], True),
+        under(EPERM, [(name,) for name in REMOVING], False),
         under(ALLOW, [("sched_setaffinity", 0)], False),
         under(PRETEND, [("sched_setaffinity", 1)], False),
         under(PRETEND, [("utimensat", 3, PATH, TIMES, 0), ("utimensat", 3, 0, 0, 0)], False),
@@ -232,6 +234,10 @@ CLAIMS: dict[str, list[Row]] = {
         under(ASK, [(one, 1, 15) for one in ("kill", "tkill", "tgkill")], False, brokered=True),
         under(EPERM, [("rt_sigqueueinfo", 1, 15)], False, brokered=True),
         under(ENOSYS, [("pidfd_send_signal", 1, 15)], False, brokered=True),
+    ],
+    "attributes of files, which take memory that nothing counts, are not to be had": [
+        under(NO_ATTRIBUTES, [(name,) for name in ("setxattr", "lsetxattr", "fsetxattr")]),
+        under(EPERM, [("setxattrat",)]),
     ],
     "only fifos are made": [
         under(ALLOW, [("mknodat", 0, 0, 0o10644)], True),
@@ -304,6 +310,8 @@ def test_what_is_recorded_is_denied_all_the_same(
             now = run(second, ARCH[machine], call, arguments)
             if name == "sendto" in seen:
                 assert (was, now) == (ALLOW, ASK if any(arguments[4:5]) else ALLOW)
+            elif name in WITHOUT_ATTRIBUTES and name in seen:
+                assert (was, now, refusal(name)) == (NO_ATTRIBUTES, ASK, errno.ENOTSUP)
             elif name in seen:
                 assert (was, now) == (ALLOW, ASK)
             elif now == ASK:
