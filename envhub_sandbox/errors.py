@@ -193,8 +193,9 @@ class ServerBusyError(WorkerError):
     ``RemoteSandbox(retry_s=...)`` waits instead.
 
     Attributes:
-        quota: ``"sessions"``, ``"jails"``, ``"runners"``, ``"memory"`` or ``"inflight"`` (both in
-            bytes); ``"draining"`` if the server is ending; empty if it did not say.
+        quota: ``"sessions"``, ``"jails"``, ``"runners"``, ``"processes"``, ``"open_files"``,
+            ``"disk_files"``, or in bytes ``"memory"``, ``"disk"`` and ``"inflight"``;
+            ``"draining"`` if the server is ending; empty if it did not say.
         used: How much of it the key uses.
         limit: How much it may use.
         retry_s: Seconds until the client may ask again.

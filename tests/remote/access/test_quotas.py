@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,17 +14,18 @@ from envhub_sandbox.errors import PolicyError, WorkerError
 from envhub_sandbox.sandboxes.remote import check_policy as check_place
 from envhub_sandbox.settings.policy import Policy
 from envhub_worker.access.quotas import (
+    BusyError,
     InFlight,
     Permissions,
     Quotas,
     RefusedError,
-    Use,
     check_jail,
     check_policy,
+    use_of,
 )
 from envhub_worker.access.sessions import MAX_HELD, Sessions
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.confinement import Confinement
+from envhub_worker.protocol.confinement import Confinement, Limits
 from envhub_worker.protocol.runtime import Runtime
 from envhub_worker.supervisor.records import Asker
 from tests.remote.listening import Listening, listening
@@ -71,17 +72,35 @@ def test_packages_of_the_repositorys_own_are_not_for_other_hosts() -> None:
 
 
 def test_the_sums_of_a_key_are_bounded() -> None:
-    """Jails, runners and memory limits of everything that is open, and the new one."""
+    """Jails, runners and each limit that a client sets, of all that is open and the new one."""
     quotas = Quotas(jails=2, runners=4, memory_bytes=100)
-    check_jail([Use(40, 2)], Use(60, 2), quotas)
+    small = use_of(Limits(memory_bytes=40), 2)
+    check_jail([small], use_of(Limits(memory_bytes=60), 2), quotas)
     for uses, more, what in (
-        ([Use(1, 1), Use(1, 1)], Use(1, 1), "jails"),
-        ([Use(1, 2)], Use(1, 3), "runners"),
-        ([Use(1, 4)], Use(0, 1), "runners"),
-        ([Use(50, 1)], Use(51, 1), "memory"),
+        ([small, small], use_of(Limits(memory_bytes=1), 1), "jails"),
+        ([small], use_of(Limits(memory_bytes=1), 3), "runners"),
+        ([small, small], {"runners": 1}, "runners"),
+        ([small], use_of(Limits(memory_bytes=61), 1), "memory"),
     ):
-        with pytest.raises(RefusedError, match=what):
+        with pytest.raises(BusyError, match=what) as caught:
             check_jail(uses, more, quotas)
+        assert caught.value.missing == what
+
+
+BOUNDED_OTHERWISE = {"cpu_time_s", "file_bytes", "output_bytes", "message_bytes", "elements"}
+
+
+@pytest.mark.parametrize("name", sorted({f.name for f in fields(Limits)} - BOUNDED_OTHERWISE))
+def test_every_limit_that_a_client_sets_stands_under_a_quota(name: str) -> None:
+    """What it sets for one jail, and what it has set for others before; its option is said."""
+    quotas = replace(Quotas(), **{name: 100})
+    check_jail([], {name: 100}, quotas)
+    option = f"--max-{name.removesuffix('_bytes').replace('_', '-')}"
+    with pytest.raises(RefusedError, match=option):
+        check_jail([], use_of(replace(Limits(), **{name: 101}), 1), quotas)
+    lower = use_of(replace(Limits(), **{name: 60}), 1)
+    with pytest.raises(BusyError, match=option):
+        check_jail([lower], lower, quotas)
 
 
 def test_bytes_in_flight_are_bounded_until_they_are_answered() -> None:

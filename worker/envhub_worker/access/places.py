@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from envhub_worker.access.audit.log import Events, Log
-from envhub_worker.access.quotas import RETRY_S, BusyError, Quotas, Use, check_jail
+from envhub_worker.access.quotas import RETRY_S, BusyError, Quotas, Use, check_jail, use_of
 from envhub_worker.access.sessions import WATCHER, Session, Sessions
 from envhub_worker.access.store.uploads import Uploads
 from envhub_worker.protocol.messages.server import DRAINING, Busy
@@ -142,18 +142,18 @@ class Places:
                 others = [one for one in self._sessions.of_key(key) if one.owner != asker.session]
                 gone = longest_gone(others)
                 if gone is None:
-                    if more.memory_bytes:
+                    if "jails" in more:
                         self.lines["jails"].wait(key, asker.session)
                     raise
                 self.end(gone, _PLACE_NEEDED)
-        if more.memory_bytes:
+        if "jails" in more:
             used, quota = len(self._uses(key)), self._quotas.jails
             self._refuse_behind("jails", key, asker.session, used, quota)
             self.lines["jails"].leave(key, asker.session)
 
     def _uses(self, key: bytes) -> list[Use]:
         return [
-            Use(entry.jail.spec.confinement.limits.memory_bytes, len(entry.links))
+            use_of(entry.jail.spec.confinement.limits, len(entry.links))
             for entry in self._jails.open_ones(key)
         ]
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass as mutable_dataclass
 from dataclasses import field
 
 from envhub_worker.access.keys import AuthorizedClients, KeyPair
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.confinement import GIB, MIB, PROFILES, Confinement
+from envhub_worker.protocol.confinement import GIB, MIB, PROFILES, Confinement, Limits
 from envhub_worker.protocol.messages.server import BUSY_ERROR, Busy
 from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.text import size_text
@@ -33,7 +33,8 @@ class Quotas:
 
     Attributes:
         runners: Processes of environments in them.
-        memory_bytes: The sum of its open jails' memory limits.
+        memory_bytes: The sum of its open jails' memory limits. ``processes``, ``open_files``,
+            ``disk_bytes`` and ``disk_files`` are sums of their limits, too.
         upload_bytes: Files of snapshots that it has brought here; the longest unused go first.
         packages_bytes: Environments of its repositories' packages, and what was downloaded for
             them; the longest unused go first.
@@ -44,6 +45,10 @@ class Quotas:
     jails: int = 64
     runners: int = 256
     memory_bytes: int = 512 * GIB
+    processes: int = 32_768
+    open_files: int = 1 << 20
+    disk_bytes: int = 512 * GIB
+    disk_files: int = 10_000_000
     upload_bytes: int = 8 * GIB
     upload_files: int = 20_000
     packages_bytes: int = 16 * GIB
@@ -86,12 +91,18 @@ class Rules:
     profile: str = "strict"
 
 
-@dataclass(frozen=True)
-class Use:
-    """What the open jails of a key take: one entry a jail."""
+_LIMITED = ("memory_bytes", "processes", "open_files", "disk_bytes", "disk_files")
+"""Limits of a jail whose sums have a quota of the same name. Of the others, ``cpu_time_s`` is time,
+``file_bytes`` is part of the scratch, ``elements`` is the client's own memory, and of messages and
+of output the server keeps no more than it has set itself."""
 
-    memory_bytes: int
-    runners: int
+Use = Mapping[str, int]
+"""What a jail takes, or further runners of it, by the names of quotas."""
+
+
+def use_of(limits: Limits, runners: int) -> Use:
+    """What a jail with these limits takes."""
+    return {"jails": 1, "runners": runners, **{name: getattr(limits, name) for name in _LIMITED}}
 
 
 def check_policy(request: m.OpenJail, confinement: Confinement, permitted: Permissions) -> None:
@@ -122,26 +133,27 @@ def check_policy(request: m.OpenJail, confinement: Confinement, permitted: Permi
 
 
 def check_jail(open_jails: Iterable[Use], more: Use, quotas: Quotas) -> None:
-    """Refuse a jail, or further runners of one (then without memory), above the quotas.
+    """Refuse a jail, or further runners of one, above the quotas.
     Raises ``RefusedError``: with the quota that it would break.
     """
     uses = list(open_jails)
-    memory, limit = sum(use.memory_bytes for use in uses), quotas.memory_bytes
-    runners = sum(use.runners for use in uses)
-    for name, what, used, added, quota, option in (
-        ("jails", "jails", len(uses), int(more.memory_bytes > 0), quotas.jails, "--max-jails"),
-        ("runners", "runners", runners, more.runners, quotas.runners, "--max-runners"),
-        ("memory", "of memory limits", memory, more.memory_bytes, limit, "--max-memory"),
-    ):
+    for name, added in more.items():
+        used, quota = sum(use[name] for use in uses), getattr(quotas, name)
         if used + added > quota:
-            shown = size_text if name == "memory" else str
+            shown = size_text if name.endswith("_bytes") else str
+            short = name.removesuffix("_bytes").replace("_", " ")
             text = (
-                f"this would make {shown(used + added)} {what} of your key, over the server's "
-                f"quota of {shown(quota)} ({option}); close environments, or lower their limits"
+                f"this would make {shown(used + added)} {_counted(name, short)} of your key, over "
+                f"the server's quota of {shown(quota)} (--max-{short.replace(' ', '-')}); close "
+                "environments, or lower their limits"
             )
             if not uses:
                 raise RefusedError("WorkerError", text)  # no waiting makes it fit
-            raise BusyError(Busy(name, used, quota, RETRY_S), text)
+            raise BusyError(Busy(short.replace(" ", "_"), used, quota, RETRY_S), text)
+
+
+def _counted(name: str, short: str) -> str:
+    return f"of {short} limits" if name in _LIMITED else short
 
 
 @mutable_dataclass

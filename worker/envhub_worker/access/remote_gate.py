@@ -21,7 +21,7 @@ from envhub_worker.access.curve_port import CurvePort
 from envhub_worker.access.gate import Gate, Incoming, Payload
 from envhub_worker.access.packages import Packages
 from envhub_worker.access.places import Drain, Places
-from envhub_worker.access.quotas import InFlight, Rules, Use, check_policy
+from envhub_worker.access.quotas import InFlight, Rules, check_policy, use_of
 from envhub_worker.access.sessions import WATCHER, Sessions
 from envhub_worker.access.store.uploads import PREFIX, Uploads, wrong_with_path
 from envhub_worker.lockdown.probe import own_runtime
@@ -121,7 +121,7 @@ class RemoteGate(Gate):
         if isinstance(request, m.OpenJail):
             return self._authorize_open(asker, request)
         if isinstance(request, m.StartRunners):
-            self._places.for_jail(asker, Use(0, request.runners))
+            self._places.for_jail(asker, {"runners": request.runners})
         elif isinstance(request, m.Relay):
             self.sessions.used(asker.identity, asker.key, request.jail)
             self._tally.asked(self._label_of(asker.key), request.operation)
@@ -155,7 +155,7 @@ class RemoteGate(Gate):
             raise RefusedError("PolicyError", f"the entry file {wrong}")
         packages = request.runtime.packages
         runtime = self._packages.runtime(key, packages) if packages else own_runtime()
-        use = Use(confinement.limits.memory_bytes, request.runners)
+        use = use_of(confinement.limits, request.runners)
         copies = self._hub_copies(key, request)
         self._places.for_jail(asker, use)
         return m.replace(

@@ -52,6 +52,8 @@ MAX_RUNNERS = 64
 """Runners of one jail: one per useful core, not one per sub-environment."""
 MAX_JAILS = 256
 """Open jails of one server."""
+MAX_SERVED_OUTPUT = 1 << 20
+"""Bytes of what a jail prints that are kept for a client on another host."""
 MAX_LOST = 4096
 """Runners of a kept jail that may die: their deaths are remembered."""
 MAX_IDLE_ZYGOTES = 2
@@ -131,7 +133,7 @@ class Jails:
             session=asker.session,
             jail=jail,
             zygote=zygote,
-            output=OutputTail(jail.output, confinement.limits.output_bytes),
+            output=OutputTail(jail.output, self._output_bytes(confinement)),
         )
         self._jails[entry.number] = entry
         self._events.follow(entry)
@@ -150,6 +152,11 @@ class Jails:
         """What its client permits; where that is somebody on another host, no more than ours."""
         wanted = entry.jail.spec.confinement.limits.message_bytes
         return limits_for(wanted if self._local else min(wanted, DEFAULT_LIMITS.message_bytes))
+
+    def _output_bytes(self, confinement: Confinement) -> int:
+        """As ``_wire_limits``: the server itself keeps them."""
+        wanted = confinement.limits.output_bytes
+        return wanted if self._local else min(wanted, MAX_SERVED_OUTPUT)
 
     def _start_runners(self, asker: Asker, entry: JailRecord, count: int) -> None:
         runners = []
