@@ -5,11 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import ActionError, LoadError, ObservationError
+from tests.support.compare import assert_same
 from tests.support.repositories import write_repository
 
 # whoever runs it, the same code describes spaces and takes steps
@@ -110,6 +112,63 @@ class TestSpacesThatAreNoBatches:
             pytest.raises(ObservationError, match="outside"),
         ):
             suites.env.reset(seed=0)
+
+
+_LAZY = """
+import gymnasium as gym
+
+class Lazy:
+    def __init__(self, fns):
+        self._fns, self._env, self.num_envs = fns, None, len(fns)
+        env = fns[0]()
+        self.observation_space = self.single_observation_space = env.observation_space
+        self.action_space = self.single_action_space = env.action_space
+        self.metadata = env.metadata
+        self.resets = 0
+
+    @property
+    def unwrapped(self):
+        return self
+
+    def _ensure(self):
+        if self._env is None:
+            self._env = gym.vector.SyncVectorEnv(self._fns)
+
+    def reset(self, **kwargs):
+        self.resets += 1
+        self._ensure()
+        return self._env.reset(**kwargs)
+
+    def step(self, actions):
+        self._ensure()
+        return self._env.step(actions)
+
+    def close(self):
+        if self._env is not None:
+            self._env.close()
+            self._env = None
+
+def make_env(n_envs=1, use_async_envs=False):
+    names = ["Pendulum-v1", "CartPole-v1", "MountainCarContinuous-v0"]
+    lazy = {name: Lazy([lambda name=name: gym.make(name)] * n_envs) for name in names}
+    return {"lazy": lazy}
+"""
+
+
+@pytest.mark.parametrize("n_envs", [1, 3])
+def test_a_space_of_one_sub_environment_under_both_names(tmp_path: Path, n_envs: int) -> None:
+    """LeRobot's lazy vector environment: the first observation tells it from Isaac Lab Arena's."""
+    with make_env(write_repository(tmp_path, _LAZY), n_envs=n_envs) as suites:
+        resets = [getattr(env, "resets") for env in suites["lazy"].values()]  # noqa: B009
+        assert resets == [1, 0, 0], "a suite of them is not started whole"
+        for name, env in suites["lazy"].items():
+            reference = gym.make_vec(name, n_envs, vectorization_mode="sync")
+            assert env.action_space == reference.action_space
+            assert env.observation_space == reference.observation_space
+            assert_same(reference.reset(seed=1), env.reset(seed=1))
+            for _ in range(3):
+                actions = reference.action_space.sample()
+                assert_same(reference.step(actions), env.step(actions))
 
 
 _BATCHED = """

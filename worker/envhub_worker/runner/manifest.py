@@ -14,7 +14,9 @@ from envhub_worker.protocol.manifest.manifest import EnvManifest, Manifest
 from envhub_worker.protocol.manifest.names import MAX_NAMES
 from envhub_worker.runner import gymnasium_compat as compat
 from envhub_worker.runner.described import facts_of
-from envhub_worker.runner.tasks import Task, derived_space
+from envhub_worker.runner.sync_envs import SubEnvs
+from envhub_worker.runner.tasks import Task
+from envhub_worker.runner.vector_spaces import Sides
 
 _GYMNASIUMS = frozenset(dir(VectorEnv)) | compat.OWN_NAMES | {"num_envs", "env", "envs"}
 _HEAD_BYTES = 2048
@@ -26,18 +28,18 @@ def describe(tasks: list[Task]) -> Manifest:
     """The manifest of everything that ``make_env`` returned."""
     lazy = all(task.recording is not None for task in tasks)
     envs = []
+    sides: Sides = {}
     for task in tasks:
-        envs.append(describe_task(task))
+        envs.append(_describe_task(task, sides))
         if len(tasks) > 1:
             task.forget_probe()  # a suite must not hold an environment of every task
     return Manifest(envs=tuple(envs), lazy=lazy, interpreter=_interpreter(), packages=_packages())
 
 
-def describe_task(task: Task) -> EnvManifest:
-    """The manifest of one task."""
+def _describe_task(task: Task, sides: Sides) -> EnvManifest:
     made = task.recording
     if made is None:
-        return describe_vector(task, task.vector)
+        return describe_vector(task, task.vector, sides)
     source = task.learn_spaces()
     return EnvManifest(
         suite=task.suite,
@@ -58,22 +60,20 @@ def describe_task(task: Task) -> EnvManifest:
     )
 
 
-def describe_vector(task: Task, env: Any) -> EnvManifest:
+def describe_vector(task: Task, env: Any, sides: Sides | None = None) -> EnvManifest:
     """The manifest of a vector environment with a ``step`` of its own."""
     mode = compat.mode_of(env, dict(getattr(env, "metadata", None) or {}).get("autoreset_mode"))
-    num_envs = int(env.num_envs)
-    single_observation, observation = _spaces(env, "observation_space", num_envs)
-    single_action, action = _spaces(env, "action_space", num_envs)
+    known = env if isinstance(env, SubEnvs) else task.vector_spaces({} if sides is None else sides)
     return EnvManifest(
         suite=task.suite,
         task=task.task,
-        num_envs=num_envs,
+        num_envs=int(env.num_envs),
         shardable=False,
         sync=True,
-        single_observation_space=single_observation,
-        single_action_space=single_action,
-        observation_space=observation,
-        action_space=action,
+        single_observation_space=known.single_observation_space,
+        single_action_space=known.single_action_space,
+        observation_space=known.observation_space,
+        action_space=known.action_space,
         autoreset_mode=getattr(mode, "value", mode),
         metadata=_metadata(env),
         render_mode=getattr(env, "render_mode", None),
@@ -81,15 +81,6 @@ def describe_vector(task: Task, env: Any) -> EnvManifest:
         attributes=_attributes(env),
         type_name=f"{type(env).__module__}.{type(env).__qualname__}",
     )
-
-
-def _spaces(env: Any, name: str, num_envs: int) -> tuple[Any, Any]:
-    """A duck-typed environment may name just one of the two, or neither."""
-    derived = derived_space(env, name)
-    if derived is not None:
-        return derived, batch_space(derived, num_envs)
-    single, batched = getattr(env, f"single_{name}"), getattr(env, name, None)
-    return single, batch_space(single, num_envs) if batched is None else batched
 
 
 def _spec(env: Any) -> dict[str, Any] | None:
