@@ -36,7 +36,7 @@ def roll(env: VectorEnv[Any, Any, Any], steps: int = 5) -> Any:
 _BATCHED = """
 import gymnasium as gym
 import numpy as np
-from gymnasium.spaces import Box
+from gymnasium.spaces import Box, Dict, Tuple
 
 class Batched(gym.Env):
     num_envs = 1
@@ -233,11 +233,14 @@ class TestWhatMakeEnvReturns:
             assert (observation.shape, reward.shape) == ((1, 54), (1,))
 
     @pytest.mark.parametrize("form", ["{'s': {0: Batched()}}", "gym.Wrapper(Batched())"])
+    @pytest.mark.parametrize(
+        "space", ["Box(-1, 1, (1, 54))", "Dict(a=Tuple((Box(-1, 1, (1, 54)), Box(-1, 1, (1,)))))"]
+    )
     def test_a_batched_env_that_cannot_be_told_apart_is_refused(
-        self, tmp_path: Path, form: str
+        self, tmp_path: Path, form: str, space: str
     ) -> None:
         """It would get (1, 1, 54), and nothing would say why."""
-        text = _BATCHED.format(single="", form=form)
+        text = _BATCHED.format(single=f"observation_space = {space}", form=form)
         with pytest.raises(LoadError, match="whose num_envs is 1 and whose spaces are batched"):
             make_env(write_repository(tmp_path / "it", text), n_envs=1)
 

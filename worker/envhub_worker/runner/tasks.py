@@ -210,20 +210,29 @@ def _has_single_spaces(env: Any) -> bool:
 
 
 def _refuse_batched(env: Any) -> None:
-    """Raise ``ResultError`` if it steps several environments at once.
+    """Raise ``ResultError`` if it, or what it wraps, steps several environments at once.
 
     A vector of it would have a dimension too many, and neither library would say so.
     """
-    count = getattr(env, "num_envs", None)
-    spaces = (env.observation_space, env.action_space)
-    if _has_single_spaces(env) or (
-        isinstance(count, int) and all((space.shape or ())[:1] == (count,) for space in spaces)
-    ):
-        raise ResultError(
-            f"make_env returned {_described(env)}, a gym.Env whose num_envs is {count} and whose "
-            "spaces are batched. Return a gymnasium.vector.VectorEnv, or give it "
-            "single_observation_space and single_action_space, and put no gym.Wrapper around it"
-        )
+    for layer in compat.layers(env):
+        count = getattr(layer, "num_envs", None)
+        if _has_single_spaces(layer) or (
+            isinstance(count, (int, np.integer)) and _is_batched(layer, int(count))
+        ):
+            raise ResultError(
+                f"make_env returned {_described(env)}, a gym.Env whose num_envs is {count} and "
+                "whose spaces are batched. Return a gymnasium.vector.VectorEnv, or give it "
+                "single_observation_space and single_action_space, and put no gym.Wrapper around it"
+            )
+
+
+def _is_batched(env: Any, count: int) -> bool:
+    """Whether its spaces are of so many. One may be a channel: then both have to be."""
+    observed, acted = (row_of(getattr(env, name), count) is not None for name in _SPACES)
+    return observed and (acted or count > 1)
+
+
+_SPACES = ("observation_space", "action_space")
 
 
 def _suite_name(env: Any) -> str:
