@@ -1,4 +1,4 @@
-"""The number of shards that is chosen, beside fixed ones: ``python -m benchmarks auto --help``.
+"""How well the number of worker processes is chosen, beside fixed numbers.
 
 For each workload and size the pin is first used as often as it has ways to be tried; then all step
 in turn, in one process: SyncVectorEnv, one worker, two, four and so on up to the cores, and what
@@ -127,3 +127,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--busy", type=int, default=0, help="processes that compute beside it")
     add("--nice", type=int, default=0, help="-20: on a machine that others use")
     return parser
+
+
+if __name__ == "__main__":
+    main()

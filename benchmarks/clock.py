@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from time import perf_counter_ns
 from typing import Any
@@ -60,16 +60,6 @@ def _think(order: Slice) -> None:
     until = perf_counter_ns() + int(order.think_s * 1e9)
     while perf_counter_ns() < until:
         pass
-
-
-def time_calls(call: Callable[[], Any], times: int) -> dict[str, Any]:
-    """Time a function that takes nothing."""
-    costs = []
-    for _ in range(times):
-        start = perf_counter_ns()
-        call()
-        costs.append(perf_counter_ns() - start)
-    return summary(costs)
 
 
 def summary(costs: Sequence[int]) -> dict[str, Any]:

@@ -2,8 +2,7 @@
 
 Reads orders from stdin and writes reports to stdout, one JSON object a line. The first report
 says ``{"ready": true, "setting": ...}`` or ``{"missing": ...}`` or ``{"failed": ...}``. An order
-is ``{"do": "slice", ...}`` with ``Slice``'s fields, ``{"do": "get_attr", "times": N}`` or
-``{"do": "close"}``. It ends with its stdin.
+is ``{"do": "slice", ...}`` with ``Slice``'s fields or ``{"do": "close"}``. It ends with its stdin.
 """
 
 from __future__ import annotations
@@ -19,14 +18,13 @@ from collections.abc import Iterator
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any, TextIO
 
-from benchmarks.clock import Slice, run_slice, time_calls
+from benchmarks.clock import Slice, run_slice
 from benchmarks.peers import PEERS, Opened, Peer, Setting
 from benchmarks.peers.missing import Missing
 from benchmarks.workloads import WORKLOADS, Workload, action_batches
 
 _CHOOSING = Slice(seconds=0.15, least_steps=3)
 _DIGEST_STEPS = 40
-_ATTRIBUTE = "gravity"
 
 
 def main() -> None:
@@ -113,9 +111,6 @@ def _obey(opened: Opened, order: dict[str, Any], actions: Iterator[Any]) -> dict
     what = order.pop("do")
     if what == "slice":
         return run_slice(opened, Slice(**order), actions)
-    if what == "get_attr":
-        get_attr = opened.get_attr  # type: ignore[attr-defined]
-        return time_calls(lambda: get_attr(_ATTRIBUTE), order["times"])
     raise ValueError(f"unknown order {what!r}")
 
 

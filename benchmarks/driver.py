@@ -64,10 +64,6 @@ class Player:
         """Run one slice."""
         return self._ask({"do": "slice", **asdict(order)})
 
-    def get_attr(self, times: int) -> dict[str, Any]:
-        """Time ``get_attr``."""
-        return self._ask({"do": "get_attr", "times": times})
-
     def _ask(self, order: dict[str, Any]) -> dict[str, Any]:
         self._signal(signal.SIGCONT)
         with suppress(BrokenPipeError):  # it has ended; there may still be a report

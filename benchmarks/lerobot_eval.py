@@ -1,6 +1,6 @@
 """LeRobot's own evaluation, called as ``lerobot-eval`` calls it; nothing of it is written again.
 
-To be imported in an interpreter that has LeRobot 0.6 (``python -m benchmarks.venvs lerobot``). The
+To be imported in an interpreter that has LeRobot 0.6 (``python -m benchmarks venvs lerobot``). The
 policy is one linear layer and the processors do nothing, so that environments are what is measured.
 """
 

@@ -1,10 +1,10 @@
-"""Steps per second over a network, against the same environments in a local sandbox.
+"""How fast steps are over a network, beside the same environments in a local sandbox.
 
-``python -m benchmarks.remote [SECONDS [WORKLOAD ...]]`` starts a server on loopback and a wire to
+``python -m benchmarks remote [SECONDS [WORKLOAD ...]]`` starts a server on loopback and a wire to
 it that delays both ways, since kernels without netem cannot. All ways have a turn in each round, in
 a new order; what is printed is medians. Beside them stands what ZeroMQ alone does in the same
 rounds, two processes with CURVE: echoes of 64 bytes, and the bytes of the workload's observation.
-``python -m benchmarks.remote driver`` measures what a step costs the client itself, of 1 and of 16
+``python -m benchmarks remote driver`` measures what a step costs the client itself, of 1 and of 16
 workers.
 """
 

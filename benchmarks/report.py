@@ -37,10 +37,6 @@ def markdown(results: dict[str, Any]) -> Iterator[str]:
             yield ""
         for cell in results.get(part, []):
             yield from cell_lines(cell)
-    if "attributes" in results:
-        yield from _attributes(results["attributes"])
-    if "spawning" in results:
-        yield from _spawning(results["spawning"])
 
 
 def _targets(results: dict[str, Any]) -> Iterator[str]:
@@ -128,33 +124,3 @@ def _digests(cell: dict[str, Any]) -> Iterator[str]:
     if len(set(found.values())) > 1:
         yield f"**Results differ**: {found}"
         yield ""
-
-
-def _attributes(found: dict[str, Any]) -> Iterator[str]:
-    yield f"## `get_attr` of {found['n']} CartPoles"
-    yield ""
-    yield "| peer | microseconds | x Async |"
-    yield "|---|---|---|"
-    for name, result in found["peers"].items():
-        ratio = _ratio(result.get("x_async"))
-        yield f"| {PEERS[name].title} | {result['call_us']:.0f} | {ratio} |"
-    yield ""
-    yield from _not_measured(found["absent"])
-
-
-def _spawning(found: dict[str, Any]) -> Iterator[str]:
-    yield "## Starting, in milliseconds, and memory, in MB"
-    yield ""
-    yield "| what | found |"
-    yield "|---|---|"
-    for name, values in found.items():
-        yield f"| {name.replace('_', ' ')} | {_flat(values)} |"
-    yield ""
-
-
-def _flat(values: Any) -> str:
-    if isinstance(values, dict):
-        return "; ".join(f"{name} {_flat(value)}" for name, value in values.items())
-    if isinstance(values, list):
-        return " ".join(map(str, values))
-    return str(values)

@@ -1,8 +1,8 @@
-"""Evaluations of suites, and first steps: ``python -m benchmarks.suites --help``.
+"""How long evaluations of whole suites take as LeRobot does them, and first steps.
 
 What is evaluated, and by what, is said in ``evaluations.py``. Every run is an interpreter of its
 own, and the variants take turns, so that ratios are of one time on one machine. Needs torch, or
-with ``--lerobot`` an interpreter with LeRobot, and root for the number of processes.
+with ``--lerobot`` an interpreter with LeRobot.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import argparse
 import json
 import os
 import py_compile
+import resource
 import statistics
 import subprocess
 import sys
@@ -26,7 +27,6 @@ from unittest.mock import patch
 from benchmarks.driver import ROOT
 from benchmarks.evaluations import LAZY, LEROBOT, LOOP, VARIANTS
 from benchmarks.interpreters import PEER_VENVS
-from benchmarks.watching import Watched, watch
 from benchmarks.workloads import REPOSITORIES
 
 HEAVY_TASKS = 6
@@ -52,43 +52,46 @@ class Suite:
     tasks: int = 10
     heavy: str = ""
 
-    def evaluate(self, variant: str, *, memory: bool = False) -> Watched:
-        """Once, in an interpreter of its own."""
+    def evaluate(self, variant: str) -> dict[str, Any]:
+        """Once, in an interpreter of its own; what it found, and its processor time as ``cpu``."""
         command = [self.python, "-m", "benchmarks.evaluations", variant, self.folder]
         command += ["--tasks", str(self.tasks), "--evaluator", self.evaluator]
         command += ["--heavy", self.heavy] if self.heavy else []
         path = os.pathsep.join([str(ROOT), str(ROOT / "worker")])
-        return watch(command, memory=memory, variables={"PYTHONPATH": path})
+        variables = {**os.environ, "PYTHONPATH": path}
+        before = _cpu_s()
+        done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, env=variables)
+        found: dict[str, Any] = json.loads(done.stdout.splitlines()[-1])
+        return {**found, "cpu": _cpu_s() - before - found["imports_cpu_s"]}
+
+
+def _cpu_s() -> float:
+    """Of all that this process has waited for."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 def compare(suite: Suite, rounds: int, variants: Sequence[str]) -> list[dict[str, Any]]:
-    """One row for each variant: medians of rounds in turns, and a run of its own for memory."""
+    """One row for each variant: medians of rounds in turns."""
     for variant in variants:
         suite.evaluate(variant)  # from here on the pin is known
-    runs: dict[str, list[Watched]] = {variant: [] for variant in variants}
+    runs: dict[str, list[dict[str, Any]]] = {variant: [] for variant in variants}
     for _ in range(rounds):
         for variant in variants:
             runs[variant].append(suite.evaluate(variant))
-    rows = [_row(v, runs[v], suite.evaluate(v, memory=True).peak_mb) for v in variants]
+    rows = [_row(variant, runs[variant]) for variant in variants]
     if any(row["returns"] != rows[0]["returns"] for row in rows):
         raise RuntimeError("the variants' returns differ")
     return rows
 
 
-def _row(variant: str, runs: list[Watched], peak_mb: float) -> dict[str, Any]:
-    found = [json.loads(run.output) for run in runs]
-    cpu = [run.cpu_s - one["imports_cpu_s"] for run, one in zip(runs, found, strict=True)]
+def _row(variant: str, runs: list[dict[str, Any]]) -> dict[str, Any]:
     return {
         "variant": variant,
-        "seconds": statistics.median(one["seconds"] for one in found),
-        "cpu": statistics.median(cpu),
-        "all": [round(one["seconds"], 2) for one in found],
-        "peak_mb": peak_mb,
-        "ever": runs[-1].ever,
-        "peak_processes": runs[-1].peak_processes,
-        "stolen": max(run.stolen for run in runs),
-        "load": round(max(run.load for run in runs), 1),
-        "returns": found[0]["returns"],
+        "seconds": statistics.median(run["seconds"] for run in runs),
+        "cpu": statistics.median(run["cpu"] for run in runs),
+        "all": [round(run["seconds"], 2) for run in runs],
+        "returns": runs[0]["returns"],
     }
 
 
@@ -159,11 +162,6 @@ def _tables(options: argparse.Namespace, suite: Suite) -> Iterator[str]:
                     chosen = replace(suite, heavy=options.simulator, tasks=HEAVY_TASKS)
                 yield f"{part}: {chosen.tasks} tasks"
                 yield from _rows(compare(chosen, rounds, options.variants))
-        if "growth" in options.parts:
-            for variant in options.variants:
-                many = [replace(suite, tasks=n) for n in (10, 10, 40)]
-                sizes = [one.evaluate(variant, memory=True).peak_mb for one in many]
-                yield f"{variant}: 10 tasks {sizes[1]} MB, 40 tasks {sizes[2]} MB"
     if "first" in options.parts:
         found = first_steps(options.rounds)
         base = statistics.median(found['python -c "import numpy, gymnasium"'])
@@ -173,19 +171,15 @@ def _tables(options: argparse.Namespace, suite: Suite) -> Iterator[str]:
 
 
 def _rows(rows: list[dict[str, Any]]) -> Iterator[str]:
-    yield "| variant | seconds | processor | memory | ever | at once | stolen | load | all |"
+    yield "| variant | seconds | processor | all |"
     for row in rows:
-        yield (
-            f"| {row['variant']} | {row['seconds']:.2f} s | {row['cpu']:.2f} s | "
-            f"{row['peak_mb']} MB | {row['ever']} | {row['peak_processes']} | "
-            f"{100 * row['stolen']:.1f} % | {row['load']} | {row['all']} |"
-        )
+        yield f"| {row['variant']} | {row['seconds']:.2f} s | {row['cpu']:.2f} s | {row['all']} |"
 
 
 def main() -> None:
     """Compare."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.suites", description=__doc__)
-    parser.add_argument("parts", nargs="*", default=["light", "heavy", "growth", "first"])
+    parser = argparse.ArgumentParser(prog="python -m benchmarks suites", description=__doc__)
+    parser.add_argument("parts", nargs="*", default=["light", "heavy", "first"])
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--tasks", type=int, default=10)
     parser.add_argument("--variants", nargs="+", choices=(*VARIANTS, LAZY))
@@ -198,7 +192,7 @@ def main() -> None:
     )
     options = parser.parse_args()
     if options.lerobot and not Path(options.lerobot).exists():
-        parser.error(f"there is no {options.lerobot}; first: python -m benchmarks.venvs lerobot")
+        parser.error(f"there is no {options.lerobot}; first: python -m benchmarks venvs lerobot")
     evaluator = LEROBOT if options.lerobot else LOOP
     options.variants = options.variants or VARIANTS
     os.chdir(ROOT)

@@ -1,4 +1,4 @@
-"""Makes the virtual environments of the other peers: ``python -m benchmarks.venvs [PEER...]``.
+"""Makes the virtual environments of the other libraries, once; PEER... makes some.
 
 Each gets its own, because their pins disagree with each other and with ours. ``$PIP_FIND_LINKS``
 is where a torch without CUDA may lie; PyPI's is large.
@@ -53,7 +53,7 @@ def make(peer: str, folder: Path) -> None:
 
 def main() -> None:
     """Make all, or those that are named; one that fails does not stop the others."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.venvs")
+    parser = argparse.ArgumentParser(prog="python -m benchmarks venvs")
     parser.add_argument("peers", nargs="*", metavar="peer", help=", ".join(REQUIREMENTS))
     parser.add_argument("--into", type=Path, default=PEER_VENVS)
     options = parser.parse_args()

@@ -7,27 +7,15 @@ from typing import Any
 from benchmarks.peers import ASYNC, SYNC
 from benchmarks.plan import Plan
 
-_STARTS = ("imports", "first_step_cold", "first_step_warm", "make_env", "workers", "memory")
-
 
 def problems(results: dict[str, Any], plan: Plan) -> list[str]:
     """What is missing or failed; empty if all is well.
 
     Peers that are not installed are no problem; ours and Gymnasium's are always there.
     """
-    found: list[str] = []
-    if "steps" in plan.parts:
-        wanted = [name for name in plan.peers if name in (SYNC, ASYNC, "envhub", "envhub-frames")]
-        found += _cells(results["steps"], len(plan.cells) * len(plan.conditions), wanted)
-    if "growth" in plan.parts:
-        found += _cells(results["growth"], len(plan.growing), plan.growing_peers())
-    if "attributes" in plan.parts:
-        absent = results["attributes"]["absent"]
-        found += [f"get_attr, {name}: {reason}" for name, reason in absent.items()]
-    if "spawning" in plan.parts:
-        for name in _STARTS:
-            found += _failures(name, results["spawning"][name])
-    return found
+    wanted = [name for name in plan.peers if name in (SYNC, ASYNC, "envhub", "envhub-frames")]
+    found = _cells(results["steps"], len(plan.cells) * len(plan.conditions), wanted)
+    return found + _cells(results.get("growth", []), len(plan.growing), plan.growing_peers())
 
 
 def _cells(cells: list[dict[str, Any]], expected: int, wanted: list[str]) -> list[str]:
@@ -43,12 +31,3 @@ def _cells(cells: list[dict[str, Any]], expected: int, wanted: list[str]) -> lis
         if len(digests) != 1:
             found.append(f"{where}: results differ between peers")
     return found
-
-
-def _failures(name: str, value: Any) -> list[str]:
-    if not isinstance(value, dict):
-        return []
-    own = [f"{name}: {value['failed']}"] if "failed" in value else []
-    return own + [
-        text for key, inner in value.items() for text in _failures(f"{name} {key}", inner)
-    ]

@@ -1,6 +1,6 @@
 # Repositories around real packages and in different styles, in an environment that has none of these:
 # cold, warm, and without a network; and equal to the same repository in an ordinary environment. All of
-# them by hand: python -m benchmarks.reach
+# them by hand: python -m benchmarks reach
 set -euo pipefail
 . "$(dirname "${BASH_SOURCE[0]}")/../lib.sh"
 built=$(wheel)

@@ -45,7 +45,6 @@ class Peer:
         settings: What to choose from, given the number of sub-environments.
         restless: It computes while nobody steps it, so it is stopped between its turns.
         digested: Its steps give Gymnasium's results, which can be compared bit by bit.
-        attributes: It has ``get_attr``.
     """
 
     name: str
@@ -56,7 +55,6 @@ class Peer:
     settings: Callable[[int], list[Setting]] = _one_setting
     restless: bool = False
     digested: bool = False
-    attributes: bool = False
     given: Setting = field(default_factory=dict)
 
     def open(self, workload: Workload, count: int, setting: Setting) -> Opened:
@@ -78,7 +76,7 @@ def _threads(count: int) -> list[Setting]:
 
 
 def _gymnasium(name: str, title: str, **given: Any) -> Peer:
-    return Peer(name, title, "gymnasium", digested=True, attributes=True, given=given)
+    return Peer(name, title, "gymnasium", digested=True, given=given)
 
 
 def _envhub(name: str, title: str, runs: Any = _always, **given: Any) -> Peer:
@@ -89,7 +87,6 @@ def _envhub(name: str, title: str, runs: Any = _always, **given: Any) -> Peer:
         needs=("zmq", "msgpack"),
         runs=runs,
         digested=True,
-        attributes=True,
         given=given,
     )
 
@@ -108,7 +105,7 @@ PEERS = {
     for peer in (
         _gymnasium(SYNC, "gymnasium SyncVectorEnv", vector="SyncVectorEnv"),
         _gymnasium(ASYNC, "gymnasium AsyncVectorEnv", vector="AsyncVectorEnv"),
-        Peer("sb3", "SB3 SubprocVecEnv", "sb3", needs=("stable_baselines3",), attributes=True),
+        Peer("sb3", "SB3 SubprocVecEnv", "sb3", needs=("stable_baselines3",)),
         Peer(
             "pufferlib",
             "PufferLib Multiprocessing",

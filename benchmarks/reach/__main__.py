@@ -1,4 +1,4 @@
-"""How much of what was written for no sandbox runs in ours: ``python -m benchmarks.reach``.
+"""How many repositories run in the sandbox that were not written for it.
 
 Repositories around packages (``packages.toml``) and in different styles (``repositories``), each in
 processes with a deadline and with caches of its own: by reference alone; if that fails, with one
@@ -60,7 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.reach", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks reach", description=__doc__)
     parser.add_argument("--only", nargs="+", metavar="NAME", help="these, instead of all")
     parser.add_argument("--quick", action="store_true", help="the dozen that CI tries")
     parser.add_argument("--again", action="store_true", help="also what results.json has")

@@ -101,6 +101,8 @@ def _repository(folder: Path) -> Case:
         for path in paths
         if path.name != "case.toml" and "__pycache__" not in path.parts
     }
+    if walk := about.pop("walk", None):  # the environment of most is the same
+        files[walk] = (HERE / "walk.py").read_bytes()
     return Case(folder.name, "repository", files=files, **_tuples(about))
 
 

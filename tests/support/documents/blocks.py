@@ -57,7 +57,6 @@ NOT_EXECUTED = {
     ("benchmarks/README.md", "python -m"): _LONG,
     ("docs/deployment.md", "envhub image build"): _DERIVED,
     ("docs/lerobot.md", "pip install"): _INSTALLS,
-    ("docs/async.md", "python -m benchmarks"): _LONG,
     ("docs/ray.md", "pip install"): _INSTALLS,
     ("docs/benchmarks.md", "python -m benchmarks"): _LONG,
     (

@@ -1,4 +1,4 @@
-"""``python -m benchmarks.reach``: what it tries, and how it compares."""
+"""``python -m benchmarks reach``: what it tries, and how it compares."""
 
 from __future__ import annotations
 

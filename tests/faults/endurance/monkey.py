@@ -1,6 +1,6 @@
 """Random operations with kills on many environments at once, each result against a model.
 
-    python -m benchmarks.monkey [--seconds 3600] [--places process tcp fleet] [--kill-every 100]
+    python -m tests.faults.endurance.monkey [--seconds 3600] [--places process tcp]
 
 Each place has a process of its own. In it a monkey opens, resets, steps, asks, kills, lets go and
 closes, whichever environment it comes upon; most are in the middle of something. In a fleet it
@@ -35,11 +35,11 @@ from typing import Any
 import numpy as np
 import psutil
 
-from benchmarks import clients
-from benchmarks.soak import EXIT, HANG, LIVE, MIB, SLOW, SLOW_S, same
-from benchmarks.workloads import REPOSITORIES, module
 from envhub_sandbox import errors, make_env
+from tests.faults.endurance import clients
+from tests.faults.endurance.soak import EXIT, HANG, LIVE, MIB, SLOW, SLOW_S, same
 from tests.support import inside
+from tests.support.samples import make_env_of, sample
 
 PLACES = ("process", "tcp", "fleet")
 
@@ -51,7 +51,7 @@ _HANG_S = 300.0
 _AMID_S = 0.001
 _PATIENCE = 200
 """Operations that an environment may outlive a kill of one of its processes."""
-_SLACK = {
+SLACK = {
     "client_descriptors": 4,
     "client_threads": 1,
     "client_mib": 48.0,
@@ -67,13 +67,14 @@ class Subject:
 
     def __init__(self, rng: np.random.Generator, sandbox: Any) -> None:
         self.name = str(rng.choice(NAMES))
+        folder = sample(self.name)
         self.n_envs = int(rng.integers(1, 5))
         most = 2 if isinstance(sandbox, str) else 3
         self.workers = int(rng.integers(1, min(self.n_envs, most) + 1))
         self.lane = str(rng.choice(["auto", "frames"]))
         policy = {"restart": "on_reset", "restart_budget": 10**9, "restart_backoff_s": 0}
         self.suites = make_env(
-            REPOSITORIES / self.name,
+            folder,
             n_envs=self.n_envs,
             use_async_envs=bool(rng.integers(2)),
             num_workers=self.workers,
@@ -82,7 +83,7 @@ class Subject:
             policy={**policy, "crash_history": 0, **clients.MEMORY},
         )
         self.env = self.suites.env
-        self.model = _model(self.name, self.n_envs)
+        self.model = make_env_of(folder)(self.n_envs)
         self.ready = False
         self.pending: Any = None
         self.doubt = 0
@@ -380,7 +381,7 @@ class Monkey:
             while time.monotonic() < end:
                 now = place.footprint(subject)
                 same_again = now["processes"] == last.get("processes")
-                if same_again and not (before and more(before, now)):
+                if same_again and not (before and clients.more(before, now, SLACK)):
                     break
                 last = now
                 time.sleep(0.5)
@@ -443,11 +444,6 @@ def _place(name: str) -> Iterator[Place]:
         yield Place(folder, None)
 
 
-def more(before: Mapping[str, float], after: Mapping[str, float]) -> list[str]:
-    """Of what there is more, beyond what one look differs from the next."""
-    return [name for name, value in after.items() if value > before[name] + _SLACK.get(name, 0)]
-
-
 def run(arguments: argparse.Namespace, name: str) -> dict[str, Any]:
     """Play in one place; what was done there, and what there was of everything."""
     begun = time.monotonic()
@@ -464,7 +460,7 @@ def run(arguments: argparse.Namespace, name: str) -> dict[str, Any]:
         "mismatches": monkey.mismatches,
         "after_a_tenth": before,
         "at_the_end": after,
-        "grown": more(before, after),
+        "grown": clients.more(before, after, SLACK),
     }
 
 
@@ -480,10 +476,6 @@ def _play(monkey: Monkey, arguments: argparse.Namespace, begun: float, part: flo
             said = f"{len(monkey.mismatches)} mismatches, {size:.0f} MiB: {dict(monkey.counts)}"
             print(said, file=sys.stderr, flush=True)
     faulthandler.cancel_dump_traceback_later()
-
-
-def _model(name: str, n_envs: int) -> Any:
-    return module(REPOSITORIES / name).make_env(n_envs)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -513,7 +505,7 @@ def passed(found: Mapping[str, Any]) -> bool:
 
 def _all(arguments: argparse.Namespace, words: list[str]) -> dict[str, Any]:
     """All places at once, each in a process of its own."""
-    command = [sys.executable, "-m", "benchmarks.monkey", *words, "--one"]
+    command = [sys.executable, "-m", "tests.faults.endurance.monkey", *words, "--one"]
     with contextlib.ExitStack() as stack:
         playing = {
             place: stack.enter_context(

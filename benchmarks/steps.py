@@ -1,4 +1,4 @@
-"""The command line: ``python -m benchmarks``."""
+"""How fast steps are beside Gymnasium's vector environments and other libraries."""
 
 from __future__ import annotations
 
@@ -10,17 +10,14 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from benchmarks.attributes import measure_attributes
 from benchmarks.driver import players
 from benchmarks.interpreters import PEER_VENVS, Interpreters
 from benchmarks.load import Patience, load_average
 from benchmarks.machine import machine
 from benchmarks.peers import PEERS
-from benchmarks.plan import PARTS, Cell, Plan, planned
-from benchmarks.plot import plot
+from benchmarks.plan import Cell, Plan, planned
 from benchmarks.report import cell_lines, write_report
 from benchmarks.rounds import CONDITIONS, measure
-from benchmarks.spawning import measure_spawning
 from benchmarks.targets import against_others, reached
 from benchmarks.wellformed import problems
 from benchmarks.workloads import WORKLOADS
@@ -45,8 +42,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
         **run(plan, Interpreters(options.venvs)),
     }
     paths = write_report(results, options.out)
-    if options.plot:
-        paths.append(plot(results, paths[0].with_suffix(".png")))
     print("\n".join(map(str, paths)), file=sys.stderr)
     wrong = problems(results, plan) if options.quick else []
     print("\n".join(wrong), file=sys.stderr, end="\n" if wrong else "")
@@ -56,20 +51,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def run(plan: Plan, interpreters: Interpreters) -> dict[str, Any]:
     """Each part of the plan."""
     patience = Patience(plan.patience_s)
-    results: dict[str, Any] = {}
-    if "steps" in plan.parts:
-        cells = _cells(plan, plan.cells, plan.peers, plan.conditions, patience, interpreters)
-        results["steps"] = cells
-        results["targets"] = reached(cells)
-        results["against_others"] = against_others(cells)
-    if "growth" in plan.parts:
+    cells = _cells(plan, plan.cells, plan.peers, plan.conditions, patience, interpreters)
+    results: dict[str, Any] = {
+        "steps": cells,
+        "targets": reached(cells),
+        "against_others": against_others(cells),
+    }
+    if plan.growing:
         peers = plan.growing_peers()
         results["growth"] = _cells(plan, plan.growing, peers, ["quiet"], patience, interpreters)
-    if "attributes" in plan.parts:
-        peers = list(plan.peers)
-        results["attributes"] = measure_attributes(peers, plan.rounds, patience, interpreters)
-    if "spawning" in plan.parts:
-        results["spawning"] = measure_spawning(plan.spawns, patience)
     return results
 
 
@@ -102,12 +92,9 @@ def _cells(
 
 def _parser() -> argparse.ArgumentParser:
     compared = [name for name, workload in WORKLOADS.items() if not workload.grows]
-    parser = argparse.ArgumentParser(
-        prog="python -m benchmarks",
-        description="envhub-sandbox against Gymnasium's vector environments, and others.",
-    )
+    parser = argparse.ArgumentParser(prog="python -m benchmarks steps", description=__doc__)
     add = parser.add_argument
-    add("parts", nargs="*", metavar="part", help=f"of {', '.join(PARTS)}; all by default")
+    add("--growth", action="store_true", help="also the cost by number and size of observations")
     add(
         "--quick",
         action="store_true",
@@ -119,10 +106,12 @@ def _parser() -> argparse.ArgumentParser:
     add("--peers", nargs="+", choices=PEERS, default=list(PEERS))
     add("--rounds", type=int, default=7)
     add("--seconds", type=float, default=0.25, help="length of a turn")
-    add("--spawns", type=int, default=50, help="workers to spawn")
     add("--patience", type=float, default=60.0, help="seconds to wait for a quiet machine")
     add("--nice", type=int, default=0, help="-20, as root: for a machine that others use")
     add("--venvs", type=Path, default=PEER_VENVS, help="virtual environments of peers, by name")
     add("--out", type=Path, default=RESULTS, help="folder for the reports")
-    add("--plot", action="store_true", help="a picture too; needs matplotlib")
     return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,4 +1,4 @@
-"""Short forms of ``benchmarks``: ``soak``, ``monkey``, ``clients``, ``auto``; what they notice."""
+"""Short forms of ``soak``, ``monkey`` and ``clients``, and that they notice what they look for."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from benchmarks import auto, clients, monkey, soak
+from tests.faults.endurance import clients, monkey, soak
 from tests.support import inside
 
 
@@ -41,20 +41,16 @@ def _result(**changes: Any) -> Any:
     return tuple({**parts, **changes}.values())
 
 
-def test_soak_would_notice_a_difference() -> None:
+def test_a_difference_would_be_noticed() -> None:
     assert soak.same(_result(), _result())
     assert not soak.same(_result(), _result(infos={}))
     assert not soak.same(_result(), _result(second=np.zeros(2)))
     assert not soak.same(_result(), _result(first=np.zeros(2, np.float32)))
-
-
-def test_soak_would_notice_growth() -> None:
     flat = {"processes": 4, "client_descriptors": 9, "client_mib": 80.0}
     found: dict[str, Any] = {"mismatches": 0, "after_warm_up": flat, "at_the_end": flat}
     assert soak.passed(found)
-    for name, value in (("processes", 5), ("client_descriptors", 20), ("client_mib", 200.0)):
-        assert not soak.passed({**found, "at_the_end": {**flat, name: value}})
     assert not soak.passed({**found, "mismatches": 1})
+    assert not soak.passed({**found, "at_the_end": {**flat, "processes": 5}})
 
 
 def test_a_short_hour(capsys: pytest.CaptureFixture[str]) -> None:
@@ -64,16 +60,6 @@ def test_a_short_hour(capsys: pytest.CaptureFixture[str]) -> None:
     for place in monkey.PLACES:
         assert found[place]["compared"] > 0
         assert found[place]["deaths"] > 0
-
-
-def test_the_monkey_would_notice_a_difference(monkeypatch: pytest.MonkeyPatch) -> None:
-    one = monkey.Monkey("process", environments=2, seed=0, kill_every=10**9)
-    monkeypatch.setattr(monkey, "same", lambda *_: False)
-    for _ in range(10):
-        one.once()
-    one.rest()
-    assert one.mismatches
-    assert len(one.mismatches) == one.counts["compared"]
 
 
 def test_the_monkey_would_notice_a_death_that_nobody_caused(
@@ -87,41 +73,18 @@ def test_the_monkey_would_notice_a_death_that_nobody_caused(
     assert any("WorkerDiedError" in said for said in one.mismatches)
 
 
-def test_the_monkey_would_notice_growth() -> None:
-    flat = {"processes": 5, "client_descriptors": 22, "client_mib": 35.0, "files": 6}
-    found: dict[str, Any] = {"mismatches": [], "grown": monkey.more(flat, flat)}
-    assert monkey.passed(found)
-    for name in flat:
-        grown = monkey.more(flat, {**flat, name: flat[name] + 100})
-        assert grown == [name]
-        assert not monkey.passed({**found, "grown": grown})
-    assert not monkey.passed({**found, "mismatches": ["one"]})
-
-
 def test_short_clients_leave_nothing(capsys: pytest.CaptureFixture[str]) -> None:
-    """Nor do those that are there at once; and a client may have several environments."""
-    code = clients.main(["--in-a-row", "2", "--at-once", "2", "--environments", "3"])
-    found = json.loads(capsys.readouterr().out)
-    assert (code, found["grown"]) == (0, [])
-    assert found["at_once"]["jails_pss_mib"] > 0
-    assert found["environments"]["processes"] > found["at_once"]["processes"]
+    code = clients.main(["--in-a-row", "2"])
+    assert (code, json.loads(capsys.readouterr().out)["grown"]) == (0, [])
 
 
-def test_growth_would_be_noticed() -> None:
+@pytest.mark.parametrize("slack", [clients.SLACK, monkey.SLACK])
+def test_growth_would_be_noticed(slack: dict[str, float]) -> None:
     """Of anything that is looked at, beyond what one look differs from the next."""
-    flat = {"server_pss_mib": 50.0, "descriptors": 20, "threads": 4, "folders": 3, "jails": 0}
-    found: dict[str, Any] = {"after_a_tenth": flat, "at_the_end": flat}
-    assert clients.grows(found) == []
+    flat = dict.fromkeys([*slack, "jails"], 20.0)
+    assert clients.more(flat, flat, slack) == []
     for name in flat:
-        found["at_the_end"] = {**flat, name: flat[name] + 100}
-        assert clients.grows(found) == [name]
-
-
-def test_short_auto(capsys: pytest.CaptureFixture[str]) -> None:
-    short = ["--rounds", "1", "--seconds", "0.01", "--busy", "1"]
-    auto.main(["--workloads", "cartpole", "--sizes", "2", *short])
-    header, _, row = [line for line in capsys.readouterr().out.splitlines() if "|" in line]
-    cells = [cell.strip() for cell in row.strip("|").split("|")]
-    assert len(cells) == header.count("|") - 1
-    assert cells[:2] == ["CartPole", "2"]
-    assert all(cells)
+        grown = clients.more(flat, {**flat, name: flat[name] + 100}, slack)
+        assert grown == [name]
+        assert not monkey.passed({"mismatches": [], "grown": grown})
+    assert not monkey.passed({"mismatches": ["one"], "grown": []})

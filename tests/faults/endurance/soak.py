@@ -1,6 +1,6 @@
 """Many steps with injected deaths, stalls and time-outs, each result against an oracle.
 
-    python -m benchmarks.soak [--steps 1000000] [--n-envs 4] [--num-workers 2] [--lane both]
+    python -m tests.faults.endurance.soak [--steps 1000000] [--lane both]
 
 The oracle is a ``SyncVectorEnv`` of the same class in this process, with the same seeds and
 actions. Under ``--restart transparent`` a death is part of the step: the rows that the infos name
@@ -26,12 +26,12 @@ from typing import Any
 import numpy as np
 import psutil
 
-from benchmarks.workloads import REPOSITORIES, module
 from envhub_sandbox import errors, make_env
 from envhub_sandbox.session.recovery import RESTARTED, derived_seed
 from tests.support import inside
+from tests.support.samples import make_env_of, sample
 
-REPOSITORY = REPOSITORIES / "walk"
+REPOSITORY = sample("walk")
 LANES = ("auto", "frames")
 MIB = 1 << 20
 LIVE, SLOW, HANG, EXIT = 0, 4, 5, 6
@@ -55,7 +55,7 @@ class Soak:
         self._faults = arguments.fault_every
         self._transparent = arguments.restart == "transparent"
         self.counts = dict.fromkeys(_COUNTED, 0)
-        self._oracle = _oracle(self._n)
+        self._oracle = make_env_of(REPOSITORY)(self._n)
         policy = {"restart": arguments.restart, "restart_budget": 10**9, "restart_backoff_s": 0}
         self.suites = make_env(
             REPOSITORY,
@@ -180,10 +180,6 @@ class Soak:
         else:
             self.counts["untold"] += 1
         self.reset()
-
-
-def _oracle(n_envs: int) -> Any:
-    return module(REPOSITORY).make_env(n_envs)
 
 
 def same(got: Any, expected: Any) -> bool:

@@ -1,17 +1,14 @@
-"""A server under many clients: what they take at once, and what short ones leave behind.
+"""What short clients, one after the other, leave behind in a server.
 
-``python -m benchmarks.clients [--in-a-row 1000] [--at-once 50] [--environments 64]`` starts a
-server on loopback. Each client is a process of its own. First so many short ones come one after the
-other, each opens an environment, steps and goes: after a tenth of them and at the end it is looked
-at what the server has, and nothing may be more. Then many are there at once, and then one with many
-environments: memory is PSS, so that what processes share is counted once. Exits with 1 if something
-grew.
+``python -m tests.faults.endurance.clients [--in-a-row 1000]`` starts a server on loopback. Each
+client is a process of its own, which opens an environment, steps and goes. After a tenth of them
+and at the end it is looked at what the server has, and nothing may be more. Exits with 1 if
+something grew.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
 import json
 import os
 import re
@@ -20,7 +17,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,11 +25,12 @@ import psutil
 
 from envhub_sandbox import RemoteSandbox, make_env
 from envhub_sandbox.sandboxes.process import BOOTSTRAP
+from tests.support.samples import sample
 
-_REPOSITORY = Path(__file__).parent / "repositories" / "cartpole"
+_REPOSITORY = sample("cartpole")
 _STEPS = 3
 _MIB = 1 << 20
-_SLACK = {"server_pss_mib": 8.0, "descriptors": 8, "threads": 1}
+SLACK = {"server_pss_mib": 8.0, "descriptors": 8, "threads": 1}
 """By how much the server may differ between two looks; all else is to be as it was."""
 _SETTLE_S = 60.0
 _PAUSE_S = 1.0
@@ -45,33 +43,22 @@ def main(words: Sequence[str] | None = None) -> int:
     """Run what was asked for; prints one JSON document."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--in-a-row", type=int, default=1000)
-    parser.add_argument("--at-once", type=int, default=50)
-    parser.add_argument("--environments", type=int, default=64)
-    parser.add_argument("--client", nargs=4, help=argparse.SUPPRESS)
+    parser.add_argument("--client", nargs=2, help=argparse.SUPPRESS)
     arguments = parser.parse_args(words)
     if arguments.client:
         return _client(*arguments.client)
     with tempfile.TemporaryDirectory(prefix="clients-") as folder, Server(Path(folder)) as server:
-        found: dict[str, Any] = {}
-        if arguments.in_a_row:
-            found["in_a_row"] = in_a_row(server, arguments.in_a_row)
-        if arguments.at_once:
-            found["at_once"] = at_once(server, arguments.at_once, 1)
-        if arguments.environments:
-            found["environments"] = at_once(server, 1, arguments.environments)
-    grown = grows(found["in_a_row"]) if arguments.in_a_row else []
+        found = in_a_row(server, arguments.in_a_row)
+    grown = more(found["after_a_tenth"], found["at_the_end"])
     print(json.dumps({**found, "grown": grown}, indent=2))
     return 1 if grown else 0
 
 
-def grows(found: dict[str, Any]) -> list[str]:
-    """What the server has more of at the end than after the first tenth."""
-    return more(found["after_a_tenth"], found["at_the_end"])
-
-
-def more(before: Mapping[str, float], after: Mapping[str, float]) -> list[str]:
+def more(
+    before: Mapping[str, float], after: Mapping[str, float], slack: Mapping[str, float] = SLACK
+) -> list[str]:
     """Of what there is more, beyond what one look differs from the next."""
-    return [name for name, value in after.items() if value > before[name] + _SLACK.get(name, 0)]
+    return [name for name, value in after.items() if value > before[name] + slack.get(name, 0)]
 
 
 def in_a_row(server: Server, count: int) -> dict[str, Any]:
@@ -87,43 +74,13 @@ def in_a_row(server: Server, count: int) -> dict[str, Any]:
     return {**each, "after_a_tenth": before, "at_the_end": server.settled(before)}
 
 
-def at_once(server: Server, clients: int, environments: int) -> dict[str, Any]:
-    """Clients that are all there, each with so many environments; and that they have gone."""
-    server.settled()
-    begun = time.perf_counter()
-    with contextlib.ExitStack() as stack:
-        running = [stack.enter_context(server.client(environments)) for _ in range(clients)]
-        # all of them are read, so that one that is slow keeps no other from saying so
-        for one in running:
-            assert one.stdout is not None
-            if one.stdout.readline() != b"ready\n":
-                raise RuntimeError("a client has failed; see what it printed")
-        taken = time.perf_counter() - begun
-        ours = sum(map(_pss, running))
-        return {
-            "clients": clients,
-            "environments_each": environments,
-            "seconds_until_all_stepped": round(taken, 1),
-            "server_pss_mib": _mib(_pss(server.process)),
-            "jails_pss_mib": _mib(_below(server.process)),
-            "clients_pss_mib": _mib(ours),
-            "processes": len(psutil.Process(server.process.pid).children(recursive=True)),
-        }
-
-
-def _client(endpoint: str, server_key: str, environments: str, stays: str) -> int:
+def _client(endpoint: str, server_key: str) -> int:
     """One client: its secret key is in its environment."""
     sandbox = RemoteSandbox(endpoint, server_key, retry_s=_RETRY_S)
-    with contextlib.ExitStack() as stack:
-        for number in range(int(environments)):
-            suites = make_env(_REPOSITORY, sandbox=sandbox, policy=MEMORY)
-            env = stack.enter_context(suites).env
-            env.reset(seed=number)
-            for _ in range(_STEPS):
-                env.step(env.action_space.sample())
-        if int(stays):
-            print("ready", flush=True)
-            sys.stdin.read()
+    with make_env(_REPOSITORY, sandbox=sandbox, policy=MEMORY) as suites:
+        suites.env.reset(seed=0)
+        for _ in range(_STEPS):
+            suites.env.step(suites.env.action_space.sample())
     return 0
 
 
@@ -197,24 +154,11 @@ class Server:
             retry_s=_RETRY_S,
         )
 
-    def _command(self, environments: int, *, stays: bool) -> list[str]:
-        words = [self._endpoint, self._public, str(environments), str(int(stays))]
-        return [sys.executable, "-m", "benchmarks.clients", "--client", *words]
-
     def short(self) -> None:
         """A client that comes, steps and goes."""
-        subprocess.run(self._command(1, stays=False), check=True, env=self._variables, timeout=600)
-
-    @contextlib.contextmanager
-    def client(self, environments: int) -> Iterator[subprocess.Popen[bytes]]:
-        """A client that says when it has stepped, and stays until then."""
-        pipe = subprocess.PIPE
-        command = self._command(environments, stays=True)
-        with subprocess.Popen(command, stdin=pipe, stdout=pipe, env=self._variables) as process:
-            try:
-                yield process
-            finally:
-                process.communicate(timeout=600)
+        command = [sys.executable, "-m", "tests.faults.endurance.clients"]
+        words = ["--client", self._endpoint, self._public]
+        subprocess.run([*command, *words], check=True, env=self._variables, timeout=600)
 
     def settled(self, before: Mapping[str, float] | None = None) -> dict[str, float]:
         """What it has, once all clients have gone: waits for their ends, but not for ever.
@@ -248,14 +192,6 @@ class Server:
         command += ["--state-dir", str(self._state)]
         done = subprocess.run(command, check=True, capture_output=True, timeout=120)
         return sum(len(one["jails"]) for one in json.loads(done.stdout)["sessions"])
-
-
-def _below(process: subprocess.Popen[Any]) -> int:
-    found = 0
-    for child in psutil.Process(process.pid).children(recursive=True):
-        with contextlib.suppress(psutil.NoSuchProcess):
-            found += child.memory_full_info().pss
-    return found
 
 
 def entries(folder: Path) -> int:
