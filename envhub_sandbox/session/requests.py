@@ -20,6 +20,7 @@ from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoA
 from envhub_sandbox.errors import (
     EnvHubError,
     LocalProtocolError,
+    RemoteEnvError,
     RemoteEnvWarning,
     WorkerDiedError,
     WorkerError,
@@ -67,6 +68,8 @@ class RequestOrder(ABC):
         attributes: Those that need no request.
         use: A thread that asks something holds its lock until it has handled the answer;
             between an ``*_async`` and its ``*_wait`` no thread does.
+        before_request, after_request: Called before each request, and once it was answered, where
+            the caller has random generators of the environment.
     """
 
     def __init__(
@@ -82,6 +85,8 @@ class RequestOrder(ABC):
         self.closed = False
         self.waiting: str | None = None
         self.face = "SandboxVectorEnv"
+        self.before_request: Callable[[], None] | None = None
+        self.after_request: Callable[[], None] | None = None
         self._repository = repository
         self._unshown = repository.warnings.unshown
         self._timeouts = repository.timeouts
@@ -168,6 +173,10 @@ class RequestOrder(ABC):
     ) -> list[m.M]:
         """With the lock held, the shards' replies to the last ``submit``."""
 
+    @abstractmethod
+    def one_each(self, what: str, replies: list[m.Value] | list[m.WatchDone]) -> tuple[Any, ...]:
+        """One value for each sub-environment, out of the shards' replies."""
+
     def explain(self, error: BaseException) -> None:
         """Before an error goes to the caller.
 
@@ -177,6 +186,8 @@ class RequestOrder(ABC):
         """
         with contextlib.suppress(RemoteEnvWarning):
             self.show_warnings()
+        if self.after_request is not None and isinstance(error, RemoteEnvError):
+            self.after_request()
         if isinstance(error, WorkerDiedError):
             self.refuse_if_closed()
 
@@ -249,6 +260,8 @@ class Requests(RequestOrder):
         Raises ``LocalProtocolError``: it cannot be sent; nothing was; ``WorkerError``: the
         environment is not in a state to take it.
         """
+        if self.before_request is not None:
+            self.before_request()
         self._sending(operation, lambda: self._submit(operation, message_for, instead))
 
     def make_ready(self, operation: str, start: Callable[[], object] | None = None) -> None:
@@ -331,6 +344,8 @@ class Requests(RequestOrder):
         except BaseException as error:
             self.explain(error)
             raise
+        if self.after_request is not None:
+            self.after_request()
         self.show_warnings()
         return replies
 
@@ -349,7 +364,7 @@ class Requests(RequestOrder):
         return answers
 
     def one_each(self, what: str, replies: list[m.Value] | list[m.WatchDone]) -> tuple[Any, ...]:
-        """One value for each sub-environment, out of the shards' replies."""
+        """See ``RequestOrder``."""
         return self._judged(lambda: self.results.one_each(what, replies))
 
     def finish_reset(
@@ -374,6 +389,8 @@ class Requests(RequestOrder):
 
         ``packed``: of them, where they have no fixed layout and were packed already.
         """
+        if self.before_request is not None:
+            self.before_request()
         try:
             lifecycle = self.lifecycle
             if lifecycle.state is not State.READY:
@@ -444,6 +461,8 @@ class Requests(RequestOrder):
         except BaseException as error:
             self.explain(error)
             raise
+        if self.after_request is not None:
+            self.after_request()
         if self._unshown:
             self.show_warnings()
         if self._counters.steps == ENOUGH_STEPS:  # it may never be closed

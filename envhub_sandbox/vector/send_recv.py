@@ -54,6 +54,7 @@ class SendRecv(VectorEnv[Any, Any, Any]):
         with self._requests.use.flight:
             flight = self._in_flight()
             rows = flight.rows(env_ids)
+            self._send_draws()
             flight.send(rows, self._read_rows(rows, actions))
 
     @short_traceback
@@ -84,6 +85,7 @@ class SendRecv(VectorEnv[Any, Any, Any]):
             flight = self._in_flight()
             rows = flight.rows(env_ids)
             seeds = _seeds_of(rows, seed, self._manifest)
+            self._send_draws()
             flight.send_reset(rows, reset_message(self._manifest, seeds, options))
 
     @short_traceback
@@ -123,7 +125,15 @@ class SendRecv(VectorEnv[Any, Any, Any]):
 
         deadline = Deadline(timeout)
         with held_in_time(self._requests.use.flight, deadline):
-            return self._in_flight().recv(self.num_envs if wanted is None else wanted, deadline)
+            received = self._in_flight().recv(self.num_envs if wanted is None else wanted, deadline)
+        if self._requests.after_request is not None:
+            self._requests.after_request()
+        return received
+
+    def _send_draws(self) -> None:
+        """Before anything is in flight: then no generator can be asked for."""
+        if self._requests.before_request is not None and self._requests.waiting is None:
+            self._requests.before_request()
 
     def _in_flight(self) -> InFlight:
         if self._flight is None:

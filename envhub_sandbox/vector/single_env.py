@@ -163,13 +163,21 @@ class SingleEnv(gym.Env[Any, Any]):
 
     @property
     def np_random(self) -> np.random.Generator:
-        """A copy of the environment's generator."""
+        """The environment's generator: a draw here advances it there, and the other way round."""
+        if isinstance(self._vector, SandboxVectorEnv):
+            return self._vector._generators.read()[0]
         found = self._vector.np_random
         return found[0] if isinstance(found, tuple) else found
 
     @np_random.setter
+    @short_traceback
     def np_random(self, value: np.random.Generator) -> None:
-        raise AttributeError("the generator is in the sandbox: seed it with reset(seed=...)")
+        if isinstance(self._vector, SandboxVectorEnv):
+            self._vector._generators.put(0, value)
+        elif isinstance(self._vector.np_random, tuple):
+            self._vector.set_attr("np_random", [value])  # type: ignore[attr-defined]
+        else:
+            self._vector.np_random = value
 
     # Gymnasium's checks look at this one
     _np_random = np_random

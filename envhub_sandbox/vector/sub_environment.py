@@ -137,7 +137,12 @@ class SubEnvironment(gym.Env[Any, Any]):
     @property  # type: ignore[misc]  # there is nothing to set
     @short_traceback
     def np_random(self) -> Any:
-        """A copy of its generator."""
+        """Its generator: a draw here advances it there, and the other way round.
+
+        A copy where the repository's own class has its sub-environments.
+        """
+        if self._vector._manifest.shardable:
+            return self._vector._generators.read()[self._index]
         return self._get("np_random")
 
     @property
@@ -187,6 +192,8 @@ class SubEnvironment(gym.Env[Any, Any]):
         """Set an attribute of it, there."""
         if name in _OURS:
             object.__setattr__(self, name, value)
+        elif name == "np_random" and self._vector._manifest.shardable:
+            self._vector._generators.put(self._index, value)
         else:
             self._call("__setattr__", (name, value), {})
 

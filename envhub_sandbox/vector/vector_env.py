@@ -9,7 +9,7 @@ from __future__ import annotations
 import warnings
 import weakref
 from collections.abc import Callable, Sequence
-from copy import copy
+from copy import copy, deepcopy
 from functools import partial
 from threading import get_ident
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
@@ -23,19 +23,19 @@ from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.remote_warnings import level_of_the_caller
 from envhub_sandbox.transport.replies import typed_reply
 from envhub_sandbox.transport.results import StepResult
-from envhub_sandbox.transport.values import generator, not_here, seeds, spec_of
+from envhub_sandbox.transport.values import not_here, seeds, spec_of
 from envhub_sandbox.vector.actions import (
     action_reader,
     check_mask,
     reset_message,
     seeds_for_all,
 )
+from envhub_sandbox.vector.generators import Generators
 from envhub_sandbox.vector.sandbox_view import SandboxView
 from envhub_sandbox.vector.send_recv import SendRecv
 from envhub_sandbox.vector.sub_environment import SubEnvironment
 from envhub_sandbox.vector.tracebacks import short_traceback, shortened
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.errors import UNTRUSTED
 from envhub_worker.protocol.lifecycle import State
 from envhub_worker.protocol.manifest.manifest import EnvManifest
 from envhub_worker.protocol.manifest.names import absent, is_servable
@@ -79,6 +79,7 @@ class SandboxVectorEnv(SendRecv):
         self._requests.face = type(self).__name__
         self._timeouts = session.repository.timeouts
         self._read_actions = action_reader(manifest, manifest.num_envs)
+        self._generators = Generators(self._requests)
         self._still: Any = None
         self.single_observation_space = manifest.single_observation_space
         self.single_action_space = manifest.single_action_space
@@ -368,16 +369,29 @@ class SandboxVectorEnv(SendRecv):
         self._still = rendered[0] if isinstance(rendered, tuple) and rendered else None
         return rendered
 
-    @property  # type: ignore[misc]  # there is nothing to set, as in SyncVectorEnv
+    @property
     @short_traceback
     def np_random(self) -> Any:
-        """Copies of the generators: ``SyncVectorEnv`` has one for each sub-environment."""
-        replies = self._requests.ask("np_random", lambda number, _: m.GetRandom(number))
-        with UNTRUSTED:  # a generator that numpy does not know breaks no rule of the wire
-            if type(replies[0].value) is dict:
-                return generator(replies[0].value)
-            states = self._requests.one_each("np_random", replies)
-            return tuple(generator(state) for state in states)
+        """The generator of each sub-environment, or the one of a repository's own class.
+
+        What is drawn from one advances that of the environment, and the other way round. Those of
+        an ``AsyncVectorEnv`` are copies, as in Gymnasium.
+        """
+        generators = self._generators.read()
+        if self._generators.single:
+            return generators[0]
+        return tuple(generators if self._manifest.sync else map(deepcopy, generators))
+
+    @np_random.setter
+    @short_traceback
+    def np_random(self, value: Any) -> None:
+        self._generators.read()
+        if not self._generators.single:  # as in SyncVectorEnv
+            raise AttributeError(
+                "np_random is the generators of the sub-environments: set that of each, as in "
+                "env.envs[0].np_random = generator"
+            )
+        self._generators.put(0, value)
 
     @property
     @short_traceback

@@ -33,7 +33,7 @@ _MOST_LASTING = 256
 _LASTING = (m.Call, m.SetAttr, m.CallOwn, m.CallOne)
 _PASSING = frozenset({"reset", "step", "render"})
 """What is over with the next seed, also where one sub-environment does it alone."""
-_SLICED = (m.Reset, m.SetAttr, m.GetOne, m.CallOne)
+_SLICED = (m.Reset, m.SetAttr, m.SetRandom, m.GetOne, m.CallOne)
 """Each shard is sent another part of these."""
 
 
@@ -289,6 +289,8 @@ def _whole(messages: Sequence[m.Message], bounds: Sequence[tuple[int, int]]) -> 
             changes["mask"] = np.concatenate([one.mask for one in others])
     if isinstance(first, m.SetAttr):
         changes["values"] = tuple(value for one in others for value in one.values)
+    if isinstance(first, m.SetRandom):
+        changes["states"] = tuple(state for one in others for state in one.states)
     if isinstance(first, (m.GetOne, m.CallOne)):
         places = [
             start + one.index

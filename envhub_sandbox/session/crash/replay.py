@@ -151,6 +151,7 @@ _REPEATED: dict[type[m.Message], Callable[[Any, Any], object]] = {
     m.CallOne: _call_one,
     m.GetOne: lambda env, message: _one(env, message, message.name),
     m.GetRandom: lambda env, message: env.np_random,
+    m.SetRandom: lambda env, message: env._generators.write(message.states, new=message.new),
 }
 
 

@@ -219,6 +219,8 @@ class FleetRequests(RequestOrder):
         """Ask the part that has the sub-environment; the others are not asked."""
         with self.use.lock:
             self.refuse_if_busy(f"envs[{index}].{name}")
+            if self.before_request is not None:
+                self.before_request()
             at = next(i for i, (start, stop) in enumerate(self.results.bounds) if index < stop)
             with self._parts[at].naming():
                 return self._each[at].ask_one(name, index, message)
@@ -229,6 +231,8 @@ class FleetRequests(RequestOrder):
         self, operation: str, message_for: MessageFor, instead: MessageFor | None = None
     ) -> None:
         """See ``Requests.submit``. Nothing is sent unless all parts are ready and all is packed."""
+        if self.before_request is not None:
+            self.before_request()
         self._make_ready(operation)
         try:
             packed = [one.pack(operation, message_for, instead) for one in self._each]
@@ -246,6 +250,8 @@ class FleetRequests(RequestOrder):
         """See ``Requests.collect``: the replies of all parts, in order."""
         deadline = deadline_of(timeout)
         replies = self._of_all(lambda at: self._each[at].collect(deadline, kind))
+        if self.after_request is not None:
+            self.after_request()
         return [reply for some in replies for reply in some]
 
     def one_each(self, what: str, replies: list[m.Value] | list[m.WatchDone]) -> tuple[Any, ...]:
@@ -268,6 +274,8 @@ class FleetRequests(RequestOrder):
 
     def submit_step(self, actions: Any) -> None:
         """See ``Requests.submit_step``: to each part its rows."""
+        if self.before_request is not None:
+            self.before_request()
         for part in self._parts:
             if part.lifecycle.state is not State.READY:
                 self._make_ready("step")
@@ -303,9 +311,12 @@ class FleetRequests(RequestOrder):
         parts = self._of_all(partial(self._collect_step, deadline), self._first)
         self._counters.stepped(perf_counter_ns() - self._sent_ns)
         try:
-            return self.results.joined_steps(parts)
+            result = self.results.joined_steps(parts)
         except batches.Misfit:
-            return self.results.joined_steps(parts, self._infos_apart(deadline))
+            result = self.results.joined_steps(parts, self._infos_apart(deadline))
+        if self.after_request is not None:
+            self.after_request()
+        return result
 
     def _collect_step(self, deadline: Deadline, at: int) -> StepResult:
         begun_ns = perf_counter_ns()

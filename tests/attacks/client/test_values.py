@@ -101,18 +101,59 @@ def test_the_control_imports_what_an_id_names(tmp_path: Path) -> None:
 # --- random generators ----------------------------------------------------------------------
 
 
+def states(*each: Any) -> Any:
+    """A worker's generators, as it gives them."""
+    numbered = ({**one, "number": 1} if isinstance(one, dict) else one for one in each)
+    return relayed(m.Value(tuple(numbered)))
+
+
+FIRST = {**philox(), "number": 1}
+
+
 @pytest.mark.parametrize("what", ["a short key", "a flag of two", "no mapping"])
 def test_generator_states_are_checked(liar: LyingServer, folder: str, what: str) -> None:
     """numpy checks none of a state's fields, so the client does; the last tests have them all."""
     with opened(liar, folder) as suites:
-        liar.lies[m.GetRandom] = relayed(m.Value((pcg64(), STATES[what])))
+        liar.lies[m.GetRandom] = states(pcg64(), STATES[what])
         error = refuses(lambda: suites.env.np_random)
         assert isinstance(error, RemoteProtocolError)
-        liar.lies[m.GetRandom] = relayed(m.Value((pcg64(), philox())))
+        liar.lies[m.GetRandom] = states(pcg64(), philox())
         assert [type(made.bit_generator) for made in suites.env.np_random] == [
             np.random.PCG64,
             np.random.Philox,
         ]
+
+
+LATER: dict[str, Any] = {
+    "a state that there cannot be": m.Value(({**philox(buffer_pos=-64), "number": 1}, FIRST)),
+    "a number that is a flag": m.Value(({**philox(), "number": True}, FIRST)),
+    "no number": m.Value((philox(), FIRST)),
+    "one for all": m.Value(FIRST),
+    "one too many": m.Value((FIRST,) * 3),
+}
+
+
+@pytest.mark.parametrize("what", [None, *LATER])
+def test_a_generator_that_the_caller_keeps_gets_no_bad_state(
+    liar: LyingServer, folder: str, what: str | None
+) -> None:
+    """It is brought up to date in place after each request, by states that are checked as before.
+
+    The control is an honest worker, whose state it takes.
+    """
+    with opened(liar, folder) as suites:
+        liar.lies[m.GetRandom] = relayed(m.Value((FIRST, FIRST)))
+        kept = suites.env.np_random
+        before = copy.deepcopy(kept[0].bit_generator.state)
+        honest = relayed(m.Value(({**philox(has_uint32=1), "number": 1}, FIRST)))
+        liar.lies[m.GetRandom] = relayed(LATER[what]) if what else honest
+        if what is None:
+            suites.env.reset()
+            assert suites.env.np_random[0] is kept[0]
+            assert kept[0].bit_generator.state["has_uint32"] == 1
+        else:
+            assert isinstance(refuses(suites.env.reset), RemoteProtocolError)
+            assert str(kept[0].bit_generator.state) == str(before)
 
 
 CRASH = """

@@ -23,8 +23,8 @@ from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits, limits_for
 from envhub_worker.protocol.manifest.manifest import encode_env, encode_manifest
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.stream import Packet, StreamReader, pack_packet
+from envhub_worker.runner import generators, loader, manifest
 from envhub_worker.runner import gymnasium_compat as compat
-from envhub_worker.runner import loader, manifest
 from envhub_worker.runner.described import described, raised
 from envhub_worker.runner.lane import Lane
 from envhub_worker.runner.prefixes import WarningLog, Watches
@@ -92,6 +92,7 @@ class Runner:
         self._entry = entry
         self._tasks: dict[tuple[str, Any], Task] = {}
         self._envs: dict[int, Any] = {}
+        self._generators: dict[int, generators.Generators] = {}
         self._stage = ""
         self.warned = WarningLog()
         self.watches = Watches()
@@ -289,14 +290,19 @@ class Runner:
 
     def get_random(self, request: m.GetRandom) -> m.Message:
         """The states of the random number generators: of all sub-environments, or just one."""
-        generators = self._envs[request.env].np_random
-        if not isinstance(generators, tuple):
-            return m.Value(generators.bit_generator.state)
-        return m.Value(tuple(generator.bit_generator.state for generator in generators))
+        own = self._generators.setdefault(request.env, generators.Generators())
+        return m.Value(own.states(self._envs[request.env]))
+
+    def set_random(self, request: m.SetRandom) -> m.Message:
+        """Bring those generators to other states, or put others in their places."""
+        put = generators.replace if request.new else generators.bring
+        put(self._envs[request.env], request.states)
+        return m.Value(None)
 
     def close(self, request: m.Close) -> m.Message:
         """``VectorEnv.close``."""
         env = self._envs.pop(request.env, None)
+        self._generators.pop(request.env, None)
         self.watches.forget(request.env)
         if env is not None:
             env.close()
@@ -372,6 +378,7 @@ _HANDLERS: dict[type[m.Message], Callable[[Runner, Any], m.Message]] = {
     m.GetOne: Runner.get_one,
     m.CallOne: Runner.call_one,
     m.GetRandom: Runner.get_random,
+    m.SetRandom: Runner.set_random,
     m.Close: Runner.close,
     m.Attach: Runner.attach,
     m.FetchInfos: Runner.fetch_infos,

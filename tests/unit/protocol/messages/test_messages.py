@@ -91,6 +91,7 @@ SAMPLES: list[m.Message] = [
     m.Method(),
     m.CallOwn(1, "describe", (), {}),
     m.GetRandom(1),
+    m.SetRandom(1, (None, {"bit_generator": "PCG64"}), True),
     m.GetOne(1, 0, None, "task"),
     m.CallOne(1, None, 0, "add", (1, "x"), {"flag": True}),
     m.Close(1),

@@ -145,9 +145,23 @@ class CallOne(Message, kind=79, asks="envs", handed=("args", "kwargs")):
 
 
 class GetRandom(Message, kind=80):
-    """Ask for the generators. Reply: ``Value``, one state each, or the one state there is."""
+    """Ask for the generators. Reply: ``Value``, one state each, or the one state there is.
+
+    A state has a ``number`` beside numpy's fields: another generator has another one.
+    """
 
     env: int
+
+
+class SetRandom(Message, kind=94):
+    """Bring generators to these states; None leaves one as it is. Reply: ``Value``.
+
+    ``new``: by generators of their own, which take the places of those that are there.
+    """
+
+    env: int
+    states: tuple[object, ...]
+    new: bool
 
 
 class Close(Message, kind=81):

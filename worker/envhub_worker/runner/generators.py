@@ -1,0 +1,46 @@
+"""The random generators of an environment, whose states the client has and brings back."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+
+class Generators:
+    """Those of one environment: of its sub-environments, or its own one."""
+
+    def __init__(self) -> None:
+        self._last: dict[int, tuple[int, Any]] = {}
+
+    def states(self, env: Any) -> Any:
+        """The state of each with its number, or of the one there is."""
+        generators = env.np_random
+        if not isinstance(generators, tuple):
+            return self._state(0, generators)
+        return tuple(self._state(place, one) for place, one in enumerate(generators))
+
+    def _state(self, place: int, generator: Any) -> dict[str, Any]:
+        number, last = self._last.get(place, (0, None))
+        if generator is not last:  # kept, so that no other one gets its id
+            self._last[place] = number + 1, generator
+        return {"number": self._last[place][0], **generator.bit_generator.state}
+
+
+def bring(env: Any, states: tuple[Any, ...]) -> None:
+    """Bring generators to these states, in place; None leaves one as it is."""
+    generators = env.np_random
+    each = generators if isinstance(generators, tuple) else (generators,)
+    for generator, state in zip(each, states, strict=True):
+        if state is not None:
+            generator.bit_generator.state = state
+
+
+def replace(env: Any, states: tuple[Any, ...]) -> None:
+    """Give sub-environments generators of their own, or the one of the vector environment."""
+    owners = env.envs if isinstance(env.np_random, tuple) else (env,)
+    for owner, state in zip(owners, states, strict=True):
+        if state is not None:
+            bits = getattr(np.random, state["bit_generator"])()
+            bits.state = state
+            owner.np_random = np.random.Generator(bits)
