@@ -323,13 +323,17 @@ class RemoteEnvWarning(UserWarning):
 
 __all__ = [name for name in dir() if name.endswith(("Error", "Warning"))]
 
-_BUILTINS: tuple[type[Exception], ...] = (
-    *(ArithmeticError, AssertionError, AttributeError, EOFError, FileNotFoundError, ImportError),
-    *(Warning, UserWarning, DeprecationWarning, RuntimeWarning, FutureWarning, UnicodeError),
-    *(IndexError, KeyError, LookupError, MemoryError, ModuleNotFoundError, NotImplementedError),
-    *(OSError, OverflowError, PermissionError, RecursionError, RuntimeError, TimeoutError),
-    *(TypeError, ValueError, ZeroDivisionError),
-)
+_BUILTINS: dict[str, type[Exception]] = {
+    kind.__name__: kind  # OSError has several names
+    for kind in vars(builtins).values()
+    if isinstance(kind, type) and issubclass(kind, Exception)
+}
+# A loop of the caller's would end at a StopIteration, and Python prints a SyntaxError without its
+# text. A group has to be made of exceptions.
+for _name in ("StopAsyncIteration", "StopIteration", "SyntaxError", "IndentationError", "TabError"):
+    del _BUILTINS[_name]
+for _name in ("Exception", "ExceptionGroup"):
+    _BUILTINS.pop(_name, None)
 
 
 def _twin(ours: type[EnvHubError], kind: type[Exception]) -> Any:
@@ -356,9 +360,11 @@ def _group(kind: Any) -> Any:
     return made
 
 
-_TWINS = {(ours, kind.__name__): _twin(ours, kind) for ours in _PREFIXES for kind in _BUILTINS}
-for _kind in (UnicodeDecodeError, UnicodeEncodeError, UnicodeTranslateError):
-    _TWINS[RemoteEnvError, _kind.__name__] = _twin(RemoteEnvError, _kind)
+_TWINS = {
+    (ours, name): _twin(ours, kind) for ours in _PREFIXES for name, kind in _BUILTINS.items()
+}
+for _name in ("UnicodeDecodeError", "UnicodeEncodeError", "UnicodeTranslateError"):
+    del _TWINS[LoadError, _name]  # they are made of five arguments, which nothing tells
 if hasattr(builtins, "ExceptionGroup"):  # since Python 3.11
     _TWINS[RemoteEnvError, "ExceptionGroup"] = _group(builtins.ExceptionGroup)
 globals().update({twin.__name__: twin for twin in _TWINS.values()})

@@ -114,14 +114,15 @@ def reported(*, debug: bool) -> Iterator[None]:
         sys.stdout.flush()
     except (typer.Exit, SystemExit):
         raise
-    except BrokenPipeError:
-        _discard_output()
-        raise typer.Exit(Exit.PIPE) from None
     except KeyboardInterrupt:
         with _ignoring_full_or_closed_output():
             say("Interrupted.")
         raise typer.Exit(Exit.INTERRUPTED) from None
     except Exception as error:
+        # a repository's own pipe is not our output
+        if isinstance(error, BrokenPipeError) and not isinstance(error, EnvHubError):
+            _discard_output()
+            raise typer.Exit(Exit.PIPE) from None
         with _ignoring_full_or_closed_output():
             _explain(error, debug)
         raise typer.Exit(code_for(error)) from None

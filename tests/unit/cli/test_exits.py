@@ -80,7 +80,7 @@ def test_a_failure_is_one_message(capsys: pytest.CaptureFixture[str]) -> None:
     """
     assert fail(UsageError("say [red]this[/red]"), debug=False) == 2
     assert capsys.readouterr() == ("", "Error: say [red]this[/red]\n")
-    theirs = errors.remote_error("ValueError", "ValueError", "x", "far \x1b away")
+    theirs = errors.remote_error("BrokenPipeError", "BrokenPipeError", "x", "far \x1b away")
     assert fail(theirs, debug=False) == 1
     assert "(--debug shows the traceback)" in capsys.readouterr().err
     fail(theirs, debug=True)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import builtins
 import copy
 import importlib.util
 import pickle
+import traceback
 from typing import Any
 
 import gymnasium as gym
@@ -15,7 +17,13 @@ from gymnasium.vector import AsyncVectorEnv
 from hypothesis import given
 from hypothesis import strategies as st
 
-from envhub_sandbox.errors import RemoteEnvError, RemoteProtocolError, remote_error
+from envhub_sandbox.errors import (
+    LoadError,
+    RemoteEnvError,
+    RemoteProtocolError,
+    load_error,
+    remote_error,
+)
 from envhub_sandbox.transport import values
 from envhub_sandbox.transport.values import spec_of
 from envhub_sandbox.vector.send_recv import SendRecv
@@ -255,6 +263,17 @@ def test_remote_errors_keep_their_text(builtin: str) -> None:
         assert (str(made), made.message, made.traceback) == (str(error), "message", "trace")
         for name in ("errno", "filename", "strerror", "name", "obj", "path"):
             assert getattr(made, name, None) is None
+
+
+def test_remote_errors_are_their_builtin_but_for_what_a_caller_would_miss() -> None:
+    """All that Python has, below OSError, too; no error ends a caller's loop or lacks its text."""
+    kinds = [kind for kind in vars(builtins).values() if isinstance(kind, type)]
+    missed = (StopIteration, StopAsyncIteration, SyntaxError)
+    for kind in (kind for kind in kinds if issubclass(kind, Exception)):
+        error = remote_error(kind.__name__, kind.__name__, "message")
+        assert isinstance(error, kind) is not issubclass(kind, missed)
+        assert isinstance(load_error(kind.__name__, "message"), LoadError)
+        assert "message" in "".join(traceback.format_exception(error))
 
 
 def test_the_proxys_own_names_are_never_served() -> None:
