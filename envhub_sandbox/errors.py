@@ -360,9 +360,7 @@ def _group(kind: Any) -> Any:
     return made
 
 
-_TWINS = {
-    (ours, name): _twin(ours, kind) for ours in _PREFIXES for name, kind in _BUILTINS.items()
-}
+_TWINS = {(ours, name): _twin(ours, kind) for ours in _PREFIXES for name, kind in _BUILTINS.items()}
 for _name in ("UnicodeDecodeError", "UnicodeEncodeError", "UnicodeTranslateError"):
     del _TWINS[LoadError, _name]  # they are made of five arguments, which nothing tells
 if hasattr(builtins, "ExceptionGroup"):  # since Python 3.11

@@ -244,7 +244,7 @@ class InfoWriter:
     ) -> None:
         self._reply = reply
         self._start = start
-        self._count = count
+        self._indices = list(range(count))
         self._pack = pack
         self._joined = joined
         self._integers: Sequence[bool] = ()
@@ -276,16 +276,18 @@ class InfoWriter:
         return size
 
     def _write_columns(self, pairs: Pairs) -> bool:
-        if len(pairs) != self._count:
+        if [index for index, _ in pairs] != self._indices:
             return False
-        keys, types, rows = self._keys, self._types, self._rows
-        for _, info in pairs:
-            if list(info) != keys or list(map(type, info.values())) != types:
+        keys = self._keys
+        if any(list(info) != keys for _, info in pairs):
+            return False
+        columns = list(zip(*[info.values() for _, info in pairs], strict=True))
+        for column, kind in zip(columns, self._types, strict=True):
+            if set(map(type, column)) != {kind}:
                 return False
         try:
-            for index, info in pairs:
-                for row, value in zip(rows, info.values(), strict=True):
-                    row[index] = value
+            for row, column in zip(self._rows, columns, strict=True):
+                row[...] = column
         except OverflowError:  # an integer beyond 64 bit: joining fails of it, or it goes encoded
             return False
         if self._fresh:  # the encoded infos lay here

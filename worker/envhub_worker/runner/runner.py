@@ -25,6 +25,7 @@ from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.stream import Packet, StreamReader, pack_packet
 from envhub_worker.runner import generators, loader, manifest
 from envhub_worker.runner import gymnasium_compat as compat
+from envhub_worker.runner.copies import taken
 from envhub_worker.runner.described import described, raised
 from envhub_worker.runner.lane import Lane
 from envhub_worker.runner.prefixes import WarningLog, Watches
@@ -209,7 +210,10 @@ class Runner:
     def fetch_infos_apart(self, request: m.FetchInfosApart) -> m.Message:
         """The last reset's or step's infos, as each sub-environment gave them."""
         env = self._envs[request.env]
-        return m.Value(tuple(env.pairs) if isinstance(env, SubEnvs) else ())
+        if not isinstance(env, SubEnvs):
+            return m.Value(())
+        # arrays without their class, as in a column: a masked one would be a text
+        return m.Value(tuple((index, taken(info)) for index, info in env.pairs))
 
     def take_apart(self, request: m.TakeApart) -> m.Message:
         """Infos are sent as the only sub-environment gives them from now on."""

@@ -26,6 +26,7 @@ from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES
 from envhub_worker.runner import old_gym
+from envhub_worker.runner.copies import kept, taken
 from envhub_worker.runner.gymnasium_compat import SyncBase
 
 Pairs = list[tuple[int, dict[Any, Any]]]
@@ -175,6 +176,8 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         self._done = [False] * self.num_envs
         self._flagged: list[int] = []  # whose flags are not both False
         self._mode = autoreset_mode
+        self._sync = sync
+        self._shared = sync and self.num_envs > 1  # the next one may fill the same info
         self.sliced = sliced
         self.apart = False
         self.pairs: Pairs = []
@@ -204,7 +207,7 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
                 raise old_gym.explained(error, self.envs[index], "reset") from error
             self.batch.store(index, observation)
             if info:
-                infos.append((index, info))
+                infos.append((index, taken(info) if self._shared else info))
             if self.apart:
                 self.integers = batches.integers(self.single_observation_space, observation)
         return infos
@@ -241,6 +244,7 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
             terminations[index] = truncations[index] = False
         flagged = self._flagged = []
         done = [False] * count
+        shared = self._shared
         infos: Pairs = []
         self.pairs = infos
         index = 0
@@ -258,7 +262,7 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
                         terminations[index] = terminated
                         truncations[index] = truncated
                         if same_step:
-                            infos.append((index, {"final_obs": observation, "final_info": info}))
+                            infos.append((index, self._final(observation, info)))
                             observation, info = env.reset()
                         else:
                             done[index] = True
@@ -271,7 +275,7 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
                 else:
                     store(index, observation)
                 if info:
-                    infos.append((index, info))
+                    infos.append((index, taken(info) if shared else info))
         except BaseException as error:
             batch.carry(index)  # who was not asked any more has his last observation still
             if isinstance(error, ValueError):
@@ -315,6 +319,17 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
             if not self.sliced:
                 raise
             return dict(batches.APART)
+
+    def _final(self, observation: Any, info: Any) -> dict[str, Any]:
+        """What is said of the end of an episode, before the reset that may overwrite it.
+
+        A single environment's is that end's. Of several it is what the class gives that the
+        repository asked for: ``SyncVectorEnv`` copies ``final_info`` here, and ``AsyncVectorEnv``
+        nothing.
+        """
+        if self.apart:
+            return {"final_obs": kept(observation), "final_info": kept(info)}
+        return {"final_obs": observation, "final_info": taken(info) if self._sync else info}
 
     def _each(self, actions: Any) -> Iterator[Any]:
         if self._restores:

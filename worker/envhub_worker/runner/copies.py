@@ -1,0 +1,58 @@
+"""Copies of what an environment returned, made before it, or a sibling, is called again.
+
+Many environments fill one mapping or one array again and again.
+"""
+
+from __future__ import annotations
+
+import sys
+from typing import Any
+
+import numpy as np
+
+_DEPTH = 32
+"""What lies deeper cannot be sent, and may be endless."""
+_FLAT = frozenset({bool, int, float, str, type(None), np.bool_})
+_FLAT |= {np.dtype(char).type for char in "bBhHiIlLqQefd"}
+
+
+def taken(info: dict[Any, Any], depth: int = _DEPTH) -> dict[Any, Any]:
+    """What ``VectorEnv._add_info`` takes at once of an info: the mappings and arrays in it.
+
+    Other objects, and a ``final_obs``, it refers to: they are what they are when they are sent.
+    """
+    if type(info) is not dict:
+        info = dict(info.items())
+    if not depth or _FLAT.issuperset(map(type, info.values())):
+        return info.copy()
+    return {
+        key: taken(value, depth - 1)
+        if isinstance(value, dict)
+        else np.array(value)
+        if isinstance(value, np.ndarray) and key != "final_obs"
+        else value
+        for key, value in info.items()
+    }
+
+
+def kept(value: Any, depth: int = _DEPTH, seen: dict[int, Any] | None = None) -> Any:
+    """A value as it is now, with all containers and arrays in it."""
+    seen = {} if seen is None else seen
+    if id(value) in seen or not depth:
+        return seen.get(id(value), value)
+    if isinstance(value, dict):
+        copy: dict[Any, Any] = {}
+        seen[id(value)] = copy
+        copy.update((key, kept(member, depth - 1, seen)) for key, member in value.items())
+        return copy
+    if isinstance(value, (list, tuple)):
+        members: list[Any] = []
+        seen[id(value)] = members
+        members += [kept(member, depth - 1, seen) for member in value]
+        seen[id(value)] = made = members if isinstance(value, list) else tuple(members)
+        return made
+    if isinstance(value, (np.ndarray, set)):
+        return value.copy()
+    torch = sys.modules.get("torch")
+    is_tensor = torch is not None and isinstance(value, getattr(torch, "Tensor", ()))
+    return value.detach().clone() if is_tensor else value
