@@ -14,6 +14,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -53,7 +54,7 @@ MAX_FILES = 50_000
 _MAX_ROW_BYTES = 2048
 """Of a file in git's listing: its names have no limit there, and each repeats those above it."""
 TIMEOUT_S = 900.0
-"""For one run of git, with all that it downloads."""
+"""For all that git does for one commit."""
 _BLOCK = 1 << 20
 _SAID_BYTES = 1000
 _ROW = re.compile(rb"(\d{6}) (\w+) ([0-9a-f]{40}) +(\d+|-)\t(.+)", re.DOTALL)
@@ -217,10 +218,11 @@ def _checked(url: str) -> str:
 
 
 class _Git:
-    """Git in one folder, with nothing of the user's own settings and logins."""
+    """Git in one folder, within one deadline, with nothing of the user's settings and logins."""
 
     def __init__(self, store: Path, variables: Variables | None) -> None:
         self._store = store
+        self._until = time.monotonic() + TIMEOUT_S
         ours = {"GIT_CONFIG_NOSYSTEM": "1", "GIT_CONFIG_GLOBAL": os.devnull, "HOME": str(store)}
         theirs = os.environ if variables is None else variables
         self._environment = {**_to_the_network(theirs), **ours, **_ALONE}
@@ -271,7 +273,7 @@ class _Git:
             **own_group(),
         ) as process:
             try:
-                process.communicate(given, TIMEOUT_S)
+                process.communicate(given, max(self._until - time.monotonic(), 0))
             finally:
                 kill_group(process)
         if process.returncode:
