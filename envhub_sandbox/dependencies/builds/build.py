@@ -22,7 +22,7 @@ from urllib.parse import unquote, urlsplit
 
 from envhub_sandbox import errors
 from envhub_sandbox.dependencies import environments, interpreters
-from envhub_sandbox.dependencies.builds import download, project, trees, wheels
+from envhub_sandbox.dependencies.builds import apart, download, project, wheels
 from envhub_sandbox.dependencies.builds.wheels import MAX_BYTES
 from envhub_sandbox.dependencies.declared import Source, parse_requirement
 from envhub_sandbox.dependencies.interpreters import Interpreter
@@ -166,10 +166,7 @@ def _fetched(source: Source, place: Path, tell: Tell) -> Path:
         download.check_out(source.url, source.commit, tree, tell)
         return _below(tree, source)
     archive = place / Path(unquote(urlsplit(source.url).path)).name
-    download.download(source.url, source.sha256, archive)
-    top = trees.unpack_tree(archive, tree, _title(source))
-    archive.unlink()
-    return top
+    return apart.fetch(source.url, source.sha256, archive, tree, _title(source))
 
 
 def _below(tree: Path, source: Source) -> Path:
@@ -234,7 +231,8 @@ class _Build:
             folder.chmod(0o755)
             found = _in_jail(self._order(packages, known), folder)
             if isinstance(found, Path):
-                wheels.check(found, self._source.name, self._source.version, self._interpreter)
+                source, interpreter = self._source, self._interpreter
+                apart.check_wheel(found, source.name, source.version, interpreter)
                 return wheels.keep(found, self._source, lock, self._interpreter)
             known = (*known, *found)
         raise BuildFailedError("its backend never has all that it needs")

@@ -1,6 +1,9 @@
 """A folder of a stranger's source files: written file by file, within bounds, without links.
 
 Source distributions and commits of git both come as ``Member``s, which ``write_tree`` writes.
+
+A tar is read by a reader of our own, forwards and once: Python's follows what headers say, also
+backwards where a size is below zero, and unpacks a file from its start for each step back.
 """
 
 from __future__ import annotations
@@ -8,11 +11,14 @@ from __future__ import annotations
 import bz2
 import gzip
 import io
+import itertools
+import re
 import stat
 import tarfile
+import tempfile
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -31,9 +37,10 @@ AT_ONCE = 2**20
 """The most that is read at once: an extended header says its own length."""
 MAX_TABLE = 16 * 2**20
 """Of a zip's table of contents."""
-_HEADERS = 1000
 _PACKINGS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 """How members of a zip may be packed: Python unpacks other ways whole, whatever it is asked for."""
+_LEAST_HEADER = 30
+"""Bytes in a zip before each member."""
 _FAR = 2 * MAX_BYTES
 _BROKEN = (OSError, EOFError, ValueError, zlib.error, tarfile.TarError, zipfile.BadZipFile)
 _BROKEN_ZIP = (RuntimeError, NotImplementedError)  # it is encrypted, or compressed in another way
@@ -43,7 +50,9 @@ _TARS: dict[str, Callable[..., Any]] = {".gz": gzip.open, ".tgz": gzip.open, ".b
 
 @dataclass(frozen=True)
 class Member:
-    """A regular file that is to be written; ``open`` gives a stream of its bytes."""
+    """A regular file that is to be written; ``open`` gives a stream of its bytes, which may have to
+    be read before the next member is asked for.
+    """
 
     path: str
     size: int
@@ -53,22 +62,27 @@ class Member:
 
 def write_tree(members: Iterable[Member], folder: Path, title: str) -> None:
     """Write files below a folder that is there and empty; within bounds, under names that stay in
-    it.
+    it. They have numbers beside it until all names are known.
     """
-    kept = list(_bounded(members, title))
-    try:
-        check_listing_names([FileRecord(one.path, one.size, "") for one in kept], title)
-    except SnapshotError as error:
-        raise PackageIntegrityError(str(error)) from error
-    for member in kept:
-        path = folder / member.path
-        folders.make(path.parent)
-        with member.open() as source, path.open("xb") as target:
-            if copy_bounded(source, target, member.size) != member.size:
-                raise PackageIntegrityError(
-                    f"{title}: {member.path!r} has not the size that it says"
-                )
-        path.chmod(0o755 if member.executable else 0o644)
+    with tempfile.TemporaryDirectory(prefix="unpacked-", dir=folder.parent) as numbered:
+        kept = []
+        for number, member in enumerate(_bounded(members, title)):
+            _write(member, Path(numbered, str(number)), title)
+            kept.append(member.path)
+        try:
+            check_listing_names([FileRecord(path, 0, "") for path in kept], title)
+        except SnapshotError as error:
+            raise PackageIntegrityError(str(error)) from error
+        for number, path in enumerate(kept):
+            folders.make((folder / path).parent)
+            Path(numbered, str(number)).rename(folder / path)
+
+
+def _write(member: Member, path: Path, title: str) -> None:
+    with member.open() as source, path.open("xb") as target:
+        if copy_bounded(source, target, member.size) != member.size:
+            raise PackageIntegrityError(f"{title}: {member.path!r} has not the size that it says")
+    path.chmod(0o755 if member.executable else 0o644)
 
 
 def _bounded(members: Iterable[Member], title: str) -> Iterator[Member]:
@@ -106,8 +120,7 @@ def _members(archive: Path, title: str) -> Iterator[Iterator[Member]]:
             stream: Any = BoundedStream(stack.enter_context(archive.open("rb")), title, MAX_TABLE)
             yield _of_zip(stack.enter_context(zipfile.ZipFile(stream)), title)
         elif opener := _TARS.get(archive.suffix):
-            stream = BoundedStream(stack.enter_context(opener(archive, "rb")), title)
-            yield _of_tar(stack.enter_context(tarfile.open(fileobj=stream, mode="r:")), title)
+            yield _of_tar(_ForwardStream(stack.enter_context(opener(archive, "rb")), title), title)
         else:
             raise PackageIntegrityError(
                 f"{title} is packed as {archive.suffix!r}; .tar.gz, .tar.bz2 and .zip are read"
@@ -115,7 +128,7 @@ def _members(archive: Path, title: str) -> Iterator[Iterator[Member]]:
 
 
 class BoundedStream(io.RawIOBase):
-    """A stream that refuses to be read far, or much at once: an archive says its own lengths."""
+    """A file that refuses to be read far, or much at once: an archive says its own lengths."""
 
     def __init__(self, stream: IO[bytes], title: str, at_once: int = AT_ONCE) -> None:
         self._stream = stream
@@ -131,7 +144,7 @@ class BoundedStream(io.RawIOBase):
         return found
 
     def seek(self, offset: int, whence: int = 0) -> int:
-        """As of every stream; one that is compressed is read up to there."""
+        """As of every file."""
         self._check(offset, _FAR)
         return self._stream.seek(offset, whence)
 
@@ -148,48 +161,143 @@ class BoundedStream(io.RawIOBase):
             raise PackagesTooLargeError(f"{self._title} is too large to be unpacked")
 
 
-def _of_tar(archive: tarfile.TarFile, title: str) -> Iterator[Member]:
-    for count, member in enumerate(archive):
-        if count > 2 * MAX_FILES:
+class _ForwardStream:
+    """A stream that is read once, to its end at the furthest, and not far.
+    ``at``: how much of it has been read.
+    """
+
+    def __init__(self, stream: IO[bytes], title: str) -> None:
+        self._stream = stream
+        self._title = title
+        self.at = 0
+
+    def take(self, size: int, *, may_end: bool = False) -> bytes:
+        """The next so many bytes; none at the end, where that may be here."""
+        if size > AT_ONCE or self.at + size > _FAR:
+            raise PackagesTooLargeError(f"{self._title} is too large to be unpacked")
+        found = self._stream.read(size)
+        if len(found) != size and (found or not may_end):
+            raise PackageIntegrityError(f"{self._title} cannot be unpacked: its end is missing")
+        self.at += len(found)
+        return found
+
+    def skip_to(self, end: int) -> None:
+        """Pass over what is before that."""
+        while self.at < end:
+            self.take(min(AT_ONCE, end - self.at))
+
+    def part(self, size: int, start: int) -> IO[bytes]:
+        """A stream of the next bytes, as long as they are the next."""
+        assert self.at == start, "members are read in their order"
+        return io.BufferedReader(_Part(self, size))
+
+
+class _Part(io.RawIOBase):
+    """So many bytes of a stream."""
+
+    def __init__(self, stream: _ForwardStream, size: int) -> None:
+        self._stream = stream
+        self._left = size
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int:
+        data = self._stream.take(min(len(buffer), self._left, AT_ONCE))
+        buffer[: len(data)] = data
+        self._left -= len(data)
+        return len(data)
+
+
+_TAR_BLOCK = 512
+_REGULAR = (tarfile.REGTYPE, tarfile.AREGTYPE, tarfile.CONTTYPE)
+_PAX = (tarfile.XHDTYPE, tarfile.SOLARIS_XHDTYPE, tarfile.XGLTYPE)
+_LONG = {tarfile.GNUTYPE_LONGNAME: "path", tarfile.GNUTYPE_LONGLINK: "linkpath"}
+_RECORD = re.compile(rb"(\d{1,7}) ([^=]+)=")
+
+
+def _of_tar(stream: _ForwardStream, title: str) -> Iterator[Member]:
+    said: dict[str, str] = {}
+    for count in itertools.count():
+        if count > 4 * MAX_FILES:  # a folder and a file, with a header for each
             raise PackagesTooLargeError(f"{title} has more than {MAX_FILES} files")
-        if len(archive.pax_headers) > _HEADERS:
-            raise PackagesTooLargeError(f"{title} has more than {_HEADERS} headers for all files")
-        # each has a copy of all headers: what is kept must not
-        archive.members.clear()  # type: ignore[attr-defined]  # not in the stubs
-        member.pax_headers = {}
-        if member.isdir():
-            continue
-        if not member.isreg():
-            raise _no_file(title, member.name)
-        path, opened = member.name.removeprefix("./"), partial(_opened, archive, member)
-        yield Member(path, member.size, bool(member.mode & stat.S_IXUSR), opened)
+        block = stream.take(_TAR_BLOCK, may_end=count > 0)
+        if not block.strip(b"\0"):
+            return
+        header = tarfile.TarInfo.frombuf(block, "utf-8", "surrogateescape")
+        size = _size_of(header, said, title)
+        start, end = stream.at, stream.at - -size // _TAR_BLOCK * _TAR_BLOCK
+        if header.type in (*_PAX, *_LONG):
+            said |= _said(header.type, stream.take(size), title)
+        elif header.type in _REGULAR:
+            path = said.get("path", header.name).removeprefix("./")
+            opened = partial(stream.part, size, start)
+            yield Member(path, size, bool(header.mode & stat.S_IXUSR), opened)
+            said = {}
+        elif header.type == tarfile.DIRTYPE:
+            said, end = {}, start  # its size is no length
+        else:
+            raise _no_file(title, said.get("path", header.name))
+        stream.skip_to(end)
 
 
-def _opened(archive: tarfile.TarFile, member: tarfile.TarInfo) -> IO[bytes]:
-    stream = archive.extractfile(member)
-    assert stream is not None
-    return stream
-
-
-def check_zip_member(member: zipfile.ZipInfo, title: str) -> None:
-    """Refuse what is neither file nor folder, and what Python unpacks whole."""
-    kinds = (0, stat.S_IFREG, *([stat.S_IFDIR] if member.is_dir() else []))
-    if stat.S_IFMT(member.external_attr >> 16) not in kinds:
-        raise _no_file(title, member.filename)
-    if member.compress_type not in _PACKINGS:
+def _size_of(header: tarfile.TarInfo, said: dict[str, str], title: str) -> int:
+    """The bytes behind a header; of a file, what the header before it may have said."""
+    size = said.get("size", "") if header.type in _REGULAR else ""
+    if header.size < 0 or not re.fullmatch(r"[0-9]{0,20}", size):
         raise PackageIntegrityError(
-            f"{title} holds {member.filename[:200]!r}, packed in another way, which is not read"
+            f"{title} holds {header.name[:200]!r}, of which the size is none"
         )
+    return int(size or header.size)
+
+
+def _said(kind: bytes, data: bytes, title: str) -> dict[str, str]:
+    """What a header says of the one that follows. For all that follow, none decides anything."""
+    if kind in _LONG:
+        name = data.partition(b"\0")[0].decode("utf-8", "surrogateescape")
+        return {_LONG[kind]: name}
+    said, at = {}, 0
+    while record := _RECORD.match(data, at):
+        end = at + int(record[1])
+        if not record.end() < end <= len(data):
+            break
+        name = record[2].decode("utf-8", "replace")
+        if name.startswith("GNU.sparse") or (kind == tarfile.XGLTYPE and name in ("path", "size")):
+            raise PackageIntegrityError(f"{title} is packed with {name}, which is not read")
+        if name in ("path", "size"):
+            said[name] = data[record.end() : end - 1].decode("utf-8", "surrogateescape")
+        at = end
+    if data[at:].strip(b"\0"):
+        raise PackageIntegrityError(f"{title} cannot be unpacked: a header of it is none")
+    return said
+
+
+def check_zip(members: Sequence[zipfile.ZipInfo], title: str) -> None:
+    """Refuse what is no file or folder, what Python unpacks whole, and what lies in another."""
+    end = 0
+    for member in sorted(members, key=lambda one: one.header_offset):
+        kinds = (0, stat.S_IFREG, *([stat.S_IFDIR] if member.is_dir() else []))
+        if stat.S_IFMT(member.external_attr >> 16) not in kinds:
+            raise _no_file(title, member.filename)
+        if member.compress_type not in _PACKINGS:
+            raise PackageIntegrityError(
+                f"{title} holds {member.filename[:200]!r}, packed in another way, which is not read"
+            )
+        if member.header_offset < end:
+            raise PackageIntegrityError(
+                f"{title} holds {member.filename[:200]!r}, which lies within another file"
+            )
+        end = member.header_offset + _LEAST_HEADER + member.compress_size
 
 
 def _of_zip(archive: zipfile.ZipFile, title: str) -> Iterator[Member]:
-    for member in archive.infolist():
+    members = archive.infolist()
+    check_zip(members, title)
+    for member in members:
         mode = member.external_attr >> 16
-        if member.is_dir():
-            continue
-        check_zip_member(member, title)
-        opened = partial(archive.open, member)
-        yield Member(member.filename, member.file_size, bool(mode & stat.S_IXUSR), opened)
+        if not member.is_dir():
+            opened = partial(archive.open, member)
+            yield Member(member.filename, member.file_size, bool(mode & stat.S_IXUSR), opened)
 
 
 def _no_file(title: str, name: str) -> PackageIntegrityError:

@@ -28,7 +28,7 @@ from packaging import tags
 from packaging.utils import InvalidWheelFilename, canonicalize_name, parse_wheel_filename
 from packaging.version import InvalidVersion, Version
 
-from envhub_sandbox.dependencies.builds.trees import MAX_TABLE, BoundedStream, check_zip_member
+from envhub_sandbox.dependencies.builds.trees import MAX_TABLE, BoundedStream, check_zip
 from envhub_sandbox.dependencies.declared import Source
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.errors import DependencyError, PackageIntegrityError, SnapshotError
@@ -121,8 +121,7 @@ def _files(archive: zipfile.ZipFile) -> None:
         raise PackageIntegrityError(
             f"it holds more than {MAX_FILES} files or {size_text(MAX_UNPACKED)}"
         )
-    for member in members:
-        check_zip_member(member, "it")
+    check_zip(members, "it")
     names = (one.filename + "_" * one.is_dir() for one in members)  # a folder as a file in it
     check_listing_names([FileRecord(name, 0, "") for name in names], "it")
 
