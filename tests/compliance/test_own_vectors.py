@@ -7,10 +7,11 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium.error as gym_errors
+import numpy as np
 import pytest
 
 from envhub_sandbox import make_env
-from envhub_sandbox.errors import RemoteEnvError
+from envhub_sandbox.errors import RemoteEnvError, RemoteEnvWarning
 from tests.support.repositories import write_repository
 
 _OWN = """
@@ -115,7 +116,6 @@ def make_env(n_envs=1, use_async_envs=False):
     return gym.vector.SyncVectorEnv([lambda: gym.wrappers.OrderEnforcing(Old())] * n_envs)
 """
 _RESETS = {
-    "def reset(self): return np.zeros(3)": r"Old.reset \(env.py, line 9\) takes no seed",
     "def reset(self, seed=None, options=None): return np.zeros(3)": r"line 9\) does not return obs",
     "def reset(self, seed=None, options=None): return np.zeros(3), {}": (
         r"Old.step \(env.py, line 11\) does not return observation, reward, terminated, truncated"
@@ -125,7 +125,7 @@ _RESETS = {
 
 @pytest.mark.parametrize("text", _RESETS)
 def test_the_api_of_old_is_named_with_its_line(tmp_path: Path, text: str) -> None:
-    """What ``gym`` before 0.26 had, in an environment of today's Gymnasium."""
+    """What ``gym`` before 0.26 had, in an environment whose ``reset`` looks like today's."""
     folder = write_repository(tmp_path, _OLD.replace("RESET", text))
     with make_env(folder) as suites:
         if "step" in _RESETS[text]:
@@ -133,6 +133,91 @@ def test_the_api_of_old_is_named_with_its_line(tmp_path: Path, text: str) -> Non
         with pytest.raises(RemoteEnvError, match=_RESETS[text]) as caught:
             _ = suites.env.step([0]) if "step" in _RESETS[text] else suites.env.reset()
     assert "0.26" in str(caught.value)
+
+
+_OF_OLD = """
+import gymnasium as gym
+import numpy as np
+from gymnasium.utils import seeding
+
+class Old(gym.Env):
+    observation_space = gym.spaces.Box(0, 1, (3,), np.float64)
+    action_space = gym.spaces.Discrete(2)
+    metadata = {"render.modes": ["rgb_array"]}
+    SEED
+
+    def reset(RESET):
+        BODY
+        self.steps = 0
+        return self.np_random.random(3)
+
+    def step(self, action):
+        self.steps += 1
+        info = {"TimeLimit.truncated": True} if self.steps == 3 and action else {}
+        return self.np_random.random(3), 1.0, self.steps == 3, info
+
+    def render(self, mode="human"):
+        return np.full((2, 2, 3), self.steps, np.uint8) if mode == "rgb_array" else None
+
+class Doubled(gym.Wrapper):
+    def reset(self):
+        return self.env.reset() / 2
+
+    def step(self, action):
+        observation, reward, done, info = self.env.step(action)
+        return observation / 2, 2 * reward, done, info
+
+gym.register("Old-v0", Old, max_episode_steps=2)
+MAKERS = {
+    "bare": Old,
+    "registered": lambda: gym.make("Old-v0"),
+    "wrapped": lambda: gym.wrappers.OrderEnforcing(Doubled(Old())),
+}
+
+class Seen(gym.vector.VectorWrapper):
+    def __init__(self, env):
+        super().__init__(env)
+        self.seen = env.envs[0].action_space
+
+def make_env(n_envs=1, use_async_envs=False, kind="bare", around=None):
+    if around == "single":
+        return MAKERS[kind]()
+    env = gym.vector.SyncVectorEnv([MAKERS[kind]] * n_envs)
+    return Seen(env) if around == "wrapper" else env
+"""
+_SEEDS = {
+    "": "self",
+    "def seed(self, seed=None): self.np_random, _ = seeding.np_random(seed)": "self, options=None",
+    "has_return_info = True": "self, *, seed=None, return_info=False, options=None",
+}
+
+
+@pytest.mark.parametrize("seed", _SEEDS)
+@pytest.mark.parametrize("around", [None, "single", "wrapper"])
+@pytest.mark.parametrize(("kind", "scale"), [("bare", 1), ("registered", 1), ("wrapped", 2)])
+def test_a_reset_of_old_is_converted_and_told(
+    tmp_path: Path, seed: str, around: str, kind: str, scale: int, recwarn: Any
+) -> None:
+    """By its signature, below the first wrapper that is of today."""
+    body = "super().reset(seed=seed)" if "return_info" in seed else "pass"
+    text = _OF_OLD.replace("RESET", _SEEDS[seed]).replace("SEED", seed).replace("BODY", body)
+    expected = np.random.Generator(np.random.PCG64(5)).random((4, 3)) / scale
+    steps = 2 if kind == "registered" else 3  # its time limit
+    folder, kwargs = write_repository(tmp_path, text), {"kind": kind, "around": around}
+    with make_env(folder, n_envs=2, env_kwargs=kwargs) as suites:
+        env = suites.env
+        rows, flags = [env.reset(seed=5)[0][0]], []
+        for _ in range(steps):
+            observation, rewards, over, cut, _ = env.step([1, 0])
+            rows.append(observation[0])
+            flags.append((over.tolist(), cut.tolist()))
+            assert rewards.tolist() == [scale, scale]
+        assert env.render()[0][0, 0, 0] == steps
+    assert np.array_equal(rows, expected[: steps + 1])
+    told = [str(one.message) for one in recwarn if one.category is RemoteEnvWarning]
+    assert len([text for text in told if "as before Gymnasium 0.26" in text]) == 1
+    no, end = [False, False], ([False, True], [True, False])
+    assert flags == ([(no, no), (no, [True, True])] if steps == 2 else [(no, no), (no, no), end])
 
 
 _RAISING = """

@@ -21,6 +21,7 @@ from envhub_sandbox.check.settings import JudgeOptions
 from envhub_sandbox.errors import EnvHubError, LoadError, RemoteEnvError
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
+from envhub_worker.protocol.manifest.names import CONVERTED
 from envhub_worker.protocol.text import printable, size_text
 
 _PICTURED = 12
@@ -86,6 +87,7 @@ class TaskJudge:
         wanted = self._asked.arguments.get("n_envs", 1)
         gave = f"make_env(n_envs={wanted}) gave {self._env.num_envs} sub-environments"
         self._holds("num-envs", self._env.num_envs == wanted, gave)
+        self._converted()
         seen = {"observe": self._sample} if self._sandbox is not None and self._pictured else {}
         self._tell("first play")
         first = self._played(self._env, mode, **seen)
@@ -102,6 +104,15 @@ class TaskJudge:
         self._alone()
         self._compare(first, mode)
         self._leaks()
+
+    def _converted(self) -> None:
+        """Raise it where the sandbox has converted what Gymnasium cannot call."""
+        if isinstance(self._env, SandboxVectorEnv):
+            try:
+                told = self._env.get_attr(CONVERTED)
+            except RemoteEnvError:  # as it should be
+                return
+            raise RemoteEnvError("TypeError", str(told[0]))
 
     def denied(self) -> tuple[str, ...] | None:
         """What was refused so far: also where it ended in an error."""

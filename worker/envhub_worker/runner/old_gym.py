@@ -1,11 +1,12 @@
-"""Environments of ``gym``, Gymnasium's predecessor, as environments of Gymnasium.
+"""Environments of ``gym``, Gymnasium's predecessor, as environments of Gymnasium, and those of
+Gymnasium whose ``reset`` is still that of ``gym``.
 
 ``gym`` is maintained no more, and much of what was published needs it. From 0.21 to 0.26 it changed
 what an environment is, and authors of one release run on another, so that nothing here asks for a
 version. It looks at what an environment takes and gives:
 
 - ``reset`` with ``seed`` where the environment and all its wrappers take one, else ``seed()``
-  before it; with an info or without.
+  before it, and for a class of Gymnasium its ``np_random``; with an info or without.
 - ``step`` with one ``done``, of which ``TimeLimit`` says in the info whether it is a truncation, or
   with two.
 - ``render(mode=...)``, or a ``render_mode`` that was given when it was made.
@@ -23,6 +24,7 @@ import traceback
 import warnings
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -32,6 +34,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.step_api_compatibility import convert_to_terminated_truncated_step_api
 from gymnasium.vector.utils import batch_space, iterate
 
+from envhub_worker.protocol.manifest.names import CONVERTED
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.runner import gymnasium_compat as compat
 from envhub_worker.runner.described import facts_of
@@ -57,8 +60,43 @@ def is_vector(value: object) -> bool:
 
 
 def adapted(env: Any) -> Any:
-    """An environment of ``gym`` as one of Gymnasium; anything else as it is."""
-    return _warned(OldEnv, env) if is_env(env) else env
+    """An environment of ``gym``, or with a ``reset`` as before Gymnasium 0.26, as one of today;
+    any other as it is.
+    """
+    if is_env(env):
+        return _warned(OldEnv, env)
+    above = None
+    for layer in compat.layers(env):
+        if isinstance(layer, gym.Env) and _is_as_before(layer):
+            return _converted(env, above, layer)
+        above = layer
+    return env
+
+
+def _is_as_before(env: Any) -> bool:
+    """Whether its ``reset`` cannot be given what Gymnasium gives, or still has ``return_info``."""
+    parameters = parameters_of(env.reset)
+    if parameters is None:
+        return False
+    lacks = not (takes(parameters, "seed") and takes(parameters, "options"))
+    return lacks or names(parameters, "return_info")
+
+
+def _converted(env: Any, above: Any, layer: Any) -> Any:
+    """``env`` with an ``OldEnv`` around one of its layers, of which the next one is ``above``."""
+    told = f"{_where(layer, 'reset')} is as before Gymnasium 0.26"
+    warnings.warn(
+        f"{told}. It runs through a compatibility wrapper of the sandbox, which seeds it by its "
+        "seed() and np_random where reset takes no seed: a time limit becomes a truncation. To "
+        f"run without it, its author should follow {_GUIDE}",
+        stacklevel=1,
+    )
+    adapter = OldEnv(layer)
+    vars(adapter)[CONVERTED] = told
+    if above is None:
+        return adapter
+    above.env = adapter
+    return env
 
 
 def adapted_vector(env: Any) -> Any:
@@ -85,28 +123,29 @@ class _Reset:
     def __init__(self, env: Any) -> None:
         self._env = env
         self._takes = frozenset(name for name in _OPTIONAL if _passes(env, name))
-        self._seeds = "seed" not in self._takes and _is_seeded(env)
 
     def __call__(self, seed: Any, options: Any) -> tuple[Any, Any]:
         """The observation, and the info where it gives one."""
-        if seed is not None and self._seeds:
-            self._env.seed(seed)
+        if seed is not None and "seed" not in self._takes:
+            self._seed(seed)
         offered = {"seed": seed, "options": options, "return_info": True}
         given = {name: offered[name] for name in self._takes if offered[name] is not None}
         result = self._env.reset(**given)
         return result if self._has_info(result) else (result, {})
+
+    def _seed(self, seed: Any) -> None:
+        *_, innermost = compat.layers(self._env)
+        if isinstance(innermost, gym.Env):
+            gym.Env.reset(innermost, seed=seed)  # its generator, and nothing else
+        # some have a method that takes nothing
+        if parameters_of(getattr(innermost, "seed", None) or (lambda: None)):
+            compat.owner(self._env, "seed").seed(seed)
 
     def _has_info(self, result: Any) -> bool:
         if not isinstance(result, tuple) or len(result) != 2 or not isinstance(result[1], dict):
             return False
         space = self._env.observation_space
         return not (hasattr(space, "spaces") and space.contains(result))
-
-
-def _is_seeded(env: Any) -> bool:
-    """Whether it has a ``seed`` that takes one; some have one that takes nothing."""
-    *_, innermost = compat.layers(env)
-    return bool(parameters_of(getattr(innermost, "seed", None) or (lambda: None)))
 
 
 def _passes(env: Any, name: str) -> bool:
@@ -124,8 +163,14 @@ class OldEnv(gym.Env[Any, Any]):
     """An environment of ``gym``. What Gymnasium's do not have is looked up, and set, in it."""
 
     def __init__(self, env: Any) -> None:
+        # a wrapper of Gymnasium's passes no mode on
+        drawing = [
+            layer
+            for layer in compat.layers(env)
+            if getattr(type(layer), "render", None) is not gym.Wrapper.render
+        ]
         asked = getattr(env, "render_mode", None) is None and all(
-            _takes(layer.render, "mode") for layer in compat.layers(env)
+            _takes(layer.render, "mode") for layer in drawing
         )
         metadata = _metadata_of(env)
         mode = next((mode for mode in _MODES if mode in metadata["render_modes"]), None)
@@ -136,7 +181,7 @@ class OldEnv(gym.Env[Any, Any]):
             metadata=metadata,
             render_mode=mode if asked else getattr(env, "render_mode", None),
             spec=_spec_of(env),
-            _mode={"mode": mode} if asked and mode else {},
+            _draw=partial(drawing[0].render, **({"mode": mode} if asked and mode else {})),
             _reset=_Reset(env),
         )
 
@@ -150,7 +195,7 @@ class OldEnv(gym.Env[Any, Any]):
 
     def render(self) -> Any:
         """In the mode of ``render_mode``."""
-        return self.env.render(**self._mode)
+        return self._draw()
 
     def close(self) -> None:
         """Close the environment."""
@@ -172,8 +217,8 @@ class OldEnv(gym.Env[Any, Any]):
 
     @property
     def np_random_seed(self) -> int:
-        """-1, as Gymnasium says of a generator whose seed is not known."""
-        return -1
+        """Its own, or -1, as Gymnasium says of a generator whose seed is not known."""
+        return int(getattr(self.env, "np_random_seed", -1))
 
     def __getattr__(self, name: str) -> Any:
         if name == "env":  # not there yet, in a copy that is being made
@@ -245,6 +290,8 @@ def _metadata_of(env: Any) -> dict[str, Any]:
 
 def _spec_of(env: Any) -> EnvSpec | None:
     spec = getattr(env, "spec", None)
+    if isinstance(spec, EnvSpec):
+        return spec
     named = getattr(spec, "id", None) is not None
     return EnvSpec(entry_point="", **facts_of(spec)) if named else None
 
@@ -276,6 +323,7 @@ _SPACES: dict[str, Callable[[Any], Any]] = {
 }
 
 
+_GUIDE = "https://gymnasium.farama.org/introduction/migration_guide/"
 _RETURNS = {
     "reset": "observation, info",
     "step": "observation, reward, terminated, truncated, info",
@@ -287,23 +335,23 @@ def explained(error: Exception, env: Any, method: str) -> Exception:
     ``error``: what calling it as of today, and taking its result apart, has raised.
     """
     text = str(error)
-    keyword = "unexpected keyword argument 'seed'" in text or "argument 'options'" in text
     unpacked = "to unpack" in text or "cannot unpack" in text
     frames = traceback.extract_tb(error.__traceback__)
     function = getattr(getattr(type(env.unwrapped), method, None), "__code__", None)
     theirs = any(function and one.filename == function.co_filename for one in frames)
-    if function is None or theirs or not (keyword or unpacked):
+    if function is None or theirs or not unpacked:
         return error
-    where = f"{type(env.unwrapped).__qualname__}.{method} ({_relative(function.co_filename)}, line "
-    where += f"{function.co_firstlineno})"
-    if keyword:
-        what = "takes no seed and options; write: def reset(self, *, seed=None, options=None)"
-    else:
-        what = f"does not return {_RETURNS[method]}"
     return type(error)(
-        f"{where} {what}. That is the API before Gymnasium 0.26; see "
-        f"https://gymnasium.farama.org/introduction/migration_guide/ ({text})"
+        f"{_where(env.unwrapped, method)} does not return {_RETURNS[method]}. That is the API "
+        f"before Gymnasium 0.26; see {_GUIDE} ({text})"
     )
+
+
+def _where(env: Any, method: str) -> str:
+    """A method as its author finds it."""
+    name = f"{type(env).__qualname__}.{method}"
+    code = getattr(getattr(type(env), method), "__code__", None)
+    return f"{name} ({_relative(code.co_filename)}, line {code.co_firstlineno})" if code else name
 
 
 def _relative(name: str) -> str:

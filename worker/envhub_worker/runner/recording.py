@@ -24,6 +24,7 @@ from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv, VectorEnv
 
 from envhub_worker.protocol.records import dataclass
 from envhub_worker.runner import gymnasium_compat as compat
+from envhub_worker.runner import old_gym
 
 _KEY = "_envhub_recording"
 _ANSWERED = frozenset({"unwrapped", "spec", "closed", "close", "num_envs"})
@@ -109,10 +110,17 @@ def _build_after_all(env: Any, cls: type) -> None:
     env.__class__ = cls
     del env.__dict__[_KEY]
     env.__dict__.pop("closed", None)
-    _REAL_INIT[cls](env, **made.arguments)
+    arguments = dict(made.arguments)
+    if made.sync:  # another process could not import what adapts them
+        arguments["env_fns"] = [partial(_adapted, fn) for fn in made.env_fns]
+    _REAL_INIT[cls](env, **arguments)
     env.__dict__.update(kept)
     if closed:  # and looked into only then
         env.close()
+
+
+def _adapted(env_fn: Callable[[], Any]) -> Any:
+    return old_gym.adapted(env_fn())
 
 
 def _lazy_class(cls: type[VectorEnv[Any, Any, Any]]) -> type:

@@ -110,3 +110,7 @@ def string_keys(value: object, what: str) -> dict[str, Any]:
     for key in value:
         checked_name(key, what)
     return value
+
+
+CONVERTED = "envhub_converted"
+"""Of a sub-environment whose ``reset`` Gymnasium cannot call: what the sandbox has converted."""
