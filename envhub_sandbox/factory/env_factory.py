@@ -43,7 +43,9 @@ from envhub_worker.protocol.stream import StreamReader, pack_packet
 if TYPE_CHECKING:
     from envhub_sandbox.session.parts.fleet_session import AnySession
 
-_FORMAT = 1
+_FORMAT = 2
+_APART = ".apart"
+"""What the file beside an entry is called that says so."""
 
 
 class ManifestCache:
@@ -54,8 +56,18 @@ class ManifestCache:
 
     def shard_trials(self, lane: str) -> ShardTrials:
         """What steps of the environments took by this lane, which lies beside the entry."""
-        path = None if self._path is None else self._path.with_suffix(f".{lane}-shards")
-        return ShardTrials(path)
+        if self._path is None:
+            return ShardTrials(None)
+        path = self._path.with_suffix(f".{lane}-shards")
+        return ShardTrials(path, apart=self._path.with_suffix(_APART).exists())
+
+    def note_shared(self) -> None:
+        """Remember that sub-environments need processes of their own, whatever the manifest says.
+        A cache that cannot be written is no error.
+        """
+        if self._path is not None:
+            with contextlib.suppress(OSError):
+                write_whole_file(self._path.with_suffix(_APART), b"")
 
     def load(self, *, max_elements: int) -> Manifest | None:
         """The remembered manifest, if there is one that can be read."""
@@ -162,6 +174,8 @@ class EnvFactory:
         given = repository.snapshot, repository.arguments, repository.policy, launcher.runs_on
         key = manifest_key(*given)
         self._cache = ManifestCache(cache_root() / "manifests", key)
+        if num_workers is None:
+            repository.warnings.note_shared = self._cache.note_shared
 
     def make(self) -> EnvSuites:
         """The environments; a first jail is opened where nothing is remembered of them."""
@@ -181,12 +195,19 @@ class EnvFactory:
         self._cache.save(loaded.value)
         try:
             self._agrees(loaded.manifest)
-            suites = self._suites(loaded.manifest, loaded)
+            suites = self._suites(loaded.manifest, self._unplayed(loaded))
             repository.warnings.show(repository.label)
             return suites
         except BaseException:
             self._launcher.close(loaded)
             raise
+
+    def _unplayed(self, loaded: LoadedJail) -> LoadedJail | None:
+        """The first jail, unless sub-environments were played there: files are not as in others."""
+        if not any(env.shardable and not env.sync for env in loaded.manifest.envs):
+            return loaded
+        self._launcher.close(loaded)
+        return None
 
     def _suites(self, manifest: Manifest, loaded: LoadedJail | None) -> EnvSuites:
         repository = self._repository
@@ -236,9 +257,11 @@ class EnvFactory:
         from envhub_sandbox.session.parts.fleet_session import FleetSession  # which few need
 
         history, unnoted = History(env, self._repository.policy.crash_history), ShardTrials(None)
+        together = self._num_workers is not None or trials.may_share(env)
+        shards = [[rows] if together else _each(*rows) for rows in bounds]
         parts = [
-            EnvSession(source(worker, 1), env, [rows], unnoted, history)
-            for worker, rows in enumerate(bounds)
+            EnvSession(source(worker, len(cut)), env, cut, unnoted, history)
+            for worker, cut in enumerate(shards)
         ]
         return FleetSession(parts, history)
 
@@ -249,6 +272,11 @@ class EnvFactory:
                 sessions[0].prewarm.adopt(loaded)
         else:
             self._launcher.close(loaded)
+
+
+def _each(start: int, stop: int) -> list[tuple[int, int]]:
+    """Each sub-environment as a slice of its own."""
+    return [(index, index + 1) for index in range(start, stop)]
 
 
 def _close_all(shared: Iterable[SharedJail]) -> None:

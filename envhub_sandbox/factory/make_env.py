@@ -113,9 +113,10 @@ def make_env(
             ``["datasets/org/data@<commit>"]``; without a prefix a model, a dataset or a Space. They
             are verified like its own files, and ``snapshot_download`` and ``hf_hub_download`` find
             them without a network. See ``docs/authors.md``.
-        num_workers: Number of processes for the sub-environments. The default is one; with
-            ``use_async_envs`` it is the number that was fastest in the first uses, and with several
-            places in ``sandbox`` it is one for each place.
+        num_workers: Number of processes for the sub-environments. The default is one. With
+            ``use_async_envs`` it is one for each sub-environment, as with ``AsyncVectorEnv``; those
+            that were found to be independent of each other share as many as are fastest. Several
+            places in ``sandbox`` have at least one each.
         prewarm: How many of a suite's next tasks start in the background when a task is first
             reset; this is also the maximum of unused jails. By default one, if tasks are closed
             before the next is reset, on this machine and without a GPU; otherwise none.

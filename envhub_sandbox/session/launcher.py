@@ -37,6 +37,9 @@ if TYPE_CHECKING:
     from envhub_sandbox.transport.connection import WorkerConnection
     from envhub_sandbox.transport.jail import JailHandle
 
+_PLAY_SHARE, _MOST_PLAY_MS = 0.5, 3_600_000
+"""How much of the time for a start may have passed when sub-environments are still played to see
+whether they are independent, and the most of it."""
 _CLOSE_S = 5.0
 _LOST_S = 1.0
 """Likewise, where the connection to the server was lost: one that lives ends by itself a jail that
@@ -293,7 +296,10 @@ class Launcher:
         self, jail: JailHandle, use: ServerUse[WorkerServer], deadline: Deadline
     ) -> LoadedJail:
         runner = jail.runners[0]
-        [reply] = jail.exchange("make_env", [(runner, self.repository.arguments)], deadline)
+        left_s = deadline.left_s()
+        play_ms = _MOST_PLAY_MS if left_s is None else int(left_s * 1000 * _PLAY_SHARE)
+        load = m.replace(self.repository.arguments, play_ms=min(play_ms, _MOST_PLAY_MS))
+        [reply] = jail.exchange("make_env", [(runner, load)], deadline)
         if not isinstance(reply, m.LoadDone):
             raise LoadError(f"the worker answered Load with {type(reply).__name__}")
         elements = self.repository.policy.limits.elements

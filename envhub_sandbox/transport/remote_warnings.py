@@ -9,14 +9,17 @@ from __future__ import annotations
 import sys
 import warnings
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from envhub_sandbox.errors import RemoteEnvWarning
+from envhub_sandbox.settings.options import option_name
 from envhub_worker.protocol.codec.inert import one_line
 from envhub_worker.protocol.codec.wire import Buffer
 from envhub_worker.protocol.messages.prefix import (
     MAX_CATEGORY,
     MAX_TEXT,
+    SHARED_CATEGORY,
+    SHARED_STATE,
     WARNINGS,
     RemoteWarning,
 )
@@ -25,6 +28,11 @@ from envhub_worker.protocol.text import printable
 MOST = 100
 """Different warnings of one repository that are shown."""
 _PACKAGE = __name__.partition(".")[0]
+_SHARED = (
+    "sub-environments that share a process use {} of it, so they may give other results than with "
+    "AsyncVectorEnv, where each has a process. From the next make_env of this commit on each has "
+    f"one here too; {option_name('num_workers', '<n_envs>')} gives each one now"
+)
 _NO_MORE = (
     "Warning",
     f"more than {MOST} different warnings: further ones are only in the worker's output",
@@ -36,10 +44,12 @@ class RemoteWarnings:
 
     Attributes:
         unshown: Those that the caller has not seen yet. Always the same object.
+        note_shared: Called where sub-environments that share a process are not independent.
     """
 
     def __init__(self) -> None:
         self.unshown: deque[RemoteWarning] = deque()
+        self.note_shared: Callable[[], None] | None = None
         self._known: set[RemoteWarning] = set()
 
     def take(self, frames: Sequence[Buffer]) -> Sequence[Buffer]:
@@ -50,7 +60,11 @@ class RemoteWarnings:
         """
         found, rest = WARNINGS.read(frames)
         for one in found:
-            self._collect(one)
+            if one[0] != SHARED_CATEGORY:
+                self._collect(one)
+            elif self.note_shared is not None:
+                self.note_shared()
+                self._collect(("SharedStateWarning", _SHARED.format(SHARED_STATE[one[1]])))
         return rest
 
     def _collect(self, one: RemoteWarning) -> None:

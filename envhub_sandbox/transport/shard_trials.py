@@ -1,10 +1,16 @@
 """Over how many processes an environment's work is spread: what was fastest when it was tried.
 
+Sub-environments that share a process share its global generators, its module and class attributes,
+and whatever else a process has once. So a synchronous environment has one process, as
+``SyncVectorEnv``, and an asynchronous one has a process for each sub-environment, as
+``AsyncVectorEnv``, unless these were shown to be independent (``runner/independence.py``). Only
+then is there a choice, which changes no result.
+
 Each use of a pin cuts its sub-environments into shards in one way, and notes how long a step took.
 The first uses try one way after the other, those that follow have the fastest. Fewer shards win
 where they are nearly as fast: they take less memory, and start sooner. All is tried again where the
 number of cores is another one, or where the same way has become much slower or faster: the load is
-another one then, or the machine. Results never depend on it.
+another one then, or the machine.
 """
 
 from __future__ import annotations
@@ -38,10 +44,12 @@ class ShardTrials:
 
     Args:
         path: The file, or None for what must not be remembered.
+        apart: Whether sub-environments that seemed to be independent were found not to be.
     """
 
-    def __init__(self, path: Path | None) -> None:
+    def __init__(self, path: Path | None, *, apart: bool = False) -> None:
         self._path = path
+        self._apart = apart
         self._cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
 
     def bounds_for(self, env: EnvManifest, num_workers: int | None) -> Bounds:
@@ -55,6 +63,8 @@ class ShardTrials:
             return even_bounds(env.num_envs, 1)
         if num_workers is not None:
             return even_bounds(env.num_envs, max(1, min(num_workers, env.num_envs)))
+        if not self.may_share(env):
+            return even_bounds(env.num_envs, env.num_envs)
         times = self._times(self._read(), env)
         tried: list[tuple[float, Bounds]] = []
         for bounds in ways_to_cut(env.num_envs, self._cores):
@@ -67,9 +77,14 @@ class ShardTrials:
         enough = _NEARLY * min(tried)[0]
         return [bounds for step_s, bounds in tried if step_s <= enough][-1]
 
+    def may_share(self, env: EnvManifest) -> bool:
+        """Whether sub-environments in one process give the same as with a process each."""
+        return env.sync or (env.independent and not self._apart)
+
     def note(self, env: EnvManifest, bounds: Bounds, step_s: float) -> None:
         """Remember what a step took. A cache that cannot be written is no error."""
-        if self._path is None or env.sync or env.num_envs == 1 or not _is_sane(step_s):
+        chosen = not env.sync and env.num_envs > 1 and self.may_share(env)
+        if self._path is None or not chosen or not _is_sane(step_s):
             return  # it must not be remembered, or there is no choice
         entries = self._read()
         times, name = self._times(entries, env), _name(bounds)

@@ -39,6 +39,7 @@ def env_manifest(observation: Space, action: Space, count: int, /, **changes: An
         "num_envs": count,
         "shardable": True,
         "sync": False,
+        "independent": True,
         "single_observation_space": observation,
         "single_action_space": action,
         "observation_space": batch_space(observation, count),

@@ -29,6 +29,7 @@ from envhub_worker.protocol.messages.prefix import (
     CHANGES,
     MAX_ATTRIBUTE,
     MAX_TEXT,
+    SHARED_CATEGORY,
     WARNINGS,
     WATCHED_TYPES,
     Attribute,
@@ -69,6 +70,10 @@ class WarningLog:
             show(message, category, filename, lineno, file, line)
 
         warnings.showwarning = hear
+
+    def note_shared(self, name: str) -> None:
+        """Sub-environments share what has this name in ``SHARED_STATE``."""
+        self.pending.append((SHARED_CATEGORY, name))
 
     def _note(self, message: object, category: type) -> None:
         if len(self._heard) >= _MOST:

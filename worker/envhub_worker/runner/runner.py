@@ -12,6 +12,7 @@ import socket
 from array import array
 from collections.abc import Callable
 from functools import partial
+from time import monotonic
 from typing import Any
 
 import cloudpickle  # type: ignore[import-untyped]
@@ -27,15 +28,19 @@ from envhub_worker.runner import generators, loader, manifest
 from envhub_worker.runner import gymnasium_compat as compat
 from envhub_worker.runner.copies import taken
 from envhub_worker.runner.described import described, raised
+from envhub_worker.runner.independence import are_independent
 from envhub_worker.runner.lane import Lane
 from envhub_worker.runner.prefixes import WarningLog, Watches
 from envhub_worker.runner.recording import standing_in
+from envhub_worker.runner.shared_state import SharedState
 from envhub_worker.runner.sync_envs import Pairs, SubEnvs
 from envhub_worker.runner.tasks import ResultError, Task, tasks_of
 
 _ANCILLARY_BYTES = socket.CMSG_SPACE(8 * array("i").itemsize)
 _RECHECK_MS = 2
 _MOST_WRAPPERS = 100
+_PLAY_S = 20.0
+"""In which sub-environments of all tasks are played, to see whether they are independent."""
 
 
 def main(stream: socket.socket, spec: JailSpec, fds: list[int]) -> int:
@@ -132,7 +137,13 @@ class Runner:
 
     def load(self, request: m.Load) -> m.Message:
         """Import the repository, call ``make_env``, describe what came back."""
-        made = manifest.describe(self._load(request))
+        latest = monotonic() + request.play_ms / 1000
+        tasks = self._load(request)
+        until = min(latest, monotonic() + _PLAY_S)
+        for task in tasks:
+            if task.may_share:
+                task.independent = are_independent(task, self._snapshot, until)
+        made = manifest.describe(tasks)
         return m.LoadDone(encode_manifest(made))
 
     def load_task(self, request: m.LoadTask) -> m.Message:
@@ -159,7 +170,12 @@ class Runner:
     def build(self, request: m.Build) -> m.Message:
         """Build a slice of a task."""
         task = self._tasks[request.suite, request.task]
+        watched = task.may_share and request.stop - request.start > 1
+        shared = SharedState(self._snapshot, self.warned.note_shared) if watched else None
         env = self._envs[request.env] = task.build(request.start, request.stop)
+        if shared is not None:
+            env.shared = shared
+            shared.built(env.envs)
         return m.BuildDone(encode_env(manifest.describe_vector(task, env)))
 
     def reset(self, request: m.Reset) -> m.Message:

@@ -20,7 +20,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from gymnasium.vector.utils import concatenate, create_empty_array, iterate
+from gymnasium.vector.utils import batch_space, concatenate, create_empty_array, iterate
 
 from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.spaces import batches
@@ -28,6 +28,7 @@ from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES
 from envhub_worker.runner import old_gym
 from envhub_worker.runner.copies import kept, taken
 from envhub_worker.runner.gymnasium_compat import SyncBase
+from envhub_worker.runner.shared_state import SharedState
 
 Pairs = list[tuple[int, dict[Any, Any]]]
 """Infos with the index of their sub-environment, in the order in which they came."""
@@ -146,6 +147,12 @@ class Batch:
         empty: Any = create_empty_array(self._space, n=self._count, fn=np.zeros)
         return concatenate(self._space, self._members, empty)
 
+    def members(self) -> list[Any]:
+        """The observation of each."""
+        if not self._slots:
+            return list(self._members)
+        return list(iterate(batch_space(self._space, self._count), self.observation()))
+
 
 class SubEnvs(SyncBase):  # type: ignore[misc]
     """Plain sub-environments, driven with ``SyncVectorEnv``'s semantics.
@@ -158,6 +165,8 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         pairs: The infos of the last reset or step, as each sub-environment gave them.
         driven: What is reset, stepped and drawn: ``envs``, or what freezes them.
         integers: Which discrete members of its last observation are Python's; () unless ``apart``.
+        shared: What they share of a process, looked at after each reset and step; None where that
+            is as it should be.
     """
 
     def __init__(
@@ -182,6 +191,7 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         self.apart = False
         self.pairs: Pairs = []
         self.integers: list[bool] = []
+        self.shared: SharedState | None = None
         self._restores = batches.restores(self.single_action_space)
         self._plain_actions = isinstance(self.single_action_space, ARRAY_SPACES)
 
@@ -210,6 +220,8 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
                 infos.append((index, taken(info) if self._shared else info))
             if self.apart:
                 self.integers = batches.integers(self.single_observation_space, observation)
+        if self.shared is not None:
+            self.shared.look()
         return infos
 
     def run_revive(self, seeds: Any) -> Pairs:
@@ -285,7 +297,14 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         self._done = done
         if self.apart:
             self.integers = batches.integers(self.single_observation_space, observation)
+        if self.shared is not None:
+            self.shared.look()
         return infos
+
+    @property
+    def resets_nothing(self) -> bool:
+        """Whether an episode that has ended stays so until a reset is asked for."""
+        return self._mode == "Disabled"
 
     def render(self) -> Any:
         """One frame each."""

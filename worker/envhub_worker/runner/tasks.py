@@ -49,6 +49,13 @@ class Task:
     """The first sub-environment, when it has been built to learn its spaces."""
     spaces: VectorSpaces | None = None
     """Those of a live environment, once they are known."""
+    independent: bool = False
+    """Whether its sub-environments were shown to change nothing for one another."""
+
+    @property
+    def may_share(self) -> bool:
+        """Whether sub-environments that ask for processes of their own may have to share one."""
+        return self.recording is not None and not self.recording.sync and self.num_envs > 1
 
     @property
     def num_envs(self) -> int:
@@ -59,7 +66,7 @@ class Task:
         """A vector environment of the sub-environments ``start`` to ``stop``."""
         if self.recording is None:
             return self.vector
-        env_fns: list[EnvFn] = [partial(self._one, index) for index in range(start, stop)]
+        env_fns: list[EnvFn] = [partial(self.build_one, index) for index in range(start, stop)]
         if start == 0 and self.probe is not None:
             first, self.probe = self.probe, None
             env_fns[0] = lambda: first
@@ -69,7 +76,7 @@ class Task:
     def learn_spaces(self) -> Any:
         """One sub-environment of a recording, to read spaces and metadata from."""
         if self.probe is None:
-            self.probe = self._one(0)
+            self.probe = self.build_one(0)
         return self.probe
 
     def vector_spaces(self, sides: Sides) -> VectorSpaces:
@@ -86,7 +93,7 @@ class Task:
                 ) from None
         return self.spaces
 
-    def _one(self, index: int) -> Any:
+    def build_one(self, index: int) -> Any:
         """A new sub-environment, as one of Gymnasium's."""
         assert self.recording is not None
         return old_gym.adapted(self.recording.env_fns[index]())

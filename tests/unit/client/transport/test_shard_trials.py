@@ -160,3 +160,23 @@ def test_what_is_no_time_or_no_choice_is_not_remembered(
     nowhere = ShardTrials(None)
     nowhere.note(ENV, [(0, 8), (8, 16)], 1e-3)
     assert nowhere.bounds_for(ENV, None) == [(0, 8), (8, 16)]
+
+
+@pytest.mark.parametrize(
+    ("changes", "apart", "processes"),
+    [
+        ({}, False, 2),
+        ({}, True, 16),
+        ({"independent": False}, False, 16),
+        ({"sync": True, "independent": False}, True, 1),
+    ],
+)
+def test_only_what_changes_nothing_is_left_to_speed(
+    path: Path, changes: dict[str, Any], apart: bool, processes: int
+) -> None:
+    """A process each, unless they are independent, and have not been found to share something."""
+    env, trials = environment(16, **changes), ShardTrials(path, apart=apart)
+    assert len(trials.bounds_for(env, None)) == processes
+    assert len(trials.bounds_for(env, 3)) == 3
+    trials.note(env, trials.bounds_for(env, None), 1e-3)
+    assert path.exists() == (processes == 2)

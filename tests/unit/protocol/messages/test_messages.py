@@ -69,7 +69,7 @@ SAMPLES: list[m.Message] = [
     ),
     m.Packages("made", "00" * 20, {"lock": "sha256:00", "packages": ("scipy==1.11",)}, "made"),
     m.RelayDonePartly((2, 1), (1,)),
-    m.Load(4, True, {"task": "pick"}, {"seed": 1}),
+    m.Load(4, True, {"task": "pick"}, {"seed": 1}, 150_000),
     m.LoadTask(4, True, {"task": "pick"}, {"seed": 1}, "suite", "task"),
     m.LoadDone({"envs": ()}),
     m.Build(1, "suite", "task", 0, 2),

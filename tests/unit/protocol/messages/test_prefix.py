@@ -14,6 +14,7 @@ from envhub_worker.protocol.messages.prefix import (
     MAX_ATTRIBUTE,
     MAX_CATEGORY,
     MAX_TEXT,
+    SHARED_CATEGORY,
     WARNINGS,
     Prefix,
 )
@@ -62,6 +63,7 @@ def test_other_frames_are_a_reply(prefix: Prefix[Any], frames: list[Buffer]) -> 
         warned((["UserWarning"], ["slow"])),
         warned(("x" * (MAX_CATEGORY + 1), "slow")),
         warned(("UserWarning", "x" * (MAX_TEXT + 1))),
+        warned((SHARED_CATEGORY, "\x1b[2Jall your files")),
         warned()[:-1],
         changed(*[CHANGE] * (CHANGES.most + 1)),
         changed("task"),

@@ -47,6 +47,8 @@ class EnvManifest:
         shardable: The worker drives the sub-environments itself, so they can be spread over several
             processes; otherwise the environment has a ``step`` of its own.
         sync: The repository asked for ``SyncVectorEnv``: its sub-environments may share state.
+        independent: Those of an asynchronous one were played apart and together in one process,
+            with equal results; otherwise each needs a process of its own.
         single_observation_space, single_action_space: Spaces of one sub-environment.
         observation_space, action_space: Batched spaces.
         autoreset_mode: ``"NextStep"``, ``"SameStep"``, ``"Disabled"``, or None if not stated.
@@ -62,6 +64,7 @@ class EnvManifest:
     num_envs: int
     shardable: bool
     sync: bool
+    independent: bool
     single_observation_space: gym.Space[Any]
     single_action_space: gym.Space[Any]
     observation_space: gym.Space[Any]
@@ -183,6 +186,7 @@ def _decode_env(value: object, reader: SpaceReader) -> EnvManifest:
         num_envs=num_envs,
         shardable=_typed(fields, "shardable", bool),
         sync=_typed(fields, "sync", bool),
+        independent=_typed(fields, "independent", bool),
         autoreset_mode=mode,
         metadata=read_metadata_facts(fields["metadata"]),
         render_mode=optional_name(fields["render_mode"], "render_mode"),

@@ -24,6 +24,19 @@ WATCHED_TYPES = frozenset({str, bytes, int, bool, type(None)})
 """Values that cannot change from within, and that are the same if they are equal. Floats are not:
 ``0.0 == -0.0``."""
 
+SHARED_CATEGORY = "shared state"
+"""In the place of a warning's category: sub-environments of one process share what the text names.
+No class is called so."""
+SHARED_STATE = {
+    "numpy.random": "numpy's global generator (np.random)",
+    "random": "the global generator of Python's random",
+    "torch": "torch's global generator",
+    "module": "attributes of a module or a class",
+    "environment": "environment variables",
+    "directory": "the working directory",
+}
+"""What a process has once, and how the client calls it."""
+
 RemoteWarning = tuple[str, str]
 """The category's name, and the text."""
 Attribute = tuple[int, str]
@@ -88,6 +101,8 @@ def _warning(value: object) -> RemoteWarning:
     category, text = value
     if len(category) > MAX_CATEGORY or len(text) > MAX_TEXT:
         raise RemoteProtocolError("a warning of the worker is too long")
+    if category == SHARED_CATEGORY and text not in SHARED_STATE:
+        raise RemoteProtocolError("the worker says that nothing known is shared")
     return category, text
 
 

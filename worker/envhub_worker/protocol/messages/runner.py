@@ -17,13 +17,16 @@ stands for the whole, as of an enum's member. ``computed`` has the values of its
 class Load(Message, kind=64, asks="make_env", handed=("cfg", "env_kwargs")):
     """Import the entry file and call its ``make_env``. Reply: ``LoadDone`` or ``RaisedException``.
 
-    ``cfg`` holds the ``vars()`` of the caller's config object, or None; see ``CONFIG_CLASS``.
+    ``cfg`` holds the ``vars()`` of the caller's config object, or None; see ``CONFIG_CLASS``. For
+    ``play_ms`` milliseconds from now on sub-environments may be played to see whether they are
+    independent.
     """
 
     n_envs: int
     use_async_envs: bool
     cfg: dict[str, object] | None
     env_kwargs: dict[str, object]
+    play_ms: int = 0
 
 
 class LoadDone(Message, kind=65):

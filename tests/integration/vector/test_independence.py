@@ -1,0 +1,210 @@
+"""Asynchronous sub-environments: a process each, or shared ones where that is equal."""
+
+from __future__ import annotations
+
+import importlib.util
+import warnings
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from envhub_sandbox import make_env
+from envhub_sandbox.errors import RemoteEnvWarning
+from tests.support import inside
+from tests.support.compare import assert_same
+
+N_ENVS = 3
+REPOSITORY = '''
+import os
+import random
+import time
+
+import gymnasium as gym
+import numpy as np
+
+LOG = []
+SHARED = {"steps": 0}
+
+
+class Scene(gym.Env):
+    """Each step gives one number, which depends on what its kind says."""
+
+    observation_space = gym.spaces.Box(-1e9, 1e9, (1,), np.float64)
+    action_space = gym.spaces.Discrete(2)
+    built = 0
+
+    def __init__(self, kind):
+        self.kind = kind
+        self.own = np.random.default_rng()
+        type(self).built += 1
+        self.number = type(self).built
+        self.gain = 1.0
+        self.late = False
+        self.here = os.getcwd()
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.t = 0
+        if seed is not None and self.kind in SEEDS:
+            SEEDS[self.kind](seed)
+        if self.kind == "directory":
+            os.makedirs(f"{self.here}/{self.number}", exist_ok=True)
+            os.chdir(f"{self.here}/{self.number}")
+        return np.array([0.0]), {}
+
+    def step(self, action):
+        self.t += 1
+        draw = np.random.rand() if self.late else VALUES.get(self.kind, plain)(self)
+        info = {"t": self.t, "object": object(), "clock": time.perf_counter()}
+        return np.array([draw * self.gain]), float(draw), self.t == 5, False, info
+
+
+def plain(scene):
+    return scene.np_random.random()
+
+
+def unseeded(scene):
+    return plain(scene) + scene.own.random() + np.random.default_rng().random()
+
+
+def counted(scene):
+    Scene.total = getattr(Scene, "total", 0) + 1
+    return plain(scene)
+
+
+def logged(scene):
+    LOG.append(scene.t)
+    return len(LOG)
+
+
+def exported(scene):
+    os.environ["SCENE"] = str(scene.number)
+    return plain(scene)
+
+
+def closed_over(scene):
+    SHARED["steps"] += 1
+    return SHARED["steps"]
+
+
+SEEDS = {"numpy": np.random.seed, "random": random.seed}
+VALUES = {
+    "numpy": lambda scene: np.random.rand(),
+    "random": lambda scene: random.random(),
+    "built": lambda scene: scene.number,
+    "unseeded": unseeded,
+    "counted": counted,
+    "logged": logged,
+    "exported": exported,
+    "closed over": closed_over,
+}
+
+
+def make_env(n_envs=1, use_async_envs=False, kind="plain", mode="NEXT_STEP"):
+    cls = gym.vector.AsyncVectorEnv if use_async_envs else gym.vector.SyncVectorEnv
+    return cls(
+        [lambda: gym.wrappers.RecordEpisodeStatistics(Scene(kind))] * n_envs,
+        autoreset_mode=getattr(gym.vector.AutoresetMode, mode),
+    )
+'''
+
+
+@pytest.fixture
+def repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder; nothing is remembered of it."""
+    monkeypatch.setenv("ENVHUB_CACHE", str(tmp_path / "cache"))
+    folder = tmp_path / "repository"
+    folder.mkdir()
+    (folder / "env.py").write_text(REPOSITORY)
+    return folder
+
+
+def processes(repository: Path, **kwargs: Any) -> int:
+    """How many processes its sub-environments have."""
+    with make_env(repository, N_ENVS, use_async_envs=True, **kwargs) as suites:
+        return len(inside.bounds(suites.env))
+
+
+@pytest.mark.parametrize(
+    "env_kwargs",
+    [{"kind": "plain"}, {"kind": "unseeded"}, {"kind": "plain", "mode": "DISABLED"}],
+    ids=str,
+)
+def test_independent_sub_environments_share_processes(
+    repository: Path, env_kwargs: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also those with a clock, a generator of their own and an object without a text in infos."""
+    import os
+
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {0, 1})
+    assert processes(repository, env_kwargs=env_kwargs) == 2
+
+
+KINDS = ["numpy", "random", "built", "counted", "logged", "exported", "directory", "closed over"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_those_that_share_something_have_a_process_each(repository: Path, kind: str) -> None:
+    assert processes(repository, env_kwargs={"kind": kind}) == N_ENVS
+
+
+def play(env: Any) -> list[Any]:
+    """Observations, rewards and flags of some steps, also of the second episodes."""
+    results: list[Any] = [env.reset(seed=7)[0].copy()]
+    for _ in range(12):
+        observation, *rest, _ = env.step(np.zeros(N_ENVS, np.int64))
+        results.append((observation.copy(), *rest))
+    return results
+
+
+@pytest.mark.parametrize("lane", ["auto", "frames"])
+@pytest.mark.parametrize("kind", ["numpy", "random", "logged", "closed over"])
+def test_results_are_those_of_gymnasium_in_every_use(
+    repository: Path, kind: str, lane: str
+) -> None:
+    spec = importlib.util.spec_from_file_location("independence_control", repository / "env.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    control = module.make_env(N_ENVS, use_async_envs=True, kind=kind)
+    expected = play(control)
+    control.close()
+    for _ in range(2):
+        given = {"env_kwargs": {"kind": kind}, "lane": lane, "use_async_envs": True}
+        with make_env(repository, N_ENVS, **given) as suites:
+            assert_same(play(suites.env), expected)
+
+
+@pytest.mark.parametrize("lane", ["auto", "frames"])
+def test_what_is_shared_later_is_said_once_and_separated_from_then_on(
+    repository: Path, lane: str
+) -> None:
+    with make_env(repository, N_ENVS, use_async_envs=True, lane=lane) as suites:
+        env = suites.env
+        env.reset(seed=1)
+        assert len(inside.bounds(env)) < N_ENVS
+        env.step(np.zeros(N_ENVS, np.int64))
+        env.set_attr("late", True)
+        with warnings.catch_warnings(record=True) as heard:
+            warnings.simplefilter("always")
+            for _ in range(3):
+                env.step(np.zeros(N_ENVS, np.int64))
+    [warning] = [one for one in heard if issubclass(one.category, RemoteEnvWarning)]
+    assert "np.random" in str(warning.message)
+    assert "num_workers" in str(warning.message)
+    assert processes(repository, lane=lane) == N_ENVS
+
+
+def test_an_explicit_number_of_processes_holds_and_is_not_watched(repository: Path) -> None:
+    """Nor is a synchronous environment, which shares its process as SyncVectorEnv does."""
+    for given in ({"use_async_envs": True, "num_workers": 1}, {"use_async_envs": False}):
+        with (
+            warnings.catch_warnings(),
+            make_env(repository, N_ENVS, env_kwargs={"kind": "numpy"}, **given) as suites,
+        ):
+            warnings.simplefilter("error")
+            play(suites.env)
+            assert len(inside.bounds(suites.env)) == 1

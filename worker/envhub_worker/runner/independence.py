@@ -1,0 +1,307 @@
+"""Whether the sub-environments of an asynchronous environment may share a process.
+
+``AsyncVectorEnv`` gives each a process. Several of them in one give the same results only where
+none touches what a process has once. No list of names shows that, so it is tried: forks of this
+runner play the sub-environments, once all together and once each alone, with equal seeds and
+actions. They may share a process if every observation, reward, flag and info is equal to the last
+bit, and nothing that ``SharedState`` looks at has changed. What cannot be played within its time
+is heavy, and has no need to share.
+
+The forks begin between the return of ``make_env`` and the first sub-environment that is built,
+where ``AsyncVectorEnv`` forks too, and one at a time: no more sub-environments live at once than
+in use. This process stays as it is; what the forks leave in files goes with the jail, which the
+client does not use any further.
+
+No two plays are equal if they read a clock or the system's entropy: an elapsed time is an info of
+``RecordEpisodeStatistics``, and an unseeded generator of its own makes no sub-environment depend
+on another. In the forks both come from counters, of which each sub-environment has its own.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import copy
+import hashlib
+import os
+import random
+import re
+import select
+import signal
+import time
+import warnings
+from collections import Counter
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from time import monotonic, process_time
+from typing import Any
+
+import numpy as np
+from gymnasium.vector.utils import concatenate, create_empty_array
+
+from envhub_worker.protocol import messages as m
+from envhub_worker.runner.described import described
+from envhub_worker.runner.shared_state import SharedState
+from envhub_worker.runner.sync_envs import SubEnvs
+from envhub_worker.runner.tasks import Task
+
+_BUILD_S = 2.0
+"""Processor time in which all sub-environments of a task are built and reset, or it is heavy."""
+_LEAST_STEPS, _MOST_STEPS = 16, 256
+_LEAST_STEPS_S, _MOST_STEPS_S = 1.0, 0.25
+"""Processor time in which the first are made, or it is heavy, and after which no further one is."""
+_STEPS_AFTER_RESET = 8
+_ALONE = 4
+"""So many of the first sub-environments, and of the last, are played alone."""
+_SEED = 20_261
+_DIGEST_BYTES = 16
+_STEP_BYTES = 4
+_EPOCH_NS = time.time_ns()
+"""Where the clocks of all plays begin."""
+_ADDRESS = re.compile(rb"0x[0-9a-f]{4,}")
+"""In the text of an object that has no other."""
+
+
+def are_independent(task: Task, root: str, until: float) -> bool:
+    """Play a task's sub-environments together and apart, and compare.
+
+    Args:
+        task: Of a recording, of which nothing has been built.
+        root: The repository's folder.
+        until: When to give up, by ``time.monotonic``.
+    """
+    count = task.num_envs
+    together = _in_fork(partial(_play, task, range(count), None, root), count, until)
+    if together is None:
+        return False
+    steps = int.from_bytes(together[:_STEP_BYTES], "little")
+    digests = [together[at:][:_DIGEST_BYTES] for at in _offsets(count)]
+    for index in sorted({*range(count)[:_ALONE], *range(count)[-_ALONE:]}):
+        alone = _in_fork(partial(_play, task, [index], steps, root), 1, until)
+        if alone is None or alone[_STEP_BYTES:] != digests[index]:
+            return False
+    return True
+
+
+def _offsets(count: int) -> Iterable[int]:
+    return range(_STEP_BYTES, _STEP_BYTES + count * _DIGEST_BYTES, _DIGEST_BYTES)
+
+
+def _in_fork(play: Callable[[], bytes], count: int, until: float) -> bytes | None:
+    """What it returns in a fork of this process: the steps, and digests of ``count``.
+    None where that fails, or takes too long.
+    """
+    source, sink = os.pipe()
+    try:
+        with warnings.catch_warnings():  # of threads, which are not in the fork
+            warnings.simplefilter("ignore")
+            pid = os.fork()
+    except OSError:  # no more processes
+        os.close(source)
+        os.close(sink)
+        return None
+    if pid == 0:
+        _play_and_exit(play, sink)
+    os.close(sink)
+    try:
+        return _read(source, _STEP_BYTES + count * _DIGEST_BYTES, until)
+    finally:
+        os.close(source)
+        with contextlib.suppress(OSError):  # with all that it has started
+            os.killpg(pid, signal.SIGKILL)
+        with contextlib.suppress(OSError):
+            os.kill(pid, signal.SIGKILL)
+        with contextlib.suppress(ChildProcessError):  # the repository may reap its children itself
+            os.waitpid(pid, 0)
+
+
+def _play_and_exit(play: Callable[[], bytes], sink: int) -> None:
+    try:
+        os.setpgid(0, 0)
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nowhere, 1)
+        os.dup2(nowhere, 2)
+        os.write(sink, play())
+    finally:
+        os._exit(0)
+
+
+def _read(source: int, size: int, until: float) -> bytes | None:
+    """So many bytes; None if they do not come in time. The end may be held open by processes that
+    the repository has started.
+    """
+    data = b""
+    poller = select.poll()
+    poller.register(source, select.POLLIN)
+    while len(data) < size and (left_s := until - monotonic()) > 0:
+        if poller.poll(left_s * 1000 + 1):
+            part = os.read(source, size - len(data))
+            if not part:
+                return None
+            data += part
+    return data if len(data) == size else None
+
+
+class _HeavyError(Exception):
+    """It takes longer than there is time."""
+
+
+def _play(task: Task, indices: Sequence[int], steps: int | None, root: str) -> bytes:
+    """The number of steps, and a digest of what each sub-environment gave.
+
+    ``steps``: as many; None for as many as there is time for. Raises where it cannot be played,
+    takes too long, or changes what a process has once.
+    """
+    assert task.recording is not None
+    turns, moved = _Turns(), list[str]()
+    turns.replace_sources()
+    state = SharedState(root, moved.append)
+    build = [partial(turns.run, index, partial(task.build_one, index)) for index in indices]
+    if steps is None:
+        build = [partial(_in_time, one) for one in build]
+    envs = SubEnvs(build, task.recording.autoreset_mode, sync=False, sliced=True)
+    envs.driven = [_Turn(turns, index, env) for index, env in zip(indices, envs.envs, strict=True)]
+    state.built(envs.envs)
+    play = _Play(envs, indices)
+    play.reset([_SEED + index for index in indices])
+    if steps is None:
+        _check_time()
+    made = play.step_on(steps)
+    play.reset(None)
+    for _ in range(_STEPS_AFTER_RESET):
+        play.step()
+    state.look_closely()
+    if moved:
+        raise RuntimeError(f"shared: {moved}")
+    return made.to_bytes(_STEP_BYTES, "little") + b"".join(one.digest() for one in play.digests)
+
+
+def _in_time(build: Callable[[], Any]) -> Any:
+    _check_time()
+    return build()
+
+
+def _check_time() -> None:
+    if process_time() > _BUILD_S:
+        raise _HeavyError
+
+
+class _Play:
+    """Plays sub-environments, and takes a digest of what each gives."""
+
+    def __init__(self, envs: SubEnvs, indices: Sequence[int]) -> None:
+        self._envs = envs
+        self.digests = [hashlib.blake2b(digest_size=_DIGEST_BYTES) for _ in indices]
+        self._actions = [copy.deepcopy(envs.single_action_space) for _ in indices]
+        for space, index in zip(self._actions, indices, strict=True):
+            space.seed(_SEED + index)
+
+    def reset(self, seeds: list[int] | None, mask: Any = None) -> None:
+        """Reset them, or those of the mask."""
+        self._note(self._envs.run_reset(seeds, None, mask))
+
+    def step_on(self, steps: int | None) -> int:
+        """Step so many times, or as often as there is time for; returns how often.
+        Raises ``_HeavyError``: that is too seldom.
+        """
+        if steps is not None:
+            for _ in range(steps):
+                self.step()
+            return steps
+        began = process_time()
+        for made in range(_MOST_STEPS):
+            passed_s = process_time() - began
+            if made < _LEAST_STEPS and passed_s > _LEAST_STEPS_S:
+                raise _HeavyError
+            if made >= _LEAST_STEPS and passed_s > _MOST_STEPS_S:
+                return made
+            self.step()
+        return _MOST_STEPS
+
+    def step(self) -> None:
+        """Step all with actions of their own; where nothing else resets what has ended, do so."""
+        envs, space = self._envs, self._envs.single_action_space
+        members = [one.sample() for one in self._actions]
+        empty: Any = create_empty_array(space, n=len(members), fn=np.zeros)
+        self._note(envs.run_step(concatenate(space, members, empty)))
+        ended = envs.batch.terminations | envs.batch.truncations
+        if envs.resets_nothing and ended.any():
+            self.reset(None, ended)
+
+    def _note(self, infos: list[tuple[int, Any]]) -> None:
+        batch, by_row = self._envs.batch, [list[Any]() for _ in self.digests]
+        for row, info in infos:
+            by_row[row].append(info)
+        members = batch.members()
+        for row, digest in enumerate(self.digests):
+            observation = members[row]
+            if type(observation) is np.ndarray and not observation.dtype.hasobject:
+                digest.update(f"{observation.dtype} {observation.shape}".encode())
+                digest.update(observation.tobytes())
+            else:
+                _add(digest, observation)
+            flags = int(batch.terminations[row]), int(batch.truncations[row])
+            digest.update(batch.rewards[row].tobytes() + bytes(flags))
+            if by_row[row]:
+                _add(digest, by_row[row])
+
+
+def _add(digest: hashlib.blake2b, value: object) -> None:
+    frames = m.pack(m.Value(value), describer=described, reduces=True)
+    digest.update(_ADDRESS.sub(b"0x", bytes(frames[0])))
+    for frame in frames[1:]:
+        digest.update(frame)
+
+
+class _Turn:
+    """One sub-environment, as far as it is driven."""
+
+    def __init__(self, turns: _Turns, index: int, env: Any) -> None:
+        self.reset = partial(turns.run, index, env.reset)
+        self.step = partial(turns.run, index, env.step)
+
+
+_OURS = -1
+"""No sub-environment's turn: copies of spaces take entropy, too."""
+
+
+class _Turns:
+    """Whose turn it is, and a clock and a source of entropy for each."""
+
+    def __init__(self) -> None:
+        self._index = _OURS
+        self._ticks: Counter[int] = Counter()
+        self._draws: Counter[int] = Counter()
+
+    def run(self, index: int, call: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
+        """Call something of a sub-environment."""
+        self._index = index
+        try:
+            return call(*args, **kwargs)
+        finally:
+            self._index = _OURS
+
+    def replace_sources(self) -> None:
+        """In this process, for good. Whoever has taken the functions themselves keeps those."""
+        seed = random.Random.seed
+        for name in ("time", "monotonic", "perf_counter", "process_time"):
+            setattr(time, f"{name}_ns", lambda: _EPOCH_NS + self._tick(1_000_000))
+            setattr(time, name, lambda: (_EPOCH_NS + self._tick(1_000_000)) / 1e9)
+        time.sleep = lambda seconds: self._sleep(seconds)
+        os.urandom = random._urandom = self._entropy  # type: ignore[attr-defined]
+
+        def seeded(generator: random.Random, a: Any = None, *args: Any, **kwargs: Any) -> None:
+            seed(generator, self._entropy(16) if a is None else a, *args, **kwargs)
+
+        random.Random.seed = seeded  # type: ignore[assignment]
+
+    def _tick(self, nanoseconds: int) -> int:
+        self._ticks[self._index] += nanoseconds
+        return self._ticks[self._index]
+
+    def _sleep(self, seconds: Any) -> None:
+        self._tick(int(seconds * 1e9))
+
+    def _entropy(self, size: int) -> bytes:
+        self._draws[self._index] += 1
+        key = f"{self._index} {self._draws[self._index]}".encode()
+        return hashlib.shake_128(key).digest(size)

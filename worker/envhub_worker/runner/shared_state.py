@@ -1,0 +1,197 @@
+"""What a process has once, and all sub-environments in it share: whether any of it has moved.
+
+``AsyncVectorEnv`` gives each sub-environment a process, and with it global generators, module and
+class attributes, environment variables and a working directory of its own. Sub-environments that
+share a process share these, so whichever of them changes while they are reset and stepped may
+change the results of all.
+
+The positions of the generators of ``numpy.random`` and ``random`` are compared after each reset
+and step, two words each: whoever draws moves the index, whoever seeds replaces the state. What
+takes longer to read is compared from time to time: a change stays, so it is seen later. Followed:
+``numpy/random/src/mt19937/mt19937.h``, CPython's ``Modules/_randommodule.c``.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import random
+import sys
+from collections.abc import Callable, Iterator
+from itertools import islice
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+_WORDS = 624
+"""Of a Mersenne Twister's state."""
+_FIRST, _MOST_APART = 64, 1 << 16
+"""Resets and steps until the first look at what takes longer to read; each later one is twice as
+far away, up to the second number."""
+_PLAIN = (bool, int, float, complex, str, bytes, type(None))
+_CONTAINERS = (list, dict, set, bytearray)
+_MOST = 1024
+"""Modules and classes that are looked at."""
+
+Words = Callable[[], tuple[int, int]]
+
+
+class SharedState:
+    """Compares what a process has once with what it was when this was made.
+
+    Attributes of modules and classes, environment variables and the working directory count from
+    ``built`` on: whatever is built last leaves its marks there, in a process of its own too.
+
+    Args:
+        root: The repository's folder. Its modules are looked at.
+        report: Called once, with a name of ``SHARED_STATE``.
+    """
+
+    def __init__(self, root: str, report: Callable[[str], None]) -> None:
+        self._root = os.path.join(root, "")
+        self._report: Callable[[str], None] | None = report
+        self._numpy, self._random = _numpy_words(), _random_words()
+        self._before = self._numpy(), self._random()
+        self._torch = _torch_states()
+        self._slow: dict[tuple[str, ...], object] | None = None
+        self._packages: set[str] = set()
+        self._left = self._every = _FIRST
+
+    def built(self, envs: list[Any]) -> None:
+        """All sub-environments exist; the packages that define them are looked at as well."""
+        self._packages = {type(env).__module__.partition(".")[0] for env in _unwrapped(envs)}
+        self._packages -= {"gymnasium", "gym", "builtins", "__main__"}
+        self._slow = self._read()
+        self.look()
+
+    def look(self) -> None:
+        """After a reset or a step: report what has moved."""
+        if self._report is None:
+            return
+        self._left -= 1
+        if (self._numpy(), self._random()) != self._before:
+            self._say("numpy.random" if self._numpy() != self._before[0] else "random")
+        elif not self._left:
+            self.look_closely()
+
+    def look_closely(self) -> None:
+        """As ``look``, also at what takes longer to read."""
+        self._left = self._every = min(2 * self._every, _MOST_APART)
+        if self._report is None or self._slow is None:
+            return
+        if not _are_equal(self._torch, _torch_states()):
+            self._say("torch")
+            return
+        now = self._read()
+        for key, before in self._slow.items():
+            if now.get(key) != before:
+                self._say(key[0])
+                return
+        self._slow = now  # with modules that were imported since
+
+    def _say(self, name: str) -> None:
+        report, self._report = self._report, None
+        if report is not None:
+            report(name)
+
+    def _read(self) -> dict[tuple[str, ...], object]:
+        """By the name in ``SHARED_STATE``, and whose it is."""
+        return {
+            ("environment",): dict(os.environ),
+            ("directory",): _working_directory(),
+            **dict(islice(self._scopes(), _MOST)),
+        }
+
+    def _scopes(self) -> Iterator[tuple[tuple[str, ...], object]]:
+        """The attributes of each module that is looked at, and of each class in it."""
+        for name, module in list(sys.modules.items()):
+            if self._is_looked_at(name, module):
+                own = dict(vars(module))
+                yield ("module", name), _plain(own)
+                for key, value in own.items():
+                    if isinstance(value, type) and value.__module__ == name:
+                        yield ("module", name, key), _plain(dict(vars(value)))
+
+    def _is_looked_at(self, name: str, module: Any) -> bool:
+        if not isinstance(module, ModuleType):
+            return False
+        file = vars(module).get("__file__")
+        ours = isinstance(file, str) and file.startswith(self._root)
+        return ours or name.partition(".")[0] in self._packages
+
+
+def _plain(attributes: dict[str, Any]) -> dict[str, object]:
+    """Values that cannot change from within, and the lengths of containers."""
+    return {
+        name: _READABLE[type(value)](value)
+        for name, value in attributes.items()
+        if type(value) in _READABLE and not name.startswith("__")
+    }
+
+
+_READABLE: dict[type, Callable[[Any], object]] = {
+    **{kind: (lambda value: (type(value), value)) for kind in _PLAIN},
+    **dict.fromkeys(_CONTAINERS, len),
+}
+
+
+def _unwrapped(envs: list[Any]) -> Iterator[Any]:
+    for env in envs:
+        yield getattr(env, "unwrapped", env)
+
+
+def _numpy_words() -> Words:
+    generator = np.random.mtrand._rand._bit_generator
+    if type(generator) is not np.random.MT19937:
+        return _constant
+    words = (ctypes.c_uint32 * (_WORDS + 1)).from_address(generator.ctypes.state_address)
+    return _reader(words, _WORDS, 0, generator)
+
+
+def _random_words() -> Words:
+    generator = random._inst
+    address = id(generator) + object.__basicsize__
+    words = (ctypes.c_uint32 * (1 + _WORDS)).from_address(address)
+    version, state, _ = generator.getstate()
+    if version != 3 or (words[0], words[1], words[_WORDS]) != (state[-1], state[0], state[-2]):
+        return _constant  # another layout
+    return _reader(words, 0, 1, generator)
+
+
+def _reader(words: Any, index: int, first: int, owner: object) -> Words:
+    """Reads two words. ``owner``: what the memory belongs to."""
+    view = memoryview(words).cast("B").cast("I")
+
+    def read(_: object = owner) -> tuple[int, int]:
+        return view[index], view[first]
+
+    return read
+
+
+def _constant() -> tuple[int, int]:
+    """Of a generator whose layout is not known."""
+    return 0, 0
+
+
+def _torch_states() -> list[Any]:
+    """The states of torch's generators; none where it has not been imported."""
+    torch = sys.modules.get("torch")
+    if torch is None or not hasattr(torch, "default_generator"):
+        return []
+    generators = [torch.default_generator]
+    if torch.cuda.is_initialized():
+        generators += torch.cuda.default_generators
+    return [generator.get_state().cpu().numpy().tobytes() for generator in generators]
+
+
+def _are_equal(before: list[Any], now: list[Any]) -> bool:
+    """A library that was imported since has not been drawn from as far as is known."""
+    return all(one == other for one, other in zip(before, now))  # noqa: B905
+
+
+def _working_directory() -> str:
+    try:
+        return os.getcwd()
+    except OSError:
+        return ""
