@@ -208,8 +208,9 @@ error source-uncommitted
     look at or converts, no git LFS pointers instead of files.
     Cure: Commit the files themselves, download them (git lfs pull), or judge the commit.
 note source-ignored
-    Git ignores nothing in the folder. Ignored files are not judged, loaded or pushed.
-    Cure: If it needs none of them, change nothing; otherwise git add --force what it needs.
+    Nothing of the folder is left out: ignored by git, unreadable, or a virtual environment. What
+    is left out is not judged, loaded or pushed.
+    Cure: If it needs none of it, change nothing; otherwise git add --force what it needs.
 note source-outside
     The code names no paths outside its own: homes, /etc, /proc, other programs' tokens.
     Cure: Use only the repository's folder and tempfile; take other paths as arguments.

@@ -70,7 +70,8 @@ def judge(asked: JudgeOptions, report: Report | None = None) -> Report:
     """
     asked.tell(f"reading {asked.reference}")
     where = {name: asked.arguments.get(name) for name in ("hub_cache_dir", "token", "endpoint")}
-    snapshot = snapshot_named(asked.reference, **where)
+    allow = bool(asked.arguments.get("allow_secrets"))
+    snapshot = snapshot_named(asked.reference, allow_secrets=allow, **where)
     report = Report(asked.reference) if report is None else report
     report.reference, report.commit = snapshot.reference, snapshot.commit
     judging = _Judge(asked, snapshot, report)
@@ -102,7 +103,7 @@ def is_moving(reference: str, snapshot: Snapshot) -> bool:
     """Whether it need not mean this commit, or version, for ever; a repository's name can read like
     a commit.
     """
-    if snapshot.repo_type == "local":
+    if snapshot.is_local:
         return False
     revision = HubRef.parse(reference).revision
     return revision is None if snapshot.repo_type == "pypi" else revision != snapshot.commit

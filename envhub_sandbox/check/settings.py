@@ -103,7 +103,7 @@ def _folder_of(reference: str) -> str | None:
     if not is_here(reference):
         return None
     try:
-        return os.path.realpath(split_local(reference)[0])
+        return os.path.realpath(split_local(reference).folder)
     except EnvHubError:
         return None  # nothing is judged: what reads it says why
 

@@ -27,7 +27,7 @@ from envhub_sandbox.dependencies.resolve import WORKERS
 from envhub_sandbox.errors import RequirementError, SnapshotError
 from envhub_sandbox.hub.git.checkout import Checkout, is_unread
 from envhub_sandbox.hub.listing import FileRecord
-from envhub_sandbox.hub.local import LocalFolder
+from envhub_sandbox.hub.local import IGNORED, REPOSITORY, LocalFolder
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.hub.sources import parsing
 from envhub_sandbox.hub.sources.parsing import MOST_BYTES, Import, ParsedFile, imports
@@ -82,7 +82,7 @@ def survey(snapshot: Snapshot, parsed: Mapping[str, ParsedFile | None]) -> Surve
         ending = bytes_of(path, contents.ENDING, max(record.size - contents.ENDING, 0))
         kind = contents.kind_of_contents(record.path, bytes_of(path, contents.BEGINNING), ending)
         found.files.append(File(record, kind))
-        found.add(contents.of_kind(record.path, kind, is_folder=snapshot.repo_type == "local"))
+        found.add(contents.of_kind(record.path, kind, is_folder=snapshot.is_local))
         for one in contents.hidden(record.path, record.path, is_code=True):
             found.add([Finding(one.id, f"its name {one.message}", file=record.path)])
         if record.path in parsed:
@@ -144,11 +144,11 @@ def _unread(record: FileRecord, why: str) -> Finding:
 
 def _in_place(snapshot: Snapshot) -> Iterator[Finding]:
     """Links, and where a folder is not what its commit is."""
-    if snapshot.repo_type != "local":
+    if not snapshot.is_local:
         yield from _links(snapshot)
         return
     try:
-        here = LocalFolder.at(snapshot.repo_id)
+        here = LocalFolder.of(snapshot)
         if here.checkout is None:
             yield from _links_of_folder(here)
             if is_unread(here.root):
@@ -157,7 +157,7 @@ def _in_place(snapshot: Snapshot) -> Iterator[Finding]:
         else:
             yield from _links(snapshot)
             yield from _uncommitted(here.checkout, snapshot)
-            yield from _left_out(here)
+        yield from _left_out(here)
     except OSError as error:
         raise SnapshotError(f"{snapshot.label}: it has changed meanwhile: {error}") from error
 
@@ -191,17 +191,18 @@ def _uncommitted(checkout: Checkout, snapshot: Snapshot) -> Iterator[Finding]:
 
 
 def _left_out(here: LocalFolder) -> Iterator[Finding]:
-    ignored = []
+    left: dict[str, list[str]] = {}
     for one in here.left_out():
-        if one.is_repository:
+        if one.why == REPOSITORY:
             message = "a git repository of its own: the commit around it has none of its files"
             yield Finding("source-uncommitted", message, file=one.path)
         else:
-            ignored.append(one.path)
-    if ignored:
-        more = len(ignored) - _SHOWN_IGNORED
-        shown = ", ".join([*ignored[:_SHOWN_IGNORED], *([f"{more} more"] if more > 0 else [])])
-        yield Finding("source-ignored", f"git leaves out {shown}")
+            left.setdefault(one.why, []).append(one.path)
+    for why, paths in left.items():
+        more = len(paths) - _SHOWN_IGNORED
+        shown = ", ".join([*paths[:_SHOWN_IGNORED], *([f"{more} more"] if more > 0 else [])])
+        begin = "git leaves out" if why == IGNORED else f"left out, {why}:"
+        yield Finding("source-ignored", f"{begin} {shown}")
 
 
 def _in_front(snapshot: Snapshot) -> Iterator[Finding]:

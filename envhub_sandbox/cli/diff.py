@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from envhub_sandbox.hub.snapshot import Snapshot
 
 
-@opt.with_options("env_kwargs", *opt.HUB)
+@opt.with_options("env_kwargs", *opt.SOURCE)
 def diff(
     *,
     then: Annotated[
@@ -65,7 +65,7 @@ def diff(
             tasks = []
             for one in read:
                 bar.begin(f"loading {one.reference} in a sandbox")
-                tasks.append(_tasks(one.snapshot, kwargs, make.hub))
+                tasks.append(_tasks(one.snapshot, kwargs, make.source))
             found += changes.environments(tasks[0], tasks[1])
     if json:
         print_json(changes.document(read[0], read[1], found))

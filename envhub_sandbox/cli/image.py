@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from envhub_sandbox.hub.snapshot import Snapshot
 
 
-@opt.with_options(*opt.HUB)
+@opt.with_options(*opt.SOURCE)
 def build(
     *,
     ref: opt.Ref,
@@ -78,7 +78,7 @@ def _build(
             f"{snapshot.repo_id} declares no packages, so it needs no image of its own. Use "
             f"--sandbox docker:{base}"
         )
-    is_local = snapshot.repo_type == "local"
+    is_local = snapshot.is_local
     name = Path(snapshot.repo_id).name if is_local else snapshot.repo_id
     engine = find_engine(engine_name)
     made = packages.derived(engine, base, request, name=name, system=system, network=network)

@@ -25,7 +25,7 @@ _SPACES = ("single_observation_space", "single_action_space", "observation_space
 _SPACE_TEXT = 2000
 _SHOWN = 40
 _OF_STATIC = {"sarif", "fail_on"}
-_OF_BOTH = {"ref", "static", "json", "token", "endpoint", "hub_cache_dir", "debug"}
+_OF_BOTH = {"ref", "static", "json", "token", "endpoint", "hub_cache_dir", "allow_secrets", "debug"}
 _PLAIN = ("Python", "text")
 _OPTIONS = [key for key in opt.ALL if key not in ("num_workers", "validate", "output")]
 

@@ -48,7 +48,7 @@ NoSpaces = Annotated[
 ]
 
 
-@opt.with_options("dependencies", "env_kwargs", "assets", *opt.HUB)
+@opt.with_options("dependencies", "env_kwargs", "assets", *opt.SOURCE)
 def lock(
     *,
     ref: opt.Ref,
@@ -81,13 +81,13 @@ def lock(
         made = making.locked(snapshot, choice, upgrade=upgrade)
         if not no_spaces:
             kwargs = _kwargs(make["env_kwargs"], old)
-            made = _with_spaces(made, snapshot, kwargs, make.hub)
+            made = _with_spaces(made, snapshot, kwargs, make.source)
         changes = [] if old is None else making.differences(old, made)
         lockfile.write(made, path)
     _print(path, made, changes, old is not None, as_json=json)
 
 
-@opt.with_options(*opt.HUB)
+@opt.with_options(*opt.SOURCE)
 def verify(
     *,
     file: Annotated[Path, typer.Argument(metavar="FILE", help="A lock file of 'envhub lock'.")],
@@ -120,7 +120,7 @@ def verify(
         now = _now(locked, snapshot, no_index=no_index)
         if not (no_spaces or locked.spaces is None or making.differences(locked, now)):
             kwargs = opt.read_env_kwargs([locked.spaces.arguments])
-            now = _with_spaces(locked, snapshot, kwargs, make.hub)
+            now = _with_spaces(locked, snapshot, kwargs, make.source)
         found = making.differences(locked, now)
     if json:
         print_json({"lock": str(file), "reference": snapshot.label, "drift": found})
@@ -146,7 +146,7 @@ def _path(output: Path | None, snapshot: Snapshot) -> Path:
         output = Path(f"pylock.{name}.toml")
     path = Path(os.path.abspath(output))
     inside = Path(snapshot.repo_id).resolve() in path.parent.resolve().joinpath("x").parents
-    if snapshot.repo_type == "local" and inside:
+    if snapshot.is_local and inside:
         raise UsageError(
             f"{path} would be inside the folder that it locks; name another place: --output FILE"
         )

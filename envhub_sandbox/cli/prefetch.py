@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from envhub_sandbox.hub.snapshot import Snapshot
 
 
-@opt.with_options("dependencies", "lock", "assets", *opt.HUB)
+@opt.with_options("dependencies", "lock", "assets", *opt.SOURCE)
 def prefetch(
     *,
     ref: opt.Ref,

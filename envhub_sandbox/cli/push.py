@@ -19,10 +19,6 @@ if TYPE_CHECKING:
 
 _STEPS = 10
 _SHOWN = 5
-_SECRETS = frozenset(
-    {".env", ".git-credentials", ".netrc", ".pypirc", "id_ed25519", "id_rsa", "credentials.json"}
-)
-_SECRET_SUFFIXES = (".pem", ".key")
 _COMPILED = (".pyc", ".pyo")
 _OF_THE_HUB = ".gitattributes"
 """What it puts into a repository that it makes."""
@@ -86,8 +82,6 @@ def _refuse_unfit(snapshot: Snapshot) -> None:
 
 def _unfit(path: str) -> str:
     *folders, name = path.split("/")
-    if name in _SECRETS or name.endswith(_SECRET_SUFFIXES):
-        return "which looks like a secret, and the Hub keeps its history; move it elsewhere"
     if name.endswith(_COMPILED):
         return "which is compiled Python, and runs instead of its source; delete it"
     if ".cache" in folders:

@@ -44,7 +44,7 @@ Grant = Annotated[
 ]
 
 
-@opt.with_options("sandbox", "profile", "python", *opt.HUB)
+@opt.with_options("sandbox", "profile", "python", *opt.SOURCE)
 def replay(
     *,
     bundle: BundleFolder,

@@ -21,6 +21,7 @@ from envhub_sandbox.cli.shared.console import (
     safe_line,
     safe_text,
     say,
+    says_what_is_seen,
 )
 from envhub_sandbox.cli.shared.exits import code_for, describe
 from envhub_sandbox.cli.shared.results import (
@@ -129,7 +130,11 @@ class _Run:
                 from envhub_sandbox.check.play.plays import check_target
 
                 check_target(self.video)
-            with ProgressBar(quiet=self.as_json) as bar, self.make.explained():
+            with (
+                ProgressBar(quiet=self.as_json) as bar,
+                says_what_is_seen(),
+                self.make.explained(),
+            ):
                 self._run(bar)
         except EnvHubError as error:
             self._print(error)

@@ -61,6 +61,7 @@ def make_env(
     limits: Limits | Mapping[str, Any] | None = None,
     token: str | bool | None = None,
     endpoint: str | None = None,
+    allow_secrets: bool = False,
     python: str | Path | None = None,
     dependencies: str | os.PathLike[str] | Mapping[str, Any] = "auto",
     lock: str | os.PathLike[str] | None = None,
@@ -79,7 +80,8 @@ def make_env(
         cfg: A hub reference (``"org/repo@commit:path"``), one of git
             (``"github:org/repo@commit:path"``), an id that a package registers
             (``"pypi:minigrid@3.0.0#MiniGrid-Empty-5x5-v0"``), a local folder (``"./my-env"``), a
-            ``.py`` file (``"env.py"``), or a ``HubEnvConfig``-like object with
+            ``.py`` file (``"env.py"``: of its folder the code sees what that file imports and what
+            git tracks), or a ``HubEnvConfig``-like object with
             ``hub_path``, whose ``vars()`` and public properties the repository's ``make_env``
             gets as ``cfg``.
         n_envs: Number of sub-environments, passed to the repository's ``make_env``.
@@ -98,6 +100,8 @@ def make_env(
         limits: Hard caps; a mapping overrides those of ``policy.limits`` that it names.
         token: As in huggingface_hub.
         endpoint: As in huggingface_hub.
+        allow_secrets: Also take a local folder that holds keys or passwords (``.ssh``, ``.env``,
+            ``*.pem``), or is a home directory: its code sees them.
         python: The interpreter that runs the repository; this one by default. It needs cloudpickle,
             gymnasium, msgpack and numpy beside the repository's own packages.
         dependencies: Where its packages come from. ``"auto"`` installs what it declares and imports
@@ -139,7 +143,7 @@ def make_env(
         HubReferenceError: ``cfg`` cannot be read.
         TypeError, ValueError: A plain argument is invalid.
         SnapshotError: The files cannot be downloaded, or differ from the commit.
-        PolicyError: An unknown or impossible policy, limit or timeout.
+        PolicyError: An unknown or impossible policy, limit or timeout; or a folder that holds keys.
         SandboxUnavailableError: This host cannot enforce the policy.
         LockError: The lock cannot be read; or something differs from it (``LockDriftError``).
         DependencyError: Its packages cannot be installed, or it imports an undeclared one.
@@ -159,7 +163,7 @@ def _make(cfg: Any, given: Options) -> EnvSuites:
         return _make_here(reference, config, options)
     occupy_streams()  # before anything of ours is opened
     wanted = _wanted(options.sandbox, options)
-    snapshot = snapshot_named(reference, **options.hub)
+    snapshot = snapshot_named(reference, **options.source)
     locked = wanted.lock.assets if wanted.lock is not None else ()
     snapshot = with_assets(snapshot, options.assets or locked, options.hub)
     packages = _packages(snapshot, wanted)
@@ -256,7 +260,7 @@ def _make_here(reference: str, config: Any, options: Options) -> EnvSuites:
     if not options.trust_remote_code:
         raise inprocess.refusal(reference)
     options.refuse_sandboxed()
-    snapshot = snapshot_named(reference, **options.hub)
+    snapshot = snapshot_named(reference, **options.source)
     further = dict(options.env_kwargs or {})
     envs = inprocess.make(snapshot, options.n_envs, options.use_async_envs, config, further)
     return EnvSuites(envs, lambda: provenance_of(snapshot, None, []))

@@ -8,6 +8,7 @@ Repository names follow ``huggingface_hub.utils.validate_repo_id``, revisions fo
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Callable
 from typing import NamedTuple
@@ -18,6 +19,8 @@ from envhub_sandbox.system.platform import IS_WINDOWS
 
 DEFAULT_PATH = "env.py"
 REPO_TYPES = ("model", "space", "dataset")
+LOCAL_TYPES = FOLDER, FILE = "local", "file"
+"""Of what is of this machine: a folder, or a file with what is its own."""
 GRAMMAR = "owner/name, owner/name@revision, owner/name:path.py or owner/name@revision:path.py"
 
 _COMMIT = re.compile(r"[0-9a-f]{40}")
@@ -59,6 +62,11 @@ def join(parts: Parts) -> str:
     at = f"@{parts.revision}" if parts.revision is not None else ""
     colon = f":{parts.path}" if parts.path != DEFAULT_PATH else ""
     return f"{prefix}{parts.repo_id}{at}{colon}"
+
+
+def local_reference(repo_type: str, folder: str, path: str) -> str:
+    """The text that means a folder of this machine with its entry file, or the file alone."""
+    return os.path.join(folder, path) if repo_type == FILE else f"{folder}:{path}"
 
 
 def is_commit(revision: str) -> bool:

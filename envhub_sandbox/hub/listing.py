@@ -19,7 +19,14 @@ from pathlib import Path
 from typing import IO, Any, NamedTuple, Protocol, TypeVar
 
 from envhub_sandbox.errors import PolicyError, SnapshotError, SnapshotTooLargeError
-from envhub_sandbox.hub.grammar import REPO_TYPES, Parts, has_control_characters, join
+from envhub_sandbox.hub.grammar import (
+    LOCAL_TYPES,
+    REPO_TYPES,
+    Parts,
+    has_control_characters,
+    join,
+    local_reference,
+)
 from envhub_sandbox.system.platform import wrong_here
 from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.runtime import is_cached_revision
@@ -85,11 +92,12 @@ class Snapshot:
     """A repository's files at one commit: verified, real files, read-only, never imported here.
 
     Attributes:
-        repo_id: ``"owner/name"``; for a local folder its absolute path; for git
-            ``"https://host/org/repo"``; for a package ``"name@version#id"``.
-        repo_type: ``"model"``, ``"space"``, ``"dataset"``, ``"git"``, ``"pypi"`` or ``"local"``.
-        commit: The full commit; for a local folder and for a package that type, ``-``, and a hash
-            of the content.
+        repo_id: ``"owner/name"``; for a local folder, also that of a file, its absolute path; for
+            git ``"https://host/org/repo"``; for a package ``"name@version#id"``.
+        repo_type: ``"model"``, ``"space"``, ``"dataset"``, ``"git"``, ``"pypi"``; ``"local"`` for
+            a folder, ``"file"`` for a file of this machine with what is its own.
+        commit: The full commit; of this machine and for a package ``local-`` or ``pypi-``, and a
+            hash of the content.
         path: The entry file, relative to ``root``, for example ``"env.py"``.
         root: The folder that holds the files (0444 in folders 0555) and nothing else.
         files: Every file below ``root``, sorted by path.
@@ -107,6 +115,11 @@ class Snapshot:
     assets: tuple[Snapshot, ...] = field(default=(), compare=False)
 
     @property
+    def is_local(self) -> bool:
+        """Whether it is of this machine."""
+        return self.repo_type in LOCAL_TYPES
+
+    @property
     def pinned(self) -> str:
         """The repository at its commit, without an entry file: ``"datasets/org/data@COMMIT"``."""
         return f"{self.name}@{self.commit}"
@@ -117,8 +130,8 @@ class Snapshot:
 
         What a package is then depends on the version in it, and on a lock.
         """
-        if self.repo_type == "local":
-            return f"{self.repo_id}:{self.path}"
+        if self.is_local:
+            return local_reference(self.repo_type, self.repo_id, self.path)
         if self.repo_type == "pypi":
             return self.name
         return join(Parts(self.repo_id, self.commit, self.path, self.repo_type))
@@ -143,13 +156,14 @@ class Snapshot:
     @property
     def name(self) -> str:
         """The repository, as a reference begins; of a local folder its path."""
-        kind = self.repo_type
-        plain = kind in ("model", "local")
-        return self.repo_id if plain else join(Parts(self.repo_id, repo_type=kind))
+        is_plain = self.is_local or self.repo_type == "model"
+        return self.repo_id if is_plain else join(Parts(self.repo_id, repo_type=self.repo_type))
 
     @property
     def label(self) -> str:
         """Repository, commit and entry file, for errors."""
+        if self.is_local:
+            return self.reference
         return f"{self._source}:{self.path}"
 
     def known_as(self, path: str) -> str | None:
@@ -157,13 +171,13 @@ class Snapshot:
         found = bisect_left(self.files, path, key=lambda file: file.path)
         if found == len(self.files) or self.files[found].path != path:
             return None
-        if self.repo_type == "local":
+        if self.is_local:
             return f'"{self.repo_id.rstrip("/")}/{path}"'
         return f'"{path}" of {self._source}'
 
     @property
     def _source(self) -> str:
-        by_content = self.repo_type in ("local", "pypi")
+        by_content = self.is_local or self.repo_type == "pypi"
         return self.name if by_content else f"{self.name}@{self.commit[:12]}"
 
 

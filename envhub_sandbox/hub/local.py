@@ -1,40 +1,50 @@
-"""A folder of this machine as the files of a snapshot, so that authors can try before they push.
+"""A folder or a file of this machine as a snapshot, so that authors can try before they push.
 
-In a git checkout these are the files that git would commit, as it would commit them: a link is a
+In a git checkout a folder is the files that git would commit, as it would commit them: a link is a
 file that holds the link's text. Elsewhere it is every file; links that stay inside the folder are
 copied as what they point to, and a link that leaves it is refused, since the jail must see nothing
 but the folder. ``.git`` is in no commit, and left out everywhere, as are sockets and pipes.
+
+A file gives of its folder what is its own (``sources.own``), and what git tracks there. Who names a
+file may have anything beside it, so no link is followed, and no file that holds keys is taken.
 """
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import hashlib
 import os
 import posixpath
 import stat
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 from envhub_sandbox.errors import (
+    PolicyError,
     RepositoryUnavailableError,
     SnapshotError,
     SnapshotTooLargeError,
 )
 from envhub_sandbox.hub.git.checkout import Checkout, read_checkout
-from envhub_sandbox.hub.grammar import DEFAULT_PATH
+from envhub_sandbox.hub.grammar import DEFAULT_PATH, FILE, FOLDER, local_reference
 from envhub_sandbox.hub.listing import (
     DEFAULT_LIMITS,
     MAX_DEPTH,
     SHA256,
     FileRecord,
     HashMismatch,
+    Snapshot,
     check_listing_names,
     copy_verified,
     digest_of,
     listing_within_limits,
 )
+from envhub_sandbox.hub.secrets import is_home, looks_secret
+from envhub_sandbox.settings.options import option_name
 from envhub_worker.protocol.records import dataclass
+from envhub_worker.protocol.text import counted
 
 _GIT = ".git"
 _EXAMPLES = "examples:"
@@ -42,6 +52,18 @@ _ALL_COUNTS = (
     "It is not in a git checkout, so every file in it is included. Move away what does not belong "
     "to the repository, or run 'git init' there and name it in .gitignore"
 )
+_SHOWN = 5
+IGNORED, REPOSITORY = "ignored by git", "a git repository of its own"
+_VENV, _UNREADABLE, _LINK, _SECRET = "a virtual environment", "unreadable", "a link", "keys"
+_CURES = {
+    IGNORED: "Run 'git add --force {path}', or take it out of .gitignore",
+    REPOSITORY: "Name that folder alone",
+    _VENV: "Move it out of there",
+    _UNREADABLE: "Give yourself permission to read it",
+    _LINK: "Put a copy in its place",
+    _SECRET: "Name the folder, with {allow}",
+}
+"""Why something is left out of a snapshot, and how it comes in."""
 
 
 class LocalFile(NamedTuple):
@@ -56,31 +78,49 @@ class LocalFile(NamedTuple):
 
 
 class LeftOut(NamedTuple):
-    """What lies in a checkout and is in no commit of it; a folder has a slash at its end. It is
-    ignored, or a repository of its own, of which git commits a pointer.
-    """
+    """What lies there and is not in the snapshot, and why; a folder has a slash at its end."""
 
     path: str
-    is_repository: bool
+    why: str
+
+
+class Listing(NamedTuple):
+    """The files of a snapshot, sorted, with their records; and what was left out."""
+
+    files: tuple[LocalFile, ...]
+    records: tuple[FileRecord, ...]
+    left_out: tuple[LeftOut, ...]
 
 
 @dataclass(frozen=True)
 class LocalFolder:
     """A folder of this machine, without links in its path; every file counts where git says nothing
     of it.
+
+    Attributes:
+        entry: The file, where a file was named: then it is what that file's code gets to see.
     """
 
     root: Path
     checkout: Checkout | None
+    entry: str | None = None
 
     def __str__(self) -> str:
-        return f"local folder {self.root}"
+        if self.entry is None:
+            return f"local folder {self.root}"
+        return f"local file {self.root / self.entry}"
 
     @classmethod
-    def at(cls, folder: str | Path) -> LocalFolder:
-        """The folder at a path."""
+    def at(cls, folder: str | Path, entry: str | None = None) -> LocalFolder:
+        """The folder at a path, or of it what a file gets to see."""
         root = Path(os.path.realpath(folder))
-        return cls(root, read_checkout(root))
+        return cls(root, read_checkout(root), entry)
+
+    @classmethod
+    def of(cls, snapshot: Snapshot) -> LocalFolder:
+        """What a snapshot is a copy of."""
+        entry = snapshot.path if snapshot.repo_type == FILE else None
+        return cls.at(snapshot.repo_id, entry)
 
     def files(self) -> Iterator[LocalFile]:
         """The files of the snapshot, with ``/`` in their names. A link that leaves the folder is
@@ -88,28 +128,80 @@ class LocalFolder:
         """
         return (one for one in self._found() if isinstance(one, LocalFile))
 
-    def listed(self) -> tuple[tuple[LocalFile, ...], tuple[FileRecord, ...]]:
-        """The files of the snapshot, within limits, and their records, by reading all of them."""
+    def listed(self, *, allow_secrets: bool = False) -> Listing:
+        """The files of the snapshot, within limits, and their records, by reading all of them.
+        Raises ``SnapshotError``: they cannot be read; ``PolicyError``: it is a folder with keys, or
+        a home.
+        """
+        left: list[LeftOut] = []
+        if self.entry is None and not allow_secrets and is_home(self.root):
+            raise self._secret("is a home directory, or has one in it")
         try:
-            found = listing_within_limits(self.files(), DEFAULT_LIMITS, str(self))
+            found = listing_within_limits(self._kept(left), DEFAULT_LIMITS, str(self))
         except OSError as error:
             raise SnapshotError(f"{self}: it cannot be read: {error}") from error
         except SnapshotTooLargeError as error:
             if self.checkout is None:
                 error.args = (f"{error}. {_ALL_COUNTS}",)
             raise
+        secret = [one.path for one in found if self.entry is None and looks_secret(one.path)]
+        if secret and not allow_secrets:
+            raise self._secret(f"holds what looks like keys or passwords: {_shown(secret)}")
         records = tuple(FileRecord(one.path, one.size, _digest(one, str(self))) for one in found)
         check_listing_names(records, str(self))
-        return found, records
+        return Listing(found, records, tuple(left))
+
+    def _secret(self, what: str) -> PolicyError:
+        ignore = ", have git ignore it" if self.checkout else ""
+        return PolicyError(
+            f"{self} {what}. The code would see all of it. Move away what it should not see"
+            f"{ignore}, or name the .py file alone, as {self.root / 'env.py'}, whose code sees of "
+            "its folder only what it imports. If it may see everything here, pass "
+            f"{option_name('allow_secrets', True)}"
+        )
+
+    def _kept(self, left: list[LeftOut]) -> Iterator[LocalFile]:
+        for one in self._found():
+            if isinstance(one, LocalFile):
+                yield one
+            elif not _is_empty_folder(self.root / one.path):
+                left.append(one)
+
+    def seen(self, listing: Listing) -> str:
+        """One line about what the code gets to see."""
+        names = [one.path for one in listing.files]
+        said = f"{self}: the code sees {counted(len(names), 'file')} of "
+        said += "it" if self.entry is None else f"its folder: {_shown(names)}"
+        left = [one for one in listing.left_out if one.why not in (IGNORED, REPOSITORY)]
+        if left:
+            said += f"; left out: {_shown([f'{one.path} ({one.why})' for one in left])}"
+        declares = self.entry is not None and "requirements.txt" not in names
+        if declares and (self.root / "requirements.txt").is_file():
+            said += f"; requirements.txt is not read unless you name the folder, {self.as_folder()}"
+        return said
+
+    def as_folder(self) -> str:
+        """A reference that shows the folder of a file as a whole."""
+        return repr(local_reference(FOLDER, str(self.root), str(self.entry)))
+
+    def advice(self, path: str) -> str:
+        """What to do so that the code sees what is there, by its path."""
+        if self.entry is not None:
+            return (
+                f"{path!r} is there, in {self.root}, but a file that is named alone shows the code "
+                "only what it imports, and what git tracks. To show it the whole folder, name that "
+                f"with its entry: {self.as_folder()}"
+            )
+        what, cure = self.why_left_out(path) or (f"has {path!r} now", "Make the environment again")
+        return f"{self} {what}. {cure}"
 
     def why_left_out(self, path: str) -> tuple[str, str] | None:
-        """What to say of a file that is there, and that git would not commit."""
+        """What to say of a file that is there, and that is not in the snapshot, and what to do."""
         for one in self.left_out():
             if f"{path}/".startswith(f"{one.path.rstrip('/')}/"):
-                what = f"has the file {path!r}, but git would not commit it"
-                if one.is_repository:
-                    return what, f"{one.path} is a separate git repository; name that one"
-                return what, f"Run 'git add --force {path}', or take it out of .gitignore"
+                allow = option_name("allow_secrets", True)
+                what = f"has the file {path!r}, but left it out: {one.path} is {one.why}"
+                return what, _CURES[one.why].format(path=path, allow=allow)
         return None
 
     def left_out(self) -> Iterator[LeftOut]:
@@ -118,9 +210,27 @@ class LocalFolder:
         return (one for one in found if not _is_empty_folder(self.root / one.path))
 
     def _found(self) -> Iterator[LocalFile | LeftOut]:
+        if self.entry is not None:
+            found = self._of_the_file(self.entry)
+            return (LeftOut(one.path, _SECRET) if looks_secret(one.path) else one for one in found)
         if self.checkout is None:
             return self._all(self.root, "", (self.root,))
         return self._committed(self.checkout, self.root, "")
+
+    def _of_the_file(self, entry: str) -> Iterator[LocalFile | LeftOut]:
+        from envhub_sandbox.hub.sources.own import own_files
+
+        if self.checkout is None:
+            own = own_files(self.root, entry, _names_below(self.root))
+            for name in sorted(own):
+                yield from self._one(self.root / name, name, (self.root,))
+            return
+        own = own_files(self.root, entry, self.checkout.names_in)
+        folders = tuple(name for name in own if name.endswith("/"))
+        for one in self._committed(self.checkout, self.root, ""):
+            is_tracked = one.path in self.checkout.tracked
+            if is_tracked or one.path in own or one.path.startswith(folders):
+                yield one
 
     def _committed(
         self, checkout: Checkout, folder: Path, prefix: str
@@ -128,32 +238,49 @@ class LocalFolder:
         for item in self._items(folder, prefix):
             name, path = prefix + item.name, Path(item.path)
             mode = item.stat(follow_symlinks=False).st_mode
-            if stat.S_ISDIR(mode) and name in checkout.folders:
-                yield from self._committed(checkout, path, f"{name}/")
+            if stat.S_ISDIR(mode) and name not in checkout.folders:
+                is_repository = name in checkout.files
+                yield LeftOut(f"{name}/", REPOSITORY if is_repository else IGNORED)
+            elif stat.S_ISDIR(mode) and _is_venv(path) and not checkout.tracks_below(name):
+                yield LeftOut(f"{name}/", _VENV)
             elif stat.S_ISDIR(mode):
-                yield LeftOut(f"{name}/", is_repository=name in checkout.files)
+                yield from self._committed(checkout, path, f"{name}/")
             elif not (stat.S_ISREG(mode) or stat.S_ISLNK(mode)):
                 continue  # git knows no sockets, pipes and devices
             elif name not in checkout.files:
-                yield LeftOut(name, is_repository=False)
+                yield LeftOut(name, IGNORED)
             elif stat.S_ISLNK(mode):
-                if name in checkout.untracked:
-                    self._refuse_environment(path, name)
                 text = os.fsencode(os.readlink(path))
                 yield LocalFile(name, path, len(text), text)
-            else:
+            elif name in checkout.tracked or os.access(path, os.R_OK):
                 yield LocalFile(name, path, item.stat(follow_symlinks=False).st_size)
+            else:  # a commit has what is tracked, so nothing of that is left out
+                yield LeftOut(name, _UNREADABLE)
 
-    def _all(self, folder: Path, prefix: str, above: tuple[Path, ...]) -> Iterator[LocalFile]:
+    def _all(
+        self, folder: Path, prefix: str, above: tuple[Path, ...]
+    ) -> Iterator[LocalFile | LeftOut]:
         for item in self._items(folder, prefix):
-            name = prefix + item.name
-            source = self._inside(item, name)
-            if source.is_dir():
-                if source in above:
-                    raise SnapshotError(f"{self}: the link {name!r} leads to a loop")
-                yield from self._all(source, f"{name}/", (*above, source))
-            elif source.is_file():
-                yield LocalFile(name, source, source.stat().st_size)
+            yield from self._one(Path(item.path), prefix + item.name, above)
+
+    def _one(self, path: Path, name: str, above: tuple[Path, ...]) -> Iterator[LocalFile | LeftOut]:
+        name = name.rstrip("/")
+        if path.is_symlink() and self.entry not in (None, name):
+            yield LeftOut(name, _LINK)
+            return
+        source = self._inside(path, name)
+        if source.is_dir() and _is_venv(source):
+            yield LeftOut(f"{name}/", _VENV)
+        elif source.is_dir() and not os.access(source, os.R_OK | os.X_OK):
+            yield LeftOut(f"{name}/", _UNREADABLE)
+        elif source.is_dir():
+            if source in above:
+                raise SnapshotError(f"{self}: the link {name!r} leads to a loop")
+            yield from self._all(source, f"{name}/", (*above, source))
+        elif source.is_file() and os.access(source, os.R_OK):
+            yield LocalFile(name, source, source.stat().st_size)
+        elif source.is_file():
+            yield LeftOut(name, _UNREADABLE)
 
     def _items(self, folder: Path, prefix: str) -> list[os.DirEntry[str]]:
         if prefix.count("/") >= MAX_DEPTH:
@@ -161,31 +288,50 @@ class LocalFolder:
         with os.scandir(folder) as listing:
             return sorted((one for one in listing if one.name != _GIT), key=lambda one: one.name)
 
-    def _inside(self, item: os.DirEntry[str], name: str) -> Path:
-        if not item.is_symlink():
-            return Path(item.path)
+    def _inside(self, path: Path, name: str) -> Path:
+        if not path.is_symlink():
+            return path
         try:
-            source = Path(os.path.realpath(item.path, strict=True))
+            source = Path(os.path.realpath(path, strict=True))
         except OSError as error:
             raise SnapshotError(f"{self}: the link {name!r} points nowhere; remove it") from error
         if not source.is_relative_to(self.root) or _GIT in source.relative_to(self.root).parts:
-            self._refuse_environment(Path(item.path), name)
             raise SnapshotError(
                 f"{self}: the link {name!r} points outside the folder (to {source}), where a "
                 "sandbox cannot read; put a copy in its place"
             )
         return source
 
-    def _refuse_environment(self, link: Path, name: str) -> None:
-        """A virtual environment is no part of a repository, and has links to its interpreter."""
-        inside = (one for one in link.parents if one.is_relative_to(self.root))
-        found = next((one for one in inside if (one / "pyvenv.cfg").is_file()), None)
-        if found is not None:
-            raise SnapshotError(
-                f"{self}: {name!r} belongs to a virtual environment. Move {found} elsewhere, or "
-                f"have git ignore it: name '{found.name}/' in .gitignore, after 'git init' if this "
-                "is not a checkout yet"
-            )
+
+def _shown(names: Collection[str]) -> str:
+    more = len(names) - _SHOWN
+    return ", ".join([*sorted(names)[:_SHOWN], *([f"{more} more"] if more > 0 else [])])
+
+
+def _is_venv(folder: Path) -> bool:
+    """Whether it is a virtual environment that was made here, as no commit can have one: its
+    interpreter is a link, or a program of Windows.
+    """
+    programs = os.path.islink(folder / "bin/python") or (folder / "Scripts/python.exe").is_file()
+    return programs and (folder / "pyvenv.cfg").is_file()
+
+
+def _names_below(root: Path) -> Callable[[str], Collection[str]]:
+    """Gives the names of the files in a folder below ``root``; no link counts, or is followed."""
+
+    @functools.cache
+    def names(folder: str) -> Collection[str]:
+        path = root / folder
+        is_plain = not folder or all(map(str.isidentifier, folder.split("/")))
+        if not is_plain or os.path.realpath(path) != str(path):
+            return ()
+        try:
+            with os.scandir(path) as listing:
+                return frozenset(one.name for one in listing if one.is_file(follow_symlinks=False))
+        except OSError:
+            return ()
+
+    return names
 
 
 def _is_empty_folder(path: Path) -> bool:
@@ -195,29 +341,58 @@ def _is_empty_folder(path: Path) -> bool:
         return False  # what may not be read may hold anything
 
 
-def split_local(text: str) -> tuple[Path, str]:
-    """The folder and entry of ``./env``, ``./env:sub/env.py``, ``./x/other.py``, ``examples:x``."""
+class LocalPath(NamedTuple):
+    """What a reference means here: a folder, its entry file, and whether only that was named."""
+
+    folder: Path
+    path: str
+    is_file: bool = False
+
+    def listed(self, *, allow_secrets: bool = False) -> tuple[LocalFolder, Listing]:
+        """What its code gets to see; raises as ``LocalFolder.listed``."""
+        here = LocalFolder.at(self.folder, self.path if self.is_file else None)
+        return here, here.listed(allow_secrets=allow_secrets)
+
+    @property
+    def repo_type(self) -> str:
+        """Of its snapshot."""
+        return FILE if self.is_file else FOLDER
+
+
+def split_local(text: str) -> LocalPath:
+    """What ``./env``, ``./env:sub/env.py``, ``./x/other.py`` or ``examples:x`` means."""
     if text.startswith(_EXAMPLES):
         text = str(_example(text))
     folder = Path(os.path.abspath(os.path.expanduser(text)))
     if folder.is_dir():
-        return folder, DEFAULT_PATH
+        return LocalPath(folder, DEFAULT_PATH)
     if folder.is_file():
         if folder.suffix != ".py":
             raise RepositoryUnavailableError(
                 f"local file {text!r}: an entry is a .py file, or a folder with an env.py"
             )
-        return folder.parent, folder.name
+        return LocalPath(folder.parent, folder.name, is_file=True)
     before, colon, after = text.rpartition(":")
     if colon and before and after:
         inner = Path(os.path.abspath(os.path.expanduser(before)))
         if inner.is_dir():  # on Windows the path may be written with backslashes
-            return inner, posixpath.normpath(after.replace(os.sep, "/"))
+            return LocalPath(inner, posixpath.normpath(after.replace(os.sep, "/")))
     raise RepositoryUnavailableError(
         f"local folder {text!r}: there is no such folder or file here (looked for {folder}). "
         "Write './folder', './folder:path/env.py' or './folder/env.py'; a repository of the Hub "
-        "is owner/name"
+        f"is owner/name{_similar(folder)}"
     )
+
+
+def _similar(path: Path) -> str:
+    """A question about what has nearly that name."""
+    import difflib
+
+    with contextlib.suppress(OSError):
+        names = [one.name for one in path.parent.iterdir() if one.suffix == ".py" or one.is_dir()]
+        close = difflib.get_close_matches(path.name, names, n=1)
+        return f". Did you mean {str(path.parent / close[0])!r}?" if close else ""
+    return ""
 
 
 def _example(text: str) -> Path:

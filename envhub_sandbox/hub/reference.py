@@ -14,7 +14,16 @@ import re
 from envhub_sandbox.errors import HubReferenceError
 from envhub_sandbox.hub import grammar, registered
 from envhub_sandbox.hub.git import address
-from envhub_sandbox.hub.grammar import DEFAULT_PATH, REPO_TYPES, Parts, Wrong, is_commit, is_local
+from envhub_sandbox.hub.grammar import (
+    DEFAULT_PATH,
+    LOCAL_TYPES,
+    REPO_TYPES,
+    Parts,
+    Wrong,
+    is_commit,
+    is_local,
+    local_reference,
+)
 from envhub_worker.protocol.records import dataclass
 
 __all__ = ["DEFAULT_PATH", "REPO_TYPES", "HubRef", "is_local", "pinned"]
@@ -95,8 +104,8 @@ class HubRef:
 
 def pinned(repo_type: str, repo_id: str, commit: str, path: str) -> str:
     """``Snapshot.reference``, by what a provenance says of it, which may be a stranger's."""
-    if repo_type == "local":
-        return f"{repo_id}:{path}"
+    if repo_type in LOCAL_TYPES:
+        return local_reference(repo_type, repo_id, path)
     if repo_type == registered.KIND:
         return str(HubRef.parse(f"{repo_type}:{repo_id}"))
     return str(HubRef(repo_id, commit, path, repo_type))

@@ -26,6 +26,7 @@ from envhub_sandbox.hub import store as store
 from envhub_sandbox.hub.answers import ABSENT, UNREACHABLE, HubFailure, Kind
 from envhub_sandbox.hub.client import HubClient, checked_endpoint, checked_token
 from envhub_sandbox.hub.git import address
+from envhub_sandbox.hub.grammar import FOLDER
 from envhub_sandbox.hub.listing import (
     DEFAULT_LIMITS,
     SHA256,
@@ -39,7 +40,7 @@ from envhub_sandbox.hub.listing import (
     listing_within_limits,
 )
 from envhub_sandbox.hub.reference import DEFAULT_PATH, HubRef, is_local
-from envhub_sandbox.system.log import SNAPSHOT
+from envhub_sandbox.system.log import SNAPSHOT, tell
 from envhub_worker.protocol.records import dataclass
 
 __all__ = ["FileRecord", "Snapshot", "SnapshotLimits", "fetch", "local"]
@@ -50,14 +51,14 @@ _SHOWN_FILES = 20
 T = TypeVar("T")
 
 
-def snapshot_named(reference: str, **hub: Any) -> Snapshot:
+def snapshot_named(reference: str, *, allow_secrets: bool = False, **hub: Any) -> Snapshot:
     """The snapshot of a hub reference or of a local folder; raises as ``fetch`` and ``local`` do.
 
     The path of a ``.py`` file that is here means that file. A reference that is also a folder here
     gets a hint. ``hub`` are ``hub_cache_dir``, ``token`` and ``endpoint``, as ``fetch`` takes them.
     """
     if is_here(reference):
-        return local(reference)
+        return local(reference, allow_secrets=allow_secrets)
     try:
         return fetch(HubRef.parse(reference), **hub)
     except (HubReferenceError, SnapshotError) as error:
@@ -72,17 +73,17 @@ def is_here(reference: str) -> bool:
     return is_local(reference) or (reference.endswith(".py") and os.path.isfile(reference))
 
 
-def commit_of(reference: str, **hub: Any) -> str:
+def commit_of(reference: str, *, allow_secrets: bool = False, **hub: Any) -> str:
     """The commit that a reference means now; raises as ``snapshot_named`` does.
 
     Nothing is downloaded or copied, and a full commit costs no request. Whether it has the entry
     file is not looked at.
     """
     if is_here(reference):
-        from envhub_sandbox.hub.local import LocalFolder, split_local
+        from envhub_sandbox.hub.local import split_local
 
-        root, _ = split_local(reference)
-        return f"local-{content_digest(LocalFolder.at(root).listed()[1])}"
+        _, listing = split_local(reference).listed(allow_secrets=allow_secrets)
+        return f"{FOLDER}-{content_digest(listing.records)}"
     ref = HubRef.parse(reference)
     if ref.repo_type == registered.KIND:
         return fetch(ref).commit
@@ -203,26 +204,34 @@ def _in_store(candidates: Sequence[_Candidate], even_if_none: bool) -> str:
     return f" These are in the store and need no Hub: {shown}."
 
 
-def local(folder: str | Path) -> Snapshot:
+def local(folder: str | Path, *, allow_secrets: bool = False) -> Snapshot:
     """Copy a folder of this machine into the store, by content: unchanged is the same snapshot.
 
-    It may also be ``folder:path/env.py``, or a ``.py`` file (whose folder is taken). In a git
-    checkout that is what git would commit, and elsewhere every file; see ``hub.local``.
+    It may also be ``folder:path/env.py``. Of a ``.py`` file it is what the file imports of its
+    folder, and what git tracks there. In a git checkout a folder is what git would commit, and
+    elsewhere every file; see ``hub.local``. What the code gets to see is told in a line.
+
+    Args:
+        allow_secrets: Whether a folder may hold keys or be a home directory.
 
     Raises:
         RepositoryUnavailableError: There is no such folder or entry file.
-        SnapshotError: A link leaves the folder, a file cannot be read, or has a name that the Hub
-            cannot have; ``SnapshotTooLargeError`` over the limits.
+        SnapshotError: A link leaves the folder, or a file has a name that the Hub cannot have;
+            ``SnapshotTooLargeError`` over the limits.
+        PolicyError: The folder holds keys, or is a home directory.
     """
-    from envhub_sandbox.hub.local import LocalFolder, copier, split_local  # no pin needs it
+    from envhub_sandbox.hub.local import copier, split_local  # no pin needs it
 
-    root, path = split_local(str(folder))
-    here = LocalFolder.at(root)
-    found, files = here.listed()
+    named = split_local(str(folder))
+    here, listing = named.listed(allow_secrets=allow_secrets)
+    files, path = listing.records, named.path
     if all(file.path != path for file in files):
         what, advice = here.why_left_out(path) or _missing_entry(path, files)
         raise RepositoryUnavailableError(f"{here} {what}. {advice}")
-    return _by_content("local", str(root), path, files, copier(found, str(here)))
+    tell(here.seen(listing), SNAPSHOT)
+    copy = copier(listing.files, str(here))
+    snapshot = _by_content(FOLDER, str(named.folder), path, files, copy)
+    return replace(snapshot, repo_type=named.repo_type)
 
 
 def _registered(ref: HubRef) -> Snapshot:

@@ -11,9 +11,11 @@ sentence, is read off the text. Trust: text from the worker, which chooses among
 
 from __future__ import annotations
 
+import os
 import re
+from collections.abc import Iterator
 
-from envhub_sandbox.errors import EnvHubError, RemoteEnvError, WorkerDiedError
+from envhub_sandbox.errors import DependencyError, EnvHubError, RemoteEnvError, WorkerDiedError
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.settings.policy import Policy
@@ -146,6 +148,46 @@ def _of_display(text: str, policy: Policy) -> str:
         "(render_mode='rgb_array'), or give the jail a display of its own, with "
         f"{option_name('display', 'virtual')}"
     )
+
+
+# --- what its folder has, and it does not see -----------------------------------------------------
+
+_QUOTED = r"'([^'\n]{1,1024})'|\"([^\"\n]{1,1024})\"|([^\s'\"]{0,512}[./][^\s'\"]{1,512})"
+_NO_MODULE = r"No module named '([\w.]{1,200})'"
+_MOST_NAMES, _DEEPEST = 16, 16
+
+
+def why_missing(error: EnvHubError, snapshot: Snapshot) -> str:
+    """What to do where code of this machine lacks a file or module that its folder has.
+
+    Trust: the names are read off the worker's text. It decides by them which of our sentences its
+    user reads, and gets no answer.
+    """
+    remote = error if isinstance(error, (RemoteEnvError, DependencyError)) else error.__cause__
+    if not isinstance(remote, (RemoteEnvError, DependencyError)) or not snapshot.is_local:
+        return ""
+    from envhub_sandbox.hub.local import LocalFolder
+
+    text = getattr(remote, "message", "") or str(remote)
+    shown = {record.path for record in snapshot.files}
+    for path in _names(text[:_TEXT_CHARS].replace(f"{snapshot.root}/", "")):
+        is_shown = path in shown or any(one.startswith(f"{path}/") for one in shown)
+        if not is_shown and os.path.lexists(os.path.join(snapshot.repo_id, path)):
+            return LocalFolder.of(snapshot).advice(path)
+    return ""
+
+
+def _names(text: str) -> Iterator[str]:
+    """Paths below a folder that a text may mean, the likeliest first."""
+    modules = [found[1].replace(".", "/") for found in re.finditer(_NO_MODULE, text)]
+    for module in modules[:_MOST_NAMES]:
+        yield from (f"{module}.py", module, f"{module.partition('/')[0]}.py", module.split("/")[0])
+    for found in list(re.finditer(_QUOTED, text))[:_MOST_NAMES]:
+        steps = (found[1] or found[2] or found[3]).rstrip(".,:;)").replace("\\", "/").split("/")
+        steps = [step for step in steps if step not in ("", ".")]
+        if steps and ".." not in steps and "\0" not in found[0]:
+            # of an absolute path, or of one on another host, only the end is known
+            yield from ("/".join(steps[first:]) for first in range(min(len(steps), _DEEPEST)))
 
 
 # --- what it was denied --------------------------------------------------------------------------

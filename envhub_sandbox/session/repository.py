@@ -33,7 +33,7 @@ from envhub_sandbox.hub.client import default_endpoint
 from envhub_sandbox.hub.logins import without_login
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.session.crash.history import Recording
-from envhub_sandbox.session.error_text import add_author_line, add_reach_advice
+from envhub_sandbox.session.error_text import add_author_line, add_reach_advice, why_missing
 from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.settings.policy import Policy, Timeouts
 from envhub_sandbox.system.folders import cache_root
@@ -226,8 +226,11 @@ class Repository:
         try:
             yield
         except EnvHubError as error:
+            advice = "" if "__notes__" in vars(error) else why_missing(error, self.snapshot)
             if isinstance(error, DependencyError) and not str(error).startswith(self.label):
-                error.args = (f"{error}. {self._advice(str(error))}",)
+                error.args = (f"{error}. {advice or self._advice(str(error))}",)
+            elif advice and advice not in str(error):
+                error.args = (f"{error.args[0]}\n{advice}", *error.args[1:])
             name_source(error, self.label)
             add_reach_advice(error, self.policy)
             add_author_line(error, self.snapshot)

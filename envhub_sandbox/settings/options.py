@@ -251,6 +251,19 @@ class Options:
         None, "--hub-cache-dir", "huggingface_hub's cache_dir.", metavar="PATH", panel=_HUB
     )
 
+    allow_secrets: bool = _option(
+        False,
+        "--allow-secrets",
+        "Let it see a folder of this machine that holds keys or passwords, or is a home directory.",
+        kind=bool,
+        panel=_HUB,
+    )
+
+    @property
+    def source(self) -> dict[str, Any]:
+        """Where a reference is looked for, and how."""
+        return {**self.hub, "allow_secrets": self.allow_secrets}
+
     @property
     def hub(self) -> dict[str, Any]:
         """Which Hub, and how."""

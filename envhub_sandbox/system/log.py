@@ -34,6 +34,7 @@ ERRORS = ROOT.getChild("errors")
 
 _WIDTH = 100
 _shown_by: list[Callable[[str], None]] = []
+_told_by: list[Callable[[str], None]] = []
 
 
 @contextlib.contextmanager
@@ -44,6 +45,30 @@ def progress_shown_by(show: Callable[[str], None]) -> Iterator[None]:
         yield
     finally:
         _shown_by.remove(show)
+
+
+@contextlib.contextmanager
+def told_by(show: Callable[[str], None]) -> Iterator[None]:
+    """While it lasts, what users have to know goes to ``show``, too; each line once."""
+    said: set[str] = set()
+
+    def once(line: str) -> None:
+        if line not in said:
+            said.add(line)
+            show(line)
+
+    _told_by.append(once)
+    try:
+        yield
+    finally:
+        _told_by.remove(once)
+
+
+def tell(line: str, log: logging.Logger) -> None:
+    """Log what users have to know."""
+    log.info("%s", line)
+    for show in _told_by[-1:]:
+        show(line)
 
 
 @contextlib.contextmanager

@@ -54,6 +54,19 @@ def user_id() -> int:
     return found
 
 
+def home_of(path: Path) -> Path:
+    """The home directory of whom a file or folder belongs to, as the system knows it; Windows does
+    not say it of others.
+    """
+    home = os.path.expanduser("~")
+    if sys.platform != "win32":
+        import pwd
+
+        with contextlib.suppress(KeyError, OSError):  # a container knows few of its users
+            home = pwd.getpwuid(os.stat(path).st_uid).pw_dir
+    return Path(os.path.realpath(home))
+
+
 def cores() -> int:
     """How many processors this process may use."""
     found = os.cpu_count() or 1

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import IO
 
 from envhub_sandbox.errors import EnvHubError, HubReferenceError
-from envhub_sandbox.hub.grammar import has_control_characters
+from envhub_sandbox.hub.grammar import FILE, FOLDER, has_control_characters, local_reference
 from envhub_sandbox.hub.local import split_local
 from envhub_sandbox.hub.reference import HubRef
 from envhub_sandbox.hub.snapshot import is_here
@@ -47,7 +47,7 @@ class ListEntry:
         """
         known = self.meaning.partition("@")[0]
         if self.meaning.startswith("/"):
-            known = "/".join(Path(self.meaning.rpartition(":")[0]).parts[-2:])
+            known = "/".join(Path(self.meaning.partition(":")[0]).parts[-2:])
         slug = re.sub(r"[^a-z0-9]+", "-", known.lower()).strip("-")[:_SLUG].strip("-")
         digest = hashlib.sha256(self.meaning.encode("utf-8", "surrogatepass")).hexdigest()[:16]
         return f"{slug}-{digest}" if slug else digest
@@ -103,9 +103,10 @@ def _meaning(reference: str) -> tuple[str, str]:
             "this is not a reference: it is too long, or has control characters"
         )
     if is_here(reference):
-        folder, path = split_local(reference)
+        folder, path, is_file = split_local(reference)
         if path == os.pardir or path.startswith(f"{os.pardir}/") or os.path.isabs(path):
             raise HubReferenceError(f"{reference}: its entry file is outside its folder")
-        return reference, f"{folder.resolve()}:{path}"
+        kind = FILE if is_file else FOLDER
+        return reference, local_reference(kind, str(folder.resolve()), path)
     ref = HubRef.parse(reference)
     return str(ref), ref.meaning

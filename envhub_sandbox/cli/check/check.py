@@ -20,6 +20,7 @@ from envhub_sandbox.cli.shared.console import (
     print_json,
     safe_line,
     say,
+    says_what_is_seen,
     show,
     show_rows,
 )
@@ -312,7 +313,7 @@ def _judge(
         )
 
     report, doing = Report(make.ref, folder=settings.folder_below_here(make.ref)), ["starting"]
-    with ProgressBar(quiet=quiet, long_s=_LONG_S) as bar:
+    with ProgressBar(quiet=quiet, long_s=_LONG_S) as bar, says_what_is_seen():
 
         def tell(what: str) -> None:
             doing.append(what)

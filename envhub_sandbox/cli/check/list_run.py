@@ -320,9 +320,8 @@ class ListRun:
                 yield one
 
     def _commit_of(self, listed: ListEntry) -> str | None:
-        where = {name: self.make.given[name] for name in ("hub_cache_dir", "token", "endpoint")}
         try:
-            return commit_of(listed.reference, **where)
+            return commit_of(listed.reference, **self.make.source)
         except EnvHubError:
             return None  # what judges it says why
 

@@ -24,7 +24,7 @@ import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from envhub_sandbox.system.log import progress_shown_by
+from envhub_sandbox.system.log import progress_shown_by, told_by
 from envhub_worker.protocol.text import duration_text, printable
 
 if TYPE_CHECKING:
@@ -252,6 +252,13 @@ def prints_on_stderr() -> Iterator[None]:
     finally:
         os.dup2(kept, 1)
         os.close(kept)
+
+
+@contextlib.contextmanager
+def says_what_is_seen() -> Iterator[None]:
+    """While it lasts, a line on stderr says what the code gets to see of this machine."""
+    with told_by(lambda line: say(safe_line(line, _LONGEST))):
+        yield
 
 
 _EVERY_S = 0.1

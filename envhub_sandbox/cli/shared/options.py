@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 
 ALL = tuple(key for key, one in OPTIONS.items() if one.command)
 """Every option that a command can have, by keys of ``OPTIONS``."""
-HUB = ("token", "endpoint", "hub_cache_dir")
+_HUB = ("token", "endpoint", "hub_cache_dir")
+SOURCE = (*_HUB, "allow_secrets")
 _PANEL = OPTIONS["n_envs"].panel
 _NAMED = 20
 
@@ -137,7 +138,7 @@ class MakeOptions:
         """What a reference names, fetched."""
         from envhub_sandbox.hub.snapshot import snapshot_named
 
-        return snapshot_named(ref, **self.hub)
+        return snapshot_named(ref, **self.source)
 
     def snapshot_with_assets(self, ref: str, locked: Sequence[str] = ()) -> Snapshot:
         """The same, with its assets: those of the command line, or these."""
@@ -147,9 +148,14 @@ class MakeOptions:
         return with_assets(self.snapshot(ref), assets, self.hub)
 
     @property
+    def source(self) -> dict[str, Any]:
+        """Where a reference is looked for, and how."""
+        return {key: self.given[key] for key in SOURCE}
+
+    @property
     def hub(self) -> dict[str, Any]:
         """Which Hub, and how."""
-        return {key: self.given[key] for key in HUB}
+        return {key: self.given[key] for key in _HUB}
 
     @property
     def in_process(self) -> bool:

@@ -143,9 +143,8 @@ def print_provenance(provenance: dict[str, Any], *, in_process: bool) -> None:
 
 def _repository(provenance: dict[str, Any]) -> str:
     kind = provenance["repo_type"]
-    commit = provenance["commit"]
-    if commit.startswith(f"{kind}-"):
-        commit = commit[: len(f"{kind}-") + _SHOWN_DIGITS]
+    word, dash, digits = provenance["commit"].rpartition("-")
+    commit = f"{word}{dash}{digits[:_SHOWN_DIGITS]}" if dash else digits
     return f"{provenance['repository']} ({kind}) at {commit}, {provenance['path']}"
 
 

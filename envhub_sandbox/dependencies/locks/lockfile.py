@@ -121,7 +121,7 @@ class LockFile:
 
 def repository_of(snapshot: Snapshot) -> str:
     """As a lock file names it."""
-    return LOCAL if snapshot.repo_type == "local" else snapshot.name
+    return LOCAL if snapshot.is_local else snapshot.name
 
 
 def reference_of(lock: LockFile) -> str | None:

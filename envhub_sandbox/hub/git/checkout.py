@@ -14,6 +14,7 @@ import re
 import shutil
 import subprocess
 from collections.abc import Iterable, Iterator
+from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
@@ -64,6 +65,27 @@ class Checkout:
     untracked: frozenset[str]
     held_back: tuple[str, ...]
     _repository: _Repository
+
+    @cached_property
+    def tracked(self) -> frozenset[str]:
+        """The files that git knows already."""
+        return self.files - self.untracked
+
+    def tracks_below(self, folder: str) -> bool:
+        """Whether git knows a file in a folder."""
+        return any(name.startswith(f"{folder}/") for name in self.tracked)
+
+    def names_in(self, folder: str) -> frozenset[str]:
+        """What the files in a folder are called."""
+        return self._names.get(folder, frozenset())
+
+    @cached_property
+    def _names(self) -> dict[str, frozenset[str]]:
+        found: dict[str, set[str]] = {}
+        for path in self.files:
+            folder, _, name = path.rpartition("/")
+            found.setdefault(folder, set()).add(name)
+        return {folder: frozenset(names) for folder, names in found.items()}
 
     def converted(self, names: Iterable[str]) -> list[tuple[str, str]]:
         """Which of these files git commits with other bytes, and by which attribute.

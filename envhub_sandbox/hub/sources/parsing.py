@@ -22,7 +22,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from envhub_sandbox.hub.snapshot import Snapshot
+from envhub_sandbox.hub.listing import Snapshot
 from envhub_sandbox.hub.sources import parser
 from envhub_sandbox.system.platform import open_flags, own_variables
 
@@ -234,29 +234,34 @@ class _ImportWalk:
 
 def _targets(one: ImportStatement, file: str, files: set[str]) -> Iterator[tuple[str, str]]:
     """Each module that is named, and the repository's own file if it is one."""
-    folder = file.rpartition("/")[0]
-    for _ in range(one.level - 1):
-        folder = folder.rpartition("/")[0]
-    dotted = list(one.names)
-    if one.level >= 0:
-        names = dict.fromkeys(f"{one.module}.{name}".strip(".") for name in one.names)
-        dotted = [one.module, *names]
+    folder, dotted = named_modules(one, file)
     for number, name in enumerate(dotted):
-        own = _own(name, folder, files)
+        own = next((path for path in candidates(name, folder) if path in files), "")
         foreign = one.level < 0 or (one.level == 0 and number == 0)
-        is_package = _own(name.partition(".")[0], folder, files)
-        if own or (foreign and not is_package):
+        first = name.partition(".")[0]
+        if own or (foreign and files.isdisjoint(candidates(first, folder))):
             yield name, own
 
 
-def _own(name: str, folder: str, files: set[str]) -> str:
+def named_modules(one: ImportStatement, file: str) -> tuple[str, list[str]]:
+    """The folder that a statement in a file is about, and what it may import, dotted; first what
+    it surely does.
+    """
+    folder = file.rpartition("/")[0]
+    for _ in range(one.level - 1):
+        folder = folder.rpartition("/")[0]
+    if one.level < 0:
+        return folder, list(one.names)
+    names = dict.fromkeys(f"{one.module}.{name}".strip(".") for name in one.names)
+    return folder, [one.module, *names]
+
+
+def candidates(name: str, folder: str) -> Iterator[str]:
+    """The files that a module's name can mean in a file of this folder."""
     path = name.replace(".", "/")
     for below in dict.fromkeys((folder, "", "src")):
         base = f"{below}/{path}".strip("/")
-        for candidate in (f"{base}.py", f"{base}/__init__.py"):
-            if candidate in files:
-                return candidate
-    return ""
+        yield from (f"{base}.py", f"{base}/__init__.py")
 
 
 def of_module(name: str) -> list[str]:

@@ -20,7 +20,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from envhub_sandbox.errors import BundleError, EnvHubError
-from envhub_sandbox.hub.grammar import is_commit
+from envhub_sandbox.hub.grammar import LOCAL_TYPES, is_commit
 from envhub_sandbox.hub.reference import pinned
 from envhub_sandbox.session.crash.bundle_writer import FORMAT
 from envhub_sandbox.settings.policy import Limits, Policy
@@ -150,9 +150,9 @@ def _reference(provenance: dict[str, Any]) -> str:
     repository, path = _member(provenance, "repository", str), _member(provenance, "path", str)
     kind = _member(provenance, "repo_type", str)
     commit = _member(provenance, "commit", str)
-    if kind == "local" and not os.path.isabs(repository):
+    if kind in LOCAL_TYPES and not os.path.isabs(repository):
         raise BundleError("a local folder's path is not absolute")
-    if kind not in ("local", "pypi") and not is_commit(commit):
+    if kind not in (*LOCAL_TYPES, "pypi") and not is_commit(commit):
         raise BundleError(f"{commit} is not a commit")
     return pinned(kind, repository, commit, path)
 

@@ -17,6 +17,7 @@ from envhub_sandbox.check.judge import judge
 from envhub_sandbox.check.settings import JudgeOptions
 from envhub_sandbox.hub.snapshot import snapshot_named
 from tests.hub.olah_server import GitRepository, OlahServer
+from tests.support.command_line import envhub
 from tests.support.repositories import STILL
 
 _ENV = """
@@ -45,6 +46,25 @@ _FOLDERS = (
     *(".mypy_cache", ".pytest_cache", ".ruff_cache"),
 )
 _NAMES = tuple(f"payload{number}" for number in range(len(_FOLDERS)))
+
+
+def test_a_file_is_judged_as_it_is_run(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+    """The same files of the folder it lies in, named in one line each time."""
+    code = f"import helper\n{STILL}\nopen('secret.txt') if helper.x else None\n"
+    for name, text in {"env.py": code, "helper.py": "x = 0\n", "secret.txt": "os.popen"}.items():
+        (tmp_path / name).write_text(text)
+    command = ["--steps", "2", "--resets", "0"]
+    told = []
+    for name in ("run", "check"):
+        done = envhub(name, tmp_path / "env.py", *(command if name == "check" else command[:2]))
+        assert done.returncode == 0, done.stderr
+        told += [line for line in done.stderr.splitlines() if "the code sees" in line]
+    line = f"local file {tmp_path}/env.py: the code sees 2 files of its folder: env.py, helper.py"
+    assert told == [line, line]
+    judged = judge(JudgeOptions(reference=f"{tmp_path}/env.py", arguments={}, steps=2, resets=0))
+    with make_env(f"{tmp_path}/env.py") as suites:
+        assert suites.provenance["commit"] == judged.commit == judged.provenance["commit"]
+        assert list(suites.provenance["files"]) == ["env.py", "helper.py"]
 
 
 @pytest.fixture

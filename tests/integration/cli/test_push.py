@@ -103,7 +103,7 @@ LIES = "return np.array([self.puck, 7], np.float32)"
     [
         ("env.py", ("import numpy as np", "import numpy as np\n1 / 0"), 4, "ZeroDivisionError"),
         ("env.py", ("return np.array([self.puck, self.goal], np.float32)", LIES), 1, "obs"),
-        (".env", ("", "HF_TOKEN=x"), 2, "looks like a secret"),
+        (".env", ("", "HF_TOKEN=x"), 2, "holds what looks like keys or passwords: .env"),
         ("lib/__pycache__/env.cpython-311.pyc", ("", "x"), 2, "is compiled Python"),
         ("lib/.cache/huggingface/x", ("", "x"), 2, "uploads nothing below .cache"),
     ],

@@ -49,11 +49,12 @@ def one_env(folder: Path, step: str, render: str = "return None") -> Path:
 
 @pytest.mark.short
 def test_a_run_prints_results_and_nothing_else() -> None:
-    """The table and the provenance on stdout, nothing on stderr, no escape sequences; what a
-    terminal cannot show is escaped."""
+    """The table and the provenance on stdout, on stderr only what the code sees of this machine, no
+    escape sequences; what a terminal cannot show is escaped."""
     ascii_only = {"PYTHONIOENCODING": "ascii"}
     done = envhub("run", EXAMPLES / "cartpole", "--episodes", "4", "--n-envs", "2", **ascii_only)
-    assert (done.returncode, done.stderr) == (0, "")
+    seen = f"local folder {EXAMPLES / 'cartpole'}: the code sees 1 file of it\n"
+    assert (done.returncode, done.stderr) == (0, seen)
     for text in ("hub_env / 0", "steps/s", str(EXAMPLES / "cartpole"), "gymnasium", "seed 0"):
         assert text in done.stdout
     assert "\x1b" not in done.stdout

@@ -8,7 +8,13 @@ from typing import Any
 import pytest
 
 from envhub_sandbox import make_env
-from envhub_sandbox.errors import LoadError, RemoteEnvError, RemoteEnvWarning, WorkerDiedError
+from envhub_sandbox.errors import (
+    DependencyError,
+    LoadError,
+    RemoteEnvError,
+    RemoteEnvWarning,
+    WorkerDiedError,
+)
 from tests.support.repositories import STILL, write_repository
 
 pytestmark = pytest.mark.short
@@ -60,6 +66,27 @@ def env(tmp_path_factory: pytest.TempPathFactory) -> Any:
     folder = write_repository(tmp_path_factory.mktemp("runs") / "repo", RUNS)
     with make_env(str(folder), policy={"restart": "on_reset"}) as suites:
         yield suites.env
+
+
+@pytest.mark.parametrize("name", ["model.xml", "data/a b.npy", "other.py"])
+@pytest.mark.parametrize("when", ["in make_env", "later"])
+def test_what_lies_beside_a_named_file_is_missed_with_a_word(
+    tmp_path: Path, name: str, when: str
+) -> None:
+    """That it is there, why the code does not see it, and which reference shows it."""
+    code = f"open({name!r})" if name != "other.py" else "__import__('oth' + 'er')"
+    folder = write_repository(
+        tmp_path / "repo", RUNS + f"\n{code if when == 'in make_env' else ''}"
+    )
+    (folder / name).parent.mkdir(exist_ok=True)
+    (folder / name).write_text("")
+    word = rf"{name!r} is there, in {folder}, but a file .*name that with .*: '{folder}:env\.py'"
+    expected = (LoadError, DependencyError, RemoteEnvError)
+    with pytest.raises(expected, match=word) as caught, make_env(folder / "env.py") as suites:
+        suites.env.call("run", code)
+    assert "environment of its own" not in str(caught.value)
+    with make_env(f"{folder}:env.py") as suites:
+        suites.env.call("run", code)
 
 
 URL = "http://envhub.example/x"

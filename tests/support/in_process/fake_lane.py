@@ -125,6 +125,7 @@ class FakeRepository(Repository):
 
     def __init__(self) -> None:
         known = {"label": "a/b", "path": None, "root": None, "assets": (), "hub_copies": ()}
+        known |= {"is_local": False}
         self.snapshot = cast("Any", SimpleNamespace(**known))
         self.policy, self.timeouts = Policy(crash_history=8), Timeouts()
         self.warnings, self.recipe, self.copy = RemoteWarnings(), None, True

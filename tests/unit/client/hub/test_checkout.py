@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from envhub_sandbox.errors import RepositoryUnavailableError, SnapshotError
-from envhub_sandbox.hub.local import LocalFolder
+from envhub_sandbox.hub.local import IGNORED, REPOSITORY, LocalFolder
 from envhub_sandbox.hub.snapshot import local
 from tests.hub.olah_server import GitRepository
 
@@ -39,7 +39,7 @@ def files(folder: Path) -> dict[str, str]:
     return {str(p.relative_to(root)): p.read_text() for p in root.rglob("*") if p.is_file()}
 
 
-def left_out(folder: Path) -> list[tuple[str, bool]]:
+def left_out(folder: Path) -> list[tuple[str, str]]:
     return [tuple(one) for one in LocalFolder.at(folder).left_out()]
 
 
@@ -69,8 +69,8 @@ def test_what_git_ignores_is_left_out_unless_it_is_committed(
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text("there")
     assert set(files(folder)) == {".gitignore", "env.py", "forced.pyc", "new.py"}
-    assert left_out(folder) == [(".venv/", False), ("a.pyc", False), ("mine.txt", False)]
-    with pytest.raises(RepositoryUnavailableError, match=r"git would not commit.*add --force"):
+    assert left_out(folder) == [(name, IGNORED) for name in (".venv/", "a.pyc", "mine.txt")]
+    with pytest.raises(RepositoryUnavailableError, match=r"is ignored by git.*add --force"):
         local(f"{folder}:a.pyc")
     repository.git("worktree", "add", "--quiet", str(tmp_path / "more"))
     (tmp_path / "more/mine.txt").write_text("")
@@ -121,13 +121,15 @@ def test_a_link_is_a_file_with_its_text(repository: GitRepository) -> None:
     assert links.items() <= files(repository.folder).items()
 
 
-def test_a_virtual_environment_is_refused_unless_it_is_committed(repository: GitRepository) -> None:
+def test_a_virtual_environment_is_left_out_unless_it_is_committed(
+    repository: GitRepository,
+) -> None:
     """Who made one here forgot to have git ignore it; a commit may hold what it likes."""
     (repository.folder / "mine/bin").mkdir(parents=True)
     (repository.folder / "mine/pyvenv.cfg").write_text("")
     (repository.folder / "mine/bin/python").symlink_to(sys.executable)
-    with pytest.raises(SnapshotError, match=r"Move .*/mine elsewhere.*'mine/' in .gitignore"):
-        local(repository.folder)
+    assert set(files(repository.folder)) == {"env.py"}
+    assert left_out(repository.folder) == [("mine/", "a virtual environment")]
     repository.commit({})
     assert set(files(repository.folder)) == {"env.py", "mine/pyvenv.cfg", "mine/bin/python"}
     repository.git("rm", "--quiet", "--cached", "-r", "mine")
@@ -153,7 +155,7 @@ def test_a_repository_within_is_a_pointer(repository: GitRepository, tmp_path: P
     repository.git(*allow, "submodule", "--quiet", "add", str(inner.folder), "sub")
     shutil.copytree(inner.folder, repository.folder / "loose")
     assert set(files(repository.folder)) == {".gitmodules", "env.py"}
-    assert left_out(repository.folder) == [("loose/", True), ("sub/", True)]
+    assert left_out(repository.folder) == [("loose/", REPOSITORY), ("sub/", REPOSITORY)]
 
 
 def test_conversions_by_git_are_named(repository: GitRepository) -> None:
@@ -177,7 +179,7 @@ def test_a_folder_in_a_checkout_is_a_part_of_it(repository: GitRepository) -> No
         (repository.folder / name).parent.mkdir(exist_ok=True)
         (repository.folder / name).write_text("")
     assert set(files(repository.folder / "envs")) == {"env.py"}
-    assert left_out(repository.folder / "envs") == [("a.log", False)]
+    assert left_out(repository.folder / "envs") == [("a.log", IGNORED)]
     assert set(files(repository.folder / "build")) == {"env.py", "b.log"}
 
 

@@ -83,16 +83,18 @@ def test_forms_of_a_local_reference(
     monkeypatch.setenv("HOME", str(folder.parent))
     snapshot = local(text.format(folder))
     assert (snapshot.path, snapshot.repo_id) == (path, str(folder))
-    inner = local(folder / "sub" / "other.py")  # the folder around a file, nothing further up
-    assert (inner.path, names(inner)) == ("other.py", ["other.py"])
+    is_file = text.endswith("/env.py")
+    assert snapshot.reference == f"{folder}{'/' if is_file else ':'}{path}"
+    assert local(snapshot.reference) == snapshot
 
 
 def test_a_folders_commit_is_named_without_a_copy(folder: Path) -> None:
     (folder / "new.py").write_text("new = 1")
     named = commit_of(str(folder))
-    assert named == commit_of(f"{folder}:new.py") == commit_of(f"{folder}/new.py")
+    alone = commit_of(f"{folder}/new.py")
+    assert named == commit_of(f"{folder}:new.py") != alone
     assert store.commits(store.folder_of("local")) == []
-    assert local(folder).commit == named
+    assert (local(folder).commit, local(folder / "new.py").commit) == (named, alone)
     (folder / "new.py").write_text("new = 2")
     assert commit_of(str(folder)) != named
 
@@ -122,11 +124,40 @@ def test_every_file_counts_but_those_of_git(folder: Path) -> None:
         assert set(names(local(folder))) == hidden | {".gitignore", "env.py", "sub/other.py"}
 
 
-def test_a_virtual_environment_is_named(folder: Path) -> None:
+def test_a_virtual_environment_is_left_out_and_said(
+    folder: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Its interpreter is a link, which no file of the Hub is: nobody hides a folder by this."""
     (folder / ".venv/bin").mkdir(parents=True)
     (folder / ".venv/pyvenv.cfg").write_text("")
+    (folder / ".venv/bin/python").write_text("")
+    assert ".venv/pyvenv.cfg" in names(local(folder))
+    (folder / ".venv/bin/python").unlink()
     (folder / ".venv/bin/python").symlink_to(sys.executable)
-    with pytest.raises(SnapshotError, match=r"Move .*/my-env/\.venv elsewhere.*'\.venv/' in .gi"):
+    with caplog.at_level("INFO", "envhub_sandbox.snapshot"):
+        assert names(local(folder)) == ["env.py", "sub/other.py"]
+    said = f"local folder {folder}: the code sees 2 files of it; left out: "
+    assert caplog.messages == [f"{said}.venv/ (a virtual environment)"]
+    with pytest.raises(RepositoryUnavailableError, match=r"'.venv/bin/x.py', but left it out"):
+        local(f"{folder}:.venv/bin/x.py")
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to be another user")
+def test_what_cannot_be_read_is_left_out_and_said(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One file of another user's is no reason to end; of what is named it is one."""
+    for name in ("theirs.txt", "private/x.txt", "mine.txt"):
+        (folder / name).parent.mkdir(exist_ok=True)
+        (folder / name).write_text("")
+        (folder / name).chmod(0o644 if name == "mine.txt" else 0o600)
+    (folder / "private").chmod(0o700)
+    monkeypatch.setattr(module.os, "access", lambda path, mode: os.stat(path).st_mode & 0o004)
+    _, listing = split_local(str(folder)).listed()
+    assert [one.path for one in listing.files] == ["env.py", "mine.txt", "sub/other.py"]
+    assert dict(listing.left_out) == {"private/": "unreadable", "theirs.txt": "unreadable"}
+    (folder / "env.py").chmod(0o600)
+    with pytest.raises(RepositoryUnavailableError, match=r"env.py is unreadable. Give yourself"):
         local(folder)
 
 
@@ -209,7 +240,7 @@ def test_an_example_is_found_from_anywhere(
     """The wheel brings them; in a checkout they are those of the checkout."""
     monkeypatch.chdir(tmp_path)
     for name in ("cartpole", "catch", "two_tasks"):
-        folder, entry = split_local(f"examples:{name}")
+        folder, entry, _ = split_local(f"examples:{name}")
         assert (folder / entry).read_bytes() == (checkout / "examples" / name / entry).read_bytes()
 
 

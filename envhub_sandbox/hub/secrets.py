@@ -1,0 +1,48 @@
+"""The names of files that hold keys, tokens or passwords, which no code gets to see unasked."""
+
+from __future__ import annotations
+
+import fnmatch
+import os
+import re
+from pathlib import Path
+
+from envhub_sandbox.system.platform import home_of
+
+_KEYS = """
+    */.ssh/* */.gnupg/* */.password-store/* */id_rsa* */id_dsa* */id_ecdsa* */id_ed25519*
+    *.pem *.key *.ppk *.p12 *.pfx *.jks *.keystore *.kdbx
+"""
+_LOGINS = """
+    */.env */.env.* */.netrc */_netrc */.git-credentials */.npmrc */.pypirc */.pgpass */.my.cnf
+    */.s3cfg */.boto */.vault-token */.dockercfg */.docker/config.json */.kube/config */kubeconfig
+    *.kubeconfig */.aws/credentials */.aws/config */.aws/sso/* */.azure/*token* */.config/gcloud/*
+    */.config/gh/hosts.yml */.cargo/credentials* */huggingface/token */huggingface/stored_tokens
+    */kaggle.json */credentials.json */client_secret*.json */service-account*.json
+    */service_account*.json */.streamlit/secrets.toml */.modal.toml
+"""
+_HARMLESS = "*.pub *.py */.env.example */.env.sample */.env.template */.env.dist"
+_BARE_KEY = r"(?s:.*/id_[^./]+)\Z"
+"""What people call further keys, such as ``id_work``; with a suffix it is some other file."""
+
+
+def _any_of(names: str, *expressions: str) -> re.Pattern[str]:
+    return re.compile("|".join([*map(fnmatch.translate, names.split()), *expressions]))
+
+
+_SECRET = _any_of(_KEYS + _LOGINS, _BARE_KEY)
+_NOT_SECRET = _any_of(_HARMLESS)
+
+
+def looks_secret(path: str) -> bool:
+    """Whether a file is one that holds keys or logins, by its path, with ``/``."""
+    name = f"/{path.lower()}"
+    return _SECRET.match(name) is not None and _NOT_SECRET.match(name) is None
+
+
+def is_home(folder: Path) -> bool:
+    """Whether a folder, a path without links, is its owner's or the caller's home, or has that in
+    it.
+    """
+    own = Path(os.path.realpath(os.path.expanduser("~")))
+    return own.is_relative_to(folder) or home_of(folder).is_relative_to(folder)

@@ -1,0 +1,76 @@
+"""What of a folder is one file's own: the file, and the modules and packages that it imports.
+
+A package is taken whole, with its data; a folder without ``__init__.py`` is nobody's, so of it only
+modules are taken that are imported by name: else a stranger's file had any folder by importing it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator
+from pathlib import Path
+
+from envhub_sandbox.hub.sources import parsing
+
+_INIT = "__init__.py"
+_MACHINE_CODE = (".so", ".pyd")
+_MOST_ROUNDS = 100
+"""How far imports are followed; each takes a process."""
+
+Names = Callable[[str], Collection[str]]
+"""The names of the files in a folder, which is written with ``/``."""
+
+
+def own_files(root: Path, entry: str, names: Names) -> set[str]:
+    """The paths of a file's own below ``root``; of a package its folder, with a slash at its end.
+    Nothing is imported or run.
+    """
+    found, waiting, left = set[str](), {entry}, parsing.MOST_BYTES_IN_ALL
+    for _ in range(_MOST_ROUNDS):
+        found |= waiting
+        texts = {}
+        for file in sorted(waiting):
+            data = parsing.content(root / file, min(left, parsing.MOST_BYTES))
+            if data is not None and file.endswith(".py"):
+                texts[file] = data
+                left -= len(data)
+        read = parsing.parsed(texts)
+        waiting = {
+            path for file, one in read.items() if one for path in _imported(file, one, names)
+        }
+        waiting -= found
+        if not waiting or None in read.values():  # what took too much once is not tried on and on
+            break
+    return {_package_of(path, names) or path for path in found | waiting}
+
+
+def _imported(file: str, read: parsing.ParsedFile, names: Names) -> Iterator[str]:
+    for statement in read.imports:
+        folder, dotted = parsing.named_modules(statement, file)
+        for module in dotted:
+            for path in parsing.candidates(module, folder):
+                for own in _files_of(path, names):
+                    yield own
+                    yield from (f"{one}/{_INIT}" for one in _packages_around(own, names))
+
+
+def _files_of(path: str, names: Names) -> Iterator[str]:
+    """A module's source, and machine code that Python would import in place of it."""
+    folder, _, name = path.rpartition("/")
+    below, begin = f"{folder}/" if folder else "", name.removesuffix("py")
+    for other in names(folder):
+        if other == name or (other.startswith(begin) and other.endswith(_MACHINE_CODE)):
+            yield below + other
+
+
+def _packages_around(path: str, names: Names) -> Iterator[str]:
+    """The packages that a file lies in, the innermost first; the folder itself is none."""
+    folder = path.rpartition("/")[0]
+    while folder:
+        if _INIT in names(folder):
+            yield folder
+        folder = folder.rpartition("/")[0]
+
+
+def _package_of(path: str, names: Names) -> str:
+    outermost = [*_packages_around(path, names)][-1:]
+    return f"{outermost[0]}/" if outermost else ""
