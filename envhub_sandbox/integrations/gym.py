@@ -23,7 +23,7 @@ from envhub_sandbox.vector.tracebacks import short_traceback
 ID = "Hub-v0"
 
 
-class SandboxEnv(SingleEnv):
+class SandboxEnv(SingleEnv, gymnasium.Env[Any, Any]):
     """One environment of a repository, in a sandbox of its own.
 
     Args:

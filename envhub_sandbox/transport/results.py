@@ -18,6 +18,8 @@ from envhub_worker.protocol.spaces import batches
 
 _SHOWN = 500
 StepResult = tuple[Any, Any, Any, Any, dict[Any, Any]]
+Own = tuple[list[dict[Any, Any]], Sequence[bool], tuple[Any, ...]]
+"""See ``Results.own``."""
 
 
 class Results:
@@ -138,17 +140,24 @@ class Results:
         if not self.apart:
             return infos
         with UNTRUSTED:
-            own, _ = self.own(infos)
+            own, _, reward = self.own(infos)
+        if reward:
+            shown = one_line(batches.reward_misfit(reward[0], 0), _SHOWN)
+            raise remote_error("ValueError", "ValueError", shown)
         return self.joined_own([m.Value(tuple((0, one) for one in own))])
 
-    def own(self, infos: dict[Any, Any]) -> tuple[list[dict[Any, Any]], Sequence[bool]]:
-        """Infos that came apart, in their order, and which members of the observation are Python's.
+    def own(self, infos: dict[Any, Any]) -> Own:
+        """Infos that came apart, in their order, which members of the observation are Python's, and
+        a reward that is no number, if there is one.
 
         Trust: input from the worker.
         """
         places = [key for key in infos if type(key) is int and key >= 0]
         own, rest = [infos[place] for place in sorted(places)], dict(infos)
         which = rest.pop(batches.APART_SCALARS, ())
+        reward = rest.pop(batches.APART_REWARD, ())
+        if type(reward) is not tuple or len(reward) > 1:
+            raise RemoteProtocolError("the worker sent more than one reward")
         if set(map(type, own)) - {dict} or type(which) is not tuple or len(own) > 2:
             raise RemoteProtocolError("the worker's infos are not one mapping each")
         for place in places:
@@ -156,7 +165,7 @@ class Results:
         marks = {key: rest[key][0] for key in rest if f"_{key}" in rest}
         if marks:  # of ours: that it was lost and came back
             own = [*own[:-1], {**(own or [{}])[-1], **marks}]
-        return own, which
+        return own, which, reward
 
     def _restored(self, infos: dict[Any, Any]) -> dict[Any, Any]:
         final = infos.get("final_obs") if self._restores else None

@@ -19,6 +19,7 @@ from gymnasium.vector import VectorEnv
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
 from envhub_sandbox.errors import ActionError
+from envhub_sandbox.transport.results import Own
 from envhub_sandbox.vector.sandbox_view import SandboxView
 from envhub_sandbox.vector.tracebacks import short_traceback, shortened
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
@@ -112,15 +113,16 @@ class SingleEnv(gym.Env[Any, Any]):
         else:
             batch, infos = self._vector.reset(seed=seed, options=options)
         with UNTRUSTED:
-            [info, *_], which = self._own(infos)
+            [info, *_], which, _ = self._own(infos)
             return self._first(batch, which), info
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """One step with ``action``, an element of ``action_space``.
 
         Returns:
-            Observation, reward as a float, terminated, truncated, info. The observation of a step
-            that ends the episode is that episode's last.
+            Observation, reward, terminated, truncated, info. A number is a float; another reward
+            (a list, one for each agent) comes as it is. The observation of a step that ends the
+            episode is that episode's last.
 
         Raises:
             ActionError, WorkerTimeoutError, WorkerDiedError, RemoteEnvError: As
@@ -142,14 +144,17 @@ class SingleEnv(gym.Env[Any, Any]):
         self, batch: Any, rewards: Any, terminations: Any, truncations: Any, infos: Any
     ) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
         """What a step of the only one returns."""
-        [info, *more], which = self._own(infos)
+        [info, *more], which, odd = self._own(infos)
         observation = self._first(batch, which)
         terminated, truncated = bool(terminations[0]), bool(truncations[0])
         if (terminated or truncated) and self._resets_in_the_same_step:
             last, last_info = info.pop("final_obs"), info.pop("final_info", {})
             self._begun = observation, {**info, **(more[0] if more else {})}
             observation, info = batches.restore(self.observation_space, last), last_info
-        return observation, float(rewards[0]), terminated, truncated, info
+        reward = rewards[0]
+        if not np.ndim(reward):  # several are of a class that has them
+            reward = float(reward)
+        return observation, odd[0] if odd else reward, terminated, truncated, info
 
     @short_traceback
     def render(self) -> Any:
@@ -304,12 +309,12 @@ class SingleEnv(gym.Env[Any, Any]):
             return first
         return batches.with_integers(self.observation_space, first, iter(which))
 
-    def _own(self, infos: dict[Any, Any]) -> tuple[list[dict[Any, Any]], Sequence[bool]]:
+    def _own(self, infos: dict[Any, Any]) -> Own:
         """Its infos, of the end of an episode before those of the next; see ``Results.own``."""
         if self._apart is None:
-            return [info_of(infos, 0, 1)], ()
-        own, which = self._apart.own(infos) if infos else ([], ())
-        return [*own, {}, {}], which
+            return [info_of(infos, 0, 1)], (), ()
+        own, which, reward = self._apart.own(infos) if infos else ([], (), ())
+        return [*own, {}, {}], which, reward
 
 
 def info_of(infos: dict[Any, Any], index: int, num_envs: int) -> dict[Any, Any]:

@@ -14,6 +14,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
+from gymnasium.vector import VectorEnv
 from gymnasium.vector.utils import iterate
 
 from envhub_sandbox.errors import ActionError, ObservationError
@@ -28,7 +29,7 @@ from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES, OpaqueSpace
 _SHOWN = 200
 
 
-class ValidatedVectorEnv(SandboxVectorEnv):
+class ValidatedVectorEnv(SandboxVectorEnv, VectorEnv[Any, Any, Any]):
     """A ``SandboxVectorEnv`` that refuses what is outside of its spaces.
 
     Raises:

@@ -15,6 +15,7 @@ from threading import get_ident
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import gymnasium as gym
+from gymnasium.vector import VectorEnv
 
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.session.env_session import EnvSession
@@ -22,7 +23,7 @@ from envhub_sandbox.session.requests import SENT, MessageFor
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.remote_warnings import level_of_the_caller
 from envhub_sandbox.transport.replies import typed_reply
-from envhub_sandbox.transport.results import StepResult
+from envhub_sandbox.transport.results import Own, StepResult
 from envhub_sandbox.transport.values import not_here, seeds, spec_of
 from envhub_sandbox.vector.actions import (
     action_reader,
@@ -55,10 +56,11 @@ class VectorApart(NamedTuple):
 
     reset: Callable[[Any, dict[str, Any] | None], tuple[Any, dict[Any, Any]]]
     step: Callable[[Any], StepResult]
-    own: Callable[[dict[Any, Any]], tuple[list[dict[Any, Any]], Sequence[bool]]]
+    own: Callable[[dict[Any, Any]], Own]
 
 
-class SandboxVectorEnv(SendRecv):
+# Gymnasium's class is named here as well, for libraries that look at direct bases alone (skrl)
+class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
     """A vector environment whose code runs in a confined process.
 
     Everything that ``VectorEnv`` has, and ``AsyncVectorEnv``'s ``*_async`` and ``*_wait``. Arrays

@@ -53,6 +53,8 @@ def test_an_honest_one_is_believed(liar: LyingServer, folder: str) -> None:
         for info in ({0: {"a": 2**80}}, {0: {}}, {}, {0: {"a": {"_a": 1}}, -1: ()}):
             liar.lies[m.Step] = relayed(_done(info))
             assert env.step(action)[4] == info.get(0, {})
+        liar.lies[m.Step] = relayed(_done({-2: ([1.0, 2.0],)}))
+        assert env.step(action)[1:] == ([1.0, 2.0], False, False, {})
 
 
 LIES: dict[str, Any] = {
@@ -64,6 +66,8 @@ LIES: dict[str, Any] = {
     "a number for integers": {0: {}, -1: 3},
     "a text for integers": {-1: "xxx"},
     "arrays for integers": {-1: np.ones(3)},
+    "a number for a reward": {-2: 3},
+    "two rewards": {-2: ([1.0], [2.0])},
 }
 
 

@@ -18,8 +18,10 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import TimeAwareObservation
 
-from envhub_sandbox import SandboxEnv
+from envhub_sandbox import SandboxEnv, make_env
 from envhub_sandbox.errors import ActionError, LoadError
+from envhub_sandbox.vector.validated import ValidatedVectorEnv
+from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from tests.support.compare import assert_same
 from tests.support.repositories import write_repository
 from tests.support.samples import EXAMPLES, make_env_of
@@ -59,6 +61,13 @@ def test_gymnasium_makes_it_by_its_id() -> None:
         envs = gym.make_vec(_ID, num_envs=3, ref=str(EXAMPLES / "cartpole"))
         assert envs.reset(seed=1)[0].shape == (3, 4)
         envs.close()
+
+
+def test_gymnasiums_classes_are_among_its_direct_bases() -> None:
+    """Some libraries look no further, skrl among them."""
+    assert gym.Env in SandboxEnv.__bases__
+    for vector in (SandboxVectorEnv, ValidatedVectorEnv):
+        assert gym.vector.VectorEnv in vector.__bases__
 
 
 def test_a_task_is_chosen_by_name() -> None:
@@ -180,6 +189,70 @@ def test_what_it_gives_is_what_the_environment_gave(
     assert type(seen[1][0]["a"]) is int
     assert type(seen[1][0]["b"][0]) is np.int64
     json.dumps(seen[1][4]["n"])
+
+
+_REWARDS = """
+import gymnasium as gym
+import numpy as np
+
+
+class Rewarding(gym.Env):
+    observation_space = gym.spaces.Box(-1, 1, (2,))
+    action_space = gym.spaces.Discrete(9)
+    each = [1, 0.5, np.float32(2), [1.0, 2], (1, [3]), {"a": 1.0}, np.array([1.5, 2]), None, "much"]
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(2, np.float32), {}
+
+    def step(self, action):
+        infos = {"action": int(action)} if action % 2 else {}
+        return np.zeros(2, np.float32), self.each[int(action)], action == 8, False, infos
+
+
+class Numbered(Rewarding):
+    count = 0
+
+    def __init__(self, number):
+        self.number = number
+
+    def step(self, action):
+        return super().step(action if self.number == 2 else 0)
+
+
+def make_env(n_envs=1, use_async_envs=False):
+    cls = gym.vector.AsyncVectorEnv if use_async_envs else gym.vector.SyncVectorEnv
+    return cls([lambda i=i: Numbered(i if n_envs > 1 else 2) for i in range(n_envs)])
+"""
+
+
+@pytest.mark.parametrize("lane", ["auto", "frames"])
+def test_a_reward_that_is_no_number_comes_as_it_is(tmp_path: Path, lane: str) -> None:
+    """From a single environment. A vector environment says whose it is, and can be used on."""
+    folder = write_repository(tmp_path / "rewards", _REWARDS)
+    here = make_env_of(folder)().envs[0]
+    with contextlib.closing(SandboxEnv(folder, lane=lane)) as env:
+        env.reset()
+        for action in range(9):
+            expected = here.step(action)
+            seen = env.step(action)
+            if action > 2:
+                assert_same(expected, seen)
+            assert_same(expected[2:], seen[2:])
+            assert action > 2 or (type(seen[1]), seen[1]) == (float, expected[1])
+        env.reset()
+        with pytest.raises(ValueError, match=r"sub-environment 0 is of type list: \[1.0, 2\]"):
+            env.vector.step([3])
+    for is_async, workers in ((False, None), (True, 1), (True, 2)):
+        with make_env(
+            str(folder), n_envs=3, use_async_envs=is_async, num_workers=workers, lane=lane
+        ) as suites:
+            suites.env.reset()
+            for action, kind in ((3, "list"), (5, "dict"), (8, "str")):
+                with pytest.raises(
+                    (ValueError, TypeError), match=rf"sub-environment 2 is of type {kind}.*number"
+                ):
+                    suites.env.step([action] * 3)
+            assert suites.env.step([1] * 3)[1].tolist() == [1.0, 1.0, 0.5]
 
 
 def test_an_attribute_that_is_set_arrives(env: Any, folder: Path) -> None:

@@ -157,6 +157,8 @@ class Lane:
             pairs = self._pairs = self._env.run_step(actions)
             if (self._watched or self._warned) and self._has_more_to_say():
                 return slabs.FETCH, 0
+            if self._env.reward:  # it is sent with the infos, and is no column
+                return slabs.FETCH, 0
             integers = self._env.integers
             if pairs or True in integers:
                 return self._writer.write(pairs, integers)

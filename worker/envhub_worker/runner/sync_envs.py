@@ -30,6 +30,8 @@ from envhub_worker.runner.copies import kept, taken
 from envhub_worker.runner.gymnasium_compat import SyncBase
 from envhub_worker.runner.shared_state import SharedState
 
+_NUMBERS = (float, int, np.number, np.bool_)
+
 Pairs = list[tuple[int, dict[Any, Any]]]
 """Infos with the index of their sub-environment, in the order in which they came."""
 NEW_ROLLOUT = "lerobot_new_rollout"
@@ -165,6 +167,7 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         pairs: The infos of the last reset or step, as each sub-environment gave them.
         driven: What is reset, stepped and drawn: ``envs``, or what freezes them.
         integers: Which discrete members of its last observation are Python's; () unless ``apart``.
+        reward: A tuple with the last reward, if that is no number; () unless ``apart``.
         shared: What they share of a process, looked at after each reset and step; None where that
             is as it should be.
     """
@@ -176,6 +179,7 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         sync: bool,
         *,
         sliced: bool = False,
+        start: int = 0,
     ) -> None:
         super().__init__(env_fns, copy=False, autoreset_mode=autoreset_mode)
         # AsyncVectorEnv stacks vector rewards, SyncVectorEnv refuses them
@@ -192,6 +196,8 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         self.pairs: Pairs = []
         self.integers: list[bool] = []
         self.shared: SharedState | None = None
+        self.reward: tuple[Any, ...] = ()
+        self._start = start
         self._restores = batches.restores(self.single_action_space)
         self._plain_actions = isinstance(self.single_action_space, ARRAY_SPACES)
 
@@ -209,6 +215,7 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
             self.driven = [FreezingEnv(one) for one in self.envs]
         infos: Pairs = []
         self.pairs = infos
+        self.reward = ()
         for index in chosen:
             seed = None if seeds is None else seeds[index]
             try:
@@ -265,10 +272,13 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
             for index, action, env, over, row in each:
                 if over:
                     observation, info = env.reset()
-                    rewards[index] = 0.0
+                    rewards[index] = reward = 0.0
                 else:
                     observation, reward, terminated, truncated, info = env.step(action)
-                    rewards[index] = reward
+                    try:
+                        rewards[index] = reward
+                    except (TypeError, ValueError) as error:
+                        self._refuse_reward(error, reward, index)
                     if terminated or truncated:
                         flagged.append(index)
                         terminations[index] = terminated
@@ -297,6 +307,7 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         self._done = done
         if self.apart:
             self.integers = batches.integers(self.single_observation_space, observation)
+            self.reward = () if isinstance(reward, _NUMBERS) else (reward,)
         if self.shared is not None:
             self.shared.look()
         return infos
@@ -305,6 +316,12 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
     def resets_nothing(self) -> bool:
         """Whether an episode that has ended stays so until a reset is asked for."""
         return self._mode == "Disabled"
+
+    def _refuse_reward(self, error: Exception, reward: Any, index: int) -> None:
+        """Raise what is wrong with a reward, unless it is sent as it is."""
+        if not self.apart:
+            text = batches.reward_misfit(reward, self._start + index, self.reward_shape)
+            raise type(error)(text) from error
 
     def render(self) -> Any:
         """One frame each."""
@@ -331,6 +348,8 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
             infos: dict[Any, Any] = {place: info for place, (_, info) in enumerate(pairs)}
             if any(self.integers):
                 infos[batches.APART_SCALARS] = tuple(self.integers)
+            if self.reward:
+                infos[batches.APART_REWARD] = self.reward
             return infos
         try:
             return batches.join_pairs(pairs, self.num_envs)

@@ -71,7 +71,8 @@ class Task:
             first, self.probe = self.probe, None
             env_fns[0] = lambda: first
         sliced = stop - start < len(self.recording.env_fns)
-        return SubEnvs(env_fns, self.recording.autoreset_mode, self.recording.sync, sliced=sliced)
+        made = self.recording
+        return SubEnvs(env_fns, made.autoreset_mode, made.sync, sliced=sliced, start=start)
 
     def learn_spaces(self) -> Any:
         """One sub-environment of a recording, to read spaces and metadata from."""

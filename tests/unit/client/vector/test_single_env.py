@@ -182,7 +182,6 @@ class _Liar(VectorEnv[Any, Any, Any]):
     [
         {"terminations": np.ones(1, bool)},
         {"terminations": np.ones((1, 2), bool)},
-        {"rewards": np.ones((1, 2))},
         {"infos": {"a": np.ones(1), "_a": np.zeros(0, bool)}},
         {"infos": {"a": 1, "_a": np.ones((1, 2), object)}, "observation": ()},
     ],

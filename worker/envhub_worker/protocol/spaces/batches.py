@@ -15,10 +15,12 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.spaces.graph import GraphInstance
 
+from envhub_worker.protocol.codec.inert import inert_copy, one_line
 from envhub_worker.protocol.errors import FAULTS, MessageTooLargeError, RemoteProtocolError
 from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES, OneOf
 
 Bounds = Sequence[tuple[int, int]]
+_SHOWN = 100
 
 
 def even_bounds(count: int, parts: int) -> list[tuple[int, int]]:
@@ -126,6 +128,21 @@ def is_apart(infos: dict[Any, Any]) -> bool:
 
 APART_SCALARS = -1
 """The key, in infos of the only sub-environment that are not joined, of what ``integers`` says."""
+
+
+APART_REWARD = -2
+"""Likewise of a tuple with its reward, where that is no number: an agent's each, for instance."""
+
+
+def reward_misfit(reward: Any, index: int, shape: tuple[int, ...] = ()) -> str:
+    """What is wrong with a reward that a vector environment cannot have."""
+    shown = inert_copy(reward)
+    needed = f"numbers of shape {shape}, as its reward_space says" if shape else "one number each"
+    return (
+        f"the reward of sub-environment {index} is of type {shown.type_name}: "
+        f"{one_line(shown.text, _SHOWN)}. A vector "
+        f"environment needs {needed}: return a number, or use SandboxEnv, which passes on any"
+    )
 
 
 def integers(space: gym.Space[Any], member: Any) -> list[bool]:
