@@ -34,8 +34,6 @@ _CONTAINERS = (list, dict, set, bytearray)
 _MOST = 1024
 """Modules and classes that are looked at."""
 
-Words = Callable[[], tuple[int, int]]
-
 
 class SharedState:
     """Compares what a process has once with what it was when this was made.
@@ -51,8 +49,9 @@ class SharedState:
     def __init__(self, root: str, report: Callable[[str], None]) -> None:
         self._root = os.path.join(root, "")
         self._report: Callable[[str], None] | None = report
-        self._numpy, self._random = _numpy_words(), _random_words()
-        self._before = self._numpy(), self._random()
+        self._generators = _numpy_generator(), random._inst
+        self._numpy, self._random = _numpy_words(self._generators[0]), _random_words()
+        self._numpy_before, self._random_before = self._numpy.tolist(), self._random.tolist()
         self._torch = _torch_states()
         self._slow: dict[tuple[str, ...], object] | None = None
         self._packages: set[str] = set()
@@ -70,8 +69,10 @@ class SharedState:
         if self._report is None:
             return
         self._left -= 1
-        if (self._numpy(), self._random()) != self._before:
-            self._say("numpy.random" if self._numpy() != self._before[0] else "random")
+        if self._numpy.tolist() != self._numpy_before:
+            self._say("numpy.random")
+        elif self._random.tolist() != self._random_before:
+            self._say("random")
         elif not self._left:
             self.look_closely()
 
@@ -141,37 +142,32 @@ def _unwrapped(envs: list[Any]) -> Iterator[Any]:
         yield getattr(env, "unwrapped", env)
 
 
-def _numpy_words() -> Words:
-    generator = np.random.mtrand._rand._bit_generator
+def _numpy_generator() -> Any:
+    return np.random.mtrand._rand._bit_generator
+
+
+def _numpy_words(generator: Any) -> memoryview:
+    """The first word of its state, and the position."""
     if type(generator) is not np.random.MT19937:
-        return _constant
-    words = (ctypes.c_uint32 * (_WORDS + 1)).from_address(generator.ctypes.state_address)
-    return _reader(words, _WORDS, 0, generator)
+        return _NO_WORDS
+    return _words(generator.ctypes.state_address)[::_WORDS]
 
 
-def _random_words() -> Words:
-    generator = random._inst
-    address = id(generator) + object.__basicsize__
-    words = (ctypes.c_uint32 * (1 + _WORDS)).from_address(address)
-    version, state, _ = generator.getstate()
-    if version != 3 or (words[0], words[1], words[_WORDS]) != (state[-1], state[0], state[-2]):
-        return _constant  # another layout
-    return _reader(words, 0, 1, generator)
+def _random_words() -> memoryview:
+    """The position, and the first word of the state."""
+    words = _words(id(random._inst) + object.__basicsize__)
+    version, state, _ = random.getstate()
+    known = version == 3 and words.tolist() == [state[-1], *state[:-1]]
+    return words[:2] if known else _NO_WORDS
 
 
-def _reader(words: Any, index: int, first: int, owner: object) -> Words:
-    """Reads two words. ``owner``: what the memory belongs to."""
-    view = memoryview(words).cast("B").cast("I")
-
-    def read(_: object = owner) -> tuple[int, int]:
-        return view[index], view[first]
-
-    return read
+def _words(address: int) -> memoryview:
+    words = (ctypes.c_uint32 * (_WORDS + 1)).from_address(address)
+    return memoryview(words).cast("B").cast("I")
 
 
-def _constant() -> tuple[int, int]:
-    """Of a generator whose layout is not known."""
-    return 0, 0
+_NO_WORDS = memoryview(bytes(8)).cast("I")
+"""Of a generator whose layout is not known."""
 
 
 def _torch_states() -> list[Any]:

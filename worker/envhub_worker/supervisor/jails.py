@@ -48,8 +48,9 @@ from envhub_worker.supervisor.runner_stream import RunnerLink
 from envhub_worker.supervisor.served_slabs import ServedSlabs
 from envhub_worker.supervisor.usage import CountLimit, reached, usage_of
 
-MAX_RUNNERS = 64
-"""Runners of one jail: one per useful core, not one per sub-environment."""
+MAX_RUNNERS, MAX_REMOTE_RUNNERS = 512, 64
+"""Runners of one jail: up to one for each sub-environment; and where its client is on another host,
+since each takes memory and descriptors of this server."""
 MAX_JAILS = 256
 """Open jails of one server."""
 MAX_SERVED_OUTPUT = 1 << 20
@@ -110,10 +111,9 @@ class Jails:
 
     def open(self, asker: Asker, request: m.OpenJail) -> None:
         """Fork a jail for a snapshot, and its first runners."""
-        if len(self.open_ones()) >= MAX_JAILS or not 1 <= request.runners <= MAX_RUNNERS:
-            raise RefusedError(
-                "WorkerError", f"at most {MAX_JAILS} jails of 1 to {MAX_RUNNERS} runners"
-            )
+        if len(self.open_ones()) >= MAX_JAILS:
+            raise RefusedError("WorkerError", f"a server has at most {MAX_JAILS} jails")
+        self._check_runners(request.runners, 0)
         copies = request.repositories
         confinement = confinement_from_wire(request.confinement)
         trees = tuple(copy.tree for copy in copies if copy.tree)
@@ -142,11 +142,19 @@ class Jails:
     def start_more(self, asker: Asker, request: m.StartRunners) -> None:
         """Fork further runners in an open jail."""
         entry = self._owned(asker, request.jail)
-        if not 1 <= request.runners <= MAX_RUNNERS - len(entry.links):
-            raise RefusedError("WorkerError", f"a jail has at most {MAX_RUNNERS} runners")
+        self._check_runners(request.runners, len(entry.links))
         if len(entry.lost) > MAX_LOST:
             raise RefusedError("WorkerError", f"{len(entry.lost)} of its runners have died")
         self._start_runners(asker, entry, request.runners)
+
+    def _check_runners(self, more: int, there: int) -> None:
+        most = MAX_RUNNERS if self._local else MAX_REMOTE_RUNNERS
+        if not 1 <= more <= most - there:
+            raise RefusedError(
+                "WorkerError",
+                f"{there + more} processes for the sub-environments of one environment: here it "
+                f"may have 1 to {most}; set num_workers to at most {most}",
+            )
 
     def _wire_limits(self, entry: JailRecord) -> WireLimits:
         """What its client permits; where that is somebody on another host, no more than ours."""

@@ -22,6 +22,8 @@ from envhub_worker.supervisor.records import Asker, RefusedError, Witness, whole
 
 MINE, THEIRS = Asker(b"one", 1, b"mine"), Asker(b"two", 1, b"theirs")
 SLABS = (0, words.HEADER_BYTES + words.INFO_BYTES, 64)
+MOST = 8
+"""Runners of a jail, in the test of that bound."""
 
 
 class _Jail:
@@ -105,12 +107,13 @@ def relay(of: Jails, entry: Any, *parts: Any, frames: int = 1, **how: Any) -> No
 def test_jails_and_their_runners_are_bounded(ours: Jails, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also those of a local client: each is a process, and memory of the server."""
     monkeypatch.setattr(jails, "MAX_JAILS", 2)
-    for runners in (0, jails.MAX_RUNNERS + 1):
-        with pytest.raises(RefusedError, match="jails of 1 to"):
+    monkeypatch.setattr(jails, "MAX_RUNNERS", MOST)
+    for runners in (0, MOST + 1):
+        with pytest.raises(RefusedError, match="may have 1 to"):
             opened(ours, runners)
-    entry = opened(ours, jails.MAX_RUNNERS - 1)
+    entry = opened(ours, MOST - 1)
     for runners in (0, 2):
-        with pytest.raises(RefusedError, match="at most"):
+        with pytest.raises(RefusedError, match="num_workers"):
             ours.start_more(MINE, m.StartRunners(entry.number, runners))
     ours.start_more(MINE, m.StartRunners(entry.number, 1))
     opened(ours)
