@@ -42,12 +42,13 @@ class FileRecord:
     """One file of a snapshot, by its path relative to the root, with ``/``, and its bytes.
 
     The digest is ``"git-sha1:<40 hex>"``, the git blob id, or ``"sha256:<64 hex>"`` for files in
-    LFS and files of a local folder.
+    LFS and files of a local folder. Git and folders say what is executable; the Hub does not.
     """
 
     path: str
     size: int
     digest: str
+    executable: bool = False
 
 
 Copier = Callable[[FileRecord, Path], None]
@@ -99,7 +100,8 @@ class Snapshot:
         commit: The full commit; of this machine and for a package ``local-`` or ``pypi-``, and a
             hash of the content.
         path: The entry file, relative to ``root``, for example ``"env.py"``.
-        root: The folder that holds the files (0444 in folders 0555) and nothing else.
+        root: The folder that holds the files (0444, programs 0555, in folders 0555) and nothing
+            else.
         files: Every file below ``root``, sorted by path.
         revision: What was asked for; None for nothing in particular.
         assets: Further repositories that its code may read.
@@ -183,7 +185,7 @@ class Snapshot:
 
 def content_digest(files: tuple[FileRecord, ...]) -> str:
     """A hash of names and contents, which is the commit of what has none."""
-    rows = [[file.path, file.size, file.digest] for file in files]
+    rows = [[file.path, file.size, file.digest, *[True] * file.executable] for file in files]
     return hashlib.sha256(json.dumps(rows).encode()).hexdigest()
 
 

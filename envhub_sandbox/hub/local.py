@@ -67,14 +67,21 @@ _CURES = {
 
 
 class LocalFile(NamedTuple):
-    """A file of a folder: its name in the snapshot, where its bytes are, and its size; or the text
-    of a link that git would commit, which is then its content.
+    """A file of a folder: its name in the snapshot, where its bytes are, its size, and whether it
+    is a program; or the text of a link that git would commit, which is then its content.
     """
 
     path: str
     source: Path
     size: int
+    executable: bool = False
     link: bytes | None = None
+
+    @classmethod
+    def at(cls, path: str, source: Path) -> LocalFile:
+        """A regular file."""
+        status = source.stat(follow_symlinks=False)
+        return cls(path, source, status.st_size, bool(status.st_mode & stat.S_IXUSR))
 
 
 class LeftOut(NamedTuple):
@@ -147,7 +154,9 @@ class LocalFolder:
         secret = [one.path for one in found if self.entry is None and looks_secret(one.path)]
         if secret and not allow_secrets:
             raise self._secret(f"holds what looks like keys or passwords: {_shown(secret)}")
-        records = tuple(FileRecord(one.path, one.size, _digest(one, str(self))) for one in found)
+        records = tuple(
+            FileRecord(one.path, one.size, _digest(one, str(self)), one.executable) for one in found
+        )
         check_listing_names(records, str(self))
         return Listing(found, records, tuple(left))
 
@@ -251,9 +260,9 @@ class LocalFolder:
                 yield LeftOut(name, IGNORED)
             elif stat.S_ISLNK(mode):
                 text = os.fsencode(os.readlink(path))
-                yield LocalFile(name, path, len(text), text)
+                yield LocalFile(name, path, len(text), link=text)
             elif name in checkout.tracked or os.access(path, os.R_OK):
-                yield LocalFile(name, path, item.stat(follow_symlinks=False).st_size)
+                yield LocalFile.at(name, path)
             else:  # a commit has what is tracked, so nothing of that is left out
                 yield LeftOut(name, _UNREADABLE)
 
@@ -278,7 +287,7 @@ class LocalFolder:
                 raise SnapshotError(f"{self}: the link {name!r} leads to a loop")
             yield from self._all(source, f"{name}/", (*above, source))
         elif source.is_file() and os.access(source, os.R_OK):
-            yield LocalFile(name, source, source.stat().st_size)
+            yield LocalFile.at(name, source)
         elif source.is_file():
             yield LeftOut(name, _UNREADABLE)
 

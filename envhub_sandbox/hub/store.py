@@ -4,7 +4,7 @@
 
     <cache>/snapshots/huggingface.co-1f2e3d4c/model--org--repo/<commit>/
         record.json     what was verified: digests, and a stat fingerprint of each file
-        tree/           the files, 0444 in folders 0555, and nothing else
+        tree/           the files, 0444 or 0555, in folders 0555, and nothing else
 
 A snapshot is built in a folder of another name and renamed into place: what bears a commit's
 name is complete. The record lies outside the tree, where the jail never sees it.
@@ -21,7 +21,7 @@ import re
 import stat
 import tempfile
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import urlsplit
@@ -38,7 +38,7 @@ _FORMAT = 1
 _ABANDONED_AFTER_S = 24 * 3600.0
 _MAX_NAME = 200
 _FILE_MODE = 0o444
-_TREE_FOLDER_MODE = 0o555
+_PROGRAM_MODE = _TREE_FOLDER_MODE = 0o555
 
 
 @dataclass(frozen=True)
@@ -157,8 +157,11 @@ def _read_record(slot: Slot, text: bytes) -> tuple[dict[str, object], dict[FileR
         document = json.loads(text)
         if document["format"] != _FORMAT:
             raise ValueError(f"unknown format {document['format']!r}")
-        rows = document["files"]
-        return document, {FileRecord(*row[:3]): [row[1], *row[3:]] for row in rows}
+        rows, programs = document["files"], frozenset(document.get("programs", ()))
+        return document, {
+            FileRecord(path, size, digest, path in programs): [size, *known]
+            for path, size, digest, *known in rows
+        }
     except (ValueError, KeyError, TypeError) as error:
         raise _damaged(slot, f"its record.json cannot be read ({error})") from error
 
@@ -195,7 +198,7 @@ def _verify_again(slot: Slot, changed: list[FileRecord]) -> None:
                 slot, f"the file {entry.path!r} was changed: {found}, not {entry.digest}"
             )
         with contextlib.suppress(OSError):
-            path.chmod(_FILE_MODE)
+            path.chmod(_mode_of(entry))
 
 
 def _damaged(
@@ -340,6 +343,10 @@ def _refuse_shared_store(place: Path) -> None:
         )
 
 
+def _mode_of(file: FileRecord) -> int:
+    return _PROGRAM_MODE if file.executable else _FILE_MODE
+
+
 def _fill(
     tree: Path, files: tuple[FileRecord, ...], copy: Callable[[FileRecord, Path], None]
 ) -> None:
@@ -351,19 +358,21 @@ def _fill(
             folders.make(target.parent)
             made.update(p for p in target.parents if tree in p.parents)
         copy(file, target)
-        target.chmod(_FILE_MODE)
+        target.chmod(_mode_of(file))
     for folder in made:
         folder.chmod(_TREE_FOLDER_MODE)
 
 
 def _write_record(
-    home: Path, tree: Path, document: Mapping[str, object], files: Iterable[FileRecord]
+    home: Path, tree: Path, document: Mapping[str, object], files: Collection[FileRecord]
 ) -> None:
     rows = [
         [file.path, file.size, file.digest, *_fingerprint((tree / file.path).lstat())[1:]]
         for file in files
     ]
-    write_whole_file(home / "record.json", json.dumps({**document, "files": rows}).encode())
+    programs = [file.path for file in files if file.executable]
+    record = {**document, "files": rows, "programs": programs}
+    write_whole_file(home / "record.json", json.dumps(record).encode())
 
 
 def _rename(building: Path, home: Path) -> None:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import stat
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
@@ -49,6 +50,12 @@ class Sent(NamedTuple):
     path: str
     size: int
     sha256: bytes
+    executable: bool
+
+    @property
+    def row(self) -> tuple[object, ...]:
+        """As the server takes it."""
+        return tuple(self) if self.executable else tuple(self)[:-1]
 
 
 def listing(root: Path) -> tuple[Sent, ...]:
@@ -70,7 +77,8 @@ def _sent(root: Path, path: Path) -> Sent:
         while piece := file.read(PIECE_BYTES):
             running.update(piece)
             size += len(piece)
-    return Sent(path.relative_to(root).as_posix(), size, running.digest())
+        executable = bool(os.fstat(file.fileno()).st_mode & stat.S_IXUSR)
+    return Sent(path.relative_to(root).as_posix(), size, running.digest(), executable)
 
 
 def upload(
@@ -93,7 +101,7 @@ def upload(
 
 
 def _offer(client: WorkerConnection, files: tuple[Sent, ...], deadline: Deadline) -> m.MissingBlobs:
-    offer = m.OfferSnapshot(tuple(tuple(file) for file in files))
+    offer = m.OfferSnapshot(tuple(file.row for file in files))
     reply, _ = client.request(offer, deadline=deadline)
     return expect_reply(reply, m.MissingBlobs)
 

@@ -208,6 +208,23 @@ def test_copies_are_charged(uploads: Uploads, monkeypatch: pytest.MonkeyPatch) -
     assert Uploads(uploads.folder, Quotas()).used_bytes(ALICE) == uploads.used_bytes(ALICE)
 
 
+def test_a_program_is_a_copy_that_may_be_run(uploads: Uploads) -> None:
+    """A link would be the file that other snapshots have; another snapshot it is, by its name."""
+    plain = bring(uploads, ("run.sh", b"x"))
+    before = uploads.used_bytes(ALICE)
+    row = (*offer(("run.sh", b"x")).files[0], True)
+    found = uploads.offer(OWNER, ALICE, m.OfferSnapshot((row,)), ())
+    assert (found.hashes, found.snapshot != plain) == ((), True)
+    modes = [
+        Path(uploads.tree(ALICE, name), "run.sh").stat().st_mode for name in (plain, found.snapshot)
+    ]
+    assert [mode & 0o777 for mode in modes] == [0o444, 0o555]
+    assert uploads.used_bytes(ALICE) - before > BLOCK_BYTES
+    for wrong in (False, 1, "True", (True, True)):
+        with pytest.raises(RefusedError, match=r"a file is \(path, size, sha256\[, True\]\)"):
+            uploads.offer(OWNER, ALICE, m.OfferSnapshot(((*row[:3], wrong),)), ())
+
+
 def _no_links(*_: object) -> None:
     raise OSError(errno.EMLINK, "too many links")
 

@@ -53,16 +53,19 @@ def _closed(path: str) -> str:
 def why_file_unwritable(error: BaseException, root: str) -> str:
     """A sentence for an error whose file lies among what a jail shares; empty for any other."""
     name = getattr(error, "filename", None)
-    if not isinstance(error, OSError) or error.errno not in _REFUSALS or type(name) is not str:
+    if not isinstance(error, OSError) or error.errno not in _REFUSALS:
         return ""
-    path = os.path.abspath(name)
+    if not isinstance(name, (str, os.PathLike)):
+        return ""
+    path = os.path.abspath(os.fsdecode(name))
     place = _place(path, root)
     if not place or os.access(path, os.W_OK):
         return ""
     if os.path.exists(path) and not _is_read_only(path):
         return (
             f"{path} is shared and has mode {os.stat(path).st_mode & 0o777:04o}. os.replace() puts "
-            "another file there, and os.chmod(path, 0o644) makes it this jail's own"
+            "another file there, and os.chmod(path, 0o755) makes it this jail's own, to be written "
+            "or run: the Hub does not say which of its files are programs"
         )
     return (
         f"{path} is in {place}, which is read-only in this jail. Write to tempfile.mkdtemp(), or "

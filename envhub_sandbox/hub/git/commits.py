@@ -328,7 +328,7 @@ class GitHost:
             if _has_lfs(found):
                 SNAPSHOT.warning("%s: of its files in LFS only the pointers are here", title)
             records = (
-                FileRecord(blob.path, blob.size, f"{GIT_SHA1}:{blob.digest}")
+                FileRecord(blob.path, blob.size, f"{GIT_SHA1}:{blob.digest}", blob.executable)
                 for blob in found.blobs
             )
             yield CommitFiles(records, partial(_copier, found))

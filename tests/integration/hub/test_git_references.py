@@ -14,12 +14,12 @@ from typer.testing import CliRunner
 
 from envhub_sandbox import make_env
 from envhub_sandbox.cli.app import app
-from envhub_sandbox.errors import RepositoryUnavailableError, SnapshotTooLargeError
+from envhub_sandbox.errors import LoadError, RepositoryUnavailableError, SnapshotTooLargeError
 from envhub_sandbox.hub.git import address
 from envhub_sandbox.hub.reference import HubRef
 from envhub_sandbox.hub.snapshot import SnapshotLimits, commit_of, fetch, snapshot_named
 from tests.support.packages.git_server import commit, git, git_served, make_repository
-from tests.support.repositories import CARTPOLE
+from tests.support.repositories import CARTPOLE, CARTPOLES
 
 pytestmark = [
     pytest.mark.short,
@@ -55,6 +55,32 @@ def envhub(*arguments: str, code: int = 0) -> dict[str, Any]:
     done = CliRunner().invoke(app, [*arguments, "--json"])
     assert done.exit_code == code, done.output
     return dict(json.loads(done.stdout))
+
+
+_RUNS_A_PROGRAM = f"""
+import pathlib
+from subprocess import check_output
+{CARTPOLES}
+PROGRAM = pathlib.Path(__file__).parent / "bin" / "count"
+
+def make_env(n_envs=1, use_async_envs=False):
+    return {{check_output([PROGRAM], text=True): {{0: cartpoles(n_envs)}}}}
+"""
+
+
+def test_a_program_of_a_commit_or_a_folder_can_be_run(ref: str, repository: Path) -> None:
+    """The Hub does not list which files are programs; the error says what to do there."""
+    (repository / "envs/bin").mkdir()
+    (repository / "envs/bin/count").write_text("#!/bin/sh\nprintf suite\n")
+    (repository / "envs/env.py").write_text(_RUNS_A_PROGRAM)
+    (repository / "envs/bin/count").chmod(0o755)
+    commit(repository)
+    for reference in (f"{ref}:envs/env.py", str(repository / "envs")):
+        with make_env(reference) as suites:
+            assert list(suites) == ["suite"]
+    (repository / "envs/bin/count").chmod(0o644)
+    with pytest.raises(LoadError, match=r"os\.chmod\(path, 0o755\) .* to be written or run"):
+        make_env(str(repository / "envs"))
 
 
 def test_it_runs_and_says_what_ran(ref: str, repository: Path, tmp_path: Path) -> None:

@@ -171,6 +171,23 @@ def test_link_inside_becomes_a_real_file(folder: Path) -> None:
     assert (snapshot.root / "link.py").read_text() == "2"
 
 
+def test_programs_stay_programs(folder: Path) -> None:
+    """Their bit is a part of the content, and comes back where somebody takes it from the copy."""
+    plain = local(folder)
+    (folder / "sub/other.py").chmod(0o755)
+    snapshot = local(folder)
+    assert [one.executable for one in snapshot.files] == [False, True]
+    assert snapshot.commit == commit_of(str(folder)) != plain.commit
+    program = snapshot.root / "sub/other.py"
+    assert [path.stat().st_mode & 0o777 for path in (snapshot.root / "env.py", program)] == [
+        0o444,
+        0o555,
+    ]
+    program.chmod(0o444)
+    assert local(folder) == snapshot
+    assert program.stat().st_mode & 0o777 == 0o555
+
+
 @pytest.mark.parametrize("target", ["/etc/passwd", "../secret", "/etc", "..", ".git/config"])
 def test_link_that_leaves_the_folder_is_refused(folder: Path, target: str) -> None:
     """Nothing outside the folder is copied in through a link, nor what may hold a login."""

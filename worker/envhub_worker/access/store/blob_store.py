@@ -34,6 +34,7 @@ class ListedFile:
     path: str
     size: int
     sha256: bytes
+    executable: bool = False
 
 
 def blob_charge(size: int) -> int:
@@ -133,7 +134,7 @@ class BlobStore:
             for file in files:
                 if self.blob(file.sha256).stat().st_size != file.size:
                     raise RefusedError("LocalProtocolError", f"{file.path!r} has another size")
-                _place(self.blob(file.sha256), building / file.path, copying)
+                _place(self.blob(file.sha256), building / file.path, file.executable, copying)
             for folder, _, _ in os.walk(building, topdown=False):
                 if folder != str(building):
                     os.chmod(folder, 0o555)
@@ -169,14 +170,15 @@ def _modified(path: Path) -> float:
     return 0.0  # somebody has removed it by hand
 
 
-def _place(blob: Path, target: Path, copying: Callable[[int], None]) -> None:
+def _place(blob: Path, target: Path, executable: bool, copying: Callable[[int], None]) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
-    try:
-        os.link(blob, target)
-    except OSError:  # more links than the file system allows, or none at all
-        copying(blob.stat().st_size)
-        shutil.copyfile(blob, target)
-        target.chmod(0o444)
+    if not executable:  # whose mode is that of the blob
+        with contextlib.suppress(OSError):  # more links than the file system allows, or none at all
+            os.link(blob, target)
+            return
+    copying(blob.stat().st_size)
+    shutil.copyfile(blob, target)
+    target.chmod(0o555 if executable else 0o444)
 
 
 def _charge_on_disk(tree: Path) -> int:

@@ -288,15 +288,17 @@ def checked_listing(files: tuple[object, ...], quotas: Quotas) -> list[ListedFil
 
 
 def _listed(file: object) -> ListedFile:
-    if type(file) is not tuple or [type(part) for part in file] != [str, int, bytes]:
-        raise RefusedError("LocalProtocolError", "a file is (path, size, sha256)")
-    path, size, sha256 = file
+    parts = file if type(file) is tuple else ()
+    executable = parts[3:] == (True,)
+    if [type(part) for part in parts] != [str, int, bytes, *[bool] * executable]:
+        raise RefusedError("LocalProtocolError", "a file is (path, size, sha256[, True])")
+    path, size, sha256 = parts[:3]
     if size < 0 or len(sha256) != _SHA256_BYTES:
-        raise RefusedError("LocalProtocolError", "a file is (path, size, sha256)")
+        raise RefusedError("LocalProtocolError", "a file is (path, size, sha256[, True])")
     wrong = wrong_with_path(path)
     if wrong:
         raise RefusedError("LocalProtocolError", f"the file {path[:200]!r} {wrong}")
-    return ListedFile(path, size, sha256)
+    return ListedFile(path, size, sha256, executable)
 
 
 def wrong_with_path(path: str) -> str:
@@ -333,5 +335,5 @@ def _check_tree(paths: list[str]) -> None:
 
 def digest_of(files: list[ListedFile]) -> str:
     """The name of a snapshot: a hash of its sorted listing."""
-    rows = [[file.path, file.size, file.sha256.hex()] for file in files]
+    rows = [[file.path, file.size, file.sha256.hex(), *[True] * file.executable] for file in files]
     return hashlib.sha256(json.dumps(rows).encode()).hexdigest()

@@ -230,7 +230,9 @@ class RelayDonePartly(Message, kind=18):
 
 
 class OfferSnapshot(Message, kind=19):
-    """A snapshot's files, each ``(path, size, sha256)``. Reply: ``MissingBlobs`` or ``Refusal``."""
+    """A snapshot's files, each ``(path, size, sha256)``, of programs with True at its end. Reply:
+    ``MissingBlobs`` or ``Refusal``.
+    """
 
     files: tuple[object, ...]
 
