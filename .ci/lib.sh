@@ -59,6 +59,7 @@ for folder in tests/attacks/*/; do
   esac
 done
 differs_by_user+=(tests/integration/{confinement,lifecycle,loading,packages})
+differs_by_user+=(tests/unit/worker tests/unit/client/{dependencies,hub,sandboxes,system})
 
 # processes: for tests that start much and wait for it: twice as many as there are cores, which three
 # processes for two still leave idle for a third of the time. Not beyond eight, as in ./test.

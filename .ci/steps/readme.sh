@@ -1,12 +1,8 @@
 # What a newcomer does: both of the README's commands, word for word, in a clean copy, with the
 # python3 that is first on the PATH; then once more as a plain user, with the system's python3.
 # Proves that they pass for both, whatever root's interpreter is, and that what cannot be tested
-# there is skipped. What others run is not repeated: root's second command leaves out the unit tests,
-# which root runs in "tests", "oldest" and "newest", with Debian's interpreter and with pyenv's, and what
-# is marked as the same for users; what jails make of root's own interpreter, which no other user may
-# read, is in the rest. The plain user's leaves out what the step "user" runs whole, with the same
-# interpreter, what is marked, and the unit tests of the protocol and of the documents, which open nothing
-# that belongs to anybody.
+# there is skipped. What others run is not repeated: what is marked as the same for users, and of the
+# plain user's what the step "user" runs whole, with the same interpreter.
 set -euo pipefail
 . "$(dirname "${BASH_SOURCE[0]}")/../lib.sh"
 unset PYTHON "${!ENVHUB_@}"
@@ -33,13 +29,12 @@ if [ "$(id -u)" != 0 ]; then
   newcomer readme env ENVHUB_CACHE="$CI_WORK/readme-cache"
   exit 0
 fi
-same="--ignore=tests/unit/protocol --ignore=tests/unit/docs"
 # both side by side: they are two users, and much of an installation is waiting
 (newcomer readme-user bash "$CI_STEPS/../as-user.sh" 0 \
-  env "PYTEST_ADDOPTS=--differs-by users ${differs_by_user[*]/#/--ignore=} $same") >"$CI_WORK/readme-user.out" 2>&1 &
+  env "PYTEST_ADDOPTS=--differs-by users ${differs_by_user[*]/#/--ignore=}") >"$CI_WORK/readme-user.out" 2>&1 &
 user=$!
 (newcomer readme env ENVHUB_CACHE="$CI_WORK/readme-cache" \
-  PYTEST_ADDOPTS="--differs-by users --ignore=tests/unit") &
+  PYTEST_ADDOPTS="--differs-by users") &
 root=$!
 failed=0
 wait "$root" || failed=1

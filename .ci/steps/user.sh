@@ -14,7 +14,7 @@ export PYTHON=/usr/bin/python3
 
 # What is marked as the same for users has been run. What the client makes of a worker's answers, and what
 # commands print, does not depend on who runs it either; the plain user of the step "readme" runs the short
-# form of these, and the unit tests.
+# form of these.
 
 # part NUMBER ARGUMENT...: these tests, by one process of a user of their own: some limits count what a
 # user runs, and two processes would count each other's. What the step "tests" installed serves here

@@ -60,7 +60,6 @@ def pair(request: pytest.FixtureRequest, case: Case, lane: str) -> Iterator[Pair
         yield both
 
 
-@pytest.mark.short
 class TestCounter(VectorEnvCompliance):
     """Every kind of value in the infos, episodes of two to six steps; five rows, three workers."""
 

@@ -11,15 +11,12 @@ import warnings
 from typing import Any
 
 import numpy as np
-import pytest
 from gymnasium.vector import VectorEnv
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from envhub_worker.protocol.spaces.batches import join_infos
 from tests.support.compare import assert_same
-
-pytestmark = pytest.mark.short
 
 VALUES: dict[str, st.SearchStrategy[Any]] = {
     "int": st.integers(-9, 9),

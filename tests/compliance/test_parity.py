@@ -129,7 +129,6 @@ class TestPendulum(VectorEnvCompliance):
         pair.step([[1 / 3]] * pair.num_envs)
 
 
-@pytest.mark.short
 class TestLeRobotPendulum(VectorEnvCompliance):
     """Dict observations and ``is_success`` in every info."""
 

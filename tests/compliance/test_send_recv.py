@@ -47,7 +47,6 @@ def _cases(n_envs: int, workers: int | None, modes: tuple[str, ...] = MODES) -> 
     return [Case(n_envs, False, {"autoreset_mode": mode}, workers) for mode in modes]
 
 
-@pytest.mark.short
 class TestCounter(VectorEnvCompliance):
     """Every kind of value in the infos; five rows, three workers."""
 

@@ -19,7 +19,7 @@ from tests.support import inside
 from tests.support.processes import descendants, eventually
 from tests.support.samples import sample
 
-pytestmark = [pytest.mark.short, pytest.mark.usefixtures("neighbour")]
+pytestmark = pytest.mark.usefixtures("neighbour")
 
 lanes = pytest.mark.parametrize("lane", ["auto", "frames"])
 

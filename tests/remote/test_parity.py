@@ -28,7 +28,6 @@ class TestCounter(VectorEnvCompliance):
     steps = 60
 
 
-@pytest.mark.short
 class TestExoticSpaces(VectorEnvCompliance):
     """Spaces that have no fixed layout."""
 

@@ -39,8 +39,6 @@ from tests.attacks.client.lying_server import (
 )
 from tests.support import inside, wire
 
-pytestmark = pytest.mark.short
-
 ALL = 2 * NUM_ENVS
 """Rows of the fleet: the first are the liar's, the others those of an honest server."""
 HONEST = slice(NUM_ENVS, ALL)

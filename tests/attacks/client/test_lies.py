@@ -49,9 +49,8 @@ from tests.support import inside
 from tests.support.repositories import CARTPOLES, write_repository
 from tests.support.wire import decode_space, deep, ext, packed, value
 
-pytestmark = pytest.mark.short
 
-
+@pytest.mark.short
 def test_canary_sings(tmp_path: Path) -> None:
     """The control: loading the pickle executes it."""
     pickle.loads(cloudpickle.dumps(Canary(tmp_path / "executed")))
@@ -87,6 +86,7 @@ REPLIES: dict[str, tuple[type[m.Message], Callable[[Any], m.Message], Callable[[
 }
 
 
+@pytest.mark.short
 @pytest.mark.parametrize("what", REPLIES)
 def test_pickles_in_replies_are_never_loaded(
     liar: LyingServer, folder: str, tmp_path: Path, what: str
@@ -152,6 +152,7 @@ WRONG: dict[str, dict[str, Any]] = {
 }
 
 
+@pytest.mark.short
 @pytest.mark.parametrize("what", list(WRONG))
 def test_wrong_arrays_are_refused(liar: LyingServer, folder: str, what: str) -> None:
     liar.lies[m.Step] = relayed(step_done(**WRONG[what]))
@@ -316,6 +317,7 @@ DOCUMENTS: dict[str, Callable[[], Frames]] = {
 }
 
 
+@pytest.mark.short
 @pytest.mark.parametrize("what", list(DOCUMENTS))
 def test_malformed_answers_are_refused(liar: LyingServer, folder: str, what: str) -> None:
     """Whatever stands where the runner's answer belongs, decoding it is bounded and harmless."""
@@ -377,6 +379,7 @@ def test_exceptions_choose_no_class(liar: LyingServer, folder: str) -> None:
     assert not {module for module in set(sys.modules) - before if module in ("antigravity",)}
 
 
+@pytest.mark.short
 def test_silence_ends_at_the_deadline(liar: LyingServer, folder: str) -> None:
     """A worker that never answers costs the time that the caller gave, and closes in time."""
     liar.lies[m.Step] = lambda asked: []

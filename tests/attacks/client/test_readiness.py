@@ -213,7 +213,6 @@ NEVER = [
 ]
 
 
-@pytest.mark.short("strict")
 @pytest.mark.parametrize(("lane", "mode"), NEVER)
 def test_who_is_never_ready_holds_nobody_up(
     strict: Arena, home: Path, lane: str, mode: str
@@ -251,7 +250,6 @@ BROKEN = [
 ]
 
 
-@pytest.mark.short("strict")
 @pytest.mark.parametrize(("lane", "mode"), BROKEN)
 def test_who_breaks_a_rule_is_given_up_alone(
     strict: Arena, tmp_path: Path, lane: str, mode: str
@@ -275,7 +273,6 @@ def test_who_breaks_a_rule_is_given_up_alone(
         assert isinstance(refused.value, WorkerDiedError)
 
 
-@pytest.mark.short("strict")
 @pytest.mark.parametrize("word", ["SEQUENCE", "OUTCOME"])
 def test_an_answer_that_is_taken_back_holds_nobody_up(
     strict: Arena, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, word: str

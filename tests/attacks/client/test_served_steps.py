@@ -21,8 +21,6 @@ from tests.attacks.client.lies import ACTIONS, Canary, refuses, relayed, started
 from tests.attacks.client.lying_server import NUM_ENVS, OBSERVATION, LyingServer, lying
 from tests.support.repositories import CARTPOLES, write_repository
 
-pytestmark = pytest.mark.short
-
 LAYOUT = slabs.observation_layout(OBSERVATION, NUM_ENVS, 1)
 assert LAYOUT is not None
 BATCH = bytes(LAYOUT.total_bytes)

@@ -17,7 +17,6 @@ from tests.hub.olah_server import GitRepository
 from tests.support.packages.git_server import ran
 
 pytestmark = [
-    pytest.mark.short,
     pytest.mark.skipif(shutil.which("git") is None, reason="needs git"),
 ]
 

@@ -34,7 +34,6 @@ from tests.support.ports import QuietHandler, serving
 from tests.support.repositories import CARTPOLE
 
 pytestmark = [
-    pytest.mark.short,
     pytest.mark.skipif(shutil.which("git") is None, reason="needs git"),
 ]
 

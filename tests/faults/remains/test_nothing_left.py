@@ -11,9 +11,6 @@ from tests.faults.remains.clients import finish, left, line, start
 from tests.faults.remains.traces import Traces
 from tests.support.processes import eventually
 
-pytestmark = pytest.mark.short
-
-
 ENDS = {
     "returns without close": "made()",
     "raises": "suites = made()\nraise KeyError('mine')",
@@ -42,6 +39,7 @@ def test_nothing_remains_of_a_client_that(body: str, folder: Path) -> None:
     assert "Exception ignored" not in said
 
 
+@pytest.mark.short
 @pytest.mark.parametrize(
     ("moment", "number"),
     [
@@ -106,6 +104,7 @@ def test_ctrl_c_in_a_step_leaves_a_usable_client(folder: Path, tmp_path: Path) -
     assert client.returncode == 0
 
 
+@pytest.mark.short
 def test_fork_refuses_and_ends_nothing(folder: Path) -> None:
     """In a fork old environments refuse and new ones work; the parent's go on throughout."""
     client = start(

@@ -68,6 +68,7 @@ def test_the_page_is_the_table() -> None:
     assert checks.DOCUMENT.read_text() == checks.document()
 
 
+@pytest.mark.short
 def test_an_honest_repository_passes(tmp_path: Path) -> None:
     """Every check that can be made of it holds, and the figures are of what was played."""
     report = judged(repository(tmp_path / "walk"), pictures=True)
@@ -274,6 +275,7 @@ def test_missing_papers_are_told(tmp_path: Path) -> None:
     assert report.findings == []
 
 
+@pytest.mark.short
 def test_the_command_line_judges(tmp_path: Path) -> None:
     """Exit codes, and the reports that were asked for; a name that a terminal would obey is a
     finding, and no reason not to judge."""

@@ -17,8 +17,6 @@ from tests.hub.stub_hub import StubHub, StubRepository
 from tests.support.interpreter import profiles
 from tests.support.repositories import STILL
 
-pytestmark = pytest.mark.short
-
 DATA = "d" * 40
 ENV = f"""{STILL}
 from pathlib import Path

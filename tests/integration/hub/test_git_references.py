@@ -22,7 +22,6 @@ from tests.support.packages.git_server import commit, git, git_served, make_repo
 from tests.support.repositories import CARTPOLE, CARTPOLES
 
 pytestmark = [
-    pytest.mark.short,
     pytest.mark.skipif(shutil.which("git") is None, reason="needs git"),
 ]
 

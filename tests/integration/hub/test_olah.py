@@ -98,7 +98,6 @@ def test_branch_tag_and_short_commit_name_the_full_commit(olah: OlahServer, get:
     assert contents(found["dev"]) == {"env.py": b"3"}
 
 
-@pytest.mark.short
 @pytest.mark.parametrize("repo_type", ["model", "space", "dataset"])
 def test_each_repository_type_loads(olah: OlahServer, get: Fetch, repo_type: str) -> None:
     make(olah, f"typed-{repo_type}", repo_type).commit({"env.py": repo_type})

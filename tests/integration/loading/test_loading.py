@@ -23,7 +23,7 @@ from tests.support.compare import assert_same
 from tests.support.repositories import CARTPOLE, CARTPOLES, STILL, write_repository
 from tests.support.samples import make_env_of, reference, sample
 
-pytestmark = [pytest.mark.same_for("users"), pytest.mark.short]
+pytestmark = pytest.mark.same_for("users")
 
 
 def roll(env: VectorEnv[Any, Any, Any], steps: int = 5) -> Any:
@@ -55,6 +55,7 @@ def make_env(n_envs=1, use_async_envs=False):
 """
 
 
+@pytest.mark.short
 class TestWhereTheCodeRuns:
     """The sample ``marker`` leaves traces of where it was imported."""
 
@@ -128,6 +129,7 @@ class TestWhereTheCodeRuns:
             assert suites.env.get_attr("built_on_main_thread") == (True, True)
 
 
+@pytest.mark.short
 class TestLayouts:
     """Where the entry point is, and what it is."""
 

@@ -17,8 +17,6 @@ from envhub_sandbox.errors import (
 )
 from tests.support.repositories import STILL, write_repository
 
-pytestmark = pytest.mark.short
-
 PARSES = f"""
 import argparse, sys
 parser = argparse.ArgumentParser()

@@ -18,8 +18,6 @@ from tests.support.compare import assert_same
 from tests.support.repositories import write_repository
 from tests.support.samples import Frozen
 
-pytestmark = pytest.mark.short
-
 NEW = {"lerobot_new_rollout": True}
 ENVS = """
 import gymnasium as gym

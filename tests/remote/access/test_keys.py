@@ -26,9 +26,8 @@ from tests.support.command_line import below, gone
 from tests.support.processes import eventually
 from tests.support.started import started
 
-pytestmark = pytest.mark.short
 
-
+@pytest.mark.short
 def test_a_server_says_what_its_client_has_to_write(
     server: Listening, monkeypatch: pytest.MonkeyPatch, repository: Path
 ) -> None:

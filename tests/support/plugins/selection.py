@@ -1,8 +1,9 @@
 """A pytest plugin: the tests that a newcomer needs to trust the copy, and ``--full`` for all.
 
-Without a path, ``-k``, ``-m`` or ``--full``, the short form is run: all of ``tests/unit``, and what
-bears the marker ``short``, as a module, a class or a function. ``@pytest.mark.short("strict-")``
-takes, of a function's cases, those whose parameters' id starts so.
+Without a path, ``-k``, ``-m`` or ``--full``, the short form is run: what bears the marker
+``short``, as a module, a class or a function. ``@pytest.mark.short("strict-")`` takes, of a
+function's cases, those whose parameters' id starts so. It is to be some hundred tests: the main
+job, an attack of each kind with its control, parity over both lanes, and the commands.
 
 CI repeats tests as another user (``--differs-by users``), and with other versions of Python and
 of packages (``--differs-by versions``). ``@pytest.mark.same_for("users", "versions")`` says for
@@ -10,6 +11,8 @@ which of these a test proves the same again: it is left out there.
 """
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import pytest
 
@@ -19,10 +22,17 @@ REPEATED = ("users", "versions")
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """``--full`` and ``--differs-by``."""
-    text = "run every test, and not only tests/unit and what is marked as short"
+    text = "run every test, and not only what is marked as short"
     parser.addoption("--full", action="store_true", help=text)
     text = "leave out what is marked as the same for them"
     parser.addoption("--differs-by", choices=REPEATED, help=text)
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """In the short form, do not import a module that marks nothing."""
+    if collection_path.is_dir() or not is_short(config):
+        return None
+    return None if "mark.short" in collection_path.read_text() else True
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -41,8 +51,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if idle := sorted(_named(items) - _named(items, met=True)):
         text = ", ".join(f"{start!r} of {test}" for test, start in idle)
         raise pytest.UsageError(f"the short selection names no case by {text}")
-    unit = config.rootpath / "tests" / "unit"
-    _keep(config, items, [x for x in items if x.path.is_relative_to(unit) or _is_marked(x)])
+    _keep(config, items, [x for x in items if _is_marked(x)])
 
 
 def pytest_terminal_summary(

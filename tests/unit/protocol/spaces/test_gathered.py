@@ -23,7 +23,6 @@ from envhub_worker.protocol.spaces.batches import (
 from tests.compliance.test_join_infos import INFO
 from tests.support.compare import assert_same
 
-pytestmark = pytest.mark.short
 _ROOM = 1 << 20
 
 
