@@ -13,5 +13,6 @@ command -v prometheus >/dev/null || export ENVHUB_CI_WITHOUT_PROMETHEUS=1
 # The step "container" has those that need an engine.
 # Ray is in the step "ray".
 export PYTEST_ADDOPTS="--ignore=tests/containers --ignore=tests/remote/ray --durations=40"  # the next minutes to save are there
+export ENVHUB_ATTACK_TABLE=$CI_WORK/attacks.md  # every attack; docs/attacks.md is a summary
 export ENVHUB_TEST_RUNNER="bash $CI_AGAIN"
 with_summary tests ./test --full -n "$(processes)"

@@ -15,7 +15,10 @@ from pathlib import Path
 CHECKOUT = Path(__file__).resolve().parents[3]
 DOCUMENTS = tuple(
     path.relative_to(CHECKOUT).as_posix()
-    for pattern in ("*.md", "docs/*.md", "benchmarks/*.md", "examples/*.md", "plugins/*/*.md")
+    for pattern in (
+        *("*.md", "docs/*.md", "docs/internals/tests.md", "benchmarks/*.md"),
+        *("examples/*.md", "plugins/*/*.md"),
+    )
     for path in sorted(CHECKOUT.glob(pattern))
 )
 
@@ -53,7 +56,7 @@ _DERIVED = (
 NOT_EXECUTED = {
     ("CONTRIBUTING.md", "python3 -m venv .venv"): _INSTALLS,
     ("CONTRIBUTING.md", ".venv/bin/ruff"): "is what CI does: .ci/steps/lint.sh, .ci/steps/tests.sh",
-    ("CONTRIBUTING.md", ".venv/bin/python -m"): _LONG,
+    ("docs/internals/tests.md", ".venv/bin/python -m"): _LONG,
     ("benchmarks/README.md", "python -m"): _LONG,
     ("docs/deployment.md", "envhub image build"): _DERIVED,
     ("docs/lerobot.md", "pip install"): _INSTALLS,

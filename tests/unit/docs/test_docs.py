@@ -19,7 +19,7 @@ from envhub_worker.protocol.lifecycle import TABLE, Event, State
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, MAX_NUM_ENVS
 from envhub_worker.protocol.manifest.manifest import MAX_ENVS
 from envhub_worker.protocol.manifest.names import MAX_NAME
-from tests.support.documents import charts, options, picture, settings
+from tests.support.documents import options, settings
 from tests.unit.docs.test_imports import folder
 
 pytestmark = pytest.mark.same_for("users")
@@ -124,13 +124,12 @@ def test_readme_opens_with_one_command_to_try_and_one_to_test() -> None:
 
 
 def test_readme_shows_the_first_command_with_what_it_prints() -> None:
-    """The picture was drawn from a run of it, moves by itself, and names no machine."""
-    drawn = picture.DOCUMENT.read_text()
-    assert f"]({picture.DOCUMENT.relative_to(CHECKOUT)})" in README
-    assert f"<title>{picture.command()}: " in drawn
+    """The picture is of a run of it, and names no machine."""
+    drawn = (CHECKOUT / "docs" / "assets" / "run.svg").read_text()
+    assert "](docs/assets/run.svg)" in README
+    command = fenced(README, "sh")[0].rpartition("/bin/")[2].strip()
+    assert f"<title>{command}: " in drawn
     assert "wrote cartpole.mp4" in drawn
-    assert "animation:" in drawn
-    assert len(drawn) < picture.MAX_BYTES
     assert not _FORBIDDEN.search(drawn)
 
 
@@ -144,9 +143,9 @@ def test_ci_runs_the_commands_of_the_readme() -> None:
     assert re.search(full, (steps / "tests.sh").read_text(), re.M)
 
 
-def test_contributing_names_every_step_and_every_folder_of_tests() -> None:
-    text = (CHECKOUT / "CONTRIBUTING.md").read_text()
-    tables = rows(section(text, "Before you propose a change"))
+def test_a_page_names_every_step_and_every_folder_of_tests() -> None:
+    text = (CHECKOUT / "docs" / "internals" / "tests.md").read_text()
+    tables = rows(section(text, "CI"))
     steps = {step.stem for step in (CHECKOUT / ".ci" / "steps").iterdir()}
     assert {name for row in tables for name in code_words(row[0])} == steps
     folders = {f"tests/{one.name}" for one in CHECKOUT.glob("tests/*") if one.is_dir()}
@@ -155,9 +154,9 @@ def test_contributing_names_every_step_and_every_folder_of_tests() -> None:
 
 
 def test_contributing_names_twenty_modules_to_read_first() -> None:
-    first, symptoms = section((CHECKOUT / "CONTRIBUTING.md").read_text(), "Where to begin").split(
-        "From a symptom to a module:"
-    )
+    first = section((CHECKOUT / "CONTRIBUTING.md").read_text(), "Where to begin")
+    page = (CHECKOUT / "docs" / "internals" / "map.md").read_text()
+    symptoms = section(page, "From a symptom to a module")
     modules = [code_words(module)[0] for module, _ in rows(first)]
     assert len(modules) == len(set(modules)) == 20
     begins = [[word for word in code_words(cell) if "/" in word] for _, cell in rows(symptoms)]
@@ -288,11 +287,10 @@ def test_error_tree_is_the_tree() -> None:
     assert {name for name in errors.__all__ if name.endswith("Error")} <= shown
 
 
-@pytest.mark.parametrize("written", [settings, options, charts])
+@pytest.mark.parametrize("written", [settings, options])
 def test_what_is_written_from_the_source_is_up_to_date(written: Any) -> None:
-    """``python -m tests.support.documents.settings``, ``options`` or ``charts`` writes it."""
+    """``python -m tests.support.documents.settings`` or ``options`` writes it."""
     assert written.DOCUMENT.read_text() == written.document()
-    assert {path: path.read_text() for path in charts.pictures()} == charts.pictures()
 
 
 def test_the_rules_of_interruption_are_those_that_the_source_names() -> None:
