@@ -80,8 +80,13 @@ def logged(scene):
 
 
 def exported(scene):
+    last = os.environ.get("SCENE", scene.number)
     os.environ["SCENE"] = str(scene.number)
-    return plain(scene)
+    return float(last)
+
+
+def located(scene):
+    return int(os.path.basename(os.getcwd()))
 
 
 def closed_over(scene):
@@ -98,6 +103,7 @@ VALUES = {
     "counted": counted,
     "logged": logged,
     "exported": exported,
+    "directory": located,
     "closed over": closed_over,
 }
 

@@ -32,6 +32,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
+from math import inf
 from time import monotonic, process_time
 from typing import Any
 
@@ -49,6 +50,8 @@ _BUILD_S = 2.0
 _LEAST_STEPS, _MOST_STEPS = 16, 256
 _LEAST_STEPS_S, _MOST_STEPS_S = 1.0, 0.25
 """Processor time in which the first are made, or it is heavy, and after which no further one is."""
+_LONGEST_STEPS_S = 2.0
+"""Of time that passes, also while it waits, after which no further one is."""
 _STEPS_AFTER_RESET = 8
 _ALONE = 4
 """So many of the first sub-environments, and of the last, are played alone."""
@@ -155,16 +158,16 @@ def _play(task: Task, indices: Sequence[int], steps: int | None, root: str) -> b
     turns, moved = _Turns(), list[str]()
     turns.replace_sources()
     state = SharedState(root, moved.append)
+    turns.most_s = _BUILD_S if steps is None else inf
     build = [partial(turns.run, index, partial(task.build_one, index)) for index in indices]
-    if steps is None:
-        build = [partial(_in_time, one) for one in build]
     envs = SubEnvs(build, task.recording.autoreset_mode, sync=False, sliced=True)
     envs.driven = [_Turn(turns, index, env) for index, env in zip(indices, envs.envs, strict=True)]
     state.built(envs.envs)
     play = _Play(envs, indices)
     play.reset([_SEED + index for index in indices])
-    if steps is None:
-        _check_time()
+    turns.most_s = inf
+    play.step()
+    state.look_closely()
     made = play.step_on(steps)
     play.reset(None)
     for _ in range(_STEPS_AFTER_RESET):
@@ -173,16 +176,6 @@ def _play(task: Task, indices: Sequence[int], steps: int | None, root: str) -> b
     if moved:
         raise RuntimeError(f"shared: {moved}")
     return made.to_bytes(_STEP_BYTES, "little") + b"".join(one.digest() for one in play.digests)
-
-
-def _in_time(build: Callable[[], Any]) -> Any:
-    _check_time()
-    return build()
-
-
-def _check_time() -> None:
-    if process_time() > _BUILD_S:
-        raise _HeavyError
 
 
 class _Play:
@@ -207,12 +200,13 @@ class _Play:
             for _ in range(steps):
                 self.step()
             return steps
-        began = process_time()
+        began, began_s = monotonic(), process_time()
         for made in range(_MOST_STEPS):
-            passed_s = process_time() - began
+            passed_s = process_time() - began_s
             if made < _LEAST_STEPS and passed_s > _LEAST_STEPS_S:
                 raise _HeavyError
-            if made >= _LEAST_STEPS and passed_s > _MOST_STEPS_S:
+            late = passed_s > _MOST_STEPS_S or monotonic() - began > _LONGEST_STEPS_S
+            if made >= _LEAST_STEPS and late:
                 return made
             self.step()
         return _MOST_STEPS
@@ -268,12 +262,15 @@ class _Turns:
     """Whose turn it is, and a clock and a source of entropy for each."""
 
     def __init__(self) -> None:
+        self.most_s = inf
         self._index = _OURS
         self._ticks: Counter[int] = Counter()
         self._draws: Counter[int] = Counter()
 
     def run(self, index: int, call: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-        """Call something of a sub-environment."""
+        """Call something of a sub-environment. Raises ``_HeavyError``: too much time has passed."""
+        if process_time() > self.most_s:
+            raise _HeavyError
         self._index = index
         try:
             return call(*args, **kwargs)

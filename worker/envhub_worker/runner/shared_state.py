@@ -29,6 +29,8 @@ _WORDS = 624
 _FIRST, _MOST_APART = 64, 1 << 16
 """Resets and steps until the first look at what takes longer to read; each later one is twice as
 far away, up to the second number."""
+_NOBODYS = {"gymnasium", "gym", "builtins", "__main__"}
+"""Packages that define environments, and are not looked at."""
 _PLAIN = (bool, int, float, complex, str, bytes, type(None))
 _CONTAINERS = (list, dict, set, bytearray)
 _MOST = 1024
@@ -39,11 +41,14 @@ class SharedState:
     """Compares what a process has once with what it was when this was made.
 
     Attributes of modules and classes, environment variables and the working directory count from
-    ``built`` on: whatever is built last leaves its marks there, in a process of its own too.
+    the first close look on: much is set once, where something is first built, reset or stepped.
 
     Args:
-        root: The repository's folder. Its modules are looked at.
+        root: The repository's folder. Its modules are looked at, and ``packages``.
         report: Called once, with a name of ``SHARED_STATE``.
+
+    Attributes:
+        packages: Those that define the environments.
     """
 
     def __init__(self, root: str, report: Callable[[str], None]) -> None:
@@ -53,16 +58,14 @@ class SharedState:
         self._numpy, self._random = _numpy_words(self._generators[0]), _random_words()
         self._numpy_before, self._random_before = self._numpy.tolist(), self._random.tolist()
         self._torch = _torch_states()
-        self._slow: dict[tuple[str, ...], object] | None = None
-        self._packages: set[str] = set()
+        self._slow: dict[tuple[str, ...], object] = {}
+        self.packages: set[str] = set()
         self._left = self._every = _FIRST
 
     def built(self, envs: list[Any]) -> None:
         """All sub-environments exist; the packages that define them are looked at as well."""
-        self._packages = {type(env).__module__.partition(".")[0] for env in _unwrapped(envs)}
-        self._packages -= {"gymnasium", "gym", "builtins", "__main__"}
-        self._slow = self._read()
-        self.look()
+        names = {type(getattr(env, "unwrapped", env)).__module__ for env in envs}
+        self.packages = {name.partition(".")[0] for name in names} - _NOBODYS
 
     def look(self) -> None:
         """After a reset or a step: report what has moved."""
@@ -79,17 +82,16 @@ class SharedState:
     def look_closely(self) -> None:
         """As ``look``, also at what takes longer to read."""
         self._left = self._every = min(2 * self._every, _MOST_APART)
-        if self._report is None or self._slow is None:
+        if self._report is None:
             return
+        before, self._slow = self._slow, self._read()  # with modules that were imported since
         if not _are_equal(self._torch, _torch_states()):
             self._say("torch")
             return
-        now = self._read()
-        for key, before in self._slow.items():
-            if now.get(key) != before:
+        for key, value in before.items():
+            if self._slow.get(key) != value:
                 self._say(key[0])
                 return
-        self._slow = now  # with modules that were imported since
 
     def _say(self, name: str) -> None:
         report, self._report = self._report, None
@@ -119,7 +121,7 @@ class SharedState:
             return False
         file = vars(module).get("__file__")
         ours = isinstance(file, str) and file.startswith(self._root)
-        return ours or name.partition(".")[0] in self._packages
+        return ours or name.partition(".")[0] in self.packages
 
 
 def _plain(attributes: dict[str, Any]) -> dict[str, object]:
@@ -135,11 +137,6 @@ _READABLE: dict[type, Callable[[Any], object]] = {
     **{kind: (lambda value: (type(value), value)) for kind in _PLAIN},
     **dict.fromkeys(_CONTAINERS, len),
 }
-
-
-def _unwrapped(envs: list[Any]) -> Iterator[Any]:
-    for env in envs:
-        yield getattr(env, "unwrapped", env)
 
 
 def _numpy_generator() -> Any:
