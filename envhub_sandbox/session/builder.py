@@ -193,14 +193,14 @@ class Builder:
         for index, reply in zip(shards, replies, strict=True):
             self._check_built(typed_reply(reply, m.BuildDone), *self._bounds[index])
         if self._results.apart:
-            self.take_apart(relay, deadline)
+            self.take_apart(relay, shards, deadline)
 
-    def take_apart(self, lane: Lane, deadline: Deadline) -> None:
-        """Have the only sub-environment's infos come as it gives them: see ``Results.apart``."""
-        [reply] = lane.jail.exchange(
-            "make_env", [(lane.runners[0], m.TakeApart(lane.number))], deadline
-        )
-        typed_reply(reply, m.Value)
+    def take_apart(self, lane: Lane, shards: Sequence[int], deadline: Deadline) -> None:
+        """Have each sub-environment's infos come as it gives them: see ``Results.apart``."""
+        message = m.TakeApart(lane.number)
+        asked: list[tuple[int, m.Message]] = [(lane.runners[shard], message) for shard in shards]
+        for reply in lane.jail.exchange("make_env", asked, deadline):
+            typed_reply(reply, m.Value)
 
     def _check_built(self, reply: m.BuildDone, start: int, stop: int) -> None:
         """Hold what was built against the manifest. Trust: input from the worker."""

@@ -137,6 +137,18 @@ class EnvSession:
         """Counters, and its state."""
         return {**self.counters.snapshot(), "state": self.lifecycle.state.name}
 
+    @property
+    def may_take_apart(self) -> bool:
+        """Whether ``take_apart`` can ask the processes now, or there are none."""
+        return self.lease.lane is None or self.lifecycle.state is State.READY
+
+    def take_apart(self, deadline: Deadline) -> bool:
+        """Whether infos come as each sub-environment gives them from now on: ``Results.apart``."""
+        with self.use.hold("make_env"):
+            if not self.lease.results.apart and self.may_take_apart:
+                self.lease.take_apart(deadline)
+            return self.lease.results.apart
+
     # --- brought back --------------------------------------------------------------------------
 
     def recover(self, grace: Deadline | None = None) -> None:

@@ -187,7 +187,7 @@ class Lease:
         """See ``Results.apart``: from now on, in the jail that there is and in each later one."""
         self.results.apart = True
         if self.lane is not None:
-            self._builder.take_apart(self.lane, deadline)
+            self._builder.take_apart(self.lane, range(len(self.results.bounds)), deadline)
 
     def _start(self, deadline: StartupDeadline, start: Callable[[], None]) -> None:
         self._startup = deadline

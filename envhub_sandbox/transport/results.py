@@ -16,9 +16,10 @@ from envhub_worker.protocol.limits import DEFAULT_LIMITS
 from envhub_worker.protocol.manifest.manifest import EnvManifest
 from envhub_worker.protocol.spaces import batches
 
+_NOT_ONE_EACH = "the worker's infos are not one mapping each"
 _SHOWN = 500
 StepResult = tuple[Any, Any, Any, Any, dict[Any, Any]]
-Own = tuple[list[dict[Any, Any]], Sequence[bool], tuple[Any, ...]]
+Own = tuple[list[list[dict[Any, Any]]], Sequence[bool], tuple[Any, ...]]
 """See ``Results.own``."""
 
 
@@ -33,8 +34,9 @@ class Results:
         manifest, bounds: As given.
         count: How many sub-environments these are: all, or those of one worker of a fleet.
         slices: The same as ``bounds``, counted from the first of these.
-        apart: Whether infos are to come as the only sub-environment gave them, which is what the
-            environment is then built for; set before that.
+        apart: Whether infos are to come as each sub-environment gave them, under its place; what
+            began in the step that ended an episode, under ``count`` more. The environment is then
+            built for that.
         max_bytes: How much larger than what the workers sent their infos may be when joined.
     """
 
@@ -91,7 +93,11 @@ class Results:
         return batches.join(self._space, observations), joined
 
     def _joined_infos(self, own: Sequence[dict[Any, Any]]) -> dict[Any, Any]:
-        return batches.join_infos(own, self._sizes, self.max_bytes)
+        return (
+            self._beside(own)
+            if self.apart
+            else batches.join_infos(own, self._sizes, self.max_bytes)
+        )
 
     def reset(
         self, replies: list[m.ResetDone], infos: dict[Any, Any] | None = None
@@ -108,7 +114,9 @@ class Results:
         Raises:
             RemoteEnvError: It would raise in Gymnasium, too.
         """
-        pairs = self.own_pairs(replies)
+        return self._joined_pairs(self.own_pairs(replies))
+
+    def _joined_pairs(self, pairs: list[tuple[int, dict[Any, Any]]]) -> dict[Any, Any]:
         try:
             infos = batches.join_pairs(pairs, self.count, DEFAULT_LIMITS.message_bytes)
         except FAULTS as error:
@@ -132,39 +140,69 @@ class Results:
 
     def infos(self, parts: list[dict[Any, Any]]) -> dict[Any, Any]:
         """One mapping of the shards' infos."""
-        whole = len(parts) == 1
-        return self._restored(parts[0] if whole else batches.join_infos(parts, self._sizes))
+        if len(parts) == 1:
+            return self._restored(parts[0])
+        if self.apart:
+            return self._beside(parts)
+        return self._restored(batches.join_infos(parts, self._sizes))
+
+    def _beside(self, parts: Sequence[dict[Any, Any]]) -> dict[Any, Any]:
+        """Infos that came apart, of all shards. Trust: input from the worker."""
+        own: dict[Any, Any] = {}
+        marks: list[dict[Any, Any]] = []
+        for part, (start, _), size in zip(parts, self.slices, self._sizes, strict=True):
+            marks.append({})
+            for key, value in part.items():
+                if type(key) is not int:
+                    marks[-1][key] = value
+                elif 0 <= key < 2 * size:
+                    own[start + key % size + key // size * self.count] = value
+        try:
+            return {**batches.join_infos(marks, self._sizes), **own}
+        except batches.Misfit as error:
+            raise RemoteProtocolError(_NOT_ONE_EACH) from error
 
     def joined(self, infos: dict[Any, Any]) -> dict[Any, Any]:
         """Infos as ``VectorEnv`` has them, also where they came apart; raises as ``own``."""
         if not self.apart:
             return infos
+        pairs = [(at, one) for at, some in enumerate(self.each(infos)) for one in some]
+        return self._joined_pairs(pairs)
+
+    def each(self, infos: dict[Any, Any]) -> list[list[dict[Any, Any]]]:
+        """Infos that came apart: each sub-environment's, in their order.
+
+        Raises:
+            RemoteEnvError: A reward is no number.
+        """
         with UNTRUSTED:
             own, _, reward = self.own(infos)
         if reward:
             shown = one_line(batches.reward_misfit(reward[0], 0), _SHOWN)
             raise remote_error("ValueError", "ValueError", shown)
-        return self.joined_own([m.Value(tuple((0, one) for one in own))])
+        return own
 
     def own(self, infos: dict[Any, Any]) -> Own:
-        """Infos that came apart, in their order, which members of the observation are Python's, and
-        a reward that is no number, if there is one.
+        """Infos that came apart; and of the only sub-environment, which members of the observation
+        are Python's, and a reward that is no number, if there is one.
 
         Trust: input from the worker.
         """
-        places = [key for key in infos if type(key) is int and key >= 0]
-        own, rest = [infos[place] for place in sorted(places)], dict(infos)
-        which = rest.pop(batches.APART_SCALARS, ())
-        reward = rest.pop(batches.APART_REWARD, ())
+        places = sorted(key for key in infos if type(key) is int and key >= 0)
+        which, reward = infos.get(batches.APART_SCALARS, ()), infos.get(batches.APART_REWARD, ())
         if type(reward) is not tuple or len(reward) > 1:
             raise RemoteProtocolError("the worker sent more than one reward")
-        if set(map(type, own)) - {dict} or type(which) is not tuple or len(own) > 2:
-            raise RemoteProtocolError("the worker's infos are not one mapping each")
+        own: list[list[dict[Any, Any]]] = [[] for _ in range(self.count)]
         for place in places:
-            del rest[place]
-        marks = {key: rest[key][0] for key in rest if f"_{key}" in rest}
-        if marks:  # of ours: that it was lost and came back
-            own = [*own[:-1], {**(own or [{}])[-1], **marks}]
+            if type(infos[place]) is not dict or place >= 2 * self.count:
+                raise RemoteProtocolError(_NOT_ONE_EACH)
+            own[place % self.count].append(infos[place])
+        if type(which) is not tuple:
+            raise RemoteProtocolError(_NOT_ONE_EACH)
+        for key in infos:  # marks of ours: which were lost and came back
+            if f"_{key}" in infos:
+                for at in np.flatnonzero(infos[f"_{key}"]):
+                    own[at] = [*own[at][:-1], {**(own[at] or [{}])[-1], key: infos[key][at]}]
         return own, which, reward
 
     def _restored(self, infos: dict[Any, Any]) -> dict[Any, Any]:
@@ -231,7 +269,7 @@ def _own_infos(value: Any, size: int) -> Sequence[tuple[int, dict[Any, Any]]]:
     pairs: Any = value if type(value) is tuple else (None,)
     for pair in pairs:
         if type(pair) is not tuple or list(map(type, pair)) != [int, dict]:
-            raise RemoteProtocolError("the worker's infos are not one mapping each")
+            raise RemoteProtocolError(_NOT_ONE_EACH)
         if not 0 <= pair[0] < size:
             raise RemoteProtocolError("the worker's infos are of no sub-environment")
     return cast("Sequence[tuple[int, dict[Any, Any]]]", pairs)

@@ -19,7 +19,6 @@ from gymnasium.vector import VectorEnv
 from gymnasium.vector.utils import concatenate, create_empty_array, iterate
 
 from envhub_sandbox.errors import ActionError
-from envhub_sandbox.transport.results import Own
 from envhub_sandbox.vector.sandbox_view import SandboxView
 from envhub_sandbox.vector.tracebacks import short_traceback, shortened
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
@@ -309,11 +308,15 @@ class SingleEnv(gym.Env[Any, Any]):
             return first
         return batches.with_integers(self.observation_space, first, iter(which))
 
-    def _own(self, infos: dict[Any, Any]) -> Own:
+    def _own(
+        self, infos: dict[Any, Any]
+    ) -> tuple[list[dict[Any, Any]], Sequence[bool], tuple[Any, ...]]:
         """Its infos, of the end of an episode before those of the next; see ``Results.own``."""
         if self._apart is None:
             return [info_of(infos, 0, 1)], (), ()
-        own, which, reward = self._apart.own(infos) if infos else ([], (), ())
+        if not infos:
+            return [{}, {}], (), ()
+        [own], which, reward = self._apart.own(infos)
         return [*own, {}, {}], which, reward
 
 

@@ -18,7 +18,6 @@ import gymnasium as gym
 from gymnasium.vector import VectorEnv
 
 from envhub_sandbox.errors import EnvHubError
-from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.requests import SENT, MessageFor
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.remote_warnings import level_of_the_caller
@@ -37,7 +36,6 @@ from envhub_sandbox.vector.send_recv import SendRecv
 from envhub_sandbox.vector.sub_environment import SubEnvironment
 from envhub_sandbox.vector.tracebacks import short_traceback, shortened
 from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.lifecycle import State
 from envhub_worker.protocol.manifest.manifest import EnvManifest
 from envhub_worker.protocol.manifest.names import absent, is_servable
 
@@ -52,11 +50,15 @@ _OURS = frozenset({"prewarm", "recv", "sandbox", "send", "send_reset"})
 
 
 class VectorApart(NamedTuple):
-    """``reset`` and ``step`` with infos as they came, and ``Results.own``, which reads these."""
+    """``reset``, ``step`` and ``step_wait`` with infos as they came, and what reads these of
+    ``Results``. ``reset`` takes seeds, options and a mask.
+    """
 
-    reset: Callable[[Any, dict[str, Any] | None], tuple[Any, dict[Any, Any]]]
+    reset: Callable[..., tuple[Any, dict[Any, Any]]]
     step: Callable[[Any], StepResult]
+    step_wait: Callable[[], StepResult]
     own: Callable[[dict[Any, Any]], Own]
+    each: Callable[[dict[Any, Any]], list[list[dict[Any, Any]]]]
 
 
 # Gymnasium's class is named here as well, for libraries that look at direct bases alone (skrl)
@@ -156,13 +158,15 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
         observation, infos = self._reset(seed, options)
         return observation, self._requests.results.joined(infos)
 
-    def _reset(self, seed: Any, options: dict[str, Any] | None) -> tuple[Any, dict[Any, Any]]:
+    def _reset(
+        self, seed: Any, options: dict[str, Any] | None, mask: Any = None
+    ) -> tuple[Any, dict[Any, Any]]:
         # Not by reset_async and reset_wait: an interrupt between them would leave `waiting` set,
         # and the next request refused, although no reset_wait can follow.
         self._note_first_use()
         with self._requests.use.flight, self._requests.use.lock:
-            self._refuse_if_busy_for_reset(options)
-            self._send_reset(seed, options)
+            self._refuse_if_busy_for_reset(options if mask is None else {"reset_mask": mask})
+            self._send_reset(seed, options, mask)
             return self._end_reset(self._timeouts.reset_s)
 
     @short_traceback
@@ -190,8 +194,7 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
             self._in_flight().drop()
         self._requests.refuse_if_busy("reset_async")
 
-    def _send_reset(self, seed: Any, options: dict[str, Any] | None) -> None:
-        mask = None
+    def _send_reset(self, seed: Any, options: dict[str, Any] | None, mask: Any = None) -> None:
         if options is not None and "reset_mask" in options:
             options = copy(options)  # the caller's own keep theirs
             mask = options.pop("reset_mask")
@@ -272,11 +275,14 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
     @short_traceback
     def step_wait(self, timeout: float | None = None) -> StepResult:
         """The results of ``step_async``; ``timeout`` in seconds, else ``Timeouts.step_s``."""
+        *done, infos = self._step_wait(timeout)
+        return (*done, self._requests.results.joined(infos))
+
+    def _step_wait(self, timeout: float | None = None) -> StepResult:
         with self._requests.use.lock:
             self._requests.end_wait("step")
             timeout_s = self._timeouts.step_s if timeout is None else timeout
-            *done, infos = self._requests.collect_step(timeout_s)
-        return (*done, self._requests.results.joined(infos))
+            return self._requests.collect_step(timeout_s)
 
     # --- everything else -----------------------------------------------------------------------
 
@@ -474,20 +480,16 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
     __html__ = _repr_html_
 
     def _apart(self) -> VectorApart | None:
-        """How a ``SingleEnv`` uses it: infos are what its only sub-environment gives from now on.
+        """How libraries of single environments use it: infos are each one's own from now on.
 
         None where the repository's own class joins them, or where it cannot be asked now.
         """
-        results, session = self._requests.results, self._session
-        if not isinstance(session, EnvSession) or not self._manifest.shardable:
+        if not self._manifest.shardable:
             return None
-        if self.num_envs != 1:
+        if not self._session.take_apart(Deadline(self._timeouts.call_s)):
             return None
-        state = session.lifecycle.state
-        with session.use.hold("make_env"):
-            if not results.apart and (session.lease.lane is None or state is State.READY):
-                session.lease.take_apart(Deadline(self._timeouts.call_s))
-        return VectorApart(self._reset, self._step, results.own) if results.apart else None
+        results = self._requests.results
+        return VectorApart(self._reset, self._step, self._step_wait, results.own, results.each)
 
 
 def leave_suite(env: SandboxVectorEnv) -> None:

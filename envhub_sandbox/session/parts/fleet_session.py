@@ -115,6 +115,13 @@ class FleetSession:
         whole = self.counters.snapshot()
         return {**whole, "state": self.lifecycle.state.name, "workers": workers}
 
+    def take_apart(self, deadline: Deadline) -> bool:
+        """See ``EnvSession``: of all parts, or of none."""
+        results = self.requests.results
+        if not results.apart and all(part.may_take_apart for part in self.parts):
+            results.apart = all(part.take_apart(deadline) for part in self.parts)
+        return results.apart
+
     def recover(self) -> None:
         """Before a reset: see ``EnvSession``. All parts share the time that one has for that."""
         grace = Deadline(GRACE_S)

@@ -36,7 +36,7 @@ from envhub_sandbox.transport.values import unpacked
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import UNTRUSTED
 from envhub_worker.protocol.shared_memory import slabs
-from envhub_worker.protocol.shared_memory.slabs import columns_of, own_info
+from envhub_worker.protocol.shared_memory.slabs import columns_of, own_infos
 from envhub_worker.protocol.stream import read_packet
 
 if TYPE_CHECKING:
@@ -194,7 +194,7 @@ class ShardSlabs:
         start = slabs.INFOS
         columns = columns_of(infos) or ()
         self._columns = [(column, column.view(self._reply, start)) for column in columns]
-        self._own = None if own_info(infos) is None else infos
+        self._own = None if own_infos(infos) is None else infos
         self._asks[slabs.KNOWN] = max((c.offset + v.nbytes for c, v in self._columns), default=0)
 
     @property
@@ -209,8 +209,10 @@ class ShardSlabs:
         columns = {column.key: view.astype(column.dtype) for column, view in self._columns}
         if self._own is None:
             return columns
-        own = {key: _as(value, columns[key][0]) for key, value in self._own[0].items()}
-        return {**self._own, 0: own}
+        first = self._own[0]
+        rows = zip(*(_members(one, columns[key]) for key, one in first.items()), strict=True)
+        own = enumerate(dict(zip(first, row, strict=True)) for row in rows)
+        return {**self._own, **dict(own)}
 
     def close(self) -> None:
         """Give everything back."""
@@ -219,9 +221,10 @@ class ShardSlabs:
         # the maps go with the last array over them
 
 
-def _as(known: Any, value: Any) -> Any:
-    """A column's value as its schema had one: of Python's class, or numpy's."""
-    return value if isinstance(known, (np.generic, np.ndarray)) else value.item()
+def _members(known: Any, column: Any) -> Sequence[Any]:
+    """A column's values as its schema had one: of Python's class, or numpy's."""
+    kept = isinstance(known, (np.generic, np.ndarray))
+    return list(column) if kept else column.tolist()
 
 
 class LaneShard(ShardSlabs):

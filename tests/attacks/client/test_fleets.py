@@ -24,6 +24,7 @@ from envhub_sandbox.errors import (
 )
 from envhub_sandbox.transport.results import Results
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.codec.inert import RemoteObject
 from envhub_worker.protocol.manifest.manifest import Manifest, encode_env, encode_manifest
 from envhub_worker.protocol.spaces import batches
 from tests.attacks.client.lies import refuses, relayed
@@ -191,6 +192,23 @@ def test_own_infos_that_would_take_too_much_are_refused() -> None:
     with pytest.raises(RemoteEnvError) as caught:
         joins.joined_own([m.Value(((0, {name: 1.0}), (1, {name: "text"})))])
     assert len(str(caught.value)) < 1000
+
+
+def test_infos_that_came_apart_are_of_its_own_rows_alone() -> None:
+    """Whatever place a worker names, no other's infos change."""
+    joins = Results(wire.env_manifest(OBSERVATION, ACTION, 3, sync=True), [(0, 1), (1, 3)])
+    joins.apart = True
+    honest = {1: {"a": 2}, 3: {"b": 3}}
+    ended = joins.own(joins.infos([{0: {"a": 1}}, honest]))[0]
+    assert ended == [[{"a": 1}], [], [{"a": 2}, {"b": 3}]]  # the control
+    for place in (2, 5, -1, -3, 1 << 70):
+        lied = joins.own(joins.infos([{place: {"a": 9}}, honest]))[0]
+        assert lied == [[], [], [{"a": 2}, {"b": 3}]]
+    lies: list[Any] = [{place: {"a": 9}} for place in ("0", True, None)]
+    lies += [{0: 5}, {0: RemoteObject("t", "r")}, {"x": np.ones(9), "_x": np.ones(9, bool)}]
+    for infos in lies:
+        with pytest.raises(RemoteProtocolError):
+            joins.own(joins.infos([infos, honest]))
 
 
 def test_rewards_of_different_shapes_are_not_joined() -> None:

@@ -306,6 +306,7 @@ class InfoWriter:
         types = list(map(type, first.values()))
         if (
             columns is None
+            or len(pairs) != len(self._indices)
             or len(columns) != 2 * len(first)
             or not all(map(batches.is_scalar, types))
         ):

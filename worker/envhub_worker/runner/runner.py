@@ -232,7 +232,7 @@ class Runner:
         return m.Value(tuple((index, taken(info)) for index, info in env.pairs))
 
     def take_apart(self, request: m.TakeApart) -> m.Message:
-        """Infos are sent as the only sub-environment gives them from now on."""
+        """Infos are sent as each sub-environment gives them from now on."""
         self._envs[request.env].apart = True
         return m.Value(None)
 

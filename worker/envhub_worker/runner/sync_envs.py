@@ -163,11 +163,12 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         batch: Where ``reset`` and ``step`` leave their results.
         reward_shape: Of one sub-environment's reward; ``()`` but for multi-objective ones.
         sliced: Whether there are others elsewhere, in other processes.
-        apart: Whether there is one, whose infos are sent as it gave them.
+        apart: Whether infos are sent as each sub-environment gave them.
         pairs: The infos of the last reset or step, as each sub-environment gave them.
         driven: What is reset, stepped and drawn: ``envs``, or what freezes them.
-        integers: Which discrete members of its last observation are Python's; () unless ``apart``.
-        reward: A tuple with the last reward, if that is no number; () unless ``apart``.
+        integers: Which discrete members of its last observation are Python's; () unless it is the
+            only one, ``apart``.
+        reward: A tuple with the last reward, if that is no number; likewise.
         shared: What they share of a process, looked at after each reset and step; None where that
             is as it should be.
     """
@@ -225,7 +226,7 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
             self.batch.store(index, observation)
             if info:
                 infos.append((index, taken(info) if self._shared else info))
-            if self.apart:
+            if self._single:
                 self.integers = batches.integers(self.single_observation_space, observation)
         if self.shared is not None:
             self.shared.look()
@@ -305,12 +306,17 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
             raise
         batch.stay()
         self._done = done
-        if self.apart:
+        if self._single:
             self.integers = batches.integers(self.single_observation_space, observation)
             self.reward = () if isinstance(reward, _NUMBERS) else (reward,)
         if self.shared is not None:
             self.shared.look()
         return infos
+
+    @property
+    def _single(self) -> bool:
+        """Whether it stands for a single environment, whose results are its own to the class."""
+        return self.apart and self.num_envs == 1 and not self.sliced
 
     @property
     def resets_nothing(self) -> bool:
@@ -319,7 +325,7 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
 
     def _refuse_reward(self, error: Exception, reward: Any, index: int) -> None:
         """Raise what is wrong with a reward, unless it is sent as it is."""
-        if not self.apart:
+        if not self._single:
             text = batches.reward_misfit(reward, self._start + index, self.reward_shape)
             raise type(error)(text) from error
 
@@ -345,7 +351,9 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         the first: then they have to be asked for one by one.
         """
         if self.apart:
-            infos: dict[Any, Any] = {place: info for place, (_, info) in enumerate(pairs)}
+            infos: dict[Any, Any] = {}
+            for index, info in pairs:
+                infos[index + self.num_envs if index in infos else index] = info
             if any(self.integers):
                 infos[batches.APART_SCALARS] = tuple(self.integers)
             if self.reward:

@@ -209,7 +209,7 @@ class FetchInfosApart(Message, kind=85):
 
 
 class TakeApart(Message, kind=93):
-    """Infos are not joined from now on, but those of the only sub-environment. Reply: ``Value``."""
+    """Infos are not joined from now on, but each sub-environment's own. Reply: ``Value``."""
 
     env: int
 

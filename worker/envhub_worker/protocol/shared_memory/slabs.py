@@ -260,10 +260,19 @@ class Column:
         return np.ndarray(self.shape, dtype, buffer, start + self.offset)
 
 
-def own_info(infos: dict[Any, Any]) -> dict[Any, Any] | None:
-    """The only one of infos that are not joined; None where there are others, or they are."""
-    own = infos.get(0)
-    return own if type(own) is dict and not infos.keys() - {0, batches.APART_SCALARS} else None
+def own_infos(infos: dict[Any, Any]) -> list[dict[Any, Any]] | None:
+    """Each sub-environment's, of infos that are not joined; None where they are, or not alike.
+
+    Alike are those of one each that have the same keys, in the same order, of the same classes.
+    """
+    places = infos.keys() - {batches.APART_SCALARS}
+    if not places or places != set(range(len(places))):
+        return None
+    own = [infos[place] for place in range(len(places))]
+    if set(map(type, own)) != {dict}:
+        return None
+    forms = [[(key, type(value)) for key, value in info.items()] for info in own]
+    return own if all(form == forms[0] for form in forms) else None
 
 
 def columns_of(infos: dict[Any, Any]) -> tuple[Column, ...] | None:
@@ -272,9 +281,10 @@ def columns_of(infos: dict[Any, Any]) -> tuple[Column, ...] | None:
     Of infos that are not joined, those of what joining makes of them.
     """
     columns: list[Column] = []
-    if own_info(infos) is not None:
+    own = own_infos(infos)
+    if own is not None:
         try:
-            infos = batches.join_pairs([(0, infos[0])], 1)
+            infos = batches.join_pairs(list(enumerate(own)), len(own))
         except FAULTS:
             return None
     offset = 0
