@@ -32,6 +32,8 @@ RESTARTED = "worker_restarted"
 """The key in the infos: whether a sub-environment was lost and came back reset."""
 _SETTINGS = 256
 """Attributes that are remembered, the last ones."""
+_SETTERS = frozenset({"__setattr__", "set_wrapper_attr"})
+"""Methods of sub-environments that set an attribute."""
 MessagesFor = Callable[["Lane", int], list[m.Message]]
 """Makes what a shard's fresh runner is asked, one after the other."""
 RowsOf = Callable[[m.Message, int], m.Message]
@@ -59,8 +61,8 @@ class Recovery:
         self._counters = lease.counters
         self._history = history
         self._seeds = SeedBook(manifest.num_envs, manifest.shardable)
-        self._settings: dict[str, list[list[bytes]]] = {}  # what was set, as shards were sent it
-        self._setting: tuple[str, list[list[bytes]]] | None = None  # what is being set
+        self._settings: dict[Any, list[list[bytes]]] = {}  # what was set, as shards were sent it
+        self._setting: tuple[Any, list[list[bytes]]] | None = None  # what is being set
         self._asked: Sequence[m.Message] = ()
         self.fresh: tuple[int, ...] = ()
 
@@ -77,15 +79,16 @@ class Recovery:
         for message, (start, _) in zip(messages, self._bounds, strict=True):
             if isinstance(message, m.Reset):
                 self._seeds.remember(message, start)
-        if isinstance(messages[0], m.SetAttr):
-            self._setting = messages[0].name, request.kept()
+        target = _target_of(messages)
+        if target is not None:
+            self._setting = target, request.kept()
 
     def answered(self) -> None:
         """Every shard has answered it, and none has raised."""
         if self._setting is not None:
-            name, sent = self._setting
-            self._settings.pop(name, None)  # the last one counts, in its place
-            self._settings[name] = sent
+            target, sent = self._setting
+            self._settings.pop(target, None)  # the last one counts, in its place
+            self._settings[target] = sent
             if len(self._settings) > _SETTINGS:
                 del self._settings[next(iter(self._settings))]
             self._setting = None
@@ -207,7 +210,7 @@ class Recovery:
 
     def _set_again(self, lane: Lane, dead: Sequence[int], deadline: Deadline) -> None:
         """Set attributes in fresh runners; what one's setter raises is only logged."""
-        for name, frames in list(self._settings.items()):
+        for (name, *_), frames in list(self._settings.items()):
             asked: list[tuple[int, list[Buffer]]] = [
                 (lane.runners[index], [*frames[index]]) for index in dead
             ]
@@ -233,6 +236,21 @@ class Recovery:
     def _size(self, index: int) -> int:
         start, stop = self._bounds[index]
         return stop - start
+
+
+def _target_of(messages: Sequence[m.Message]) -> tuple[Any, ...] | None:
+    """The attribute that a request sets, and where; None if it sets none."""
+    first = messages[0]
+    if isinstance(first, m.SetAttr):
+        return (first.name,)
+    calls = [message for message in messages if isinstance(message, (m.Call, m.CallOne))]
+    if not calls or calls[0].name not in _SETTERS:
+        return None
+    args = max((call.args for call in calls), key=len)  # one has them where only one is meant
+    if not args or not isinstance(args[0], str):
+        return None
+    where = [(getattr(call, "index", None), getattr(call, "depth", None)) for call in calls]
+    return (args[0], calls[0].name, *where)
 
 
 def _step_rows(reply: m.Message, size: int) -> m.Message:

@@ -313,6 +313,19 @@ def test_attributes_that_were_set_are_set_again(env: Any) -> None:
     assert env.get_attr("weight") == (5, 6, 7, 8)
 
 
+def test_what_was_set_in_one_sub_environment_is_set_again(env: Any) -> None:
+    """As what was set in all; whichever came last counts."""
+    env.call("__setattr__", "weight", 5)
+    env.envs[3].weight = 6
+    env.envs[2].set_wrapper_attr("colour", "red")
+    env.envs[3].colour = "blue"
+    env.call("__setattr__", "colour", "green")
+    *_, truncated, _ = env.step(LAST_DIES)
+    assert truncated.tolist() == [False, False, True, True]
+    assert env.get_attr("weight") == (5, 5, 5, 6)
+    assert env.get_attr("colour") == ("green",) * 4
+
+
 def test_attributes_are_set_again_as_they_were_sent() -> None:
     with begun() as env:
         goals = {"goal": np.zeros(2)}
