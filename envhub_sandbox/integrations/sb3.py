@@ -9,10 +9,12 @@ environments are reset: what is trained here has the same weights as what is tra
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 from gymnasium.vector.utils import iterate
 from stable_baselines3.common.vec_env.base_vec_env import VecEnv
@@ -20,6 +22,8 @@ from stable_baselines3.common.vec_env.base_vec_env import VecEnv
 from envhub_sandbox.factory.make_env import make_env
 from envhub_sandbox.vector.single_env import info_of
 from envhub_sandbox.vector.suites import choose, closed_if_it_fails
+from envhub_sandbox.vector.vector_env import SandboxVectorEnv
+from envhub_worker.protocol.codec.inert import RemoteObject
 from envhub_worker.protocol.errors import UNTRUSTED
 
 _Indices = int | Iterable[int] | None
@@ -32,6 +36,9 @@ class SandboxVecEnv(VecEnv):
     ``info["terminal_observation"]``. Where the vector environment does not do so itself
     (``AutoresetMode.SAME_STEP``), those that have ended are reset here, by ``reset_mask``.
 
+    Infos are each sub-environment's own, as it gave them. Only what a repository's own vector class
+    or a wrapper around ``vector`` has joined is taken apart here: numbers are Python's then.
+
     Args:
         vector: What ``make_env`` made.
 
@@ -43,6 +50,9 @@ class SandboxVecEnv(VecEnv):
         self.vector: Any = vector
         mode = getattr(vector.metadata.get("autoreset_mode"), "value", None)
         self._resets_in_the_same_step = mode == "SameStep"
+        self._apart = vector._apart() if isinstance(vector, SandboxVectorEnv) else None
+        self._is_plain = hasattr(vector, "env_fns")  # a Sync- or AsyncVectorEnv, or its proxy
+        self._one_for_all = True
         super().__init__(
             vector.num_envs, vector.single_observation_space, vector.single_action_space
         )
@@ -75,30 +85,54 @@ class SandboxVecEnv(VecEnv):
         with closed_if_it_fails(make_env(ref, n_envs=n_envs, **options)) as suites:
             return cls(choose(suites, suite, task))
 
+    @property
+    def envs(self) -> list[Any]:
+        """A handle on each sub-environment: ``SandboxVectorEnv.envs``."""
+        return list(self.vector.envs)
+
+    def set_options(self, options: Any = None) -> None:
+        """Options for the next ``reset``: a mapping for all, or a list with one for each."""
+        self._one_for_all = not isinstance(options, (list, tuple))
+        super().set_options(options)
+
     def reset(self) -> Any:
         """Observations, with the seeds of ``seed()`` and the options of ``set_options()``."""
-        seeds, options = self._seeds, self._options
+        seeds, options, together = self._seeds, self._options, self._one_for_all
         self._reset_seeds()
         self._reset_options()
-        if all(one == options[0] for one in options):
-            batch, infos = self.vector.reset(seed=seeds, options=options[0] or None)
-            with UNTRUSTED:
-                self.reset_infos = self._infos(infos)
-            return batch
-        for index, own in enumerate(options):
+        self._one_for_all = True
+        if together:
+            return self._reset(seeds, options[0] or None, None)
+        for index in range(self.num_envs):
             mask = np.arange(self.num_envs) == index
-            batch, infos = self.vector.reset(seed=seeds, options={**own, "reset_mask": mask})
-            with UNTRUSTED:
-                self.reset_infos[index] = info_of(infos, index, self.num_envs)
+            batch = self._reset(seeds, options[index] or None, mask)
         return batch
 
-    def step_async(self, actions: np.ndarray) -> None:
-        """Send the actions, ``(num_envs, ...)``."""
+    def _reset(self, seeds: Any, options: dict[str, Any] | None, mask: Any) -> Any:
+        """The observations of all after a reset of those of ``mask``, or of all for None."""
+        if self._apart is not None:
+            batch, infos = self._apart.reset(seeds, options, mask)
+        elif mask is None:
+            batch, infos = self.vector.reset(seed=seeds, options=options)
+        else:
+            masked = {**(options or {}), "reset_mask": mask}
+            batch, infos = self.vector.reset(seed=seeds, options=masked)
+        with UNTRUSTED:
+            for index, info in enumerate(self._infos(infos)):
+                if mask is None or mask[index]:
+                    self.reset_infos[index] = info
+        return batch
+
+    def step_async(self, actions: Any) -> None:
+        """Send the actions: ``(num_envs, ...)``, a list with one for each, or a batched mapping."""
+        if not isinstance(actions, dict):
+            actions = _batch_of(self.action_space, actions)
         self.vector.step_async(actions)
 
     def step_wait(self) -> Any:
         """Observations, rewards float32 ``(num_envs,)``, dones bool ``(num_envs,)``, infos."""
-        batch, rewards, terminations, truncations, batched = self.vector.step_wait()
+        wait = self.vector.step_wait if self._apart is None else self._apart.step_wait
+        batch, rewards, terminations, truncations, batched = wait()
         with UNTRUSTED:  # of a repository's own class, whose results nothing declares
             dones = np.logical_or(terminations, truncations).reshape(self.num_envs)
             infos = self._infos(batched)
@@ -118,12 +152,9 @@ class SandboxVecEnv(VecEnv):
             return batch
         with UNTRUSTED:
             lasts = list(iterate(self.vector.observation_space, batch))
-        batch, begun = self.vector.reset(options={"reset_mask": dones})
-        with UNTRUSTED:
             for index in ended:
                 infos[index]["terminal_observation"] = lasts[index]
-                self.reset_infos[index] = info_of(begun, index, self.num_envs)
-        return batch
+        return self._reset(None, None, dones)
 
     def _begun(self, ended: list[int], infos: list[dict[str, Any]]) -> None:
         """Take apart what belongs to the end of an episode, and to the beginning of the next."""
@@ -142,25 +173,41 @@ class SandboxVecEnv(VecEnv):
         """An attribute of each sub-environment, or of those at ``indices``."""
         if attr_name == "render_mode":
             return [self.vector.render_mode] * len(list(self._get_indices(indices)))
-        values = self.vector.get_attr(attr_name)
-        return [values[index] for index in self._get_indices(indices)]
+        chosen = list(self._get_indices(indices))
+        if not self._is_plain:
+            values = self.vector.get_attr(attr_name)
+            return [values[index] for index in chosen]
+        if chosen == list(range(self.num_envs)):
+            values = self.vector.call("get_wrapper_attr", attr_name)  # a method is not called
+            if not any(isinstance(value, RemoteObject) for value in values):
+                return list(values)
+        return [self.envs[index].get_wrapper_attr(attr_name) for index in chosen]
 
     def set_attr(self, attr_name: str, value: Any, indices: _Indices = None) -> None:
-        """Set an attribute of every sub-environment. Raises ``ValueError``: only some are meant."""
-        if set(self._get_indices(indices)) != set(range(self.num_envs)):
-            raise ValueError("a sandboxed vector environment sets an attribute of all or of none")
-        self.vector.set_attr(attr_name, [value] * self.num_envs)
+        """Set an attribute of each sub-environment's outermost wrapper, as ``setattr`` does.
+
+        ``env_method("set_wrapper_attr", name, value)`` sets it where it is.
+
+        Raises:
+            ValueError: A repository's own vector class sets it in all or in none.
+        """
+        chosen = list(self._get_indices(indices))
+        if self._is_plain:
+            self.env_method("__setattr__", attr_name, value, indices=chosen)
+        elif set(chosen) == set(range(self.num_envs)):
+            self.vector.set_attr(attr_name, [value] * self.num_envs)
+        else:
+            raise ValueError("the repository's vector class sets an attribute of all or of none")
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: _Indices = None, **method_kwargs: Any
     ) -> list[Any]:
         """Call a method of each sub-environment, or of those at ``indices`` alone."""
         chosen = list(self._get_indices(indices))
-        if set(chosen) == set(range(self.num_envs)):
-            results = self.vector.call(method_name, *method_args, **method_kwargs)
-            return [results[index] for index in chosen]
+        if chosen == list(range(self.num_envs)):
+            return list(self.vector.call(method_name, *method_args, **method_kwargs))
         return [
-            getattr(self.vector.envs[index], method_name)(*method_args, **method_kwargs)
+            self.envs[index].get_wrapper_attr(method_name)(*method_args, **method_kwargs)
             for index in chosen
         ]
 
@@ -169,8 +216,36 @@ class SandboxVecEnv(VecEnv):
         return [False for _ in self._get_indices(indices)]
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """What each sub-environment renders."""
-        return self.vector.render() or [None] * self.num_envs
+        """What each sub-environment renders, if its render mode is ``rgb_array``."""
+        if self.render_mode == "rgb_array":
+            return self.vector.render() or [None] * self.num_envs
+        warnings.warn(
+            f"the render mode is {self.render_mode}, and images come of `rgb_array` alone",
+            UserWarning,
+            stacklevel=2,
+        )
+        return [None] * self.num_envs
 
-    def _infos(self, batched: dict[str, Any]) -> list[dict[str, Any]]:
-        return [info_of(batched, index, self.num_envs) for index in range(self.num_envs)]
+    def _infos(self, infos: dict[Any, Any]) -> list[dict[Any, Any]]:
+        """Each sub-environment's; those of an end of an episode with those of the beginning."""
+        if self._apart is None:
+            return [_plain(info_of(infos, index, self.num_envs)) for index in range(self.num_envs)]
+        own = self._apart.each(infos)
+        return [{key: value for info in some[::-1] for key, value in info.items()} for some in own]
+
+
+def _batch_of(space: spaces.Space[Any], members: Any) -> Any:
+    """Members of the space as a batch; of spaces that are arrays as they are."""
+    if isinstance(space, spaces.Dict):
+        return {key: _batch_of(sub, [m[key] for m in members]) for key, sub in space.items()}
+    if isinstance(space, spaces.Tuple):
+        each = enumerate(space.spaces)
+        return tuple(_batch_of(sub, [m[place] for m in members]) for place, sub in each)
+    return members
+
+
+def _plain(value: Any) -> Any:
+    """Numbers of arrays that numpy has made of Python's are these again."""
+    if isinstance(value, dict):
+        return {key: _plain(member) for key, member in value.items()}
+    return value.item() if isinstance(value, (np.int64, np.float64, np.bool_)) else value
