@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json as json_module
+import os
 import shutil
 import time
 from collections.abc import Sequence
@@ -15,6 +16,7 @@ import typer
 from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import out, print_json, safe_line, say, show, show_rows
 from envhub_sandbox.cli.shared.exits import Exit, UsageError
+from envhub_sandbox.hub.grammar import FOLDER
 from envhub_worker.protocol.text import counted, size_text
 
 if TYPE_CHECKING:
@@ -35,6 +37,8 @@ class StoredSnapshot:
         revision: The branch or tag that it was fetched as, or None.
         used: Unix time (seconds) of the last use.
         size: Bytes of all files, as the record has them.
+        folder: Of ``"local"``: the folder that it was made of; another one of the same content is
+            the same snapshot.
     """
 
     repository: str
@@ -43,9 +47,19 @@ class StoredSnapshot:
     used: float
     size: int
     home: Path
+    folder: str | None = None
+
+    @property
+    def name(self) -> str:
+        """What people know it by."""
+        return self.folder or self.repository
 
     def answers_to(self, name: str) -> bool:
-        """Whether a name means it: the repository, a commit's beginning, or both with ``@``."""
+        """Whether a name means it: the repository, the folder, a commit's beginning, or repository
+        and commit with ``@``.
+        """
+        if self.folder is not None and self.folder == os.path.abspath(name):
+            return True
         repository, _, commit = name.partition("@")
         if commit and name != self.repository:
             return repository == self.repository and self.commit.startswith(commit)
@@ -71,14 +85,16 @@ def _read(record: Path) -> StoredSnapshot | None:
         return None
     home = record.parent
     revision = document.get("revision")
-    return StoredSnapshot(_repository(document), home.name, revision, used, size, home)
+    repository = _repository(document)
+    folder = str(document.get("repo_id")) if repository == FOLDER else None
+    return StoredSnapshot(repository, home.name, revision, used, size, home, folder)
 
 
 def _repository(document: dict[str, Any]) -> str:
     kind, name = document.get("repo_type"), str(document.get("repo_id"))
     prefixes = {"space": "spaces/", "dataset": "datasets/", "pypi": "pypi:"}
     prefixes["git"] = f"git+{document.get('endpoint')}/"
-    return "local" if kind == "local" else prefixes.get(str(kind), "") + name
+    return FOLDER if kind == FOLDER else prefixes.get(str(kind), "") + name
 
 
 @opt.with_options()
@@ -91,14 +107,15 @@ def list_(
 
     found, made = stored_snapshots(), environments.every()
     if json:
-        own = _documents(found, repository="repository", commit="commit", revision="revision")
+        names = ("repository", "commit", "revision", "folder")
+        own = _documents(found, **dict(zip(names, names, strict=True)))
         theirs = _documents(made, name="key", python="python", version="version", packages="pins")
         folder = str(cache_root())
         print_json({"folder": folder, "snapshots": own, "environments": theirs})
         return
     if found:
         snapshots = [
-            (one.repository, one.commit[:_SHOWN], one.revision or "", *_when_and_size(one))
+            (one.name, one.commit[:_SHOWN], one.revision or "", *_when_and_size(one))
             for one in found
         ]
         heads = ("repository", "commit", "revision", "last used", "size")
@@ -141,8 +158,8 @@ def remove(
         list[str] | None,
         typer.Argument(
             metavar="[NAME]...",
-            help="A repository, repository@commit, or at least 7 characters of a commit or of an "
-            "environment.",
+            help="A repository, repository@commit, a folder that is here, or at least 7 characters "
+            "of a commit or of an environment.",
         ),
     ] = None,
     everything: Annotated[

@@ -51,8 +51,13 @@ def test_list_shows_what_is_stored(stored: list[str]) -> None:
     assert [one["commit"] for one in found["snapshots"]] == stored
     assert all(one["bytes"] == len("NAME = 'a'\n") for one in found["snapshots"])
     assert found["folder"] == str(cache_root())
+    folders = [str(cache_root().parent / name) for name in "abc"]
+    assert [one["folder"] for one in found["snapshots"]] == folders
     text = RUNNER.invoke(app, ["cache", "list"]).stdout
-    assert all(commit[:18] in text for commit in stored)
+    rows = [line.split()[:2] for line in text.splitlines()[1:4]]
+    assert rows == [[name, commit[:18]] for name, commit in zip(folders, stored, strict=True)]
+    assert RUNNER.invoke(app, ["cache", "remove", folders[0]]).exit_code == 0
+    assert [one.commit for one in stored_snapshots()] == stored[1:]
 
 
 def test_hub_repositories_are_named_as_they_are_written(
