@@ -66,7 +66,7 @@ def push(
         snapshot = local(folder)
         _refuse_unfit(snapshot)
         bar.begin("checking it in a sandbox")
-        _check(folder, snapshot, {key: make[key] for key in ("env_kwargs", "dependencies")})
+        _check(snapshot, {key: make[key] for key in ("env_kwargs", "dependencies")})
         if not dry_run:
             bar.begin(f"uploading to {ref}")
             target, others = _publish(snapshot, target, make, message, private)
@@ -89,14 +89,14 @@ def _unfit(path: str) -> str:
     return ""
 
 
-def _check(folder: str, snapshot: Snapshot, options: dict[str, Any]) -> None:
+def _check(snapshot: Snapshot, options: dict[str, Any]) -> None:
     """Load it and step it.
     Raises ``EnvHubError``: it does not load, or breaks a rule; ``UsageError``: the folder was
     changed meanwhile.
     """
     from envhub_sandbox.factory.make_env import make_env
 
-    with make_env(folder, n_envs=2, validate=True, **options) as suites:
+    with make_env(snapshot.reference, n_envs=2, validate=True, **options) as suites:
         for _, _, env in opt.select_envs(suites, None, None):
             env.reset(seed=0)
             env.action_space.seed(0)
@@ -105,7 +105,7 @@ def _check(folder: str, snapshot: Snapshot, options: dict[str, Any]) -> None:
             env.close()
         commit = suites.provenance["commit"]
     if commit != snapshot.commit:
-        raise UsageError(f"{folder} was changed while it was checked; try again")
+        raise UsageError(f"{snapshot.repo_id} was changed while it was checked; try again")
 
 
 def _publish(

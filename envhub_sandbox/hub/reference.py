@@ -26,7 +26,7 @@ from envhub_sandbox.hub.grammar import (
 )
 from envhub_worker.protocol.records import dataclass
 
-__all__ = ["DEFAULT_PATH", "REPO_TYPES", "HubRef", "is_local", "pinned"]
+__all__ = ["DEFAULT_PATH", "REPO_TYPES", "HubRef", "is_local", "is_of_another_place", "pinned"]
 
 _OTHERS = (address, registered)
 """References that are none of the Hub's."""
@@ -109,6 +109,11 @@ def pinned(repo_type: str, repo_id: str, commit: str, path: str) -> str:
     if repo_type == registered.KIND:
         return str(HubRef.parse(f"{repo_type}:{repo_id}"))
     return str(HubRef(repo_id, commit, path, repo_type))
+
+
+def is_of_another_place(text: str) -> bool:
+    """Whether it is of git or of the package index, by how it begins."""
+    return any(one.is_one(text.strip()) for one in _OTHERS)
 
 
 def _check(parts: Parts) -> None:

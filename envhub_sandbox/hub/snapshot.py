@@ -8,8 +8,10 @@ read-only in a store of our own. A full commit that is in the store costs no req
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -39,7 +41,7 @@ from envhub_sandbox.hub.listing import (
     content_digest,
     listing_within_limits,
 )
-from envhub_sandbox.hub.reference import DEFAULT_PATH, HubRef, is_local
+from envhub_sandbox.hub.reference import DEFAULT_PATH, HubRef, is_local, is_of_another_place
 from envhub_sandbox.system.log import SNAPSHOT, tell
 from envhub_worker.protocol.records import dataclass
 
@@ -54,23 +56,45 @@ T = TypeVar("T")
 def snapshot_named(reference: str, *, allow_secrets: bool = False, **hub: Any) -> Snapshot:
     """The snapshot of a hub reference or of a local folder; raises as ``fetch`` and ``local`` do.
 
-    The path of a ``.py`` file that is here means that file. A reference that is also a folder here
-    gets a hint. ``hub`` are ``hub_cache_dir``, ``token`` and ``endpoint``, as ``fetch`` takes them.
+    The path of a ``.py`` file or of a folder that is here means that, with a warning where it could
+    be a repository of the Hub. ``hub`` are ``hub_cache_dir``, ``token`` and ``endpoint``, as
+    ``fetch`` takes them.
     """
     if is_here(reference):
+        _warn_of_two_meanings(reference)
         return local(reference, allow_secrets=allow_secrets)
     try:
         return fetch(HubRef.parse(reference), **hub)
     except (HubReferenceError, SnapshotError) as error:
-        if os.path.exists(reference.partition(":")[0]):
-            hint = f"There is a folder of that name here; for the folder, write './{reference}'."
+        if os.path.isdir(reference.partition("/")[0]):
+            hint = f"For something in the folder of that name here, write './{reference}'."
             error.args = (f"{error}\n{hint}",)
         raise
 
 
 def is_here(reference: str) -> bool:
-    """Whether a reference names a folder or a file of this machine."""
-    return is_local(reference) or (reference.endswith(".py") and os.path.isfile(reference))
+    """Whether a reference names a folder or a file of this machine. What has a revision never does,
+    nor what says that it is something else, as ``pypi:``.
+    """
+    if is_local(reference):
+        return True
+    if reference.endswith(".py") and os.path.isfile(reference):
+        return True
+    is_other = "@" in reference or "://" in reference or is_of_another_place(reference)
+    return not is_other and os.path.isdir(reference.partition(":")[0])
+
+
+def _warn_of_two_meanings(reference: str) -> None:
+    """A folder that is here comes before a repository of the Hub, and not in silence."""
+    if is_local(reference) or not os.path.isdir(reference.partition(":")[0]):
+        return
+    with contextlib.suppress(HubReferenceError):
+        ref = HubRef.parse(reference)
+        warnings.warn(
+            f"{reference!r} is a folder here, and is taken as that. Write './{reference}' to say "
+            f"so, or '{replace(ref, revision='main')}' for the repository of that name on the Hub",
+            stacklevel=2,
+        )
 
 
 def commit_of(reference: str, *, allow_secrets: bool = False, **hub: Any) -> str:

@@ -46,11 +46,12 @@ def push(
     capsys: pytest.CaptureFixture[str],
     monkeypatch: pytest.MonkeyPatch,
 ) -> Callable[..., Done]:
-    """Run the command here, to its end."""
+    """Run the command here, to its end, on a folder that lies beside it."""
     monkeypatch.setenv("HF_TOKEN", TOKEN)
+    monkeypatch.chdir(mine.parent)
 
     def run(*options: str) -> Done:
-        arguments = ["push", str(mine), "org/my-env", "--endpoint", stub_hub.endpoint, *options]
+        arguments = ["push", mine.name, "org/my-env", "--endpoint", stub_hub.endpoint, *options]
         capsys.readouterr()
         with pytest.raises(SystemExit) as ended:
             app(arguments, prog_name="envhub")

@@ -6,6 +6,7 @@ import os
 import shutil
 import socket
 import sys
+import warnings
 from pathlib import Path
 
 import pytest
@@ -18,7 +19,15 @@ from envhub_sandbox.errors import (
 )
 from envhub_sandbox.hub import local as module
 from envhub_sandbox.hub.local import split_local
-from envhub_sandbox.hub.snapshot import Snapshot, SnapshotLimits, commit_of, local, store
+from envhub_sandbox.hub.snapshot import (
+    Snapshot,
+    SnapshotLimits,
+    commit_of,
+    is_here,
+    local,
+    snapshot_named,
+    store,
+)
 
 
 @pytest.fixture
@@ -86,6 +95,34 @@ def test_forms_of_a_local_reference(
     is_file = text.endswith("/env.py")
     assert snapshot.reference == f"{folder}{'/' if is_file else ':'}{path}"
     assert local(snapshot.reference) == snapshot
+
+
+@pytest.mark.parametrize(
+    "text", ["org/repo", "org/repo/", "org", "org:repo/env.py", "org/repo:env.py"]
+)
+def test_a_folder_that_is_here_comes_before_the_hub(
+    tmp_path: Path, snapshot_store: Path, monkeypatch: pytest.MonkeyPatch, text: str
+) -> None:
+    """With a warning that names both, where the Hub could have it; a revision is the Hub's."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("org/repo/env.py", "org/env.py", "pypi/env.py", "github/env.py"):
+        Path(name).parent.mkdir(parents=True, exist_ok=True)
+        Path(name).write_text("")
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        snapshot = snapshot_named(text)
+    folder, _, path = text.rstrip("/").partition(":")
+    assert snapshot.reference == f"{tmp_path / folder}:{path or 'env.py'}"
+    told = [str(one.message) for one in caught]
+    if folder == "org/repo" and not text.endswith("/"):
+        assert told == [
+            f"{text!r} is a folder here, and is taken as that. Write './{text}' to say so, or "
+            "'org/repo@main' for the repository of that name on the Hub"
+        ]
+    else:
+        assert told == []
+    others = ("org/repo@main", "pypi:x#y", "github:a/b:env.py", "https://x/org/env.py", "no/repo")
+    assert not any(map(is_here, others))
 
 
 def test_a_folders_commit_is_named_without_a_copy(folder: Path) -> None:
