@@ -13,18 +13,22 @@ import weakref
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from envhub_sandbox.errors import LoadError
+from envhub_sandbox.errors import LoadError, remote_error
 from envhub_sandbox.session.launcher import ExpectedManifest, Launcher, LoadedJail
 from envhub_sandbox.system.platform import OwnerProcess
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.replies import typed_reply
+from envhub_sandbox.transport.replies import check_reply, typed_reply
 from envhub_sandbox.transport.results import Results
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest.manifest import EnvManifest, decode_env
+from envhub_worker.protocol.spaces.differing import Pair, differing
+from envhub_worker.protocol.text import printable
 
 if TYPE_CHECKING:
     from envhub_sandbox.transport.lane import Lane
 
+_LONGEST = 8192
+"""Characters of an error that shows spaces."""
 _numbers = itertools.count(1)
 
 
@@ -189,9 +193,16 @@ class Builder:
             )
             for index in shards
         ]
-        replies = relay.jail.exchange("make_env", builds, deadline)
+        packed = [(runner, relay.jail.pack(message)) for runner, message in builds]
+        replies = relay.jail.ask("make_env", packed, deadline)
+        spaces = [_spaces(self._manifest)]
         for index, reply in zip(shards, replies, strict=True):
-            self._check_built(typed_reply(reply, m.BuildDone), *self._bounds[index])
+            if type(reply) is not m.BuildDone:
+                self._refuse_differing(spaces)  # which in one process comes first
+            check_reply(reply)
+            built = typed_reply(reply, m.BuildDone)
+            spaces.append(self._check_built(built, *self._bounds[index]))
+        self._refuse_differing(spaces)
         if self._results.apart:
             self.take_apart(relay, shards, deadline)
 
@@ -202,13 +213,22 @@ class Builder:
         for reply in lane.jail.exchange("make_env", asked, deadline):
             typed_reply(reply, m.Value)
 
-    def _check_built(self, reply: m.BuildDone, start: int, stop: int) -> None:
-        """Hold what was built against the manifest. Trust: input from the worker."""
+    def _check_built(self, reply: m.BuildDone, start: int, stop: int) -> Pair:
+        """Hold what was built against the manifest; returns the spaces of one sub-environment of
+        it. Trust: input from the worker.
+        """
         most = self._repository.policy.limits.elements
         built, wanted = decode_env(reply.manifest, max_elements=most), self._manifest
         count = stop - start if wanted.shardable else wanted.num_envs
-        if built.num_envs != count or _kind(built) != _kind(wanted):
+        differs = start == 0 and _spaces(built) != _spaces(wanted)  # they describe the first
+        if built.num_envs != count or built.autoreset_mode != wanted.autoreset_mode or differs:
             self._refuse()
+        return _spaces(built)
+
+    def _refuse_differing(self, spaces: Sequence[Pair]) -> None:
+        text = differing(self._manifest.sync, spaces)
+        if text:
+            raise remote_error("RuntimeError", "RuntimeError", printable(text, _LONGEST))
 
     def _fast_lane(self, relay: Lane, loaded: LoadedJail, deadline: Deadline) -> Lane:
         """Agree with the runners on slabs and doorbells; the relay where there can be none.
@@ -247,13 +267,9 @@ class Builder:
 
 
 def _shape(manifest: EnvManifest) -> tuple[Any, ...]:
-    return (manifest.num_envs, manifest.shardable, *_kind(manifest))
+    mode = manifest.autoreset_mode
+    return (manifest.num_envs, manifest.shardable, mode, *_spaces(manifest))
 
 
-def _kind(manifest: EnvManifest) -> tuple[Any, ...]:
-    """What a slice has in common with the whole."""
-    return (
-        manifest.autoreset_mode,
-        manifest.single_observation_space,
-        manifest.single_action_space,
-    )
+def _spaces(manifest: EnvManifest) -> Pair:
+    return manifest.single_observation_space, manifest.single_action_space

@@ -220,6 +220,52 @@ def test_a_reset_of_old_is_converted_and_told(
     assert flags == ([(no, no), (no, [True, True])] if steps == 2 else [(no, no), (no, no), end])
 
 
+_DIFFERING = """
+import gymnasium as gym
+import numpy as np
+
+class Sized(gym.Env):
+    def __init__(self, seen, moves):
+        self.observation_space = gym.spaces.Dict(a=gym.spaces.Box(0, 1, (seen,)))
+        self.action_space = gym.spaces.Discrete(moves)
+
+    def reset(self, *, seed=None, options=None):
+        return {"a": np.zeros(self.observation_space["a"].shape, np.float32)}, {}
+
+def make_env(n_envs=1, use_async_envs=False, sizes=()):
+    fns = [lambda size=size: Sized(*size) for size in sizes]
+    kind = gym.vector.AsyncVectorEnv if use_async_envs else gym.vector.SyncVectorEnv
+    return kind(fns)
+"""
+
+
+@pytest.mark.parametrize("use_async_envs", [False, True])
+@pytest.mark.parametrize(
+    "sizes",
+    [
+        ((2, 2), (2, 2), (3, 2), (4, 2)),
+        ((2, 2), (2, 2), (2, 3), (2, 4)),
+        ((2, 2), (2, 2), (2, 2), (2, 3)),
+    ],
+)
+def test_spaces_that_differ_are_refused_as_by_gymnasium(
+    tmp_path: Path, sizes: Any, use_async_envs: bool
+) -> None:
+    """With its text, whatever the number of workers, and where a slice differs in itself."""
+    folder = write_repository(tmp_path, _DIFFERING)
+    kwargs: dict[str, Any] = {"use_async_envs": use_async_envs}
+    namespace: dict[str, Any] = {}
+    exec(_DIFFERING, namespace)
+    with pytest.raises(RuntimeError) as expected:
+        namespace["make_env"](sizes=sizes, **kwargs)
+    for workers in (None, 1, 2, 3, 4):
+        given = {"n_envs": 4, "env_kwargs": {"sizes": sizes}, "num_workers": workers, **kwargs}
+        with pytest.raises(RuntimeError) as caught, make_env(folder, **given) as suites:
+            suites.env.reset()
+        assert str(expected.value) in str(caught.value)
+        assert isinstance(caught.value, RemoteEnvError)
+
+
 _RAISING = """
 import gymnasium as gym
 from gymnasium import error

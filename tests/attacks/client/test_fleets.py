@@ -17,7 +17,6 @@ from gymnasium import spaces
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import (
     EnvHubError,
-    LoadError,
     MessageTooLargeError,
     RemoteEnvError,
     RemoteProtocolError,
@@ -227,7 +226,8 @@ def test_another_space_is_refused_before_the_first_step(
     other = spaces.Box(-1, 1, (4,), np.float32)
     built = env_manifest(single_observation_space=other)
     honest.lies[m.Build] = relayed(m.BuildDone(encode_env(built)))
-    with pytest.raises(LoadError, match="another environment"), fleet(liar, honest, folder):
+    named = "spaces are not equivalent"
+    with pytest.raises(RemoteEnvError, match=named), fleet(liar, honest, folder):
         pass
     del honest.lies[m.Build]
     with fleet(liar, honest, folder):  # the control

@@ -246,6 +246,15 @@ class TestWhatMakeEnvReturns:
         with pytest.raises(LoadError, match="whose num_envs is 1 and whose spaces are batched"):
             make_env(write_repository(tmp_path / "it", text), n_envs=1)
 
+    def test_an_env_whose_spaces_follow_n_envs_is_refused(self, tmp_path: Path) -> None:
+        """It is batched, though it names no number of sub-environments."""
+        text = _BATCHED.format(single="", form="Batched()").replace("num_envs = 1", "rows = 1")
+        text += "\n    env.observation_space = Box(-1, 1, (n_envs, 54))\n    return env\n"
+        folder = write_repository(tmp_path, text.replace("return Batched()", "env = Batched()"))
+        named = r"other spaces for n_envs=1.*return a gymnasium.vector"
+        with pytest.raises(LoadError, match=named), make_env(folder, n_envs=3) as suites:
+            suites.env.reset()
+
     def test_duck_typed_vector_env(self) -> None:
         """An object with the methods of a VectorEnv is one, and keeps its attributes."""
         with make_env(sample("duck_typed"), n_envs=2) as suites:

@@ -16,6 +16,7 @@ import numpy as np
 from gymnasium.vector import VectorEnv
 
 from envhub_worker.protocol.manifest.manifest import TaskId
+from envhub_worker.protocol.spaces.differing import Pair, differing
 from envhub_worker.runner import gymnasium_compat as compat
 from envhub_worker.runner import old_gym
 from envhub_worker.runner.recording import Recording, recording
@@ -66,13 +67,22 @@ class Task:
         """A vector environment of the sub-environments ``start`` to ``stop``."""
         if self.recording is None:
             return self.vector
-        env_fns: list[EnvFn] = [partial(self.build_one, index) for index in range(start, stop)]
-        if start == 0 and self.probe is not None:
-            first, self.probe = self.probe, None
-            env_fns[0] = lambda: first
+        envs = [self._first_or_new(index) for index in range(start, stop)]
+        self._refuse_differing(envs, start)
+        env_fns: list[EnvFn] = [partial(_itself, env) for env in envs]
         sliced = stop - start < len(self.recording.env_fns)
         made = self.recording
         return SubEnvs(env_fns, made.autoreset_mode, made.sync, sliced=sliced, start=start)
+
+    def _refuse_differing(self, envs: list[Any], start: int) -> None:
+        """Raise what Gymnasium raises of sub-environments with different spaces."""
+        assert self.recording is not None
+        sync, pairs = self.recording.sync, [_spaces_of(env) for env in envs]
+        text = differing(sync, pairs)
+        if text and start:  # which speaks of the first of all
+            text = differing(sync, [_spaces_of(self.learn_spaces()), *pairs])
+        if text:
+            raise RuntimeError(text)
 
     def learn_spaces(self) -> Any:
         """One sub-environment of a recording, to read spaces and metadata from."""
@@ -94,6 +104,12 @@ class Task:
                 ) from None
         return self.spaces
 
+    def _first_or_new(self, index: int) -> Any:
+        if index or self.probe is None:
+            return self.build_one(index)
+        first, self.probe = self.probe, None
+        return first
+
     def build_one(self, index: int) -> Any:
         """A new sub-environment, as one of Gymnasium's."""
         assert self.recording is not None
@@ -104,6 +120,14 @@ class Task:
         if self.probe is not None:
             self.probe.close()
             self.probe = None
+
+
+def _itself(env: Any) -> Any:
+    return env
+
+
+def _spaces_of(env: Any) -> Pair:
+    return env.observation_space, env.action_space
 
 
 def tasks_of(result: Any, n_envs: int, use_async_envs: bool, again: EnvFn) -> list[Task]:
@@ -191,6 +215,12 @@ class _Maker:
                 raise ResultError(
                     f"make_env returns the same Env object each time, so n_envs={self._n_envs} "
                     "cannot be honoured; use n_envs=1, or return a VectorEnv"
+                )
+            if _spaces_of(env) != _spaces_of(first):
+                raise ResultError(
+                    f"make_env returned {_described(first)} for n_envs={self._n_envs}, and an Env "
+                    f"with other spaces for n_envs=1: {_spaces_of(first)} and {_spaces_of(env)}. "
+                    "If it steps several environments, return a gymnasium.vector.VectorEnv"
                 )
             self._seen.append(env)
             return env
