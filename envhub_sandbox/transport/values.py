@@ -23,7 +23,7 @@ import numpy as np
 import numpy.typing as npt
 from gymnasium.envs.registration import EnvSpec
 
-from envhub_sandbox.errors import RemoteProtocolError
+from envhub_sandbox.errors import DependencyError, RemoteProtocolError
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.arrays import INLINE_BYTES, widened_numpy
 from envhub_worker.protocol.codec.inert import RemoteObject, one_line
@@ -138,12 +138,17 @@ _FORMS: dict[str, _Form] = {
 
 
 @cache
-def _torch() -> Any:
+def installed_torch() -> Any:
+    """The caller's torch, or None. Raises ``DependencyError``: it cannot be imported."""
     # a fixed name of ours: nothing is imported because a worker said so
     if importlib.util.find_spec("torch") is None:
         return None
-    import torch
-
+    try:
+        import torch
+    except Exception as error:  # not the worker's fault, whose tensor it was to be
+        raise DependencyError(
+            f"torch is installed here, and cannot be imported: {error}"
+        ) from error
     return torch
 
 
@@ -154,7 +159,7 @@ def to_tensor(array: npt.NDArray[Any], dtype: str) -> Any:
         array: The bits, owned and writable; ``uint16`` for ``bfloat16``.
         dtype: Torch's name of the dtype, out of the codec's table.
     """
-    torch = _torch()
+    torch = installed_torch()
     if torch is None:
         return widened_numpy(array) if dtype == "bfloat16" else array
     tensor = torch.from_numpy(array)

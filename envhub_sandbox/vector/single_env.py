@@ -16,7 +16,7 @@ import numpy as np
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import VectorEnv
-from gymnasium.vector.utils import concatenate, create_empty_array, iterate
+from gymnasium.vector.utils import concatenate, create_empty_array
 
 from envhub_sandbox.errors import ActionError
 from envhub_sandbox.vector.sandbox_view import SandboxView
@@ -28,7 +28,9 @@ from envhub_worker.protocol.spaces import batches
 
 _DECLARED = frozenset({"action_space", "observation_space", "metadata", "render_mode"})
 """What is known of the environment without a request; set here and there."""
-_OURS = frozenset({"_apart", "_begun", "_close", "_resets_in_the_same_step", "_spec", "_vector"})
+_OURS = frozenset(
+    {"_apart", "_begun", "_close", "_observations", "_resets_in_the_same_step", "_spec", "_vector"}
+)
 _PACKAGE = __name__.partition(".")[0]
 _PLAIN = (spaces.Box, spaces.Discrete, spaces.MultiBinary, spaces.MultiDiscrete)
 
@@ -62,6 +64,8 @@ class SingleEnv(gym.Env[Any, Any]):
         self._close = close or vector.close
         self._apart = vector._apart() if isinstance(vector, SandboxVectorEnv) else None
         self._begun: tuple[Any, dict[str, Any]] | None = None
+        # as they were declared: the caller may set others
+        self._observations = vector.single_observation_space, vector.observation_space
         items = vector.metadata.items()  # the mode is a vector environment's alone
         self.__dict__.update(  # not by __setattr__, which sets them in the environment as well
             observation_space=vector.single_observation_space,
@@ -149,7 +153,7 @@ class SingleEnv(gym.Env[Any, Any]):
         if (terminated or truncated) and self._resets_in_the_same_step:
             last, last_info = info.pop("final_obs"), info.pop("final_info", {})
             self._begun = observation, {**info, **(more[0] if more else {})}
-            observation, info = batches.restore(self.observation_space, last), last_info
+            observation, info = batches.restore(self._observations[0], last), last_info
         reward = rewards[0]
         if not np.ndim(reward):  # several are of a class that has them
             reward = float(reward)
@@ -303,10 +307,10 @@ class SingleEnv(gym.Env[Any, Any]):
 
     def _first(self, batch: Any, which: Sequence[bool]) -> Any:
         """The only observation; its discrete members of the class that they had there."""
-        first = next(iter(iterate(self._vector.observation_space, batch)))
+        [first, *_] = batches.members(*self._observations, batch, 1)
         if True not in which:
             return first
-        return batches.with_integers(self.observation_space, first, iter(which))
+        return batches.with_integers(self._observations[0], first, iter(which))
 
     def _own(
         self, infos: dict[Any, Any]

@@ -242,7 +242,7 @@ class SubEnvironment(gym.Env[Any, Any]):
 
     def _restored(self, result: Any) -> Any:
         """The result of a reset or a step, with the classes that the space gives observations."""
-        space = self._vector.single_observation_space
+        space = self._vector._manifest.single_observation_space  # the caller may set another one
         if type(result) is not tuple or not result or not batches.restores(space):
             return result
         with UNTRUSTED:

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from functools import partial
-from itertools import count
-from typing import Any
+from itertools import count, islice
+from typing import Any, cast
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.vector import VectorEnv
-from gymnasium.vector.utils import iterate
 
 from envhub_sandbox.errors import ActionError, ObservationError
 from envhub_sandbox.session.parts.fleet_session import AnySession
@@ -24,6 +23,7 @@ from envhub_sandbox.transport.results import StepResult
 from envhub_sandbox.vector.tracebacks import short_traceback
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol.codec.inert import one_line
+from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES, OpaqueSpace
 
 _SHOWN = 200
@@ -43,7 +43,8 @@ class ValidatedVectorEnv(SandboxVectorEnv, VectorEnv[Any, Any, Any]):
         self._own_observations, own_actions = (
             session.manifest.own_batch(name) for name in ("observation_space", "action_space")
         )
-        members = partial(_members, self.action_space, own_actions)
+        actions = self.single_action_space, self.action_space, self.num_envs, own_actions
+        members = partial(_members, *actions)
         space = self.single_action_space if own_actions is None else own_actions
         # not a bound method: it would refer to this environment (interruption.md, rule 13)
         self._checks = members, space
@@ -86,9 +87,10 @@ class ValidatedVectorEnv(SandboxVectorEnv, VectorEnv[Any, Any, Any]):
     def _check_batch(self, operation: str, observations: Any, ids: Sequence[int] = ()) -> None:
         with self._session.repository.named():
             try:
-                members = list(
-                    _members(self.observation_space, self._own_observations, observations)
-                )
+                declared = self.single_observation_space, self.observation_space
+                own = self._own_observations
+                each = _members(*declared, self.num_envs, own, observations)
+                members = list(islice(each, len(ids) or None))
             except Exception as error:  # a vector environment of the repository's own gave it
                 text = f"{operation} returned no batch of observations for {self.observation_space}"
                 raise ObservationError(text, observation=observations) from error
@@ -153,11 +155,19 @@ def _read_and_check(
     return batch
 
 
-def _members(space: gym.Space[Any], own: gym.Space[Any] | None, batch: Any) -> Iterable[Any]:
+def _members(
+    single: gym.Space[Any],
+    space: gym.Space[Any],
+    count: int,
+    own: gym.Space[Any] | None,
+    batch: Any,
+) -> Iterable[Any]:
     """One value for each sub-environment; the batch where it has a space of its own."""
     if own is not None:
         return [batch]
-    return batch if isinstance(space, OpaqueSpace) else iterate(space, batch)
+    if isinstance(space, OpaqueSpace):
+        return cast("Iterable[Any]", batch)
+    return batches.members(single, space, batch, count)
 
 
 def _shown(value: Any) -> str:

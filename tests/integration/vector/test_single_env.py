@@ -285,6 +285,73 @@ def test_an_attribute_that_is_set_arrives(env: Any, folder: Path) -> None:
     assert env.reset()[1]["level"] == 5
 
 
+_EMPTY = """
+import copy
+
+import gymnasium as gym
+import numpy as np
+
+S = gym.spaces
+SPACES = [
+    S.Dict({}),
+    S.Tuple(()),
+    S.Dict({"a": S.Discrete(2), "c": S.Dict({})}),
+    S.Tuple((S.Tuple(()), S.Box(-1, 1, (0, 2)), S.Dict(b=S.Text(3), c=S.Tuple(())))),
+]
+
+
+class Empty(gym.Env):
+    def __init__(self, space):
+        self.observation_space, self.action_space = copy.deepcopy(space), copy.deepcopy(space)
+
+    def reset(self, *, seed=None, options=None):
+        self.steps = 0
+        self.observation_space.seed(seed)
+        return self.observation_space.sample(), {"none": (), "rows": np.zeros((0, 4))}
+
+    def step(self, action):
+        assert action in self.action_space
+        self.steps += 1
+        return action, 1.0, self.steps == 2, False, {"none": {}}
+
+
+def make_env(n_envs=1, use_async_envs=False, kind=0, mode="NextStep"):
+    return gym.vector.SyncVectorEnv(
+        [lambda: Empty(SPACES[kind])] * n_envs, autoreset_mode=gym.vector.AutoresetMode(mode)
+    )
+"""
+
+
+@pytest.mark.parametrize("kind", range(4))
+@pytest.mark.parametrize("options", [{}, {"lane": "frames"}, {"validate": True}], ids=str)
+def test_empty_mappings_and_tuples_are_members_too(
+    tmp_path: Path, kind: int, options: dict[str, Any]
+) -> None:
+    """Of actions and of observations, also of the last of an episode."""
+    folder = write_repository(tmp_path / "empty", _EMPTY)
+    for mode in ("NextStep", "SameStep"):
+        seen = []
+        arguments = {"kind": kind, "mode": mode}
+        for env in (
+            make_env_of(folder)(**arguments).envs[0],
+            SandboxEnv(folder, env_kwargs=arguments, **options),
+        ):
+            env.action_space.seed(3)
+            played = [env.reset(seed=1)]
+            played += [env.step(env.action_space.sample()) for _ in range(2)]
+            seen.append([*played, env.reset(seed=2)])
+            env.close()
+        assert_same(*seen)
+
+
+def test_spaces_that_the_caller_sets_are_not_the_workers_fault(folder: Path) -> None:
+    """Results are read by the spaces that were declared."""
+    with contextlib.closing(SandboxEnv(folder)) as env:
+        env.observation_space = gym.spaces.Dict(other=gym.spaces.Discrete(2))
+        assert env.reset(seed=1)[0]["a"] == 0
+        assert type(env.step(1)[0]["a"]) is int
+
+
 class _Derived(SandboxEnv):
     """Has attributes of its own."""
 

@@ -20,7 +20,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
-from gymnasium.vector.utils import batch_space, concatenate, create_empty_array, iterate
+from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
 
 from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.spaces import batches
@@ -153,7 +153,8 @@ class Batch:
         """The observation of each."""
         if not self._slots:
             return list(self._members)
-        return list(iterate(batch_space(self._space, self._count), self.observation()))
+        batched = batch_space(self._space, self._count)
+        return list(batches.members(self._space, batched, self.observation(), self._count))
 
 
 class SubEnvs(SyncBase):  # type: ignore[misc]
@@ -242,7 +243,12 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         self.batch.truncations[...] = True
         self._flagged = list(range(self.num_envs))
         if self._mode == "SameStep":
-            fresh = iterate(self.observation_space, self.batch.observation())
+            fresh = batches.members(
+                self.single_observation_space,
+                self.observation_space,
+                self.batch.observation(),
+                self.num_envs,
+            )
             finals = [(i, {"final_obs": row, "final_info": {}}) for i, row in enumerate(fresh)]
             self.pairs = sorted([*finals, *infos], key=itemgetter(0))
             return self.pairs
@@ -380,7 +386,10 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
     def _each(self, actions: Any) -> Iterator[Any]:
         if self._restores:
             actions = batches.restore_batch(self.single_action_space, actions)
-        return iter(actions) if self._plain_actions else iterate(self.action_space, actions)
+        if self._plain_actions:
+            return iter(actions)
+        spaces = self.single_action_space, self.action_space
+        return iter(batches.members(*spaces, actions, self.num_envs))
 
 
 def _reward_shape(env: Any) -> tuple[int, ...]:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import copy
 import pickle
+import sys
 import warnings
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -14,7 +16,8 @@ import pytest
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
-from envhub_sandbox.errors import RemoteEnvWarning, RemoteProtocolError
+from envhub_sandbox.errors import DependencyError, RemoteEnvWarning, RemoteProtocolError
+from envhub_sandbox.transport import values
 from envhub_sandbox.transport.remote_warnings import MOST, RemoteWarnings
 from envhub_sandbox.transport.values import DescriptionReader
 from envhub_worker.protocol import messages as m
@@ -103,13 +106,13 @@ def test_a_message_has_one_budget() -> None:
     space = spaces.Box(0, 1, (3000,))
     assert arrived((space,), limits) == (space,)
     bits = np.random.default_rng(1)
-    for values in (
+    for many in (
         (space, spaces.Box(0, 2, (3000,)), space),
         (EnvSpec("A-v0"),) * 49,
         (bits,) * 13,
     ):
         with pytest.raises(RemoteProtocolError, match="cost more"):
-            arrived(values, limits)
+            arrived(many, limits)
 
 
 def test_nobody_else_makes_anything_of_descriptions() -> None:
@@ -175,3 +178,19 @@ def test_what_the_filters_raise_leaves_the_rest() -> None:
             heard.show("a/b@c")
     [two] = told(heard)
     assert two.message.text == "two"
+
+
+def test_a_torch_that_cannot_be_imported_is_not_the_workers_fault(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A tensor is made by the caller's own torch, which the worker did not break."""
+    torch = pytest.importorskip("torch")
+    frames = m.pack(m.Value(torch.zeros(2)))
+    (tmp_path / "torch.py").write_text("raise RuntimeError('another numpy')")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "torch")
+    values.installed_torch.cache_clear()
+    with pytest.raises(DependencyError, match=r"torch is installed here.*another numpy"):
+        values.unpacked(frames)
+    monkeypatch.undo()
+    assert values.unpacked(frames).value.tolist() == [0, 0]  # type: ignore[attr-defined]

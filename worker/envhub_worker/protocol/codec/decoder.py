@@ -19,7 +19,7 @@ from envhub_worker.protocol.codec.inert import (
     one_line,
 )
 from envhub_worker.protocol.codec.wire import Buffer
-from envhub_worker.protocol.errors import MessageTooLargeError, ProtocolError, RemoteProtocolError
+from envhub_worker.protocol.errors import EnvHubError, MessageTooLargeError, RemoteProtocolError
 from envhub_worker.protocol.limits import WireLimits
 
 if TYPE_CHECKING:
@@ -98,7 +98,7 @@ class Decoder:
                 object_pairs_hook=self._map,
                 strict_map_key=False,
             )
-        except ProtocolError:
+        except EnvHubError:
             raise
         except MemoryError as error:
             raise MessageTooLargeError("There is not enough memory to decode it.") from error

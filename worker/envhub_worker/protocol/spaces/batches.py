@@ -7,13 +7,14 @@ custom space, a tuple of members. Followed: ``gymnasium.vector.utils.iterate`` a
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
 from gymnasium import spaces
 from gymnasium.spaces.graph import GraphInstance
+from gymnasium.vector.utils import iterate
 
 from envhub_worker.protocol.codec.inert import inert_copy, one_line
 from envhub_worker.protocol.errors import FAULTS, MessageTooLargeError, RemoteProtocolError
@@ -66,6 +67,32 @@ def split(space: gym.Space[Any], batch: Any, bounds: Bounds) -> list[Any]:
         parts = [split(sub, item, bounds) for sub, item in zip(space.spaces, batch, strict=True)]
         return [tuple(part[index] for part in parts) for index in range(len(bounds))]
     return [batch[start:stop] for start, stop in bounds]
+
+
+def members(
+    space: gym.Space[Any], batched: gym.Space[Any], batch: Any, count: int
+) -> Iterable[Any]:
+    """Gymnasium's ``iterate``, which finds no members where a mapping or a tuple is empty."""
+    if _has_empty(space):
+        return (_member(space, batch, index) for index in range(count))
+    return iterate(batched, batch)
+
+
+def _has_empty(space: gym.Space[Any]) -> bool:
+    if isinstance(space, spaces.Dict):
+        return not space.spaces or any(map(_has_empty, space.spaces.values()))
+    return isinstance(space, spaces.Tuple) and (
+        not space.spaces or any(map(_has_empty, space.spaces))
+    )
+
+
+def _member(space: gym.Space[Any], batch: Any, index: int) -> Any:
+    if isinstance(space, spaces.Dict):
+        return {key: _member(sub, batch[key], index) for key, sub in space.spaces.items()}
+    if isinstance(space, spaces.Tuple):
+        pairs = zip(space.spaces, batch, strict=True)
+        return tuple(_member(sub, item, index) for sub, item in pairs)
+    return batch[index]
 
 
 def reordered(space: gym.Space[Any], batch: Any, order: Sequence[int]) -> Any:
