@@ -11,7 +11,7 @@ import contextlib
 import hashlib
 import os
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -42,6 +42,8 @@ from envhub_worker.protocol.stream import StreamReader, pack_packet
 
 if TYPE_CHECKING:
     from envhub_sandbox.session.parts.fleet_session import AnySession
+
+SharedJails = dict[Launcher, SharedJail]
 
 _FORMAT = 2
 _APART = ".apart"
@@ -227,41 +229,44 @@ class EnvFactory:
         return EnvSuites(
             envs,
             lambda: repository.provenance(manifest),
-            partial(_close_all, shared or ()),
+            partial(_close_all, {} if shared is None else shared),
             repository.recipe,
         )
 
-    def _shared(self, loaded: LoadedJail | None) -> list[SharedJail]:
+    def _shared(self, loaded: LoadedJail | None) -> SharedJails:
         """A jail for all environments, for each worker."""
-        shared = [SharedJail(launcher, self._cache.forget) for launcher in self._launchers]
+        shared = {one: SharedJail(one, self._cache.forget) for one in self._launchers}
         if loaded is not None:
-            shared[0].provide(loaded)
+            shared[self._launcher].provide(loaded)
         return shared
 
     def _session(
-        self, manifest: Manifest, env: EnvManifest, shared: list[SharedJail] | None
+        self, manifest: Manifest, env: EnvManifest, shared: SharedJails | None
     ) -> AnySession:
         workers = min(len(self._launchers), env.num_envs) if env.shardable else 1
         trials = self._cache.shard_trials(self._repository.lane)
         bounds = trials.bounds_for(env, self._num_workers if workers == 1 else workers)
         forget = self._cache.forget
 
-        def source(worker: int, shards: int) -> JailSource:
-            if shared is not None:
-                return shared[worker]
-            expected = ExpectedManifest(manifest, env, shards)
-            return JailSource(self._launchers[worker], forget, expected)
+        def source(launcher: Launcher, shards: int) -> JailSource:
+            if shared is None:
+                expected = ExpectedManifest(manifest, env, shards)
+                return JailSource(launcher, forget, expected)
+            if launcher not in shared:
+                shared[launcher] = SharedJail(launcher, forget)
+            return shared[launcher]
 
         if workers == 1:
-            return EnvSession(source(0, len(bounds)), env, bounds, trials)
+            return EnvSession(source(self._launcher, len(bounds)), env, bounds, trials)
         from envhub_sandbox.session.parts.fleet_session import FleetSession  # which few need
 
+        seats = list(zip(self._launchers, bounds))  # noqa: B905 - there may be more places
+        if self._num_workers is None and not trials.may_share(env):
+            seats = [seat for launcher, rows in seats for seat in _each(launcher, *rows)]
         history, unnoted = History(env, self._repository.policy.crash_history), ShardTrials(None)
-        together = self._num_workers is not None or trials.may_share(env)
-        shards = [[rows] if together else _each(*rows) for rows in bounds]
         parts = [
-            EnvSession(source(worker, len(cut)), env, cut, unnoted, history)
-            for worker, cut in enumerate(shards)
+            EnvSession(source(launcher, 1), env, [rows], unnoted, history)
+            for launcher, rows in seats
         ]
         return FleetSession(parts, history)
 
@@ -274,12 +279,13 @@ class EnvFactory:
             self._launcher.close(loaded)
 
 
-def _each(start: int, stop: int) -> list[tuple[int, int]]:
-    """Each sub-environment as a slice of its own."""
-    return [(index, index + 1) for index in range(start, stop)]
+def _each(launcher: Launcher, start: int, stop: int) -> Iterator[tuple[Launcher, tuple[int, int]]]:
+    """A worker in the same place for each sub-environment."""
+    for index in range(start, stop):
+        yield launcher if index == start else launcher.another(), (index, index + 1)
 
 
-def _close_all(shared: Iterable[SharedJail]) -> None:
+def _close_all(shared: SharedJails) -> None:
     with ExitStack() as stack:  # interruption.md, rule 9
-        for one in shared:
+        for one in shared.values():
             stack.callback(one.close)

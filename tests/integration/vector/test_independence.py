@@ -165,10 +165,12 @@ def play(env: Any) -> list[Any]:
     return results
 
 
-@pytest.mark.parametrize("lane", ["auto", "frames"])
+@pytest.mark.parametrize(
+    "where", [{}, {"lane": "frames"}, {"sandbox": ["process", "process"]}], ids=str
+)
 @pytest.mark.parametrize("kind", ["numpy", "random", "logged", "closed over"])
 def test_results_are_those_of_gymnasium_in_every_use(
-    repository: Path, kind: str, lane: str
+    repository: Path, kind: str, where: dict[str, Any]
 ) -> None:
     spec = importlib.util.spec_from_file_location("independence_control", repository / "env.py")
     assert spec is not None
@@ -179,8 +181,8 @@ def test_results_are_those_of_gymnasium_in_every_use(
     expected = play(control)
     control.close()
     for _ in range(2):
-        given = {"env_kwargs": {"kind": kind}, "lane": lane, "use_async_envs": True}
-        with make_env(repository, N_ENVS, **given) as suites:
+        given = {"env_kwargs": {"kind": kind}, "use_async_envs": True}
+        with make_env(repository, N_ENVS, **given, **where) as suites:
             assert_same(play(suites.env), expected)
 
 
