@@ -1,7 +1,7 @@
 """Every option of ``make_env``, once: type, default, check, help, and its name for commands.
 
-The parameters of ``envhub``, the fields of LeRobot's configuration and ``docs/options.md`` are made
-from this table. ``make_env`` has names and defaults in its signature too, for editors and readers;
+The parameters of ``envhub`` and the fields of LeRobot's configuration are made from this table.
+``make_env`` has names and defaults in its signature too, for editors and readers;
 a test compares the two.
 
 An error names an option by its key (``option_name``). What reads a command line calls

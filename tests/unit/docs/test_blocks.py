@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import importlib
 import importlib.util
 import inspect
@@ -16,7 +17,7 @@ from typer.testing import CliRunner
 
 from envhub_sandbox.cli.app import app
 from tests import libraries
-from tests.support.documents import blocks, options, shell
+from tests.support.documents import blocks, shell
 from tests.support.documents.blocks import CHECKOUT, DRAWN, HELD, OWN, PARSED, RUN, SHOWN, Block
 
 pytestmark = pytest.mark.same_for("users", "versions")
@@ -103,11 +104,10 @@ def held(words: list[str]) -> None:
         done = CliRunner().invoke(app, [*(word for word in rest if word != "..."), "--help"])
         assert done.exit_code == 0, (words, done.output)
     elif program == "envhub-worker":
-        known = re.split(r"^## ", options.document(), flags=re.M)
-        [part] = [one for one in known if one.startswith(f"`envhub-worker {rest[0]}`")]
-        assert {word for word in rest if word.startswith("--")} <= set(
-            re.findall(r"--[\w-]+", part)
-        )
+        parser = argparse.ArgumentParser()
+        importlib.import_module(f"envhub_worker.cli.{rest[0]}").add_arguments(parser)
+        known = set(re.findall(r"--[\w-]+", parser.format_help()))
+        assert {word for word in rest if word.startswith("--")} <= known
     elif program in ("python", "python3") and rest[0] == "-m":
         assert importlib.util.find_spec(rest[1]) is not None, words
     elif program == "pytest":
