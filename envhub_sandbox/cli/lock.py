@@ -116,7 +116,10 @@ def verify(
         from envhub_sandbox.dependencies.locks import lockfile, making
 
         locked = lockfile.read(file)
-        snapshot = make.snapshot_with_assets(_reference(ref, locked, file), locked.assets)
+        place = _reference(ref, locked, file)
+        if ref is None:  # the lock names it, which may be a stranger's
+            make.snapshot(place, public=True)
+        snapshot = make.snapshot_with_assets(place, locked.assets)
         now = _now(locked, snapshot, no_index=no_index)
         if not (no_spaces or locked.spaces is None or making.differences(locked, now)):
             kwargs = opt.read_env_kwargs([locked.spaces.arguments])

@@ -21,6 +21,7 @@ from envhub_sandbox.cli.shared.console import (
     show_rows,
 )
 from envhub_sandbox.cli.shared.exits import Exit, UsageError
+from envhub_sandbox.errors import RepositoryUnavailableError
 
 if TYPE_CHECKING:
     from envhub_sandbox.session.crash.bundle_reader import Bundle
@@ -60,6 +61,7 @@ def replay(
 
     [bold]envhub replay ~/.cache/envhub-sandbox/crashes/20261121T081500-5f3a9c01[/bold]
     """
+    from envhub_sandbox.hub.snapshot import is_here
     from envhub_sandbox.session.crash import bundle_reader
     from envhub_sandbox.session.crash import replay as repeating
 
@@ -83,6 +85,9 @@ def replay(
     if "profile" in given:
         options["policy"] = {**options["policy"], "profile": given.pop("profile")}
     options |= {**given, "sandbox": sandbox}
+    hub = {name: options[name] for name in opt.SOURCE if name in options}
+    if not (grant or loaded.is_ours or "token" in given or is_here(loaded.reference)):
+        _require_public(loaded, hub)
     changed: list[str] = []
     with ProgressBar(quiet=json) as bar, contextlib.ExitStack() as stack:
         bar.begin(f"loading {safe_line(loaded.label)}")
@@ -93,6 +98,18 @@ def replay(
         _print(loaded, replayed)
     codes = {repeating.Verdict.SAME: Exit.OK, repeating.Verdict.DIFFERENT: Exit.DIFFERENT}
     raise typer.Exit(codes.get(replayed.verdict, Exit.SURVIVED))
+
+
+def _require_public(bundle: Bundle, hub: dict[str, Any]) -> None:
+    """Refuse a repository that only the user's login brings: a stranger may have named it."""
+    from envhub_sandbox.hub.snapshot import snapshot_named
+
+    try:
+        snapshot_named(bundle.reference, **hub, public=True)
+    except RepositoryUnavailableError as error:
+        why = "What a bundle names is had without a login. If you trust its source, add --grant"
+        error.args = (f"{error}\n{why}",)
+        raise
 
 
 def _made(

@@ -165,7 +165,7 @@ def _make(cfg: Any, given: Options) -> EnvSuites:
     wanted = _wanted(options.sandbox, options)
     snapshot = snapshot_named(reference, **options.source)
     locked = wanted.lock.assets if wanted.lock is not None else ()
-    snapshot = with_assets(snapshot, options.assets or locked, options.hub)
+    snapshot = with_assets(snapshot, options.assets, options.hub, locked)
     packages = _packages(snapshot, wanted)
     load = m.Load(
         n_envs=options.n_envs,

@@ -14,7 +14,7 @@ import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import field
+from dataclasses import field, replace
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -25,6 +25,7 @@ from urllib.parse import parse_qsl, quote, urlsplit
 from envhub_sandbox.errors import HubReferenceError, SnapshotError, SnapshotIntegrityError
 from envhub_sandbox.hub.answers import (
     HostileAnswerError,
+    HubFailure,
     bounded_body,
     chain,
     conceal,
@@ -109,12 +110,24 @@ class HubClient:
 
     def resolve(self, repo: Repository, revision: str | None) -> str:
         """Ask which full commit a revision is; None is ``main``, as in huggingface_hub."""
-        url = f"{self._api(repo)}/revision/{quote(revision or 'main', safe='')}"
         with self._explained(repo, revision):
-            commit = self._get(url, {})[0]["sha"]
+            commit = self._about(repo, revision or "main")["sha"]
             if not isinstance(commit, str) or not is_commit(commit):
                 raise ValueError("the answer has no full commit")
         return commit
+
+    def is_public(self, repo: Repository, commit: str) -> bool:
+        """Whether everybody gets this commit, without a login. Raises nothing."""
+        everybody = replace(self, endpoint=self.public_endpoint, token=False)
+        try:
+            with everybody._explained(repo, commit):
+                said = everybody._about(repo, commit)
+                return said["sha"] == commit and not said.get("private") and not said.get("gated")
+        except (HubFailure, SnapshotError):
+            return False
+
+    def _about(self, repo: Repository, revision: str) -> Any:
+        return self._get(f"{self._api(repo)}/revision/{quote(revision, safe='')}", {})[0]
 
     def listing(self, repo: Repository, commit: str) -> Iterator[FileRecord]:
         """Yield the files of a commit with their sizes and digests, page by page."""
@@ -228,12 +241,19 @@ class HubClient:
         # HfApi.list_repo_tree has no timeout, and in 2.x retries a broken Hub for 24 s.
         client: Any = import_module("huggingface_hub.utils")
         timeout = import_module("huggingface_hub.constants").HF_HUB_ETAG_TIMEOUT
-        login, token = self._login()
-        headers = {**client.build_hf_headers(token=token, **_LIBRARY), **login}
-        options = {"headers": headers, "params": query, "timeout": timeout}
+        options = {"headers": self._headers(), "params": query, "timeout": timeout}
         with streamed(client.get_session(), url, options) as response:
             client.hf_raise_for_status(response)
             return json.loads(bounded_body(response)), response.links.get("next", {}).get("url")
+
+    def has_login(self) -> bool:
+        """Whether requests carry a token, or the login of a mirror."""
+        return any(name.lower() == "authorization" for name in self._headers())
+
+    def _headers(self) -> dict[str, str]:
+        client: Any = import_module("huggingface_hub.utils")
+        login, token = self._login()
+        return {**client.build_hf_headers(token=token, **_LIBRARY), **login}
 
     @contextmanager
     def _explained(self, repo: Repository, revision: str | None) -> Iterator[None]:

@@ -41,6 +41,7 @@ from envhub_sandbox.hub.listing import (
     content_digest,
     listing_within_limits,
 )
+from envhub_sandbox.hub.logins import without_login
 from envhub_sandbox.hub.reference import DEFAULT_PATH, HubRef, is_local, is_of_another_place
 from envhub_sandbox.system.log import SNAPSHOT, tell
 from envhub_worker.protocol.records import dataclass
@@ -57,8 +58,8 @@ def snapshot_named(reference: str, *, allow_secrets: bool = False, **hub: Any) -
     """The snapshot of a hub reference or of a local folder; raises as ``fetch`` and ``local`` do.
 
     The path of a ``.py`` file or of a folder that is here means that, with a warning where it could
-    be a repository of the Hub. ``hub`` are ``hub_cache_dir``, ``token`` and ``endpoint``, as
-    ``fetch`` takes them.
+    be a repository of the Hub. ``hub`` are ``hub_cache_dir``, ``token``, ``endpoint`` and
+    ``public``, as ``fetch`` takes them.
     """
     if is_here(reference):
         _warn_of_two_meanings(reference)
@@ -124,6 +125,7 @@ def fetch(
     endpoint: str | None = None,
     limits: SnapshotLimits = DEFAULT_LIMITS,
     needs_entry: bool = True,
+    public: bool = False,
 ) -> Snapshot:
     """Bring a repository's files here, verified.
 
@@ -136,6 +138,8 @@ def fetch(
         endpoint: As in huggingface_hub: None for ``$HF_ENDPOINT`` or https://huggingface.co.
         limits: What the repository may bring.
         needs_entry: False for one that is no environment: it may be of any type.
+        public: Only what everybody is given, without a login: for what a stranger names. What is
+            in the store because the caller's login has brought it is no answer.
 
     Raises:
         RepositoryUnavailableError: No such repository, revision or file, no access, no Hub. The
@@ -147,7 +151,9 @@ def fetch(
     """
     if ref.repo_type == registered.KIND:
         return _registered(ref)
-    candidates = _candidates(ref, hub_cache_dir, token, endpoint, limits, needs_entry)
+    if public:
+        token, endpoint = False, without_login(checked_endpoint(endpoint))
+    candidates = _candidates(ref, hub_cache_dir, token, endpoint, limits, needs_entry, public)
     try:
         for candidate in candidates if ref.is_pinned else ():
             if (stored := candidate.stored()) is not None:
@@ -170,6 +176,7 @@ def _candidates(
     endpoint: str | None = None,
     limits: SnapshotLimits = DEFAULT_LIMITS,
     needs_entry: bool = True,
+    public: bool = False,
 ) -> Sequence[_Candidate]:
     """As what it may be read."""
     if ref.repo_type == address.KIND:
@@ -183,7 +190,7 @@ def _candidates(
     every = ("model", "space") if needs_entry else ("model", "dataset", "space")
     kinds = (ref.repo_type,) if ref.repo_type else every
     repos = [Repository(kind, ref.repo_id) for kind in kinds]
-    return [_Candidate(ref, repo, hub, limits, needs_entry) for repo in repos]
+    return [_Candidate(ref, repo, hub, limits, needs_entry, public) for repo in repos]
 
 
 def _first(candidates: Sequence[_Candidate], ask: Callable[[_Candidate], T]) -> T:
@@ -209,7 +216,9 @@ def _unavailable(
     advice = best.advice
     if best.kind is Kind.NO_REPOSITORY and ref.repo_type is None and candidates[0].needs_entry:
         advice += f". A dataset repository is written 'datasets/{ref.repo_id}'"
-    in_store = "" if best.kind is Kind.NO_ENTRY else _in_store(candidates, best.kind in UNREACHABLE)
+    in_store = ""
+    if best.kind is not Kind.NO_ENTRY and not candidates[0].public:
+        in_store = _in_store(candidates, best.kind in UNREACHABLE)
     return RepositoryUnavailableError(f"{ref} on {endpoint}: {whats}. {advice}.{in_store}")
 
 
@@ -291,13 +300,16 @@ def _by_content(
 
 @dataclass(frozen=True)
 class _Candidate:
-    """A reference read as a repository of one type. Raises ``HubFailure`` and ``SnapshotError``."""
+    """A reference read as a repository of one type. Raises ``HubFailure`` and ``SnapshotError``.
+    ``public``: see ``fetch``; git has no logins.
+    """
 
     ref: HubRef
     repo: Repository
     host: RepositoryHost
     limits: SnapshotLimits
     needs_entry: bool
+    public: bool = False
 
     @property
     def folder(self) -> Path:
@@ -308,7 +320,8 @@ class _Candidate:
         """The pinned commit, if it is in the store. No request. Raises ``HalfDeletedError``."""
         slot = self._slot(self.ref.revision or "")
         files = store.load(slot)
-        return None if files is None else self._finished(slot, files)
+        hidden = self.public and not store.is_public(slot)
+        return None if files is None or hidden else self._finished(slot, files)
 
     def fetched(self) -> Snapshot:
         """The revision as the host resolves it now, downloaded unless it is in the store."""
@@ -319,7 +332,18 @@ class _Candidate:
             files = store.load(slot)
         if files is None:
             raise SnapshotError(f"{slot.title}: it was removed from the store meanwhile; try again")
+        if self.public and not store.is_public(slot) and not self._note_whether_public(slot):
+            what = f"the {self.repo.repo_type} repository is not given without a login"
+            raise HubFailure(Kind.GATED, what, "Only what needs none is taken here")
         return self._finished(slot, files)
+
+    def _note_whether_public(self, slot: store.Slot) -> bool:
+        """Whether the host gives it to everybody, which the store remembers; git has no logins."""
+        host = self.host
+        public = not isinstance(host, HubClient) or host.is_public(self.repo, slot.commit)
+        if public:
+            store.mark_public(slot)
+        return public
 
     def resolved(self) -> str:
         """The commit that the revision is at the host now."""
@@ -342,6 +366,8 @@ class _Candidate:
             note = {"endpoint": self.host.public_endpoint, **self.repo._asdict()}
             note["revision"] = None if self.ref.is_pinned else self.ref.usual_revision
             store.publish(slot, files, source.copier(files, slot.title), note)
+        if isinstance(self.host, HubClient) and not self.host.has_login():
+            self._note_whether_public(slot)
         SNAPSHOT.info("%s: verified, and in the store", slot.title)
 
     def _slot(self, commit: str) -> store.Slot:

@@ -3,7 +3,8 @@
 ::
 
     <cache>/snapshots/huggingface.co-1f2e3d4c/model--org--repo/<commit>/
-        record.json     what was verified: digests, and a stat fingerprint of each file
+        record.json     what was verified: digests, and a stat fingerprint of each file; and whether
+                        the host gave it without a login
         tree/           the files, 0444 or 0555, in folders 0555, and nothing else
 
 A snapshot is built in a folder of another name and renamed into place: what bears a commit's
@@ -35,6 +36,7 @@ from envhub_sandbox.system.platform import IS_WINDOWS, open_flags
 from envhub_worker.protocol.records import dataclass
 
 _FORMAT = 1
+_PUBLIC = "public"
 _ABANDONED_AFTER_S = 24 * 3600.0
 _MAX_NAME = 200
 _FILE_MODE = 0o444
@@ -134,6 +136,20 @@ def load(slot: Slot) -> tuple[FileRecord, ...] | None:
         with contextlib.suppress(OSError):  # A read-only store only stays slower.
             _write_record(slot.home, slot.tree, document, entries)
     return tuple(entries)
+
+
+def is_public(slot: Slot) -> bool:
+    """Whether a stored snapshot was once to be had without a login."""
+    text = _record_of(slot)
+    return text is not None and _read_record(slot, text)[0].get(_PUBLIC) is True
+
+
+def mark_public(slot: Slot) -> None:
+    """Note that a snapshot, which is in the store, is to be had without a login."""
+    if (text := _record_of(slot)) is not None:
+        document, entries = _read_record(slot, text)
+        with contextlib.suppress(OSError):  # a read-only store asks the host again
+            _write_record(slot.home, slot.tree, {**document, _PUBLIC: True}, entries)
 
 
 def load_whole(slot: Slot) -> tuple[FileRecord, ...] | None:

@@ -38,6 +38,8 @@ class StubRepository:
         listed: Lies: fields of the listing's entry of a path (``{"size": 3}``).
         truncated: Paths whose download ends half way.
         head_headers: Further headers of the answers to HEAD and GET of files.
+        token: Without it there is no such repository.
+        gated: Without a token there are no files, but all else.
     """
 
     files: dict[str, bytes]
@@ -48,6 +50,8 @@ class StubRepository:
     listed: dict[str, dict[str, Any]] = field(default_factory=dict)
     truncated: set[str] = field(default_factory=set)
     head_headers: dict[str, str] = field(default_factory=dict)
+    token: str = ""
+    gated: bool = False
 
     def at(self, revision: str) -> StubRepository:
         if revision not in self.earlier:
@@ -236,7 +240,7 @@ class _Handler(BaseHTTPRequestHandler):
     def _answer_api(self, steps: list[str], query: dict[str, list[str]]) -> None:
         repo_type, repo_id, rest = steps[0].removesuffix("s"), "/".join(steps[1:3]), steps[3:]
         repository = self.stub.repositories.get((repo_type, repo_id))
-        if repository is None:
+        if repository is None or not self._may_see(repository):
             self._absent("RepoNotFound", 401)
         elif len(rest) > 1 and not self._known(repository, rest[1]):
             self._absent("RevisionNotFound")
@@ -285,6 +289,9 @@ class _Handler(BaseHTTPRequestHandler):
         url = f"{self.stub.endpoint}/{name}/commit/{repository.commit}"
         self._send_json({"success": True, "commitOid": repository.commit, "commitUrl": url})
 
+    def _may_see(self, repository: StubRepository) -> bool:
+        return self.headers.get("authorization", "").endswith(repository.token)
+
     def _known(self, repository: StubRepository, revision: str) -> bool:
         known = revision in repository.refs or revision in repository.earlier
         return known or repository.commit.startswith(revision)
@@ -292,7 +299,13 @@ class _Handler(BaseHTTPRequestHandler):
     def _answer_info(self, repository: StubRepository, repo_id: str) -> None:
         siblings = [{"rfilename": path} for path in repository.files]
         info = {"id": repo_id, "sha": repository.commit, "siblings": siblings, "tags": []}
-        info |= {"private": False, "gated": False, "disabled": False, "downloads": 0, "likes": 0}
+        info |= {
+            "private": False,
+            "gated": repository.gated,
+            "disabled": False,
+            "downloads": 0,
+            "likes": 0,
+        }
         self._send(200, json.dumps(info).encode(), {"Content-Type": "application/json"})
 
     def _answer_tree(self, repository: StubRepository, query: dict[str, list[str]]) -> None:
@@ -312,8 +325,10 @@ class _Handler(BaseHTTPRequestHandler):
         named = self.stub.repositories.get((repo_type, "/".join(steps[:2])))
         repository = named and named.at("".join(steps[3:4]))
         path = "/".join(steps[4:])
-        if repository is None:
+        if repository is None or not self._may_see(repository):
             self._absent("RepoNotFound", 401)
+        elif repository.gated and "authorization" not in self.headers:
+            self._absent("GatedRepo", 401)
         elif path not in repository.files:
             self._absent("EntryNotFound")
         else:

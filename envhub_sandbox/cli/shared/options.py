@@ -134,18 +134,17 @@ class MakeOptions:
             self._check_trust()
         return _READERS.get(key, lambda given: given)(self.given[key])
 
-    def snapshot(self, ref: str) -> Snapshot:
-        """What a reference names, fetched."""
+    def snapshot(self, ref: str, *, public: bool = False) -> Snapshot:
+        """What a reference names, fetched; see ``fetch`` for ``public``."""
         from envhub_sandbox.hub.snapshot import snapshot_named
 
-        return snapshot_named(ref, **self.source)
+        return snapshot_named(ref, **self.source, public=public)
 
     def snapshot_with_assets(self, ref: str, locked: Sequence[str] = ()) -> Snapshot:
-        """The same, with its assets: those of the command line, or these."""
+        """The same, with its assets: those of the command line, or of a lock."""
         from envhub_sandbox.hub.sources.assets import with_assets
 
-        assets = self.given.get("assets") or locked
-        return with_assets(self.snapshot(ref), assets, self.hub)
+        return with_assets(self.snapshot(ref), self.given.get("assets") or (), self.hub, locked)
 
     @property
     def source(self) -> dict[str, Any]:

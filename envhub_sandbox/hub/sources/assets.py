@@ -1,9 +1,9 @@
 """Further repositories of the Hub that a jail may read: those of ``assets=`` and of the card.
 
 They are fetched and verified as an environment's own files are. The caller's may be private; what
-the author's card declares is fetched without a token and only as a full commit: a card must not
-bring the caller's private data into a jail, nor name something that changes. It declares them in
-the ``envhub:`` mapping of the YAML in front of README.md::
+the author's card declares, or a lock names, is had without a login, also from the store: neither
+must bring the caller's private data into a jail. A card names full commits only. It declares them
+in the ``envhub:`` mapping of the YAML in front of README.md::
 
     ---
     envhub:
@@ -25,9 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from envhub_sandbox.errors import EnvHubError, HubReferenceError, SnapshotError
-from envhub_sandbox.hub.client import checked_endpoint
 from envhub_sandbox.hub.listing import DEFAULT_LIMITS, SnapshotLimits
-from envhub_sandbox.hub.logins import without_login
 from envhub_sandbox.hub.reference import DEFAULT_PATH, REPO_TYPES, HubRef, is_local
 from envhub_sandbox.hub.snapshot import Snapshot, fetch
 from envhub_sandbox.settings.options import MAX_ASSETS, option_name
@@ -87,25 +85,33 @@ def _value(node: Any, key: str) -> Any:
     return next((value for name, value in node.value if name.value == key), None)
 
 
-def with_assets(snapshot: Snapshot, given: Sequence[str], hub: Mapping[str, Any]) -> Snapshot:
+def with_assets(
+    snapshot: Snapshot, given: Sequence[str], hub: Mapping[str, Any], locked: Sequence[str] = ()
+) -> Snapshot:
     """The snapshot with its assets, fetched and verified.
 
-    References of the caller replace the card's of the same repository. ``hub`` is what ``fetch``
-    takes. Raises as that, and for a card that cannot be read, and for what is no asset.
+    Args:
+        given: The caller's references, or else those of a lock (``locked``); they replace the
+            card's of the same repository.
+        hub: What ``fetch`` takes.
+
+    Raises as that, and for a card that cannot be read, and for what is no asset.
     """
-    wanted = [_asset(text, snapshot, option_name("assets")) for text in given]
+    where = option_name("assets") if given else "the lock"
+    wanted = [_asset(text, snapshot, where) for text in given or locked]
     declared = _declared(snapshot)
     if not wanted and not declared:
         return snapshot
     with progress_shown("assets") as tell:
-        found = [_fetched(ref, option_name("assets"), tell, hub) for ref in wanted]
+        hub = dict(hub) if given else {**hub, "public": True}
+        found = [_fetched(ref, where, tell, hub) for ref in wanted]
         theirs = {(one.repo_type, one.repo_id.casefold()) for one in found}
         left = DEFAULT_LIMITS.max_bytes
         for ref in declared:
             if any(_may_be(ref, *one) for one in theirs):
                 continue
             limits = replace(DEFAULT_LIMITS, max_bytes=max(1, left))
-            taken = _fetched(ref, f"its {CARD}", tell, _without_logins(hub), limits)
+            taken = _fetched(ref, f"its {CARD}", tell, {**hub, "public": True}, limits)
             left -= sum(file.size for file in taken.files)
             found.append(taken)
             SNAPSHOT.info(
@@ -168,12 +174,6 @@ def _may_be(ref: HubRef, repo_type: str, repo_id: str) -> bool:
     return ref.repo_id.casefold() == repo_id and ref.repo_type in (None, repo_type)
 
 
-def _without_logins(hub: Mapping[str, Any]) -> dict[str, Any]:
-    """Neither with the caller's token, nor with the login in the address of a mirror."""
-    endpoint = without_login(checked_endpoint(hub.get("endpoint")))
-    return {**hub, "token": False, "endpoint": endpoint}
-
-
 def _fetched(
     ref: HubRef,
     where: str,
@@ -185,7 +185,9 @@ def _fetched(
     try:
         return fetch(ref, **hub, limits=limits, needs_entry=False)
     except EnvHubError as error:
-        why = "" if where == option_name("assets") else ", and it is fetched without a login"
+        option, why = option_name("assets"), ""
+        if where != option:
+            why = f", and it is fetched without a login. If it is meant, name it by {option}"
         error.args = (f"{error}\nIt is an asset: {where} names it{why}.", *error.args[1:])
         raise
 

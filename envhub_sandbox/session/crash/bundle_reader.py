@@ -21,9 +21,11 @@ import numpy as np
 
 from envhub_sandbox.errors import BundleError, EnvHubError
 from envhub_sandbox.hub.grammar import LOCAL_TYPES, is_commit
-from envhub_sandbox.hub.reference import pinned
+from envhub_sandbox.hub.local import split_local
+from envhub_sandbox.hub.reference import is_local, pinned
 from envhub_sandbox.session.crash.bundle_writer import FORMAT
 from envhub_sandbox.settings.policy import Limits, Policy
+from envhub_sandbox.system.folders import cache_root
 from envhub_sandbox.transport.values import to_tensor
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.inert import one_line
@@ -67,6 +69,7 @@ class Bundle:
     Attributes:
         label: Repository, commit and entry file.
         reference: The same, pinned, as ``make_env`` takes it.
+        is_ours: It lies where this program writes the caller's bundles.
         files: Digest by path.
         death: ``reason``, ``exit_code``, ``signal``, ``request``, ``message``.
         load: The arguments of the repository's ``make_env``.
@@ -79,6 +82,7 @@ class Bundle:
 
     label: str
     reference: str
+    is_ours: bool
     files: dict[str, str]
     death: dict[str, Any]
     load: m.Load
@@ -112,6 +116,7 @@ def _bundle(folder: Path, document: dict[str, Any]) -> Bundle:
     return Bundle(
         label=one_line(_member(document, "label", str), 1000),
         reference=_reference(provenance),
+        is_ours=folder.resolve().parent == (cache_root() / "crashes").resolve(),
         files=_files(_member(provenance, "files", dict)),
         death=_death(_member(document, "death", dict)),
         load=_load(folder),
@@ -275,6 +280,8 @@ def _files(mapping: dict[str, Any]) -> dict[str, str]:
 _GRANTED = ("profile", "network", "display", "readable", "gpu", "environment")
 _CARRIED = ("hub_cache_dir", "endpoint", "python", "dependencies", "lock", "assets")
 _MAX_WISH = 4000
+_LONGEST_S = 24 * 3600.0
+"""Of a timeout."""
 _USUAL: tuple[object, ...] = (None, "auto", [])
 
 
@@ -294,12 +301,20 @@ def wishes(bundle: Bundle) -> list[str]:
         found += [f"limits.{n}={v!r}" for n, v in limits.items() if _is_more(n, v)]
     carried = {name: bundle.arguments.get(name) for name in _CARRIED}
     found += [f"{name}={value!r}" for name, value in carried.items() if value not in _USUAL]
-    if bundle.reference.startswith("git+"):  # a host that the bundle chose is asked
+    if bundle.reference.startswith("git+") or _is_another_folder(bundle):
+        # a host that the bundle chose is asked, or what lies anywhere here is shown to a jail
         found.append(f"repository={bundle.reference!r}")
     for wish in found:
         if len(wish) > _MAX_WISH:
             raise BundleError(f"it asks for more than can be shown: {one_line(wish, 300)}")
     return [one_line(wish, 8 * _MAX_WISH) for wish in found]  # a line each, whatever its name is
+
+
+def _is_another_folder(bundle: Bundle) -> bool:
+    """Whether it is about a folder of this machine, but not the one that the user stands in."""
+    if bundle.is_ours or not is_local(bundle.reference):
+        return False
+    return split_local(bundle.reference).folder.resolve() != Path.cwd()
 
 
 def _policy(bundle: Bundle) -> dict[str, Any]:
@@ -346,9 +361,9 @@ def _known(cls: type[Any], value: Any) -> dict[str, Any]:
 
 
 def _timeouts(bundle: Bundle) -> dict[str, Any]:
-    """Those that were used, but for those without an end."""
+    """Those that were used, but none without an end, or one that is far."""
     timeouts = bundle.arguments.get("timeouts")
     names = ("startup_s", "reset_s", "step_s", "call_s")
     found = timeouts if isinstance(timeouts, dict) else {}
     given = {name: found[name] for name in names if isinstance(found.get(name), (int, float))}
-    return {name: seconds for name, seconds in given.items() if seconds < float("inf")}
+    return {name: seconds for name, seconds in given.items() if seconds <= _LONGEST_S}

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,14 @@ import yaml
 from huggingface_hub import hf_hub_download
 
 from envhub_sandbox import make_env
+from envhub_sandbox.dependencies import interpreters
+from envhub_sandbox.dependencies.locks import lockfile
+from envhub_sandbox.dependencies.locks.pylock import PylockPackage, Wheel
 from envhub_sandbox.errors import (
     EnvHubError,
     HubReferenceError,
+    LockDriftError,
+    RepositoryUnavailableError,
     SnapshotError,
     SnapshotIntegrityError,
     SnapshotTooLargeError,
@@ -33,6 +39,10 @@ import os
 class Reads(Still):
     def read(self, path):
         return open(path).read()
+
+    def asset(self, repository):
+        folder = os.environ["HF_HOME"] + "/hub/models--" + repository + "/snapshots/"
+        return [open(folder + commit + "/x").read() for commit in os.listdir(folder)]
 
     def found(self):
         hub = os.environ["HF_HOME"] + "/hub"
@@ -131,6 +141,46 @@ def test_a_card_that_names_the_callers_private_repository(
         assert set(asked_for(stub_hub, "org/repo")) == {"Bearer hf_mine"}
     followed(stub_hub, tmp_path / "control", 1, token="hf_mine")
     assert "Bearer hf_mine" in asked_for(stub_hub, "me/private")
+
+
+def locked(folder: Path, asset: str) -> Path:
+    """A lock file that names an asset. It fits no repository, which is found out afterwards."""
+    path = folder / "pylock.env.toml"
+    package = PylockPackage("x", "1.0", (Wheel("0" * 64, "", None),))
+    files = {"env.py": f"sha256:{'0' * 64}"}
+    runner = lockfile.Runner.of(interpreters.own())
+    lock = lockfile.LockFile("org/repo", COMMIT, "env.py", files, runner, (package,))
+    lockfile.write(replace(lock, assets=(asset,)), path)
+    return path
+
+
+@pytest.mark.parametrize("kind", ["private", "gated"])
+def test_what_the_callers_login_has_brought_is_no_strangers(
+    stub_hub: StubHub, make: Make, tmp_path: Path, kind: str
+) -> None:
+    """The store has the commit, and so needs no request; for a card and a lock the Hub is asked all
+    the same, whether everybody gets it. The control is the caller's own word.
+    """
+    mine = stub_hub.add("me/mine", {"x": "secret"})
+    mine.token, mine.gated = ("hf_mine", False) if kind == "private" else ("", True)
+    asset = f"me/mine@{COMMIT}"
+    with make(asset, assets=[asset], token="hf_mine") as suites:
+        assert suites.env.call("asset", "me--mine") == (["secret"],), "the control failed"
+    before = len(stub_hub.requests)
+    with pytest.raises(RepositoryUnavailableError, match=r"README\.md names it, and it is fetched"):
+        make(asset, token="hf_mine")
+    with pytest.raises(RepositoryUnavailableError, match="the lock names it, and it is fetched"):
+        make(asset, token="hf_mine", lock=locked(tmp_path, asset))
+    asked = zip(stub_hub.requests[before:], stub_hub.authorizations[before:], strict=True)
+    assert {token for request, token in asked if "me/mine" in request} == {None}
+    mine.token, mine.gated = "", False
+    with make(asset, token="hf_mine") as suites:  # now that everybody gets it
+        assert suites.env.call("asset", "me--mine") == (["secret"],)
+    with pytest.raises(LockDriftError):
+        make(asset, token="hf_mine", lock=locked(tmp_path, asset))
+    before = len(stub_hub.requests)
+    make(asset, token="hf_mine").close()
+    assert len(stub_hub.requests) == before, "what is known to be public is asked for again"
 
 
 @pytest.mark.parametrize(

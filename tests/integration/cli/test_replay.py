@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pytest
 
 from envhub_sandbox import errors, make_env
+from envhub_sandbox.system.folders import cache_root
 from tests.hub.olah_server import OlahServer
+from tests.hub.stub_hub import StubHub
 from tests.support.command_line import envhub
 from tests.support.output.bundles import crashed
 from tests.support.repositories import STILL, write_repository
@@ -57,10 +60,39 @@ def test_what_cannot_be_replayed_is_refused(tmp_path: Path) -> None:
     document = json.loads(file.read_text())
     document["task"]["suite"] = "\x1b[31mother"
     file.write_text(json.dumps(document))
-    refused = envhub("replay", bundle)
+    refused = envhub("replay", bundle, "--grant")
     assert refused.returncode == 2
     assert "so nothing can be repeated" in refused.stderr
     assert "\x1b" not in refused.stderr
+
+
+def test_a_bundle_opens_neither_a_folder_nor_what_a_login_has_brought(
+    stub_hub: StubHub, hub_cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without --grant: but for the folder that the user stands in, and what everybody gets. What
+    this program has written itself, where it writes bundles, is the user's own.
+    """
+    stub_hub.add("me/mine", {"env.py": (sample("faulty") / "env.py").read_text()})
+    stub_hub.repositories["model", "me/mine"].token = "hf_mine"
+    place = {"endpoint": stub_hub.endpoint, "hub_cache_dir": hub_cache, "token": "hf_mine"}
+    monkeypatch.setenv("HF_TOKEN", "hf_mine")
+    hub = ("--endpoint", stub_hub.endpoint, "--hub-cache-dir", hub_cache)
+    for folder, said in (
+        (crashed(tmp_path / "a", sample("faulty")), "repository="),
+        (crashed(tmp_path / "b", f"me/mine@{'c0ffee':0<40}", **place), "without a login"),
+    ):
+        refused = envhub("replay", folder, *hub)
+        assert refused.returncode != 0
+        assert said in refused.stderr
+        assert "--grant" in refused.stderr
+        assert envhub("replay", folder, *hub, "--grant").returncode == 0
+        ours = cache_root() / "crashes" / f"ours-{folder.parent.name}"
+        shutil.copytree(folder, ours)
+        assert envhub("replay", ours, *hub).returncode == 0
+    monkeypatch.chdir(sample("faulty"))
+    assert envhub("replay", next((tmp_path / "a").iterdir())).returncode == 0
+    stub_hub.repositories["model", "me/mine"].token = ""
+    assert envhub("replay", next((tmp_path / "b").iterdir()), *hub).returncode == 0
 
 
 _FUSE = f"""{STILL}
@@ -98,7 +130,7 @@ def test_a_config_and_a_task_are_found_again(tmp_path: Path) -> None:
         env.reset(seed=1)
         with pytest.raises(errors.WorkerDiedError) as caught:
             _ = [env.step([0]) for _ in range(10)]
-    done = envhub("replay", str(caught.value.bundle), "--json")
+    done = envhub("replay", str(caught.value.bundle), "--grant", "--json")
     assert done.returncode == 0, done.stderr
     document = json.loads(done.stdout)
     assert (document["doubts"], document["replayed"]["steps"]) == ([], 5)
