@@ -17,6 +17,7 @@ import hashlib
 import os
 import posixpath
 import stat
+import warnings
 from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
 from typing import NamedTuple
@@ -53,14 +54,17 @@ _ALL_COUNTS = (
     "to the repository, or run 'git init' there and name it in .gitignore"
 )
 _SHOWN = 5
+_REQUIREMENTS = "requirements.txt"
 IGNORED, REPOSITORY = "ignored by git", "a git repository of its own"
-_VENV, _UNREADABLE, _LINK, _SECRET = "a virtual environment", "unreadable", "a link", "keys"
+_VENV, _UNREADABLE, _SECRET = "a virtual environment", "unreadable", "keys"
+_LINK, _DEAD_LINK = "a link", "a link to nothing"
 _CURES = {
     IGNORED: "Run 'git add --force {path}', or take it out of .gitignore",
     REPOSITORY: "Name that folder alone",
     _VENV: "Move it out of there",
     _UNREADABLE: "Give yourself permission to read it",
     _LINK: "Put a copy in its place",
+    _DEAD_LINK: "Put a file in its place",
     _SECRET: "Name the folder, with {allow}",
 }
 """Why something is left out of a snapshot, and how it comes in."""
@@ -184,10 +188,20 @@ class LocalFolder:
         left = [one for one in listing.left_out if one.why not in (IGNORED, REPOSITORY)]
         if left:
             said += f"; left out: {_shown([f'{one.path} ({one.why})' for one in left])}"
-        declares = self.entry is not None and "requirements.txt" not in names
-        if declares and (self.root / "requirements.txt").is_file():
-            said += f"; requirements.txt is not read unless you name the folder, {self.as_folder()}"
         return said
+
+    def warn_of_requirements(self, listing: Listing) -> None:
+        """Other packages than its author's may give other results."""
+        beside = self.root / _REQUIREMENTS
+        if self.entry is None or not beside.is_file():
+            return
+        if any(one.path == _REQUIREMENTS for one in listing.files):
+            return
+        warnings.warn(
+            f"{self.root / self.entry} is named alone, so {beside} does not say which packages it "
+            f"gets. Name the folder, {self.as_folder()}, or declare them in the file itself",
+            stacklevel=2,
+        )
 
     def as_folder(self) -> str:
         """A reference that shows the folder of a file as a whole."""
@@ -277,6 +291,9 @@ class LocalFolder:
         if path.is_symlink() and self.entry not in (None, name):
             yield LeftOut(name, _LINK)
             return
+        if path.is_symlink() and not os.path.exists(os.path.realpath(path)):
+            yield LeftOut(name, _DEAD_LINK)  # editors lock files by such
+            return
         source = self._inside(path, name)
         if source.is_dir() and _is_venv(source):
             yield LeftOut(f"{name}/", _VENV)
@@ -300,10 +317,7 @@ class LocalFolder:
     def _inside(self, path: Path, name: str) -> Path:
         if not path.is_symlink():
             return path
-        try:
-            source = Path(os.path.realpath(path, strict=True))
-        except OSError as error:
-            raise SnapshotError(f"{self}: the link {name!r} points nowhere; remove it") from error
+        source = Path(os.path.realpath(path))
         if not source.is_relative_to(self.root) or _GIT in source.relative_to(self.root).parts:
             raise SnapshotError(
                 f"{self}: the link {name!r} points outside the folder (to {source}), where a "

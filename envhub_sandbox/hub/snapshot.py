@@ -262,6 +262,7 @@ def local(folder: str | Path, *, allow_secrets: bool = False) -> Snapshot:
         what, advice = here.why_left_out(path) or _missing_entry(path, files)
         raise RepositoryUnavailableError(f"{here} {what}. {advice}")
     tell(here.seen(listing), SNAPSHOT)
+    here.warn_of_requirements(listing)
     copy = copier(listing.files, str(here))
     snapshot = _by_content(FOLDER, str(named.folder), path, files, copy)
     return replace(snapshot, repo_type=named.repo_type)

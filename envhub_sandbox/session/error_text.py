@@ -14,6 +14,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Iterator
+from pathlib import Path
 
 from envhub_sandbox.errors import DependencyError, EnvHubError, RemoteEnvError, WorkerDiedError
 from envhub_sandbox.hub.snapshot import Snapshot
@@ -154,6 +155,10 @@ def _of_display(text: str, policy: Policy) -> str:
 
 _QUOTED = r"'([^'\n]{1,1024})'|\"([^\"\n]{1,1024})\"|([^\s'\"]{0,512}[./][^\s'\"]{1,512})"
 _NO_MODULE = r"No module named '([\w.]{1,200})'"
+_NOT_FOUND = (
+    r"(?i)not found|no such|no file|no module|does not exist|doesn't exist|unable to|error opening|"
+    r"(can ?not|can't|could not|couldn't|failed to) (be )?(open|find|found|load|read|locate|access)"
+)
 _MOST_NAMES, _DEEPEST = 16, 16
 
 
@@ -169,19 +174,25 @@ def why_missing(error: EnvHubError, snapshot: Snapshot) -> str:
     from envhub_sandbox.hub.local import LocalFolder
 
     text = getattr(remote, "message", "") or str(remote)
+    if not re.search(_NOT_FOUND, text):
+        return ""
     shown = {record.path for record in snapshot.files}
-    for path in _names(text[:_TEXT_CHARS].replace(f"{snapshot.root}/", "")):
+    for path in _names(text[:_TEXT_CHARS].replace(f"{snapshot.root}/", ""), snapshot.repo_id):
         is_shown = path in shown or any(one.startswith(f"{path}/") for one in shown)
         if not is_shown and os.path.lexists(os.path.join(snapshot.repo_id, path)):
             return LocalFolder.of(snapshot).advice(path)
     return ""
 
 
-def _names(text: str) -> Iterator[str]:
+def _names(text: str, folder: str) -> Iterator[str]:
     """Paths below a folder that a text may mean, the likeliest first."""
-    modules = [found[1].replace(".", "/") for found in re.finditer(_NO_MODULE, text)]
+    modules = [found[1].split(".")[0] for found in re.finditer(_NO_MODULE, text)]
     for module in modules[:_MOST_NAMES]:
-        yield from (f"{module}.py", module, f"{module.partition('/')[0]}.py", module.split("/")[0])
+        yield from (f"{module}.py", module)
+        # in a folder that code puts on its path
+        for path in sorted(Path(folder).glob(f"*/{module}*")):
+            if path.name in (module, f"{module}.py"):
+                yield path.relative_to(folder).as_posix()
     for found in list(re.finditer(_QUOTED, text))[:_MOST_NAMES]:
         steps = (found[1] or found[2] or found[3]).rstrip(".,:;)").replace("\\", "/").split("/")
         steps = [step for step in steps if step not in ("", ".")]

@@ -16,6 +16,9 @@ _MACHINE_CODE = (".so", ".pyd")
 _MOST_ROUNDS = 100
 """How far imports are followed; each takes a process."""
 
+_MOST_KNOWN = 100
+_KNOWN: dict[bytes, parsing.ParsedFile | None] = {}
+
 Names = Callable[[str], Collection[str]]
 """The names of the files in a folder, which is written with ``/``."""
 
@@ -33,7 +36,7 @@ def own_files(root: Path, entry: str, names: Names) -> set[str]:
             if data is not None and file.endswith(".py"):
                 texts[file] = data
                 left -= len(data)
-        read = parsing.parsed(texts)
+        read = _read(texts)
         waiting = {
             path for file, one in read.items() if one for path in _imported(file, one, names)
         }
@@ -41,6 +44,16 @@ def own_files(root: Path, entry: str, names: Names) -> set[str]:
         if not waiting or None in read.values():  # what took too much once is not tried on and on
             break
     return {_package_of(path, names) or path for path in found | waiting}
+
+
+def _read(texts: dict[str, bytes]) -> dict[str, parsing.ParsedFile | None]:
+    """What each text is; one that was read in this process before is not parsed again."""
+    known = dict(_KNOWN)  # other threads may read files, too
+    found = parsing.parsed({file: text for file, text in texts.items() if text not in known})
+    if len(known) > _MOST_KNOWN:
+        _KNOWN.clear()
+    _KNOWN.update((texts[file], one) for file, one in found.items())
+    return {file: found[file] if file in found else known[text] for file, text in texts.items()}
 
 
 def _imported(file: str, read: parsing.ParsedFile, names: Names) -> Iterator[str]:

@@ -66,13 +66,14 @@ def env(tmp_path_factory: pytest.TempPathFactory) -> Any:
         yield suites.env
 
 
-@pytest.mark.parametrize("name", ["model.xml", "data/a b.npy", "other.py"])
+@pytest.mark.parametrize("name", ["model.xml", "data/a b.npy", "other.py", "lib/other.py"])
 @pytest.mark.parametrize("when", ["in make_env", "later"])
 def test_what_lies_beside_a_named_file_is_missed_with_a_word(
     tmp_path: Path, name: str, when: str
 ) -> None:
     """That it is there, why the code does not see it, and which reference shows it."""
-    code = f"open({name!r})" if name != "other.py" else "__import__('oth' + 'er')"
+    code = "sys.path.append('lib')\n__import__('oth' + 'er')"
+    code = code if name.endswith("other.py") else f"open({name!r})"
     folder = write_repository(
         tmp_path / "repo", RUNS + f"\n{code if when == 'in make_env' else ''}"
     )

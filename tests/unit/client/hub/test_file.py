@@ -147,15 +147,24 @@ def test_a_home_directory_is_refused(
     assert "a.png" in shown(folder / "pictures")
 
 
+def test_requirements_that_do_not_count_are_said(folder: Path) -> None:
+    """Other versions may give other results; what the folder says counts for the folder."""
+    write(folder, "requirements.txt")
+    shutil.rmtree(folder / ".ssh")
+    (folder / ".env").unlink()
+    with pytest.warns(UserWarning, match=rf"requirements.txt does not say .* '{folder}:env.py'"):
+        assert shown(folder / "env.py") == {"env.py"}
+    assert "requirements.txt" in shown(f"{folder}:env.py")
+
+
 def test_one_line_says_what_the_code_sees(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
-    write(folder, "requirements.txt", "a.py", **{"env.py": "import a"})
+    write(folder, "a.py", **{"env.py": "import a"})
     with caplog.at_level("INFO", "envhub_sandbox.snapshot"):
         local(folder / "env.py")
         local(folder, allow_secrets=True)
     assert caplog.messages == [
-        f"local file {folder}/env.py: the code sees 2 files of its folder: a.py, env.py; "
-        f"requirements.txt is not read unless you name the folder, '{folder}:env.py'",
-        f"local folder {folder}: the code sees 8 files of it",
+        f"local file {folder}/env.py: the code sees 2 files of its folder: a.py, env.py",
+        f"local folder {folder}: the code sees 7 files of it",
     ]
 
 
