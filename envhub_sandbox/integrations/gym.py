@@ -10,17 +10,19 @@ What stands before the colon is imported by Gymnasium, which finds the id regist
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import gymnasium
 from gymnasium.vector import VectorEnv
 
+from envhub_sandbox.errors import LoadError
 from envhub_sandbox.factory.make_env import make_env
+from envhub_sandbox.session.repository import ENV_ID
 from envhub_sandbox.vector.single_env import SingleEnv
 from envhub_sandbox.vector.suites import choose, closed_if_it_fails
 from envhub_sandbox.vector.tracebacks import short_traceback
-
-ID = "Hub-v0"
+from envhub_sandbox.vector.vector_env import SandboxVectorEnv, refuse_limit
 
 
 class SandboxEnv(SingleEnv, gymnasium.Env[Any, Any]):
@@ -54,6 +56,29 @@ class SandboxEnv(SingleEnv, gymnasium.Env[Any, Any]):
 
 
 @short_traceback
+def make_again(ref: Any, *, render_mode: str | None = None, **options: Any) -> SandboxEnv:
+    """What ``gymnasium.make(env.spec)`` calls.
+
+    As ``SandboxEnv``, but where the repository's ``make_env`` takes no ``render_mode``: then the
+    environment has the one that the repository gives it, and another is told by a warning.
+    """
+    try:
+        return SandboxEnv(ref, render_mode=render_mode, **options)
+    except LoadError as error:
+        if render_mode is None or "make_env takes no render_mode" not in str(error):
+            raise
+    env = SandboxEnv(ref, **options)
+    if env.render_mode != render_mode:
+        warnings.warn(
+            f"{env}: make_env takes no render_mode, so it is {env.render_mode!r} and not "
+            f"{render_mode!r}",
+            UserWarning,
+            stacklevel=2,
+        )
+    return env
+
+
+@short_traceback
 def make_vector(
     ref: Any,
     num_envs: int = 1,
@@ -61,6 +86,7 @@ def make_vector(
     suite: str | None = None,
     task: int | str | None = None,
     render_mode: str | None = None,
+    max_episode_steps: int | None = None,
     **options: Any,
 ) -> VectorEnv[Any, Any, Any]:
     """What ``gymnasium.make_vec`` calls: the vector environment of a repository.
@@ -71,11 +97,18 @@ def make_vector(
         suite: Which suite of the repository; needed where there are several.
         task: Which task of it; likewise.
         render_mode: Handed to the repository's ``make_env``, if given.
+        max_episode_steps: The repository's own, as a spec has it.
         options: ``make_env``'s.
+
+    Raises:
+        ValueError: ``max_episode_steps`` is another number.
     """
     suites = make_env(ref, n_envs=num_envs, **_with_render_mode(options, render_mode))
     with closed_if_it_fails(suites):
-        return choose(suites, suite, task)
+        vector = choose(suites, suite, task)
+        if isinstance(vector, SandboxVectorEnv):
+            refuse_limit(vector, max_episode_steps)
+        return vector
 
 
 def _with_render_mode(options: dict[str, Any], render_mode: str | None) -> dict[str, Any]:
@@ -85,7 +118,7 @@ def _with_render_mode(options: dict[str, Any], render_mode: str | None) -> dict[
     return {**options, "env_kwargs": given}
 
 
-if ID not in gymnasium.registry:
+if ENV_ID not in gymnasium.registry:
     gymnasium.register(
-        ID, entry_point=f"{__name__}:SandboxEnv", vector_entry_point=f"{__name__}:make_vector"
+        ENV_ID, entry_point=f"{__name__}:SandboxEnv", vector_entry_point=f"{__name__}:make_vector"
     )

@@ -21,6 +21,7 @@ from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 
 from envhub_sandbox.errors import (
     DependencyError,
@@ -34,8 +35,8 @@ from envhub_sandbox.hub.logins import without_login
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.session.crash.history import Recording
 from envhub_sandbox.session.error_text import add_author_line, add_reach_advice, why_missing
-from envhub_sandbox.settings.options import option_name
-from envhub_sandbox.settings.policy import Policy, Timeouts
+from envhub_sandbox.settings.options import Options, option_name
+from envhub_sandbox.settings.policy import Limits, Policy, Timeouts
 from envhub_sandbox.system.folders import cache_root
 from envhub_sandbox.system.locks import SharedLock
 from envhub_sandbox.system.log import CRASHES
@@ -53,6 +54,11 @@ from envhub_worker.protocol.text import printable
 _PLAIN = (type(None), bool, int, float, complex, str, bytes, np.ndarray, np.generic)
 _MAX_DEPTH = 16
 _LEFT_OUT = object()
+ENV_ID = "Hub-v0"
+"""What Gymnasium calls every environment of ours."""
+_MAKERS = "envhub_sandbox.integrations.gym"
+_SPEC_FACTS = frozenset({"max_episode_steps", "reward_threshold", "nondeterministic"})
+"""What is true of the environment in a sandbox as well."""
 
 
 @dataclass(frozen=True)
@@ -86,17 +92,54 @@ class Recipe:
 
     def make(self) -> Any:
         """Fresh environments: what ``make_env`` returns and raises."""
-        cfg: Any = self.reference
-        if self.config is not None:
-            cfg = PlainConfig(self.reference, {**self.config, "hub_path": self.reference})
-        options = dict(self.options)
-        if options.get("endpoint") == without_login(default_endpoint()):
-            options["endpoint"] = None  # it may come with a login here
-        return self.make_env(cfg, **options)
+        return self.make_env(self._cfg, **self._options)
 
     def make_one(self, suite: str, task: int | str) -> Any:
         """One fresh environment of them."""
         return self.make()[suite][task]
+
+    def spec(self, suite: str, task: int | str, facts: Mapping[str, Any] | None) -> EnvSpec:
+        """Of which ``gym.make`` makes one of them again, in a sandbox.
+
+        Args:
+            suite: That the environment is of.
+            task: Likewise.
+            facts: What the repository's own spec says, if it has one. Trust: input from the worker;
+                nothing is taken of how it is made.
+        """
+        known = {name: value for name, value in (facts or {}).items() if name in _SPEC_FACTS}
+        if (known.get("max_episode_steps") or 0) < 1:
+            known["max_episode_steps"] = None
+        return EnvSpec(
+            ENV_ID,
+            entry_point=f"{_MAKERS}:make_again",
+            vector_entry_point=f"{_MAKERS}:make_vector",
+            kwargs={"ref": self._cfg, "suite": suite, "task": task, **self._differing()},
+            **{**known, "nondeterministic": bool(known.get("nondeterministic"))},
+        )
+
+    @property
+    def _cfg(self) -> Any:
+        if self.config is None:
+            return self.reference
+        return PlainConfig(self.reference, {**self.config, "hub_path": self.reference})
+
+    @property
+    def _options(self) -> dict[str, Any]:
+        options = dict(self.options)
+        if options.get("endpoint") == without_login(default_endpoint()):
+            options["endpoint"] = None  # it may come with a login here
+        return options
+
+    def _differing(self) -> dict[str, Any]:
+        """The options that are not the default ones, as JSON has them where it can."""
+        default = Options()
+        return {
+            name: plain
+            for name, value in self._options.items()
+            if name != "n_envs" and value != getattr(default, name)
+            if (plain := _differences(value)) not in (None, {}, ())
+        }
 
 
 def provenance_of(
@@ -131,6 +174,21 @@ def provenance_of(
         "profile": profile,
         "places": list(places),
         "layers": [dict(layer) for layer in report],
+    }
+
+
+def _differences(value: Any) -> Any:
+    """Of a policy and the like the fields that are not the default ones; else the value itself."""
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    if not isinstance(value, (Policy, Timeouts, Limits)):
+        return value
+    default = type(value)()
+    each = {item.name: getattr(value, item.name) for item in fields(value)}
+    return {
+        name: _differences(field_value)
+        for name, field_value in each.items()
+        if field_value != getattr(default, name)
     }
 
 

@@ -209,32 +209,26 @@ def _spec(value: object) -> Any:
     return RemoteObject(_SPEC_TYPE, one_line(str(facts), _SHOWN)) if made is None else made
 
 
-def spec_of(given: dict[str, Any] | None, reference: str = "") -> EnvSpec | None:
+def spec_of(given: dict[str, Any] | None) -> EnvSpec | None:
     """A spec with these facts, as ``read_spec`` lets them through.
 
     A string names what refuses, so that it can be written as JSON like any other.
 
     Args:
         given: ``id``, ``max_episode_steps``, ``reward_threshold``, ``nondeterministic``.
-        reference: The repository, for the text of the refusal.
     """
     # gym.make imports what stands before a colon
     if given is None or given.get("id") is None or ":" in given["id"]:
         return None
     facts = {name: value for name, value in given.items() if value is not None}
     try:
-        return EnvSpec(
-            **facts,
-            entry_point=_REFUSAL,
-            vector_entry_point=_REFUSAL,
-            kwargs={"reference": reference} if reference else {},
-        )
+        return EnvSpec(**facts, entry_point=_REFUSAL, vector_entry_point=_REFUSAL)
     except Exception:  # an id that this Gymnasium cannot read: not worth failing for
         return None
 
 
 def not_here(*args: Any, reference: str = "", **kwargs: Any) -> NoReturn:
-    """What ``gym.make(env.spec)`` calls.
+    """What ``gym.make`` calls with the spec of a sub-environment, or one in an info.
 
     Raises:
         gymnasium.error.Error: Always.

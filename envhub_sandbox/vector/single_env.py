@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import html
 from collections.abc import Callable, Sequence
+from copy import copy
 from typing import Any, SupportsFloat, cast
 
 import gymnasium as gym
@@ -201,20 +202,33 @@ class SingleEnv(gym.Env[Any, Any]):
     @property
     @short_traceback
     def spec(self) -> Any:
-        """What was set here, or the environment's: its id and limits, of which nothing is made.
+        """What was set here, or what ``gym.make`` makes the same of, in a sandbox again.
 
-        The first reading asks for it, which starts its processes.
+        Its limits are those of the environment's own spec, which is that of
+        ``env.vector.envs[0]``.
         """
         if "_spec" not in self.__dict__:
-            if getattr(self._vector, "closed", False):
-                return None
-            spec = self._vector.spec or getattr(self._inner, "spec", None)
-            self._spec = spec if isinstance(spec, EnvSpec) else None
+            self._spec = self._own_spec()
         return self._spec
 
     @spec.setter
     def spec(self, value: Any) -> None:
+        own = self._own_spec() if isinstance(value, EnvSpec) else None
+        if own is not None and value.id == own.id and value.max_episode_steps is None:
+            value = copy(value)  # gym.make knows of no limit of the repository's
+            value.max_episode_steps = own.max_episode_steps
         self._spec = value
+
+    def _own_spec(self) -> EnvSpec | None:
+        vector = self._vector
+        if not isinstance(vector, SandboxVectorEnv):
+            spec = vector.spec or getattr(self._inner, "spec", None)
+            return spec if isinstance(spec, EnvSpec) else None
+        facts = vector._manifest.spec
+        if facts is None and not (vector._manifest.shardable or vector.closed):
+            inner = getattr(self._inner, "spec", None)  # of a class's own sub-environment
+            facts = vars(inner) if isinstance(inner, EnvSpec) else None
+        return vector._spec_again(facts)
 
     @short_traceback
     def __setattr__(self, name: str, value: Any) -> None:

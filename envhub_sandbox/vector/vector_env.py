@@ -15,6 +15,7 @@ from threading import get_ident
 from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import gymnasium as gym
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import VectorEnv
 
 from envhub_sandbox.errors import EnvHubError
@@ -23,7 +24,7 @@ from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.remote_warnings import level_of_the_caller
 from envhub_sandbox.transport.replies import typed_reply
 from envhub_sandbox.transport.results import Own, StepResult
-from envhub_sandbox.transport.values import not_here, seeds, spec_of
+from envhub_sandbox.transport.values import not_here, seeds
 from envhub_sandbox.vector.actions import (
     action_reader,
     check_mask,
@@ -91,7 +92,8 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
         self.action_space = manifest.action_space
         self.metadata = metadata_of(manifest)
         self.render_mode = manifest.render_mode
-        self.spec = spec_of(manifest.spec, session.repository.label)  # facts, which make nothing
+        # as in Gymnasium, where a SyncVectorEnv has none
+        self.spec = self._spec_again(manifest.spec) if self._has_spec else None
         if manifest.shardable:  # a repository's own class has others, or none
             self.autoreset_mode = self.metadata.get("autoreset_mode")
             self.copy = session.repository.copy
@@ -479,6 +481,14 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
 
     __html__ = _repr_html_
 
+    @property
+    def _has_spec(self) -> bool:
+        return not self._manifest.shardable and self._manifest.spec is not None
+
+    def _spec_again(self, facts: dict[str, Any] | None) -> EnvSpec:
+        recipe = self._session.repository.recipe
+        return recipe.spec(self._manifest.suite, self._manifest.task, facts)
+
     def _apart(self) -> VectorApart | None:
         """How libraries of single environments use it: infos are each one's own from now on.
 
@@ -495,6 +505,20 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
 def leave_suite(env: SandboxVectorEnv) -> None:
     """Have its first use start no other task of its suite: ``EnvSuites.map`` does that."""
     env._session.prewarm.on_first_use(lambda: None, lambda: False)
+
+
+def refuse_limit(env: SandboxVectorEnv, steps: int | None) -> None:
+    """Refuse another limit of an episode's steps than the repository's own, for which None stands.
+
+    Raises:
+        ValueError: It is another one.
+    """
+    own = env._spec_again(env._manifest.spec).max_episode_steps
+    if steps not in (None, own):
+        raise ValueError(
+            f"{env}: its episodes are of {own or 'any number of'} steps, and not of {steps}: a "
+            "limit is the repository's, or a gymnasium.wrappers.TimeLimit around SandboxEnv"
+        )
 
 
 def metadata_of(manifest: EnvManifest) -> dict[str, Any]:

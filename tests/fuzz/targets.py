@@ -281,7 +281,7 @@ def manifest(dice: Dice) -> None:
     for env in found.envs:
         usable((env.metadata, env.attributes, env.render_mode, env.suite, env.task))
         metadata_of(env)
-        spec = spec_of(env.spec, "a/b@c")
+        spec = spec_of(env.spec)
         entry = f"{values.__name__}:{values.not_here.__name__}"
         demand(spec is None or spec.entry_point == entry, "an entry point of the worker's")
         for space in (env.single_observation_space, env.single_action_space):

@@ -396,7 +396,7 @@ def attempts(env: Any, canary: Path) -> dict[str, bool]:
     copied = copy.deepcopy([TOKEN, env])
     copied[1].close()
     with contextlib.suppress(Exception):
-        gym.make(env.spec)
+        gym.make(env.spec).close()
     assert env.render()[0] == SCRIPT  # of which a notebook shows frames alone
     return {
         "have a deep copy hand over what else is copied": TOKEN in env.loot,

@@ -23,6 +23,7 @@ from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
 
 from envhub_sandbox.errors import RemoteProtocolError
+from envhub_sandbox.integrations import gym as maker
 from envhub_sandbox.transport.values import generator
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest.manifest import (
@@ -48,7 +49,7 @@ from tests.attacks.client.lying_server import NUM_ENVS, LyingServer, env_manifes
 def specified(liar: LyingServer, folder: str, spec: dict[str, Any]) -> Any:
     """``make_env`` of an environment with this specification."""
     value = manifest()
-    value["envs"][0]["spec"] = spec
+    value["envs"][0].update(spec=spec, shardable=False)
     liar.lies[m.Load] = relayed(m.LoadDone(value))
     return opened(liar, folder)
 
@@ -68,15 +69,27 @@ MAKERS: dict[str, Callable[[EnvSpec], object]] = {
 
 
 @pytest.mark.parametrize("how", list(MAKERS))
-def test_specs_make_nothing_here(liar: LyingServer, folder: str, tmp_path: Path, how: str) -> None:
-    """``gym.make(env.spec)`` runs no entry point that a worker names, and says why not."""
+def test_specs_make_nothing_here(
+    liar: LyingServer,
+    folder: str,
+    tmp_path: Path,
+    how: str,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """``gym.make(env.spec)`` runs no entry point that a worker names, but makes it again by
+    ``make_env``, of the caller's own reference."""
     canary = tmp_path / "made"
     with specified(liar, folder, spec_of(canary)) as suites:
         spec = suites.env.spec
         assert spec is not None
-        assert (spec.id, spec.max_episode_steps) == ("Trap-v0", 7)
-        with pytest.raises(gym.error.Error, match=r"sandbox.*make_env"):
+        assert (spec.id, spec.max_episode_steps) == ("Hub-v0", 7)
+        assert not spec.additional_wrappers
+        spec.kwargs.pop("sandbox")  # that of the test, which JSON has no form for
+        made: list[Any] = []
+        monkeypatch.setattr(maker, "make_env", lambda ref, **options: made.append(ref))
+        with pytest.raises(Exception):  # noqa: B017,PT011  # what that returns is none
             MAKERS[how](spec)
+        assert made == [suites.reference]
     assert not canary.exists()
     naive = EnvSpec(**spec_of(canary))
     with pytest.raises(Exception):  # noqa: B017,PT011  # what it returns is no environment
@@ -86,9 +99,10 @@ def test_specs_make_nothing_here(liar: LyingServer, folder: str, tmp_path: Path,
 
 @pytest.mark.parametrize("name", ["antigravity:Trap-v0", "a/b/c:d", "a b"])
 def test_spec_names_import_nothing(liar: LyingServer, folder: str, name: str) -> None:
-    """``gym.make(env.spec.id)`` imports the module before a colon: no id of ours has one."""
-    with specified(liar, folder, {"id": name}) as suites:
-        assert suites.env.spec is None
+    """``gym.make(env.spec.id)`` imports the module before a colon: the id is ours."""
+    with specified(liar, folder, {"id": name, "max_episode_steps": -1}) as suites:
+        assert suites.env.spec.id == "Hub-v0"
+        assert suites.env.spec.max_episode_steps is None
 
 
 def test_the_control_imports_what_an_id_names(tmp_path: Path) -> None:

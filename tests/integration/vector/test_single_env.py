@@ -7,6 +7,7 @@ from __future__ import annotations
 import contextlib
 import copy
 import json
+import pickle
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,6 +16,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils.env_checker import check_env
 from gymnasium.wrappers import TimeAwareObservation
 
@@ -386,21 +388,81 @@ def test_its_actions_and_the_vector_environment_below(env: Any, folder: Path) ->
     assert env.step(True)[4]["kind"] == "bool"
 
 
-def test_its_spec_has_the_plain_fields(tmp_path: Path) -> None:
-    text = """
+_MADE = """
 import gymnasium as gym
-def make_env(n_envs=1, use_async_envs=False):
-    return gym.vector.SyncVectorEnv([lambda: gym.make("CartPole-v1")] * n_envs)
+
+
+class Plain(gym.Env):
+    observation_space = gym.spaces.Box(-1, 1, (2,))
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return self.np_random.uniform(-1, 1, 2).astype("f4"), {}
+
+    def step(self, action):
+        return self.np_random.uniform(-1, 1, 2).astype("f4"), 0.0, False, False, {}
+
+
+def make_env(n_envs=1, use_async_envs=False, plain=False):
+    def one():
+        if plain:
+            return gym.wrappers.TimeLimit(Plain(), 7)
+        return gym.make("CartPole-v1", render_mode="rgb_array")
+
+    return gym.vector.SyncVectorEnv([one] * n_envs)
 """
-    env = SandboxEnv(write_repository(tmp_path / "spec", text))
-    try:
-        assert env.spec is not None
-        assert (env.spec.id, env.spec.max_episode_steps) == ("CartPole-v1", 500)
-        assert env.spec.reward_threshold == 475.0
-        assert TimeAwareObservation(env).observation_space.shape == (5,)
-        with pytest.raises(gym.error.Error, match="sandbox"):
-            gym.make(env.spec)
+_AGAIN: dict[str, Any] = {
+    "gym.make": gym.make,
+    "its own make": EnvSpec.make,
+    "JSON": lambda spec: gym.make(EnvSpec.from_json(spec.to_json())),
+    "a pickle": lambda spec: gym.make(pickle.loads(pickle.dumps(copy.deepcopy(spec)))),
+    "make_vec": lambda spec: gym.make_vec(spec, num_envs=1),
+}
+
+
+def test_its_spec_makes_it_again(tmp_path: Path) -> None:
+    """In a sandbox, by the same options but the token, which is in no file that has a spec. What
+    Gymnasium and others check with copies (``check_env``, minari) works."""
+    folder = write_repository(tmp_path / "made", _MADE)
+    policy = {"restart": "on_reset", "limits": {"processes": 64}}
+    options: dict[str, Any] = {"policy": policy, "timeouts": {"step_s": 50.0}, "copy": False}
+    with contextlib.closing(SandboxEnv(folder, token="hf_secret", **options)) as env:
+        spec = env.spec
+        assert spec is not None
+        assert (spec.id, spec.max_episode_steps, spec.reward_threshold) == ("Hub-v0", 500, 475.0)
+        assert spec.nondeterministic is False
+        assert spec.kwargs["policy"] == policy
+        assert (spec.kwargs["timeouts"], spec.kwargs["copy"]) == ({"step_s": 50.0}, False)
+        assert "hf_secret" not in spec.to_json()
+        first = env.reset(seed=4)[0]
+        for how, make in _AGAIN.items():
+            with contextlib.closing(make(spec)) as again:
+                ours = SandboxVectorEnv if how == "make_vec" else SandboxEnv
+                assert isinstance(again.unwrapped, ours), how
+                assert np.array_equal(np.ravel(again.reset(seed=4)[0]), first), how
+                assert again.spec.kwargs["policy"] == policy
+        with pytest.raises(ValueError, match="500 steps, and not of 9"):
+            gym.make_vec(spec, max_episode_steps=9)
+        with pytest.warns(UserWarning, match="takes no render_mode, so it is 'rgb_array'"):
+            check_env(env)
         env.spec = None
         assert env.spec is None
-    finally:
+
+
+def test_a_time_limit_without_a_spec_is_known(tmp_path: Path) -> None:
+    """As Gymnasium finds it by looking through the wrappers."""
+    folder = write_repository(tmp_path / "made", _MADE)
+    plain = {"plain": True}
+    played = []
+    for env in (
+        make_env_of(folder)(plain=True).envs[0],
+        SandboxEnv(folder, env_kwargs=plain),
+        gym.make(_ID, ref=str(folder), env_kwargs=plain),
+    ):
+        timed = TimeAwareObservation(env, normalize_time=True)
+        seen = [timed.observation_space, timed.reset(seed=1), timed.step(1)]
+        played.append([*seen, *(timed.step(0) for _ in range(6))])
         env.close()
+    assert_same(played[0], played[1])
+    assert_same(played[0], played[2])

@@ -5,10 +5,12 @@ from __future__ import annotations
 import os
 import platform
 import sys
+from contextlib import suppress
 from typing import Any
 
 from gymnasium.vector import VectorEnv
 from gymnasium.vector.utils import batch_space
+from gymnasium.wrappers import TimeLimit
 
 from envhub_worker.protocol.manifest.manifest import EnvManifest, Manifest
 from envhub_worker.protocol.manifest.names import MAX_NAMES
@@ -55,7 +57,7 @@ def _describe_task(task: Task, sides: Sides) -> EnvManifest:
         autoreset_mode=made.autoreset_mode,
         metadata=_metadata(source),
         render_mode=getattr(source, "render_mode", None),
-        spec=None,
+        spec=_spec(source),
         attributes=(),
         type_name=f"gymnasium.vector.{'Sync' if made.sync else 'Async'}VectorEnv",
     )
@@ -86,8 +88,14 @@ def describe_vector(task: Task, env: Any, sides: Sides | None = None) -> EnvMani
 
 
 def _spec(env: Any) -> dict[str, Any] | None:
-    spec = getattr(env, "spec", None)
-    return None if getattr(spec, "id", None) is None else facts_of(spec)
+    """What its spec says; without one, how long a ``TimeLimit`` lets an episode be."""
+    spec = None
+    with suppress(Exception):  # Gymnasium's wrappers make it, of what the repository gave them
+        spec = env.spec
+    if getattr(spec, "id", None) is not None:
+        return facts_of(spec)
+    limits = (layer for layer in compat.layers(env) if isinstance(layer, TimeLimit))
+    return next(({"max_episode_steps": layer._max_episode_steps} for layer in limits), None)
 
 
 def _attributes(env: Any) -> tuple[str, ...]:
