@@ -177,13 +177,14 @@ MAKERS = {
 class Seen(gym.vector.VectorWrapper):
     def __init__(self, env):
         super().__init__(env)
-        self.seen = env.envs[0].action_space
+        self.seen = env.single_action_space
 
 def make_env(n_envs=1, use_async_envs=False, kind="bare", around=None):
     if around == "single":
         return MAKERS[kind]()
-    env = gym.vector.SyncVectorEnv([MAKERS[kind]] * n_envs)
-    return Seen(env) if around == "wrapper" else env
+    vector = gym.vector.SyncVectorEnv if around != "async" else gym.vector.AsyncVectorEnv
+    env = vector([MAKERS[kind]] * n_envs)
+    return Seen(env) if around else env
 """
 _SEEDS = {
     "": "self",
@@ -193,7 +194,7 @@ _SEEDS = {
 
 
 @pytest.mark.parametrize("seed", _SEEDS)
-@pytest.mark.parametrize("around", [None, "single", "wrapper"])
+@pytest.mark.parametrize("around", [None, "single", "wrapper", "async"])
 @pytest.mark.parametrize(("kind", "scale"), [("bare", 1), ("registered", 1), ("wrapped", 2)])
 def test_a_reset_of_old_is_converted_and_told(
     tmp_path: Path, seed: str, around: str, kind: str, scale: int, recwarn: Any

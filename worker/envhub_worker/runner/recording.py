@@ -17,6 +17,7 @@ import inspect
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
+from multiprocessing import get_start_method
 from typing import Any
 
 import gymnasium as gym
@@ -111,7 +112,8 @@ def _build_after_all(env: Any, cls: type) -> None:
     del env.__dict__[_KEY]
     env.__dict__.pop("closed", None)
     arguments = dict(made.arguments)
-    if made.sync:  # another process could not import what adapts them
+    method = arguments.get("context") or get_start_method()
+    if made.sync or method == "fork":  # another process could not import what adapts them
         arguments["env_fns"] = [partial(_adapted, fn) for fn in made.env_fns]
     _REAL_INIT[cls](env, **arguments)
     env.__dict__.update(kept)
