@@ -191,9 +191,8 @@ class _Maker:
             return Task(suite, task, recording=made, vector=None if made else env)
         if old_gym.is_vector(env):
             return Task(suite, task, vector=old_gym.adapted_vector(env))
-        if isinstance(env, gym.Env):
-            _refuse_batched(env)
         if isinstance(env, gym.Env) or old_gym.is_env(env):
+            _refuse_batched(env)
             return Task(suite, task, recording=self._multiplied(env, pick))
         lacks = [name for name in _DUCK if not hasattr(env, name)]
         if not {"reset", "step"} & {*lacks}:
@@ -266,7 +265,8 @@ def _refuse_batched(env: Any) -> None:
 
 def _is_batched(env: Any, count: int) -> bool:
     """Whether its spaces are of so many. One may be a channel: then both have to be."""
-    observed, acted = (row_of(getattr(env, name), count) is not None for name in _SPACES)
+    own = (old_gym.space_of(getattr(env, name)) for name in _SPACES)
+    observed, acted = (row_of(space, count) is not None for space in own)
     return observed and (acted or count > 1)
 
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from envhub_worker.runner import old_gym
+from envhub_worker.runner.tasks import ResultError, tasks_of
 
 OBSERVATION = np.zeros(2, np.float32)
 
@@ -190,3 +191,12 @@ def test_what_is_gymnasiums_stays_as_it_is(recwarn: Any) -> None:
     env = gymnasium.make("CartPole-v1")
     assert old_gym.adapted(env) is env
     assert not recwarn.list
+
+
+def test_one_that_is_batched_is_refused() -> None:
+    class Batched(Bare):
+        num_envs = len(OBSERVATION)
+
+    with pytest.raises(ResultError, match=f"num_envs is {len(OBSERVATION)} and whose spaces are"):
+        tasks_of(Wrapper(Batched()), 1, False, Batched)
+    assert len(tasks_of(Wrapper(Bare()), 1, False, Bare)) == 1  # the control
