@@ -177,8 +177,8 @@ def _votes(space: Space, value: Any, count: int) -> Iterator[bool | None]:
         for index, sub in enumerate(space.spaces):
             yield from _votes(sub, value[index], count) if known else (None,)
     elif isinstance(space, ARRAY_SPACES):
-        shape = tuple(np.shape(value))
-        yield {space.shape: True, (count, *(space.shape or ())): False}.get(shape)
+        sides = {len(space.shape or ()): True, len(space.shape or ()) + 1: False}
+        yield sides.get(len(np.shape(value)))
     else:
         yield not (isinstance(value, (tuple, list)) and len(value) == count)
 

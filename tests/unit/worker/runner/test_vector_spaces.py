@@ -114,6 +114,11 @@ def test_a_tensor_tells_as_an_array_does() -> None:
     assert known.single_observation_space.shape == (2,)
 
 
+def test_a_shape_that_is_not_the_spaces_tells_by_its_dimensions() -> None:
+    known = spaces_of(vector(np.zeros((3, 5)), **one_space(ROW, ROW)), {})
+    assert (known.single_action_space, known.action_space) == (ROW, ROWS)
+
+
 def test_an_action_space_stands_for_itself_where_observations_are_known() -> None:
     """No reset is needed; a batch of choices is one choice, a Box of joints is of one."""
     known: dict[str, Any] = {"single_observation_space": ROW, "observation_space": ROWS}
