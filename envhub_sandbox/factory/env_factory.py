@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
-import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
@@ -127,7 +126,7 @@ def manifest_key(snapshot: Snapshot, load: m.Load, policy: Policy, runtime: Runt
     )
     digest = hashlib.sha256(arguments)
     digest.update(repr(facts).encode())
-    digest.update(b"".join(map(bytes, encode([os.environ.get(n) for n in policy.environment]))))
+    digest.update(b"".join(map(bytes, encode(policy.confinement().environment))))
     return digest.hexdigest()
 
 

@@ -55,7 +55,7 @@ if TYPE_CHECKING:
 BOOTSTRAP = Path(envhub_worker.protocol.__file__).parent.parent / "bootstrap.py"
 _STARTUP_S = 60.0
 _STOP_S = 5.0
-_KEPT_VARIABLES = ("PATH", "LANG", "LC_ALL", "LC_CTYPE", "TZ", "TMPDIR")
+_KEPT_VARIABLES = ("PATH", "LANG", "LC_ALL", "LC_CTYPE", "TZ", "TMPDIR", "PYTHONHASHSEED")
 SERVER = "envhub-"
 CONTAINER = "envhub-docker-"
 _NAME = re.compile(rf"{SERVER}(docker-|scratch-|state-)?[a-z0-9_]{{8}}")

@@ -16,6 +16,7 @@ from envhub_sandbox.errors import PolicyError
 from envhub_sandbox.settings.options import option_name
 from envhub_worker.protocol.confinement import DISPLAYS, NETWORKS, PROFILES, Confinement, Limits
 from envhub_worker.protocol.records import dataclass
+from envhub_worker.protocol.start_variables import fixed_hash_seed, why_not
 from envhub_worker.protocol.text import parse_size
 
 __all__ = [
@@ -82,7 +83,8 @@ class Policy:
         gpu: ``True`` grants all GPUs, ``[0, 2]`` these, in the order of ``nvidia-smi`` (NVIDIA's by
             PCI address, then others): the device nodes for computing and rendering, and the
             devices' own folders of ``/sys``. If one is missing, no jail starts.
-        environment: Names of environment variables whose values the jail may see.
+        environment: Names of environment variables whose values the jail may see. Those that are
+            read when a process starts work as well, or are refused with the reason.
         limits: Hard caps.
         restart: After the worker has died: ``"never"`` starts no new one; ``"on_reset"`` starts one
             at the next ``reset()``; ``"transparent"`` restarts the process that died at once, and
@@ -137,6 +139,8 @@ class Policy:
         # frozen: this is how a field gets the form that the rest relies on
         object.__setattr__(self, "readable", _texts("readable", self.readable))
         object.__setattr__(self, "environment", _texts("environment", self.environment))
+        for name in self.environment:
+            _granted(name, os.environ.get(name, ""))
         object.__setattr__(self, "limits", _checked(self.limits))
         for path in self.readable:
             if not os.path.isabs(path):
@@ -145,8 +149,15 @@ class Policy:
                 )
 
     def confinement(self) -> Confinement:
-        """What travels to the worker; the named environment variables get their values here."""
-        granted = {name: os.environ[name] for name in self.environment if name in os.environ}
+        """What travels to the worker; the named environment variables get their values here.
+
+        Raises:
+            PolicyError: A variable with this value cannot be granted.
+        """
+        named = {name: os.environ[name] for name in self.environment if name in os.environ}
+        granted = {**fixed_hash_seed(os.environ), **named}
+        for name, value in granted.items():
+            _granted(name, value)
         return Confinement(
             profile=self.profile,
             network=self.network,
@@ -236,6 +247,12 @@ def _path(name: str, value: object) -> str:
 def _seconds(name: str, value: Any) -> None:
     if not (_is_number(value) and 0 <= value < float("inf")):
         raise PolicyError(f"{option_name(name)} is {value!r}; it takes seconds, 0 or more")
+
+
+def _granted(name: str, value: str) -> None:
+    reason = why_not(name, value)
+    if reason:
+        raise PolicyError(f"{option_name('environment')} has {name}, which {reason}")
 
 
 def _gpu(value: object) -> bool | tuple[int, ...]:

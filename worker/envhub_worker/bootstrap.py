@@ -5,17 +5,21 @@ environment), and a repository may bring a ``worker.py`` of its own. So the pack
 from the folder of this very file::
 
     python -I .../bootstrap.py worker ARGS...    envhub_worker.__main__.main(ARGS)
-    python -I .../bootstrap.py zygote ARGS...    envhub_worker.spawn.zygote.main(ARGS)
+    python -s .../bootstrap.py zygote ARGS...    envhub_worker.spawn.zygote.main(ARGS)
     python -I .../bootstrap.py probe             envhub_worker.lockdown.probe.main([])
     python -I -S .../bootstrap.py bytecode PATH  envhub_worker.bytecode.main([PATH])
 """
 
 from __future__ import annotations
 
+import sys
+
+if __name__ == "__main__" and not (sys.flags.isolated or getattr(sys.flags, "safe_path", False)):
+    del sys.path[0]  # the folder of this file, whose modules are nobody else's
+
 import importlib
 import importlib.util
 import os
-import sys
 from collections.abc import Sequence
 
 _PROGRAMS = {
@@ -39,9 +43,10 @@ def command(python: str, program: str, *args: str, site: bool = True) -> list[st
     """The argv that runs ``program`` (a key of ``_PROGRAMS``) with ``args`` in ``python``.
 
     Without ``site`` there are no packages but the standard library, and so no start-up files of
-    theirs: no ``.pth``, no ``sitecustomize``.
+    theirs: no ``.pth``, no ``sitecustomize``. A zygote, whose environment is built, obeys the
+    variables for Python in it.
     """
-    flags = ["-I"] if site else ["-I", "-S"]
+    flags = ["-s" if program == "zygote" else "-I", *([] if site else ["-S"])]
     return [python, *flags, os.path.abspath(__file__), program, *args]
 
 

@@ -4,10 +4,17 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
+from pathlib import Path
 
 import psutil
 import pytest
 
+from envhub_sandbox import make_env
+from envhub_sandbox.errors import EnvHubError
+from envhub_sandbox.settings import policy
+from envhub_worker import bootstrap
 from tests.attacks.harness import Arena, Run, call, control_run, run_in
 from tests.support.processes import eventually
 
@@ -31,6 +38,23 @@ def test_what_watches_a_jail_cannot_be_stopped_by_it(arena: Arena) -> None:
         finally:
             resume(above)
     arena.judge("stop server, zygote and init", "succeeds", through, run.text)
+
+
+def test_a_client_runs_nothing_in_a_zygote_by_the_variables_that_it_is_started_with(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One that does not check itself; a zygote is not confined when it starts."""
+    mark = tmp_path / "mark"
+    (tmp_path / "sitecustomize.py").write_text(f"open({str(mark)!r}, 'w')")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    command = bootstrap.command(sys.executable, "zygote", "no descriptor")
+    subprocess.run(command, env={"PYTHONPATH": str(tmp_path)}, stderr=subprocess.DEVNULL)
+    assert mark.exists()
+    mark.unlink()
+    monkeypatch.setattr(policy, "why_not", lambda name, value: "")
+    with pytest.raises(EnvHubError, match="confinement"):
+        make_env("examples:cartpole", policy={"environment": ("PYTHONPATH",)})
+    assert not mark.exists()
 
 
 def watchers(run: Run) -> list[int]:

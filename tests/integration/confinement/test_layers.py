@@ -450,7 +450,7 @@ def test_command_line_of_a_runner_tells_nothing(cell: Cell) -> None:
     """The zygote's configuration, with the paths of the server, is not in it; outside, its pid is
     the one that was said."""
     arguments = cell.run("result = open('/proc/self/cmdline').read().split(chr(0))")["result"]
-    assert (arguments[1], arguments[3]) == ("-I", "zygote")
+    assert (arguments[1], arguments[3]) == ("-s", "zygote")
     assert arguments[4].isdigit()
     assert arguments[5:] == [""]
     outside = Path(f"/proc/{cell.wait_for(RunnerStarted).pid}/cmdline").read_text()

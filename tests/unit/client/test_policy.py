@@ -139,6 +139,7 @@ def test_only_named_variables_get_a_value(monkeypatch: pytest.MonkeyPatch) -> No
     monkeypatch.setenv("GRANTED", "yes")
     monkeypatch.setenv("SECRET", "no")
     monkeypatch.delenv("UNSET", raising=False)
+    monkeypatch.delenv("PYTHONHASHSEED", raising=False)
     granted = Policy(environment=("GRANTED", "UNSET")).confinement().environment
     assert granted == {"GRANTED": "yes"}
 

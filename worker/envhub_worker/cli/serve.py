@@ -86,13 +86,15 @@ def _serve_in(arguments: argparse.Namespace) -> int:
 
 def _ahead(arguments: argparse.Namespace) -> ZygoteProcess | None:
     from envhub_worker.protocol.runtime import Runtime
+    from envhub_worker.protocol.start_variables import fixed_hash_seed
     from envhub_worker.spawn.zygote_process import ZygoteProcess
 
     if not arguments.ahead:
         return None
     runtime = Runtime(arguments.python, arguments.packages)
     try:
-        return ZygoteProcess(runtime, arguments.runtime_dir, ahead=True)
+        granted = fixed_hash_seed(os.environ)
+        return ZygoteProcess(runtime, arguments.runtime_dir, granted, ahead=True)
     except OSError:  # opening a jail in that interpreter says why
         return None
 

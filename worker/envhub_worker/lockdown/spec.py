@@ -10,6 +10,7 @@ from envhub_worker.protocol.confinement import DISPLAYS, NETWORKS, PROFILES, Con
 from envhub_worker.protocol.errors import RemoteProtocolError
 from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.runtime import HubCopy, read_hub_copies
+from envhub_worker.protocol.start_variables import why_not
 
 _MAX_LIMIT = 1 << 62
 _MAX_OUTPUT_BYTES = 64 << 20
@@ -98,5 +99,7 @@ def _may_be_granted(environment: Any) -> bool:
         return False
     texts = [*environment, *environment.values()]
     if not all(type(text) is str and "\0" not in text for text in texts):
+        return False
+    if any(why_not(name, value) for name, value in environment.items()):
         return False
     return sum(map(len, texts)) <= _MAX_ENVIRONMENT_BYTES

@@ -28,7 +28,7 @@ from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.runtime import OWN, RECORD, Runtime
 from envhub_worker.spawn.channel import close_fds
 from envhub_worker.spawn.jail import Jail
-from envhub_worker.spawn.zygote_process import ZygoteProcess, resolved
+from envhub_worker.spawn.zygote_process import ZygoteProcess
 
 _END_S = 8.0
 _LOG_TAIL_BYTES = 8192
@@ -75,16 +75,16 @@ class Spawner:
         Args:
             confinement: What the zygote's jails have in common.
             target: What a confined runner runs: ``"module:function"``, or ``"/a.py:function"``.
-            ahead: A process to use, if it is one of this interpreter; else it is ended.
+            ahead: A process to use, if it was started as this one would be; else it is ended.
         """
         self._jails: dict[int, Jail] = {}
         self._count = 0
         self._pidfd = -1
         self._exited = False
-        if ahead is not None and ahead.runtime != resolved(runtime):
+        if ahead is not None and not ahead.serves(runtime, confinement.environment):
             ahead.discard()
             ahead = None
-        self._process = ahead or ZygoteProcess(runtime, runtime_dir)
+        self._process = ahead or ZygoteProcess(runtime, runtime_dir, confinement.environment)
         self._folder = self._process.folder
         self._user: int | None = None
         refusal = None

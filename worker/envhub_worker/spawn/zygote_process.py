@@ -10,11 +10,13 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 
 from envhub_worker import bootstrap
 from envhub_worker.lockdown.mechanisms.environment import zygote_environment
 from envhub_worker.protocol.runtime import OWN, Runtime
+from envhub_worker.protocol.start_variables import at_start
 from envhub_worker.spawn.channel import Channel
 
 _END_S = 8.0
@@ -33,16 +35,26 @@ class ZygoteProcess:
             ``site``, and so sees none: not those, and not the interpreter's own.
         ahead: Import before the configuration comes, and so before any confinement: only where that
             is from what the server has imported the same from.
+        granted: The variables of its jails.
 
     Attributes:
+        environment: What it was executed with.
         channel: Its first message is the configuration.
         folder: Removed by ``Spawner.close``.
         pid: Of what was started, which may only wait for the zygote.
     """
 
-    def __init__(self, runtime: Runtime, runtime_dir: Path, *, ahead: bool = False) -> None:
+    def __init__(
+        self,
+        runtime: Runtime,
+        runtime_dir: Path,
+        granted: Mapping[str, str],
+        *,
+        ahead: bool = False,
+    ) -> None:
         self.runtime = resolved(runtime)
         python, site = self.runtime.python, not runtime.packages
+        self.environment = zygote_environment(os.environ, python, at_start(granted))
         self.folder = runtime_dir / f"zygote-{os.urandom(4).hex()}"
         self.folder.mkdir(mode=0o700)
         self.log = self.folder / "log"
@@ -57,11 +69,17 @@ class ZygoteProcess:
                 stdout=log,
                 stderr=log,
                 cwd="/",
-                env=zygote_environment(os.environ, python),
+                env=self.environment,
                 pass_fds=[theirs.fileno()],
                 start_new_session=True,
             )
         self.pid = self._process.pid
+
+    def serves(self, runtime: Runtime, granted: Mapping[str, str]) -> bool:
+        """Whether it was started as the zygote of such jails would be."""
+        runtime = resolved(runtime)
+        wanted = zygote_environment(os.environ, runtime.python, at_start(granted))
+        return (self.runtime, self.environment) == (runtime, wanted)
 
     def wait(self) -> int:
         """Its exit code; it is killed if it does not end by itself soon."""

@@ -24,6 +24,7 @@ from envhub_worker.protocol.confinement import Confinement
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, MAX_IN_FLIGHT, WireLimits, limits_for
 from envhub_worker.protocol.runtime import Runtime
 from envhub_worker.protocol.shared_memory import words
+from envhub_worker.protocol.start_variables import at_start
 from envhub_worker.spawn.channel import close_fds
 from envhub_worker.spawn.spawner import JailExited, Spawner
 from envhub_worker.spawn.zygote_process import ZygoteProcess
@@ -61,7 +62,7 @@ MAX_IDLE_ZYGOTES = 2
 """Without a jail, when another is started. A client mostly has one policy, or two in turns."""
 _OF_POLICY = ("profile", "network", "readable", "gpu", "record_denials")
 
-_Zygote = tuple[Any, ...]  # its name: a runtime, and these parts of a policy
+_Zygote = tuple[Any, ...]  # its name: a runtime, variables, and these parts of a policy
 
 
 class Jails:
@@ -125,7 +126,9 @@ class Jails:
             hub_copies=copies,
         )
         # a zygote is one environment's: not even what it has not imported is shared with another
-        zygote = (request.runtime, *(getattr(confinement, name) for name in _OF_POLICY))
+        started_with = frozenset(at_start(confinement.environment).items())
+        of_policy = (getattr(confinement, name) for name in _OF_POLICY)
+        zygote = (request.runtime, started_with, *of_policy)
         jail = self._spawner(zygote, request.runtime, confinement).spawn(spec)
         entry = JailRecord(
             number=secrets.randbits(62),

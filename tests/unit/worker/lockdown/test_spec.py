@@ -11,6 +11,13 @@ from envhub_worker.lockdown.spec import confinement_from_wire
 from envhub_worker.protocol.confinement import Confinement, Limits
 from envhub_worker.protocol.errors import RemoteProtocolError
 
+UNCONFINED: tuple[dict[str, str], ...] = (
+    *({"LD_PRELOAD": "/a.so"}, {"PYTHONPATH": "/a"}, {"GLIBC_TUNABLES": "a"}, {"TZ": ":/dev/zero"}),
+    *({"TZ": "a/../b"}, {"LANG": "/a"}, {"PYTHONWARNINGS": "error:a:b.C"}, {"PYTHONHASHSEED": "a"}),
+    *({"LD_AUDIT": ""}, {"PYTHONSTARTUP": ""}, {"PYTHONIOENCODING": "a.b"}),
+)
+"""What a process that is not confined yet would be started with."""
+
 
 def wire(**changes: Any) -> dict[str, Any]:
     """An ordinary confinement as it travels, but for this."""
@@ -19,7 +26,9 @@ def wire(**changes: Any) -> dict[str, Any]:
 
 def test_an_ordinary_one_is_what_it_was() -> None:
     made = Confinement(
-        readable=("/data",), environment={"A": "b"}, limits=Limits(cpu_time_s=None, file_bytes=5)
+        readable=("/data",),
+        environment={"A": "/b", "LD_SDK_KEY": "/c", "TZ": "EST5EDT,M3.2.0/2:00,M11.1.0"},
+        limits=Limits(cpu_time_s=None, file_bytes=5),
     )
     assert confinement_from_wire({**asdict(made), "readable": ["/data"]}) == made
     assert confinement_from_wire({**asdict(made), "gpu": [0, 2]}) == replace(made, gpu=(0, 2))
@@ -32,6 +41,7 @@ def test_an_ordinary_one_is_what_it_was() -> None:
         *({"gpu": lie} for lie in (1, [], [True], [-1], "0", list(range(65)))),
         *({"readable": lie} for lie in ("/etc", [b"/etc"], ["/a"] * 65)),
         *({"environment": {"A": lie}} for lie in (b"b", "b" * (64 << 10), "b\0c")),
+        *({"environment": item} for item in UNCONFINED),
         *({"environment": ["A"]}, {"record_denials": 1}, {"display": ":0"}),
         *({"limits": lie} for lie in (None, {"unknown": 1}, {"memory_bytes": None})),
         {"limits": {"output_bytes": 1 << 30}},

@@ -205,7 +205,7 @@ def test_close_leaves_no_process_and_no_file(folder: Path, confinement: Confinem
 
 def test_a_process_that_started_ahead_is_used(folder: Path) -> None:
     """It becomes the zygote, and what it has imported serves a jail that is as confined."""
-    ahead = ZygoteProcess(OWN, folder, ahead=True)
+    ahead = ZygoteProcess(OWN, folder, {}, ahead=True)
     with spawner_in(folder, STRICT, ahead=ahead) as spawner:
         cell = new_cell(spawner, make_snapshot(folder), STRICT)
         cell.start()
@@ -219,7 +219,7 @@ def test_a_process_that_started_ahead_is_used(folder: Path) -> None:
 
 
 def test_a_process_of_another_interpreter_is_not(folder: Path) -> None:
-    ahead = ZygoteProcess(OWN, folder, ahead=True)
+    ahead = ZygoteProcess(OWN, folder, {}, ahead=True)
     other = folder / "python"
     other.symlink_to(sys.executable)
     spawner = Spawner(

@@ -116,11 +116,12 @@ def test_shared_packages_cannot_be_written(cell: Cell) -> None:
 
 def test_the_zygote_imports_no_package(folder: Path, runtime: Runtime) -> None:
     """What was started ahead for these packages is used, and has none of the server's either."""
-    ahead = ZygoteProcess(runtime, folder, ahead=True)
+    ahead = ZygoteProcess(runtime, folder, {}, ahead=True)
     with spawner_in(folder, STRICT, runtime=runtime, ahead=ahead) as spawner:
         cell = new_cell(spawner, make_snapshot(folder), STRICT)
         cell.start()
         names = cell.run("import sys; result = sorted(sys.modules)")["result"]
+        assert cell.run("import sys; result = sys.flags.hash_randomization")["result"] == 0
         assert inside.zygote_pid(spawner) == ahead.pid
     ours = {name for name in names if name.partition(".")[0] not in sys.stdlib_module_names}
     assert {name.partition(".")[0] for name in ours} <= {"__main__", "__mp_main__", "envhub_worker"}

@@ -5,8 +5,12 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping
 
+from envhub_worker.protocol.start_variables import HASH_SEED
+
 _PATH = "/usr/local/bin:/usr/bin:/bin:/usr/local/sbin:/usr/sbin:/sbin"
 _INHERITED = ("LANG", "LC_ALL", "LC_CTYPE", "TZ")
+_KEPT = ("PATH", HASH_SEED, *_INHERITED)
+"""What a jail, and an interpreter that is started in it, has of its zygote's."""
 
 THREAD_TIMEOUT = "20"
 """For OpenBLAS, which reads it once: in cycles, a power of two. By default a runner's threads would
@@ -27,15 +31,20 @@ _HEADLESS = {
 _OFFLINE = {"HF_HUB_OFFLINE": "1", "PIP_RETRIES": "0", "UV_OFFLINE": "1"}
 
 
-def zygote_environment(host: Mapping[str, str], python: str) -> dict[str, str]:
-    """What the zygote is executed with. ``host`` gives language and time zone, nothing else."""
+def zygote_environment(
+    host: Mapping[str, str], python: str, granted: Mapping[str, str]
+) -> dict[str, str]:
+    """What the zygote is executed with. ``host`` gives language and time zone, nothing else.
+    ``granted``: what ``start_variables.at_start`` gives.
+    """
     return {
         **{name: host[name] for name in _INHERITED if name in host},
         "PATH": f"{os.path.dirname(python)}:{_PATH}",
         "HOME": "/nonexistent",
+        "OPENBLAS_THREAD_TIMEOUT": THREAD_TIMEOUT,
+        **granted,
         # A thread in the zygote would make unshare(CLONE_NEWUSER) fail, and die in the fork.
         "OPENBLAS_NUM_THREADS": "1",
-        "OPENBLAS_THREAD_TIMEOUT": THREAD_TIMEOUT,
     }
 
 
@@ -49,7 +58,7 @@ def jail_environment(
     """What a runner of a jail sees.
     ``granted``: variables that the caller grants by name; they win.
     """
-    kept = {name: value for name, value in base.items() if name in ("PATH", *_INHERITED)}
+    kept = {name: value for name, value in base.items() if name in _KEPT}
     return {
         **kept,
         **_HEADLESS,

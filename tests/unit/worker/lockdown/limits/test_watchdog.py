@@ -339,10 +339,10 @@ def _nest(tree: Path, depth: int) -> None:
 
 def test_zygote_environment_is_built() -> None:
     host = {"HF_TOKEN": "x", "LANG": "de_DE.UTF-8", "TZ": "UTC", "HOME": "/home/ann", "PATH": "/x"}
-    built = zygote_environment(host, "/opt/py/bin/python")
+    built = zygote_environment(host, "/opt/py/bin/python", {"TZ": "CET"})
     assert {name: built[name] for name in ("LANG", "TZ", "HOME")} == {
         "LANG": "de_DE.UTF-8",
-        "TZ": "UTC",
+        "TZ": "CET",
         "HOME": "/nonexistent",
     }
     assert built["PATH"].startswith("/opt/py/bin:/usr/local/bin:")
@@ -352,12 +352,12 @@ def test_zygote_environment_is_built() -> None:
 
 def test_jail_environment_grants_by_name() -> None:
     """The caller's variables win over ours; the zygote's own thread limit does not pass."""
-    base = zygote_environment({"LANG": "C"}, "/usr/bin/python3")
+    base = zygote_environment({"LANG": "C"}, "/usr/bin/python3", {"PYTHONHASHSEED": "0"})
     built = jail_environment(base, {"TOKEN": "t", "MPLBACKEND": "svg"}, "/h", "/t")
     assert built["TOKEN"] == "t"
     assert built["MPLBACKEND"] == "svg"
     assert built["HOME"] == "/h"
     assert built["TMPDIR"] == "/t"
-    assert built["LANG"] == "C"
+    assert (built["LANG"], built["PYTHONHASHSEED"]) == ("C", "0")
     assert built["SDL_VIDEODRIVER"] == "dummy"
     assert "OPENBLAS_NUM_THREADS" not in built

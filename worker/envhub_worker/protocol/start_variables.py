@@ -1,0 +1,82 @@
+"""Environment variables that are read once, when a process or a library of it starts.
+
+The processes of a jail are forked from a zygote, which has started already: set in a jail, most of
+these would do nothing. So a zygote is started with them, one for each set of values. It is not
+confined then, and a server's client is a stranger: names and values are those that make it open,
+load and import nothing. All others of the kind are refused.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+
+HASH_SEED = "PYTHONHASHSEED"
+_MAX_HASH_SEED = 2**32 - 1
+
+_FLAGS = (
+    "ASYNCIODEBUG|COERCECLOCALE|DEVMODE|DONTWRITEBYTECODE|FAULTHANDLER|INTMAXSTRDIGITS|MALLOC|"
+    "NODEBUGRANGES|OPTIMIZE|TRACEMALLOC|UNBUFFERED|UTF8|WARNDEFAULTENCODING|_CPU_COUNT|_GIL"
+)
+# The category of a filter is imported if it has a dot.
+_FILTER = r"\w*(:[^:,]*(:\w*(:[^:,]*(:\d*)?)?)?)?"
+_STARTED_WITH = {
+    HASH_SEED: r"random|\d{1,10}",
+    rf"PYTHON({_FLAGS})": r"\w*",
+    "PYTHONIOENCODING": r"[\w-]*(:\w*)?",
+    "PYTHONWARNINGS": rf"{_FILTER}(,{_FILTER})*",
+    "LANG|LANGUAGE|LC_[A-Z]+": r"[\w.@:-]*",
+    "TZ": r"(?!.*\.\.)([\w<][\w+,.:<>/-]*)?",
+    "MALLOC_(ARENA_MAX|ARENA_TEST|MMAP_MAX_|MMAP_THRESHOLD_|PERTURB_|TOP_PAD_|TRIM_THRESHOLD_)": (
+        r"\d*"
+    ),
+    r"(NPY|NUMPY)_\w+": r"[\w, ]*",
+    r"OPENBLAS_(?!NUM_THREADS|DEFAULT_NUM_THREADS)\w+": r"\w*",
+}
+_VALUES = {
+    re.compile(name, re.ASCII): re.compile(_STARTED_WITH[name], re.ASCII) for name in _STARTED_WITH
+}
+_REFUSED = re.compile(
+    "LD_(ASSUME_KERNEL|AUDIT|BIND_NOT|BIND_NOW|DEBUG|DEBUG_OUTPUT|DYNAMIC_WEAK|HWCAP_MASK|"
+    "LIBRARY_PATH|ORIGIN_PATH|POINTER_GUARD|PREFER_MAP_32BIT_EXEC|PRELOAD|PROFILE|PROFILE_OUTPUT|"
+    "SHOW_AUXV|TRACE_LOADED_OBJECTS|USE_LOAD_BIAS|VERBOSE|WARN)|GCONV_PATH|GLIBC_TUNABLES|LOCPATH|"
+    "MALLOC_(CHECK_|TRACE)|NLSPATH|PYTHON(?!BREAKPOINT$)[A-Z0-9]+|"
+    "PYTHON_(CONTEXT_AWARE_WARNINGS|FROZEN_MODULES|JIT|PERF_JIT_SUPPORT|PRESITE|"
+    "THREAD_INHERIT_CONTEXT|TLBC)"
+)
+
+
+def _values_of(name: str) -> re.Pattern[str] | None:
+    """Which values a zygote may be started with; None if it is with none."""
+    return next((values for names, values in _VALUES.items() if names.fullmatch(name)), None)
+
+
+def why_not(name: str, value: str = "") -> str:
+    """Why a jail cannot have this variable with this value; nothing, if it can."""
+    values = _values_of(name)
+    if values is None:
+        if not _REFUSED.fullmatch(name):
+            return ""
+        return (
+            "is read when a process starts, and those of a jail are forked from one that has "
+            "started: it would do nothing. Have env.py set it for the processes that it starts, or "
+            "do there what it says"
+        )
+    if values.fullmatch(value):
+        return ""
+    return (
+        f"is {value!r}: a process that is not confined yet is started with it, which takes only "
+        "values that name no file and no module"
+    )
+
+
+def at_start(environment: Mapping[str, str]) -> dict[str, str]:
+    """Those that a zygote is started with. Sets of text have one order in all jails."""
+    own = {name: value for name, value in environment.items() if _values_of(name) is not None}
+    return {HASH_SEED: "0", **own}
+
+
+def fixed_hash_seed(environment: Mapping[str, str]) -> dict[str, str]:
+    """The seed that a caller's own interpreter has, where that is a number."""
+    seed = environment.get(HASH_SEED, "")
+    return {HASH_SEED: seed} if seed.isdecimal() and int(seed) <= _MAX_HASH_SEED else {}
