@@ -23,7 +23,7 @@ pytestmark = [
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
 ]
 
-_STARTS, _CLOSES = (23, 7) if "ENVHUB_TEST_LONG" in os.environ else (211, 53)
+_STARTS, _CLOSES = (23, 7) if "ENVHUB_TEST_LONG" in os.environ else (101, 29)
 """Calls between two moments: of some 500 in a start, and of some 120 in a close."""
 _WAYS: dict[str, dict[str, Any]] = {
     "auto": {"use_async_envs": True},
