@@ -31,7 +31,6 @@ from benchmarks.workloads import REPOSITORIES
 
 HEAVY_TASKS = 6
 _MODULE_BYTES = 2_000_000
-_FIRST_ROUNDS = 7
 
 
 @dataclass(frozen=True)

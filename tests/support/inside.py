@@ -263,11 +263,6 @@ def lane(env: Any) -> SharedMemoryLane | None:
     return found if isinstance(found, SharedMemoryLane) else None
 
 
-def force_spin(used: SharedMemoryLane, chooser: Any) -> None:
-    """Have another one decide for how long a step spins."""
-    used._step_spin = chooser
-
-
 def release_of_server(env: Any) -> Callable[[], None]:
     """What lets go of the server that it holds while it has no jail."""
     return session(env).lease._release_server
