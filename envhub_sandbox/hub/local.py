@@ -125,7 +125,9 @@ class LocalFolder:
     def at(cls, folder: str | Path, entry: str | None = None) -> LocalFolder:
         """The folder at a path, or of it what a file gets to see."""
         root = Path(os.path.realpath(folder))
-        return cls(root, read_checkout(root), entry)
+        # a home is no repository of a file's, though some keep it in git
+        is_own = entry is not None and is_home(root)
+        return cls(root, None if is_own else read_checkout(root), entry)
 
     @classmethod
     def of(cls, snapshot: Snapshot) -> LocalFolder:

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import fnmatch
-import os
 import re
 from pathlib import Path
 
-from envhub_sandbox.system.platform import home_of
+from envhub_sandbox.system.platform import homes_of
 
 _KEYS = """
     */.ssh/* */.gnupg/* */.password-store/* */id_rsa* */id_dsa* */id_ecdsa* */id_ed25519*
-    *.pem *.key *.ppk *.p12 *.pfx *.jks *.keystore *.kdbx
+    *_rsa *_ed25519 *.pem *.key *.ppk *.p12 *.pfx *.jks *.keystore *.kdbx
 """
 _LOGINS = """
     */.env */.env.* */.netrc */_netrc */.git-credentials */.npmrc */.pypirc */.pgpass */.my.cnf
@@ -21,7 +20,7 @@ _LOGINS = """
     */kaggle.json */credentials.json */client_secret*.json */service-account*.json
     */service_account*.json */.streamlit/secrets.toml */.modal.toml
 """
-_HARMLESS = "*.pub *.py */.env.example */.env.sample */.env.template */.env.dist"
+_HARMLESS = "*.pub *.py *cacert.pem */.env.example */.env.sample */.env.template */.env.dist"
 _BARE_KEY = r"(?s:.*/id_[^./]+)\Z"
 """What people call further keys, such as ``id_work``; with a suffix it is some other file."""
 
@@ -44,5 +43,4 @@ def is_home(folder: Path) -> bool:
     """Whether a folder, a path without links, is its owner's or the caller's home, or has that in
     it.
     """
-    own = Path(os.path.realpath(os.path.expanduser("~")))
-    return own.is_relative_to(folder) or home_of(folder).is_relative_to(folder)
+    return any(home.is_relative_to(folder) for home in homes_of(folder))

@@ -54,17 +54,18 @@ def user_id() -> int:
     return found
 
 
-def home_of(path: Path) -> Path:
-    """The home directory of whom a file or folder belongs to, as the system knows it; Windows does
-    not say it of others.
+def homes_of(path: Path) -> list[Path]:
+    """The home directories of the caller and of whom a file or folder belongs to, without links;
+    Windows does not say it of others.
     """
-    home = os.path.expanduser("~")
+    found = [os.path.expanduser("~")]
     if sys.platform != "win32":
         import pwd
 
         with contextlib.suppress(KeyError, OSError):  # a container knows few of its users
-            home = pwd.getpwuid(os.stat(path).st_uid).pw_dir
-    return Path(os.path.realpath(home))
+            found.append(pwd.getpwuid(os.stat(path).st_uid).pw_dir)
+    # of whom nothing is known it is a bare "~"
+    return [Path(os.path.realpath(one)) for one in found if os.path.isabs(one)]
 
 
 def cores() -> int:

@@ -98,9 +98,38 @@ def test_what_git_tracks_beside_it_is_shown(tmp_path: Path, snapshot_store: Path
     assert (local(repository.folder / "env.py").root / "data.xml").read_text() == "2"
 
 
+@needs_git
+def test_what_git_tracks_of_a_home_is_not_shown(
+    tmp_path: Path, snapshot_store: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Some keep their home in git; what lies there is no file's repository."""
+    repository = GitRepository(tmp_path / "home")
+    repository.commit({"env.py": "import a", "a.py": "", ".bashrc": "", "notes/x.txt": ""})
+    monkeypatch.setenv("HOME", str(repository.folder))
+    assert shown(repository.folder / "env.py") == {"env.py", "a.py"}
+
+
+def test_who_has_no_home_is_refused_nothing(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A container may run as a user that it does not know."""
+    monkeypatch.setattr("os.path.expanduser", lambda path: path)
+    monkeypatch.chdir(folder)
+    for name in (".env", ".ssh/id_rsa"):
+        (folder / name).unlink()
+    assert "tax.pdf" in shown(folder)
+
+
 @pytest.mark.parametrize(
     "name",
-    [".env", "a/.ssh/config", ".netrc", "certs/server.PEM", "id_rsa", "id_work", ".kube/config"],
+    [
+        ".env",
+        "a/.ssh/config",
+        ".netrc",
+        "certs/server.PEM",
+        "id_rsa",
+        "id_work",
+        "deploy_rsa",
+        ".kube/config",
+    ],
 )
 def test_a_folder_with_keys_is_refused(folder: Path, name: str) -> None:
     shutil.rmtree(folder)
@@ -127,7 +156,15 @@ def test_of_a_checkout_counts_what_git_would_commit(tmp_path: Path, snapshot_sto
 
 @pytest.mark.parametrize(
     "name",
-    ["id_map.py", "id_rsa.pub", ".env.example", "environment.env", "model.keys", "env.key.py"],
+    [
+        "cacert.pem",
+        "id_map.py",
+        "id_rsa.pub",
+        ".env.example",
+        "environment.env",
+        "model.keys",
+        "env.key.py",
+    ],
 )
 def test_other_names_are_no_keys(name: str) -> None:
     assert not looks_secret(name)
