@@ -337,8 +337,9 @@ def _is_venv(folder: Path) -> bool:
     """Whether it is a virtual environment that was made here, as no commit can have one: its
     interpreter is a link, or a program of Windows.
     """
-    programs = os.path.islink(folder / "bin/python") or (folder / "Scripts/python.exe").is_file()
-    return programs and (folder / "pyvenv.cfg").is_file()
+    program, other = folder / "bin/python", folder / "Scripts/python.exe"
+    is_made = os.path.islink(program) or os.path.isfile(other)  # which raise nothing
+    return is_made and os.path.isfile(folder / "pyvenv.cfg")
 
 
 def _names_below(root: Path) -> Callable[[str], Collection[str]]:

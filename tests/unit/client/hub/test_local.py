@@ -5,9 +5,13 @@ from __future__ import annotations
 import os
 import shutil
 import socket
+import subprocess
 import sys
+import tempfile
 import warnings
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -18,7 +22,7 @@ from envhub_sandbox.errors import (
     SnapshotTooLargeError,
 )
 from envhub_sandbox.hub import local as module
-from envhub_sandbox.hub.local import split_local
+from envhub_sandbox.hub.local import LeftOut, split_local
 from envhub_sandbox.hub.snapshot import (
     Snapshot,
     SnapshotLimits,
@@ -179,23 +183,37 @@ def test_a_virtual_environment_is_left_out_and_said(
         local(f"{folder}:.venv/bin/x.py")
 
 
-@pytest.mark.skipif(os.geteuid() != 0, reason="needs root, to be another user")
-def test_what_cannot_be_read_is_left_out_and_said(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """One file of another user's is no reason to end; of what is named it is one."""
-    for name in ("theirs.txt", "private/x.txt", "mine.txt"):
-        (folder / name).parent.mkdir(exist_ok=True)
-        (folder / name).write_text("")
-        (folder / name).chmod(0o644 if name == "mine.txt" else 0o600)
-    (folder / "private").chmod(0o700)
-    monkeypatch.setattr(module.os, "access", lambda path, mode: os.stat(path).st_mode & 0o004)
-    _, listing = split_local(str(folder)).listed()
-    assert [one.path for one in listing.files] == ["env.py", "mine.txt", "sub/other.py"]
-    assert dict(listing.left_out) == {"private/": "unreadable", "theirs.txt": "unreadable"}
-    (folder / "env.py").chmod(0o600)
-    with pytest.raises(RepositoryUnavailableError, match=r"env.py is unreadable. Give yourself"):
-        local(folder)
+@pytest.fixture
+def open_ground() -> Iterator[Path]:
+    """A folder that every user may enter."""
+    with tempfile.TemporaryDirectory() as folder:
+        Path(folder).chmod(0o755)
+        yield Path(folder)
+
+
+_LISTS = """
+import sys
+from envhub_sandbox.hub.local import LeftOut, split_local
+for reference in sys.argv[1:]:
+    _, listing = split_local(reference).listed()
+    print([one.path for one in listing.files], listing.left_out)
+"""
+
+
+def test_what_cannot_be_read_is_left_out_and_said(open_ground: Path) -> None:
+    """One file or folder of another user's is no reason to end."""
+    for name, mode in {"env.py": 0o644, "a.txt": 0, "b/x.txt": 0o644, "c.py": 0o644}.items():
+        (open_ground / name).parent.mkdir(exist_ok=True)
+        (open_ground / name).write_text("import c")
+        (open_ground / name).chmod(mode)
+    (open_ground / "b").chmod(0o600)  # its names can be read, and nothing else of it
+    (open_ground / "d").mkdir(mode=0)
+    other: dict[str, Any] = {"user": 65534, "group": 65534} if os.geteuid() == 0 else {}
+    command = [sys.executable, "-c", _LISTS, str(open_ground), str(open_ground / "env.py")]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd="/", **other)
+    assert done.stderr == ""
+    left = [LeftOut(path, "unreadable") for path in ("a.txt", "b/", "d/")]
+    assert done.stdout == f"['c.py', 'env.py'] {tuple(left)}\n['c.py', 'env.py'] ()\n"
 
 
 def test_link_inside_becomes_a_real_file(folder: Path) -> None:
