@@ -55,6 +55,9 @@ class Batch(gym.vector.VectorEnv):
         self.done = self.count >= 7 + np.arange(self.num_envs)
         return self.seen(), rewards, np.zeros(self.num_envs, bool), self.done.copy(), {}
 
+    def call(self, name, *args, **kwargs):
+        return (getattr(self, name, None),) * self.num_envs
+
 def make_env(n_envs=1, use_async_envs=False):
     return Batch(n_envs)
 """

@@ -112,7 +112,8 @@ class TaskJudge:
                 told = self._env.get_attr(CONVERTED)
             except RemoteEnvError:  # as it should be
                 return
-            raise RemoteEnvError("TypeError", str(told[0]))
+            if isinstance(told[0], str):  # a class of its own may have a value for every name
+                raise RemoteEnvError("TypeError", told[0])
 
     def denied(self) -> tuple[str, ...] | None:
         """What was refused so far: also where it ended in an error."""
