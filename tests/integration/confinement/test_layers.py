@@ -7,8 +7,10 @@ The verdict is read outside where it can be: a canary that was (not) written, a 
 from __future__ import annotations
 
 import os
+import re
 import socket
 import subprocess
+import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import replace
@@ -18,6 +20,8 @@ from typing import Any
 import psutil
 import pytest
 
+import envhub_sandbox
+import envhub_worker
 from envhub_worker.protocol.confinement import Confinement
 from envhub_worker.spawn.jail import JailFailed
 from tests.support import inside
@@ -34,6 +38,7 @@ from tests.support.confinement_kit import (
     unconfined,
 )
 from tests.support.interpreter import can_run, needs, profiles, ways_to_it
+from tests.support.repositories import STILL
 from tests.support.trees import fingerprint
 
 
@@ -357,8 +362,9 @@ result = {
               if os.path.exists(p)],
     "writable": [p for p in ("/", "/usr", "/usr/bin", "/etc", "/dev", "/proc", "/sandbox", "/sys")
                  if os.access(p, os.W_OK)],
-    "told": [p for p in ("cmdline", "kallsyms", "interrupts", "partitions", "keys", "diskstats")
-             if open("/proc/" + p).read()],
+    "told": [p for p in ("cmdline", "kallsyms", "interrupts", "partitions", "keys", "diskstats",
+                         "sys/kernel/random/boot_id") if open("/proc/" + p).read()],
+    "group": open("/proc/self/cgroup").read(),
 }
 """
     seen = cells["strict"].run(source)["result"]
@@ -370,6 +376,57 @@ result = {
     assert max(seen["pids"]) < 100
     assert os.getpid() in unconfined(source)["result"]["pids"]
     assert (seen["there"], seen["writable"], seen["told"]) == ([], [], [])
+    told_outside = unconfined(source)["result"]["told"]
+    assert "sys/kernel/random/boot_id" in told_outside, "the control failed"
+    assert not re.findall(rf"\b{os.getpid()}\b|\b_{os.getpid()}_", seen["group"])
+
+
+LINKED = """
+import os, sys
+sys.path[:0] = [sys.argv[1] + "/worker", sys.argv[1] + "/client"]
+import envhub_sandbox, envhub_worker
+assert envhub_worker.__file__.startswith(sys.argv[1]), envhub_worker.__file__
+with envhub_sandbox.make_env(sys.argv[2], policy={"profile": sys.argv[3]}) as suites:
+    suites.env.reset(seed=0)
+    print(suites.env.call("own_path")[0].startswith(sys.argv[1]))
+    print(suites.env.call("late")[0])
+    try:
+        print(suites.env.call("unsendable"))
+    except Exception as error:
+        print(error)
+"""
+LATE = f"""{STILL}
+import sys
+class Late(Still):
+    def own_path(self):
+        return sys.modules["envhub_worker"].__file__
+    def late(self):
+        import envhub_worker.cli.health
+        return "imported"
+    def unsendable(self):
+        endless = []
+        endless.append(endless)
+        return endless
+
+def make_env(n_envs=1, use_async_envs=False):
+    return vector(Late, n_envs)
+"""
+
+
+@pytest.mark.parametrize("strict", profiles("strict"))
+def test_a_link_below_tmp_leads_to_the_worker_all_the_time(tmp_path: Path, strict: str) -> None:
+    """A jail has a /tmp of its own, with the links in it that its interpreter is reached by: what
+    is imported late is found, and with it the answer that needed it.
+    """
+    (tmp_path / "env.py").write_text(LATE)
+    with tempfile.TemporaryDirectory(dir="/tmp") as folder:
+        os.chmod(folder, 0o755)
+        for name, package in (("worker", envhub_worker), ("client", envhub_sandbox)):
+            os.symlink(Path(str(package.__file__)).resolve().parents[1], f"{folder}/{name}")
+        done = python("-c", LINKED, folder, tmp_path, strict)
+    below, late, answer = done.stdout.splitlines()[:3]
+    assert (below, late) == ("True", "imported")
+    assert "cannot be sent: it contains itself" in answer
 
 
 @pytest.mark.short

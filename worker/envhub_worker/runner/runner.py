@@ -20,6 +20,7 @@ import numpy as np
 
 from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.codec import unsendable as unsendable  # a reply may need it later
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits, limits_for
 from envhub_worker.protocol.manifest.manifest import encode_env, encode_manifest
 from envhub_worker.protocol.spaces import batches

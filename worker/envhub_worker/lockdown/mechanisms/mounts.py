@@ -33,6 +33,10 @@ _PROC_KEPT = frozenset(
 )
 
 
+# Below what stays: it is the same for all jails of a host, and for no other.
+_PROC_COVERED = ("/proc/sys/kernel/random/boot_id",)
+
+
 def enter_root(plan: RootPlan, place: str, copied: Sequence[str], user: int | None) -> None:
     """Make ``place`` a root with what ``plan`` says and the host's /proc; enter it, detach the old.
 
@@ -129,7 +133,7 @@ def mount_proc() -> None:
 
 def proc_to_cover() -> tuple[list[str], list[str]]:
     """(files, folders) of /proc that a jail has no use for and could read."""
-    files: list[str] = []
+    files = list(filter(os.path.exists, _PROC_COVERED))
     folders: list[str] = []
     for name in sorted(os.listdir("/proc")):
         if not name.isdigit() and name not in _PROC_KEPT:  # processes come and go
@@ -181,6 +185,7 @@ def mount_jail(
     packages: str,
     roots: Iterable[str],
     trees: Iterable[str],
+    links: Mapping[str, str],
     *,
     size: int,
     inodes: int,
@@ -191,6 +196,7 @@ def mount_jail(
         snapshot: Shown at this path; everything else below ``roots`` is hidden.
         packages: Folder of packages of its own, with a skeleton; or empty.
         trees: What the zygote's root shows (``RootPlan.trees``).
+        links: Its links, of which some may lead to the interpreter.
     """
     hidden = [*roots, TEMPORARY, SHARED_MEMORY, HOME, WORK]
     buried = [path for path in trees if any(within(path, folder) for folder in hidden)]
@@ -205,6 +211,9 @@ def mount_jail(
         )
     _mount_scratch(size, inodes)
     _put(kept)
+    for path, target in links.items():
+        if any(within(path, folder) for folder in hidden):
+            _link(path, target)
     for folder in roots:
         with contextlib.suppress(OSError):
             kernel.restrict_mount(folder, kernel.ATTR_RDONLY)

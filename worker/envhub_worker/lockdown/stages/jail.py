@@ -58,6 +58,7 @@ def _mount(spec: JailSpec, common: Common) -> View:
         common.config.packages,
         common.root.roots,
         common.root.trees,
+        common.root.links,
         size=limits.disk_bytes,
         inodes=limits.disk_files,
     )
