@@ -148,15 +148,10 @@ def _sockets(marker: str) -> Iterator[str]:
 
 
 def _cgroups() -> Iterator[str]:
-    """Groups that servers below this very process have made."""
-    prefix = tuple(f"envhub_{pid}_" for pid in _children())
-    for line in _read("/proc/self/cgroup").splitlines():
-        _, controller, own = line.split(":", 2)
-        for root in {f"/sys/fs/cgroup/{controller}", f"/sys/fs/cgroup/{controller}{own}"}:
-            with contextlib.suppress(OSError):
-                for name in os.listdir(root):
-                    if prefix and name.startswith(prefix):
-                        yield from (entry for entry, _, _ in os.walk(os.path.join(root, name)))
+    """Groups that servers below this very process have made, and hold a lock of."""
+    for _, path in _descriptors(set(_children())):
+        if path.startswith("/sys/fs/cgroup/") and "/envhub_" in path:
+            yield from (entry for entry, _, _ in os.walk(path))
 
 
 def _children() -> list[int]:

@@ -252,7 +252,7 @@ def test_control_groups_of_ended_servers_are_left_behind(tmp_path: Path) -> None
     assert [Path(one.name).name for one in groups] == ["envhub_1_zygote-1"]
     assert groups[0].remove()
     assert not Path(groups[0].name).exists()
-    [mine] = tmp_path.glob(f"envhub_{os.getpid()}_zygote-1")
+    [mine] = tmp_path.glob("envhub_*_zygote-1")
     assert not leftovers.Leftover("control group", str(mine)).remove()
     living.remove()
     assert not mine.exists()

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import fcntl
 import os
+import secrets
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -73,16 +74,17 @@ class Tree:
     """The folder that holds the groups of one spawner's jails.
 
     Its lock is held as long as this process lives: by that others know that it is in use, in
-    whatever namespace they are. The pid in its name is for people.
+    whatever namespace they are. Its name says nothing of the host: jails read it.
     """
 
     def __init__(self, hierarchy: Hierarchy, name: str) -> None:
-        """Make the folder ``envhub_<our pid>_<name>``.
+        """Make the folder ``envhub_<random>_<name>``.
         Raises ``OSError``: the kernel refuses; use the watchdog.
         """
         self._locks: list[int] = []
         self.kind = hierarchy.kind
-        self._folders = [f"{folder}/{_PREFIX}{os.getpid()}_{name}" for folder in hierarchy.folders]
+        own = f"{_PREFIX}{secrets.randbits(62)}_{name}"
+        self._folders = [f"{folder}/{own}" for folder in hierarchy.folders]
         _remove_abandoned(hierarchy.folders)
         if self.kind == "cgroup-v2":
             _step_aside(hierarchy.folders[0])
