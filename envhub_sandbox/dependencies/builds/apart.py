@@ -18,10 +18,10 @@ from envhub_sandbox import errors
 from envhub_sandbox.dependencies.builds import download, trees, wheels
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.errors import DependencyError, EnvHubError, PackageIntegrityError
-from envhub_sandbox.system.platform import IS_LINUX, end_with, pidfd
+from envhub_sandbox.system.platform import end_with, pidfd
 from envhub_worker.protocol.text import printable
 
-if sys.platform != "win32":
+if sys.platform == "linux":
     import resource
 
 DEADLINE_S = 1800.0
@@ -74,7 +74,7 @@ def _asked(order: dict[str, Any], title: str) -> str:
 def main(owner: int) -> int:
     """Carry out the order on stdin."""
     end_with(owner, 0)
-    if IS_LINUX:
+    if sys.platform == "linux":
         resource.setrlimit(resource.RLIMIT_AS, (_MEMORY_BYTES, _MEMORY_BYTES))
     order = json.load(sys.stdin)
     try:
