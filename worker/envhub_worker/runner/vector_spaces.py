@@ -154,7 +154,11 @@ def _leaves(space: Space) -> Iterator[Space]:
 def _side(env: Any, space: Any, count: int, sides: Sides) -> bool | None:
     key = type(env), type(getattr(env, "unwrapped", env))
     if key not in sides:
-        votes = set(_votes(space, _first_observation(env), count))
+        try:
+            observation = _first_observation(env)
+        except Exception:  # the caller's own reset raises it where it belongs
+            return None
+        votes = set(_votes(space, observation, count))
         agreed = votes.pop() if len(votes) == 1 else None
         if agreed is None:
             return None

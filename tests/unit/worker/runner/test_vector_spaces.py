@@ -119,6 +119,16 @@ def test_a_shape_that_is_not_the_spaces_tells_by_its_dimensions() -> None:
     assert (known.single_action_space, known.action_space) == (ROW, ROWS)
 
 
+def test_a_reset_that_fails_is_the_callers() -> None:
+    """What tells nothing is taken as it is declared."""
+
+    def reset() -> Any:
+        raise KeyError("options")
+
+    env = SimpleNamespace(num_envs=3, reset=reset, **one_space(ROWS, ROWS))
+    assert spaces_of(env, {}) == VectorSpaces(ROWS, ROWS, ROWS, ROWS)
+
+
 def test_an_action_space_stands_for_itself_where_observations_are_known() -> None:
     """No reset is needed; a batch of choices is one choice, a Box of joints is of one."""
     known: dict[str, Any] = {"single_observation_space": ROW, "observation_space": ROWS}
