@@ -6,6 +6,7 @@ import builtins
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import gymnasium.error as gym_errors
 import numpy as np
 import pytest
@@ -14,6 +15,31 @@ from envhub_sandbox import make_env
 from envhub_sandbox.errors import RemoteEnvError, RemoteEnvWarning
 from tests.support.repositories import write_repository
 
+_TIMED = """
+import time
+
+import gymnasium as gym
+import numpy as np
+
+
+class Timed(gym.Env):
+    observation_space = gym.spaces.Box(-1, 1, (1,), np.float32)
+    action_space = gym.spaces.Discrete(2)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        begun = time.monotonic()
+        time.sleep(0.1)
+        info = {"span": (begun, time.monotonic())}
+        return np.zeros(1, np.float32), float(self.np_random.random()), False, False, info
+
+
+def make_env(n_envs=1, use_async_envs=False, **arguments):
+    return gym.vector.AsyncVectorEnv([Timed] * n_envs, **arguments)
+"""
 _OWN = """
 import gymnasium as gym
 import numpy as np
@@ -308,3 +334,33 @@ def test_errors_are_of_their_class(tmp_path: Path) -> None:
         with pytest.raises(OSError, match="BrokenPipe"):
             env.call("fail", "BrokenPipeError")
         assert len(env.get_attr("render_mode")) == 1
+
+
+def _side_by_side(spans: Any) -> int:
+    """How many of these spans of time at most have a moment in common."""
+    return max(sum(begun <= moment < end for begun, end in spans) for moment, _ in spans)
+
+
+@pytest.mark.skipif(not hasattr(gym.vector, "AutoresetMode"), reason="an argument of Gymnasium 1.4")
+@pytest.mark.parametrize("bound", [1, 2])
+def test_no_more_are_stepped_at_a_time_than_the_repository_permits(
+    bound: int, tmp_path: Path
+) -> None:
+    """``max_concurrency``, whatever the number of workers; results are the same."""
+    folder = write_repository(tmp_path, _TIMED)
+    rewards = []
+    for given in ({"max_concurrency": bound}, {}):
+        with make_env(folder, 4, env_kwargs=given, num_workers=4) as suites:
+            suites.env.reset(seed=3)
+            _, reward, *_, infos = suites.env.step(np.zeros(4, np.int64))
+            rewards.append(reward.tolist())
+            if given:
+                assert _side_by_side(infos["span"]) <= bound
+    assert rewards[0] == rewards[1]
+
+
+@pytest.mark.parametrize("given", [{"max_concurrency": 0}, {"context": "spoon"}])
+def test_an_argument_that_gymnasium_refuses_is_refused(given: Any, tmp_path: Path) -> None:
+    folder = write_repository(tmp_path, _TIMED)
+    with pytest.raises(ValueError, match=next(iter(given)).partition("_")[0]):
+        make_env(folder, 2, env_kwargs=given)

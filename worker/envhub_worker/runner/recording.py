@@ -14,6 +14,7 @@ Followed: ``gymnasium.vector.SyncVectorEnv.__init__`` and ``AsyncVectorEnv.__ini
 from __future__ import annotations
 
 import inspect
+import multiprocessing
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
@@ -21,6 +22,7 @@ from multiprocessing import get_start_method
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv, VectorEnv
 
 from envhub_worker.protocol.records import dataclass
@@ -96,6 +98,8 @@ def _record(
         return None
     if arguments.get("observation_mode", "same") != "same":
         return None  # the spaces differ, and only all of them make the batched one
+    if not _steps_all_at_once(arguments) or not _can_start(arguments):
+        return None
     env_fns = arguments["env_fns"] = list(arguments["env_fns"])
     return Recording(
         env_fns=env_fns,
@@ -103,6 +107,21 @@ def _record(
         autoreset_mode=compat.mode_named(arguments.get("autoreset_mode", compat.DEFAULT_MODE)),
         arguments=arguments,
     )
+
+
+def _steps_all_at_once(arguments: dict[str, Any]) -> bool:
+    """Whether no ``max_concurrency`` holds sub-environments back: workers know of no others."""
+    bound = arguments.get("max_concurrency")
+    if bound is None:
+        return True
+    is_number = isinstance(bound, (int, np.integer))
+    return is_number and bool(bound >= max(1, len(arguments["env_fns"])))
+
+
+def _can_start(arguments: dict[str, Any]) -> bool:
+    """Whether ``context``, which is of no further use here, is a way to start processes."""
+    context = arguments.get("context")
+    return context is None or context in multiprocessing.get_all_start_methods()
 
 
 def _build_after_all(env: Any, cls: type) -> None:
