@@ -318,6 +318,20 @@ class Requests(RequestOrder):
         if self._prewarm.first_use is not None:
             self._prewarm.note_use()
 
+    def submit_alone(self, lane: Lane, operation: str, message: m.Message) -> None:
+        """With the lock held, send the only runner of ``lane`` a request, while other runners, or
+        it, may owe answers to earlier ones; raises as ``submit`` does.
+        """
+
+        def send() -> None:
+            lane.send_some(operation, lane.runners, [lane.jail.pack(message)], ahead=True)
+
+        if self.lifecycle.state is State.READY:
+            self._sending(operation, lambda: self._send(operation, send))
+        else:
+            self._sending(operation, send)
+            self._counters.requests += 1
+
     def _request(self, lane: Lane, operation: str, message_for: MessageFor) -> Request:
         bounds = self.results.bounds
         messages = [message_for(lane.number, each) for each in bounds]
@@ -329,16 +343,20 @@ class Requests(RequestOrder):
         lane.jail.request(operation, [message_for(lane.number, (0, count))], [(0, count)])
 
     def collect(
-        self, timeout: float | Deadline | None, kind: type[m.M] | tuple[type[m.M], ...]
+        self,
+        timeout: float | Deadline | None,
+        kind: type[m.M] | tuple[type[m.M], ...],
+        lane: Lane | None = None,
     ) -> list[m.M]:
-        """With the lock held, the shards' replies to the last ``submit``.
+        """With the lock held, the shards' replies to the last ``submit``; those that are owed to
+        ``lane`` after ``submit_alone``.
         Raises ``WorkerTimeoutError``: the environment is then LATE: ``reset`` brings it back;
         ``WorkerDiedError``: the environment is then DEAD; with ``restart="transparent"`` READY;
         ``RemoteEnvError``: the repository's code raised; the environment is still usable;
         ``ClosedEnvironmentError``: a ``close`` in another thread came first.
         """
         try:
-            replies = self._judged(lambda: self._collect(deadline_of(timeout), kind))
+            replies = self._judged(lambda: self._collect(deadline_of(timeout), kind, lane))
             if self.lifecycle.state is State.CLOSED:
                 self._lease.let_go()
         except BaseException as error:
@@ -349,11 +367,13 @@ class Requests(RequestOrder):
         self.show_warnings()
         return replies
 
-    def _collect(self, deadline: Deadline, kind: type[m.M] | tuple[type[m.M], ...]) -> list[m.M]:
+    def _collect(
+        self, deadline: Deadline, kind: type[m.M] | tuple[type[m.M], ...], lane: Lane | None
+    ) -> list[m.M]:
         if self.lifecycle.state is not State.PENDING:
             raise self._nothing_pending()
         try:
-            replies = self._finish(self._lane().replies, deadline)
+            replies = self._finish((lane or self._lane()).replies, deadline)
         except RunnersDiedError as deaths:
             if self._recovery is None:
                 raise self._failures.dead(deaths.first) from None
@@ -435,9 +455,9 @@ class Requests(RequestOrder):
             self._counters.requests += 1
             self._history.step(actions)
 
-    def owe(self) -> None:
-        """After an answer: a step that was sent ahead is pending now."""
-        self.lifecycle.request = "step"
+    def owe(self, operation: str = "step") -> None:
+        """After an answer: what was sent besides is pending now."""
+        self.lifecycle.request = operation
         self.lifecycle.moved(Event.SUBMIT)
 
     def collect_step(self, timeout: float | Deadline | None) -> StepResult:

@@ -110,6 +110,7 @@ class WorkerConnection:
         self._packed: tuple[m.Message | None, list[Buffer]] = (None, [])
         self._latest: Buffer = b""
         self._arrived: dict[int, _Received | EnvHubError] = {}
+        self._kept: set[int] = set()
         self.torn = False
         self._compression = ""
         self.patience_s = 0
@@ -167,7 +168,8 @@ class WorkerConnection:
         self.sent_bytes += size
 
     def receive(self, request_id: int, deadline: Deadline) -> tuple[m.Message, list[Buffer]]:
-        """The reply to a request, with its payload. Replies to others are dropped and counted.
+        """The reply to a request, with its payload. Replies to others are dropped and counted,
+        unless they are to be kept.
 
         Raises:
             WorkerTimeoutError: The deadline came first. The reply may still come; it is dropped.
@@ -183,6 +185,7 @@ class WorkerConnection:
             reply, payload = found or self._receive(request_id, deadline)
             if not self._must_say_hello(request_id, reply):
                 self._sent.pop(request_id, None)
+                self._kept.discard(request_id)
                 return reply, payload
             _, unanswered = self._sent.pop(request_id)
             self.hello(deadline)
@@ -200,8 +203,11 @@ class WorkerConnection:
             reply_id, reply = m.unpack_header(frames[0], limits=self._limits)
             if reply_id == request_id:
                 return reply, frames[1:]
-            self._sent.pop(reply_id, None)
-            self.stale_replies += 1
+            if reply_id in self._kept:
+                self._arrived[reply_id] = reply, frames[1:]
+            else:
+                self._sent.pop(reply_id, None)
+                self.stale_replies += 1
             if deadline.passed:  # a flood of these would be waited for without end
                 raise WorkerTimeoutError("the worker did not answer in time")
 
@@ -226,8 +232,13 @@ class WorkerConnection:
         found = self._arrived.get(request_id)
         return (None, []) if found is None or isinstance(found, EnvHubError) else found
 
+    def keep(self, request_id: int) -> None:
+        """Keep its reply where it comes before another one that is waited for."""
+        self._kept.add(request_id)
+
     def forget(self, request_id: int) -> None:
         """Its reply is not wanted any more, whether or not it has ``arrived``."""
+        self._kept.discard(request_id)
         self._arrived.pop(request_id, None)
 
     def sources(self) -> list[Source]:

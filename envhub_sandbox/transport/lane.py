@@ -159,6 +159,8 @@ class Lane:
         self._sending = True  # interruption.md, rule 1: half a message, or a whole one
         try:
             self._owed.append((relay(), self._asked_ns, unpack))
+            if ahead:
+                self.jail.client.keep(self._owed[-1][0])
         except EnvHubError:  # nothing was sent
             self._sending = False
             raise
@@ -220,6 +222,20 @@ class Lane:
         """
         for index, runner in zip(dead, fresh, strict=True):
             self.runners[index] = runner
+
+    def of_shard(self, shard: int) -> Lane:
+        """A way to one shard alone, by messages: before each of them ``leave_slots`` is called."""
+        results = Results(self.declared.manifest, [self.declared.bounds[shard]])
+        results.apart, results.max_bytes = self.declared.apart, self.declared.max_bytes
+        return Lane(self.jail, [self.runners[shard]], self.number, results)
+
+    def leave_slots(self) -> None:
+        """Results come another way next: no shard may write where a batch is held."""
+
+    def owe_for(self, other: Lane) -> None:
+        """Have ``catch_up`` take what another lane of this jail is owed."""
+        self._owed.extend(other._owed)
+        self._sending = self._sending or other._sending
 
     def traffic(self) -> tuple[int, int, int]:
         """Stale replies, and bytes sent and received, so far."""

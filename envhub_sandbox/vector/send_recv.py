@@ -35,7 +35,8 @@ class SendRecv(VectorEnv[Any, Any, Any]):
         """Send actions to some sub-environments; ``recv`` returns the results.
 
         A worker steps all of its sub-environments together, so ``env_ids`` must have all or none of
-        them. With ``make_env(..., min_ready=...)`` each sub-environment has a worker of its own.
+        them. With ``make_env(..., min_ready=...)`` each sub-environment has a worker of its own;
+        with ``num_workers`` workers share them.
 
         May be called again before the results are received, up to sixteen times for each
         sub-environment, which takes the actions one after the other.
@@ -110,6 +111,7 @@ class SendRecv(VectorEnv[Any, Any, Any]):
 
         Raises:
             NoAsyncCallError: Nothing was sent.
+            ValueError: ``min_ready`` is less than one worker has, and there is no other.
             WorkerTimeoutError: ``timeout`` has passed, and nothing is lost; or the step of one
                 worker took longer than ``Timeouts.step_s``.
             WorkerDiedError: The process of a worker ended.

@@ -24,6 +24,7 @@ from gymnasium.error import NoAsyncCallError
 from envhub_sandbox.errors import ActionError, WorkerTimeoutError
 from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.failures import refusal
+from envhub_sandbox.session.parts.shard_queue import ShardQueue
 from envhub_sandbox.session.parts.worker_queue import WorkerQueue
 from envhub_sandbox.session.requests import SENT, MessageFor, RequestOrder
 from envhub_sandbox.session.use_lock import FleetUse, all_held
@@ -82,7 +83,8 @@ class InFlight:
 
     def __init__(self, order: RequestOrder, parts: Sequence[EnvSession]) -> None:
         self._order = order
-        self._queues = [WorkerQueue(part, sliced=len(parts) > 1) for part in parts]
+        self._queues = _queues_of(parts)
+        self._shared = any(isinstance(queue, ShardQueue) for queue in self._queues)
         self._space = order.results.manifest.single_observation_space
         self._actions = order.results.manifest.single_action_space
         self._worker_of = [at for at, queue in enumerate(self._queues) for _ in range(queue.count)]
@@ -147,7 +149,10 @@ class InFlight:
         with self._sending("send", queues, WorkerQueue.prepare):
             for queue, part in zip(queues, parts, strict=True):
                 queue.step(part)
-            self._order.note_sent(actions if len(queues) == len(self._queues) else None)
+            of_all = len(queues) == len(self._queues)
+            self._order.note_sent(actions if of_all else None)
+            if of_all and self._shared:
+                queues[0].part.history.step(actions)
 
     def send_reset(self, rows: Rows, message_for: MessageFor) -> None:
         """Send each worker a reset of all of its sub-environments; raises as ``send``."""
@@ -211,6 +216,7 @@ class InFlight:
                 self._note()
             raise NoAsyncCallError("Calling `recv` without any prior call to `send`.", "recv")
         self._refuse_if_interrupted("recv")
+        self._refuse_fewer_than_come(min_ready)
         deadline = deadline_of(timeout)
         with self._held([queue for queue in self._queues if queue.busy]):
             try:
@@ -223,6 +229,20 @@ class InFlight:
                 raise
             finally:
                 self._note()
+
+    def _refuse_fewer_than_come(self, min_ready: int) -> None:
+        """Raises ``ValueError``: where one worker has all, they are ready together."""
+        [queue, *others] = self._queues
+        if others or min_ready >= queue.count:
+            return
+        whole = f"one worker steps all {queue.count} sub-environments, so they are ready together"
+        if not self._order.results.manifest.shardable:
+            cure = "the repository's own vector class does so: wait for all of them, or use `step`"
+        elif queue.part.repository.policy.restart == "transparent":
+            cure = 'with `restart="transparent"` give make_env `min_ready`, which separates them'
+        else:
+            cure = "give make_env `min_ready`, or a larger `num_workers`, for more workers"
+        raise ValueError(f"`min_ready` is {min_ready}, but {whole}: {cure}. Nothing is lost")
 
     def _wait(self, deadline: Deadline) -> list[int]:
         """Sleep until workers have answered, or are late; which. Raises ``WorkerTimeoutError``."""
@@ -293,6 +313,16 @@ class InFlight:
                 self._sends = False
             finally:
                 self._note()
+
+
+def _queues_of(parts: Sequence[EnvSession]) -> list[WorkerQueue]:
+    """One for each worker, in the order of their sub-environments."""
+    [part, *others] = parts
+    # a runner that comes back in the same jail repeats the last request of all
+    if others or len(part.bounds) == 1 or part.repository.policy.restart == "transparent":
+        return [WorkerQueue(one, one.rows, sliced=bool(others)) for one in parts]
+    shards: list[ShardQueue] = []
+    return [ShardQueue(part, shard, shards) for shard in range(len(part.bounds))]
 
 
 @contextmanager

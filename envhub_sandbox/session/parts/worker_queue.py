@@ -26,7 +26,7 @@ from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.requests import MessageFor
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.lane import Lane
-from envhub_sandbox.transport.results import StepResult
+from envhub_sandbox.transport.results import Results, StepResult
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.lifecycle import State
 from envhub_worker.protocol.limits import MAX_IN_FLIGHT
@@ -41,6 +41,7 @@ class WorkerQueue:
 
     Args:
         part: Its session.
+        rows: The first of its sub-environments, and the one after the last.
         sliced: Whether there are other workers, with whose infos its own are joined.
 
     Attributes:
@@ -51,14 +52,15 @@ class WorkerQueue:
         taking: Whether an answer is being taken; else an interrupt came into that.
     """
 
-    def __init__(self, part: EnvSession, *, sliced: bool) -> None:
+    def __init__(self, part: EnvSession, rows: tuple[int, int], *, sliced: bool) -> None:
         self.part = part
-        self.rows = part.rows
+        self.rows = rows
         self.failure: EnvHubError | None = None
         self.count = self.rows[1] - self.rows[0]
         self._requests = part.requests
         self._timeouts = part.repository.timeouts
         self._sliced = sliced
+        self._lost = tuple(range(*rows))  # what nothing more comes of, after an error
         self._owed: deque[str] = deque()
         self._waiting: deque[Any] = deque()
         self._deadline = Deadline(None)
@@ -97,9 +99,8 @@ class WorkerQueue:
                 "results were not received: call `recv` first",
                 "send",
             )
-        if not self.busy and self.part.lifecycle.state is not State.READY:
-            with self._naming():
-                self._requests.make_ready("step")
+        if not self.busy:
+            self._make_ready("step")
 
     def prepare_reset(self) -> None:
         """Likewise before ``reset``: what has died or is late is brought back, as ``reset`` does.
@@ -111,9 +112,15 @@ class WorkerQueue:
                 "received: call `recv` first, or `reset` for all",
                 "send",
             )
+        self._make_ready("reset")
+
+    def _make_ready(self, operation: str) -> None:
+        if operation != "reset" and self.part.lifecycle.state is State.READY:
+            return
         with self._naming():
-            self.part.recover()
-            self._requests.make_ready("reset")
+            if operation == "reset":
+                self.part.recover()
+            self._requests.make_ready(operation)
 
     def step(self, actions: Any) -> None:
         """After ``prepare``, send it a step. Where that fails, ``take`` raises it."""
@@ -181,18 +188,29 @@ class WorkerQueue:
             yield
         except EnvHubError as error:
             self.part.name_in(error)
-            error.env_ids = tuple(range(*self.rows))
+            error.env_ids = self._lost
             raise
 
     def _take(self) -> StepResult:
         if self._owed[0] == "step":
-            *result, infos = self._requests.collect_step(self._deadline)
-            return (*result, self._requests.results.joined(infos))
-        replies = self._requests.collect(self._deadline, m.ResetDone)
-        observation, infos = self._requests.finish_reset(replies, self._deadline)
+            *result, infos = self._collect_step()
+            return (*result, self._results().joined(infos))
+        observation, infos = self._finish_reset(self._collect(m.ResetDone))
         no = np.zeros(self.count, np.bool_)
-        infos = self._requests.results.joined(infos)
+        infos = self._results().joined(infos)
         return observation, np.zeros(self.count), no, no.copy(), infos
+
+    def _results(self) -> Results:
+        return self._requests.results
+
+    def _collect_step(self) -> StepResult:
+        return self._requests.collect_step(self._deadline)
+
+    def _collect(self, kind: type[m.M]) -> list[m.M]:
+        return self._requests.collect(self._deadline, kind)
+
+    def _finish_reset(self, replies: list[m.ResetDone]) -> tuple[Any, dict[Any, Any]]:
+        return self._requests.finish_reset(replies, self._deadline)
 
     def _check(self, result: StepResult) -> None:
         """Whether it can be joined with others' results. Trust: input from the worker."""

@@ -278,6 +278,10 @@ class SharedMemoryLane(Lane):
             spin_ns = self._spin.budget_ns if index < self._awake else 0
             shard.tell(b"".join(pack_packet(0, frames)), (slot, spin_ns, cpus[index]))
 
+    def leave_slots(self) -> None:
+        """See ``Lane``."""
+        self.observations.leave()
+
     def send_for_infos(self) -> None:
         """See ``Lane``."""
         self._asked = _BY_SERVER

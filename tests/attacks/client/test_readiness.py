@@ -243,6 +243,45 @@ def test_who_is_always_ready_has_its_own_results_alone(strict: Arena, tmp_path: 
         assert "count" not in of_it[0], "the control: it has answered a step that it never made"
 
 
+@pytest.mark.short("strict")
+@pytest.mark.parametrize("lane", ["auto", "frames", "tcp"])
+def test_who_shares_its_jail_and_is_never_ready_holds_nobody_up(
+    strict: Arena, home: Path, lane: str
+) -> None:
+    with among(strict, liar(home, "never"), lane, min_ready=None, num_workers=COUNT) as suites:
+        assert not Among(suites.env).others_go_on()
+
+
+@pytest.mark.short("strict")
+@pytest.mark.parametrize("mode", ["twice by message", "unlike"])
+def test_who_shares_its_jail_and_breaks_a_rule_has_nobody_elses_results(
+    strict: Arena, tmp_path: Path, mode: str
+) -> None:
+    """The jail is given up; what had come of the others before is theirs."""
+    with among(strict, liar(tmp_path, mode), "auto", min_ready=None, num_workers=COUNT) as suites:
+        counts = [0] * COUNT
+
+        def receive() -> None:
+            received = suites.env.recv(1)
+            for place, index in enumerate(received.env_ids.tolist()):
+                counts[index] += 1
+                seen = np.full(2, counts[index] * (index + 1) / 1e6, np.float32)
+                assert_same(seen, received.observations[place], "observation")
+
+        def receive_all() -> None:
+            while True:
+                receive()
+
+        suites.env.reset(seed=1)
+        suites.env.send(np.zeros(1, np.int64), [0])
+        receive()  # the control
+        suites.env.send(np.zeros(COUNT, np.int64))
+        suites.env.send(np.zeros(COUNT, np.int64))
+        with pytest.raises((RemoteProtocolError, WorkerDiedError)) as caught:
+            receive_all()
+        assert HOSTILE in (caught.value.env_ids or ())
+
+
 BROKEN = [
     ("frames", "twice by message"),
     ("frames", "unlike"),

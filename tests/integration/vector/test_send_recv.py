@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import pickle
+import threading
 from collections.abc import Iterator
 from contextlib import ExitStack
 from pathlib import Path
@@ -13,8 +14,16 @@ import numpy as np
 import pytest
 from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError
 
-from envhub_sandbox.errors import ActionError, ObservationError, RemoteEnvError, WorkerError
-from tests.support.objects.gates import LARGE, RAISE, Gates, ids, send
+from envhub_sandbox.errors import (
+    ActionError,
+    ObservationError,
+    RemoteEnvError,
+    WorkerDiedError,
+    WorkerError,
+    WorkerTimeoutError,
+)
+from tests.support import inside
+from tests.support.objects.gates import DIE, LARGE, RAISE, Gates, ids, send
 from tests.support.repositories import STILL, write_repository
 from tests.support.started import started
 
@@ -191,14 +200,103 @@ def test_what_cannot_be_meant_is_refused(gates: Gates) -> None:
 
 
 def test_one_worker_is_ready_as_a_whole(gates: Gates) -> None:
-    """Without ``min_ready``: whatever is wanted, all of them come."""
-    for workers in (1, 2):
-        env = gates.env(4, min_ready=None, num_workers=workers)
-        send(env, 0, 0, 0, 0)
-        send(env, 0, 0, 0, 1)
-        assert ids(env.recv(1)) == [0, 1, 2, 3]
-        gates.open(1)
-        assert env.recv().rewards.tolist() == [0.0, 0.0, 0.0, 1.0]
+    """A wait for fewer is refused, and takes nothing away."""
+    env = gates.env(4, min_ready=None, num_workers=1)
+    send(env, 0, 0, 0, 1)
+    for wanted in (1, 3):
+        with pytest.raises(ValueError, match=r"one worker steps all 4 .* give make_env"):
+            env.recv(wanted)
+    gates.open(1)
+    assert env.recv().rewards.tolist() == [0.0, 0.0, 0.0, 1.0]
+    env = gates.env(4, num_workers=2, min_ready=None, policy={"restart": "transparent"})
+    send(env, 0, 0, 0, 0)
+    with pytest.raises(ValueError, match="transparent"):
+        env.recv(1)
+    assert ids(env.recv()) == [0, 1, 2, 3]
+
+
+@pytest.fixture
+def shards(tmp_path: Path, lane: str) -> Iterator[Gates]:
+    """Environments whose workers are the processes of one jail."""
+    with ExitStack() as stack:
+        yield Gates(tmp_path, stack, lane=lane)
+
+
+def test_workers_of_one_jail_are_ready_one_by_one(shards: Gates) -> None:
+    """Without ``min_ready`` for ``make_env``, after a reset and steps of all, and before them."""
+    env = shards.env(6, num_workers=3)
+    with pytest.raises(ActionError, match="env_ids lacks 1"):
+        send(env, 0, ids=[0])
+    send(env, 1, 0, 0, 0, 2, 2)
+    assert ids(env.recv(1)) == [2, 3]
+    send(env, 0, 3, ids=[3, 2], what=LARGE)  # in whatever order, and more than one at a time
+    send(env, 0, 0, ids=[2, 3])
+    shards.open(2, 3)
+    got = [env.recv(1) for _ in range(3)]
+    assert [ids(one) for one in got if ids(one) == [2, 3]] == [[2, 3]] * 2
+    assert [one.observations[:, 0].tolist() for one in got if ids(one) == [2, 3]] == [
+        [2, 2],
+        [3, 3],
+    ]
+    with pytest.raises(WorkerTimeoutError):
+        env.recv(1, timeout=0.1)
+    shards.open(1)
+    assert ids(env.recv()) == [0, 1]
+    assert env.step(np.zeros((6, 2), np.int64))[0][:, 0].tolist() == [2, 2, 4, 4, 2, 2]
+    env.send_reset([4, 5], seed=7)
+    assert env.recv().observations[:, 1].tolist() == [11, 12]
+    with pytest.raises(NoAsyncCallError):
+        env.recv(1)
+
+
+def test_what_one_worker_of_a_jail_raises_is_its_own(shards: Gates) -> None:
+    """It takes its next action, and the others' results come."""
+    env = shards.env(2, num_workers=2)
+    env.send(np.array([[0, RAISE], [1, 0]]))
+    send(env, 0, ids=[0])
+    with pytest.raises(RemoteEnvError) as caught:
+        env.recv(1)
+    assert caught.value.env_ids == (0,)
+    assert ids(env.recv(1)) == [0]
+    shards.open(1)
+    assert ids(env.recv(1)) == [1]
+
+
+def test_a_death_takes_the_workers_of_a_jail_along(shards: Gates) -> None:
+    """The error names all whose results are lost; what came before it is there."""
+    env = shards.env(3, num_workers=3, policy={"restart": "on_reset"})
+    env.send(np.array([[0, 0], [1, DIE], [2, 0]]))
+    with contextlib.suppress(WorkerTimeoutError):  # until the first has answered
+        env.recv(2, timeout=1)
+    shards.open(1)
+    with pytest.raises(WorkerDiedError) as caught:
+        env.recv(2)
+    assert caught.value.env_ids == (1, 2)
+    assert ids(env.recv()) == [0]
+    assert env.reset(seed=1)[0].tolist() == [[0, 1], [0, 2], [0, 3]]
+
+
+def test_who_is_late_in_a_jail_holds_nobody_up_before(shards: Gates) -> None:
+    env = shards.env(3, num_workers=3)
+    env.reset()
+    with inside.hurried(env, step_s=1.0):
+        send(env, 0, 1, 1)
+        assert ids(env.recv(1)) == [0]
+        with pytest.raises(WorkerTimeoutError) as late:
+            env.recv(1)
+    assert late.value.env_ids == (1, 2)
+    shards.open(1)
+    assert env.reset(seed=1)[0][:, 1].tolist() == [1, 2, 3]
+
+
+def test_who_closes_ends_the_wait_for_workers_of_one_jail(shards: Gates) -> None:
+    env = shards.env(2, num_workers=2)
+    send(env, 1, 1)
+    closing = threading.Timer(0.3, env.close)
+    closing.start()
+    with pytest.raises(ClosedEnvironmentError):
+        env.recv(1)
+    closing.join()
 
 
 def test_a_fork_neither_sends_nor_receives(gates: Gates) -> None:

@@ -66,6 +66,9 @@ class FakeServer:
     def peek(self, request_id: int) -> tuple[m.Message | None, list[Any]]:
         return self._replies.get(request_id, (None, []))
 
+    def keep(self, request_id: int) -> None:
+        """Every reply is kept here."""
+
     def forget(self, request_id: int) -> None:
         self._replies.pop(request_id, None)
 

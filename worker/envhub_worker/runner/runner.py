@@ -121,7 +121,7 @@ class Runner:
         if self.lane is not None and not by_lane:
             if isinstance(request, m.FetchInfos) and self.lane.unsent:
                 return self.lane.unsent
-            if isinstance(request, m.Reset) and request.env == self.lane.number:
+            if isinstance(request, (m.Reset, m.Step)) and request.env == self.lane.number:
                 self.lane.leave_slot()
         try:
             reply = _HANDLERS[type(request)](self, request)

@@ -33,7 +33,7 @@ def part(lane: FakeLane) -> EnvSession:
 
 @pytest.fixture
 def queue(part: EnvSession) -> WorkerQueue:
-    return WorkerQueue(part, sliced=True)
+    return WorkerQueue(part, part.rows, sliced=True)
 
 
 def taken(queue: WorkerQueue) -> StepResult:
@@ -129,10 +129,10 @@ def test_rewards_of_a_worker_among_others_are_one_number_each() -> None:
             return (observation, np.zeros((1, 2)), *rest)
 
     session = fleet_over([FakeLane(1), Wide(1)]).parts[1]
-    alone = WorkerQueue(session, sliced=False)
+    alone = WorkerQueue(session, session.rows, sliced=False)
     step(alone)
     assert taken(alone)[1].shape == (1, 2)
-    among = WorkerQueue(session, sliced=True)
+    among = WorkerQueue(session, session.rows, sliced=True)
     step(among)
     with pytest.raises(RemoteProtocolError, match="one number each"):
         taken(among)
