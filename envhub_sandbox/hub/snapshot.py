@@ -74,15 +74,16 @@ def snapshot_named(reference: str, *, allow_secrets: bool = False, **hub: Any) -
 
 
 def is_here(reference: str) -> bool:
-    """Whether a reference names a folder or a file of this machine. What has a revision never does,
-    nor what says that it is something else, as ``pypi:``.
+    """Whether a reference names a folder or a file of this machine, or a .py file in a folder that
+    is here. What has a revision never does, nor what says that it is something else, as ``pypi:``.
     """
-    if is_local(reference):
+    if is_local(reference) or (reference.endswith(".py") and os.path.isfile(reference)):
         return True
-    if reference.endswith(".py") and os.path.isfile(reference):
-        return True
+    folder, colon, _ = reference.partition(":")
+    if not colon and folder.endswith(".py"):
+        folder = os.path.dirname(folder)  # its name may be mistyped
     is_other = "@" in reference or "://" in reference or is_of_another_place(reference)
-    return not is_other and os.path.isdir(reference.partition(":")[0])
+    return not is_other and os.path.isdir(folder)
 
 
 def _warn_of_two_meanings(reference: str) -> None:

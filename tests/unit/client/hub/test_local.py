@@ -125,6 +125,8 @@ def test_a_folder_that_is_here_comes_before_the_hub(
         ]
     else:
         assert told == []
+    with pytest.raises(RepositoryUnavailableError, match=r"Did you mean '.*/org/env\.py'\?"):
+        snapshot_named("org/evn.py")
     others = ("org/repo@main", "pypi:x#y", "github:a/b:env.py", "https://x/org/env.py", "no/repo")
     assert not any(map(is_here, others))
 
