@@ -92,6 +92,7 @@ class Generators:
             raise TypeError(f"np_random takes a numpy Generator of {names}, got {value!r}")
         with self._requests.use.lock:
             count = len(self.read())
+            self.before_request()  # the draws from others
             states: list[Any] = [None] * count
             states[index] = bits.state
             self.write(states, new=True)
@@ -122,7 +123,7 @@ class Generators:
 
     def after_request(self) -> None:
         """Bring those up to date that the caller has kept."""
-        if self._asking or self._requests.waiting is not None:
+        if self._current or self._asking or self._requests.waiting is not None:
             return
         if any(live.references() != _UNKEPT for live in self._live):
             with suppress(WorkerError, RemoteEnvError):  # this one was answered: the next says it

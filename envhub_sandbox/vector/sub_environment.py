@@ -170,7 +170,7 @@ class SubEnvironment(gym.Env[Any, Any]):
     @short_traceback
     def get_wrapper_attr(self, name: str) -> Any:
         """An attribute of the outermost wrapper that has it."""
-        return self._get(name, _SEARCHED)
+        return self.np_random if name == "np_random" else self._get(name, _SEARCHED)
 
     @short_traceback
     def set_wrapper_attr(self, name: str, value: Any, **kwargs: Any) -> Any:

@@ -294,7 +294,8 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
         with self._requests.use.lock:
             self._requests.refuse_if_busy("call_async")
             if not (args or kwargs) and self._manifest.shardable:
-                return self._read(name)
+                own = name == "np_random" and self._manifest.sync  # or it would be copies
+                return cast("tuple[Any, ...]", self.np_random) if own else self._read(name)
             self._send_call(name, args, kwargs)  # as reset
             return self._end_call(self._timeouts.call_s)
 

@@ -183,6 +183,7 @@ def _vectors(env: Any) -> list[Any]:
     for _ in range(3):
         seen.append([one.random() for one in env.np_random])
         seen += [env.envs[1].np_random.random(), env.step([0, 1])]
+        seen.append([one.random() for one in env.get_attr("np_random")])
     env.envs[0].np_random = mine = np.random.default_rng(7)
     return [*seen, env.step([0, 1]), mine.random(), env.envs[0].unwrapped.np_random is mine]
 

@@ -21,6 +21,11 @@ class Generators:
         return tuple(self._state(place, one) for place, one in enumerate(generators))
 
     def _state(self, place: int, generator: Any) -> dict[str, Any]:
+        if not isinstance(generator, np.random.Generator):
+            raise TypeError(
+                f"np_random is a {type(generator).__name__} here, and no numpy Generator: draw "
+                "from it in the environment alone"
+            )
         number, last = self._last.get(place, (0, None))
         if generator is not last:  # kept, so that no other one gets its id
             self._last[place] = number + 1, generator
