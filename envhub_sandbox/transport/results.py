@@ -202,7 +202,7 @@ class Results:
         for key in infos:  # marks of ours: which were lost and came back
             if f"_{key}" in infos:
                 for at in np.flatnonzero(infos[f"_{key}"]):
-                    own[at] = [*own[at][:-1], {**(own[at] or [{}])[-1], key: infos[key][at]}]
+                    own[at] = [*own[at][:-1], {**(own[at] or [{}])[-1], key: True}]
         return own, which, reward
 
     def _restored(self, infos: dict[Any, Any]) -> dict[Any, Any]:

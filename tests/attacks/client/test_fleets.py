@@ -203,6 +203,8 @@ def test_infos_that_came_apart_are_of_its_own_rows_alone() -> None:
     for place in (2, 5, -1, -3, 1 << 70):
         lied = joins.own(joins.infos([{place: {"a": 9}}, honest]))[0]
         assert lied == [[], [], [{"a": 2}, {"b": 3}]]
+    marked = {"lost": np.full(1, 7), "_lost": np.ones(1, bool)}  # one is true, whatever it holds
+    assert joins.own(joins.infos([marked, honest]))[0][0] == [{"lost": True}]
     lies: list[Any] = [{place: {"a": 9}} for place in ("0", True, None)]
     lies += [{0: 5}, {0: RemoteObject("t", "r")}, {"x": np.ones(9), "_x": np.ones(9, bool)}]
     for infos in lies:
