@@ -16,9 +16,8 @@ import pytest
 
 from envhub_sandbox import Limits, Policy, Timeouts, make_env
 from envhub_sandbox.cli.app import whole_command
-from envhub_sandbox.errors import HubReferenceError, PolicyError, RepositoryUnavailableError
+from envhub_sandbox.errors import PolicyError, RepositoryUnavailableError
 from envhub_sandbox.factory.make_env import interpreter
-from envhub_sandbox.hub import snapshot
 from envhub_sandbox.session.repository import plain_config
 from envhub_sandbox.settings.options import (
     OPTIONS,
@@ -126,23 +125,6 @@ def test_properties_of_a_config_cross() -> None:
     assert inner[CONFIG_CLASS][0][0][1] == type(_Config().inner).__qualname__
     assert (names[0][1], computed) == ("_Config", {"type": "hub"})
     assert fields == ("hub_path", "task", "inner")
-
-
-def test_a_folder_written_like_a_repository_gets_a_hint(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """``examples/cartpole`` is a hub reference; the folder is ``./examples/cartpole``."""
-
-    def missing(*_: object, **__: object) -> None:
-        raise HubReferenceError("not found")
-
-    (tmp_path / "examples" / "cartpole").mkdir(parents=True)
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(snapshot, "fetch", missing)
-    with pytest.raises(HubReferenceError, match=r"write '\./examples/cartpole:env\.py'"):
-        make_env("examples/cartpole:env.py")
-    with pytest.raises(HubReferenceError, match=r"not found$"):
-        make_env("examples/other")
 
 
 # --- Each option once, and each place's own spelling of it

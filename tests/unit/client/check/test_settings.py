@@ -120,7 +120,7 @@ def test_where_it_lies_below_the_current_folder(
     (tmp_path / "link").symlink_to(tmp_path / "here/a")
     monkeypatch.chdir(tmp_path / "here")
     below = {"./a": "a/", "./a/b": "a/b/", "./a/b/env.py": "a/b/", "./a:b/env.py": "a/"}
-    below |= {str(tmp_path / "here/a"): "a/", "../link/b": "a/b/"}
-    elsewhere = ("./", "../", "../here", "a/b", "org/repo@main", "./nowhere")
+    below |= {str(tmp_path / "here/a"): "a/", "../link/b": "a/b/", "a/b": "a/b/"}
+    elsewhere = ("./", "../", "../here", "a/b@main", "org/repo@main", "./nowhere")
     for reference, folder in {**below, **dict.fromkeys(elsewhere, "")}.items():
         assert settings.folder_below_here(reference) == folder, reference
