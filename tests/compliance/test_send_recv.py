@@ -173,3 +173,42 @@ def test_results_do_not_depend_on_who_is_ready_first(
         for step, (wanted, found) in enumerate(zip(expected, taken[index], strict=True)):
             what = f"sub-environment {index}, step {step}"
             assert_same((*wanted[:4], _own(wanted[4], 0)), found, what)
+
+
+_RAISING = """
+import time
+import gymnasium as gym
+import numpy as np
+
+class Raising(gym.Env):
+    observation_space = action_space = gym.spaces.Discrete(3)
+
+    def reset(self, *, seed=None, options=None):
+        return 0, {}
+
+    def step(self, action):
+        if action == 1:
+            raise ValueError("one")
+        time.sleep(0.3 * (action == 2))
+        return action, 1.0, False, False, {}
+
+def make_env(n_envs=1, use_async_envs=False):
+    return gym.vector.SyncVectorEnv([Raising] * n_envs)
+"""
+
+
+def test_an_error_does_not_overtake_the_result_before_it(tmp_path: Path, lane: str) -> None:
+    """While a receipt waits for another worker, the first one's next answer may be an error."""
+    folder = write_repository(tmp_path, _RAISING)
+    with make_env(folder, 2, min_ready=2, lane=lane) as suites:
+        env = suites.env
+        env.reset()
+        env.send(np.array([0, 2]))
+        env.send(np.array([1]), [0])
+        received = env.recv()
+        assert received.env_ids.tolist() == [0, 1]
+        assert received.observations.tolist() == [0, 2]
+        with pytest.raises(ValueError, match="one") as info:
+            env.recv()
+        assert info.value.env_ids == (0,)  # type: ignore[attr-defined]
+        env.step(np.array([0, 0]))

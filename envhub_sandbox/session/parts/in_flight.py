@@ -21,7 +21,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from gymnasium.error import NoAsyncCallError
 
-from envhub_sandbox.errors import ActionError, WorkerTimeoutError
+from envhub_sandbox.errors import (
+    ActionError,
+    EnvHubError,
+    RemoteEnvWarning,
+    WorkerTimeoutError,
+)
 from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.failures import refusal
 from envhub_sandbox.session.parts.shard_queue import ShardQueue
@@ -88,7 +93,7 @@ class InFlight:
         self._space = order.results.manifest.single_observation_space
         self._actions = order.results.manifest.single_action_space
         self._worker_of = [at for at, queue in enumerate(self._queues) for _ in range(queue.count)]
-        self._ready: deque[tuple[int, StepResult]] = deque()
+        self._ready: deque[tuple[int, StepResult | Exception]] = deque()
         self._sends = False
 
     # --- there ---------------------------------------------------------------------------------
@@ -222,7 +227,7 @@ class InFlight:
             try:
                 while (taken := self._first(min_ready)) is None:
                     for place in self._wait(deadline):
-                        self._queues[place].take(partial(self._keep, place))
+                        self._take(place)
                 return self._joined(taken)
             except Exception:
                 self._order.refuse_if_closed()  # as by a signal handler
@@ -259,18 +264,33 @@ class InFlight:
             raise _too_few(deadline)
         return [busy[at] for at in found or late]
 
-    def _keep(self, place: int, result: StepResult) -> None:
+    def _take(self, place: int) -> None:
+        """Take a worker's oldest answer. An error waits for the worker's results before it."""
+        try:
+            self._queues[place].take(partial(self._keep, place))
+        except (EnvHubError, RemoteEnvWarning) as error:
+            if all(at != place for at, _ in self._ready):
+                raise
+            self._keep(place, error)
+
+    def _keep(self, place: int, result: StepResult | Exception) -> None:
         self._ready.append((place, result))
 
     def _first(self, min_ready: int) -> dict[int, StepResult] | None:
         """Results by workers, in the order in which they were taken; None while these are too few.
 
-        As many as there are, where no more are to come.
+        As many as there are, where no more are to come. Raises the error whose turn it is.
         """
         self._order.refuse_if_closed()
         oldest: dict[int, StepResult] = {}
-        for place, result in self._ready:
-            oldest.setdefault(place, result)
+        for entry in self._ready:
+            place, result = entry
+            if place in oldest:
+                continue
+            if isinstance(result, Exception):
+                self._ready.remove(entry)
+                raise result
+            oldest[place] = result
         owing = any(queue.busy for at, queue in enumerate(self._queues) if at not in oldest)
         taken: dict[int, StepResult] = {}
         rows = 0
