@@ -212,3 +212,40 @@ def test_an_error_does_not_overtake_the_result_before_it(tmp_path: Path, lane: s
             env.recv()
         assert info.value.env_ids == (0,)  # type: ignore[attr-defined]
         env.step(np.array([0, 0]))
+
+
+def test_who_has_ended_is_refused_in_its_turn(tmp_path: Path, lane: str) -> None:
+    """Where nothing resets by itself, those before it have been stepped, as in Gymnasium."""
+    folder, here = write_repository(tmp_path, _ENDING), dict[str, Any]()
+    exec(_ENDING, here)
+    expected = here["make_env"](3)
+    with make_env(folder, 3, lane=lane) as suites:
+        for env in (expected, suites.env):
+            env.reset()
+            env.step(np.array([0, 1, 0]))
+            with pytest.raises(AssertionError, match="_autoreset_envs"):
+                env.step(np.zeros(3, int))
+            mask = np.array([False, True, False])
+            env.reset(options={"reset_mask": mask})
+        zeros = np.zeros(3, int)
+        assert_same(expected.step(zeros), suites.env.step(zeros), "the next step")
+
+
+_ENDING = """
+import gymnasium as gym
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+
+class Ending(gym.Env):
+    observation_space = action_space = gym.spaces.Discrete(9)
+
+    def reset(self, *, seed=None, options=None):
+        self.now = 0
+        return 0, {}
+
+    def step(self, action):
+        self.now += 1
+        return self.now, 1.0, action == 1, False, {}
+
+def make_env(n_envs=1, use_async_envs=False):
+    return SyncVectorEnv([Ending] * n_envs, autoreset_mode=AutoresetMode.DISABLED)
+"""

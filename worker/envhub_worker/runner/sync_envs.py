@@ -259,8 +259,6 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         """Step every sub-environment, or reset it where its episode is over; returns the infos.
         Rows of the batch of actions are handed out as they are.
         """
-        if self._mode == "Disabled" and any(self._done):
-            raise AssertionError(f"self._autoreset_envs={np.array(self._done)!r}")
         batch, same_step, count = self.batch, self._mode == "SameStep", self.num_envs
         store, rows, rewards = batch.store, batch.rows, batch.rewards
         dtype, shape = (None, None) if rows[0] is None else (rows[0].dtype, rows[0].shape)
@@ -278,6 +276,8 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         try:
             for index, action, env, over, row in each:
                 if over:
+                    if self.resets_nothing:  # those before it have been stepped, as in Gymnasium
+                        raise AssertionError(f"self._autoreset_envs={np.array(self._done)!r}")
                     observation, info = env.reset()
                     rewards[index] = reward = 0.0
                 else:
