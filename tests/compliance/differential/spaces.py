@@ -19,16 +19,24 @@ _INTEGERS = (np.int8, np.uint8, np.int16, np.int32, np.int64)
 _DEPTH = 2
 
 
-def space(draw: Random, *, loose: bool, depth: int = 0) -> Space:
-    """A random space; only if it may be ``loose``, one that has no fixed layout."""
+def space(draw: Random, *, loose: bool, depth: int = 0, least: int = 1) -> Space:
+    """A random space; only if it may be ``loose``, one that has no fixed layout. Composite ones
+    have at least so many members.
+    """
     kinds = [*_FLAT, *(_LOOSE if loose else ()), *(_DEEP if depth < _DEPTH else ())]
     kind = draw.choice(kinds)
     if kind in _DEEP:
-        inner = [space(draw, loose=loose, depth=depth + 1) for _ in range(draw.randrange(1, 4))]
+        count = draw.randrange(least, 4)
+        inner = [space(draw, loose=loose, depth=depth + 1, least=least) for _ in range(count)]
         if kind == "tuple":
             return spaces.Tuple(inner)
         return spaces.Dict(dict(zip(draw.sample("zyxab", len(inner)), inner, strict=True)))
     return _ONE[kind](draw)
+
+
+def flat_space(draw: Random) -> Space:
+    """A random space whose batch is an array."""
+    return _ONE[draw.choice(_FLAT)](draw)
 
 
 def _box(draw: Random) -> Space:

@@ -6,20 +6,24 @@ from typing import Any
 
 import pytest
 
-from tests.compliance.differential import cases
+from tests.compliance.differential import KINDS, cases, rows, sharing
 from tests.compliance.theirs.through_sandbox import vector
 
 CALLS = 12
 EACH = 20
 
 
-@pytest.mark.short("0")
-@pytest.mark.parametrize("first", range(0, 3 * EACH, EACH))
-def test_random_cases_do_not_differ(first: int) -> None:
-    """Whatever is drawn and called, the sandbox gives what ``SyncVectorEnv`` gives."""
-    for number in range(first, first + EACH):
-        drawn = cases.case(number)
-        found = cases.difference(drawn, CALLS)
+@pytest.mark.short("calls-0")
+@pytest.mark.parametrize(
+    ("kind", "first"),
+    [*(("calls", n * EACH) for n in range(3)), ("rows", 0), ("sharing", 0)],
+)
+def test_random_cases_do_not_differ(kind: str, first: int) -> None:
+    """Whatever is drawn and called, the sandbox gives what Gymnasium gives."""
+    several = KINDS[kind]
+    for number in range(first, first + (EACH if kind != "sharing" else EACH // 4)):
+        drawn = several.case(number)
+        found = several.difference(drawn, CALLS)
         assert found is None, f"{drawn}: {found}"
 
 
@@ -27,7 +31,13 @@ def test_what_differs_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     def turned(env_fns: Any, **kwargs: Any) -> Any:
         return vector(env_fns[::-1], **kwargs)
 
-    monkeypatch.setattr(cases, "vector", turned)
-    several = [drawn for drawn in map(cases.case, range(10)) if len(drawn.env_fns) > 1]
-    assert several
-    assert any(cases.difference(drawn, CALLS) for drawn in several)
+    for kind in (cases, rows):
+        monkeypatch.setattr(kind, "vector", turned)
+        several = [drawn for drawn in map(kind.case, range(10)) if len(drawn.env_fns) > 1]
+        assert several
+        assert any(kind.difference(drawn, CALLS) for drawn in several)
+
+
+def test_one_process_for_those_that_share_is_found() -> None:
+    several = [drawn for drawn in map(sharing.case, range(12)) if "sandbox" not in drawn.options]
+    assert any(sharing.difference(drawn, CALLS, {"num_workers": 1}) for drawn in several)

@@ -126,7 +126,7 @@ _LEROBOT = ("lerobot.config", "lerobot.install")
 # where tests and benchmarks may name what starts with an underscore, and others' names that they do
 SEAM = "tests/support/inside.py"
 PRIVATE_NAMES_OF_OTHERS = {
-    *("_add_info", "_autoreset_envs"),  # Gymnasium's, the oracle's
+    *("_add_info", "_autoreset_envs", "_env_obs", "_terminations", "_truncations"),  # Gymnasium's
     *("_exit", "_getframe", "_resource_tracker"),  # the standard library's
     "_ensure",  # what LeRobot looks for
 }
