@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import signal
 import traceback
 from collections.abc import Callable, Sequence
@@ -65,9 +66,14 @@ class OutputTail:
         return start, bytes(self._kept[start - first : start - first + MAX_BYTES])
 
     def text(self, lines: int = 40) -> str:
-        """The last lines, fit for a terminal."""
-        kept = bytes(self._kept[-self._limit :]).decode("utf-8", "backslashreplace")
-        return printable("\n".join(kept.splitlines()[-lines:]))
+        """The last lines, fit for a terminal. Of one that is cut off no end is told: a client looks
+        for whole secrets in it.
+        """
+        kept = bytes(self._kept[-self._limit :])
+        if len(kept) < self._total:
+            kept = re.split(rb"[\r\n]", kept, maxsplit=1)[-1]
+        said = kept.decode("utf-8", "backslashreplace")
+        return printable("\n".join(said.splitlines()[-lines:]))
 
     def close(self) -> None:
         """Close the pipe. Idempotent."""

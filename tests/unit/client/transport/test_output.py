@@ -97,6 +97,21 @@ def test_a_follower_gets_every_byte_that_is_kept(
     tail.close()
 
 
+@pytest.mark.parametrize("end", ["\n", "\r"])
+def test_what_is_told_does_not_begin_amid_a_line(end: str) -> None:
+    """Half of a secret would not be found where secrets are left out."""
+    reads, writes = os.pipe2(os.O_NONBLOCK)
+    tail = OutputTail(reads, 20)
+    os.write(writes, f"before{end}".encode())
+    tail.read()
+    assert tail.text() == "before", "all of it is there"
+    os.write(writes, f"key=hf_secretsecret{end}and more of it".encode())
+    tail.read()
+    assert tail.text() == "and more of it"
+    os.close(writes)
+    tail.close()
+
+
 def test_a_follower_ends_though_a_server_does_not() -> None:
     """It has more at each request, for ever; who stops following is not kept busy."""
     ended = threading.Event()
