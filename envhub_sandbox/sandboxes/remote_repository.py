@@ -90,7 +90,8 @@ def upload(
     """
     wanted = _offer(client, files, deadline)
     by_hash = {file.sha256: file for file in files}
-    missing = [by_hash[sha] for sha in wanted.hashes if isinstance(sha, bytes) and sha in by_hash]
+    asked = {sha for sha in wanted.hashes if isinstance(sha, bytes)}  # each once, however often
+    missing = [file for sha, file in by_hash.items() if sha in asked]
     if not wanted.hashes:
         return wanted.snapshot, 0
     _put(client, root, missing, deadline)

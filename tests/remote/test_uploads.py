@@ -6,6 +6,7 @@ import errno
 import hashlib
 import os
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -268,6 +269,18 @@ def test_what_is_half_deleted_is_made_again(uploads: Uploads) -> None:
     assert len(list(tree.parent.iterdir())) == 3
     Uploads(uploads.folder, Quotas())
     assert list(tree.parent.iterdir()) == [tree]
+
+
+def test_what_a_server_asks_for_again_travels_once(tmp_path: Path) -> None:
+    """It could keep its client at it until the deadline, for ever the same few bytes."""
+    (tmp_path / "file").write_bytes(b"x" * 10)
+    files = remote_repository.listing(tmp_path)
+    wanted = [m.MissingBlobs("sha256:x", (files[0].sha256,) * 1000), m.MissingBlobs("sha256:x", ())]
+    client = Mock()
+    client.request.side_effect = [(one, []) for one in wanted]
+    client.receive.return_value = m.Done(), []
+    assert remote_repository.upload(client, tmp_path, files, Deadline(60)) == ("sha256:x", 10)
+    assert client.send.call_count == 1
 
 
 def test_only_the_edited_file_travels_to_a_real_server(server: Listening, tmp_path: Path) -> None:
