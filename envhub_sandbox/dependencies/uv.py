@@ -32,7 +32,7 @@ from envhub_sandbox.errors import (
 from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.system import locks
 from envhub_sandbox.system.folders import remove_tree
-from envhub_sandbox.system.platform import IS_WINDOWS
+from envhub_sandbox.system.platform import IS_WINDOWS, kill_group, own_group
 from envhub_worker.protocol.text import printable
 
 if sys.platform == "linux":
@@ -50,6 +50,8 @@ _CLEAN_S = 60.0
 CACHE_WAIT_S = 10.0
 """For how long to wait for others who use uv's cache."""
 _SHOWN = 4000
+LISTEN_S = 10.0
+"""For whoever holds uv's stderr after its end, in no group of its own."""
 _KEPT_LINES = 400
 
 _NO_INDEX = (
@@ -134,8 +136,9 @@ def run(
             pass_fds=() if IS_WINDOWS else tuple(keep),
             text=True,
             errors="replace",
+            **own_group(),
         )
-        listener = threading.Thread(target=_listen, args=(process.stderr, lines, tell))
+        listener = threading.Thread(target=_listen, args=(process.stderr, lines, tell), daemon=True)
         with process:
             try:
                 listener.start()
@@ -146,8 +149,10 @@ def run(
                 text = f"{what}: uv was not done after {timeout_s:.0f} s"
                 raise IndexUnavailableError(text) from None
             finally:
-                process.kill()
-                listener.join()
+                kill_group(process)  # what it has started may hold its stderr
+                listener.join(LISTEN_S)
+                if listener.is_alive():  # closing it would wait for the listener
+                    process.stderr = None
         if sys.platform != "win32" and process.returncode == -signal.SIGXFSZ:
             raise PackagesTooLargeError(
                 f"{what}: a file was about to have more than {file_bytes} bytes"
