@@ -33,6 +33,13 @@ class UniterableError(ActionTypeError, CustomSpaceError):
     """A scalar for several members of a space that is no array: which Gymnasium raises there."""
 
 
+class SeedError(TypeError, Error):
+    """A seed that is no integer of Python's, which neither Gymnasium's environments take."""
+
+    def __init__(self, seed: object) -> None:
+        super().__init__(f"Seed must be a python integer, actual type: {type(seed)}: use int(seed)")
+
+
 @singledispatch
 def batch_of(space: gym.Space[Any], value: Any, count: int | None, where: str = "actions") -> Any:
     """A batch of ``count`` members of a *single* action space.
@@ -156,11 +163,15 @@ class ActionReader:
 def seeds_for_all(seed: Any, manifest: EnvManifest) -> Any:
     """One seed or None per sub-environment, or None for none at all."""
     count = manifest.num_envs
-    if isinstance(seed, (int, np.integer)):
-        return [int(seed) + index for index in range(count)] if manifest.shardable else int(seed)
+    if isinstance(seed, int):
+        return [seed + index for index in range(count)] if manifest.shardable else seed
     if seed is None:
         return None
-    seeds = [None if one is None else _seed(one) for one in seed]
+    try:
+        each = list(seed)
+    except TypeError:
+        raise SeedError(seed) from None
+    seeds = [None if one is None else _seed(one) for one in each]
     if len(seeds) != count:
         raise ValueError(
             "If seeds are passed as a list the length must match "
@@ -170,9 +181,9 @@ def seeds_for_all(seed: Any, manifest: EnvManifest) -> Any:
 
 
 def _seed(given: Any) -> int:
-    if not isinstance(given, (int, np.integer)):
-        raise Error(f"Seed must be a python integer, actual type: {type(given)}")
-    return int(given)
+    if not isinstance(given, int):
+        raise SeedError(given)
+    return given
 
 
 def check_mask(mask: Any, num_envs: int) -> None:

@@ -197,8 +197,10 @@ def test_what_is_refused_in_gymnasiums_words(make: Make) -> None:
             env.step(np.array(actions))
     with pytest.raises(TypeError):
         env.step(0)
+    with pytest.raises(TypeError):
+        env.reset(seed=np.int64(3))
     with pytest.raises(gym.error.Error, match="Seed must be a python integer"):
-        env.reset(seed=[1.5, "2", 3])
+        env.reset(seed=[np.int64(1), 2, 3])
 
 
 @pytest.mark.parametrize("make", ALL, indirect=True)
