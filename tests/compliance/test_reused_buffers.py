@@ -35,6 +35,7 @@ class Reuses(gym.Env):
         self.length = length
         self.observation = {"b": np.zeros(2, np.float32), "n": 0}
         own = {"a": np.zeros(2), "in": {"c": np.zeros(1)}, "masked": np.ma.masked_array([0], [1])}
+        own["mixed"] = 0 if length == 2 else 0.0  # of which workers make different columns
         self.info = OF_ALL.get(of_all, own)
 
     def filled(self, value):

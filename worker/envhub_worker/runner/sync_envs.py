@@ -192,7 +192,7 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         self._flagged: list[int] = []  # whose flags are not both False
         self._mode = autoreset_mode
         self._sync = sync
-        self._shared = sync and self.num_envs > 1  # the next one may fill the same info
+        self._siblings = sync and self.num_envs > 1
         self.sliced = sliced
         self.apart = False
         self.pairs: Pairs = []
@@ -218,6 +218,7 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         infos: Pairs = []
         self.pairs = infos
         self.reward = ()
+        copied = self._copier()
         for index in chosen:
             seed = None if seeds is None else seeds[index]
             try:
@@ -226,7 +227,7 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
                 raise old_gym.explained(error, self.envs[index], "reset") from error
             self.batch.store(index, observation)
             if info:
-                infos.append((index, taken(info) if self._shared else info))
+                infos.append((index, copied(info) if copied else info))
             if self._single:
                 self.integers = batches.integers(self.single_observation_space, observation)
         if self.shared is not None:
@@ -268,7 +269,7 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
             terminations[index] = truncations[index] = False
         flagged = self._flagged = []
         done = [False] * count
-        shared = self._shared
+        copied = self._copier()
         infos: Pairs = []
         self.pairs = infos
         index = 0
@@ -304,7 +305,7 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
                 else:
                     store(index, observation)
                 if info:
-                    infos.append((index, taken(info) if shared else info))
+                    infos.append((index, copied(info) if copied else info))
         except BaseException as error:
             batch.carry(index)  # who was not asked any more has his last observation still
             if isinstance(error, ValueError):
@@ -371,6 +372,12 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
             if not self.sliced:
                 raise
             return dict(batches.APART)
+
+    def _copier(self) -> Callable[[Any], Any] | None:
+        """What keeps an info as it is, where a sibling that comes next may fill the same."""
+        if not self._siblings:
+            return None
+        return kept if self.apart else taken
 
     def _final(self, observation: Any, info: Any) -> dict[str, Any]:
         """What is said of the end of an episode, before the reset that may overwrite it.
