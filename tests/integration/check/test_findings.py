@@ -275,7 +275,6 @@ def test_missing_papers_are_told(tmp_path: Path) -> None:
     assert report.findings == []
 
 
-@pytest.mark.short
 def test_the_command_line_judges(tmp_path: Path) -> None:
     """Exit codes, and the reports that were asked for; a name that a terminal would obey is a
     finding, and no reason not to judge."""
