@@ -16,6 +16,7 @@ from contextlib import suppress
 from typing import Any
 
 import numpy as np
+from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError
 
 from envhub_sandbox.errors import RemoteEnvError, RemoteProtocolError, WorkerError
 from envhub_sandbox.session.requests import MessageFor, RequestOrder
@@ -25,6 +26,8 @@ from envhub_worker.protocol.errors import UNTRUSTED
 from envhub_worker.protocol.spaces.spaces import BIT_GENERATORS
 
 _NUMBER = "number"
+_SAID_NEXT = (WorkerError, RemoteEnvError, AlreadyPendingCallError, ClosedEnvironmentError)
+"""What must not hide the answer to a request, and is raised by the next one; of other threads'."""
 
 
 class _Live:
@@ -116,17 +119,17 @@ class Generators:
         """Send what the caller has drawn; from then on its generators are out of date."""
         if not self._current or self._asking:
             return
+        self._current = False  # also where they cannot be sent: a reset is no way back else
         states = [live.drawn() for live in self._live]
         if any(state is not None for state in states):
             self.write(states)
-        self._current = False
 
     def after_request(self) -> None:
         """Bring those up to date that the caller has kept."""
         if self._current or self._asking or self._requests.waiting is not None:
             return
         if any(live.references() != _UNKEPT for live in self._live):
-            with suppress(WorkerError, RemoteEnvError):  # this one was answered: the next says it
+            with suppress(*_SAID_NEXT):
                 self._fetch()
 
     def _fetch(self) -> None:

@@ -229,8 +229,12 @@ class FleetRequests(RequestOrder):
             if self.before_request is not None:
                 self.before_request()
             at = next(i for i, (start, stop) in enumerate(self.results.bounds) if index < stop)
-            with self._parts[at].naming():
-                return self._each[at].ask_one(name, index, message)
+            try:
+                with self._parts[at].naming():
+                    return self._each[at].ask_one(name, index, message)
+            finally:
+                if self.after_request is not None:
+                    self.after_request()
 
     # --- requests ------------------------------------------------------------------------------
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import signal
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,8 @@ import pytest
 from gymnasium.wrappers import AddWhiteNoise, AtariPreprocessing, ObstructView, StickyAction
 
 from envhub_sandbox import SandboxEnv, make_env
+from envhub_sandbox.errors import WorkerError
+from tests.support import inside
 from tests.support.compare import assert_same
 from tests.support.repositories import write_repository
 from tests.support.samples import make_env_of
@@ -184,22 +188,26 @@ def _vectors(env: Any) -> list[Any]:
         seen.append([one.random() for one in env.np_random])
         seen += [env.envs[1].np_random.random(), env.step([0, 1])]
         seen.append([one.random() for one in env.get_attr("np_random")])
+    kept = env.np_random
+    seen += [env.envs[1].step(0)[:2], [one.random() for one in kept], env.step([0, 1])]
     env.envs[0].np_random = mine = np.random.default_rng(7)
     return [*seen, env.step([0, 1]), mine.random(), env.envs[0].unwrapped.np_random is mine]
 
 
-@pytest.mark.parametrize("lane", ["auto", "frames"])
-def test_those_of_a_vector_environment_are_gymnasiums(folder: Path, lane: str) -> None:
+@pytest.mark.parametrize(
+    "where", [{}, {"lane": "frames"}, {"sandbox": ["process", "process"]}], ids=str
+)
+def test_those_of_a_vector_environment_are_gymnasiums(folder: Path, where: dict[str, Any]) -> None:
     """Live in a ``SyncVectorEnv``, copies of an ``AsyncVectorEnv``, and one of a class's own."""
-    with make_env(str(folder), n_envs=2, lane=lane) as suites:
+    with make_env(str(folder), n_envs=2, **where) as suites:
         assert_same(_vectors(_here(folder, n_envs=2)), _vectors(suites.env))
         with pytest.raises(AttributeError, match="envs"):
             suites.env.np_random = np.random.default_rng(1)
-    with make_env(str(folder), n_envs=2, use_async_envs=True, lane=lane) as suites:
+    with make_env(str(folder), n_envs=2, use_async_envs=True, **where) as suites:
         suites.env.reset(seed=1)
         first, again = (suites.env.np_random[0].random() for _ in range(2))
         assert first == again
-    ours = make_env(str(folder), n_envs=2, lane=lane, env_kwargs={"own": True})
+    ours = make_env(str(folder), n_envs=2, **where, env_kwargs={"own": True})
     with ours as suites:
         played = []
         for env in (suites.env, _here(folder, n_envs=2, own=True)):
@@ -207,6 +215,21 @@ def test_those_of_a_vector_environment_are_gymnasiums(folder: Path, lane: str) -
             env.np_random = mine = np.random.default_rng(7)
             played.append([*seen, env.step([0, 1]), mine.random(), env.np_random is mine])
         assert_same(*played)
+
+
+def test_draws_that_cannot_be_sent_leave_a_way_back(folder: Path) -> None:
+    """A worker that has died takes none; ``send_reset`` starts another."""
+    with make_env(str(folder), n_envs=2, min_ready=1, policy={"restart": "on_reset"}) as suites:
+        env = suites.env
+        env.reset(seed=1)
+        kept = env.np_random
+        for pid in inside.part_pids(inside.parts(env)[0]):
+            os.kill(pid, signal.SIGKILL)
+        kept[0].random()
+        with pytest.raises(WorkerError):
+            env.step([0, 1])
+        env.send_reset(seed=2)
+        assert len(env.recv(min_ready=2)[-1]) == 2
 
 
 def test_send_and_recv_take_the_draws_along(folder: Path) -> None:
