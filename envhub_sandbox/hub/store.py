@@ -147,9 +147,10 @@ def is_public(slot: Slot) -> bool:
 def mark_public(slot: Slot) -> None:
     """Note that a snapshot, which is in the store, is to be had without a login."""
     if (text := _record_of(slot)) is not None:
-        document, entries = _read_record(slot, text)
+        # the rest stays: of files that have changed meanwhile nothing is known
+        document = {**_read_record(slot, text)[0], _PUBLIC: True}
         with contextlib.suppress(OSError):  # a read-only store asks the host again
-            _write_record(slot.home, slot.tree, {**document, _PUBLIC: True}, entries)
+            write_whole_file(slot.record, json.dumps(document).encode())
 
 
 def load_whole(slot: Slot) -> tuple[FileRecord, ...] | None:
