@@ -160,6 +160,8 @@ _NOT_FOUND = (
     r"(can ?not|can't|could not|couldn't|failed to) (be )?(open|find|found|load|read|locate|access)"
 )
 _MOST_NAMES, _DEEPEST = 16, 16
+_NAMED_CHARS = 4096
+"""Of a worker's text, in which names are looked for: the search takes time."""
 
 
 def why_missing(error: EnvHubError, snapshot: Snapshot) -> str:
@@ -177,7 +179,7 @@ def why_missing(error: EnvHubError, snapshot: Snapshot) -> str:
     if not re.search(_NOT_FOUND, text):
         return ""
     shown = {record.path for record in snapshot.files}
-    for path in _names(text[:_TEXT_CHARS].replace(f"{snapshot.root}/", ""), snapshot.repo_id):
+    for path in _names(text[:_NAMED_CHARS].replace(f"{snapshot.root}/", ""), snapshot.repo_id):
         is_shown = path in shown or any(one.startswith(f"{path}/") for one in shown)
         if not is_shown and os.path.lexists(os.path.join(snapshot.repo_id, path)):
             return LocalFolder.of(snapshot).advice(path)

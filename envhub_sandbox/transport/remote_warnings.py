@@ -64,6 +64,7 @@ class RemoteWarnings:
                 self._collect(one)
             elif self.note_shared is not None:
                 self.note_shared()
+                self.note_shared = None  # a hostile worker says it again and again
                 self._collect(("SharedStateWarning", _SHARED.format(SHARED_STATE[one[1]])))
         return rest
 
