@@ -16,13 +16,14 @@ _MAX_HASH_SEED = 2**32 - 1
 
 _FLAGS = (
     "ASYNCIODEBUG|COERCECLOCALE|DEVMODE|DONTWRITEBYTECODE|FAULTHANDLER|INTMAXSTRDIGITS|MALLOC|"
-    "NODEBUGRANGES|OPTIMIZE|TRACEMALLOC|UNBUFFERED|UTF8|WARNDEFAULTENCODING|_CPU_COUNT|_GIL"
+    "NODEBUGRANGES|OPTIMIZE|UNBUFFERED|UTF8|WARNDEFAULTENCODING|_CPU_COUNT|_GIL"
 )
 # The category of a filter is imported if it has a dot.
 _FILTER = r"\w*(:[^:,]*(:\w*(:[^:,]*(:\d*)?)?)?)?"
 _STARTED_WITH = {
     HASH_SEED: r"random|\d{1,10}",
     rf"PYTHON({_FLAGS})": r"\w*",
+    "PYTHONTRACEMALLOC": r"\d?",
     "PYTHONIOENCODING": r"[\w-]*(:\w*)?",
     "PYTHONWARNINGS": rf"{_FILTER}(,{_FILTER})*",
     "LANG|LANGUAGE|LC_[A-Z]+": r"[\w.@:-]*",
@@ -79,4 +80,5 @@ def at_start(environment: Mapping[str, str]) -> dict[str, str]:
 def fixed_hash_seed(environment: Mapping[str, str]) -> dict[str, str]:
     """The seed that a caller's own interpreter has, where that is a number."""
     seed = environment.get(HASH_SEED, "")
-    return {HASH_SEED: seed} if seed.isdecimal() and int(seed) <= _MAX_HASH_SEED else {}
+    known = seed.isascii() and seed.isdecimal() and int(seed) <= _MAX_HASH_SEED
+    return {HASH_SEED: str(int(seed))} if known else {}
