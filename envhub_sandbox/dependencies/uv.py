@@ -32,7 +32,7 @@ from envhub_sandbox.errors import (
 from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.system import locks
 from envhub_sandbox.system.folders import remove_tree
-from envhub_sandbox.system.platform import IS_WINDOWS, kill_group, own_group
+from envhub_sandbox.system.platform import IS_WINDOWS
 from envhub_worker.protocol.text import printable
 
 if sys.platform == "linux":
@@ -50,8 +50,6 @@ _CLEAN_S = 60.0
 CACHE_WAIT_S = 10.0
 """For how long to wait for others who use uv's cache."""
 _SHOWN = 4000
-LISTEN_S = 10.0
-"""For whoever holds uv's stderr after its end, in no group of its own."""
 _KEPT_LINES = 400
 
 _NO_INDEX = (
@@ -136,9 +134,8 @@ def run(
             pass_fds=() if IS_WINDOWS else tuple(keep),
             text=True,
             errors="replace",
-            **own_group(),
         )
-        listener = threading.Thread(target=_listen, args=(process.stderr, lines, tell), daemon=True)
+        listener = threading.Thread(target=_listen, args=(process.stderr, lines, tell))
         with process:
             try:
                 listener.start()
@@ -149,10 +146,8 @@ def run(
                 text = f"{what}: uv was not done after {timeout_s:.0f} s"
                 raise IndexUnavailableError(text) from None
             finally:
-                kill_group(process)  # what it has started may hold its stderr
-                listener.join(LISTEN_S)
-                if listener.is_alive():  # closing it would wait for the listener
-                    process.stderr = None
+                process.kill()
+                listener.join()
         if sys.platform != "win32" and process.returncode == -signal.SIGXFSZ:
             raise PackagesTooLargeError(
                 f"{what}: a file was about to have more than {file_bytes} bytes"

@@ -12,7 +12,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import psutil
 import pytest
 
 from envhub_sandbox.dependencies import index as places
@@ -28,7 +27,6 @@ from envhub_sandbox.errors import (
     ResolutionError,
 )
 from tests.support.packages.wheels import WORKERS, Index, make_wheel
-from tests.support.processes import eventually
 from tests.unit.docs.test_distributions import project
 
 __all__ = ["project"]
@@ -234,29 +232,6 @@ def another_uv(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[str
         monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
 
     return replace
-
-
-def test_who_holds_what_uv_writes_is_not_waited_for(
-    another_uv: Callable[[str], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A child that uv has left is ended, and one that has left its group, too, keeps nobody."""
-    monkeypatch.setattr(uv, "LISTEN_S", 1.0)
-    held = tmp_path / "held"
-    another_uv(
-        "import os, time\n"
-        "for own in (0, 1):\n"
-        "    if os.fork() == 0:\n"
-        "        own and os.setsid()\n"
-        f"        open({str(held)!r} + str(own), 'w').write(str(os.getpid()))\n"
-        "        time.sleep(600)\n"
-        f"while not os.path.exists({str(held)!r} + '0'): time.sleep(0.01)\n"
-        f"while not os.path.exists({str(held)!r} + '1'): time.sleep(0.01)\n"
-    )
-    uv.run(["x"], what="x", timeout_s=100)
-    left, apart = (int(Path(f"{held}{own}").read_text()) for own in (0, 1))
-    assert eventually(lambda: not psutil.pid_exists(left))
-    assert psutil.pid_exists(apart), "the control failed: it was not waited for either"
-    os.kill(apart, 9)
 
 
 def test_a_uv_that_is_late_is_ended(another_uv: Callable[[str], None], tmp_path: Path) -> None:
