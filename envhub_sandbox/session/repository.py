@@ -364,7 +364,10 @@ class Repository:
             CRASHES.warning("%s: no crash bundle could be written: %s", self.label, problem)
         else:
             error.bundle = str(bundle)
-            again = f"To try the same again: envhub replay {shlex.quote(error.bundle)}"
+            # of a folder, a bundle elsewhere than in the cache might be anybody's
+            elsewhere = self.snapshot.is_local and self.policy.crash_folder
+            options = " --grant" if elsewhere else ""
+            again = f"To try the same again: envhub replay {shlex.quote(error.bundle)}{options}"
             error.args = (f"{error.args[0]}\n{again}", *error.args[1:])
             CRASHES.info("%s: crash bundle %s", self.label, bundle)
 

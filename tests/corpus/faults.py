@@ -216,9 +216,6 @@ _SEEDS = {
         "    self.at += np.random.default_rng().normal() * int(action)",
         "the time of day": "def move(self, action):\n    self.at += int(action) + time.time() % 1",
         "an identifier by lot": _REWARD + "uuid.uuid4().int % 1000 / 1000",
-        "the hash of a text": _REWARD + "float(hash('walk'))",
-        "the order of a set": _REWARD
-        + "sum(7.0**at * ord(one) for at, one in enumerate(set('abcdefghijkl')))",
     },
     "seed-fixed": {
         "always the same without a seed": "def reset(self, *, seed=None, options=None):\n"

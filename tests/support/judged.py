@@ -218,6 +218,7 @@ FAILING = {
     "old_gym": ("imports", "it imports gym, which nothing declares"),
     "noisy": ("loads", "it fails, and paints meanwhile"),
     "prompts": ("loads", "it asks a question that nobody answers"),
+    "walk": ("survives", "an action ends it, and one never returns"),
     "torch_obs": ("autoreset", "its episodes end in the same step, and without final_obs"),
     "wrong_types": ("loads", "what it returns is no environment"),
 }

@@ -202,7 +202,8 @@ class _Game:
         waiting = self._in_flight()
         if not waiting:
             return None
-        wanted = self._draw.randrange(1, sum(len(one.rows) for one in waiting) + 1)
+        least = 1 if len(self.slices) > 1 else self._env.num_envs  # one worker is ready as a whole
+        wanted = self._draw.randrange(least, sum(len(one.rows) for one in waiting) + 1)
         received = _asked(self._env.recv, wanted)
         ids = list(getattr(received, "env_ids", ()))
         if not ids:

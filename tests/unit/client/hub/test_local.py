@@ -202,6 +202,7 @@ for reference in sys.argv[1:]:
 """
 
 
+@needs("no-userns")  # what it starts is another user's
 def test_what_cannot_be_read_is_left_out_and_said(open_ground: Path) -> None:
     """One file or folder of another user's is no reason to end."""
     for name, mode in {"env.py": 0o644, "a.txt": 0, "b/x.txt": 0o644, "c.py": 0o644}.items():
