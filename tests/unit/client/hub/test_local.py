@@ -32,6 +32,7 @@ from envhub_sandbox.hub.snapshot import (
     snapshot_named,
     store,
 )
+from tests.support.interpreter import needs
 
 
 @pytest.fixture
