@@ -323,15 +323,16 @@ class RemoteEnvWarning(UserWarning):
 
 __all__ = [name for name in dir() if name.endswith(("Error", "Warning"))]
 
+# A loop of the caller's would end at a StopIteration, and Python prints a SyntaxError without its
+# text. A group has to be made of exceptions.
+_WITHOUT_TWIN = (StopIteration, StopAsyncIteration, SyntaxError)
 _BUILTINS: dict[str, type[Exception]] = {
     kind.__name__: kind  # OSError has several names
     for kind in vars(builtins).values()
-    if isinstance(kind, type) and issubclass(kind, Exception)
+    if isinstance(kind, type)
+    and issubclass(kind, Exception)
+    and not issubclass(kind, _WITHOUT_TWIN)
 }
-# A loop of the caller's would end at a StopIteration, and Python prints a SyntaxError without its
-# text. A group has to be made of exceptions.
-for _name in ("StopAsyncIteration", "StopIteration", "SyntaxError", "IndentationError", "TabError"):
-    del _BUILTINS[_name]
 for _name in ("Exception", "ExceptionGroup"):
     _BUILTINS.pop(_name, None)
 
