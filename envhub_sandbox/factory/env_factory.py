@@ -187,28 +187,35 @@ class EnvFactory:
             return self._suites(manifest, None)
         with repository.named():
             deadline = Deadline(repository.timeouts.startup_s)
-            ask = partial(self._launcher.open, deadline)
             try:
-                loaded = retry_while_busy(ask, self._launcher.retry_s, deadline, repository.label)
+                loaded = self._open(deadline)
             except BaseException:
                 repository.warnings.show(repository.label)
                 raise
         self._cache.save(loaded.value)
         try:
             self._agrees(loaded.manifest)
-            suites = self._suites(loaded.manifest, self._unplayed(loaded))
+            if _is_used(loaded.manifest) and _was_played(loaded.manifest):
+                loaded = self._open_again(loaded, deadline)
+            suites = self._suites(loaded.manifest, loaded)
             repository.warnings.show(repository.label)
             return suites
         except BaseException:
             self._launcher.close(loaded)
             raise
 
-    def _unplayed(self, loaded: LoadedJail) -> LoadedJail | None:
-        """The first jail, unless sub-environments were played there: files are not as in others."""
-        if not any(env.shardable and not env.sync for env in loaded.manifest.envs):
-            return loaded
-        self._launcher.close(loaded)
-        return None
+    def _open(self, deadline: Deadline, known: ExpectedManifest | None = None) -> LoadedJail:
+        ask = partial(self._launcher.open, deadline, known)
+        return retry_while_busy(ask, self._launcher.retry_s, deadline, self._repository.label)
+
+    def _open_again(self, played: LoadedJail, deadline: Deadline) -> LoadedJail:
+        """Another jail in the place of one in which sub-environments were played: files that these
+        have written are not there.
+        """
+        self._launcher.close(played)
+        manifest = played.manifest
+        with self._repository.named():
+            return self._open(deadline, ExpectedManifest(manifest, manifest.envs[0]))
 
     def _suites(self, manifest: Manifest, loaded: LoadedJail | None) -> EnvSuites:
         repository = self._repository
@@ -276,6 +283,15 @@ class EnvFactory:
                 sessions[0].prewarm.adopt(loaded)
         else:
             self._launcher.close(loaded)
+
+
+def _is_used(manifest: Manifest) -> bool:
+    """Whether environments live in the jail that describes them: a suite's tasks have their own."""
+    return not manifest.lazy or len(manifest.envs) == 1
+
+
+def _was_played(manifest: Manifest) -> bool:
+    return any(env.shardable and not env.sync and env.num_envs > 1 for env in manifest.envs)
 
 
 def _each(launcher: Launcher, start: int, stop: int) -> Iterator[tuple[Launcher, tuple[int, int]]]:
