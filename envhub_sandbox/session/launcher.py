@@ -191,6 +191,7 @@ class Launcher:
         use = self._acquire(place)
         if use.server.far is not None:
             deadline.postpone(monotonic() - began)  # a cluster may have started a machine for it
+        loaded: LoadedJail | None = None
         try:  # interruption.md, rule 4
             # one on another host runs anyway
             if self.repository.timeouts.server_idle_s != 0 and use.server.is_ours:
@@ -200,7 +201,10 @@ class Launcher:
                 self.repository.places[self._worker] = loaded.address = place.address
                 return loaded
         except BaseException:
-            use.release()
+            if loaded is None:
+                use.release()
+            else:  # its finalizer does nothing once the use is released
+                self.close(loaded)
             raise
 
     def _open(
