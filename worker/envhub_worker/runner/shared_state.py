@@ -85,7 +85,8 @@ class SharedState:
         if self._report is None:
             return
         before, self._slow = self._slow, self._read()  # with modules that were imported since
-        if not _are_equal(self._torch, _torch_states()):
+        torch, self._torch = self._torch, _torch_states()  # it may have been imported since
+        if not _are_equal(torch, self._torch):
             self._say("torch")
             return
         for key, value in before.items():

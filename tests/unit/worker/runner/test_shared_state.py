@@ -84,3 +84,19 @@ def test_what_takes_longer_to_read_is_looked_at_by_itself(
         state.look()
         scene.Scene.best += 1
     assert reported == ["module"]
+
+
+def test_torch_is_looked_at_also_where_it_is_imported_later(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    torch = pytest.importorskip("torch")
+    monkeypatch.delitem(sys.modules, "torch")
+    reported: list[str] = []
+    state = SharedState(str(tmp_path), reported.append)
+    state.look_closely()
+    monkeypatch.setitem(sys.modules, "torch", torch)
+    state.look_closely()
+    assert reported == []
+    torch.rand(1)
+    state.look_closely()
+    assert reported == ["torch"]
