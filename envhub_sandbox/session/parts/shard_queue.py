@@ -54,14 +54,10 @@ class ShardQueue(WorkerQueue):
 
     # --- there ---------------------------------------------------------------------------------
 
-    def _make_ready(self, operation: str) -> None:
+    def _is_ready(self, operation: str) -> bool:
+        """Also while other shards of the jail have not answered."""
         state = self.part.lifecycle.state
-        if state is State.READY or (state is State.PENDING and _owing(self._others)):
-            return
-        with self._naming():
-            if operation == "reset":
-                self.part.recover()
-            self._requests.make_ready(operation)
+        return state is State.READY or (state is State.PENDING and bool(_owing(self._others)))
 
     def step(self, actions: Any) -> None:
         """See ``WorkerQueue``."""

@@ -114,8 +114,12 @@ class WorkerQueue:
             )
         self._make_ready("reset")
 
+    def _is_ready(self, operation: str) -> bool:
+        """Whether it can be sent at once; a reset first finds out whether the worker lives."""
+        return operation != "reset" and self.part.lifecycle.state is State.READY
+
     def _make_ready(self, operation: str) -> None:
-        if operation != "reset" and self.part.lifecycle.state is State.READY:
+        if self._is_ready(operation):
             return
         with self._naming():
             if operation == "reset":
