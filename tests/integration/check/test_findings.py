@@ -27,7 +27,6 @@ from tests.corpus.honest import HONEST
 from tests.support import inside
 from tests.support import judged as corpus
 from tests.support.command_line import envhub, python
-from tests.support.documents import checks
 from tests.support.output.ci import obeyed
 from tests.support.repositories import write_repository
 from tests.support.samples import EXAMPLES, SAMPLES
@@ -61,11 +60,6 @@ def repository(folder: Path, text: str = _HONEST, **files: str) -> Path:
 def judged(folder: Path, steps: int = 25, **more: Any) -> Report:
     asked = JudgeOptions(reference=str(folder), arguments={"n_envs": 2}, steps=steps, **more)
     return judge(asked)
-
-
-def test_the_page_is_the_table() -> None:
-    """To write it again: ``python -m tests.support.documents.checks``."""
-    assert checks.DOCUMENT.read_text() == checks.document()
 
 
 @pytest.mark.short

@@ -19,7 +19,7 @@ from envhub_worker.protocol.lifecycle import TABLE, Event, State
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, MAX_NUM_ENVS
 from envhub_worker.protocol.manifest.manifest import MAX_ENVS
 from envhub_worker.protocol.manifest.names import MAX_NAME
-from tests.support.documents import settings
+from tests.support.documents import checks, settings
 from tests.unit.docs.test_imports import folder
 
 pytestmark = pytest.mark.same_for("users")
@@ -287,9 +287,10 @@ def test_error_tree_is_the_tree() -> None:
     assert {name for name in errors.__all__ if name.endswith("Error")} <= shown
 
 
-def test_what_is_written_from_the_source_is_up_to_date() -> None:
-    """``python -m tests.support.documents.settings`` writes it."""
-    assert settings.DOCUMENT.read_text() == settings.document()
+@pytest.mark.parametrize("page", [checks, settings])
+def test_what_is_written_from_the_source_is_up_to_date(page: Any) -> None:
+    """``python -m tests.support.documents.NAME`` writes it."""
+    assert page.DOCUMENT.read_text() == page.document()
 
 
 def test_the_rules_of_interruption_are_those_that_the_source_names() -> None:
