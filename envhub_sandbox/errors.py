@@ -14,7 +14,6 @@
         LockDriftError
       ActionError (ValueError)
         ActionTypeError (TypeError)
-      ObservationError (ValueError)
       SandboxUnavailableError
       DependencyError (ImportError)
         RequirementError
@@ -115,20 +114,6 @@ class ActionError(EnvHubError, ValueError):
 
 class ActionTypeError(ActionError, TypeError):
     """The actions are not a batch, for example a single number."""
-
-
-class ObservationError(EnvHubError, ValueError):
-    """With ``validate=True``: an observation is outside its space. The env is still usable.
-
-    Attributes:
-        index: Of the sub-environment.
-        observation: Its observation.
-    """
-
-    def __init__(self, message: str, *, index: int = 0, observation: object = None) -> None:
-        super().__init__(message)
-        self.index = index
-        self.observation = observation
 
 
 class SandboxUnavailableError(EnvHubError):

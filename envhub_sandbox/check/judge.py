@@ -20,6 +20,7 @@ from envhub_sandbox import RaySandbox, __version__
 from envhub_sandbox.check.checks import CHECKS
 from envhub_sandbox.check.findings import Report
 from envhub_sandbox.check.play.confinement import Confinement, denial_findings
+from envhub_sandbox.check.play.members import OutsideSpaceError
 from envhub_sandbox.check.play.task import TaskJudge
 from envhub_sandbox.check.settings import JudgeOptions
 from envhub_sandbox.check.static import survey, undeclared
@@ -30,7 +31,6 @@ from envhub_sandbox.errors import (
     DependencyError,
     EnvHubError,
     LoadError,
-    ObservationError,
     PackageIntegrityError,
     RemoteEnvError,
     RemoteProtocolError,
@@ -250,17 +250,17 @@ class _Judge:
         self._unrecorded = "" if self._is_here else "only --sandbox process records them"
         if self._is_here:
             try:
-                return self.make(record_denials=True, num_workers=1, validate=True)
+                return self.make(record_denials=True, num_workers=1)
             except SandboxUnavailableError as error:  # of the profile, too: then it is raised again
                 self._unrecorded = str(error)
-        return self.make(num_workers=1, validate=True)
+        return self.make(num_workers=1)
 
     @contextmanager
     def _stopping(self, task: str) -> Iterator[None]:
         try:
             yield
-        except (ObservationError, CustomSpaceError) as error:  # the latter's is of actions
-            check = "observation-space" if isinstance(error, ObservationError) else "runs"
+        except (OutsideSpaceError, CustomSpaceError) as error:  # the latter's is of actions
+            check = "observation-space" if isinstance(error, OutsideSpaceError) else "runs"
             self._report.judged(check, [str(error)], task)
         except RemoteEnvError as error:
             line = error.where.strip().partition("\n")[0]

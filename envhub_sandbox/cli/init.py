@@ -37,14 +37,14 @@ def init(
 
     If git is installed and the folder is in no checkout, 'git init' runs in it.
 
-    [bold]envhub init my-env && envhub run ./my-env --validate[/bold]
+    [bold]envhub init my-env && envhub run ./my-env[/bold]
     """
     name = repository_name(folder)
     _write(folder, starter(name, time.localtime().tm_year, lerobot=lerobot))
     make_checkout(folder)
     shown = safe_line(str(folder) if folder.is_absolute() else f"./{folder}")
     out(shown)
-    say(f"Try it: envhub run {shown} --validate. Publish it: envhub push {shown} OWNER/{name}")
+    say(f"Try it: envhub run {shown}. Publish it: envhub push {shown} OWNER/{name}")
 
 
 def repository_name(folder: Path) -> str:
@@ -84,7 +84,7 @@ __pycache__/
 
 Try it::
 
-    envhub run . --episodes 4 --n-envs 2 --validate
+    envhub run . --episodes 4 --n-envs 2
 """
 
 import gymnasium as gym
@@ -174,7 +174,8 @@ $evaluated
 ## For its authors
 
 ```sh
-envhub run . --episodes 4 --n-envs 2 --validate   # in a sandbox, every value held against its space
+envhub run . --episodes 4 --n-envs 2   # plays it in a sandbox
+envhub check .                         # judges it, every observation against its space
 pytest --envhub-ref .
 envhub push . OWNER/$name
 ```
@@ -206,7 +207,6 @@ import numpy as np
 
 
 def test_an_episode_ends_and_the_same_seed_is_the_same_episode(envhub_env):
-    """Every action and observation is held against its space on the way."""
     returns = []
     for _ in range(2):
         envhub_env.reset(seed=0)
@@ -238,7 +238,7 @@ jobs:
     # Ubuntu lets no program make user namespaces, which the strict profile needs
     - run: sudo sysctl -w kernel.apparmor_restrict_unprivileged_userns=0
     - run: envhub doctor
-    - run: envhub run . --episodes 4 --n-envs 2 --validate
+    - run: envhub check . --github
     - run: pytest --envhub-ref .
 """),
 }

@@ -27,7 +27,7 @@ _SHOWN = 40
 _OF_STATIC = {"sarif", "fail_on"}
 _OF_BOTH = {"ref", "static", "json", "token", "endpoint", "hub_cache_dir", "allow_secrets", "debug"}
 _PLAIN = ("Python", "text")
-_OPTIONS = [key for key in opt.ALL if key not in ("num_workers", "validate", "output")]
+_OPTIONS = [key for key in opt.ALL if key not in ("num_workers", "output")]
 
 
 @opt.with_options(*_OPTIONS)

@@ -50,9 +50,8 @@ def push(
 ) -> None:
     """Publish a folder on the Hub as one commit, and print the pinned reference.
 
-    First the folder is loaded, reset and stepped in a sandbox, and every value is compared with
-    its space. If that fails, nothing is uploaded; otherwise exactly the checked copy is. Files of
-    the repository that the folder lacks stay there.
+    First the folder is loaded, reset and stepped in a sandbox. If that fails, nothing is uploaded;
+    otherwise exactly the checked copy is. Files of the repository that the folder lacks stay there.
     """
     from envhub_sandbox.hub.reference import HubRef
     from envhub_sandbox.hub.snapshot import local
@@ -96,7 +95,7 @@ def _check(snapshot: Snapshot, options: dict[str, Any]) -> None:
     """
     from envhub_sandbox.factory.make_env import make_env
 
-    with make_env(snapshot.reference, n_envs=2, validate=True, **options) as suites:
+    with make_env(snapshot.reference, n_envs=2, **options) as suites:
         for _, _, env in opt.select_envs(suites, None, None):
             env.reset(seed=0)
             env.action_space.seed(0)

@@ -27,7 +27,6 @@ from envhub_sandbox.session.repository import Recipe, Repository
 from envhub_sandbox.settings.policy import Limits, Policy, Timeouts
 from envhub_sandbox.system.folders import CACHE_VARIABLE, cache_root
 from envhub_sandbox.system.platform import end_with
-from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.runtime import Runtime
 
@@ -55,7 +54,7 @@ def _built(folder: Path, order: Mapping[str, Any]) -> dict[str, Any]:
     tools = _tools(folder / "tools")
     repository = _repository(folder, order)
     launcher = Launcher(repository, PROCESS, cache_root() / "snapshots")
-    with EnvFactory([launcher], 1, 0, SandboxVectorEnv, lambda manifest: None).make() as suites:
+    with EnvFactory([launcher], 1, 0, lambda manifest: None).make() as suites:
         env = suites.env
         names = ("packages", "python", "backend", "backend_path", "known", "environment")
         asked = {name: order[name] for name in names}

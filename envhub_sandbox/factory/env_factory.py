@@ -153,7 +153,6 @@ class EnvFactory:
             alone.
         num_workers: Over how many processes sub-environments are spread; None for as many as help.
         prewarm: How many tasks are started ahead; None for what is seen to help.
-        face: The class that callers get.
         agrees: Raises where the repository is not what was locked.
     """
 
@@ -162,10 +161,8 @@ class EnvFactory:
         launchers: Sequence[Launcher],
         num_workers: int | None,
         prewarm: int | None,
-        face: type[SandboxVectorEnv],
         agrees: Callable[[Manifest], None],
     ) -> None:
-        self._face = face
         self._agrees = agrees
         self._launchers = launchers
         self._launcher = launcher = launchers[0]
@@ -228,7 +225,7 @@ class EnvFactory:
         suites: dict[str, list[TaskPrewarm]] = {}
         for session in sessions:
             env = session.manifest
-            envs.setdefault(env.suite, {})[env.task] = self._face(session)
+            envs.setdefault(env.suite, {})[env.task] = SandboxVectorEnv(session)
             suites.setdefault(env.suite, []).append(session.prewarm)
         if shared is None and self._prewarm != 0:
             SuitePrewarm(list(suites.values()), self._prewarm)

@@ -37,7 +37,6 @@ from envhub_sandbox.system.folders import cache_root
 from envhub_sandbox.system.platform import occupy_streams
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_sandbox.vector.tracebacks import short_traceback
-from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.runtime import Runtime
@@ -71,7 +70,6 @@ def make_env(
     min_ready: int | None = None,
     lane: str = "auto",
     copy: bool = True,
-    validate: bool = False,
     server_key: str | None = None,
 ) -> EnvSuites:
     """Make the vector environments of a repository, without its code entering this process.
@@ -131,8 +129,6 @@ def make_env(
         lane: ``"auto"`` steps over shared memory where that is possible, ``"frames"`` never does.
         copy: False returns observations in shared memory instead of copies. As in Gymnasium, no
             later step changes an array that is still in use; but the worker can.
-        validate: Compare every action and observation with its space, value by value: for tests,
-            because it is slower. Shapes and dtypes are always checked.
         server_key: For ``sandbox="tcp://..."``: that server's public key.
 
     Returns:
@@ -206,7 +202,6 @@ def _make(cfg: Any, given: Options) -> EnvSuites:
         _launchers(repository, wanted.place, options),
         options.num_workers,
         _ahead(wanted, options),
-        _face(options.validate),
         lock_checker(wanted.lock, snapshot.label, load.env_kwargs, config),
     ).make()
 
@@ -284,14 +279,6 @@ def _ahead(wanted: _Plan, options: Options) -> int | None:
     if options.prewarm is None and (options.sandbox != "process" or wanted.policy.gpu):
         return 0
     return options.prewarm
-
-
-def _face(validate: bool) -> type[SandboxVectorEnv]:
-    if not validate:
-        return SandboxVectorEnv
-    from envhub_sandbox.vector.validated import ValidatedVectorEnv
-
-    return ValidatedVectorEnv
 
 
 # --- what arguments mean

@@ -35,10 +35,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.fixture
 def envhub_env(request: pytest.FixtureRequest) -> Iterator[Any]:
-    """The vector environment of ``--envhub-ref``, in a sandbox, made for this test alone.
-
-    Every action and observation is held against its space (``validate=True``).
-    """
+    """The vector environment of ``--envhub-ref``, in a sandbox, made for this test alone."""
     ref = request.config.getoption("--envhub-ref")
     if ref is None:
         pytest.fail("the fixture envhub_env needs --envhub-ref REF, as in --envhub-ref .")
@@ -50,7 +47,7 @@ def envhub_env(request: pytest.FixtureRequest) -> Iterator[Any]:
     for mark in reversed(list(marks)):  # the nearest last, which wins
         options |= mark.kwargs
     chosen = options.pop("suite", None), options.pop("task", None)
-    with make_env(_from_where_pytest_began(ref, request), **{"validate": True, **options}) as made:
+    with make_env(_from_where_pytest_began(ref, request), **options) as made:
         yield choose(made, *chosen)
 
 

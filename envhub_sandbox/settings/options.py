@@ -198,13 +198,6 @@ class Options:
         least=1,
         sandboxed=True,
     )
-    validate: bool = _option(
-        False,
-        "--validate",
-        "Compare every action and observation with its space, value by value.",
-        kind=bool,
-        sandboxed=True,
-    )
     prewarm: int | None = _option(None, kind=int, least=0, sandboxed=True)
     min_ready: int | None = _option(None, kind=int, least=1, sandboxed=True)
     lane: str = _option("auto", check=_lane)

@@ -1,6 +1,7 @@
 """Plays an environment with seeded actions and keeps a trace: a digest of each step, to compare.
 
-What a step returns is looked at meanwhile: shapes of masks, numbers that are not finite, times."""
+What a step returns is looked at meanwhile: members of the observation space, shapes of masks,
+numbers that are not finite, times."""
 
 from __future__ import annotations
 
@@ -16,6 +17,7 @@ import numpy as np
 from gymnasium.vector import VectorEnv
 
 from envhub_sandbox.check.play.episodes import Episode, EpisodeCounter, RolloutError, on_cpu
+from envhub_sandbox.check.play.members import check_observations
 
 Env = VectorEnv[Any, Any, Any]
 _NOTED = 3
@@ -74,6 +76,9 @@ def play(
         seed: Of the environment, and of the actions unless ``actions_seed`` is given.
         like: Stop at the first step that differs from this one.
         observe: Called with the number of each step that was made; 0 is the reset.
+
+    Raises:
+        OutsideSpaceError: An observation is no member of its space.
     """
     counter, counts = EpisodeCounter(env.num_envs, env.num_envs * steps, mode), True
     trace, ended = Trace(counted=counter.counted), np.zeros(env.num_envs, np.bool_)
@@ -81,6 +86,7 @@ def play(
     began = time.perf_counter()
     first = env.reset(seed=seed)[0]
     trace.times = {"reset_s": time.perf_counter() - began}
+    check_observations(env, "reset", first)
     _look_at(trace, first, "the reset")
     trace.steps.append(digest(first))
     observe(0)
@@ -89,12 +95,15 @@ def play(
             break
         resumed = ""
         if mode == "Disabled" and ended.any():
-            resumed = digest(env.reset(options={"reset_mask": ended})[0])
+            observations = env.reset(options={"reset_mask": ended})[0]
+            check_observations(env, "reset", observations)
+            resumed = digest(observations)
         actions = env.action_space.sample()
         trace.actions.append(digest(actions))
         begun = time.perf_counter()
         result = env.step(actions)
         trace.spent.append(time.perf_counter() - begun)
+        check_observations(env, "step", result[0], result[4].get("final_obs"))
         trace.steps.append(resumed + digest(result[:4]))  # infos may hold times
         ended = _judge(trace, result, ended, mode, number)
         if counts:

@@ -62,7 +62,7 @@ def _with_settings(ctx: typer.Context, path: Path | None) -> Path | None:
     return path
 
 
-_HERE = ("lock", "num_workers", "validate", "trust_remote_code", "network", "gpu", "readable")
+_HERE = ("lock", "num_workers", "trust_remote_code", "network", "gpu", "readable")
 _OPTIONS = [key for key in opt.ALL if key not in (*_HERE, "environment", "output")]
 
 

@@ -16,7 +16,6 @@ from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoA
 
 from envhub_sandbox.errors import (
     ActionError,
-    ObservationError,
     RemoteEnvError,
     WorkerDiedError,
     WorkerError,
@@ -24,8 +23,6 @@ from envhub_sandbox.errors import (
 )
 from tests.support import inside
 from tests.support.objects.gates import DIE, LARGE, RAISE, Gates, ids, send
-from tests.support.repositories import STILL, write_repository
-from tests.support.started import started
 
 pytestmark = pytest.mark.same_for("users")
 
@@ -321,17 +318,3 @@ def test_a_fork_neither_sends_nor_receives(gates: Gates) -> None:
         assert ids(again.recv()) == [0, 1]
     gates.open(1, 2)
     assert ids(env.recv(2)) == [0, 1]
-
-
-def test_what_comes_is_checked_where_that_is_wanted(tmp_path: Path, lane: str) -> None:
-    text = STILL.replace("return 0, 0.0", "return 1 + int(action), 0.0")
-    folder = write_repository(tmp_path, text)
-    with started(folder, 3, lane=lane, min_ready=1, validate=True) as env:
-        with pytest.raises(ActionError, match="the action of sub-environment 2 is outside"):
-            env.send(np.array([0, 5]), [0, 2])
-        env.send(np.array([0, 1]), [0, 2])
-        with pytest.raises(
-            ObservationError, match=r"sub-environment 2 gave np.int64\(2\)"
-        ) as caught:
-            env.recv(2)
-        assert caught.value.index == 2

@@ -22,7 +22,6 @@ from gymnasium.wrappers import TimeAwareObservation
 
 from envhub_sandbox import SandboxEnv, make_env
 from envhub_sandbox.errors import ActionError, LoadError
-from envhub_sandbox.vector.validated import ValidatedVectorEnv
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from tests.support.compare import assert_same
 from tests.support.repositories import write_repository
@@ -68,8 +67,7 @@ def test_gymnasium_makes_it_by_its_id() -> None:
 def test_gymnasiums_classes_are_among_its_direct_bases() -> None:
     """Some libraries look no further, skrl among them."""
     assert gym.Env in SandboxEnv.__bases__
-    for vector in (SandboxVectorEnv, ValidatedVectorEnv):
-        assert gym.vector.VectorEnv in vector.__bases__
+    assert gym.vector.VectorEnv in SandboxVectorEnv.__bases__
 
 
 def test_a_task_is_chosen_by_name() -> None:
@@ -325,7 +323,7 @@ def make_env(n_envs=1, use_async_envs=False, kind=0, mode="NextStep"):
 
 
 @pytest.mark.parametrize("kind", range(4))
-@pytest.mark.parametrize("options", [{}, {"lane": "frames"}, {"validate": True}], ids=str)
+@pytest.mark.parametrize("options", [{}, {"lane": "frames"}], ids=str)
 def test_empty_mappings_and_tuples_are_members_too(
     tmp_path: Path, kind: int, options: dict[str, Any]
 ) -> None:

@@ -21,7 +21,6 @@ from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.settings.policy import Policy, Timeouts
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.results import Results
-from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest.manifest import Manifest, encode_env, encode_manifest
 from envhub_worker.protocol.runtime import OWN
@@ -54,7 +53,7 @@ def launcher(server: LyingServer, tmp_path: Path, snapshot_store: Path) -> Launc
 
 
 def suites(launcher: Launcher, agrees: Callable[[Manifest], None] = lambda _: None) -> Any:
-    return EnvFactory([launcher], None, 0, SandboxVectorEnv, agrees).make()
+    return EnvFactory([launcher], None, 0, agrees).make()
 
 
 def asked(server: LyingServer, kind: type[m.Message]) -> int:

@@ -76,7 +76,6 @@ def test_what_cannot_be_is_refused(
     [
         *({"policy": {"network": "none"}}, {"limits": {"memory_bytes": MIB}}),
         *({"timeouts": {"step_s": 1}}, {"python": "python3"}, {"num_workers": 2}),
-        {"validate": True},
     ],
     ids=lambda given: next(iter(given)),
 )

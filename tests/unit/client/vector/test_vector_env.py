@@ -8,7 +8,6 @@ from collections.abc import Callable
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
-import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
@@ -20,12 +19,10 @@ from envhub_sandbox.transport.shared_memory.client_slabs import LaneShard
 from envhub_sandbox.vector import vector_env
 from envhub_sandbox.vector.sandbox_view import SandboxView
 from envhub_sandbox.vector.sub_environment import SubEnvironment
-from envhub_sandbox.vector.validated import holds
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.inert import RemoteObject
 from envhub_worker.protocol.shared_memory import slabs
-from envhub_worker.protocol.spaces.spaces import OpaqueSpace
 from tests.support import inside
 from tests.support.in_process.fake_lane import FakeLane, session_over
 from tests.support.in_process.interrupts import before_line
@@ -110,22 +107,6 @@ def test_a_runner_is_told_all_after_an_interrupt(what: str, afterwards: tuple[st
             break
         line += 1
     assert line > 4
-
-
-# --- Which values are in a space, for ``validate=True``
-
-
-def test_holds_counts_numbers_as_what_they_are_worth() -> None:
-    """Not by their dtype, as ``contains`` does."""
-    box = gym.spaces.Box(0, 1, (2,), np.float32)
-    nested = gym.spaces.Dict(a=gym.spaces.Tuple([box, gym.spaces.Discrete(3)]))
-    good = {"a": (np.array([0.0, 1.0]), np.int64(2))}
-    assert holds(nested, good)
-    assert not holds(nested, {"a": (good["a"][0], np.int64(3))})
-    assert not holds(nested, {"a": good["a"][:1]})
-    assert not holds(nested, {"b": good["a"]})
-    assert not holds(box, np.array(["0", "1"]))
-    assert holds(OpaqueSpace("their.Space", "Space()"), object())
 
 
 # --- ``env.sandbox`` beside other programs of the caller's: copies, pickles, logs

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from gymnasium import spaces
+from gymnasium.vector.utils import batch_space
 
+from envhub_sandbox.check.play.members import OutsideSpaceError, check_observations, holds
 from envhub_sandbox.check.play.traces import Trace, digest, play
+from envhub_worker.protocol.spaces.spaces import OpaqueSpace
 from tests.support import inside
 
 _MORE = (0.0, False)
@@ -23,6 +27,8 @@ class _Scripted:
     whether they end it."""
 
     num_envs = 1
+    single_observation_space = spaces.Box(-np.inf, np.inf, (), np.float64)
+    observation_space = spaces.Box(-np.inf, np.inf, (1,), np.float64)
 
     def __init__(self, begun: Sequence[float], steps: Sequence[tuple[float, bool]]) -> None:
         self.action_space = spaces.MultiDiscrete([2])
@@ -115,3 +121,46 @@ def test_a_digest_is_of_values(one: Any, two: Any) -> None:
 @pytest.mark.parametrize(("one", "two"), _OTHER)
 def test_other_values_have_another_digest(one: Any, two: Any) -> None:
     assert digest(one) != digest(two)
+
+
+def test_a_member_of_another_dtype_counts_by_its_value() -> None:
+    """Not by its dtype, as ``contains`` does."""
+    box = spaces.Box(0, 1, (2,), np.float32)
+    nested = spaces.Dict(a=spaces.Tuple([box, spaces.Discrete(3)]))
+    good = {"a": (np.array([0.0, 1.0]), np.int64(2))}
+    assert holds(nested, good)
+    assert not holds(nested, {"a": (good["a"][0], np.int64(3))})
+    assert not holds(nested, {"a": good["a"][:1]})
+    assert not holds(nested, {"b": good["a"]})
+    assert not holds(box, np.array(["0", "1"]))
+    assert holds(OpaqueSpace("their.Space", "Space()"), object())
+
+
+@pytest.mark.parametrize(
+    ("values", "final", "error"),
+    [
+        ([0.0, 0.5], None, None),
+        ([0.0, 0.5], np.array([None, 0.5], object), None),
+        ([0.0, 2.0], None, "sub-environment 1 gave"),
+        ([0.0, np.nan], None, "sub-environment 1 gave"),
+        ([0.0, 0.5], np.array([2.0, None], object), "the last step .* sub-environment 0 gave"),
+        (None, None, "no batch of observations"),
+    ],
+)
+@pytest.mark.parametrize("own", [False, True], ids=["batch", "own"])
+def test_an_observation_outside_its_space_ends_the_play(
+    values: Any, final: Any, error: str | None, own: bool
+) -> None:
+    """A space that is no batch of the single one decides for the whole batch."""
+    single = spaces.Box(0, 1, (), np.float32)
+    batched = spaces.Box(0, 1, (1, 2), np.float32) if own else batch_space(single, 2)
+    env: Any = SimpleNamespace(
+        num_envs=2, single_observation_space=single, observation_space=batched
+    )
+    batch = None if values is None else np.array([values] if own else values, np.float32)
+    if error is None:
+        check_observations(env, "step", batch, final)
+        return
+    whole = own and final is None
+    with pytest.raises(OutsideSpaceError, match="sub-environment 0 gave" if whole else error):
+        check_observations(env, "step", batch, final)
