@@ -258,12 +258,12 @@ class _SafeFormatter(logging.Formatter):
 @contextlib.contextmanager
 def _logged(*, verbose: bool, worker_output: str | None) -> Iterator[None]:
     """Show logs on stderr while it lasts."""
-    from envhub_sandbox.system.log import OUTPUT, ROOT
+    from envhub_sandbox.system.log import MESSAGES, OUTPUT, ROOT
 
     with contextlib.ExitStack() as shown:
         if verbose:
             handler = _show(shown, ROOT, "%(asctime)s %(message)s")
-            handler.addFilter(lambda record: record.name != OUTPUT.name)
+            handler.addFilter(lambda record: record.name not in (OUTPUT.name, MESSAGES.name))
             shown.callback(OUTPUT.setLevel, OUTPUT.level)
             OUTPUT.setLevel(logging.INFO)  # else no jail's output is followed
         if worker_output == "-":

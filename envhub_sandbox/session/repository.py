@@ -229,10 +229,6 @@ class Repository:
         installed: dict[str, Any] | None,
         advice: Callable[[str], str],
     ) -> None:
-        if os.environ.get("ENVHUB_TRACE") == "1":
-            from envhub_sandbox.transport import trace
-
-            trace.start()
         self.snapshot = snapshot
         self.arguments = arguments
         self.policy = policy

@@ -4,7 +4,8 @@ The loggers are silent until the application that uses us sets them up. ``envhub
 logs jails: opened, closed (DEBUG), died, timed out, restarted (INFO).
 ``envhub_sandbox.worker.output`` has every line that they print (DEBUG). ``envhub_sandbox.snapshot``
 logs downloads, ``envhub_sandbox.dependencies`` packages, ``envhub_sandbox.crashes``
-crash bundles. ``envhub_sandbox.errors`` has our own frames of what is raised (DEBUG).
+crash bundles. ``envhub_sandbox.errors`` has our own frames of what is raised, and
+``envhub_sandbox.messages`` the names of messages to and from a server, no values (DEBUG).
 
 Progress is shown on a terminal or in a notebook, for what takes a moment, such as packages.
 Elsewhere (in CI, under a program) there is the log.
@@ -30,6 +31,7 @@ SNAPSHOT = ROOT.getChild("snapshot")
 DEPENDENCIES = ROOT.getChild("dependencies")
 CRASHES = ROOT.getChild("crashes")
 ERRORS = ROOT.getChild("errors")
+MESSAGES = ROOT.getChild("messages")
 
 
 _WIDTH = 100

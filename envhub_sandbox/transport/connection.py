@@ -22,6 +22,7 @@ from envhub_sandbox.errors import (
     WorkerTimeoutError,
 )
 from envhub_sandbox.settings.options import option_name
+from envhub_sandbox.system.log import MESSAGES
 from envhub_sandbox.system.platform import OwnerProcess, fork_error_text
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.replies import expect_reply
@@ -151,6 +152,8 @@ class WorkerConnection:
         """Send a request; returns its id."""
         self.check_process()
         request_id = next(self._ids)
+        operation = getattr(message, "operation", "")
+        MESSAGES.debug("> %d %s %s", request_id, type(message).__name__, operation)
         if message is not self._packed[0]:  # a step's is the same each time
             self._packed = message, m.pack(message)
         header, *buffers = self._packed[1]
@@ -186,6 +189,7 @@ class WorkerConnection:
             if not self._must_say_hello(request_id, reply):
                 self._sent.pop(request_id, None)
                 self._kept.discard(request_id)
+                MESSAGES.debug("< %d %s", request_id, type(reply).__name__)
                 return reply, payload
             _, unanswered = self._sent.pop(request_id)
             self.hello(deadline)

@@ -12,6 +12,7 @@ from time import perf_counter_ns
 from typing import Any
 
 from envhub_sandbox.errors import EnvHubError, RemoteProtocolError, WorkerDiedError
+from envhub_sandbox.system.log import MESSAGES
 from envhub_sandbox.transport.connection import Source
 from envhub_sandbox.transport.deadline import Cores, Deadline, SpinChooser, own_cpus
 from envhub_sandbox.transport.jail import Frames, Request
@@ -266,6 +267,7 @@ class SharedMemoryLane(Lane):
                 self.observations.leave()
             super().send(request)
             return
+        MESSAGES.debug("> %s in shared memory", operation)
         self._asked = operation  # interruption.md, rule 1: first
         self._asked_ns = perf_counter_ns()
         self._spin = self._talk_spin
@@ -302,6 +304,7 @@ class SharedMemoryLane(Lane):
             self._refuse_further(missing)
             for index, reply in zip(missing, self._fetch(missing, deadline), strict=True):
                 answers[index] = reply
+        MESSAGES.debug("< %s in shared memory", operation)
         replies = [answer for answer in answers if answer is not None]
         return self._with_observations(replies) if operation == "reset" else replies
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
 import os
-import re
 import select
 import subprocess
 from collections.abc import Iterator
@@ -14,12 +12,8 @@ from itertools import pairwise
 import pytest
 
 from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError, WorkerTimeoutError
-from envhub_sandbox.transport import trace
 from envhub_sandbox.transport.connection import WorkerConnection, describe_exit
 from envhub_sandbox.transport.deadline import Deadline
-from envhub_sandbox.transport.lane import Lane
-from envhub_sandbox.transport.shared_memory.lane import SharedMemoryLane
-from envhub_sandbox.transport.shared_memory.served_lane import ServedLane
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.limits import WireLimits
 from tests.attacks.client.lying_server import Asked, Frames, LyingServer, lying
@@ -189,29 +183,9 @@ def test_the_end_of_a_server_has_arrived_as_well() -> None:
         connection.close()
 
 
-# --- ``ENVHUB_TRACE=1``: names of messages, both ways, and no value of them
-
-
-NAMES = ("send", "receive", "send_step", "send_for_infos", "wait", "replies")
-CLASSES = (WorkerConnection, Lane, SharedMemoryLane, ServedLane)
-
-
-@pytest.fixture
-def fresh(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """No class is changed yet, and none will be after the test."""
-    for cls in CLASSES:
-        for name in vars(cls).keys() & set(NAMES):
-            monkeypatch.setattr(cls, name, vars(cls)[name])
-    importlib.reload(trace)  # it starts once
-    yield
-    importlib.reload(trace)
-
-
-@pytest.mark.usefixtures("fresh")
-def test_each_message_is_a_line(capsys: pytest.CaptureFixture[str]) -> None:
-    """Once, however often it is asked for; what fails is named by its error."""
-    trace.start()
-    trace.start()
+def test_the_log_names_each_message(caplog: pytest.LogCaptureFixture) -> None:
+    """Both ways, and no value of them."""
+    caplog.set_level("DEBUG", "envhub_sandbox.messages")
     with lying() as server:
         client = WorkerConnection(server.endpoint, server.process_fd)
         client.request(m.Hello(m.VERSION, b"a secret"), deadline=Deadline(60))
@@ -219,15 +193,6 @@ def test_each_message_is_a_line(capsys: pytest.CaptureFixture[str]) -> None:
         with pytest.raises(WorkerTimeoutError):
             client.receive(99, Deadline(0))
         client.close()
-    lines = capsys.readouterr().err.splitlines()
-    ends = [
-        "> WorkerConnection.send Hello",
-        "< WorkerConnection.receive Welcome (N ms)",
-        "> WorkerConnection.send ReadOutput step",
-        "< WorkerConnection.receive Output (N ms)",
-        "< WorkerConnection.receive WorkerTimeoutError (N ms)",
+    assert [line.strip() for line in caplog.messages] == [
+        *("> 1 Hello", "< 1 Welcome", "> 2 ReadOutput step", "< 2 Output")
     ]
-    shown = [re.sub(r"\(\d+\.\d{3} ms\)", "(N ms)", line) for line in lines]
-    assert [line.split(" MainThread ")[1] for line in shown] == ends
-    assert all(re.match(r"\+\d+\.\d{6} ", line) for line in lines)
-    assert "secret" not in "".join(lines)
