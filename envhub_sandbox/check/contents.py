@@ -2,19 +2,20 @@
 
 Their beginnings and their names decide whether they are text, Python, machine code, pickles or
 archives; nothing is opened in any other sense. Reading is bounded by file and in all. Of source
-this finds what is written plainly, by people who hide nothing.
+this finds what is written plainly, by people who hide nothing: only the jail protects.
 """
 
 from __future__ import annotations
 
 import codecs
 import re
+import sys
 import unicodedata
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from envhub_sandbox.check.findings import Finding
-from envhub_sandbox.hub.sources.parsing import ParsedFile
+from envhub_sandbox.hub.sources.parsing import ImportStatement, ParsedFile
 
 BEGINNING = 8192
 """Bytes that decide what kind a file is."""
@@ -139,54 +140,81 @@ _NETWORK, _PROCESS, _DYNAMIC, _UNPICKLING, _NATIVE, _OUTSIDE, _OBSCURE = (
     f"source-{kind}"
     for kind in ("network", "process", "dynamic", "pickle", "native", "outside", "obscure")
 )
+
+
+def _each(check: str, *names: str) -> dict[str, str]:
+    return dict.fromkeys(" ".join(names).split(), check)
+
+
 _MODULES = {
-    **dict.fromkeys(
-        ("socket", "ssl", "http", "urllib", "requests", "httpx", "aiohttp", "ftplib", "smtplib"),
+    **_each(
         _NETWORK,
+        "socket ssl http urllib requests httpx aiohttp ftplib smtplib urllib3 websocket websockets",
+        "paramiko xmlrpc socketserver telnetlib poplib imaplib nntplib asyncore asynchat wsgiref",
+        "pycurl zmq grpc tornado twisted trio anyio gevent eventlet httplib2 httpcore boto3",
     ),
-    **dict.fromkeys(("urllib3", "websocket", "websockets", "paramiko", "xmlrpc"), _NETWORK),
-    **dict.fromkeys(("socketserver", "telnetlib", "poplib", "imaplib"), _NETWORK),
-    **dict.fromkeys(("subprocess", "pty"), _PROCESS),
-    **dict.fromkeys(("pickle", "dill", "joblib", "cloudpickle", "marshal", "shelve"), _UNPICKLING),
-    **dict.fromkeys(("ctypes", "cffi"), _NATIVE),
-    **dict.fromkeys(("builtins", "runpy", "zipimport", "imp", "code", "codeop"), _DYNAMIC),
+    **_each(_PROCESS, "subprocess pty posix nt posixsubprocess winapi webbrowser antigravity"),
+    **_each(_PROCESS, "pexpect ptyprocess sh plumbum fabric"),
+    **_each(_UNPICKLING, "pickle dill joblib cloudpickle marshal shelve jsonpickle cPickle"),
+    **_each(_NATIVE, "ctypes cffi cffi_backend"),
+    **_each(_DYNAMIC, "builtins runpy zipimport imp code codeop frozen_importlib interpreters"),
+    **_each(_DYNAMIC, "frozen_importlib_external xxsubinterpreters"),
 }
-_CALLS = dict.fromkeys(("eval", "exec", "compile", "__import__"), _DYNAMIC)
-"""Only where they are called: the first is a common name for an argument."""
-_PROGRAMS = (
-    *("system", "popen", "fork", "forkpty", "posix_spawn", "posix_spawnp", "execl", "execle"),
-    *("execlp", "execlpe", "execv", "execve", "execvp", "execvpe", "spawnl", "spawnle", "spawnlp"),
-    *("spawnlpe", "spawnv", "spawnve", "spawnvp", "spawnvpe"),
-)
+"""By their first names; a private one of Python's, such as ``_socket``, is its public twin."""
 _NAMES = {
-    **dict.fromkeys((f"os.{name}" for name in _PROGRAMS), _PROCESS),
-    "asyncio.create_subprocess_exec": _PROCESS,
-    "asyncio.create_subprocess_shell": _PROCESS,
-    "asyncio.open_connection": _NETWORK,
-    "importlib.import_module": _DYNAMIC,
-    "importlib.util.spec_from_file_location": _DYNAMIC,
-    "importlib.util.spec_from_loader": _DYNAMIC,
-    "importlib.machinery.SourceFileLoader": _DYNAMIC,
-    "importlib.machinery.SourcelessFileLoader": _DYNAMIC,
-    "importlib.machinery.ExtensionFileLoader": _NATIVE,
-    "codecs.register": _DYNAMIC,
-    "site.addsitedir": _DYNAMIC,
-    "sys.meta_path": _DYNAMIC,
-    "sys.path_hooks": _DYNAMIC,
-    "types.CodeType": _DYNAMIC,
-    "torch.load": _UNPICKLING,
-    "pandas.read_pickle": _UNPICKLING,
-    "os.path.expanduser": _OUTSIDE,
-    "pathlib.Path.home": _OUTSIDE,
+    **_each(_DYNAMIC, "eval exec compile __import__ builtins __loader__"),
+    **_each(
+        _PROCESS,
+        "os.system os.popen os.fork os.forkpty os.posix_spawn os.posix_spawnp os.startfile",
+        "os.execl os.execle os.execlp os.execlpe os.execv os.execve os.execvp os.execvpe os.spawnl",
+        "os.spawnle os.spawnlp os.spawnlpe os.spawnv os.spawnve os.spawnvp os.spawnvpe",
+        "util.spawnv_passfds psutil.Popen .create_subprocess_exec .create_subprocess_shell",
+        ".subprocess_exec .subprocess_shell",
+    ),
+    **_each(
+        _NETWORK,
+        ".open_connection .open_unix_connection .start_server .start_unix_server .sock_connect",
+        ".create_connection .create_server .create_unix_connection .create_unix_server",
+        ".create_datagram_endpoint multiprocessing.connection.Client hub.load_state_dict_from_url",
+        "multiprocessing.connection.Listener handlers.SocketHandler handlers.DatagramHandler",
+        "handlers.HTTPHandler handlers.SMTPHandler hub.download_url_to_file",
+    ),
+    **_each(
+        _DYNAMIC,
+        "importlib.import_module importlib.__import__ importlib.util.spec_from_file_location",
+        "importlib.util.spec_from_loader importlib.machinery.SourceFileLoader codecs.register",
+        "importlib.machinery.SourcelessFileLoader importlib.metadata.EntryPoint site.addsitedir",
+        "site.addpackage sys.meta_path sys.path_hooks types.CodeType types.FunctionType",
+        "pkgutil.resolve_name pkgutil.find_loader pkgutil.get_loader pydoc.importfile pydoc.locate",
+        "pydoc.safeimport config.dictConfig config.fileConfig config.DictConfigurator",
+        "config.listen timeit.timeit timeit.repeat timeit.Timer cProfile.run cProfile.runctx",
+        "profile.run profile.runctx pdb.run pdb.runeval torch.hub.load hydra.utils.instantiate",
+        "hydra.utils.get_class .exec_module .load_module .__globals__ .__builtins__ .f_globals",
+        ".f_builtins concurrent.interpreters",
+    ),
+    **_each(
+        _NATIVE,
+        "importlib.machinery.ExtensionFileLoader ctypeslib.load_library .enable_load_extension",
+        "ops.load_library classes.load_library cpp_extension.load cpp_extension.load_inline",
+    ),
+    **_each(
+        _UNPICKLING,
+        "torch.load torch.serialization.load .read_pickle reduction.ForkingPickler yaml.Loader",
+        "allow_pickle=True yaml.unsafe_load yaml.unsafe_load_all yaml.UnsafeLoader yaml.CLoader",
+        "yaml.CUnsafeLoader loader.Loader loader.UnsafeLoader cyaml.CLoader cyaml.CUnsafeLoader",
+    ),
+    "yaml.load without a Loader": _UNPICKLING,
+    **_each(_OUTSIDE, "os.path.expanduser pathlib.Path.home"),
 }
-_REFLECTED = ("os", "sys", "builtins", "importlib", "subprocess", "socket", "ctypes")
-"""Modules of which getattr may fetch what an author does not want to write down."""
+"""As a name is, or as it ends behind another; with a dot in front, what anything may have."""
+_REFLECTED = {"os", "sys", "builtins", "importlib", "subprocess", "socket", "ctypes"}
+"""Modules of which a computed name may fetch what an author does not want to write down."""
 _LONG_LINE = re.compile(r"^[^\n]{2000,}", re.MULTILINE)
 
 
 def constructs(file: str, parsed: ParsedFile) -> Iterator[Finding]:
     """What a file has of them, each once in a line."""
-    found = (*_imported(parsed), *_named(parsed), *_fetched(parsed), *_said(parsed))
+    found = (*_imported(parsed), *_used(parsed), *_said(parsed))
     for line, check, message in sorted(set(found)):
         yield Finding(check, message, file=file, line=line)
 
@@ -201,30 +229,43 @@ def long_lines(file: str, text: str) -> Iterator[Finding]:
 
 def _imported(parsed: ParsedFile) -> Iterator[tuple[int, str, str]]:
     for one in parsed.imports:
-        # below 0: names of modules; 0: names out of one; above: relative
-        modules = one.names if one.level < 0 else () if one.level else (one.module,)
-        for name in (module.partition(".")[0] for module in modules):
-            if check := _MODULES.get(name):
+        for name in dict.fromkeys(module.partition(".")[0] for module in _absolute(one)):
+            public = _bare(name) if name in sys.stdlib_module_names else name  # of _socket: socket
+            if check := _MODULES.get(public):
                 yield one.line, check, f"imports {name}"
 
 
-def _named(parsed: ParsedFile) -> Iterator[tuple[int, str, str]]:
-    for name, line in parsed.calls:
-        if check := _CALLS.get(name):
-            yield line, check, f"calls {name}"
+def _absolute(one: ImportStatement) -> Sequence[str]:
+    # below 0: names of modules; 0: names out of one; above: relative
+    return one.names if one.level < 0 else () if one.level else (one.module,)
+
+
+def _bare(name: str) -> str:
+    """As ``_os``, by which ``random`` holds ``os``, is meant; ``__dict__`` is no private name."""
+    return name if name.startswith("__") else name.lstrip("_")
+
+
+def _used(parsed: ParsedFile) -> Iterator[tuple[int, str, str]]:
+    imported = {name.partition(".")[0] for one in parsed.imports for name in _absolute(one)}
+    through = imported - _MODULES.keys()
     for name, line in parsed.uses:
-        if check := _NAMES.get(name):
-            yield line, check, f"uses {name}"
+        parts = name.split(".")
+        for found, meant in _meant(parts):
+            yield line, found, f"uses {meant}"
+        if parts[-1] in ("[computed]", "__dict__") and parts[-2] in _REFLECTED:
+            yield line, _DYNAMIC, f"gets something of {parts[-2]} by a computed name"
+        for part in map(_bare, parts[1:] if parts[0] in through else ()):
+            if part in sys.stdlib_module_names and (check := _MODULES.get(part)):
+                yield line, check, f"reaches {part} through {parts[0]}"
 
 
-def _fetched(parsed: ParsedFile) -> Iterator[tuple[int, str, str]]:
-    for module, name, line in parsed.fetches:
-        if (module, name) == ("numpy.load", "allow_pickle"):
-            yield line, _UNPICKLING, "calls numpy.load with allow_pickle"
-        elif name is None and module in _REFLECTED:
-            yield line, _DYNAMIC, f"gets something of {module} by a computed name"
-        elif check := _NAMES.get(f"{module}.{name}"):
-            yield line, check, f"gets {module}.{name} by its name"
+def _meant(parts: list[str]) -> Iterator[tuple[str, str]]:
+    """What a dotted name is in the table: by its end, of which the first may be private."""
+    bare = [*map(_bare, parts)]
+    ends = [".".join(bare[start:]) for start in range(len(parts) - 1)] or parts
+    if len(parts) != 2 or parts[0] not in ("self", "cls"):
+        ends.append(f".{parts[-1]}")
+    yield from ((check, end.strip(".")) for end in ends if (check := _NAMES.get(end)))
 
 
 def _said(parsed: ParsedFile) -> Iterator[tuple[int, str, str]]:

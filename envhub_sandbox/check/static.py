@@ -136,6 +136,8 @@ def _in_code(record: FileRecord, parsed: ParsedFile | None) -> Iterator[Finding]
     yield from itertools.islice(found, _MOST_OF_A_FILE)
     if next(found, None) is not None:
         yield _unread(record, f"there is more in it than the first {_MOST_OF_A_FILE} findings")
+    elif not parsed.is_whole:
+        yield _unread(record, "it imports or names more than is kept of a file")
 
 
 def _unread(record: FileRecord, why: str) -> Finding:

@@ -2,10 +2,9 @@
 
 ``parsing.py`` runs this file by its path, alone in a fresh interpreter: it imports the standard
 library and nothing else. Stdin has each file behind its length (four bytes, big endian), stdout
-gets one line of JSON for each, in the same order: what it imports, calls, uses and names, or its
+gets one line of JSON for each, in the same order: what it imports, uses and names, or its
 encoding where that is another than UTF-8, nothing of what is no Python, ``null`` of what was too
-much. Names are followed to what they were
-imported as in that file, and no further.
+much. Names are followed to what that file imports and assigns, and no further.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ CPU_S = 20.0
 """For one file; 256 KiB that a person wrote take less than one."""
 OUTPUT = 64 << 20
 MOST = 10_000
-"""Of each kind, for one file."""
+"""Of each kind, for one file; it is said where there are more."""
 LONGEST = 1024
 """Of a module, as a path of a file can be."""
 _LONGEST_TEXT = 200
@@ -46,6 +45,14 @@ _OUTSIDE = re.compile(
 _ID = re.compile(r"[A-Za-z0-9_./-]{1,80}-v\d{1,3}")
 _ENTRY_POINT = re.compile(r"([A-Za-z_][\w.]*):([A-Za-z_]\w*)")
 _MISSING = {"BaseException", "Exception", "ImportError", "ModuleNotFoundError"}
+_BUILTINS = {"eval", "exec", "compile", "__import__", "builtins", "__loader__"}
+_BY_TEXT = {"getattr", "getattr_static", "__getattribute__"}
+_IMPORTERS = {"__import__", "import_module", "resolve_name", "locate"}
+_SAVING = {"save", "savez", "savez_compressed", "write_array"}
+_MOST_MEANINGS = 16
+"""Of one expression."""
+_ROUNDS = 4
+"""Assignments that are followed behind one another, at least."""
 _WORDLESS = re.compile(r"(?<![A-Za-z0-9+/=_\\-])[A-Za-z0-9+/=_\\-]{1000,}")
 
 
@@ -90,7 +97,9 @@ def described(data: bytes) -> dict[str, Any] | None:
     try:
         # the bytes: what ``import`` compiles; a decoded text can be another program
         tree = ast.parse(data)
-        return {kind: rows[:MOST] for kind, rows in _rows(tree).items()}
+        rows = _rows(tree)
+        whole = all(len(found) <= MOST for found in rows.values())
+        return {"is_whole": whole, **{kind: found[:MOST] for kind, found in rows.items()}}
     except (RecursionError, MemoryError):
         return None
     except (SyntaxError, ValueError):
@@ -117,26 +126,22 @@ def encoding(data: bytes) -> str:
 def _rows(tree: ast.Module) -> dict[str, list[Any]]:
     required = {id(node) for node in _required(tree)}
     within = _places(tree)
-    aliases = _aliases(tree)
-    found: dict[str, list[Any]] = {
-        kind: [] for kind in ("imports", "calls", "uses", "fetches", "texts", "entries", "ids")
-    }
-    for node in ast.walk(tree):
+    nodes = list(ast.walk(tree))
+    meanings = _Meanings(nodes)
+    uses = {(name, line): None for node in nodes for name, line in meanings.used(node)}
+    found: dict[str, list[Any]] = {kind: [] for kind in ("imports", "texts", "entries", "ids")}
+    found["uses"] = [[name[:LONGEST], line] for name, line in uses]
+    for node in nodes:
         if isinstance(node, (ast.Import, ast.ImportFrom)):
             found["imports"].append(
                 [*_import(node), id(node) in required, node.lineno, within.get(id(node), "")]
             )
-        elif isinstance(node, ast.Call) and (name := _meant(node.func, aliases)):
-            found["calls"].append([name, node.lineno])
-            found["fetches"] += _fetched(name, node, aliases)
-            for module, names in _imported_by_name(name, node):
+        elif isinstance(node, ast.Call):
+            for module, names in _imported_by_name(meanings.of(node.func), node):
                 place = within.get(id(node), "")
                 found["imports"].append(
                     [*(0, module, names, id(node) in required, node.lineno), place]
                 )
-        elif isinstance(node, (ast.Name, ast.Attribute)):
-            if (name := _meant(node, aliases)) and "." in name:
-                found["uses"].append([name, node.lineno])
         elif isinstance(node, ast.Constant) and isinstance(node.value, str):
             found["texts"] += _text(node)
             if _ID.fullmatch(node.value):
@@ -184,12 +189,11 @@ def _definitions(tree: ast.Module) -> list[list[Any]]:
     return [[name, list(names)] for name, names in found.items()]
 
 
-def _imported_by_name(called: str, node: ast.Call) -> Iterator[tuple[str, list[str]]]:
+def _imported_by_name(called: list[str], node: ast.Call) -> Iterator[tuple[str, list[str]]]:
     """``import_module("a.b")``, and ``register(..., entry_point="a.b:C")``."""
-    first = node.args[0] if node.args else None
-    if called == "importlib.import_module" and isinstance(first, ast.Constant):
-        if isinstance(first.value, str) and not first.value.startswith("."):
-            yield first.value[:LONGEST], []
+    if "importlib.import_module" in called:
+        if (module := _constant(node.args[:1])) and not module.startswith("."):
+            yield module[:LONGEST], []
         return
     for keyword in node.keywords:
         value = keyword.value.value if isinstance(keyword.value, ast.Constant) else None
@@ -198,38 +202,204 @@ def _imported_by_name(called: str, node: ast.Call) -> Iterator[tuple[str, list[s
             yield found[1], [found[2]]
 
 
-def _aliases(tree: ast.Module) -> dict[str, str]:
-    """What names mean that were imported anywhere in a file: ``{"np": "numpy"}``."""
-    found = {}
-    for node in ast.walk(tree):
-        if isinstance(node, ast.Import):
-            for alias in node.names:
-                if alias.asname:
-                    found[alias.asname] = alias.name[:_LONGEST_TEXT]
-        elif isinstance(node, ast.ImportFrom) and not node.level:
-            for alias in node.names:
-                whole = f"{(node.module or '')[:_LONGEST_TEXT]}.{alias.name[:_LONGEST_TEXT]}"
-                found[alias.asname or alias.name] = whole
-    return found
+class _Meanings:
+    """What the expressions of a file may mean, by what it imports and where it assigns that to.
 
+    A name may mean several things, since no scope is followed. What a text names, as in
+    ``getattr(os, "system")`` or ``vars(os)["system"]``, is as if it were written out.
+    """
 
-def _meant(node: ast.expr, aliases: dict[str, str]) -> str:
-    first, dot, rest = _dotted(node).partition(".")
-    return f"{aliases.get(first, first)}{dot}{rest}"[:LONGEST]
+    def __init__(self, nodes: list[ast.AST]) -> None:
+        self._imported: dict[str, list[str]] = {}
+        self._assigned: dict[str, list[str]] = {}
+        self._stars: list[str] = []
+        self._free = _BUILTINS - {_bound_by(node) for node in nodes}
+        self._roots = {*self._free, *_BY_TEXT, "vars"}
+        for node in nodes:
+            if isinstance(node, (ast.Import, ast.ImportFrom)):
+                self._import(node)
+        pairs = [pair for node in nodes for pair in _assignments(node)]
+        for _ in range(_ROUNDS):
+            if not sum([self._assign(target, self.of(value)) for target, value in pairs]):
+                break
 
+    def _import(self, node: ast.Import | ast.ImportFrom) -> None:
+        for alias, name in zip(node.names, _imported(node), strict=False):
+            self._roots.add(name.partition(".")[0])
+            if alias.name == "*":
+                _add(self._stars, [name[:-2]])
+            elif alias.asname or isinstance(node, ast.ImportFrom):
+                _add(self._imported.setdefault(alias.asname or alias.name, []), [name])
+            else:
+                first = name.partition(".")[0]
+                _add(self._imported.setdefault(first, []), [first])
 
-def _fetched(called: str, node: ast.Call, aliases: dict[str, str]) -> list[list[Any]]:
-    """``getattr(module, name)``: the name is null where it is computed."""
-    if called == "numpy.load":
-        pickles = [one for one in node.keywords if one.arg == "allow_pickle" and _may_be(one.value)]
-        return [["numpy.load", "allow_pickle", node.lineno] for _ in pickles[:1]]
-    if called != "getattr" or len(node.args) < 2:
+    def _assign(self, target: ast.AST, meanings: list[str]) -> bool:
+        known = [one for one in meanings if re.split(r"[.:]", one)[0] in self._roots]
+        known = [one for one in known if not one.endswith("()")]
+        name = _bound_by(target) or getattr(target, "attr", "")
+        return bool(known and name) and _add(self._assigned.setdefault(name, []), known)
+
+    def used(self, node: ast.AST) -> list[tuple[str, int]]:
+        """What a node makes use of, dotted, or a builtin; and its line."""
+        line = getattr(node, "lineno", 0)
+        return [(name, line) for name in self._used(node)]
+
+    def _used(self, node: ast.AST) -> list[str]:
+        if isinstance(node, ast.ImportFrom):
+            return _imported(node)
+        if isinstance(node, ast.Call):
+            called = self.of(node.func)
+            builtins = [name for name in called if name in _BUILTINS]
+            return [*builtins, *_arguments(called, node), *filter(_is_dotted, self.of(node))]
+        if isinstance(node, ast.Name):
+            return [one for one in self.of(node) if _is_dotted(one) or one in self._free]
+        if isinstance(node, (ast.Attribute, ast.Subscript)):
+            return list(filter(_is_dotted, self.of(node)))
         return []
-    name = node.args[1]
-    text = name.value if isinstance(name, ast.Constant) and isinstance(name.value, str) else None
-    if isinstance(name, ast.Constant) and text is None:
-        return []
-    return [[_meant(node.args[0], aliases), text and text[:_LONGEST_TEXT], node.lineno]]
+
+    def of(self, node: ast.AST | None, left: int = _DEEPEST) -> list[str]:
+        """An expression's meanings; those of a container are its members'."""
+        found: list[str] = []
+        if not left or node is None:
+            return ["()"]
+        if isinstance(node, ast.Name):
+            found = self._named(node.id)
+        elif isinstance(node, ast.Attribute):
+            found = [f"{base}.{node.attr}" for base in self.of(node.value, left - 1)]
+            found += self._assigned.get(node.attr, [])
+        elif isinstance(node, ast.Call):
+            for function in self.of(node.func, left - 1):
+                _add(found, self._called(function, node, left - 1))
+        elif isinstance(node, ast.Subscript):
+            for base in self.of(node.value, left - 1):
+                _add(found, self._item(base, _constant([node.slice])))
+        elif isinstance(node, (ast.Constant, ast.Lambda)):
+            found = ["()"]
+        else:
+            for child in ast.iter_child_nodes(node):
+                if isinstance(child, ast.expr) and len(found) < _MOST_MEANINGS:
+                    _add(found, [one for one in self.of(child, left - 1) if one != "()"])
+        return found[:_MOST_MEANINGS] or ["()"]
+
+    def _named(self, name: str) -> list[str]:
+        if name == "__builtins__":
+            return ["builtins"]
+        usual = [name, *(f"{module}.{name}" for module in self._stars)]
+        return self._imported.get(name, usual) + self._assigned.get(name, [])
+
+    def _called(self, function: str, node: ast.Call, left: int) -> list[str]:
+        owner, _, name = function.rpartition(".")
+        owners, arguments = [owner], node.args
+        if name in _BY_TEXT and len(arguments) > 1:
+            owners, arguments = self.of(arguments[0], left), arguments[1:]
+        text = _constant(arguments[:1])
+        if name in _BY_TEXT and arguments:
+            computed = "[computed]" if not isinstance(arguments[0], ast.Constant) else "()"
+            return [f"{one}.{text or computed}" for one in owners]
+        if name in _IMPORTERS and text:
+            self._roots.add(re.split("[.:]", text)[0])
+            return [text.replace(":", ".")]
+        if name in ("attrgetter", "methodcaller") and text:
+            return [f"operator:{text}"]
+        if function.startswith("operator:") and arguments:
+            return [f"{one}.{function[9:]}" for one in self.of(arguments[0], left)]
+        if name in ("vars", "getmembers") and arguments:
+            return [f"{one}.__dict__" for one in self.of(arguments[0], left)]
+        return self._item(owner, text) if name in ("get", "pop") and text else [f"{function}()"]
+
+    def _item(self, base: str, key: str) -> list[str]:
+        """What a dict, by what it is, has by a key; else what is in a container."""
+        if base in ("globals()", "locals()", "vars()") and key:
+            return self._named(key)
+        if base == "sys.modules" and key:
+            return [key]
+        if base == "builtins" or base.endswith(".__dict__"):
+            return [f"{base.removesuffix('.__dict__')}.{key or '[computed]'}"]
+        return [base]
+
+
+def _imported(node: ast.Import | ast.ImportFrom) -> list[str]:
+    """The dotted name of each thing that a statement imports, but of the repository's own."""
+    names = [alias.name[:_LONGEST_TEXT] for alias in node.names]
+    if isinstance(node, ast.Import):
+        return names
+    module = (node.module or "")[:_LONGEST_TEXT]
+    return [] if node.level else [f"{module}.{name}" for name in names]
+
+
+def _add(known: list[str], further: list[str]) -> bool:
+    """Whether there was one among them that was not known."""
+    new = [one for one in dict.fromkeys(further) if one not in known]
+    known += new[: max(_MOST_MEANINGS - len(known), 0)]
+    return bool(new) and len(known) < _MOST_MEANINGS
+
+
+def _is_dotted(name: str) -> bool:
+    return "." in name and not name.endswith("()")
+
+
+def _constant(nodes: list[ast.expr]) -> str:
+    """A text that is written out, alone; else an empty one."""
+    value = nodes[0].value if nodes and isinstance(nodes[0], ast.Constant) else None
+    return value[:_LONGEST_TEXT] if isinstance(value, str) else ""
+
+
+def _bound_by(node: ast.AST) -> str:
+    """The name that a node gives a value of a file's own."""
+    if isinstance(node, ast.Name):
+        return "" if isinstance(node.ctx, ast.Load) else node.id
+    if isinstance(node, (ast.arg, ast.keyword)):
+        return node.arg or ""
+    return node.name if isinstance(node, (ast.FunctionDef, ast.ClassDef)) else ""
+
+
+def _assignments(node: ast.AST) -> Iterator[tuple[ast.AST, ast.expr]]:
+    """Each target with its value; a loop's is a member."""
+    if isinstance(node, ast.Assign):
+        for target in node.targets:
+            yield from _unpacked(target, node.value)
+    elif isinstance(node, (ast.For, ast.AsyncFor, ast.comprehension)):
+        yield from _unpacked(node.target, node.iter)
+    elif isinstance(node, (ast.AnnAssign, ast.NamedExpr, ast.AugAssign)) and node.value:
+        yield from _unpacked(node.target, node.value)
+    elif isinstance(node, ast.withitem) and node.optional_vars:
+        yield from _unpacked(node.optional_vars, node.context_expr)
+    elif isinstance(node, ast.keyword):
+        yield node, node.value
+    elif isinstance(node, ast.arguments):
+        usual = [*node.posonlyargs, *node.args]
+        yield from zip(reversed(usual), reversed(node.defaults), strict=False)
+        pairs = zip(node.kwonlyargs, node.kw_defaults, strict=True)
+        yield from ((one, value) for one, value in pairs if value)
+
+
+def _unpacked(target: ast.expr, value: ast.expr) -> Iterator[tuple[ast.AST, ast.expr]]:
+    if isinstance(target, (ast.Tuple, ast.List)):
+        values = value.elts if isinstance(value, (ast.Tuple, ast.List)) else []
+        if len(values) != len(target.elts):
+            values = [value] * len(target.elts)
+        for one, its in zip(target.elts, values, strict=True):
+            yield from _unpacked(one, its)
+    elif isinstance(target, (ast.Subscript, ast.Starred)):
+        yield from _unpacked(target.value, value)
+    else:
+        yield target, value
+
+
+def _arguments(called: list[str], node: ast.Call) -> Iterator[str]:
+    """What makes a call load pickles: an argument, or the lack of one."""
+    given = {one.arg: one.value for one in node.keywords}
+    if isinstance(several := given.pop(None, None), ast.Dict):
+        keys = [_constant([key]) if key else "" for key in several.keys]
+        given |= zip(keys, several.values, strict=True)
+    if "numpy.load" in called and len(node.args) > 2:
+        given["allow_pickle"] = node.args[2]
+    names = {name.rpartition(".")[2] for name in called}
+    if _may_be(given.get("allow_pickle", ast.Constant(None))) and names.isdisjoint(_SAVING):
+        yield "allow_pickle=True"
+    if {"yaml.load", "yaml.load_all"} & {*called} and "Loader" not in given and len(node.args) < 2:
+        yield "yaml.load without a Loader"
 
 
 def _may_be(node: ast.expr) -> bool:

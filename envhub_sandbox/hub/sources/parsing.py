@@ -60,9 +60,7 @@ class ParsedFile:
 
     Attributes:
         imports: In the order of a walk.
-        calls: Dotted names.
-        uses: Dotted names, whether they are called or not.
-        fetches: Of ``getattr``: of what, and by which name; None for one that is computed.
+        uses: Dotted names, called or not; ``[computed]`` for what is got by a computed name.
         texts: ``"outside"`` with a text that names a place beyond, or ``"wordless"``; its length.
         entries: The arguments of each ``make_env``.
         ids: Texts such as ``"Ant-v5"``.
@@ -71,18 +69,18 @@ class ParsedFile:
         encoding: Where it is neither UTF-8 nor ASCII, and so has not been read: its name, or an
             empty one where there is none.
         is_python: Of this version.
+        is_whole: Whether that is all; else there is more of a kind than is kept.
     """
 
     imports: tuple[ImportStatement, ...] = ()
-    calls: tuple[tuple[str, int], ...] = ()
     uses: tuple[tuple[str, int], ...] = ()
-    fetches: tuple[tuple[str, str | None, int], ...] = ()
     texts: tuple[tuple[str, str, int, int], ...] = ()
     entries: tuple[tuple[str, int], ...] = ()
     ids: tuple[tuple[str, int], ...] = ()
     definitions: tuple[tuple[str, Sequence[str]], ...] = ()
     encoding: str | None = None
     is_python: bool = True
+    is_whole: bool = True
 
 
 def read(snapshot: Snapshot) -> dict[str, ParsedFile | None]:
@@ -162,9 +160,10 @@ def _answer(row: Any) -> ParsedFile | None:
         return None
     if not row or "encoding" in row:
         return ParsedFile(is_python=bool(row), **row)
+    whole = row.pop("is_whole")
     found: dict[str, Any] = {kind: tuple(map(tuple, rows)) for kind, rows in row.items()}
     found["imports"] = tuple(ImportStatement(*one) for one in row["imports"])
-    return ParsedFile(**found)
+    return ParsedFile(is_whole=whole, **found)
 
 
 Files = Mapping[str, ParsedFile | None]
