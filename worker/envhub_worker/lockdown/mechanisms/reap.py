@@ -11,7 +11,8 @@ from collections.abc import Callable, Collection, Iterator
 
 from envhub_worker.lockdown.mechanisms.procfs import descendants
 
-_ROUNDS_S = 5.0
+PATIENCE_S = 5.0
+"""For those that were killed; what waits in the kernel ends later."""
 _PAUSE_S = 0.001
 
 #: The signals that ``child_signals`` sets handlers for.
@@ -51,27 +52,30 @@ def kill_descendants(keep: Collection[int] = (), root: int | None = None) -> Non
     one that is inside ``fork`` when it is stopped may finish that, and its child can appear after
     the last look. So the end is a look that finds only what had ended before it began: whatever
     lives then has a parent that this look would have found. ``root`` must adopt the orphans of its
-    descendants.
+    descendants. However slow the machine is, those that are new are killed, too: what is stopped
+    counts as a process, so a limit on processes bounds how many appear.
     """
     root = os.getpid() if root is None else root
-    deadline = time.monotonic() + _ROUNDS_S
+    deadline = 0.0
+    killed: set[int] = set()
     ended: set[int] = set()
     while not ended.issuperset(descendants(root, keep)):
-        stopped = _stop_below(root, keep, deadline)
+        stopped = _stop_below(root, keep)
         _signal(stopped, signal.SIGKILL)
-        if time.monotonic() > deadline:
-            return  # what waits in the kernel ends later
+        if stopped - killed:
+            deadline = time.monotonic() + PATIENCE_S
+        elif time.monotonic() > deadline:
+            return
+        killed = stopped
         time.sleep(_PAUSE_S)
         ended = {pid for pid in stopped if _has_ended(pid)}
 
 
-def _stop_below(root: int, keep: Collection[int], deadline: float) -> set[int]:
+def _stop_below(root: int, keep: Collection[int]) -> set[int]:
     stopped: set[int] = set()
     while new := set(descendants(root, keep)) - stopped:
         _signal(new, signal.SIGSTOP)
         stopped |= new
-        if time.monotonic() > deadline:
-            break
     return stopped
 
 
