@@ -103,6 +103,8 @@ _CURES = {
     errno.ENOSPC: _SPACE,
     errno.EDQUOT: _SPACE,
     errno.EFBIG: "raise the limit on the size of a file (ulimit -f)",
+    errno.ETOOMANYREFS: "this user's processes send each other more descriptors than may be on "
+    "their way at once: try again, or raise the limit on open files (ulimit -n)",
     errno.ENOMEM: "free memory, or raise the limit on it",
 }
 

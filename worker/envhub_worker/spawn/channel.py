@@ -53,21 +53,30 @@ class Channel:
     def send_pidfd(self, message: Message, pid: int) -> None:
         """Send with a pidfd of ``pid``, a child that is not reaped yet, or this process."""
         pidfd = os.pidfd_open(pid)
-        self.send(message, [pidfd])
-        os.close(pidfd)
+        try:
+            self.send(message, [pidfd])
+        finally:
+            os.close(pidfd)
 
     def flush(self) -> None:
-        """Send what is waiting, as far as the socket takes it. A peer that is gone is no error."""
+        """Send what is waiting, as far as the socket takes it. A peer that is gone is no error.
+        Raises ``OSError``: a message cannot be sent, and is dropped.
+        """
         while self._unsent:
             data, fds = self._unsent[0]
             try:
                 socket.send_fds(self._socket, [data], fds, socket.MSG_NOSIGNAL)
             except BlockingIOError:
                 return
-            except OSError:
+            except ConnectionError:
                 pass  # the reader sees the end of the stream and says what died
-            self._unsent.popleft()
-            close_fds(fds)
+            except OSError:
+                self._drop_first()
+                raise
+            self._drop_first()
+
+    def _drop_first(self) -> None:
+        close_fds(self._unsent.popleft()[1])
 
     def receive(self) -> tuple[Message, list[int]] | None:
         """The next message and its descriptors, or None at the end of the stream.
@@ -109,7 +118,7 @@ class Channel:
     def close(self) -> None:
         """Close the socket and whatever was not sent. Idempotent."""
         while self._unsent:
-            close_fds(self._unsent.popleft()[1])
+            self._drop_first()
         self._socket.close()
 
 

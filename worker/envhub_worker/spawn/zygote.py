@@ -168,9 +168,13 @@ class Zygote:
         pid = namespaces.fork_in_new_pid_namespace() if self._common.namespaced else os.fork()
         if pid == 0:
             jail_init.run(control, output, self._common)
-        close_fds(fds)
         self._inits[pid] = jail
-        self._channel.send_pidfd({"event": "spawned", "id": jail}, pid)
+        try:
+            self._channel.send_pidfd({"event": "spawned", "id": jail}, pid)
+        except OSError as error:  # this jail's end, whose output says why, and no other's
+            os.write(output, f"the jail was not announced to the server: {error}\n".encode())
+            os.kill(pid, signal.SIGKILL)
+        close_fds(fds)
 
     def _reap(self) -> None:
         gone = False

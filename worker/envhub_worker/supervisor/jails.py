@@ -172,7 +172,11 @@ class Jails:
     def _start_runners(self, asker: Asker, entry: JailRecord, count: int) -> None:
         runners = []
         for _ in range(count):
-            runner, sock = entry.jail.start_runner()
+            try:
+                runner, sock = entry.jail.start_runner()
+            except OSError as error:  # or those that did start would live on, unheard of
+                self._events.end(entry, whole_jail("killed", detail=str(error)))
+                raise
             entry.links[runner] = RunnerLink(sock, self._wire_limits(entry))
             self._events.follow_runner(entry, runner)
             runners.append(runner)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import os
-from collections.abc import Iterator
+import socket
+from collections.abc import Iterator, Sequence
 
 import pytest
 
@@ -69,6 +71,27 @@ def test_sending_to_nobody_is_no_error(ends: tuple[Channel, Channel]) -> None:
     theirs.close()
     ours.send({"a": 1})
     assert ours.drain() == ([], True)
+
+
+def test_a_message_that_cannot_be_sent_is_an_error_and_holds_up_no_other(
+    ends: tuple[Channel, Channel], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Such as one whose descriptors the kernel refuses: its sender knows what waits for it."""
+    ours, theirs = ends
+    sends = socket.send_fds
+
+    def refuse(sock: socket.socket, data: list[bytes], fds: Sequence[int], *flags: int) -> int:
+        if fds:
+            raise OSError(errno.ETOOMANYREFS, "Too many references")
+        return sends(sock, data, fds, *flags)
+
+    monkeypatch.setattr(socket, "send_fds", refuse)
+    count = len(os.listdir("/proc/self/fd"))
+    with pytest.raises(OSError, match="Too many references"):
+        ours.send_pidfd({"n": 1}, os.getpid())
+    assert len(os.listdir("/proc/self/fd")) == count
+    ours.send({"n": 2})
+    assert theirs.receive() == ({"n": 2}, [])
 
 
 def test_oversized_message_is_refused(ends: tuple[Channel, Channel]) -> None:

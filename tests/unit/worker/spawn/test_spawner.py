@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import signal
 import subprocess
@@ -9,6 +10,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import psutil
 import pytest
@@ -17,7 +19,10 @@ from envhub_worker import bootstrap
 from envhub_worker.lockdown.mechanisms import procfs
 from envhub_worker.protocol.confinement import LACKS_PACKAGES, Confinement
 from envhub_worker.protocol.runtime import OWN, Runtime
+from envhub_worker.spawn import jail_init
+from envhub_worker.spawn.channel import Channel
 from envhub_worker.spawn.spawner import Spawner, ZygoteDied
+from envhub_worker.spawn.zygote import Zygote
 from envhub_worker.spawn.zygote_process import ZygoteProcess
 from tests.support import inside
 from tests.support.confinement_kit import (
@@ -315,3 +320,34 @@ def test_requests_wait_for_the_zygote(folder: Path) -> None:
         for cell in cells:
             cell.start()
         assert [cell.run("result = 1") for cell in cells] == [{"result": 1}] * 5
+
+
+def test_a_jail_that_cannot_be_announced_ends_alone_and_says_why(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Others of its user may have all the descriptors on their way that the kernel permits."""
+
+    def refuse(channel: Channel, message: dict[str, Any], pid: int) -> None:
+        if message["event"] == "spawned":
+            raise OSError(errno.ETOOMANYREFS, "Too many references")
+        channel.send(message)
+
+    monkeypatch.setattr(jail_init, "run", lambda *_: signal.pause())
+    monkeypatch.setattr(Channel, "send_pidfd", refuse)
+    server, theirs = Channel.pair()
+    output, written = os.pipe()
+    zygote = os.fork()
+    if zygote == 0:
+        server.close()
+        Zygote(Channel(theirs), mock.Mock(namespaced=False)).run()
+        os._exit(0)
+    theirs.close()
+    server.send({"op": "spawn", "id": 1}, [output, written])
+    os.close(written)
+    seen: list[Any] = []
+    wait_until(lambda: seen.extend(server.drain()[0]) or len(seen) == 2, "the jail lives")
+    assert seen[1] == ({"event": "exited", "id": 1, "code": None, "signal": signal.SIGKILL}, [])
+    assert b"Too many references" in os.read(output, 4096)
+    server.close()
+    assert os.waitpid(zygote, 0)[1] == 0
+    os.close(output)

@@ -121,6 +121,23 @@ def test_jails_and_their_runners_are_bounded(ours: Jails, monkeypatch: pytest.Mo
         opened(ours)
 
 
+def test_a_jail_whose_runner_cannot_be_asked_for_ends(
+    ours: Jails, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With the cause for its client; else the others would live on, and nobody hear of them."""
+    start = _Jail.start_runner
+
+    def refuse(jail: _Jail) -> tuple[int, socket.socket]:
+        if jail.others:
+            raise OSError("Too many references")
+        return start(jail)
+
+    monkeypatch.setattr(_Jail, "start_runner", refuse)
+    with pytest.raises(OSError, match="Too many references"):
+        opened(ours, 2)
+    assert ours.open_ones() == []
+
+
 def test_a_jail_is_its_sessions(ours: Jails) -> None:
     entry = opened(ours)
     for ask, request in (
