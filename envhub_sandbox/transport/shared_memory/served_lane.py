@@ -86,18 +86,20 @@ class ServedLane(Lane):
         super().renew(dead, fresh, deadline)
         for index in dead:
             self._shards[index] = self._shards[index].again()
-        if not self._attach(dead, deadline):
+        if not self._attach(dead, deadline, again=True):
             raise RemoteProtocolError("a fresh runner refuses the slabs that others take")
 
-    def _attach(self, shards: Sequence[int], deadline: Deadline) -> bool:
-        """Have the server make slabs and the runners serve them; whether all of them do."""
+    def _attach(self, shards: Sequence[int], deadline: Deadline, *, again: bool = False) -> bool:
+        """Have the server make slabs and the runners serve them; whether all of them do.
+        ``again``: others have; a refusal of the server's is raised.
+        """
         runners, wanted = self.runners, [(index, self._shards[index]) for index in shards]
         sizes = tuple((runners[index], *shard.sizes) for index, shard in wanted)
         if not all(slabs.served(*one[1:], self.jail.limits.message_bytes) for one in sizes):
             return False
         request = m.ShareSlabs(self.jail.number, sizes)
         reply, _ = self.jail.client.request(request, deadline=deadline)
-        if isinstance(reply, m.Refusal):  # its own limits are lower
+        if isinstance(reply, m.Refusal) and not again:  # its limits, or a quota, are lower
             return False
         expect_reply(reply, m.Done)
         parts = tuple((runner, 1) for runner in runners)

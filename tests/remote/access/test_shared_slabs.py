@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -13,7 +14,7 @@ from envhub_sandbox import make_env
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.shared_memory import words
-from tests.remote.listening import Listening
+from tests.remote.listening import Listening, listening
 from tests.support import inside
 from tests.support.processes import eventually
 from tests.support.samples import sample
@@ -67,6 +68,22 @@ def test_slabs_are_no_memory_beside_the_limit(env: Any) -> None:
     assert "memory_bytes" in refused.message
     # the same again is no more than there was
     assert isinstance(share(env, [(0, most)]), m.Done)
+
+
+def test_slabs_are_no_memory_beside_the_quota(tmp_path: Path) -> None:
+    """Of a key; an environment whose slabs find no room steps all the same, by messages."""
+    most = 63 * MIB
+    quota = f"--max-memory={LIMIT_BYTES + 2 * most + 8 * MIB}B"
+    with listening(tmp_path, quota) as server, opened(server) as env:
+        assert isinstance(share(env, [(0, most), (1, most)]), m.Done)
+        refused = share(env, [(2, most)])
+        assert isinstance(refused, m.Refusal), refused
+        assert "--max-memory" in refused.message
+        assert isinstance(share(env, [(1, most)]), m.Done)
+    quota = f"--max-memory={LIMIT_BYTES}B"
+    with listening(tmp_path / "full", quota) as server, opened(server) as env:
+        assert isinstance(share(env, [(0, 64)]), m.Refusal)
+        assert env.step(env.action_space.sample())[0].shape == env.observation_space.shape
 
 
 def test_slabs_that_are_made_again_leave_nothing(env: Any, server: Listening) -> None:

@@ -15,6 +15,7 @@ from envhub_worker.access.audit.log import Events, Log
 from envhub_worker.access.quotas import RETRY_S, BusyError, Quotas, Use, check_jail, use_of
 from envhub_worker.access.sessions import WATCHER, Session, Sessions
 from envhub_worker.access.store.uploads import Uploads
+from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.messages.server import DRAINING, Busy
 from envhub_worker.supervisor.jails import Jails
 from envhub_worker.supervisor.records import Asker, JailRecord
@@ -151,9 +152,19 @@ class Places:
             self._refuse_behind("jails", key, asker.session, used, quota)
             self.lines["jails"].leave(key, asker.session)
 
+    def for_slabs(self, asker: Asker, request: m.ShareSlabs) -> None:
+        """Hold slabs, of which some replace others, against the quota of memory."""
+        parts = [part for part in request.slabs if type(part) is tuple and len(part) == 4]
+        replaced = {part[0] for part in parts if type(part[0]) is int}
+        sizes = [size for part in parts for size in part[2:] if type(size) is int and size > 0]
+        for entry in self._jails.open_ones(asker.session):
+            if entry.number == request.jail:
+                more = sum(sizes) + entry.shared_bytes(replaced) - entry.shared_bytes()
+                self.for_jail(asker, {"memory_bytes": max(more, 0)})
+
     def _uses(self, key: bytes) -> list[Use]:
         return [
-            use_of(entry.jail.spec.confinement.limits, len(entry.links))
+            use_of(entry.jail.spec.confinement.limits, len(entry.links), entry.shared_bytes())
             for entry in self._jails.open_ones(key)
         ]
 

@@ -33,8 +33,9 @@ class Quotas:
 
     Attributes:
         runners: Processes of environments in them.
-        memory_bytes: The sum of its open jails' memory limits. ``processes``, ``open_files``,
-            ``disk_bytes`` and ``disk_files`` are sums of their limits, too.
+        memory_bytes: The sum of its open jails' memory limits, and of the slabs that the server
+            shares with them. ``processes``, ``open_files``, ``disk_bytes`` and ``disk_files`` are
+            sums of their limits, too.
         upload_bytes: Files of snapshots that it has brought here; the longest unused go first.
         packages_bytes: Environments of its repositories' packages, and what was downloaded for
             them; the longest unused go first.
@@ -100,9 +101,10 @@ Use = Mapping[str, int]
 """What a jail takes, or further runners of it, by the names of quotas."""
 
 
-def use_of(limits: Limits, runners: int) -> Use:
-    """What a jail with these limits takes."""
-    return {"jails": 1, "runners": runners, **{name: getattr(limits, name) for name in _LIMITED}}
+def use_of(limits: Limits, runners: int, shared_bytes: int = 0) -> Use:
+    """What a jail with these limits takes; ``shared_bytes``: of slabs, which are the server's."""
+    use = {"jails": 1, "runners": runners, **{name: getattr(limits, name) for name in _LIMITED}}
+    return {**use, "memory_bytes": limits.memory_bytes + shared_bytes}
 
 
 def check_policy(request: m.OpenJail, confinement: Confinement, permitted: Permissions) -> None:

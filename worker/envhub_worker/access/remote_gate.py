@@ -122,6 +122,8 @@ class RemoteGate(Gate):
             return self._authorize_open(asker, request)
         if isinstance(request, m.StartRunners):
             self._places.for_jail(asker, {"runners": request.runners})
+        elif isinstance(request, m.ShareSlabs):
+            self._places.for_slabs(asker, request)
         elif isinstance(request, m.Relay):
             self.sessions.used(asker.identity, asker.key, request.jail)
             self._tally.asked(self._label_of(asker.key), request.operation)

@@ -235,7 +235,7 @@ class Jails:
             if not words.served(leaves, request_bytes, observation_bytes, most):
                 raise RefusedError("WorkerError", f"no slabs are made as in {part}")
             # what the server touches first is charged to the server, whatever bounds the jail
-            if _shared_bytes(entry, runner) + request_bytes + observation_bytes > room:
+            if entry.shared_bytes({runner}) + request_bytes + observation_bytes > room:
                 raise RefusedError("WorkerError", "its slabs would be more than memory_bytes")
             slabs = ServedSlabs(leaves, request_bytes, observation_bytes)
             self._events.share(entry.links[runner], slabs)
@@ -398,12 +398,6 @@ def _note_limits(entry: JailRecord, usage: dict[str, int]) -> None:
     for name in sorted(found):
         if f"limit {name}" not in entry.denied:
             entry.denied.insert(0, f"limit {name}")
-
-
-def _shared_bytes(entry: JailRecord, but: int) -> int:
-    """Of the slabs that there are for its runners; those of one are about to be replaced."""
-    others = (link.slabs for runner, link in entry.links.items() if runner != but)
-    return sum(slabs.shared_bytes for slabs in others if slabs is not None)
 
 
 def _can_step(link: RunnerLink | None, frames: list[bytes]) -> bool:

@@ -9,7 +9,7 @@ import os
 import re
 import signal
 import traceback
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field
 from time import monotonic
 from typing import Any, NamedTuple
@@ -230,6 +230,11 @@ class JailRecord:
         sent, received = self.moved
         links = self.links.values()
         return sent + sum(one.sent for one in links), received + sum(one.received for one in links)
+
+    def shared_bytes(self, but: Collection[object] = ()) -> int:
+        """Of the slabs that the server shares with its runners, but for those of some."""
+        others = (link.slabs for runner, link in self.links.items() if runner not in but)
+        return sum(slabs.shared_bytes for slabs in others if slabs is not None)
 
     def drop(self, runner: int) -> RunnerLink:
         """Its link to a runner, which it has no more."""
