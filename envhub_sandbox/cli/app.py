@@ -58,10 +58,6 @@ _COMMANDS: dict[str, tuple[str, str | Where]] = {
         "workflow.",
         "init:init",
     ),
-    "push": (
-        "Publish a folder on the Hub as one commit, and print the pinned reference.",
-        "push:push",
-    ),
     "replay": (
         "Repeat the requests of a crash bundle, and report whether it dies in the same way.",
         "replay:replay",

@@ -44,7 +44,7 @@ def init(
     make_checkout(folder)
     shown = safe_line(str(folder) if folder.is_absolute() else f"./{folder}")
     out(shown)
-    say(f"Try it: envhub run {shown}. Publish it: envhub push {shown} OWNER/{name}")
+    say(f"Try it: envhub run {shown}. Publish it: hf upload OWNER/{name} {shown}")
 
 
 def repository_name(folder: Path) -> str:
@@ -175,9 +175,8 @@ $evaluated
 
 ```sh
 envhub run . --episodes 4 --n-envs 2   # plays it in a sandbox
-envhub check .                         # judges it, every observation against its space
 pytest --envhub-ref .
-envhub push . OWNER/$name
+envhub check . && hf upload OWNER/$name .
 ```
 """),
     "LICENSE": Template("""\

@@ -189,23 +189,6 @@ class HubClient:
 
         return copy
 
-    def publish(
-        self, repo: Repository, folder: Path, revision: str | None, message: str, *, private: bool
-    ) -> None:
-        """Upload a folder as one commit; a repository that is not there is made."""
-        client: Any = import_module("huggingface_hub")
-        with self._explained(repo, revision):
-            headers, token = self._login()
-            hub = client.HfApi(self.public_endpoint, token=token, headers=headers, **_LIBRARY)
-            sdk = {"space_sdk": "static"} if repo.repo_type == "space" else {}
-            hub.create_repo(**repo._asdict(), private=private or None, exist_ok=True, **sdk)
-            given = {"folder_path": folder, "revision": revision, "commit_message": message}
-            try:
-                hub.upload_folder(**repo._asdict(), **given)
-            except ValueError as error:  # 0.34 cannot read the answer of an endpoint of one's own
-                if "repo ID" not in str(error):
-                    raise
-
     def _download(self, repo: Repository, commit: str, path: str, **more: Any) -> Path:
         from huggingface_hub import hf_hub_download
 

@@ -1,12 +1,11 @@
 """A Hub that lies and fails on demand: a small HTTP server that speaks the Hub's API.
 
 It serves ``StubRepository`` objects truthfully until a test plants a lie in one, or a fault that
-answers the requests it matches instead. Whoever has a token may make repositories, and commit.
+answers the requests it matches instead.
 """
 
 from __future__ import annotations
 
-import base64
 import contextlib
 import hashlib
 import json
@@ -102,8 +101,6 @@ class StubHub:
         self.authorizations: list[str | None] = []
         self.page_size: int | None = None
         self.sent = 0
-        self.created: list[dict[str, Any]] = []
-        self.ignored: set[str] = set()
         self.stopped = threading.Event()
         self.noting = threading.Lock()
         hub = self
@@ -162,20 +159,6 @@ class _Handler(BaseHTTPRequestHandler):
     def do_HEAD(self) -> None:
         self._answer()
 
-    def do_POST(self) -> None:
-        self._body = self._read_body()  # first: another request may follow on the connection
-        self._answer()
-
-    def _read_body(self) -> bytes:
-        if "chunked" not in self.headers.get("Transfer-Encoding", ""):
-            return self.rfile.read(int(self.headers.get("Content-Length", 0)))
-        body = b""
-        while size := int(self.rfile.readline(), 16):
-            body += self.rfile.read(size)
-            self.rfile.readline()
-        self.rfile.readline()
-        return body
-
     def log_message(self, *_: object) -> None:
         pass
 
@@ -190,9 +173,7 @@ class _Handler(BaseHTTPRequestHandler):
             return
         split = urlsplit(self.path)
         steps = [unquote(step) for step in split.path.strip("/").split("/")]
-        if self.command == "POST":
-            self._answer_post(steps[1:])
-        elif steps[0] == "api":
+        if steps[0] == "api":
             self._answer_api(steps[1:], parse_qs(split.query))
         else:
             self._answer_file(steps)
@@ -231,9 +212,6 @@ class _Handler(BaseHTTPRequestHandler):
         if self.command != "HEAD":
             self.wfile.write(body)
 
-    def _send_json(self, value: object, status: int = 200) -> None:
-        self._send(status, json.dumps(value).encode(), {"Content-Type": "application/json"})
-
     def _absent(self, code: str, status: int = 404) -> None:
         self._send(status, b"{}", {"X-Error-Code": code, "X-Error-Message": code})
 
@@ -248,46 +226,6 @@ class _Handler(BaseHTTPRequestHandler):
             self._answer_tree(repository.at(rest[1]), query)
         else:
             self._answer_info(repository.at(rest[-1]) if rest else repository, repo_id)
-
-    def _answer_post(self, steps: list[str]) -> None:
-        repository = self.stub.repositories.get((steps[0].removesuffix("s"), "/".join(steps[1:3])))
-        if steps == ["validate-yaml"]:
-            self._send_json({"errors": [], "warnings": []})
-        elif not self.headers.get("authorization", "").startswith("Bearer hf_"):
-            self._absent("RepoNotFound", 401)
-        elif steps == ["repos", "create"]:
-            self._create(json.loads(self._body))
-        elif repository is None:
-            self._absent("RepoNotFound")
-        elif steps[3] == "preupload":
-            files = [file["path"] for file in json.loads(self._body)["files"]]
-            answers = [
-                {"path": path, "uploadMode": "regular", "shouldIgnore": path in self.stub.ignored}
-                for path in files
-            ]
-            self._send_json({"files": answers})
-        else:
-            self._commit(repository, "/".join(steps[1:3]))
-
-    def _create(self, wanted: dict[str, Any]) -> None:
-        self.stub.created.append(wanted)
-        repo_type, name = wanted.get("type", "model"), f"{wanted['organization']}/{wanted['name']}"
-        url = {"url": f"{self.stub.endpoint}/{name}", "name": name}
-        if (repo_type, name) in self.stub.repositories:
-            self._send_json({"error": "You already created this repo", **url}, 409)
-        else:
-            self.stub.add(name, {}, repo_type)
-            self._send_json(url)
-
-    def _commit(self, repository: StubRepository, name: str) -> None:
-        repository.earlier[repository.commit] = dict(repository.files)
-        for line in map(json.loads, self._body.splitlines()):
-            if line["key"] == "file":
-                value = line["value"]
-                repository.files[value["path"]] = base64.b64decode(value["content"])
-        repository.commit = hashlib.sha1(self._body).hexdigest()
-        url = f"{self.stub.endpoint}/{name}/commit/{repository.commit}"
-        self._send_json({"success": True, "commitOid": repository.commit, "commitUrl": url})
 
     def _may_see(self, repository: StubRepository) -> bool:
         return self.headers.get("authorization", "").endswith(repository.token)

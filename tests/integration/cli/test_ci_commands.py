@@ -120,7 +120,6 @@ def commands(place: Path) -> list[list[str]]:
         ["lock", raises, "--no-spaces", "--output", str(place / "lock.toml")],
         ["verify", str(place / "lock.toml"), fails, "--no-index", "--no-spaces"],
         ["prefetch", str(place / "wants")],
-        ["push", raises, "owner/name", "--dry-run"],
         ["replay", str(place / "bundle")],
         ["cache", "list"],
         ["cache", "remove", FORGED[0]],

@@ -44,7 +44,7 @@ def pytest_run(folder: Path, *options: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_a_new_repository_passes_its_own_tests(tmp_path: Path) -> None:
-    """In a sandbox, values held against spaces; so do its further options."""
+    """In a sandbox; so do its further options."""
     made = run(tmp_path, *COMMAND, "init", "my-env")
     assert (made.returncode, made.stdout) == (0, "./my-env\n")
     folder = tmp_path / "my-env"

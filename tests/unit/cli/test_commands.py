@@ -53,8 +53,6 @@ _REFUSED = [
     ("diff ./gone ./gone", 3, _NO_FOLDER),
     ("run ./gone", 3, _NO_FOLDER),
     ("run 'no spaces allowed'", 2, "Error: hub reference 'no spaces allowed'"),
-    ("push ./gone owner/name", 3, _NO_FOLDER),
-    ("push . no-owner", 2, "the owner is missing"),
     ("prefetch ./gone", 3, _NO_FOLDER),
     ("cache remove gone", 2, "the cache has nothing named 'gone'"),
     ("doctor --profile gone", 2, "it is one of strict, no-userns, container"),
