@@ -19,6 +19,7 @@ from envhub_worker.protocol.spaces import batches
 _NOT_ONE_EACH = "the worker's infos are not one mapping each"
 _SHOWN = 500
 StepResult = tuple[Any, Any, Any, Any, dict[Any, Any]]
+OwnInfo = tuple[int, dict[Any, Any], batches.Forms]
 Own = tuple[list[list[dict[Any, Any]]], Sequence[bool], tuple[Any, ...]]
 """See ``Results.own``."""
 
@@ -114,11 +115,16 @@ class Results:
         Raises:
             RemoteEnvError: It would raise in Gymnasium, too.
         """
-        return self._joined_pairs(self.own_pairs(replies))
+        own = self.own_pairs(replies)
+        forms = [form for _, _, form in own]
+        return self._joined_pairs([(index, info) for index, info, _ in own], forms)
 
-    def _joined_pairs(self, pairs: list[tuple[int, dict[Any, Any]]]) -> dict[Any, Any]:
+    def _joined_pairs(
+        self, pairs: batches.Pairs, forms: Sequence[batches.Forms] = ()
+    ) -> dict[Any, Any]:
+        most = DEFAULT_LIMITS.message_bytes
         try:
-            infos = batches.join_pairs(pairs, self.count, DEFAULT_LIMITS.message_bytes)
+            infos = batches.join_pairs(pairs, self.count, most, forms)
         except FAULTS as error:
             if isinstance(error, (EnvHubError, MemoryError)):
                 raise
@@ -126,15 +132,19 @@ class Results:
             raise remote_error(name, name, one_line(str(error), _SHOWN)) from error
         return self._restored(infos)
 
-    def own_pairs(self, replies: list[m.Value]) -> list[tuple[int, dict[Any, Any]]]:
-        """Those infos, each with the place of its sub-environment. Trust: input from the worker.
+    def own_pairs(self, replies: list[m.Value]) -> list[OwnInfo]:
+        """Those infos, each with the place of its sub-environment and its forms.
+
+        Trust: input from the worker.
 
         Raises:
             RemoteProtocolError: They are of others, or none.
         """
-        pairs, start = [], 0
+        pairs: list[OwnInfo] = []
+        start = 0
         for reply, size in zip(replies, self._sizes, strict=True):
-            pairs += [(start + index, info) for index, info in _own_infos(reply.value, size)]
+            each = _own_infos(reply.value, size)
+            pairs += [(start + index, info, forms) for index, info, forms in each]
             start += size
         return pairs
 
@@ -264,15 +274,17 @@ class Results:
         return bool(part.ndim == 1 or not self.manifest.sync)
 
 
-def _own_infos(value: Any, size: int) -> Sequence[tuple[int, dict[Any, Any]]]:
+def _own_infos(value: Any, size: int) -> Sequence[OwnInfo]:
     """Trust: input from the worker."""
-    pairs: Any = value if type(value) is tuple else (None,)
-    for pair in pairs:
-        if type(pair) is not tuple or list(map(type, pair)) != [int, dict]:
+    each: Any = value if type(value) is tuple else (None,)
+    for own in each:
+        if type(own) is not tuple or list(map(type, own)) != [int, dict, dict]:
             raise RemoteProtocolError(_NOT_ONE_EACH)
-        if not 0 <= pair[0] < size:
+        if not 0 <= own[0] < size:
             raise RemoteProtocolError("the worker's infos are of no sub-environment")
-    return cast("Sequence[tuple[int, dict[Any, Any]]]", pairs)
+        if not batches.are_forms(own[2]):
+            raise RemoteProtocolError("the worker's infos are of no form")
+    return cast("Sequence[OwnInfo]", each)
 
 
 def all_replies(replies: Sequence[m.Message], kind: type[m.M] | tuple[type[m.M], ...]) -> list[m.M]:

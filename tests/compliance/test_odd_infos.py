@@ -6,12 +6,18 @@ import contextlib
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import pytest
+from gymnasium.vector import SyncVectorEnv
 
 from envhub_sandbox import SandboxEnv, make_env
 from envhub_sandbox.errors import RemoteEnvError
 from envhub_worker.protocol.codec.inert import RemoteObject
+from tests.compliance.differential.cases import without_members
+from tests.compliance.differential.scripted import Level, Mode
+from tests.compliance.theirs.through_sandbox import by_value, vector
+from tests.support.compare import assert_same
 from tests.support.repositories import write_repository
 
 _ENV = """
@@ -96,3 +102,47 @@ def test_one_environment_has_plain_values_of_them(folder: Path) -> None:
                 assert found.tolist() == value
             else:
                 assert (type(found), found) == (type(value), value)
+
+
+_WITHOUT: dict[str, Any] = {}
+BY_ROW: dict[str, list[dict[Any, Any]]] = {
+    "a member first": [{"a": Level.LOW}, {"a": 2}, {"a": 3}],
+    "a member later": [{"a": 1}, {"a": Level.LOW}, {"a": 2.5}],
+    "members as keys": [{Mode.FAST: 1}, {Level.LOW: 2.5, "b": {Mode.FAST: 1}}, {"fast": 2.5}],
+    "an object of no dimension": [_WITHOUT, {"a": np.array(None)}, {"b": {"c": np.array(None)}}],
+    "one beside None": [{"a": None}, {"a": np.array(None)}, _WITHOUT],
+    "its own mask": [_WITHOUT, {"_a": 1, "a": "x"}, _WITHOUT],
+}
+
+
+class Tells(gym.Env[Any, Any]):
+    """Its infos are what its row of ``BY_ROW`` says."""
+
+    observation_space = gym.spaces.Discrete(2)
+    action_space = gym.spaces.Discrete(2)
+
+    def __init__(self, infos: dict[Any, Any]) -> None:
+        self.infos = infos
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        return 0, self.infos
+
+    def step(self, action: Any) -> Any:
+        return 1, 0.0, False, False, self.infos
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"num_workers": 3}, {"num_workers": 3, "lane": "frames"}, {"sandbox": ["process"] * 2}],
+    ids=str,
+)
+def test_classes_that_the_wire_changes_decide_as_in_gymnasium(options: dict[str, Any]) -> None:
+    """Which column a value makes, what a mask is called, and what rows without it hold."""
+    for name, rows in BY_ROW.items():
+        make = [lambda row=row: Tells(row) for row in rows]
+        reference = SyncVectorEnv(make)
+        with by_value(), contextlib.closing(vector(make, options=options)) as env:
+            for name_of_call, args in (("reset", ()), ("step", ([0] * len(rows),))):
+                expected = getattr(reference, name_of_call)(*args)[-1]
+                infos = getattr(env, name_of_call)(*args)[-1]
+                assert_same(without_members(expected), infos, name)

@@ -225,7 +225,8 @@ def apart(dice: Dice) -> None:
     sizes = dice.rng.choice(SIZES)
     stops = np.cumsum(sizes).tolist()
     found = Results(env_manifest(), list(zip([0, *stops], stops, strict=False)))
-    honest = [tuple((index, {"a": 1, "b": {"c": "x"}}) for index in range(size)) for size in sizes]
+    own = {"a": 1, "b": {"c": "x"}}, {"b": ("_b", False, {"c": ("_c", True, {})})}
+    honest = [tuple((index, *own) for index in range(size)) for size in sizes]
     with UNTRUSTED:
         joined = found.joined_own([m.Value(dice.spoiled(part)) for part in honest])
     for key, value in joined.items():

@@ -135,10 +135,12 @@ def test_values_for_others_are_refused(liar: LyingServer, honest: LyingServer, f
 
 
 OWN: dict[str, Any] = {
-    "of a row of the other's": ((NUM_ENVS, {"a": -1}), (0, {"a": -1})),
-    "of a row before the first": ((-1, {"a": -1}),),
+    "of a row of the other's": ((NUM_ENVS, {"a": -1}, {}), (0, {"a": -1}, {})),
+    "of a row before the first": ((-1, {"a": -1}, {}),),
     "of none": 3,
-    "that are no mapping": ((0, [1]),),
+    "that are no mapping": ((0, [1], {}),),
+    "whose mask is no text": ((0, {"a": -1}, {"a": (3, True, {})}),),
+    "whose inner forms are none": ((0, {"a": {}}, {"a": ("_a", False, {"b": 1})}),),
 }
 
 
@@ -148,9 +150,9 @@ def test_infos_of_others_are_refused(
 ) -> None:
     """Where infos do not fit together they are asked for one by one, and each is of a row."""
     with fleet(liar, honest, folder) as env:
-        honest.lies[m.FetchInfosApart] = relayed(m.Value(((0, {"a": 1}), (1, {"a": 2}))))
+        honest.lies[m.FetchInfosApart] = relayed(m.Value(((0, {"a": 1}, {}), (1, {"a": 2}, {}))))
         liar.lies[m.Step] = relayed(step_done(**TRUE, info={"a": np.zeros(ALL)}))
-        liar.lies[m.FetchInfosApart] = relayed(m.Value(((0, {"a": 8}), (1, {"a": 9}))))
+        liar.lies[m.FetchInfosApart] = relayed(m.Value(((0, {"a": 8}, {}), (1, {"a": 9}, {}))))
         assert env.step(ACTIONS)[4]["a"].tolist() == [8, 9, 1, 2]  # the control
         liar.lies[m.FetchInfosApart] = relayed(m.Value(OWN[what]))
         error = refuses(lambda: env.step(ACTIONS))
@@ -184,12 +186,12 @@ def test_infos_that_would_take_too_much_are_joined_one_by_one() -> None:
 def test_own_infos_that_would_take_too_much_are_refused() -> None:
     """Joined here, one row's makes a column for all; and what does not fit is told in short."""
     joins = Results(wire.env_manifest(OBSERVATION, ACTION, 64, sync=True), [(0, 64)])
-    assert joins.joined_own([m.Value(((0, {"a": np.zeros(1000)}),))])["a"].shape == (64, 1000)
+    assert joins.joined_own([m.Value(((0, {"a": np.zeros(1000)}, {}),))])["a"].shape == (64, 1000)
     with pytest.raises(MessageTooLargeError):
-        joins.joined_own([m.Value(((0, {"a": np.zeros(1 << 20)}),))])
+        joins.joined_own([m.Value(((0, {"a": np.zeros(1 << 20)}, {}),))])
     name = "x" * 100_000
     with pytest.raises(RemoteEnvError) as caught:
-        joins.joined_own([m.Value(((0, {name: 1.0}), (1, {name: "text"})))])
+        joins.joined_own([m.Value(((0, {name: 1.0}, {}), (1, {name: "text"}, {})))])
     assert len(str(caught.value)) < 1000
 
 

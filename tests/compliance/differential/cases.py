@@ -71,12 +71,7 @@ def case(number: int) -> Case:
         is_async = False
     if reuses:  # of which AsyncVectorEnv sends what is there after the reset
         is_async = False
-    # a member among other values is a number in the client, which then chooses the column's dtype
-    members = options.get("num_workers") == 1 or "env_kwargs" in options
-    env_fns = [
-        partial(made, observed, acted, number, index, *how, members=members)
-        for index in range(count)
-    ]
+    env_fns = [partial(made, observed, acted, number, index, *how) for index in range(count)]
     return Case(number, list(env_fns), mode, is_async, options, observing)
 
 

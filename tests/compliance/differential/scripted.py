@@ -54,7 +54,6 @@ class Scripted(gym.Env[Any, Any]):
         variety: How often a key's value is of a kind that only this sub-environment has.
         reuses: Whether it fills the same arrays and mappings again and again.
         odd_rewards: Of what kinds its rewards are, but numbers.
-        members: Whether values may be members of enumerations that are numbers or texts.
         raises: How often a reset or a step raises, before anything has changed; then infos have
             values of one kind and dtype each, which any batch of rows can hold.
     """
@@ -71,7 +70,6 @@ class Scripted(gym.Env[Any, Any]):
         reuses: bool = False,
         odd_rewards: tuple[str, ...] = (),
         raises: float | None = None,
-        members: bool = False,
     ) -> None:
         self.observation_space = observation_space
         self.action_space = action_space
@@ -83,7 +81,6 @@ class Scripted(gym.Env[Any, Any]):
         self.index = index
         self.odd_rewards = odd_rewards
         self.raises = raises
-        self.members = members
         self.count = 0
         self.buffers: Any = ({}, {}) if reuses else None
         self.draw = random.Random(f"{number} {index}")
@@ -163,7 +160,7 @@ class Scripted(gym.Env[Any, Any]):
         if kind == "steady":
             return DTYPES[self.number % len(DTYPES)](draw.randrange(100))
         if kind == "member":
-            return draw.choice(MEMBERS) if self.members else "member"
+            return draw.choice(MEMBERS)
         if kind == "scalar":
             return draw.choice(DTYPES)(draw.randrange(100))
         if kind == "array":
@@ -171,7 +168,7 @@ class Scripted(gym.Env[Any, Any]):
             shape = (2,) if draw.random() > self.variety / 4 else (3,)
             return np.full(shape, draw.randrange(100), DTYPES[self.number % len(DTYPES)])
         if kind == "objects":
-            return np.array([draw.randrange(9), None, "x"], dtype=object)
+            return draw.choice([np.array([draw.randrange(9), None, "x"]), np.array(None)])
         if kind in ("list", "tuple", "dict"):
             inner = SIMPLE if depth > 1 else KINDS
             items = [self.value(draw.choice(inner), depth + 1) for _ in range(draw.randrange(3))]

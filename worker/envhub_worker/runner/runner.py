@@ -230,7 +230,8 @@ class Runner:
         if not isinstance(env, SubEnvs):
             return m.Value(())
         # arrays without their class, as in a column: a masked one would be a text
-        return m.Value(tuple((index, taken(info)) for index, info in env.pairs))
+        each = ((index, taken(info), batches.forms_of(info)) for index, info in env.pairs)
+        return m.Value(tuple(each))
 
     def take_apart(self, request: m.TakeApart) -> m.Message:
         """Infos are sent as each sub-environment gives them from now on."""

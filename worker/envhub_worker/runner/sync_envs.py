@@ -13,6 +13,7 @@ the next rollout is announced; a frame of it is drawn once. Followed:
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from operator import itemgetter
 from typing import Any
@@ -189,6 +190,7 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         self.batch = Batch(self.single_observation_space, self.num_envs, self.reward_shape)
         self.driven: Sequence[Any] = self.envs
         self._done = [False] * self.num_envs
+        self._done_before = self._done
         self._flagged: list[int] = []  # whose flags are not both False
         self._mode = autoreset_mode
         self._sync = sync
@@ -215,6 +217,7 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
             self.batch.terminations[index] = self.batch.truncations[index] = False
         if self.driven is self.envs and announces_rollout(options):
             self.driven = [FreezingEnv(one) for one in self.envs]
+        self._done_before = self._done
         infos: Pairs = []
         self.pairs = infos
         self.reward = ()
@@ -308,11 +311,14 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
                     infos.append((index, copied(info) if copied else info))
         except BaseException as error:
             batch.carry(index)  # who was not asked any more has his last observation still
+            if same_step and flagged[-1:] == [index]:  # it is the reset that raised
+                with contextlib.suppress(Exception):  # it does not fit, and is not the failure
+                    store(index, observation)
             if isinstance(error, ValueError):
                 raise old_gym.explained(error, self.envs[index], "step") from error
             raise
         batch.stay()
-        self._done = done
+        self._done_before, self._done = self._done, done
         if self._single:
             self.integers = batches.integers(self.single_observation_space, observation)
             self.reward = () if isinstance(reward, _NUMBERS) else (reward,)
@@ -367,11 +373,14 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
                 infos[batches.APART_REWARD] = self.reward
             return infos
         try:
-            return batches.join_pairs(pairs, self.num_envs)
+            join = batches.join_slice if self.sliced else batches.join_pairs
+            return join(pairs, self.num_envs)
         except Exception:
-            if not self.sliced:
-                raise
-            return dict(batches.APART)
+            if self.sliced:
+                return dict(batches.APART)
+            if self._sync:  # whose step ends here, before it notes what has ended
+                self._done = self._done_before
+            raise
 
     def _copier(self) -> Callable[[Any], Any] | None:
         """What keeps an info as it is, where a sibling that comes next may fill the same."""

@@ -5,7 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 import gymnasium as gym
+import numpy as np
 import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.runner.sync_envs import NEW_ROLLOUT, SubEnvs, announces_rollout
@@ -24,3 +26,51 @@ def test_a_slice_says_what_it_cannot_join() -> None:
     with pytest.raises(ValueError, match="info 'a' of sub-environment 1"):
         SubEnvs(make, "NextStep", sync=True).joined(pairs)
     assert SubEnvs(make, "NextStep", sync=True, sliced=True).joined(pairs) == batches.APART
+
+
+class Fails(gym.Env[Any, Any]):
+    """Each step ends an episode. Its reset raises, or its info is not like its siblings'."""
+
+    observation_space = gym.spaces.Discrete(99)
+    action_space = gym.spaces.Discrete(2)
+    failing = ""
+    count = 0
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> Any:
+        self.count += 10
+        if self.failing == "reset":
+            raise RuntimeError("no reset")
+        return self.count, {}
+
+    def step(self, action: Any) -> Any:
+        self.count += 1
+        return self.count, 0.0, True, False, {"a": "text" if self.failing == "infos" else 1}
+
+
+@pytest.mark.parametrize(
+    ("failing", "mode"), [("reset", "SameStep"), ("infos", "Disabled"), ("infos", "NextStep")]
+)
+def test_it_goes_on_after_a_failure_as_gymnasium_does(failing: str, mode: str) -> None:
+    """An autoreset that raises leaves the last observation; a step whose infos cannot be joined
+    leaves no episode that has ended.
+    """
+    ours = SubEnvs([Fails, Fails], mode, sync=True)
+    theirs = SyncVectorEnv([Fails, Fails], autoreset_mode=AutoresetMode(mode))
+    ours.run_reset(None, None, None)
+    theirs.reset()
+    for env in (ours, theirs):
+        env.envs[1].failing = failing
+    with pytest.raises((RuntimeError, ValueError)) as expected:
+        theirs.step([0, 0])
+    with pytest.raises(expected.type):
+        ours.joined(ours.run_step(np.zeros(2, int)))
+    for env in (ours, theirs):
+        env.envs[1].failing = ""
+    if failing == "infos":
+        ours.joined(ours.run_step(np.zeros(2, int)))
+        observation = theirs.step([0, 0])[0]
+    else:
+        mask = np.array([True, False])
+        ours.run_reset(None, None, mask)
+        observation = theirs.reset(options={"reset_mask": mask})[0]
+    assert ours.batch.observation().tolist() == observation.tolist()

@@ -261,7 +261,11 @@ def _join_part(
         array = joined.get(key)
         if array is None:
             room.take(value, count)
-            array = joined[key] = _blank(value, count)
+            zeros = _is_after_mask(key, part)
+            mask = joined.pop(f"_{key}") if zeros else None
+            array = joined[key] = _blank(value, count, zeros=zeros)
+            if zeros:
+                joined[f"_{key}"] = mask
         if (array.dtype, array.shape[1:]) != (value.dtype, value.shape[1:]):
             raise ValueError("an entry is of another dtype or shape in another shard")
         array[window] = value
@@ -351,25 +355,61 @@ def _has(infos: dict[Any, Any], key: Any, index: int) -> bool:
     return not is_mask or bool(mask[index])
 
 
-def _blank(value: Any, count: int) -> Any:
-    if value.dtype == object and value.ndim == 1:
+def _blank(value: Any, count: int, *, zeros: bool = False) -> Any:
+    if value.dtype == object and value.ndim == 1 and not zeros:
         return np.full(count, None, dtype=object)
     return np.zeros((count, *value.shape[1:]), dtype=value.dtype)
 
 
+def _is_after_mask(key: Any, part: dict[Any, Any]) -> bool:
+    """Whether a slice says by the order that rows without this entry are 0: see ``join_slice``."""
+    mask = f"_{key}"
+    return f"_{mask}" not in part and next(k for k in part if k in (key, mask)) == mask
+
+
+Forms = dict[Any, Any]
+"""What infos lose on the wire and joining them depends on: see ``forms_of``."""
 Pairs = Sequence[tuple[int, dict[Any, Any]]]
 """Infos with the index of their sub-environment, in the order in which they came."""
 Column = Callable[[Any, int], Any]
 _SCALARS = frozenset({int, float, bool})
+_NO_FORMS: Forms = {}
+_NO_FORM: tuple[str, bool, Forms] = ("", False, _NO_FORMS)
+_SAME = frozenset({*_SCALARS, str, bytes, type(None), list, tuple, np.ndarray, np.bool_})
+"""Values of these classes are joined alike on both sides."""
 
 
-def join_pairs(pairs: Pairs, count: int, max_bytes: int | None = None) -> dict[Any, Any]:
+def forms_of(info: dict[Any, Any]) -> Forms:
+    """For each entry whose class the wire changes: its mask's name, whether its column is one of
+    objects, and the same of what it holds. A member of an ``IntEnum`` arrives as its number.
+    """
+    forms: Forms = {}
+    for key, value in info.items():
+        inner = forms_of(value) if isinstance(value, dict) else {}
+        if inner or type(key) is not str or not (inner or type(value) in _SAME | {dict}):
+            is_array = isinstance(value, (dict, np.ndarray)) or is_scalar(type(value))
+            forms[key] = (f"_{key}", not is_array, inner)
+    return forms
+
+
+def are_forms(forms: Any) -> bool:
+    """Whether they are what ``forms_of`` makes. Trust: they may be anything."""
+    return type(forms) is dict and all(
+        type(form) is tuple and list(map(type, form)) == [str, bool, dict] and are_forms(form[2])
+        for form in forms.values()
+    )
+
+
+def join_pairs(
+    pairs: Pairs, count: int, max_bytes: int | None = None, forms: Sequence[Forms] = ()
+) -> dict[Any, Any]:
     """The infos of ``count`` sub-environments, as ``VectorEnv._add_info`` joins them.
 
     Args:
         pairs: Each sub-environment's own.
         count: Number of sub-environments.
         max_bytes: What all columns together may take: a few bytes make a large column.
+        forms: Of each of the pairs, what ``forms_of`` says of it elsewhere.
 
     Raises:
         Exception: Whatever Gymnasium would raise, with the key in front.
@@ -386,29 +426,66 @@ def join_pairs(pairs: Pairs, count: int, max_bytes: int | None = None) -> dict[A
         return blank_column(value, count)
 
     infos: dict[Any, Any] = {}
-    for index, info in pairs:
-        add_info(infos, info, index, count, blank_column if max_bytes is None else column)
+    make = blank_column if max_bytes is None else column
+    for (index, info), own in zip(pairs, forms or itertools.repeat(_NO_FORMS), strict=False):
+        add_info(infos, info, index, count, make, own)
     return infos
 
 
+def join_slice(pairs: Pairs, count: int) -> dict[Any, Any]:
+    """``join_pairs`` of some of the sub-environments.
+
+    The column of an array of objects without dimensions is 0 where a row has no such entry, others
+    of objects are None. Rows elsewhere may all have none: the mask of such a column comes first.
+    """
+    zeros: list[Any] = []
+
+    def column(value: Any, count: int) -> Any:
+        array = blank_column(value, count)
+        if array.dtype == object and isinstance(value, np.ndarray) and not value.ndim:
+            zeros.append(array)
+        return array
+
+    infos: dict[Any, Any] = {}
+    for index, info in pairs:
+        add_info(infos, info, index, count, column)
+    return _masks_first(infos, zeros) if zeros else infos
+
+
+def _masks_first(infos: dict[Any, Any], columns: list[Any]) -> dict[Any, Any]:
+    ordered: dict[Any, Any] = {}
+    for key, value in infos.items():
+        if any(value is column for column in columns):
+            ordered[f"_{key}"] = infos[f"_{key}"]
+        ordered[key] = _masks_first(value, columns) if isinstance(value, dict) else value
+    return ordered
+
+
 def add_info(
-    infos: dict[Any, Any], info: dict[Any, Any], index: int, count: int, column: Column
+    infos: dict[Any, Any],
+    info: dict[Any, Any],
+    index: int,
+    count: int,
+    column: Column,
+    forms: Forms = _NO_FORMS,
 ) -> dict[Any, Any]:
     """``VectorEnv._add_info``, without its allocations."""
     for key, value in info.items():
         array: Any
+        mask_key, is_object, inner = forms.get(key, _NO_FORM) if forms else _NO_FORM
         try:
             if key == "final_obs":
                 array = infos.get(key)
                 if array is None:
                     array = np.full(count, None, dtype=object)
                 array[index] = value
-            elif isinstance(value, dict):
-                array = add_info(infos.get(key, {}), value, index, count, column)
+            elif isinstance(value, dict) and not is_object:
+                array = add_info(infos.get(key, {}), value, index, count, column, inner)
             else:
-                array = infos[key] if key in infos else column(value, count)
+                first = None if is_object else value
+                array = infos[key] if key in infos else column(first, count)
                 array[index] = value
-            mask_key = f"_{key}"
+            mask_key = mask_key or f"_{key}"
             mask = infos.get(mask_key)
             if mask is None:
                 mask = np.zeros(count, np.bool_)
