@@ -83,6 +83,20 @@ def test_packages_lie_behind_the_standard_library(cell: Cell) -> None:
     assert cell.run("result = callable(exit)") == {"result": True}
 
 
+def test_packages_are_as_deep_as_paths_go(folder: Path, runtime: Runtime) -> None:
+    """A stranger has chosen how deep: deeper than functions of Python call each other."""
+    deepest = runtime.packages
+    for _ in range(1500):
+        deepest += "/d"
+        os.mkdir(deepest)
+    with spawner_in(folder, STRICT, runtime=runtime) as spawner:
+        cell = new_cell(spawner, make_snapshot(folder), STRICT)
+        cell.start()
+        told = f"import os; result = os.mkdir({deepest + '/own'!r})"
+        assert cell.run(told) == {"result": None}
+    remove_tree(Path(runtime.packages))
+
+
 def test_packages_of_the_interpreter_are_not_there(cell: Cell) -> None:
     """Neither those of the tests' interpreter, nor what a distribution added to its base."""
     paths = cell.run("import sys; result = sys.path")["result"]

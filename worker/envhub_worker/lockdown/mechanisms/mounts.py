@@ -281,10 +281,15 @@ def _mount_links(snapshot: str) -> None:
 
 
 def _mirror_folders(source: str, target: str) -> None:
-    """What is shared is read-only, and perhaps another user's: in a view folders are the jail's."""
-    os.mkdir(target, 0o755)
-    for folder, names, _ in os.walk(source):
-        for name in names:
-            path = os.path.join(folder, name)
-            if not os.path.islink(path):
-                os.mkdir(target + path[len(source) :], 0o755)
+    """What is shared is read-only, and perhaps another user's: in a view folders are the jail's.
+
+    Without recursion, as ``os.walk`` has it before Python 3.12: of a package, a stranger chose how
+    deep it is.
+    """
+    waiting = [""]
+    while waiting:
+        below = waiting.pop()
+        os.mkdir(target + below, 0o755)
+        with contextlib.suppress(OSError), os.scandir(source + below) as items:
+            folders = (item.name for item in items if item.is_dir(follow_symlinks=False))
+            waiting += [f"{below}/{name}" for name in folders]
