@@ -49,6 +49,8 @@ _WATCH_S = 1.0
 _CLEAN_S = 60.0
 CACHE_WAIT_S = 10.0
 """For how long to wait for others who use uv's cache."""
+LISTEN_S = 10.0
+"""For what it has written on stderr, once it has ended: another process may hold that open."""
 _SHOWN = 4000
 _KEPT_LINES = 400
 
@@ -113,7 +115,7 @@ def run(
 
     Raises ``DependencyError``: it failed, or there is none.
     """
-    lines: list[str] = []
+    lines, done = list[str](), threading.Event()
     with (
         tempfile.TemporaryDirectory(prefix="envhub-uv-") as nowhere,
         tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as asked,
@@ -135,7 +137,9 @@ def run(
             text=True,
             errors="replace",
         )
-        listener = threading.Thread(target=_listen, args=(process.stderr, lines, tell))
+        heard = (process.stderr, lines, tell, done)
+        # not in a group of its own, which would outlive a server that is killed with its group
+        listener = threading.Thread(target=_listen, args=heard, daemon=True)
         with process:
             try:
                 listener.start()
@@ -147,7 +151,10 @@ def run(
                 raise IndexUnavailableError(text) from None
             finally:
                 process.kill()
-                listener.join()
+                listener.join(LISTEN_S)
+                done.set()
+                if listener.is_alive():
+                    process.stderr = None  # closing it would wait for the listener
         if sys.platform != "win32" and process.returncode == -signal.SIGXFSZ:
             raise PackagesTooLargeError(
                 f"{what}: a file was about to have more than {file_bytes} bytes"
@@ -179,9 +186,11 @@ def _wait(process: subprocess.Popen[str], timeout_s: float, watch: Callable[[], 
             watch()
 
 
-def _listen(stream: IO[str], lines: list[str], tell: Tell) -> None:
-    """Pass on what it writes on stderr, and keep the last lines of it."""
+def _listen(stream: IO[str], lines: list[str], tell: Tell, done: threading.Event) -> None:
+    """Pass on what is written on stderr until ``done``, and keep the last lines of it."""
     for line in stream:
+        if done.is_set():
+            return
         del lines[:-_KEPT_LINES]
         lines.append(printable(_SECRET.sub("****", line.rstrip()), 500))
         tell(lines[-1].strip())

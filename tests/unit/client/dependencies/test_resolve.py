@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import signal
 import subprocess
 import sys
 import tempfile
@@ -232,6 +233,25 @@ def another_uv(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Callable[[str
         monkeypatch.setenv("PATH", f"{tmp_path}:{os.environ['PATH']}")
 
     return replace
+
+
+def test_who_holds_the_stderr_of_a_uv_that_has_ended_is_not_waited_for(
+    another_uv: Callable[[str], None], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What uv itself has written is heard to its last line."""
+    monkeypatch.setattr(uv, "LISTEN_S", 3.0)
+    told = list[str]()
+    another_uv(
+        "import os\n"
+        "if pid := os.fork():\n"
+        f"    open({str(tmp_path / 'holder')!r}, 'w').write(str(pid))\n"
+        "    sys.exit('its last line')\n"
+        "time.sleep(600)\n"
+    )
+    with pytest.raises(DependencyError, match="its last line"):
+        uv.run(["pip"], what="no", timeout_s=600, tell=told.append)
+    os.kill(int((tmp_path / "holder").read_text()), signal.SIGKILL)  # it was not waited for
+    assert told == ["its last line"]
 
 
 def test_a_uv_that_is_late_is_ended(another_uv: Callable[[str], None], tmp_path: Path) -> None:
