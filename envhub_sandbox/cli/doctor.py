@@ -14,7 +14,6 @@ import os
 import platform
 import shutil
 import subprocess
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -238,9 +237,9 @@ def probe() -> dict[str, Any]:
 
     ``gpu`` are the device nodes that ``gpu=True`` grants, or None where that cannot be seen.
     """
-    from envhub_sandbox.sandboxes.process import BOOTSTRAP
+    from envhub_sandbox.sandboxes.process import worker_program
 
-    command = [sys.executable, "-I", str(BOOTSTRAP), "probe"]
+    command = worker_program("probe")
     try:
         done = subprocess.run(command, capture_output=True, timeout=_PROBE_S, check=True, cwd="/")
         found = json_format.loads(done.stdout)

@@ -257,6 +257,15 @@ def _distribution(name: str) -> metadata.Distribution | None:
         return None
 
 
+def installed_from(name: str) -> str:
+    """The folder that a distribution of this interpreter was installed from; empty for none."""
+    found = _distribution(name)
+    with contextlib.suppress(ValueError, LookupError, TypeError):
+        facts = json.loads((found.read_text("direct_url.json") if found else None) or "{}")
+        return str(facts["url"]) if isinstance(facts["dir_info"], dict) else ""
+    return ""
+
+
 def _is_among(found: metadata.Distribution | InstalledPackage, versions: SpecifierSet) -> bool:
     try:
         return versions.contains(found.version, prereleases=True)

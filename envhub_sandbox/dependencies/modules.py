@@ -12,7 +12,8 @@ import json
 import os
 import re
 import sys
-from collections.abc import Collection, Mapping
+import sysconfig
+from collections.abc import Collection, Mapping, Sequence
 from functools import lru_cache
 from importlib.machinery import PathFinder
 from pathlib import Path
@@ -23,6 +24,7 @@ from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.system.folders import cache_root, keep, recall
 from envhub_worker.protocol.records import dataclass
+from envhub_worker.protocol.runtime import mapped_modules
 from envhub_worker.protocol.text import printable
 
 if TYPE_CHECKING:
@@ -122,9 +124,36 @@ def _of_module(name: str, extras: Mapping[str, WantedPackage]) -> tuple[str, str
 
 
 def is_here(guess: Guess) -> bool:
-    """Whether this interpreter can import its module. Nothing is imported."""
-    here = [path for path in sys.path if path not in ("", os.getcwd())]
-    return PathFinder.find_spec(guess.module, here) is not None
+    """Whether a jail in this interpreter can import its module. Nothing is imported.
+
+    A jail does not have what only this process imports from: the folder of its program, the
+    current one, and those of PYTHONPATH.
+    """
+    program = getattr(sys.modules.get("__main__"), "__file__", None)
+    own = {"", os.getcwd()}
+    own.update(map(os.path.abspath, os.environ.get("PYTHONPATH", "").split(os.pathsep)))
+    if program and sys.path[0] == os.path.dirname(os.path.abspath(program)):
+        own.add(sys.path[0])
+    return bool(_path_here(guess.module, [path for path in sys.path if path not in own]))
+
+
+def _path_here(module: str, folders: Sequence[str]) -> str:
+    """Where this process finds a top-level module, as data: no finder is asked but Python's own,
+    since there are finders that install what they are asked for. Empty for nowhere.
+    """
+    mapped = mapped_modules(sys.meta_path).get(module)
+    spec = None if mapped else PathFinder.find_spec(module, folders)
+    if spec is None:
+        return mapped[0] if mapped else _built_on_import(module)
+    return spec.origin or next(iter(spec.submodule_search_locations or ()), "")
+
+
+def _built_on_import(module: str) -> str:
+    """The folder that Meson's finder builds a module in, each time it is imported."""
+    for finder in sys.meta_path:
+        if module in getattr(finder, "_top_level_modules", ()):
+            return str(getattr(finder, "_build_path", finder))
+    return ""
 
 
 def read(snapshot: Snapshot) -> tuple[tuple[str, str, int], ...]:
@@ -193,7 +222,11 @@ class MissingModule:
     def _cure(self, module: str, says: DeclaredPackages | None) -> str:
         from envhub_sandbox.hub.sources.parsing import of_module
 
-        name = next(iter(of_module(module)), "NAME-OF-THE-PACKAGE")
+        names = of_module(module)
+        path = _path_here(module.partition(".")[0], sys.path) if module else ""
+        if path and not names:  # an index may have another one of that name
+            return self._local(module.partition(".")[0], path)
+        name = next(iter(names), "NAME-OF-THE-PACKAGE")
         extra = option_name("dependencies", {"extra": [name]})
         if self.place in ("docker", "remote"):
             return self._elsewhere(extra)
@@ -206,6 +239,30 @@ class MissingModule:
             host = option_name("dependencies", "host")
             return f"{here}, as {host} says; leave that out to give it an environment of its own"
         return f"{here}; it gets an environment of its own, and the package in it, with {extra}"
+
+    def _local(self, module: str, path: str) -> str:
+        """What grants a module that this process can import, and the jail cannot."""
+        here = f"{module} is importable here at {path}, which the jail cannot see"
+        if self.place == "docker":
+            image = option_name("sandbox", "docker:IMAGE")
+            return f"{here}: it ran in a container; name an image that has it, with {image}"
+        if self.place == "remote":
+            return f"{here}: it ran on another host, whose operator has to install it"
+        if self.own:
+            host = option_name("dependencies", "host")
+            return f"{here}: it ran in an environment of its own; {host} runs it in this one"
+        python = self.python or sys.executable
+        folders = Path(path).absolute().parents
+        project = next((one for one in folders if (one / "pyproject.toml").is_file()), None)
+        project = project or next((one for one in folders if (one / "setup.py").is_file()), None)
+        editable = "" if _built_on_import(module) else "-e "
+        if project is not None:
+            return f"{here}. Install it: {python} -m pip install {editable}{project}"
+        folder = folders[Path(path).stem == "__init__"]
+        return (
+            f"{here}: it has the packages of {python} alone. Copy the module into the repository, "
+            f"or write the line {folder} into a file NAME.pth in {sysconfig.get_path('purelib')}"
+        )
 
     def _elsewhere(self, extra: str) -> str:
         where = "in a container" if self.place == "docker" else "on another host"

@@ -242,8 +242,18 @@ def _what_is_required(said: str, every: Sequence[WantedPackage]) -> str:
     """The requirements that an explanation speaks of, with where each stands."""
     words = {canonicalize_name(word) for word in re.findall(r"[A-Za-z0-9][A-Za-z0-9._-]*", said)}
     named = [one for one in every if canonicalize_name(one.requirement.name) in words]
-    lines = [f"  {one.requirement}  ({one.where})" for one in (named or every)[:20]]
+    lines = [
+        f"  {one.requirement}  ({one.where}{_from_a_folder(one.requirement.name)})"
+        for one in (named or every)[:20]
+    ]
     return "\n".join(["What is required of these packages:", *lines])
+
+
+def _from_a_folder(name: str) -> str:
+    """That this interpreter has a package from a folder, which an index need not know."""
+    folder = interpreters.installed_from(name)
+    host = option_name("dependencies", "host")
+    return f"; installed here from {folder}, which {host} uses" if folder else ""
 
 
 def advice(asked: str, tried: Sequence[str], error: ResolutionError) -> str:

@@ -47,7 +47,7 @@ from envhub_sandbox.system.platform import (
     pidfd,
     user_id,
 )
-from envhub_worker.protocol.runtime import OWN, Runtime
+from envhub_worker.protocol.runtime import OWN, Runtime, site_options
 
 if TYPE_CHECKING:
     from envhub_sandbox.dependencies.packages import PackageTarget
@@ -66,6 +66,11 @@ _SOCKET_BYTES = 107
 _LONGEST = f"/{CONTAINER}12345678/sockets/server"
 _EMPTY_S = 60.0
 """No client needs so long from a folder to the first file in it."""
+
+
+def worker_program(*arguments: str) -> list[str]:
+    """The command that runs a program of ``bootstrap.py`` in this interpreter."""
+    return [sys.executable, "-I", str(BOOTSTRAP), *site_options(), *arguments]
 
 
 class LocalServer(WorkerServer):
@@ -222,7 +227,7 @@ def _execute(
     server: LocalServer, store: Path, runtime: Runtime, ready: int
 ) -> subprocess.Popen[bytes]:
     arguments = [
-        *(sys.executable, "-I", str(BOOTSTRAP), "worker", "serve"),
+        *worker_program("worker", "serve"),
         *("--endpoint", server.endpoint, "--runtime-dir", str(server.folder)),
         *("--readable-root", str(store)),
         *("--ahead", "--python", runtime.python, "--packages", runtime.packages),

@@ -39,7 +39,9 @@ _NEEDED = {
 """What this package imports, and what that is called where it is installed from."""
 
 
-def command(python: str, program: str, *args: str, site: bool = True) -> list[str]:
+def command(
+    python: str, program: str, *args: str, site: bool = True, options: Sequence[str] = ()
+) -> list[str]:
     """The argv that runs ``program`` (a key of ``_PROGRAMS``) with ``args`` in ``python``.
 
     Without ``site`` there are no packages but the standard library, and so no start-up files of
@@ -47,7 +49,22 @@ def command(python: str, program: str, *args: str, site: bool = True) -> list[st
     variables for Python in it.
     """
     flags = ["-s" if program == "zygote" else "-I", *([] if site else ["-S"])]
-    return [python, *flags, os.path.abspath(__file__), program, *args]
+    return [python, *flags, os.path.abspath(__file__), *options, program, *args]
+
+
+def _add_user_site(folder: str) -> None:
+    """Packages of ``pip install --user``, before those of all users, as Python has them.
+
+    Python itself adds them by a home, which a server and a zygote do not have.
+    """
+    import site
+
+    site.USER_SITE = folder
+    known = list(sys.path)
+    site.addsitedir(folder)
+    shared = [known.index(path) for path in site.getsitepackages() if path in known]
+    first = min(shared, default=len(known))
+    sys.path[:] = [*known[:first], *sys.path[len(known) :], *known[first:]]
 
 
 def load_package() -> None:
@@ -67,6 +84,9 @@ def load_package() -> None:
 
 def main(argv: Sequence[str]) -> int:
     """Load the package and run the program that ``argv`` names; return its exit code."""
+    if argv[:1] == ["--user-site"]:
+        _add_user_site(argv[1])
+        argv = argv[2:]
     if not argv or argv[0] not in _PROGRAMS:
         sys.stderr.write(f"usage: bootstrap.py {{{','.join(_PROGRAMS)}}} ARGS...\n")
         return 2

@@ -19,7 +19,7 @@ import tempfile
 from typing import Any
 
 from envhub_sandbox.dependencies import index
-from envhub_sandbox.sandboxes.process import BOOTSTRAP
+from envhub_sandbox.sandboxes.process import worker_program
 from envhub_sandbox.system.folders import cache_root
 from envhub_sandbox.system.platform import pidfd
 
@@ -82,7 +82,7 @@ class WorkerActor:
         with pidfd() as ourselves:
             return subprocess.Popen(
                 [
-                    *(sys.executable, "-I", str(BOOTSTRAP), "worker", "listen", "--bind", bind),
+                    *worker_program("worker", "listen", "--bind", bind),
                     *("--only-client", client_key, "--state-dir", str(cache_root() / "ray")),
                     *(*permitted, "--dependencies", "--log-level=warning"),
                     *("--client-pidfd", str(ourselves), "--ready-fd", str(ready)),

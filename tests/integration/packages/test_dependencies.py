@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import importlib.util
+import os
+import subprocess
 import sys
+import sysconfig
+import venv
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,6 +16,7 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import DependencyError, RequirementError, ResolutionError
+from envhub_sandbox.sandboxes.process import BOOTSTRAP
 from envhub_sandbox.system.log import DEPENDENCIES
 from tests.support.compare import assert_same, rolled
 from tests.support.packages.wheels import Index, make_wheel
@@ -63,7 +68,9 @@ def test_once_made_it_needs_no_index(packages: Index, tmp_path: Path) -> None:
     assert len(packages.asked) == asked
 
 
-def test_a_missing_module_and_its_cure(packages: Index, tmp_path: Path) -> None:
+def test_a_missing_module_and_its_cure(
+    packages: Index, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The error has the module, the repository and an argument; with that it runs."""
     folder = write_repository(tmp_path / "forgetful", ENV)
     with pytest.raises(DependencyError, match="No module named 'not_here'") as caught:
@@ -73,8 +80,81 @@ def test_a_missing_module_and_its_cure(packages: Index, tmp_path: Path) -> None:
     assert "It declares no packages" in said
     assert "dependencies={'extra': ['NAME-OF-THE-PACKAGE']}" in said
     assert said.count("dependencies=") == 1
+    (tmp_path / "not_here.py").write_text("")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(DependencyError, match=r"is importable here at .*jail cannot see") as caught:
+        make_env(folder)
+    assert f"NAME.pth in {sysconfig.get_path('purelib')}" in str(caught.value)
+    (tmp_path / "setup.py").write_text("")
+    with pytest.raises(DependencyError, match=f"-m pip install -e {tmp_path}\n") as caught:
+        make_env(folder)
+    assert "NAME-OF" not in str(caught.value)
     with make_env(folder, dependencies={"extra": ["not-here"]}) as suites:
         assert suites.env.call("version") == ("2.0",)
+
+
+FINDER = """
+import importlib.util, os, sys
+TABLE = {value!r}
+class Finder:
+    TABLE = TABLE
+    @classmethod
+    def find_spec(cls, name, path=None, target=None):
+        if name not in cls.TABLE: return None
+        paths = cls.TABLE[name]
+        base = paths if isinstance(paths, str) else paths[0]
+        for file in (base, base + ".py", base + "/__init__.py"):
+            if os.path.isfile(file): return importlib.util.spec_from_file_location(name, file)
+sys.meta_path.append(Finder)
+"""
+WAYS = ["flat", "single", "redirected", "searched", "linked", "source", "for_the_user"]
+LOCAL = f"import {', '.join(WAYS)}\n" + importing(
+    "pathlib",
+    sum=f"sum(one.VALUE for one in ({', '.join(WAYS)}))",
+    beside="sorted(path.name for path in pathlib.Path(flat.__file__).parents[1].iterdir())",
+)
+
+
+def test_each_way_to_a_module_leads_there_in_a_jail(tmp_path: Path) -> None:
+    """Of ``pip install -e`` and ``--user``: tables of finders, links, ``.pth`` files. Of a finder
+    and no further: what lies beside its package is here, and not there.
+    """
+    base = tmp_path / "projects"
+    for number, name in enumerate(WAYS):
+        (base / name / name).mkdir(parents=True)
+        (base / name / name / "__init__.py").write_text(f"VALUE = {2**number}")
+    (base / "single" / "single" / "__init__.py").rename(base / "single.py")
+    venv.create(tmp_path / "venv", system_site_packages=True, symlinks=True)
+    version = f"python{sys.version_info[0]}.{sys.version_info[1]}"
+    site = tmp_path / "venv" / "lib" / version / "site-packages"
+    tables = {
+        "MAPPING": {"flat": str(base / "flat" / "flat"), "single": str(base / "single")},
+        "_redirections": {"redirected": str(base / "redirected" / "redirected" / "__init__.py")},
+        "submodule_search_locations": {"searched": [str(base / "searched" / "searched")]},
+    }
+    for name, value in tables.items():
+        finder = FINDER.format(value=value).replace("TABLE", name)
+        (site / f"editable{name}.py").write_text(finder)
+    (site / "linked").symlink_to(base / "linked" / "linked")
+    own = [sysconfig.get_path("purelib"), Path(__file__).parents[3], BOOTSTRAP.parents[1]]
+    lines = [*map(str, own), str(base / "source"), *(f"import editable{name}" for name in tables)]
+    (site / "all.pth").write_text("\n".join(lines))
+    mine = tmp_path / "home" / ".local" / "lib" / version / "site-packages"
+    mine.mkdir(parents=True)
+    (base / "for_the_user" / "for_the_user").rename(mine / "for_the_user")
+    (base / "flat" / "secret.txt").write_text("")
+    folder = write_repository(tmp_path / "repo", LOCAL)
+    code = "import sys; from envhub_sandbox import make_env\n"
+    code += (
+        "with make_env(sys.argv[1], n_envs=1) as s: print(s.env.call('sum'), s.env.call('beside'))"
+    )
+    done = subprocess.run(
+        [tmp_path / "venv" / "bin" / "python", "-c", code, folder],
+        env={**os.environ, "HOME": str(tmp_path / "home")},
+        capture_output=True,
+        text=True,
+    )
+    assert done.stdout == f"({2 ** len(WAYS) - 1},) (['flat'],)\n", done.stderr
 
 
 def test_this_interpreter_is_used_when_it_is_asked_for(packages: Index, tmp_path: Path) -> None:
@@ -102,12 +182,27 @@ def test_nothing_is_made_where_nothing_is_missing(
     ("requirements", "error", "said"),
     [
         ("numpy\n-e .\n", RequirementError, "line 2 of requirements.txt"),
-        ("not-here>=3\n", ResolutionError, "line 1 of requirements.txt"),
+        (
+            "not-here>=3\n",
+            ResolutionError,
+            "line 1 of requirements.txt; installed here from file://",
+        ),
     ],
 )
 def test_an_error_names_the_repository_and_runs_nothing(
-    packages: Index, tmp_path: Path, requirements: str, error: type[Exception], said: str
+    packages: Index,
+    tmp_path: Path,
+    requirements: str,
+    error: type[Exception],
+    said: str,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    """Of a package that is here from a folder, too: the index may have another of that name."""
+    metadata = tmp_path / "site" / "not_here-2.0.dist-info"
+    metadata.mkdir(parents=True)
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: not-here\nVersion: 2.0\n")
+    (metadata / "direct_url.json").write_text('{"dir_info": {}, "url": "file:///not-here"}')
+    monkeypatch.syspath_prepend(metadata.parent)
     folder = write_repository(tmp_path / "repo", ENV, requirements__txt=requirements)
     with pytest.raises(error, match=said) as caught:
         make_env(folder)

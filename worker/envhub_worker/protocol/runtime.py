@@ -6,6 +6,8 @@ And what it finds in its cache of the Hub: see ``HubCopy``.
 from __future__ import annotations
 
 import re
+import sys
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 from envhub_worker.protocol.errors import RemoteProtocolError
@@ -18,6 +20,12 @@ _STEP = r"\w[\w.+#=@%,-]{0,99}"
 _REVISION = rf"(?a){_STEP}(/{_STEP}){{0,4}}"
 _MAX_REVISIONS = 4
 _MAX_PATH = 4096
+_TABLES = (
+    *("MAPPING", "NAMESPACES"),  # setuptools
+    "_redirections",  # editables, which Hatch and PDM use
+    *("known_source_files", "submodule_search_locations"),  # scikit-build-core
+)
+"""Where the finders of ``pip install -e`` say which module lies where."""
 
 
 class Runtime(NamedTuple):
@@ -43,6 +51,35 @@ removes them has it alone. No jail sees it."""
 
 OWN = Runtime("")
 """The worker server's own interpreter, with its packages."""
+
+
+def site_options() -> list[str]:
+    """What tells ``bootstrap.py`` where ``pip install --user`` has put packages of this process."""
+    import site
+
+    folder = site.getusersitepackages()
+    return ["--user-site", folder] if folder in sys.path else []
+
+
+def mapped_modules(finders: Iterable[object]) -> dict[str, tuple[str, ...]]:
+    """Where finders (``sys.meta_path``) have modules, by full name: read as data, none is asked.
+
+    A path may lack its suffix, as setuptools writes that of a single file.
+    """
+    found: dict[str, tuple[str, ...]] = {}
+    for table in _tables(finders):
+        for name, paths in table.items():
+            each = (paths,) if isinstance(paths, str) else tuple(map(str, paths))
+            found[name] = found.get(name, ()) + each
+    return found
+
+
+def _tables(finders: Iterable[object]) -> Iterator[Mapping[str, Any]]:
+    for finder in finders:
+        module = sys.modules.get(getattr(finder, "__module__", ""))
+        for holder in (finder, module):
+            tables = (getattr(holder, "__dict__", {}).get(name) for name in _TABLES)
+            yield from (table for table in tables if isinstance(table, dict))
 
 
 class HubCopy(NamedTuple):

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from envhub_worker import bootstrap
 from envhub_worker.lockdown.mechanisms.environment import zygote_environment
-from envhub_worker.protocol.runtime import OWN, Runtime
+from envhub_worker.protocol.runtime import OWN, Runtime, site_options
 from envhub_worker.protocol.start_variables import at_start
 from envhub_worker.spawn.channel import Channel
 
@@ -62,9 +62,10 @@ class ZygoteProcess:
         at_once = "ahead" if ahead and self.runtime == resolved(OWN) else ""
         at_once = "standard" if runtime.packages else at_once
         arguments = [str(theirs.fileno()), *([at_once] if at_once else [])]
+        options = site_options() if self.runtime == resolved(OWN) else []
         with theirs, open(self.log, "ab") as log:
             self._process = subprocess.Popen(
-                bootstrap.command(python, "zygote", *arguments, site=site),
+                bootstrap.command(python, "zygote", *arguments, site=site, options=options),
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,

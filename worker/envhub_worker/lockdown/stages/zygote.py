@@ -9,11 +9,13 @@ As root it first becomes a user that owns nothing; the root is built before, whi
 from __future__ import annotations
 
 import contextlib
+import importlib.machinery
+import itertools
 import os
 import pwd
 import signal
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from functools import partial
 
 import envhub_worker
@@ -24,6 +26,7 @@ from envhub_worker.lockdown.mechanisms import kernel, landlock, mounts, namespac
 from envhub_worker.lockdown.plan import needs_broker
 from envhub_worker.lockdown.seccomp.filter import compile_filter
 from envhub_worker.lockdown.seccomp.policy import policy_table, watched_calls
+from envhub_worker.protocol.runtime import mapped_modules
 
 
 def enter(config: ZygoteConfig) -> Common:
@@ -108,7 +111,22 @@ def interpreter_paths() -> list[str]:
     package = os.path.dirname(os.path.abspath(envhub_worker.__file__))
     prefixes = [sys.prefix, sys.base_prefix, sys.exec_prefix, sys.base_exec_prefix]
     binaries = [os.path.dirname(sys.executable), os.path.dirname(os.path.realpath(sys.executable))]
-    return [*prefixes, *binaries, *filter(os.path.isabs, sys.path), package, *_mapped_folders()]
+    folders = [*filter(os.path.isabs, sys.path), *_editable_paths()]
+    return [*prefixes, *binaries, *folders, package, *_mapped_folders()]
+
+
+def _editable_paths() -> Iterator[str]:
+    """Modules elsewhere that finders and links lead to, as after ``pip install -e``."""
+    suffixes = tuple(importlib.machinery.all_suffixes())
+    for path in itertools.chain(*mapped_modules(sys.meta_path).values()):
+        folder, name = os.path.split(path)
+        bases = [folder] if name.startswith("__init__.") else [path, *(path + e for e in suffixes)]
+        yield from filter(os.path.isabs, bases)
+    for folder in filter(os.path.isabs, sys.path):
+        with contextlib.suppress(OSError), os.scandir(folder) as items:
+            for item in filter(os.DirEntry.is_symlink, items):
+                if item.name.endswith(suffixes) or os.path.isfile(f"{item.path}/__init__.py"):
+                    yield item.path
 
 
 def _mapped_folders() -> Iterable[str]:
