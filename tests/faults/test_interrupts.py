@@ -129,27 +129,6 @@ def _half(client: Any, frames: Any, copy: bool) -> None:
     raise KeyboardInterrupt
 
 
-@lanes
-@pytest.mark.parametrize("owner", ["jail", "book"])
-def test_ctrl_c_in_close_leaves_nothing(
-    lane: str, owner: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """While the repository's ``close`` is waited for, or a step's time noted; repeatable."""
-    suites = made(lane)
-    env = suites.env
-    loaded, release = inside.loaded(env), released(env)
-    assert loaded is not None
-    if owner == "jail":
-        monkeypatch.setattr(loaded.jail, "receive", interrupted)
-    else:
-        monkeypatch.setattr(*inside.noting_steps(env), interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        env.close()
-    assert loaded.closed
-    assert (inside.lane(env), release) == (None, [True])
-    suites.close()
-
-
 class Inside:
     """A place in the client that another thread has come to, and stays in until it may go on."""
 

@@ -381,11 +381,6 @@ def holding(env: Any) -> Spot:
     return launcher(env), "hold"
 
 
-def noting_steps(env: Any) -> Spot:
-    """Where it is noted what its steps took, at its close."""
-    return session(env).lease, "note_steps"
-
-
 def sending(connection: WorkerConnection) -> Spot:
     """Where the frames of a message go out."""
     return connection, "_put"

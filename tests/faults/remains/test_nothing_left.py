@@ -72,38 +72,6 @@ def test_nothing_remains_after(moment: str, number: signal.Signals, folder: Path
     finish(client)
 
 
-def test_ctrl_c_in_a_step_leaves_a_usable_client(folder: Path, tmp_path: Path) -> None:
-    """KeyboardInterrupt comes at once; then a step says what to do, and reset() does it."""
-    client = start(
-        folder,
-        f"""
-        for lane in ("auto", "frames"):
-            output = {str(tmp_path)!r} + "/" + lane
-            suites = made("step", "hang", lane=lane, policy={{"output": output}})
-            try:
-                say(output)
-                suites.env.step([0, 1])
-            except KeyboardInterrupt:
-                pass
-            try:
-                suites.env.step([0, 0])
-            except errors.WorkerTimeoutError as error:
-                say("reset()" in str(error))
-            suites.env.reset()
-            say(suites.env.step([0, 0])[0].tolist())
-            suites.close()
-        """,
-    )
-    for _ in range(2):
-        output = Path(line(client))
-        assert eventually(lambda: "about to hang" in output.read_text())  # noqa: B023
-        client.send_signal(signal.SIGINT)
-        assert line(client) == "True"
-        assert line(client) == "[[1.0], [1.0]]"
-    finish(client)
-    assert client.returncode == 0
-
-
 @pytest.mark.short
 def test_fork_refuses_and_ends_nothing(folder: Path) -> None:
     """In a fork old environments refuse and new ones work; the parent's go on throughout."""
@@ -157,31 +125,6 @@ def test_multiprocessing_fork_ends_nothing(folder: Path) -> None:
         """,
     )
     assert finish(client).split("\n")[:2] == ["[1, 2]", "[[2.0], [2.0]]"]
-
-
-def test_close_under_a_running_step_returns(folder: Path) -> None:
-    """``close`` from another thread ends the step with Gymnasium's error, soon."""
-    client = start(
-        folder,
-        """
-        from gymnasium.error import ClosedEnvironmentError
-
-        def step(env):
-            try:
-                env.step([0, 1])
-            except ClosedEnvironmentError:
-                say("closed")
-
-        for lane in ("auto", "frames"):
-            suites = made("step", "hang", lane=lane)
-            stepping = threading.Thread(target=step, args=[suites.env])
-            stepping.start()
-            time.sleep(0.5)
-            suites.close()
-            stepping.join()
-        """,
-    )
-    assert finish(client).split() == ["closed", "closed"]
 
 
 def test_signal_handler_may_close_what_its_own_thread_waits_for(folder: Path) -> None:

@@ -166,14 +166,6 @@ else:
 HOME = "os.path.expanduser('~')"
 
 
-def test_scratch_folders_share_one_quota() -> None:
-    with limited("strict", disk_bytes=20 * MIB, file_bytes=12 * MIB) as cell:
-        cell.run(FILL.format(folder=HOME, mib=12))
-        written, errno = cell.run(FILL.format(folder="'/tmp'", mib=12))["result"]
-        assert written < 10
-        assert errno
-
-
 @needs("no-userns")
 def test_disk_fill_ends_the_runner_without_a_mount_namespace() -> None:
     """There is no quota there; init counts and ends the runner."""

@@ -13,7 +13,6 @@ import pytest
 from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError
 
 from envhub_sandbox import make_env
-from envhub_sandbox.errors import WorkerTimeoutError
 from envhub_worker.protocol.lifecycle import State
 from tests.support import inside
 from tests.support.samples import SAMPLES
@@ -178,19 +177,3 @@ def test_a_close_in_another_thread_does_not_wait(env: Any, monkeypatch: pytest.M
     finish()
     closing.join(DEADLINE_S)
     assert len(errors) == 1
-
-
-def test_a_step_without_its_second_half_is_late(env: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The control: an interrupt between the halves, and no other thread."""
-
-    def interrupted(timeout_s: float | None = None) -> Any:
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(inside.session(env).requests, "collect_step", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        env.step(ACTIONS)
-    monkeypatch.undo()
-    with pytest.raises(WorkerTimeoutError, match="the last step was interrupted"):
-        env.step(ACTIONS)
-    env.reset(seed=0)
-    env.step(ACTIONS)

@@ -181,6 +181,9 @@ def test_what_cannot_be_meant_is_refused(gates: Gates) -> None:
     for text, env_ids in wrong.items():
         with pytest.raises(ActionError, match=text):
             send(env, *[0] * len(env_ids), ids=env_ids)
+    for unreadable in ([-1], [], [[0], [0, 1]], [0.5], 1, ["0"]):
+        with pytest.raises(ActionError, match="env_ids"):
+            env.send(np.zeros((1, 2), np.int64), unreadable)
     for actions in (np.zeros((2, 2), np.int64), np.zeros((1, 3), np.int64), [[0.5, 0]]):
         with pytest.raises(ActionError):
             env.send(actions, [2])

@@ -71,20 +71,6 @@ def pool() -> Iterator[Pool]:
 # --- in use --------------------------------------------------------------------------------------
 
 
-def test_started_for_the_first_and_ended_by_the_last(pool: Pool) -> None:
-    """However many use it in between; the next one gets a fresh one."""
-    one, two = pool.acquire("key", Server), pool.acquire("key", Server)
-    first = one.server
-    assert two.server is first
-    assert two.users() == 2
-    for _ in range(2):
-        one.release()
-    assert not first.ends
-    two.release()
-    assert first.ends == here()
-    assert pool.acquire("key", Server).server is not first
-
-
 def test_a_dead_one_stays_with_its_users_and_others_get_a_fresh_one(pool: Pool) -> None:
     """The dead one is ended when its last user gives it back, and the fresh one is not."""
     dead = pool.acquire("key", Server)
@@ -227,13 +213,6 @@ def test_an_interrupted_release_is_finished_by_the_next(then: str) -> None:
 
 
 # --- kept for the next ---------------------------------------------------------------------------
-
-
-def test_the_next_gets_the_idle_one(pool: Pool) -> None:
-    first = given_up(pool, "key", 600)
-    for _ in range(100):
-        assert given_up(pool, "key", 600) is first
-    assert not first.ends
 
 
 def test_its_time_comes(pool: Pool) -> None:

@@ -9,8 +9,7 @@ import pytest
 
 from envhub_sandbox.errors import WorkerDiedError, WorkerError, WorkerTimeoutError
 from envhub_sandbox.session.counters import Counters, FleetCounters
-from envhub_sandbox.session.failures import Failures, Restarts, backoff_s, refusal
-from envhub_sandbox.settings.policy import Policy
+from envhub_sandbox.session.failures import Failures, backoff_s, refusal
 from envhub_worker.protocol.lifecycle import State
 from tests.support.in_process.fake_lane import FakeLane, session_over
 
@@ -62,19 +61,6 @@ def test_backoff_doubles_and_is_bounded() -> None:
     assert [backoff_s(0.1, n) for n in range(5)] == [0.0, 0.1, 0.2, 0.4, 0.8]
     assert backoff_s(0.1, 10_000) == 30.0
     assert backoff_s(0.0, 10_000) == 0.0
-
-
-def test_restarts_are_counted_until_the_budget_ends() -> None:
-    counters = Counters()
-    restarts = Restarts(Policy(restart="on_reset", restart_budget=1), counters)
-    restarts.spend("reset")
-    with pytest.raises(WorkerDiedError, match="all 1 restarts are used up"):
-        restarts.spend("reset")
-    assert counters.restarts == counters.numbers()["restarts"] == 1
-    closed = Restarts(Policy(restart="on_reset"), Counters())
-    closed.give_up()
-    with pytest.raises(WorkerDiedError, match="closed during reset"):
-        closed.spend("reset")
 
 
 # --- What is counted once for all workers, what is their sum, and who is waited for

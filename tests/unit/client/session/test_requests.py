@@ -99,16 +99,6 @@ def test_a_late_reply_is_refused_until_a_reset(session: EnvSession, lane: FakeLa
     assert session.lifecycle.state is State.READY
 
 
-def test_ctrl_c_in_a_wait_says_so_next_time(session: EnvSession, lane: FakeLane) -> None:
-    """The next request does not take the answer to the interrupted one."""
-    lane.fails = KeyboardInterrupt()
-    session.requests.submit_step(ACTIONS)
-    with pytest.raises(KeyboardInterrupt):
-        session.requests.collect_step(1.0)
-    with pytest.raises(WorkerTimeoutError, match="the last step was interrupted"):
-        session.requests.ask("render", render)
-
-
 def test_the_order_is_gymnasiums(session: EnvSession) -> None:
     """A wait without its request, a request before its wait, and anything after close."""
     requests = session.requests

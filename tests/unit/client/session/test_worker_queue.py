@@ -1,4 +1,4 @@
-"""What one worker owes: how much it may, what a failure leaves, and what an interrupt shows."""
+"""What one worker owes: how much it may, and what could not be sent."""
 
 from __future__ import annotations
 
@@ -8,12 +8,10 @@ import numpy as np
 import pytest
 from gymnasium.error import AlreadyPendingCallError
 
-from envhub_sandbox.errors import LocalProtocolError, RemoteProtocolError
+from envhub_sandbox.errors import LocalProtocolError
 from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.parts.worker_queue import WorkerQueue
 from envhub_sandbox.transport.results import StepResult
-from envhub_worker.protocol import messages as m
-from envhub_worker.protocol.lifecycle import State
 from envhub_worker.protocol.limits import MAX_IN_FLIGHT
 from tests.support.in_process.fake_lane import FakeLane, fleet_over
 
@@ -43,10 +41,6 @@ def taken(queue: WorkerQueue) -> StepResult:
     return result
 
 
-def reset(number: int, bounds: tuple[int, int]) -> m.Reset:
-    return m.Reset(number, None, None, None)
-
-
 def step(queue: WorkerQueue) -> None:
     queue.prepare()
     queue.step(ACTIONS)
@@ -66,23 +60,6 @@ def test_so_many_may_be_owed_and_no_more(queue: WorkerQueue, lane: FakeLane) -> 
         taken(queue)
     assert not queue.busy
     assert len(lane.sent) == MAX_IN_FLIGHT + 1
-
-
-def test_a_reset_waits_for_nothing_and_nobody(queue: WorkerQueue, part: EnvSession) -> None:
-    """It is refused while an answer is owed; its own has rewards of 0 and no flags."""
-    step(queue)
-    with pytest.raises(AlreadyPendingCallError, match="send_reset"):
-        queue.prepare_reset()
-    taken(queue)
-    queue.prepare_reset()
-    queue.reset(reset)
-    reset_s = part.repository.timeouts.reset_s
-    assert reset_s is not None
-    assert 0 < (queue.left_s or 0) <= reset_s
-    observation, rewards, terminations, truncations, infos = taken(queue)
-    assert (observation.shape, rewards.tolist(), infos) == ((1, 3), [0.0], {})
-    assert not terminations.any()
-    assert terminations is not truncations, "the caller may write into one of them"
 
 
 def test_what_could_not_be_sent_is_raised_where_it_is_received(
@@ -106,34 +83,3 @@ def test_what_could_not_be_sent_is_raised_where_it_is_received(
     assert not queue.busy
     step(queue)
     assert taken(queue)[1].tolist() == [0.0]
-
-
-def test_an_interrupt_in_an_answer_shows(queue: WorkerQueue, lane: FakeLane) -> None:
-    """Until it is forgotten: ``drop`` takes no further answer out of what is half taken."""
-    step(queue)
-    lane.fails = KeyboardInterrupt()
-    with pytest.raises(KeyboardInterrupt):
-        taken(queue)
-    assert (queue.taking, queue.interrupted, queue.busy) == (True, True, True)
-    queue.drop()
-    assert (queue.taking, queue.interrupted, queue.busy) == (False, False, False)
-    assert lane.owed is not None, "a reset catches up with it"
-
-
-def test_rewards_of_a_worker_among_others_are_one_number_each() -> None:
-    """Else they cannot be joined with others'; alone, a worker may give any shape."""
-
-    class Wide(FakeLane):
-        def result(self, infos: dict[Any, Any] | None = None) -> StepResult:
-            observation, _, *rest = super().result(infos)
-            return (observation, np.zeros((1, 2)), *rest)
-
-    session = fleet_over([FakeLane(1), Wide(1)]).parts[1]
-    alone = WorkerQueue(session, session.rows, sliced=False)
-    step(alone)
-    assert taken(alone)[1].shape == (1, 2)
-    among = WorkerQueue(session, session.rows, sliced=True)
-    step(among)
-    with pytest.raises(RemoteProtocolError, match="one number each"):
-        taken(among)
-    assert session.lifecycle.state is State.DEAD

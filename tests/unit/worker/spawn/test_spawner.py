@@ -77,35 +77,6 @@ def processes_that_mention(text: str) -> list[int]:
     return [pid for pid in others if text.encode() in procfs.content(f"/proc/{pid}/cmdline")]
 
 
-def test_runner_runs_code_and_is_announced_with_its_layers(cell: Cell) -> None:
-    assert cell.run("result = 6 * 7") == {"result": 42}
-    started = cell.wait_for(RunnerStarted)
-    assert started.runner == 1
-    assert {"no-new-privileges", "rlimits"} <= {layer["layer"] for layer in started.report}
-    assert all(layer["enforced"] in (True, False) for layer in started.report)
-
-
-def test_runner_sees_only_the_built_environment(cell: Cell) -> None:
-    names = cell.run("import os; result = sorted(os.environ)")["result"]
-    raw = cell.run("result = open('/proc/self/environ').read()")["result"]
-    assert "GRANTED" in names
-    assert "PYTEST_CURRENT_TEST" not in f"{names} {raw}"
-
-
-def test_runner_holds_only_the_named_descriptors(cell: Cell) -> None:
-    """Standard streams, its stream and what was passed through; stdin is empty."""
-    source = "import os, sys; result = [len(os.listdir('/proc/self/fd')), sys.stdin.read()]"
-    read, write = os.pipe()
-    second = cell.start((write,))
-    # 0, 1, 2, the stream, the passed pipe, and the listing's own descriptor.
-    assert cell.run(source, second) == {"result": [6, ""]}
-    told = "import os, sys; k = sys._getframe(1).f_globals; result = os.write(k['FDS'][0], b'x')"
-    assert cell.run(told, second) == {"result": 1}
-    assert os.read(read, 10) == b"x"
-    os.close(read)
-    os.close(write)
-
-
 def test_runner_has_private_home_and_shows_the_snapshot(cell: Cell) -> None:
     """HOME, TMPDIR and the working directory are the jail's own; the snapshot shows through.
 
@@ -132,14 +103,6 @@ def test_runners_draw_different_random_numbers(cell: Cell) -> None:
     first_draw, second_draw = cell.run(source), cell.run(source, second)
     assert first_draw["result"][0] != second_draw["result"][0]
     assert first_draw["result"][1] != second_draw["result"][1]
-
-
-def test_output_of_all_runners_arrives(cell: Cell) -> None:
-    cell.run("import os, sys; os.write(1, b'one\\n'); os.write(2, b'two\\n'); print('three')")
-    cell.run("import subprocess; subprocess.run(['/bin/echo', 'four'])")
-    cell.hang_up()  # flushes what Python still buffers
-    for text in (b"one", b"two", b"three", b"four"):
-        cell.wait_for_output(text)
 
 
 @pytest.mark.parametrize("killed", [True, False])
@@ -186,26 +149,6 @@ def test_no_daemon_outlives_its_jail(cell: Cell, folder: Path, end: str) -> None
         cell.hang_up()
         cell.wait_for(RunnerExited)
     wait_until(lambda: not processes_that_mention(mark), "the daemon lived on")
-
-
-def test_jail_can_start_runners_after_its_last_one_ended(cell: Cell) -> None:
-    cell.run("import os; os._exit(1)")
-    cell.wait_for(RunnerExited)
-    second = cell.start()
-    assert cell.run("result = 'again'", second) == {"result": "again"}
-
-
-def test_close_leaves_no_process_and_no_file(folder: Path, confinement: Confinement) -> None:
-    """After close, no process mentions the runtime folder and nothing is left in it."""
-    runtime = folder / "runtime"
-    runtime.mkdir()
-    with spawner_in(runtime, confinement, readable_roots=[str(folder)]) as spawner:
-        cell = new_cell(spawner, make_snapshot(folder), confinement)
-        cell.start()
-        assert cell.run("result = 1") == {"result": 1}
-        zygote = inside.zygote_pid(spawner)
-    assert not os.path.exists(f"/proc/{zygote}")
-    assert list(runtime.iterdir()) == []
 
 
 def test_a_process_that_started_ahead_is_used(folder: Path) -> None:
@@ -267,50 +210,6 @@ def test_dead_zygote_is_told_with_its_log(folder: Path) -> None:
     assert "Traceback" not in died.log
     assert died.code == LACKS_PACKAGES
     spawner.close()
-
-
-SERVER = """
-import sys, time
-sys.path.insert(0, {kit!r})
-from pathlib import Path
-from typing import Any
-from confinement_kit import *
-from envhub_worker.protocol.confinement import Confinement
-confinement = Confinement(profile={profile!r})
-with spawner_in(Path({folder!r}), confinement) as spawner:
-    cell = new_cell(spawner, make_snapshot(Path({folder!r})), confinement)
-    cell.start()
-    cell.run({daemon!r})
-    print("up", flush=True)
-    time.sleep(1000)
-"""
-
-
-def test_killed_server_leaves_no_process(folder: Path, confinement: Confinement) -> None:
-    """SIGKILL of the server ends zygote, init, runner and a daemon of the jail."""
-    mark = str(folder / "mark")
-    kit = str(Path(__file__).parents[3] / "support")
-    daemon = DAEMON.format(mark=mark)
-    profile = confinement.profile
-    source = SERVER.format(kit=kit, folder=str(folder), profile=profile, daemon=daemon)
-    server = subprocess.Popen([sys.executable, "-c", source], stdout=subprocess.PIPE)
-    assert server.stdout is not None
-    assert server.stdout.readline() == b"up\n"
-    below = procfs.descendants(server.pid)
-    assert len(below) >= 3
-    # the server mentions it too
-    wait_until(lambda: {*processes_that_mention(mark)} - {server.pid}, "the daemon never came")
-    server.kill()
-    server.wait()
-    server.stdout.close()
-    wait_until(lambda: set(below).isdisjoint(living()), "a process lived on")
-    wait_until(lambda: not processes_that_mention(mark), "the daemon lived on")
-
-
-def living() -> set[int]:
-    """All processes that are no zombies."""
-    pids = procfs.pids()
-    return {pid for pid in pids if b") Z " not in (procfs.content(f"/proc/{pid}/stat") or b") Z ")}
 
 
 def test_requests_wait_for_the_zygote(folder: Path) -> None:
