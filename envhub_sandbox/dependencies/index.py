@@ -73,6 +73,11 @@ def is_chosen() -> bool:
     return any(name in found for name in _CHOOSE_AN_INDEX)
 
 
+def hides_refusals() -> bool:
+    """Whether uv takes an index that wants a login for one that does not have the package."""
+    return environment().get("UV_INDEX_STRATEGY", "").startswith("unsafe")
+
+
 def options() -> tuple[str, ...]:
     """Options on the command line of uv: it has no variable for that there is no index."""
     return ("--no-index",) if environment().get("UV_NO_INDEX", "").lower() in _YES else ()

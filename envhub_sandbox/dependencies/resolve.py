@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 from packaging.utils import canonicalize_name
 from packaging.version import Version
@@ -33,6 +35,7 @@ _PIN = re.compile(r"([a-z0-9][a-z0-9.-]*)==([A-Za-z0-9.!+_-]+) \\")
 _IS_PYTHON = re.compile(
     r"does not satisfy Python|with a matching Python|no usable wheels|requires? Python"
 )
+_NOT_FOUND = "not found in the package registry"
 _NO_WHEELS = re.compile(r"Wheels are required for `([A-Za-z0-9._-]+)`")
 _NEEDS_PYTHON = re.compile(r"does not satisfy Python>=(3\.\d+)")
 _HASH = re.compile(r"    --hash=(sha(?:256|384|512):[0-9a-f]+)( \\)?")
@@ -133,21 +136,25 @@ def _compiled(
         "--excludes": "".join(f"{name}\n" for name in request.without),
     }
     named = {option: f"{option[2:]}.txt" for option, text in files.items() if text}
+    ask = partial(
+        uv.run,
+        [
+            *("pip", "compile", "-", "--no-header", "--no-annotate"),
+            *(*target.options, *index.options(), *words),
+            *(("--exclude-newer", request.exclude_newer) if request.exclude_newer else ()),
+            *(word for pair in named.items() for word in pair),
+        ],
+        what=f"no versions of the packages could be chosen for {target}",
+        given=_lines(every),
+        timeout_s=_RESOLVE_S,
+        files={**{name: files[option] for option, name in named.items()}, **settings},
+    )
     try:
-        return uv.run(
-            [
-                *("pip", "compile", "-", "--no-header", "--no-annotate"),
-                *(*target.options, *index.options(), *words),
-                *(("--exclude-newer", request.exclude_newer) if request.exclude_newer else ()),
-                *(word for pair in named.items() for word in pair),
-            ],
-            what=f"no versions of the packages could be chosen for {target}",
-            given=_lines(every),
-            timeout_s=_RESOLVE_S,
-            tell=tell,
-            files={**{name: files[option] for option, name in named.items()}, **settings},
-        )
+        return ask(tell=tell)
     except ResolutionError as error:
+        if _NOT_FOUND in str(error) and index.hides_refusals():
+            with contextlib.suppress(ResolutionError):  # this strategy says why one did not answer
+                ask(variables={"UV_INDEX_STRATEGY": "first-index"})
         what = _what_is_required(str(error), [*every, *request.constraints, *request.override])
         raise ResolutionError(f"{error}\n{what}") from error
 

@@ -59,6 +59,13 @@ _NO_INDEX = (
     "pip's settings; environments that exist already work offline"
 )
 
+_NO_LOGIN = (
+    "An index or a proxy refused to answer without the right login. Write it into the index's URL "
+    "in UV_INDEX, UV_DEFAULT_INDEX or pip's settings (https://USER:PASSWORD@HOST/simple, with "
+    "other characters than letters and digits as %XX), into .netrc or a keyring; a proxy's into "
+    "HTTPS_PROXY"
+)
+
 # What uv says, and what that means for the user; the first that is found counts.
 _MEANINGS: tuple[tuple[str, type[DependencyError], str], ...] = (
     (
@@ -75,6 +82,7 @@ _MEANINGS: tuple[tuple[str, type[DependencyError], str], ...] = (
         "prefetch --upgrade REF",
     ),
     (r"network was disabled", IndexUnavailableError, _NO_INDEX),
+    (r"\b(401 Unauthorized|403 Forbidden|407 Proxy)", IndexUnavailableError, _NO_LOGIN),
     (
         r"yanked",
         ResolutionError,

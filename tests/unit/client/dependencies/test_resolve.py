@@ -169,9 +169,18 @@ def test_a_release_that_was_taken_back(index: Index) -> None:
         resolve("wanted")
 
 
-def test_no_index(index: Index) -> None:
-    index.broken = 503
-    with pytest.raises(IndexUnavailableError, match="UV_INDEX_URL"):
+@pytest.mark.parametrize("strategy", ["first-index", "unsafe-best-match"])
+@pytest.mark.parametrize(
+    ("status", "said"),
+    [(503, "Check the network"), (401, "the right login"), (403, "login"), (407, "HTTPS_PROXY")],
+)
+def test_no_index(
+    index: Index, monkeypatch: pytest.MonkeyPatch, strategy: str, status: int, said: str
+) -> None:
+    """One that wants a login is not one without the package, as pip's strategy has it."""
+    index.broken = status
+    monkeypatch.setenv("UV_INDEX_STRATEGY", strategy)
+    with pytest.raises(IndexUnavailableError, match=f"(?s){said}.*{status} "):
         resolve("numpy")
 
 
