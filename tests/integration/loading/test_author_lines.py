@@ -93,6 +93,23 @@ def test_the_line_in_a_repository_of_the_hub(stub_hub: StubHub, hub_cache: Path)
     assert str(hub_cache) not in str(error) + vars(error)["__notes__"][0]
 
 
+@pytest.mark.parametrize(("lane", "workers"), [("auto", 1), ("auto", 2), ("frames", 2)])
+def test_a_result_that_does_not_fit_leads_to_its_return(
+    tmp_path: Path, lane: str, workers: int
+) -> None:
+    """With the call, the sub-environment among all of them, and what its space says."""
+    text = ENV.replace("return 0, {}", "self.angle = [0, 1.5][seed - 2]\n        return 0, {}")
+    folder = repository(tmp_path, text.replace("turn(action)", "self.angle"))
+    with make_env(str(folder), n_envs=2, lane=lane, num_workers=workers) as suites:
+        suites.env.reset(seed=[2, 3])
+        with pytest.raises(TypeError) as caught:
+            suites.env.step([0, 0])
+    told = "step of sub-environment 1 returned float 1.5, its observation_space is Discrete(2)"
+    line = "return self.angle, 0.0, False, False, {}"
+    where = f'  File "{folder}/env.py", line 14, in step\n    {line}'
+    assert str(caught.value).endswith(f"TypeError: {told}\n{where}")
+
+
 @pytest.mark.parametrize(
     ("at", "lane", "shown"),
     [

@@ -116,6 +116,7 @@ IMPORTERS = {
     "envhub_sandbox.sandboxes.inprocess": "the repository's, where sandbox=None trusts it",
     "envhub_worker.bootstrap": "our own programs",
     "envhub_worker.runner.loader": "the repository's",
+    "envhub_worker.runner.returned": "nothing but 'raise error', in the place of a line",
     "envhub_worker.spawn.runner_entry": "the program of a runner, which the server names",
     "envhub_worker.spawn.zygote": "a list of our own",
 }

@@ -24,6 +24,7 @@ import numpy as np
 from gymnasium.vector import SyncVectorEnv, VectorEnv
 
 from envhub_worker.protocol.spaces import batches
+from envhub_worker.runner import returned
 
 _MODES: Any = getattr(gym.vector, "AutoresetMode", None)
 _BEFORE_1_0 = issubclass(VectorEnv, gym.Env)
@@ -110,7 +111,7 @@ def _parts(env: Any, method: str, result: Any, names: tuple[str, ...]) -> Any:
     if isinstance(result, (tuple, list)) and len(result) == len(names):
         return result
     got = f"{len(result)} values" if isinstance(result, tuple) else f"a {type(result).__name__}"
-    raise _misfit(env, f"{method} returns {got} in place of {', '.join(names)}")
+    raise _misfit(env, method, f"returns {got} in place of {', '.join(names)}")
 
 
 def _column(env: Any, name: str, values: Any, dtype: Any) -> Any:
@@ -123,7 +124,8 @@ def _column(env: Any, name: str, values: Any, dtype: Any) -> Any:
     shape, dtype = getattr(values, "shape", None), getattr(values, "dtype", None)
     if not shape or shape[0] != env.num_envs or getattr(dtype, "kind", "f") == "O":
         count = env.num_envs
-        raise _misfit(env, f"step returns {name} that are not one number each, {count} in all")
+        found = f"{batches.shown(values)} as {name}"
+        raise _misfit(env, "step", f"returns {found}, which have to be one number each, {count}")
     return values
 
 
@@ -133,15 +135,14 @@ def _own_infos(env: Any, method: str, infos: Any) -> Any:
         return infos
     mappings = isinstance(infos, (list, tuple)) and all(isinstance(one, dict) for one in infos)
     if not mappings or len(infos) != env.num_envs:
-        raise _misfit(env, f"{method} returns infos that are a {type(infos).__name__}, no dict")
+        raise _misfit(env, method, f"returns infos that are a {type(infos).__name__}, no dict")
     return batches.join_pairs([(i, one) for i, one in enumerate(infos) if one], len(infos))
 
 
-def _misfit(env: Any, what: str) -> TypeError:
+def _misfit(env: Any, method: str, what: str) -> Exception:
     kind = type(env)
-    return TypeError(
-        f"make_env returned a VectorEnv ({kind.__module__}.{kind.__qualname__}) whose {what}"
-    )
+    text = f"make_env returned a VectorEnv ({kind.__module__}.{kind.__qualname__}) whose {method}"
+    return returned.raised_at(TypeError(f"{text} {what}"), env, method)
 
 
 class _WithMode(SyncVectorEnv):

@@ -33,6 +33,7 @@ from envhub_worker.runner.independence import are_independent
 from envhub_worker.runner.lane import Lane
 from envhub_worker.runner.prefixes import WarningLog, Watches
 from envhub_worker.runner.recording import standing_in
+from envhub_worker.runner.returned import misfit_in_vector
 from envhub_worker.runner.shared_state import SharedState
 from envhub_worker.runner.sync_envs import Pairs, SubEnvs
 from envhub_worker.runner.tasks import ResultError, Task, tasks_of
@@ -189,15 +190,15 @@ class Runner:
         if request.mask is not None:
             options = {} if options is None else options  # our own copy
             options["reset_mask"] = request.mask
-        result = compat.reset_result(env, env.reset(seed=request.seeds, options=options))
-        return m.ResetDone(*result)
+        result = _call_own(env, "reset", seed=request.seeds, options=options)
+        return m.ResetDone(*compat.reset_result(env, result))
 
     def step(self, request: m.Step) -> m.Message:
         """``VectorEnv.step``."""
         env = self._envs[request.env]
         if not isinstance(env, SubEnvs):
             actions = _restored(env, request.actions)
-            return m.StepDone(*compat.step_result(env, env.step(actions)))
+            return m.StepDone(*compat.step_result(env, _call_own(env, "step", actions)))
         return _step_done(env, env.run_step(request.actions))
 
     def revive(self, request: m.Revive) -> m.Message:
@@ -329,6 +330,17 @@ class Runner:
         if env is not None:
             env.close()
         return m.Value(None)
+
+
+def _call_own(env: Any, method: str, *args: Any, **kwargs: Any) -> Any:
+    """A method of the repository's own vector environment."""
+    try:
+        return getattr(env, method)(*args, **kwargs)
+    except (IndexError, KeyError, TypeError, ValueError) as error:
+        told = misfit_in_vector(error, env, method)
+        if told is error:
+            raise
+        raise told from None
 
 
 def _restored(env: Any, actions: Any) -> Any:

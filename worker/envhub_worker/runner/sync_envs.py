@@ -16,7 +16,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
 from operator import itemgetter
-from typing import Any
+from typing import Any, NoReturn
 
 import gymnasium as gym
 import numpy as np
@@ -26,7 +26,7 @@ from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
 from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES
-from envhub_worker.runner import old_gym
+from envhub_worker.runner import old_gym, returned
 from envhub_worker.runner.copies import kept, taken
 from envhub_worker.runner.gymnasium_compat import SyncBase
 from envhub_worker.runner.shared_state import SharedState
@@ -107,9 +107,14 @@ class Batch:
         self._left: int | None = None
         layout = slabs.observation_layout(space, count, 1)
         if layout is None:
-            self.store: Store = self._members.__setitem__
+            self.store: Store = self._keep
         else:
             self.write_to([[np.zeros(leaf.shape, leaf.dtype) for leaf in layout.leaves]])
+
+    def _keep(self, index: int, member: Any) -> None:
+        for path, _, seen in returned.parts(self._space, member):
+            raise ValueError(f"{seen} cannot be written into observation{path}")
+        self._members[index] = member
 
     def write_to(self, slots: list[list[Any]]) -> None:
         """Write observations into these leaves from now on: one list for each slot."""
@@ -224,13 +229,16 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         copied = self._copier()
         for index in chosen:
             seed = None if seeds is None else seeds[index]
+            result: Sequence[Any] = ()
             try:
                 observation, info = self.driven[index].reset(seed=seed, options=options)
-            except (TypeError, ValueError) as error:
-                raise old_gym.explained(error, self.envs[index], "reset") from error
-            self.batch.store(index, observation)
-            if info:
-                infos.append((index, copied(info) if copied else info))
+                result = (observation, info)
+                self.batch.store(index, observation)
+                if info:
+                    returned.check_info(info)
+                    infos.append((index, copied(info) if copied else info))
+            except Exception as error:
+                self._refuse(error, index, "reset", result)
             if self._single:
                 self.integers = batches.integers(self.single_observation_space, observation)
         if self.shared is not None:
@@ -275,7 +283,7 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         copied = self._copier()
         infos: Pairs = []
         self.pairs = infos
-        index = 0
+        index, answered, over, again = 0, -1, False, -1
         each = zip(range(count), self._each(actions), self.driven, self._done, rows, strict=True)
         try:
             for index, action, env, over, row in each:
@@ -283,20 +291,25 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
                     if self.resets_nothing:  # those before it have been stepped, as in Gymnasium
                         raise AssertionError(f"self._autoreset_envs={np.array(self._done)!r}")
                     observation, info = env.reset()
+                    answered = index
                     rewards[index] = reward = 0.0
                 else:
                     observation, reward, terminated, truncated, info = env.step(action)
+                    answered = index
                     try:
                         rewards[index] = reward
-                    except (TypeError, ValueError) as error:
-                        self._refuse_reward(error, reward, index)
+                    except (TypeError, ValueError):
+                        if not self._single:  # where it is sent as it is
+                            raise
                     if terminated or truncated:
                         flagged.append(index)
                         terminations[index] = terminated
                         truncations[index] = truncated
                         if same_step:
                             infos.append((index, self._final(observation, info)))
+                            again, answered = index, -1
                             observation, info = env.reset()
+                            answered = index
                         else:
                             done[index] = True
                 if (
@@ -308,15 +321,22 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
                 else:
                     store(index, observation)
                 if info:
+                    if type(info) is not dict:
+                        returned.check_info(info)
                     infos.append((index, copied(info) if copied else info))
         except BaseException as error:
             batch.carry(index)  # who was not asked any more has his last observation still
-            if same_step and flagged[-1:] == [index]:  # it is the reset that raised
+            if again == index != answered:  # it is the reset that raised
                 with contextlib.suppress(Exception):  # it does not fit, and is not the failure
                     store(index, observation)
-            if isinstance(error, ValueError):
-                raise old_gym.explained(error, self.envs[index], "step") from error
-            raise
+            if not isinstance(error, Exception):
+                raise
+            method = "reset" if over or again == index else "step"
+            result: Sequence[Any] = ()
+            if answered == index:
+                numbers = (0.0 if self._single else reward, terminated, truncated)
+                result = (observation, *(() if method == "reset" else numbers), info)
+            self._refuse(error, index, method, result)
         batch.stay()
         self._done_before, self._done = self._done, done
         if self._single:
@@ -336,11 +356,19 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         """Whether an episode that has ended stays so until a reset is asked for."""
         return self._mode == "Disabled"
 
-    def _refuse_reward(self, error: Exception, reward: Any, index: int) -> None:
-        """Raise what is wrong with a reward, unless it is sent as it is."""
-        if not self._single:
-            text = batches.reward_misfit(reward, self._start + index, self.reward_shape)
-            raise type(error)(text) from error
+    def _refuse(
+        self, error: Exception, index: int, method: str, result: Sequence[Any] = ()
+    ) -> NoReturn:
+        """Raise what a call has raised, or what is wrong with the result that it returned."""
+        env = self.envs[index]
+        if result:
+            declared = self.single_observation_space, self.reward_shape
+            told = returned.misfit(error, env, method, self._start + index, result, *declared)
+        else:
+            told = old_gym.explained(error, env, method)
+        if told is error:
+            raise error
+        raise told from None
 
     def render(self) -> Any:
         """One frame each."""

@@ -163,13 +163,22 @@ APART_REWARD = -2
 
 def reward_misfit(reward: Any, index: int, shape: tuple[int, ...] = ()) -> str:
     """What is wrong with a reward that a vector environment cannot have."""
-    shown = inert_copy(reward)
     needed = f"numbers of shape {shape}, as its reward_space says" if shape else "one number each"
     return (
-        f"the reward of sub-environment {index} is of type {shown.type_name}: "
-        f"{one_line(shown.text, _SHOWN)}. A vector "
-        f"environment needs {needed}: return a number, or use SandboxEnv, which passes on any"
+        f"step of sub-environment {index} returned {shown(reward)} as reward. A vector environment "
+        f"needs {needed}: return float(reward), or use SandboxEnv, which passes on any"
     )
+
+
+def shown(value: Any) -> str:
+    """The dtype and shape of an array; of anything else its class and the beginning of its repr."""
+    if isinstance(value, gym.Space):
+        return f"the space {one_line(str(value), _SHOWN)}"
+    if hasattr(value, "dtype") and hasattr(value, "shape"):
+        kind = "" if isinstance(value, (np.ndarray, np.generic)) else f"{type(value).__name__} "
+        return one_line(f"{kind}{value.dtype} {tuple(value.shape)}", _SHOWN)
+    inert = inert_copy(value)
+    return f"{inert.type_name} {one_line(inert.text, _SHOWN)}"
 
 
 def integers(space: gym.Space[Any], member: Any) -> list[bool]:
