@@ -269,6 +269,7 @@ class RemoteEnvError(EnvHubError):
         traceback: The formatted traceback, with the names of the repository's files.
         where: Its last line in the repository's own files, under the author's name of the file;
             may be empty. It is also at the end of ``str()``.
+        file, line: Of that line, with the file's name in the repository; empty and 0 for none.
     """
 
     def __init__(self, type_name: str, message: str, traceback: str = "") -> None:
@@ -277,7 +278,8 @@ class RemoteEnvError(EnvHubError):
         self.type_name = type_name
         self.message = message
         self.traceback = traceback
-        self.where = ""
+        self.where = self.file = ""
+        self.line = 0
 
     def __reduce__(self) -> tuple[object, ...]:
         return (

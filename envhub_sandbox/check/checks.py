@@ -255,6 +255,8 @@ CURES = {
     **dict.fromkeys(("ConnectionError", "HTTPError", "URLError", "gaierror"), _BRING),
     **dict.fromkeys(("MemoryError", "out-of-memory"), _MEMORY),
     **dict.fromkeys(("TimeoutError", "timeout"), _TIME),
+    "returned": "Return what the spaces say: observations with the keys, shape and kind of numbers "
+    "of observation_space, a number, two bools and a dict; or change the space.",
     "FileNotFoundError": "Put the file into the repository, and open it relative to "
     "Path(__file__).parent.",
     "PermissionError": "Write to the working folder, to tempfile or to the home that the jail has.",

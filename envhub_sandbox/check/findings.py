@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from bisect import insort
 from collections import Counter
 from collections.abc import Collection, Iterable
@@ -11,14 +12,28 @@ from typing import Any
 from envhub_sandbox.check.checks import CHECKS, CURES, Check, Severity
 from envhub_sandbox.check.play.confinement import Confinement
 from envhub_sandbox.check.play.plays import Play
+from envhub_sandbox.errors import EnvHubError, RemoteEnvError, WorkerDiedError, WorkerTimeoutError
 from envhub_worker.protocol.text import counted, duration_text, printable
 
+_RETURNED = re.compile(r"(?:reset|step) of sub-environment \d+ returned ")
 _LONGEST = 1_000
 _MOST = 500
 """Findings: a repository of ten thousand files is no reason for as many lines."""
 _SHOWN = 60
 _OF_EACH = 20
 """Of one check, which are kept whatever there is of others: no flood of notes hides an error."""
+
+
+def _cause(error: EnvHubError) -> str:
+    """What an error is about, as ``CURES`` names it. Trust: the worker's word."""
+    if isinstance(error, WorkerDiedError):
+        return error.reason
+    if isinstance(error, WorkerTimeoutError):
+        return "timeout"
+    remote = error if isinstance(error, RemoteEnvError) else error.__cause__
+    if not isinstance(remote, RemoteEnvError):
+        return ""
+    return "returned" if _RETURNED.match(remote.message) else remote.type_name.rpartition(".")[2]
 
 
 @dataclass(frozen=True)
@@ -103,13 +118,21 @@ class Report:
     folder: str = ""
     _kept: Counter[str] = field(default_factory=Counter, repr=False)
 
-    def judged(self, check: str, found: Iterable[str], task: str = "", *, cause: str = "") -> None:
+    def judged(self, check: str, found: Iterable[str], task: str = "") -> None:
         """A check was made: it found this, or nothing. Trust: texts from the worker."""
         messages = list(found)
         for message in messages:
-            self.add(Finding(check, message, task, cause=cause))
+            self.add(Finding(check, message, task))
         if not messages:
             self.passed.append((check, task))
+
+    def raised(self, check: str, error: EnvHubError, task: str = "", message: str = "") -> None:
+        """A check ended in an error: what it says, and the author's line. Trust: the worker's."""
+        remote = error if isinstance(error, RemoteEnvError) else error.__cause__
+        place = (remote.file, remote.line) if isinstance(remote, RemoteEnvError) else ("", 0)
+        if isinstance(error, RemoteEnvError):
+            message = f"{error.type_name}: {error.message}"
+        self.add(Finding(check, message or str(error), task, *place, cause=_cause(error)))
 
     def add(self, finding: Finding) -> Finding | None:
         """Add what was found, made printable; None where there is no room for it."""

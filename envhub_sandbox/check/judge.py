@@ -82,16 +82,6 @@ def judge(asked: JudgeOptions, report: Report | None = None) -> Report:
     return report
 
 
-def _cause(error: EnvHubError) -> str:
-    """What an error is about, as ``CURES`` names it. Trust: the worker's word."""
-    if isinstance(error, WorkerDiedError):
-        return error.reason
-    if isinstance(error, WorkerTimeoutError):
-        return "timeout"
-    remote = error if isinstance(error, RemoteEnvError) else error.__cause__
-    return remote.type_name.rpartition(".")[2] if isinstance(remote, RemoteEnvError) else ""
-
-
 def _limit(name: str, value: int) -> str:
     words = name.replace("_", " ")
     if name.endswith("_bytes"):
@@ -230,11 +220,11 @@ class _Judge:
 
     def _unloaded(self, error: EnvHubError) -> None:
         if isinstance(error, (WorkerDiedError, WorkerTimeoutError)):
-            self._report.judged("survives", [f"while it loaded: {error}"], cause=_cause(error))
+            self._report.raised("survives", error, message=f"while it loaded: {error}")
         elif not isinstance(error, DependencyError):  # also a name that a terminal would obey
-            self._report.judged("loads", [str(error)], cause=_cause(error))
+            self._report.raised("loads", error)
         elif all(one.id != "imports" for one in self._report.findings):  # else it has been said
-            self._report.judged("imports", [str(error)])
+            self._report.raised("imports", error)
 
     def _denied(self, denied: Iterable[str] | None, task: str = "") -> None:
         """What a jail was refused, where that was recorded."""
@@ -263,14 +253,12 @@ class _Judge:
             check = "observation-space" if isinstance(error, OutsideSpaceError) else "runs"
             self._report.judged(check, [str(error)], task)
         except RemoteEnvError as error:
-            line = error.where.strip().partition("\n")[0]
-            found = [f"{error.type_name}: {error.message}" + (f" ({line})" if line else "")]
-            self._report.judged("runs", found, task, cause=_cause(error))
+            self._report.raised("runs", error, task)
         except (LoadError, DependencyError, RemoteProtocolError) as error:
-            found = [f"another result than the first time: {error}"]
-            self._report.judged("loads", found, task, cause=_cause(error))
+            again = f"another result than the first time: {error}"
+            self._report.raised("loads", error, task, again)
         except (WorkerDiedError, WorkerTimeoutError) as error:
-            self._report.judged("survives", [str(error)], task, cause=_cause(error))
+            self._report.raised("survives", error, task)
         else:
             for check in ("observation-space", "runs", "survives"):
                 self._report.judged(check, [], task)

@@ -37,7 +37,10 @@ def add_author_line(error: EnvHubError, snapshot: Snapshot) -> None:
     if not isinstance(remote, RemoteEnvError) or "__notes__" in vars(error):
         return
     frames = [found for found in re.finditer(_FRAME, remote.traceback) if _place(found, snapshot)]
-    where = _line(frames[-1], snapshot) if frames else ""
+    where = ""
+    for last in frames[-1:]:
+        where = _line(last, snapshot)
+        remote.file, remote.line = _name(last, snapshot), int(last["line"])
     named = re.sub(_FRAME, lambda found: _named(found, snapshot), remote.traceback)
     remote.traceback = printable(named, _TRACEBACK_CHARS)
     remote.where = where
@@ -50,8 +53,12 @@ def add_author_line(error: EnvHubError, snapshot: Snapshot) -> None:
 
 
 def _place(found: re.Match[str], snapshot: Snapshot) -> str | None:
-    name = found["file"].removeprefix(f"{snapshot.root}/")  # older workers give the whole path
-    return snapshot.known_as(name)
+    return snapshot.known_as(_name(found, snapshot))
+
+
+def _name(found: re.Match[str], snapshot: Snapshot) -> str:
+    """Of a file in the repository; older workers give its whole path."""
+    return found["file"].removeprefix(f"{snapshot.root}/")
 
 
 def _named(found: re.Match[str], snapshot: Snapshot) -> str:

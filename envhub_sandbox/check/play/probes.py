@@ -15,6 +15,7 @@ from gymnasium.vector import VectorEnv
 
 from envhub_sandbox.errors import RemoteEnvError
 from envhub_sandbox.vector.pictures import is_frame
+from envhub_worker.protocol.spaces.batches import shown
 from envhub_worker.protocol.text import printable, size_text
 
 _ROUNDS = 3
@@ -85,11 +86,11 @@ def wrong_frames(env: VectorEnv[Any, Any, Any]) -> Iterator[str]:
         return
     given = env.render()
     if not isinstance(given, (tuple, list)) or len(given) != env.num_envs:
-        yield f"{mode}: render() gave {kind(given)}, not one result for each sub-environment"
+        yield f"{mode}: render() gave {shown(given)}, not one result for each sub-environment"
         return
     for index, one in enumerate(given):
         if not _fits(one, mode):
-            yield f"{mode}: sub-environment {index} gave {kind(one)}"
+            yield f"{mode}: sub-environment {index} gave {shown(one)}"
             return
 
 
@@ -99,11 +100,6 @@ def _fits(one: Any, mode: str) -> bool:
     if mode == "rgb_array_list":
         return isinstance(one, (list, tuple)) and all(map(is_frame, one))
     return is_frame(one)
-
-
-def kind(value: Any) -> str:
-    """Its type and shape, in words."""
-    return f"{getattr(value, 'dtype', type(value).__name__)} {getattr(value, 'shape', '')}".strip()
 
 
 # --- what LeRobot needs --------------------------------------------------------------------------

@@ -22,6 +22,7 @@ from envhub_sandbox.errors import EnvHubError, LoadError, RemoteEnvError
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from envhub_worker.protocol.manifest.names import CONVERTED
+from envhub_worker.protocol.spaces import batches
 from envhub_worker.protocol.text import printable, size_text
 
 _PICTURED = 12
@@ -278,14 +279,12 @@ class TaskJudge:
             self._play.played = len(self._play.memory)
 
     def _render(self) -> None:
-        wrong: list[str] = []
-        cause = ""
         try:
-            wrong += self._renders()
+            wrong = [*self._renders()]
         except RemoteEnvError as error:
-            wrong.append(f"{error.type_name}: {error.message}")
-            cause = error.type_name.rpartition(".")[2]
-        self._report.judged("render", wrong, self._name, cause=cause)
+            self._report.raised("render", error, self._name)
+        else:
+            self._say("render", wrong)
         # LeRobot's evaluation reads the number, and so does Gymnasium's RecordVideo
         fps = self._env.metadata.get("render_fps")
         is_rate = isinstance(fps, (int, float)) and not isinstance(fps, bool) and fps > 0
@@ -330,7 +329,7 @@ class TaskJudge:
         space = self._env.single_observation_space
         with contextlib.suppress(CustomSpaceError):  # whose code is not here to be asked
             if _would_be_cast(observation, space) or not space.contains(observation):
-                given = probes.kind(observation)
+                given = batches.shown(observation)
                 yield f"sub-environment 0 gave {given}, which is not in {space}"
 
 
@@ -347,12 +346,12 @@ def _untyped(reward: Any, terminated: Any, truncated: Any, info: Any) -> Iterato
     """What Gymnasium's ``check_env`` refuses of a step. Trust: input from the worker."""
     is_vector = isinstance(reward, np.ndarray) and reward.size > 1  # as mo-gymnasium's
     if not is_vector and not isinstance(reward, (int, float, np.integer, np.floating)):
-        yield f"the reward is {probes.kind(reward)}, not a number"
+        yield f"the reward is {batches.shown(reward)}, not a number"
     for name, value in (("terminated", terminated), ("truncated", truncated)):
         if not isinstance(value, (bool, np.bool_)):
-            yield f"{name} is {probes.kind(value)}, not a bool"
+            yield f"{name} is {batches.shown(value)}, not a bool"
     if not isinstance(info, Mapping):
-        yield f"the info is {probes.kind(info)}, not a dict"
+        yield f"the info is {batches.shown(info)}, not a dict"
 
 
 def _can_be_guessed(space: spaces.Space[Any]) -> bool:

@@ -286,6 +286,7 @@ def test_the_command_line_judges(tmp_path: Path) -> None:
     assert 'failures="1"' in (tmp_path / "junit").read_text()
     [result] = json.loads((tmp_path / "sarif").read_text())["runs"][0]["results"]
     assert result["ruleId"] == "runs"
+    assert result["locations"][0]["physicalLocation"]["region"]["startLine"] > 1
     policy = tmp_path / "policy.toml"
     policy.write_text('profile = "nothing"')
     refused = envhub("check", folder, "--policy", policy)
@@ -293,7 +294,8 @@ def test_the_command_line_judges(tmp_path: Path) -> None:
     allowed = envhub("check", folder, "--steps", "5", "--allow", "runs", "--github")
     assert allowed.returncode == 0, allowed.stderr
     [command] = obeyed(allowed.stdout)
-    assert command.startswith("::error title=envhub check%3A runs")
+    line = _HONEST.partition("self.reward()")[0].count("\n") + 1
+    assert command.startswith(f"::error file=env.py,line={line},title=envhub check%3A runs")
     nowhere = envhub("check", tmp_path / "nowhere")
     assert nowhere.returncode == 3, "it could not be judged"
     text = _HONEST.replace(
