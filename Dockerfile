@@ -4,16 +4,15 @@
 #   docker build -t envhub-worker .
 #
 # The base is any image on glibc whose python3 is 3.10 or later and can make virtual environments.
-ARG BASE_IMAGE=python:3.12-slim
+ARG BASE_IMAGE=python:3.12-slim@sha256:78387bc3881b8273120a12ebe6c1ab22b018ccc2c9adf565ae1ac9b536e184ea
 
 FROM ${BASE_IMAGE} AS build
 # An environment of its own, where nothing of the base image's is seen.
 RUN python3 -m venv /opt/envhub-worker
-# What the worker imports, and its --metrics, are a group there, which pip can read since 25.1.
-COPY pyproject.toml /build/
-RUN cd /build \
-    && /opt/envhub-worker/bin/python -m pip install --no-cache-dir --quiet 'pip>=25.1' \
-    && /opt/envhub-worker/bin/python -m pip install --no-cache-dir --only-binary :all: --group image \
+# What the worker imports, and its --metrics: the group "image" of pyproject.toml, by .ci/lock.sh.
+COPY .ci/locks/image.txt /build/
+RUN /opt/envhub-worker/bin/python -m pip install --no-cache-dir --only-binary :all: \
+        --require-hashes -r /build/image.txt \
     && find /opt/envhub-worker -type d -name tests -prune -exec rm -r {} +
 COPY worker/envhub_worker /build/envhub_worker
 # Compiled here: nobody can write bytecode into a read-only container.

@@ -1,4 +1,4 @@
-# Style, spelling, and types of both packages. Proves that
+# Style, spelling, locks, and types of both packages. Proves that
 # nothing is called that is not there, on any path: of a client not even on macOS and Windows.
 set -euo pipefail
 . "$(dirname "${BASH_SOURCE[0]}")/../lib.sh"
@@ -6,6 +6,11 @@ make_venv "$(find_python 3.11 || command -v python3)" "$CI_WORK/lint"
 bin=$CI_WORK/lint/bin
 "$bin/uv" pip install --quiet --python "$bin/python" '.[video,metrics]' --group lint
 "$bin/uv" pip uninstall --quiet --python "$bin/python" envhub-sandbox
+
+# the locks are what their command makes of pyproject.toml
+cp -R .ci/locks "$CI_WORK/locks"
+UV=$bin/uv .ci/lock.sh
+diff -r .ci/locks "$CI_WORK/locks"
 
 "$bin/ruff" check .
 "$bin/ruff" format --check .

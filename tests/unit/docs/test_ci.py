@@ -13,9 +13,12 @@ from typing import Any
 
 import pytest
 import yaml
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 from typer.testing import CliRunner
 
 from envhub_sandbox.cli.app import app
+from envhub_sandbox.hub.sources import toml
 from tests.support.repositories import write_repository
 
 pytestmark = pytest.mark.same_for("users", "versions")
@@ -118,7 +121,7 @@ def test_the_action_takes_a_weaker_profile_only_where_it_is_named(
 
 
 def test_the_action_installs_itself(checkout: Path, tmp_path: Path) -> None:
-    """From its own checkout, or what is named, into an environment of its own."""
+    """The packages of its lock, then its own checkout or what is named, and nothing else."""
     step = loaded(checkout, "action.yml")["runs"]["steps"][0]
     says = '#!/bin/sh\nfor one in "$@"; do echo "<$one>"; done\n'
     program(tmp_path / "bin" / "python3", says)
@@ -128,8 +131,11 @@ def test_the_action_installs_itself(checkout: Path, tmp_path: Path) -> None:
         env = {"ENVHUB_PACKAGE": package, "ENVHUB_ACTION": "/the/action"}
         done = run(step["run"], **env | {"PATH": path, "RUNNER_TEMP": str(tmp_path)})
         venv = ["<-I>", "<-m>", "<venv>", f"<{tmp_path}/envhub>"]
-        pip = ["<-I>", "<-m>", "<pip>", "<install>", "<--quiet>", f"<{installed}>"]
-        assert done.stdout.split() == [*venv, *pip]
+        pip = ["<-I>", "<-m>", "<pip>", "<install>", "<--quiet>"]
+        locked = ["<--require-hashes>", "<--only-binary>", "<:all:>", "<-r>"]
+        lock = "</the/action/.ci/locks/action.txt>"
+        alone = ["<--no-deps>", "<--no-build-isolation>", f"<{installed}>"]
+        assert done.stdout.split() == [*venv, *pip, *locked, lock, *pip, *alone]
 
 
 def test_nothing_of_the_checkout_runs_while_envhub_is_installed(
@@ -143,10 +149,13 @@ def test_nothing_of_the_checkout_runs_while_envhub_is_installed(
     program(tmp_path / "envhub" / "bin" / "python", help_only)
     path = f"{tmp_path / 'bin'}:{os.environ['PATH']}"
     given = {"PATH": path, "RUNNER_TEMP": str(tmp_path), "ENVHUB_VENV": f"{tmp_path}/envhub"}
-    action = loaded(checkout, "action.yml")["runs"]["steps"][0]["run"].splitlines()
-    lines = [*action, *loaded(checkout, "examples/ci/gitlab.yml")["envhub-check"]["script"]]
+    action = loaded(checkout, "action.yml")["runs"]["steps"][0]["run"]
+    lines = [
+        *action.replace("\\\n", " ").splitlines(),
+        *loaded(checkout, "examples/ci/gitlab.yml")["envhub-check"]["script"],
+    ]
     named = [line for line in lines if any(f"-m {name}" in line for name in _INSTALLERS)]
-    assert len(named) == 4
+    assert len(named) == 5
     for line in named:
         assert "unjudged" not in run(line, repository, ENVHUB_ACTION="/the/action", **given).stdout
         control = run(line.replace(" -I", ""), repository, ENVHUB_ACTION="/the/action", **given)
@@ -214,6 +223,64 @@ def test_what_is_named_exists(checkout: Path) -> None:
     used = {word for text in texts for word in re.findall(r"--[a-z][a-z-]+", text)}
     assert {"--github", "--junit", "--fail-on"} <= used
     assert [word for word in sorted(used) if word not in done.stdout] == []
+
+
+# --- What the action and the image install is the same each day
+
+
+_PYTHONS = ("3.10", "3.11", "3.12", "3.13")
+
+
+def installs(text: str) -> list[str]:
+    """Each command that installs packages, but those of a lock or of no further ones; and images
+    that are named by a tag alone.
+    """
+    lines = text.replace("\\\n", " ").splitlines()
+    found = [line for line in lines if re.search(r"\bpip\W+(install|download|wheel)\b", line)]
+    alone = ("--require-hashes", "--no-deps --no-build-isolation")
+    found = [line for line in found if not any(option in line for option in alone)]
+    images = re.findall(r"^(?:ARG BASE_IMAGE=|FROM )(?!\$\{BASE_IMAGE\})(\S+)", text, re.MULTILINE)
+    return [*found, *(one for one in images if not re.search(r"@sha256:[0-9a-f]{64}$", one))]
+
+
+def unlocked(lock: str, wanted: list[str]) -> list[str]:
+    """What a lock lacks, or has without a hash, of requirements under each Python on Linux."""
+    pins = [line for line in lock.replace("\\\n", " ").splitlines() if not line.startswith("#")]
+    missing = [pin for pin in pins if not re.search(r"--hash=sha256:[0-9a-f]{64}", pin)]
+    for python in _PYTHONS:
+        here = {"python_version": python, "python_full_version": f"{python}.1"}
+        here |= {"sys_platform": "linux", "implementation_name": "cpython"}
+        found = [Requirement(pin.split(" --hash")[0]) for pin in pins]
+        found = [one for one in found if one.marker is None or one.marker.evaluate(here)]
+        versions = {canonicalize_name(one.name): str(one.specifier)[2:] for one in found}
+        assert len(versions) == len(found)
+        for one in map(Requirement, wanted):
+            version = versions.get(canonicalize_name(one.name), "0")
+            needed = one.marker is None or one.marker.evaluate(here)
+            if needed and not one.specifier.contains(version):
+                missing.append(f"{one} for Python {python}")
+    return missing
+
+
+def test_the_action_and_the_image_install_what_is_locked(checkout: Path) -> None:
+    """By hashes that fit ``pyproject.toml``; whether they are complete, pip and CI say."""
+    project = toml.loads((checkout / "pyproject.toml").read_text(), 1 << 20)
+    groups = project["dependency-groups"]
+    wanted = {
+        "action": project["project"]["dependencies"] + project["build-system"]["requires"],
+        "image": [*groups["worker"], *(one for one in groups["image"] if isinstance(one, str))],
+    }
+    for name, needs in wanted.items():
+        lock = (checkout / ".ci" / "locks" / f"{name}.txt").read_text()
+        assert unlocked(lock, needs) == []
+        assert len(unlocked(lock, [*needs, "numpy>=99"])) == len(_PYTHONS)
+        hashless = re.sub(r"(?m)^(cloudpickle==[^\\]*)\\\n( .*\n)+", r"\1\n", lock)
+        assert len(unlocked(hashless, needs)) == 1
+    for name in ("action.yml", "Dockerfile"):
+        text = (checkout / name).read_text()
+        assert installs(text) == []
+        assert installs(text.replace("--require-hashes", ""))
+    assert installs("ARG BASE_IMAGE=python:3.12-slim\n") == ["python:3.12-slim"]
 
 
 # --- The documents' site loads nothing from elsewhere: what CI asks of it would find it
