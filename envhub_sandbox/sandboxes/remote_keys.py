@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import ipaddress
 import os
 import re
@@ -19,6 +18,7 @@ CLIENT_KEY_VARIABLE = "ENVHUB_CLIENT_KEY"
 CONFIG_VARIABLE = "ENVHUB_CONFIG"
 _HOST = re.compile(r"[a-z0-9_.:%;-]+")
 """What ZeroMQ connects to; of others it says nothing that names the endpoint."""
+_MAX_FILE_CHARACTERS = 1 << 20
 
 
 def address_of(endpoint: str) -> str:
@@ -74,12 +74,27 @@ def server_key(endpoint: str, given: str | None) -> bytes:
 
 
 def _known(address: str) -> str | None:
-    with contextlib.suppress(OSError):
-        for line in (config_folder() / "known_hosts").read_text().splitlines():
-            words = line.split()
-            if len(words) == 2 and words[0] == address:
-                return words[1]
+    for line in _read(config_folder() / "known_hosts", "known_hosts").splitlines():
+        words = line.split()
+        if len(words) == 2 and words[0] == address:
+            return words[1]
     return None
+
+
+def _read(path: Path, what: str) -> str:
+    """As much of a file of keys as a person writes; empty if there is none.
+    Raises ``PolicyError``: it cannot be read.
+    """
+    try:
+        with path.open(encoding="utf-8-sig", errors="replace") as file:
+            text = file.read(_MAX_FILE_CHARACTERS + 1)
+    except (FileNotFoundError, NotADirectoryError):
+        return ""
+    except (OSError, ValueError) as error:  # the latter: a name with a null character
+        raise PolicyError(f"{what}: {error}") from error
+    if len(text) > _MAX_FILE_CHARACTERS:
+        raise PolicyError(f"{what}: {path} is larger than {_MAX_FILE_CHARACTERS >> 20} MiB")
+    return text
 
 
 def is_key_file(key: str | os.PathLike[str] | None) -> bool:
@@ -96,19 +111,26 @@ def is_key_file(key: str | os.PathLike[str] | None) -> bool:
 def client_key(given: str | os.PathLike[str] | None) -> bytes:
     """Our secret key: given, in the environment, or in its file; raises as ``server_key``."""
     default = config_folder() / "client.key"
-    text = given or os.environ.get(CLIENT_KEY_VARIABLE) or (default if default.exists() else None)
-    if text is None:
-        raise SandboxUnavailableError(
-            "a remote server accepts only clients with a listed key, and this client has no key: "
-            f"run 'envhub-worker keygen --out {default.parent}' and give the public key to the "
-            f"server's --authorized-clients, or set {CLIENT_KEY_VARIABLE} to the key that the "
-            "server printed"
-        )
-    path = Path(text)
-    with contextlib.suppress(OSError):
-        if isinstance(text, os.PathLike) or os.sep in text or path.is_file():
-            return _parsed(path.expanduser().read_text(), "client_key")
-    return _parsed(os.fspath(text), "client_key")
+    named = given or os.environ.get(CLIENT_KEY_VARIABLE) or default
+    if not is_key_file(named) and not _is_file(named):
+        return _parsed(os.fspath(named), "client_key")
+    if text := _read(Path(os.path.expanduser(named)), "client_key"):
+        return _parsed(text, "client_key")
+    if named is not default:  # without its name, which may be a key that was mistyped
+        raise PolicyError("client_key: it names a file that is empty or not there, or is no key")
+    raise SandboxUnavailableError(
+        "a remote server accepts only clients with a listed key, and this client has no key: "
+        f"run 'envhub-worker keygen --out {default.parent}' and give the public key to the "
+        f"server's --authorized-clients, or set {CLIENT_KEY_VARIABLE} to the key that the "
+        "server printed"
+    )
+
+
+def _is_file(text: str | os.PathLike[str]) -> bool:
+    try:
+        return os.path.isfile(text)
+    except ValueError:  # it holds a null character
+        return False
 
 
 def _parsed(text: str, what: str) -> bytes:

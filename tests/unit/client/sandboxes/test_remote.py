@@ -143,6 +143,38 @@ def test_our_key_is_a_text_or_a_file(config: Path) -> None:
     assert not any(map(remote_keys.is_key_file, [None, text, "mistyped"]))
 
 
+@pytest.mark.parametrize("name", ["client.key", "known_hosts"])
+def test_a_file_of_keys_that_cannot_be_read_is_said(config: Path, name: str) -> None:
+    """Odd bytes are no key of anybody's, and what is no file, or a huge one, is not read."""
+
+    def read() -> bytes:
+        is_ours = name == "client.key"
+        return remote_keys.client_key(None) if is_ours else remote_keys.server_key(_ENDPOINT, None)
+
+    pair = keys.generate()
+    line = f"host:7777 {key_text(pair.public)}" if name == "known_hosts" else key_text(pair.secret)
+    (config / name).write_bytes(f"\ufeff{line}\n".encode())
+    assert read() in (pair.public, pair.secret)
+    (config / name).write_bytes(b"\xff\xfe\x00")
+    with pytest.raises((PolicyError, SandboxUnavailableError)):
+        read()
+    with (config / name).open("wb") as file:
+        file.truncate(1 << 30)
+    with pytest.raises(PolicyError, match="larger than 1 MiB"):
+        read()
+    (config / name).unlink()
+    (config / name).mkdir()
+    with pytest.raises(PolicyError, match="Is a directory"):
+        read()
+
+
+def test_a_key_that_was_mistyped_is_not_repeated(config: Path, tmp_path: Path) -> None:
+    for wrong in ("nowhere/" + "k" * 33, str(tmp_path / "none.key"), "x" * 41, "a/\0b"):
+        with pytest.raises(PolicyError, match="client_key") as caught:
+            remote_keys.client_key(wrong)
+        assert wrong not in str(caught.value)
+
+
 def test_a_listing_names_each_file_once(tmp_path: Path) -> None:
     """By its path, sorted, with its size and hash, however many pieces it has."""
     large = b"x" * (remote_repository.PIECE_BYTES + 1)
