@@ -130,7 +130,7 @@ def _rows(tree: ast.Module) -> dict[str, list[Any]]:
     meanings = _Meanings(nodes)
     uses = {(name, line): None for node in nodes for name, line in meanings.used(node)}
     found: dict[str, list[Any]] = {kind: [] for kind in ("imports", "texts", "entries", "ids")}
-    found["uses"] = [[name[:LONGEST], line] for name, line in uses]
+    found["uses"] = [[name[-LONGEST:], line] for name, line in uses]  # its end says what it is
     for node in nodes:
         if isinstance(node, (ast.Import, ast.ImportFrom)):
             found["imports"].append(
@@ -266,7 +266,8 @@ class _Meanings:
         if isinstance(node, ast.Name):
             found = self._named(node.id)
         elif isinstance(node, ast.Attribute):
-            found = [f"{base}.{node.attr}" for base in self.of(node.value, left - 1)]
+            name = node.attr[:_LONGEST_TEXT]
+            found = [f"{base}.{name}" for base in self.of(node.value, left - 1)]
             found += self._assigned.get(node.attr, [])
         elif isinstance(node, ast.Call):
             for function in self.of(node.func, left - 1):
@@ -285,7 +286,7 @@ class _Meanings:
     def _named(self, name: str) -> list[str]:
         if name == "__builtins__":
             return ["builtins"]
-        usual = [name, *(f"{module}.{name}" for module in self._stars)]
+        usual = [name[:_LONGEST_TEXT], *(f"{module}.{name}" for module in self._stars)]
         return self._imported.get(name, usual) + self._assigned.get(name, [])
 
     def _called(self, function: str, node: ast.Call, left: int) -> list[str]:

@@ -95,6 +95,7 @@ _WORTH_A_LOOK = [
     ("import operator, os; operator.methodcaller('popen', 'x')(os)", "source-process"),
     ("import random; random._os.popen('x')", "source-process"),
     ("import logging; logging.os.popen('x')", "source-process"),
+    (f"{'.'.join(['y' * 190] * 6)}.os.popen('x')", "source-process"),
     ("from os import popen as p", "source-process"),
     ("import webbrowser", "source-process"),
     ("import multiprocessing.util as u; u.spawnv_passfds(a, b, c)", "source-process"),
