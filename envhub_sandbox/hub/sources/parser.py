@@ -314,7 +314,7 @@ class _Meanings:
         if base in ("globals()", "locals()", "vars()") and key:
             return self._named(key)
         if base == "sys.modules" and key:
-            return [key]
+            return [f"{base}.{key}"]
         if base == "builtins" or base.endswith(".__dict__"):
             return [f"{base.removesuffix('.__dict__')}.{key or '[computed]'}"]
         return [base]
