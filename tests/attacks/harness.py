@@ -1,6 +1,6 @@
 """Runs one payload twice, outside and inside of a sandbox, and keeps what became of it.
 
-A payload is a file in ``hostile/payloads``. What it says about itself is only a detail: whether
+A payload is a function in ``hostile/payloads``. What it says of itself is only a detail: whether
 an attack succeeded is decided by a function of the test that looks from outside, at a listener, a
 file, a victim, the process table, or (where something is to be stolen) for a random token in what
 came back through the channels that the repository has anyway.
@@ -110,7 +110,7 @@ class Attacks:
 
         Args:
             title: The attack's name in the table.
-            payload: File in ``hostile/payloads``.
+            payload: Function in ``hostile/payloads``.
             succeeded: Looks from outside, while the payload's process is still there.
             inside: Arguments that differ inside.
             policy: Fields of the policy besides the profile.

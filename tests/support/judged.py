@@ -8,6 +8,7 @@ the tests.
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -21,7 +22,14 @@ from tests.support.samples import SAMPLES, sample
 
 HOSTILE = SAMPLES.parent / "attacks" / "hostile"
 PAYLOADS = HOSTILE / "payloads"
-NO_ATTACKS = {"__init__", "be_victim", "kernel", "plant", "running", "use_card", "where_am_i"}
+KINDS = {
+    name: path.name
+    for path in PAYLOADS.glob("*.py")
+    if path.stem not in ("kernel", "running", "use_card")
+    for name in re.findall(r"^def ([a-z]\w*)", path.read_text(), re.MULTILINE)
+}
+"""The file of each payload."""
+NO_ATTACKS = {"be_victim", "plant", "where_am_i"}
 _TIMEOUTS = dict.fromkeys(("call_s", "reset_s", "step_s"), 30.0)
 _MIB = 1 << 20
 _CLIENT = {"pid": os.getpid()}
@@ -179,7 +187,7 @@ ATTACKS = {
 
 
 def told_of(payload: str, attack: Attack) -> list[Finding]:
-    """What is found where a payload runs; of what is read in source, what stands in its file."""
+    """What is found where a payload runs; of what is read in source, what is in its file."""
     order = {"name": payload, "arguments": dict(attack.arguments), "alias": "judged"}
     arguments = {
         "n_envs": 1,
@@ -189,7 +197,7 @@ def told_of(payload: str, attack: Attack) -> list[Finding]:
     }
     resets = 2 if attack.stage == "reset" else 0
     asked = JudgeOptions(reference=str(HOSTILE), arguments=arguments, steps=1, resets=resets)
-    return [one for one in judge(asked).findings if one.file in ("", f"payloads/{payload}.py")]
+    return [one for one in judge(asked).findings if one.file in ("", f"payloads/{KINDS[payload]}")]
 
 
 def is_told(found: list[Finding], attack: Attack) -> bool:

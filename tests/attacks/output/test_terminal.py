@@ -32,8 +32,8 @@ if payload == "type_into_terminal":
     del arguments["ways"]
 if place == "control":
     sys.path.insert(0, folder)
-    import importlib
-    print(importlib.import_module("payloads." + payload).attack(**arguments))
+    from payloads.running import attack_of
+    print(attack_of(payload)(**arguments))
 else:
     from envhub_sandbox import make_env
     with make_env(folder, policy={"profile": profile}) as suites:

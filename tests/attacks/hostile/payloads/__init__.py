@@ -1,1 +1,1 @@
-"""One file per attack: ``attack(**arguments)`` returns what it got, or raises."""
+"""Attacks by kind: ``NAME(**arguments)`` of one of these returns what it got, or raises."""

@@ -8,7 +8,7 @@ import shutil
 _AT_FDCWD, _EXCHANGE = -100, 2
 
 
-def attack(place):
+def change_tree(place):
     errors = []
     for name, change in WAYS.items():
         try:

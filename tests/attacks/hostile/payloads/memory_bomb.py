@@ -21,7 +21,7 @@ _PAGE = mmap.PAGESIZE
 _LIBC = ctypes.CDLL(None, use_errno=True)
 
 
-def attack(kind, size):
+def memory_bomb(kind, size):
     taken = [_TAKERS[kind]() for _ in range(size // _PIECE)]
     kept.append(taken)
     if kind in _FOLDERS:

@@ -4,12 +4,22 @@ import ctypes
 import importlib
 
 _PR_SET_NAME = 15
+_KINDS = (
+    *("files", "network", "processes", "leaks", "privileges", "nodes", "resources"),
+    *("memory_bomb", "change_tree", "use_card"),
+)
 
 
 def run(name, arguments, alias):
     """What the attack returned; the process is called ``alias`` from then on."""
     call_me(alias)
-    return importlib.import_module(f"payloads.{name}").attack(**arguments)
+    return attack_of(name)(**arguments)
+
+
+def attack_of(name):
+    """The attack of that name, of whatever kind."""
+    kinds = (importlib.import_module(f"payloads.{kind}") for kind in _KINDS)
+    return next(getattr(kind, name) for kind in kinds if hasattr(kind, name))
 
 
 def call_me(alias):

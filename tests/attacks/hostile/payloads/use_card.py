@@ -10,7 +10,7 @@ class Handle(ctypes.Structure):
     _fields_ = (("data", ctypes.c_char * 64),)
 
 
-def attack(handle="", size=16):
+def use_card(handle="", size=16):
     cuda = start()
     name = ctypes.create_string_buffer(100)
     check(cuda.cuDeviceGetName(name, 100, 0), "cuDeviceGetName")

@@ -1,7 +1,0 @@
-"""List a folder."""
-
-import os
-
-
-def attack(path):
-    return os.listdir(path)
