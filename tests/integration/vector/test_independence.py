@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import time
 import warnings
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import RemoteEnvWarning
+from envhub_worker.runner import independence
 from tests.support import inside
 from tests.support.compare import assert_same
 
@@ -154,6 +156,23 @@ KINDS = ["numpy", "random", "built", "counted", "logged", "exported", "directory
 @pytest.mark.parametrize("kind", KINDS)
 def test_those_that_share_something_have_a_process_each(repository: Path, kind: str) -> None:
     assert processes(repository, env_kwargs={"kind": kind}) == N_ENVS
+
+
+def test_who_waits_for_ever_is_not_played_for_ever() -> None:
+    """No time passes meanwhile: a step that sleeps until something happens would never end."""
+    turns = independence._Turns()
+
+    def wait() -> None:
+        while True:
+            time.sleep(0.001)
+
+    def give_up() -> bytes:
+        turns.replace_sources()
+        with pytest.raises(independence._HeavyError):
+            turns.run(0, wait)
+        return b"over"
+
+    assert independence._in_fork(give_up, 0, time.monotonic() + 60) == b"over"
 
 
 def play(env: Any) -> list[Any]:

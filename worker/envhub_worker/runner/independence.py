@@ -27,6 +27,7 @@ import random
 import re
 import select
 import signal
+import threading
 import time
 import warnings
 from collections import Counter
@@ -52,6 +53,8 @@ _LEAST_STEPS_S, _MOST_STEPS_S = 1.0, 0.25
 """Processor time in which the first are made, or it is heavy, and after which no further one is."""
 _LONGEST_STEPS_S = 2.0
 """Of time that passes, also while it waits, after which no further one is."""
+_LONGEST_SLEEP_S = 60.0
+"""In one call, by the clock of a play: who waits for what no play brings would wait for ever."""
 _STEPS_AFTER_RESET = 8
 _ALONE = 4
 """So many of the first sub-environments, and of the last, are played alone."""
@@ -264,14 +267,15 @@ class _Turns:
     def __init__(self) -> None:
         self.most_s = inf
         self._index = _OURS
+        self._slept_s = 0.0
         self._ticks: Counter[int] = Counter()
         self._draws: Counter[int] = Counter()
 
     def run(self, index: int, call: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-        """Call something of a sub-environment. Raises ``_HeavyError``: too much time has passed."""
+        """Call something of a sub-environment. Raises ``_HeavyError``: it takes too much time."""
         if process_time() > self.most_s:
             raise _HeavyError
-        self._index = index
+        self._index, self._slept_s = index, 0.0
         try:
             return call(*args, **kwargs)
         finally:
@@ -297,6 +301,10 @@ class _Turns:
 
     def _sleep(self, seconds: Any) -> None:
         self._tick(int(seconds * 1e9))
+        if threading.current_thread() is threading.main_thread():  # others may have a loop to run
+            self._slept_s += seconds
+            if self._slept_s > _LONGEST_SLEEP_S:
+                raise _HeavyError
 
     def _entropy(self, size: int) -> bytes:
         self._draws[self._index] += 1
