@@ -15,7 +15,7 @@ from envhub_sandbox import errors, make_env
 from envhub_sandbox.session.crash import bundle_writer
 from envhub_sandbox.session.crash.bundle_reader import load_bundle
 from envhub_worker.protocol import messages as m
-from tests.support.command_line import document_here, envhub
+from tests.support.command_line import document, envhub
 from tests.support.processes import eventually
 from tests.support.samples import sample
 from tests.support.started import started
@@ -64,7 +64,7 @@ def test_a_replay_dies_at_the_same_step(
         env.reset(options={"reset_mask": mask, "toll": 1.5})
         error = play(env)
     assert f"envhub replay {error.bundle}" in str(error)
-    found = document_here("replay", "--grant", str(error.bundle))
+    found = document("replay", "--grant", str(error.bundle))
     assert found["verdict"] == "same"
     assert found["doubts"] == found["changed_files"] == []
     assert found["replayed"]["requests"] == found["recorded"]["requests"] > 10
@@ -82,7 +82,7 @@ def test_every_ending_and_every_action_comes_again(
     with brittle(tmp_path, actions, ending, n_envs=2, policy={"limits": limits}) as suites:
         suites.env.reset(seed=11)
         error = play(suites.env)
-    found = document_here("replay", "--grant", str(error.bundle))
+    found = document("replay", "--grant", str(error.bundle))
     assert found["verdict"] == "same"
     assert found["recorded"]["reason"] == error.reason
     assert error.reason == ("signal" if ending == "segfault" else "out-of-memory")
@@ -138,14 +138,14 @@ def test_a_mended_repository_survives(tmp_path: Path) -> None:
         error = play(env)
     entry = repository / "env.py"
     entry.write_text(entry.read_text().replace("os._exit(9)", "None"))
-    found = document_here("replay", "--grant", str(error.bundle), code=8)
+    found = document("replay", "--grant", str(error.bundle), code=8)
     assert (found["verdict"], found["changed_files"]) == ("survived", ["env.py"])
     entry.write_text(entry.read_text().replace('"exit": lambda: None', '"exit": lambda: 1 / 0'))
     assert (
-        document_here("replay", "--grant", str(error.bundle), code=8)["replayed"]["death"] is None
+        document("replay", "--grant", str(error.bundle), code=8)["replayed"]["death"] is None
     )
     entry.write_text(entry.read_text().replace("lambda: 1 / 0", "lambda: os._exit(10)"))
-    found = document_here("replay", "--grant", str(error.bundle), code=7)
+    found = document("replay", "--grant", str(error.bundle), code=7)
     assert found["verdict"] == "different"
     assert found["replayed"]["death"]["exit_code"] == 10
 
@@ -155,7 +155,7 @@ def test_a_death_in_make_env_is_repeated_too(tmp_path: Path) -> None:
     policy = {"crash_folder": str(tmp_path)}
     with pytest.raises(errors.WorkerDiedError) as caught:
         make_env(sample("exits"), env_kwargs=kwargs, policy=policy)
-    found = document_here("replay", "--grant", str(caught.value.bundle))
+    found = document("replay", "--grant", str(caught.value.bundle))
     assert (found["verdict"], found["replayed"]["requests"]) == ("same", 0)
 
 
@@ -170,7 +170,7 @@ def test_a_process_that_was_given_up_leaves_a_bundle(tmp_path: Path) -> None:
         env.reset(seed=1)
     [folder] = tmp_path.iterdir()
     assert load_bundle(folder).death["reason"] == "timeout"
-    assert document_here("replay", "--grant", str(folder))["verdict"] == "same"
+    assert document("replay", "--grant", str(folder))["verdict"] == "same"
 
 
 def test_what_was_forgotten_is_said(tmp_path: Path) -> None:
@@ -178,7 +178,7 @@ def test_what_was_forgotten_is_said(tmp_path: Path) -> None:
     with brittle(tmp_path, policy={"crash_history": 10}) as suites:
         suites.env.reset(seed=1)
         error = play(suites.env)
-    found = document_here("replay", "--grant", str(error.bundle), code=7)
+    found = document("replay", "--grant", str(error.bundle), code=7)
     assert found["replayed"]["requests"] < found["recorded"]["requests"]
     assert "had been forgotten" in found["doubts"][0]
 
@@ -246,7 +246,7 @@ def test_a_death_that_is_hidden_leaves_a_bundle_too(
         assert env.sandbox.stats()["restarts"] == 1
     [folder] = tmp_path.iterdir()
     assert str(folder) in caplog.text
-    assert document_here("replay", "--grant", str(folder))["verdict"] == "same"
+    assert document("replay", "--grant", str(folder))["verdict"] == "same"
 
 
 @pytest.mark.parametrize("secret", ["s3cr3t-value-of-it", "s3cr3t-line one\ns3cr3t-line two"])

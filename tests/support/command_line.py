@@ -1,4 +1,4 @@
-"""The command line ``envhub`` in a process of its own, and the processes below it."""
+"""The command line ``envhub``, here or in a process of its own, and the processes below it."""
 
 from __future__ import annotations
 
@@ -37,30 +37,21 @@ def python(
 
 
 def envhub(*arguments: str | Path, **variables: str) -> subprocess.CompletedProcess[str]:
-    """Run the command line to its end."""
-    return subprocess.run(
-        [*COMMAND, *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        encoding="utf-8",
-        env={**os.environ, "PYTHONIOENCODING": "utf-8", **variables},
-        timeout=240,
-        check=False,
-    )
+    """Run the command line to its end, in this process, whose worker servers it uses."""
+    done = CliRunner().invoke(app, [*map(str, arguments)], env=variables, prog_name="envhub")
+    return subprocess.CompletedProcess(arguments, done.exit_code, done.stdout, done.stderr)
+
+
+def program(*arguments: str | Path, **variables: str) -> subprocess.CompletedProcess[str]:
+    """The same in a process of its own, where its streams and what it imports matter."""
+    variables = {"PYTHONIOENCODING": "utf-8", **variables}
+    return python(*COMMAND[1:], *arguments, code=None, **variables)
 
 
 def document(*arguments: str | Path, code: int = 0) -> dict[str, Any]:
     """The document of ``--json``, which is all that is on stdout."""
     done = envhub(*arguments, "--json")
     assert done.returncode == code, done.stderr
-    read: dict[str, Any] = json.loads(done.stdout, parse_constant=pytest.fail)
-    return read
-
-
-def document_here(*arguments: str | Path, code: int = 0) -> dict[str, Any]:
-    """The same of a command in this process, whose worker servers it uses."""
-    done = CliRunner().invoke(app, [*map(str, arguments), "--json"])
-    assert done.exit_code == code, done.output
     read: dict[str, Any] = json.loads(done.stdout, parse_constant=pytest.fail)
     return read
 

@@ -14,7 +14,7 @@ from envhub_sandbox import make_env
 from envhub_sandbox.cli.app import whole_command
 from envhub_sandbox.errors import EnvHubError
 from tests.hub.olah_server import OlahServer
-from tests.support.command_line import document, envhub
+from tests.support.command_line import document, envhub, program
 from tests.support.repositories import CARTPOLE, STILL, write_repository
 from tests.support.samples import EXAMPLES, sample
 
@@ -52,7 +52,7 @@ def test_a_run_prints_results_and_nothing_else() -> None:
     """The table and the provenance on stdout, on stderr only what the code sees of this machine, no
     escape sequences; what a terminal cannot show is escaped."""
     ascii_only = {"PYTHONIOENCODING": "ascii"}
-    done = envhub("run", EXAMPLES / "cartpole", "--episodes", "4", "--n-envs", "2", **ascii_only)
+    done = program("run", EXAMPLES / "cartpole", "--episodes", "4", "--n-envs", "2", **ascii_only)
     seen = f"local folder {EXAMPLES / 'cartpole'}: the code sees 1 file of it\n"
     assert (done.returncode, done.stderr) == (0, seen)
     for text in ("hub_env / 0", "steps/s", str(EXAMPLES / "cartpole"), "gymnasium", "seed 0"):
@@ -176,11 +176,11 @@ def test_markup_and_messages_are_shown_as_text(tmp_path: Path) -> None:
 
 def test_without_a_sandbox_it_runs_here_when_trusted(tmp_path: Path) -> None:
     """And says that nothing confined it; its own errors are still its own."""
-    done = envhub("run", EXAMPLES / "cartpole", "--sandbox", "none", "--trust-remote-code")
+    done = program("run", EXAMPLES / "cartpole", "--sandbox", "none", "--trust-remote-code")
     assert done.returncode == 0, done.stderr
     assert "nothing: the code ran in this process" in done.stdout
     folder = one_env(tmp_path / "one", "return {}['missing']")
-    failed = envhub("run", folder, "--sandbox", "none", "--trust-remote-code")
+    failed = program("run", folder, "--sandbox", "none", "--trust-remote-code")
     assert failed.returncode == 1
     assert "KeyError: 'missing'" in failed.stderr
 
@@ -188,7 +188,7 @@ def test_without_a_sandbox_it_runs_here_when_trusted(tmp_path: Path) -> None:
 def test_prints_stay_off_stdout_without_a_sandbox(tmp_path: Path) -> None:
     """It has the results and nothing else, whoever prints in this process or below it."""
     folder = write_repository(tmp_path / "prints", _PRINTS)
-    done = envhub("run", folder, "--sandbox", "none", "--trust-remote-code", "--json")
+    done = program("run", folder, "--sandbox", "none", "--trust-remote-code", "--json")
     assert done.returncode == 0, done.stderr
     json.loads(done.stdout)
     assert "printed by Python" in done.stderr
