@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from envhub_worker.protocol.spaces.batches import (
@@ -70,6 +70,7 @@ UNLIKE = st.fixed_dictionaries({}, optional={"one": ANY, "other": ANY})
 
 @settings(max_examples=200, deadline=None)
 @given(st.lists(UNLIKE, min_size=1, max_size=6))
+@example([{"other": {"b": ""}}, {"other": {"a": 0, "b": ""}}, {"other": 0}])
 def test_each_has_its_own_whatever_the_others_say(infos: list[dict[str, Any]]) -> None:
     """Also where one has a mapping and another an array, and where dtypes differ."""
     each, sizes = [joined([info]) for info in infos], [1] * len(infos)
@@ -92,7 +93,7 @@ def member(infos: dict[Any, Any], key: str, index: int) -> Any:
 
 def plain(value: Any) -> Any:
     if isinstance(value, dict):
-        return {key: plain(item) for key, item in value.items()}
+        return {key: plain(value[key]) for key in sorted(value)}
     return value.item() if isinstance(value, np.generic) else value
 
 
