@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import time
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -158,21 +159,32 @@ def test_those_that_share_something_have_a_process_each(repository: Path, kind: 
     assert processes(repository, env_kwargs={"kind": kind}) == N_ENVS
 
 
-def test_who_waits_for_ever_is_not_played_for_ever() -> None:
-    """No time passes meanwhile: a step that sleeps until something happens would never end."""
-    turns = independence._Turns()
+def _sleep() -> None:
+    while True:
+        time.sleep(0.001)
 
-    def wait() -> None:
-        while True:
-            time.sleep(0.001)
+
+def _fill() -> None:
+    bytes(1 << 30)
+
+
+@pytest.mark.parametrize(
+    ("step", "error"), [(_sleep, independence.HeavyError), (_fill, MemoryError)]
+)
+def test_who_would_wait_for_ever_or_take_all_memory_is_given_up(
+    step: Callable[[], None], error: type[Exception]
+) -> None:
+    """Sleeping takes no time there, so waiting for something would never end; and the kernel ends a
+    jail with too little memory, whichever of its processes took it."""
+    turns = independence.Turns()
 
     def give_up() -> bytes:
         turns.replace_sources()
-        with pytest.raises(independence._HeavyError):
-            turns.run(0, wait)
+        with pytest.raises(error):
+            turns.run(0, step)
         return b"over"
 
-    assert independence._in_fork(give_up, 0, time.monotonic() + 60) == b"over"
+    assert independence.in_fork(give_up, 0, time.monotonic() + 60, 64 << 20) == b"over"
 
 
 def play(env: Any) -> list[Any]:

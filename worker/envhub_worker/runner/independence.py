@@ -25,6 +25,7 @@ import hashlib
 import os
 import random
 import re
+import resource
 import select
 import signal
 import threading
@@ -67,22 +68,24 @@ _ADDRESS = re.compile(rb"0x[0-9a-f]{4,}")
 """In the text of an object that has no other."""
 
 
-def are_independent(task: Task, root: str, until: float) -> bool:
+def are_independent(task: Task, root: str, until: float, most_bytes: int) -> bool:
     """Play a task's sub-environments together and apart, and compare.
 
     Args:
         task: Of a recording, of which nothing has been built.
         root: The repository's folder.
         until: When to give up, by ``time.monotonic``.
+        most_bytes: Of memory that a play may take: more could be the end of the whole jail.
     """
     count = task.num_envs
-    together = _in_fork(partial(_play, task, range(count), None, root), count, until)
+    play = partial(in_fork, until=until, most_bytes=most_bytes)
+    together = play(partial(_play, task, range(count), None, root), count)
     if together is None:
         return False
     steps = int.from_bytes(together[:_STEP_BYTES], "little")
     digests = [together[at:][:_DIGEST_BYTES] for at in _offsets(count)]
     for index in sorted({*range(count)[:_ALONE], *range(count)[-_ALONE:]}):
-        alone = _in_fork(partial(_play, task, [index], steps, root), 1, until)
+        alone = play(partial(_play, task, [index], steps, root), 1)
         if alone is None or alone[_STEP_BYTES:] != digests[index]:
             return False
     return True
@@ -92,9 +95,9 @@ def _offsets(count: int) -> Iterable[int]:
     return range(_STEP_BYTES, _STEP_BYTES + count * _DIGEST_BYTES, _DIGEST_BYTES)
 
 
-def _in_fork(play: Callable[[], bytes], count: int, until: float) -> bytes | None:
+def in_fork(play: Callable[[], bytes], count: int, until: float, most_bytes: int) -> bytes | None:
     """What it returns in a fork of this process: the steps, and digests of ``count``.
-    None where that fails, or takes too long.
+    None where that fails, or takes too long or too much.
     """
     source, sink = os.pipe()
     try:
@@ -106,7 +109,7 @@ def _in_fork(play: Callable[[], bytes], count: int, until: float) -> bytes | Non
         os.close(sink)
         return None
     if pid == 0:
-        _play_and_exit(play, sink)
+        _play_and_exit(play, sink, most_bytes)
     os.close(sink)
     try:
         return _read(source, _STEP_BYTES + count * _DIGEST_BYTES, until)
@@ -120,15 +123,25 @@ def _in_fork(play: Callable[[], bytes], count: int, until: float) -> bytes | Non
             os.waitpid(pid, 0)
 
 
-def _play_and_exit(play: Callable[[], bytes], sink: int) -> None:
+def _play_and_exit(play: Callable[[], bytes], sink: int, most_bytes: int) -> None:
     try:
         os.setpgid(0, 0)
+        _bound_memory(most_bytes)
         nowhere = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nowhere, 1)
         os.dup2(nowhere, 2)
         os.write(sink, play())
     finally:
         os._exit(0)
+
+
+def _bound_memory(most_bytes: int) -> None:
+    """Refuse this process, from now on, more than so much beyond what it has."""
+    with open("/proc/self/statm") as file:
+        data_pages = int(file.read().split()[5])
+    _, hard = resource.getrlimit(resource.RLIMIT_DATA)
+    most = data_pages * resource.getpagesize() + most_bytes
+    resource.setrlimit(resource.RLIMIT_DATA, (most if hard < 0 else min(most, hard), hard))
 
 
 def _read(source: int, size: int, until: float) -> bytes | None:
@@ -147,7 +160,7 @@ def _read(source: int, size: int, until: float) -> bytes | None:
     return data if len(data) == size else None
 
 
-class _HeavyError(Exception):
+class HeavyError(Exception):
     """It takes longer than there is time."""
 
 
@@ -158,7 +171,7 @@ def _play(task: Task, indices: Sequence[int], steps: int | None, root: str) -> b
     takes too long, or changes what a process has once.
     """
     assert task.recording is not None
-    turns, moved = _Turns(), list[str]()
+    turns, moved = Turns(), list[str]()
     turns.replace_sources()
     state = SharedState(root, moved.append)
     turns.most_s = _BUILD_S if steps is None else inf
@@ -197,7 +210,7 @@ class _Play:
 
     def step_on(self, steps: int | None) -> int:
         """Step so many times, or as often as there is time for; returns how often.
-        Raises ``_HeavyError``: that is too seldom.
+        Raises ``HeavyError``: that is too seldom.
         """
         if steps is not None:
             for _ in range(steps):
@@ -207,7 +220,7 @@ class _Play:
         for made in range(_MOST_STEPS):
             passed_s = process_time() - began_s
             if made < _LEAST_STEPS and passed_s > _LEAST_STEPS_S:
-                raise _HeavyError
+                raise HeavyError
             late = passed_s > _MOST_STEPS_S or monotonic() - began > _LONGEST_STEPS_S
             if made >= _LEAST_STEPS and late:
                 return made
@@ -252,7 +265,7 @@ def _add(digest: hashlib.blake2b, value: object) -> None:
 class _Turn:
     """One sub-environment, as far as it is driven."""
 
-    def __init__(self, turns: _Turns, index: int, env: Any) -> None:
+    def __init__(self, turns: Turns, index: int, env: Any) -> None:
         self.reset = partial(turns.run, index, env.reset)
         self.step = partial(turns.run, index, env.step)
 
@@ -261,7 +274,7 @@ _OURS = -1
 """No sub-environment's turn: copies of spaces take entropy, too."""
 
 
-class _Turns:
+class Turns:
     """Whose turn it is, and a clock and a source of entropy for each."""
 
     def __init__(self) -> None:
@@ -272,9 +285,9 @@ class _Turns:
         self._draws: Counter[int] = Counter()
 
     def run(self, index: int, call: Callable[..., Any], *args: Any, **kwargs: Any) -> Any:
-        """Call something of a sub-environment. Raises ``_HeavyError``: it takes too much time."""
+        """Call something of a sub-environment. Raises ``HeavyError``: it takes too much time."""
         if process_time() > self.most_s:
-            raise _HeavyError
+            raise HeavyError
         self._index, self._slept_s = index, 0.0
         try:
             return call(*args, **kwargs)
@@ -304,7 +317,7 @@ class _Turns:
         if threading.current_thread() is threading.main_thread():  # others may have a loop to run
             self._slept_s += seconds
             if self._slept_s > _LONGEST_SLEEP_S:
-                raise _HeavyError
+                raise HeavyError
 
     def _entropy(self, size: int) -> bytes:
         self._draws[self._index] += 1

@@ -41,14 +41,16 @@ from envhub_worker.runner.tasks import ResultError, Task, tasks_of
 _ANCILLARY_BYTES = socket.CMSG_SPACE(8 * array("i").itemsize)
 _RECHECK_MS = 2
 _MOST_WRAPPERS = 100
-_PLAY_S = 20.0
-"""In which sub-environments of all tasks are played, to see whether they are independent."""
+_PLAY_S, _PLAY_MEMORY = 20.0, 0.5
+"""In which sub-environments of all tasks are played, to see whether they are independent, and the
+share of the jail's memory that they may take."""
 
 
 def main(stream: socket.socket, spec: JailSpec, fds: list[int]) -> int:
     """Serve until the other side closes the stream. Runs confined, as the jail's main program."""
     limits = limits_for(spec.confinement.limits.message_bytes)
-    runner = Runner(spec.snapshot, spec.entry, limits)
+    play_bytes = int(spec.confinement.limits.memory_bytes * _PLAY_MEMORY)
+    runner = Runner(spec.snapshot, spec.entry, limits, play_bytes)
     runner.warned.listen()
     reader = StreamReader()
     poller = select.poll()
@@ -93,7 +95,13 @@ def _send(stream: socket.socket, request_id: int, frames: list[Any]) -> None:
 class Runner:
     """The state of one runner: the repository's tasks and the environments built of them."""
 
-    def __init__(self, snapshot: str, entry: str, limits: WireLimits = DEFAULT_LIMITS) -> None:
+    def __init__(
+        self,
+        snapshot: str,
+        entry: str,
+        limits: WireLimits = DEFAULT_LIMITS,
+        play_bytes: int = 1 << 30,
+    ) -> None:
         self._pack = partial(m.pack, describer=described, limits=limits)
         self._pack_infos = partial(self._pack, reduces=True)
         self._snapshot = snapshot
@@ -101,6 +109,7 @@ class Runner:
         self._tasks: dict[tuple[str, Any], Task] = {}
         self._envs: dict[int, Any] = {}
         self._generators: dict[int, generators.Generators] = {}
+        self._play_bytes = play_bytes
         self._stage = ""
         self.warned = WarningLog()
         self.watches = Watches()
@@ -144,7 +153,7 @@ class Runner:
         until = min(latest, monotonic() + _PLAY_S)
         for task in tasks:
             if task.may_share:
-                task.independent = are_independent(task, self._snapshot, until)
+                task.independent = are_independent(task, self._snapshot, until, self._play_bytes)
         made = manifest.describe(tasks)
         return m.LoadDone(encode_manifest(made))
 
