@@ -141,9 +141,7 @@ def test_a_mended_repository_survives(tmp_path: Path) -> None:
     found = document("replay", "--grant", str(error.bundle), code=8)
     assert (found["verdict"], found["changed_files"]) == ("survived", ["env.py"])
     entry.write_text(entry.read_text().replace('"exit": lambda: None', '"exit": lambda: 1 / 0'))
-    assert (
-        document("replay", "--grant", str(error.bundle), code=8)["replayed"]["death"] is None
-    )
+    assert document("replay", "--grant", str(error.bundle), code=8)["replayed"]["death"] is None
     entry.write_text(entry.read_text().replace("lambda: 1 / 0", "lambda: os._exit(10)"))
     found = document("replay", "--grant", str(error.bundle), code=7)
     assert found["verdict"] == "different"
