@@ -20,6 +20,7 @@ from enum import Enum
 from typing import Any
 
 from envhub_sandbox.settings.options import option_name
+from envhub_worker.protocol.text import printable
 
 MAX_BODY_BYTES = 64 << 20
 """Of a page of a listing, unpacked: those of the Hub have some 300 kB."""
@@ -80,6 +81,7 @@ def _judge(response: Any, *_: object, **__: object) -> None:
 
 
 _LONGEST_QUOTE = 200
+_LOGIN = re.compile(r"//[^/?#\s]*@")
 _LOG_IN = "log in with `hf auth login` (`huggingface-cli login` before 1.0) or pass a token"
 
 
@@ -139,13 +141,25 @@ class Kind(Enum):
     )
     UNREACHABLE = (
         "the Hub cannot be reached ({reason})",
-        "Check the network, the proxy settings and the endpoint",
+        "Check the network, the endpoint (HF_ENDPOINT), the proxy (HTTPS_PROXY) and, for a "
+        "certificate, SSL_CERT_FILE and REQUESTS_CA_BUNDLE",
+    )
+    PROXY_LOGIN = (
+        "a proxy on the way to the Hub wants a login (407)",
+        "Set HTTPS_PROXY to http://USER:PASSWORD@HOST:PORT",
     )
     BROKEN_DOWNLOAD = (
         "the download broke off or had the wrong length",
         "Try again; if it persists, a proxy or a mirror changes the files",
     )
-    DISK_FULL = ("the disk is full", "Free space, or put the Hub cache elsewhere (HF_HOME)")
+    DISK_FULL = (
+        "the disk is full ({reason})",
+        "Free space, or put the Hub cache elsewhere (HF_HOME)",
+    )
+    CACHE = (
+        "the Hub client cannot use its cache ({reason})",
+        "Fix the permissions, or put the Hub cache elsewhere (HF_HOME)",
+    )
     OTHER = (
         "the Hub client failed ({reason}){said}",
         "Check the endpoint; if it is right, try again with HF_DEBUG=1",
@@ -156,7 +170,10 @@ ABSENT = frozenset({Kind.NO_REPOSITORY, Kind.NO_REVISION, Kind.NO_ENTRY})
 """The repository is not there or not like this: one of another type may be."""
 
 UNREACHABLE = frozenset(
-    {Kind.OFFLINE, Kind.TIMEOUT, Kind.UNREACHABLE, Kind.RATE_LIMITED, Kind.SERVER_ERROR}
+    {
+        *(Kind.OFFLINE, Kind.TIMEOUT, Kind.UNREACHABLE, Kind.PROXY_LOGIN, Kind.RATE_LIMITED),
+        Kind.SERVER_ERROR,
+    }
 )
 """Nothing was learned about the repository: what the store has may still be what is wanted."""
 
@@ -200,11 +217,19 @@ def explain(
         "status": getattr(response, "status_code", "not found"),
         "said": _said(response),
         "wait": _wait(response),
-        "reason": type(source).__name__,
+        "reason": _reason(source),
         "no_token": option_name("token", False),
     }
     what, advice = (text.format(**fields) for text in kind.value)
     return HubFailure(kind, redact(what, secrets), redact(advice, secrets))
+
+
+def _reason(error: BaseException) -> str:
+    """The class, and what the system said: of all that wraps it the innermost that has a text."""
+    texts = [str(link) for link in chain(error) if isinstance(link, OSError) and str(link)]
+    text = _LOGIN.sub("//***@", printable([str(error), *texts][-1])[:_LONGEST_QUOTE])
+    text = " ".join(text.split())
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__
 
 
 def redact(text: str, secrets: tuple[str, ...]) -> str:
@@ -246,6 +271,8 @@ def _kind_of(error: BaseException) -> Kind | None:
         return _KIND_OF_STATUS.get(status, Kind.SERVER_ERROR if status >= 500 else Kind.OTHER)
     if isinstance(error, OSError) and error.errno in (errno.ENOSPC, errno.EDQUOT):
         return Kind.DISK_FULL
+    if isinstance(error, OSError) and error.filename and error.errno != errno.ENOENT:
+        return Kind.CACHE
     if "Consistency check failed" in str(error) or "IncompleteRead" in str(error):
         return Kind.BROKEN_DOWNLOAD
     if names & _TIMEOUT_CLASSES:
@@ -267,6 +294,7 @@ _KIND_OF_STATUS = {
     401: Kind.UNAUTHORIZED,
     403: Kind.FORBIDDEN,
     404: Kind.NO_REPOSITORY,
+    407: Kind.PROXY_LOGIN,
     408: Kind.TIMEOUT,
     429: Kind.RATE_LIMITED,
 }

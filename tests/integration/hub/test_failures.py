@@ -75,7 +75,8 @@ ANSWERS = [
     (API, 429, {}, ["rate limit", "Wait a few minutes"]),
     (API, 500, {}, ["has a problem (500)", "try again later"]),
     (API, 503, {"X-Error-Message": "over\x07loaded"}, ["(503)", '"over loaded"']),
-    (API, 418, {}, ["Hub client failed", "endpoint"]),
+    (API, 407, {}, ["proxy", "(407)", "HTTPS_PROXY"]),
+    (API, 418, {}, ["Hub client failed", "418", "endpoint"]),
     (API, 0, {}, ["cannot be reached", "proxy"]),
     (API, 200, {}, ["Check the endpoint"]),  # of a server that is no Hub
     ("/tree/", 403, {"X-Error-Code": "GatedRepo"}, ["gated"]),
@@ -157,8 +158,16 @@ def test_refused_connection_fails_at_once_and_says_that_the_store_is_empty(
     monkeypatch.setattr(time, "sleep", slept.append)
     message = str(failure(get))
     assert "cannot be reached" in message
+    assert "onnection refused" in message
     assert "No commit of it is in the store" in message
     assert sum(slept) < 5, "huggingface_hub's own retries wait for 24 s"
+
+
+def test_a_cache_of_the_hub_that_cannot_be_used_is_named(get: Fetch, tmp_path: Path) -> None:
+    """With its path, what the system says and the variable: the network is not to blame."""
+    (tmp_path / "file").write_text("")
+    message = str(failure(get, hub_cache_dir=tmp_path / "file" / "hub"))
+    assert re.search(rf"NotADirectoryError: .*{tmp_path}/file.*HF_HOME", message), message
 
 
 def test_silent_hub_is_given_up(
