@@ -44,6 +44,8 @@ PROCESSES, FORKS = 32, 80
 DISK, FILL = 16 * MIB, 64 * MIB
 FILES, INODES = 300, 1500
 CPU_S, SPIN_S = 1, 3.0
+TERMINALS = 80
+"""A jail may have 64; programs beside these tests open some."""
 
 
 @pytest.mark.short("strict-fork")
@@ -55,6 +57,19 @@ def test_fork_bomb_stops_at_the_limit(arena: Arena, title: str, payload: str) ->
         lambda run: tasks(run) > PROCESSES,
         limits={"processes": PROCESSES},
         count=FORKS,
+    )
+
+
+def test_pseudo_terminals_stop_at_a_number(arena: Arena) -> None:
+    """Each is some memory of the kernel in no account. The host counts those of all users."""
+    total = Path("/proc/sys/kernel/pty/nr")
+    before = [0]
+    arena.attack(
+        "pseudo terminals",
+        "terminals",
+        lambda run: int(total.read_text()) - before[0] > TERMINALS,
+        before=lambda: before.__setitem__(0, int(total.read_text())),
+        count=2 * TERMINALS,
     )
 
 

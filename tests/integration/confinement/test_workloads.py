@@ -224,6 +224,26 @@ result = subprocess.check_output([path], text=True)
     assert outcome(strict, source) == "ran\n"
 
 
+def test_a_program_has_a_terminal_of_the_jails_own(strict: Cell) -> None:
+    """``pty.fork``: it leads a session there. Nobody else's terminal can be seen."""
+    theirs, ours = os.openpty()
+    source = """
+import os, pty
+before = sorted(os.listdir("/dev/pts"))
+pid, fd = pty.fork()
+if not pid: os.execv("/bin/sh", ["sh", "-c", "tty; test -t 1 && echo to it"])
+said = b""
+try:
+    while piece := os.read(fd, 100): said += piece
+except OSError: pass
+result = [before, said.decode(), os.waitpid(pid, 0)[1]]
+"""
+    assert os.path.basename(os.ttyname(ours)) in os.listdir("/dev/pts")
+    assert outcome(strict, source) == [["ptmx"], "/dev/pts/0\r\nto it\r\n", 0]
+    os.close(theirs)
+    os.close(ours)
+
+
 def test_identity_and_host_questions_are_answered(cell: Cell) -> None:
     """Who am I, how many cores, how much memory: libraries ask at import."""
     source = """

@@ -17,9 +17,12 @@ HOME = "/sandbox/home"
 WORK = "/sandbox/work"
 TEMPORARY = "/tmp"
 SHARED_MEMORY = "/dev/shm"
+TERMINALS = "/dev/pts"
 
 #: Mount points that each jail fills for itself.
-OWN_FOLDERS = (HOME, WORK, TEMPORARY, SHARED_MEMORY, "/proc", "/.scratch", "/.skeleton")
+OWN_FOLDERS = (
+    *(HOME, WORK, TEMPORARY, SHARED_MEMORY, TERMINALS, "/proc", "/.scratch", "/.skeleton"),
+)
 
 _SYSTEM = ("/usr", "/bin", "/sbin", "/lib", "/lib32", "/lib64", "/libx32")
 _ETC_FOLDERS = ("/etc/alternatives", "/etc/fonts", "/etc/glvnd", "/etc/vulkan", "/etc/OpenCL")
@@ -40,6 +43,7 @@ _TEXTS = {
 }
 _DEV_LINKS = {
     "/dev/fd": "/proc/self/fd",
+    "/dev/ptmx": f"{TERMINALS}/ptmx",
     "/dev/stdin": "/proc/self/fd/0",
     "/dev/stdout": "/proc/self/fd/1",
     "/dev/stderr": "/proc/self/fd/2",

@@ -17,12 +17,23 @@ from typing import NamedTuple
 
 from envhub_worker.lockdown import root_plan
 from envhub_worker.lockdown.mechanisms import kernel, namespaces
-from envhub_worker.lockdown.root_plan import HOME, SHARED_MEMORY, TEMPORARY, WORK, RootPlan, within
+from envhub_worker.lockdown.root_plan import (
+    HOME,
+    SHARED_MEMORY,
+    TEMPORARY,
+    TERMINALS,
+    WORK,
+    RootPlan,
+    within,
+)
 
 _READ_ONLY = kernel.ATTR_RDONLY | kernel.ATTR_NOSUID | kernel.ATTR_NODEV
 _PLAIN = kernel.MS_NOSUID | kernel.MS_NODEV
 _SCRATCH = "/.scratch"
 _SKELETON = "/.skeleton"
+_MAX_TERMINALS = 64
+"""Pseudo terminals of one jail: each is some 40 KiB of the kernel's memory in no account, and all
+users of a host, its own programs apart, have 3,072."""
 
 # Of what /proc shows about the host, this stays: libraries ask for it. The rest is covered.
 _PROC_KEPT = frozenset(
@@ -210,6 +221,7 @@ def mount_jail(
             "size=64k,nr_inodes=64,mode=755",
         )
     _mount_scratch(size, inodes)
+    _mount_terminals()
     _put(kept)
     for path, target in links.items():
         if any(within(path, folder) for folder in hidden):
@@ -230,6 +242,14 @@ def _mount_scratch(size: int, inodes: int) -> None:
         os.mkdir(f"{_SCRATCH}/{name}", 0o700)
         _bind(f"{_SCRATCH}/{name}", target)
     os.mkdir(f"{TEMPORARY}/runtime", 0o700)
+
+
+def _mount_terminals() -> None:
+    """An instance of the jail's own, whose terminals nobody else sees; else there are none."""
+    with contextlib.suppress(OSError):
+        options = f"newinstance,ptmxmode=666,mode=600,max={_MAX_TERMINALS}"
+        flags = kernel.MS_NOSUID | kernel.MS_NOEXEC
+        kernel.mount("terminals", TERMINALS, "devpts", flags, options)
 
 
 def _mount_views(snapshot: str, packages: str) -> View:

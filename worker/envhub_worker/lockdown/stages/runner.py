@@ -17,6 +17,7 @@ from envhub_worker.lockdown.context import JailContext
 from envhub_worker.lockdown.layers import LayerUnavailableError
 from envhub_worker.lockdown.mechanisms import kernel, landlock, process
 from envhub_worker.lockdown.mechanisms.landlock import LandlockRule
+from envhub_worker.lockdown.root_plan import TERMINALS
 from envhub_worker.lockdown.seccomp import filter
 from envhub_worker.lockdown.seccomp.evidence import OwnPaths
 from envhub_worker.protocol.confinement import Limits
@@ -110,6 +111,7 @@ def rules(jail: JailContext, pid: int) -> list[LandlockRule]:
     writable = _writable(jail)
     # CUDA names its threads there, and gives up (error 304) where it cannot. Nobody else's
     # processes are in a pid namespace's /proc; without one, children cannot name theirs.
+    devices = [*common.root.devices, *([TERMINALS] if common.namespaced else [])]
     threads = (
         [] if common.config.gpu is False else ["/proc" if common.namespaced else f"{own}/task"]
     )
@@ -117,7 +119,7 @@ def rules(jail: JailContext, pid: int) -> list[LandlockRule]:
         *(LandlockRule(path, landlock.READ) for path in readable),
         *([] if common.namespaced else [LandlockRule(own, landlock.READ_DIR)]),
         *(LandlockRule(path, landlock.WRITE) for path in writable),
-        *(LandlockRule(path, landlock.DEVICE) for path in common.root.devices),
+        *(LandlockRule(path, landlock.DEVICE) for path in devices),
         *(LandlockRule(path, landlock.WRITE_FILE | landlock.TRUNCATE) for path in threads),
     ]
 
@@ -133,7 +135,8 @@ def runner_paths(jail: JailContext, pid: int, thread: int) -> OwnPaths:
     streams = ("/dev/fd", "/dev/stdin", "/dev/stdout", "/dev/stderr")
     itself = ("/proc/self", "/proc/thread-self", f"/proc/{pid}", f"/proc/{thread}")
     scratch = tuple(_writable(jail))
-    changed = (*scratch, *jail.common.root.devices, *streams, *itself)
+    terminals = (TERMINALS, "/dev/ptmx") if jail.common.namespaced else ()
+    changed = (*scratch, *jail.common.root.devices, *terminals, *streams, *itself)
     read = (*jail.common.root.trees, jail.spec.snapshot, *changed)
     return OwnPaths(changed=changed, read=read, scratch=scratch)
 
