@@ -203,12 +203,14 @@ def _ran(provenance: Mapping[str, Any]) -> Iterator[str]:
     interpreter = _pairs(provenance.get("interpreter"))
     says = [(f"{name}, as it says", value) for name, value in interpreter]
     yield from facts([*((name, provenance.get(name)) for name in _RAN), *says])
+    listed = provenance.get("layers") or ()
+    held = sum(one.get("enforced") is True for one in listed)
     layers = [
-        tuple(text(layer.get(name)) for name in ("layer", "enforced", "detail"))
-        for layer in provenance.get("layers") or ()
+        tuple(text(one.get(name)) for name in ("layer", "enforced", "detail")) for one in listed
     ]
     yield from folded(
-        f"layers that confined it ({len(layers)})", table(("layer", "holds", "how"), layers)
+        f"layers that confined it ({held} of {len(layers)})",
+        table(("layer", "holds", "how"), layers),
     )
     for name, said in (
         ("files", "files, by their hashes"),

@@ -14,6 +14,8 @@ from envhub_worker.protocol.text import counted, printable
 
 _MOST, _LONGEST = 40, 300
 _WHOLE = "strict"
+_OF_ALL_PLAIN_USERS = "user-quotas"
+"""A layer that none of them can have: ``envhub doctor`` says so once, and not each run."""
 _NETWORK = "socket AF_"
 _LOCAL = frozenset({"socket AF_UNIX", "socketpair AF_UNIX"})
 _DEEDS = {"connect": "connect to", "sendto": "send to"}
@@ -73,7 +75,8 @@ class Confinement:
             other = f", in a container; {self.asked} was asked for"
             yield "confined by", layers + other * (self.profile != self.asked)
         for layer, why in self.missing:
-            yield "not enforced", f"{layer}: {why}"
+            if layer != _OF_ALL_PLAIN_USERS:
+                yield "not enforced", f"{layer}: {why}"
         if self.unrecorded:
             yield "not recorded", f"denied attempts: {self.unrecorded}"
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from envhub_sandbox.cli.shared.console import safe_line, show, show_rows
-from envhub_worker.protocol.text import counted
 
 if TYPE_CHECKING:
     from envhub_sandbox.check.play.episodes import Rollout
@@ -159,13 +158,11 @@ def _interpreter(interpreter: dict[str, str], packages: dict[str, str], names: s
 
 
 def _confinement(provenance: dict[str, Any], in_process: bool) -> list[tuple[str, str]]:
-    """How many layers held, whose names ``--json`` has; those that did not, one by one."""
+    """What ``envhub check`` says of it; ``--json`` has the layers by name."""
     if in_process:
         return [("confined by", "nothing: the code ran in this process")]
-    layers = provenance.get("layers") or []
-    if not layers:
+    if not provenance.get("layers"):
         return [("confined by", "nothing ran")]
-    missing = [layer for layer in layers if not layer.get("enforced")]
-    held = f"{provenance.get('profile')}, {counted(len(layers) - len(missing), 'layer')}"
-    lacks = [f"{layer.get('layer', '?')}: {layer.get('detail', '')}" for layer in missing]
-    return [("confined by", held), *(("not enforced", text) for text in lacks)]
+    from envhub_sandbox.check.play.confinement import Confinement
+
+    return list(Confinement.of(str(provenance.get("profile")), provenance, "").rows())

@@ -152,7 +152,9 @@ def _limit_layers(
         "watchdog": f"{amount}, measured by the jail's init; bursts between two looks overshoot",
     }
     # what the kernel counts per user, and a jail therefore takes from others' share
-    quotas = Layer("user-quotas", False, f"shared with this user's programs: {SHARED_QUOTAS}")
+    shared = f"shared with this user's programs: {SHARED_QUOTAS}"
+    alone = "jails of root, or of a user who runs nothing else, have their own"
+    quotas = Layer("user-quotas", False, f"{shared}; {alone}")
     if root:
         quotas = Layer("user-quotas", True, "its own: no other program runs as this user")
     layers = [Layer("memory", True, detail[memory] + uncounted), quotas]

@@ -100,10 +100,13 @@ def test_what_confined_it_is_text(text: str) -> None:
 
 
 def test_all_that_there_can_be_is_a_line_and_no_notice() -> None:
-    """As where it did not load, so that nobody knows which layers held."""
+    """As where it did not load, so that nobody knows which layers held. What no plain user can
+    have is no news of each run.
+    """
     made = Report("./walk:env.py")
+    quotas = {"layer": "user-quotas", "enforced": False, "detail": "shared"}
     for profile in ("strict", ""):
-        made.confinement = Confinement.of("strict", {"profile": profile, "layers": []}, "")
+        made.confinement = Confinement.of("strict", {"profile": profile, "layers": [quotas]}, "")
         [line] = made.confinement.lines()
         assert line.startswith("confined by: strict")
         assert list(reports.workflow_commands(made)) == []

@@ -53,7 +53,7 @@ def test_strict_as_a_user_has_every_layer() -> None:
             "user-quotas",
             False,
             "shared with this user's programs: pages of pipes, descriptors in flight in sockets, "
-            "epoll watches",
+            "epoll watches; jails of root, or of a user who runs nothing else, have their own",
         ),
     ]
 
