@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import Any
 from urllib.parse import quote
 from xml.etree import ElementTree
@@ -39,31 +39,6 @@ def document(report: Report, failures: Sequence[Finding]) -> dict[str, Any]:
         "confinement": None if report.confinement is None else report.confinement.document(),
         "provenance": report.provenance,
     }
-
-
-def read_report(document: Mapping[str, Any]) -> tuple[Report, list[Finding]]:
-    """A report and what fails it, of what ``document`` has made and somebody may have changed.
-    Raises ``KeyError``, ``TypeError`` or ``ValueError``: it is no such document.
-    """
-    report = Report(_str(document["reference"]), commit=_str(document["commit"]))
-    failures = []
-    for row in document["findings"]:
-        place = (_str(row["task"] or ""), _str(row["file"] or ""), int(row["line"] or 0))
-        kept = report.add(Finding(CHECKS[row["check"]].id, _str(row["message"]), *place))
-        failures += [kept] if kept is not None and row["fails"] is True else []
-    report.passed = [(CHECKS[row["check"]].id, _str(row["task"])) for row in document["held"]]
-    report.left_out = int(document["left_out"])
-    report.unmade = [CHECKS[check].id for check in document["unjudged"]["checks"]]
-    report.waiting = [_str(task) for task in document["unjudged"]["tasks"]]
-    if document["passed"] is not (not failures):
-        raise ValueError("the findings are not what the verdict says")
-    return report, failures
-
-
-def _str(value: object) -> str:
-    if not isinstance(value, str):
-        raise TypeError(f"{type(value).__name__} is no text")
-    return value
 
 
 def junit(report: Report, failures: Sequence[Finding]) -> str:

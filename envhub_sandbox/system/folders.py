@@ -205,10 +205,9 @@ def _group(gid: int) -> str:
 _NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | open_flags("O_CLOEXEC")
 
 
-def write_whole_file(path: Path, data: bytes, *, mode: int = 0o600, durable: bool = False) -> None:
+def write_whole_file(path: Path, data: bytes, *, mode: int = 0o600) -> None:
     """Write a file under another name, and rename it: meanwhile others read the old one.
     ``mode``: its mode; the umask takes from it.
-    ``durable``: whether it is also whole after a loss of power.
     Raises ``OSError``: it cannot be written. Nothing is left of it.
     """
     part = path.with_name(f".{path.name}-{secrets.token_hex(4)}")
@@ -216,9 +215,6 @@ def write_whole_file(path: Path, data: bytes, *, mode: int = 0o600, durable: boo
     try:
         with open(descriptor, "wb") as file:
             file.write(data)
-            file.flush()
-            if durable:
-                os.fsync(descriptor)
         os.replace(part, path)
     except BaseException:
         with contextlib.suppress(OSError):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -39,13 +40,10 @@ if TYPE_CHECKING:
 SETTINGS = (
     *("steps", "resets", "slow_step", "seed", "fail_on", "allow", "policy", "n_envs"),
     *("timeout", "memory", "disk", "processes", "cpu_time"),
-    *("jobs", "max_memory", "deadline"),
+    "deadline",
 )
 """What may stand in ``[check]`` of ``--settings FILE``, by the names in Python."""
-OF_A_LIST = ("output", "jobs", "max_memory", "again")
-"""What means nothing for one repository; it may stand in a file that is for both."""
 _PANEL = "What it says"
-_LIST = "A list"
 _FILE = "FILE"
 _MAY = "What it may do"
 _LONG_S = 10.0
@@ -144,32 +142,6 @@ def check(
             "--all",
             metavar="FILE",
             help="Judge a list of references, one per line; '-' is stdin.",
-            rich_help_panel=_LIST,
-        ),
-    ] = None,
-    output: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="DIR",
-            help="With --all: the folder for reports and their index. A run continues there.",
-            rich_help_panel=_LIST,
-        ),
-    ] = None,
-    jobs: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            help="With --all: repositories judged at once; by default one for every two cores.",
-            rich_help_panel=_LIST,
-        ),
-    ] = None,
-    max_memory: Annotated[
-        str | None,
-        typer.Option(
-            metavar="SIZE",
-            help="With --all: sum of the memory limits of all jails at once; by default the free "
-            "memory of this machine and its control groups.",
-            rich_help_panel=_LIST,
         ),
     ] = None,
     deadline: Annotated[
@@ -181,14 +153,6 @@ def check(
             help="Time for one repository; after it the report names what was not judged.",
         ),
     ] = 900.0,
-    again: Annotated[
-        bool,
-        typer.Option(
-            "--again",
-            help="With --all: judge also repositories that have results.",
-            rich_help_panel=_LIST,
-        ),
-    ] = False,
     suite: opt.Suite = None,
     task: opt.Task = None,
     policy: Annotated[
@@ -210,43 +174,16 @@ def check(
 
     [bold]envhub check org/repo@<commit> --junit report.xml[/bold]
 
-    [bold]envhub check --all references.txt --output judged[/bold]
+    [bold]envhub check --all references.txt --json[/bold]
     """
     if not math.isfinite(deadline):
         raise UsageError(f"--deadline is {deadline}; it takes seconds, such as 900")
     least, allowed = level(str(fail_on)), _known(allow or ())
     from envhub_sandbox.check.settings import no_report_but_ours, refuse_files_of_the_judged
 
-    if listed is not None:
-        _refuse_beside_a_list(ref=ref, sarif=sarif, html=html)
-        from envhub_sandbox.cli.check import list_run
-
-        run = list_run.ListRun(
-            file=listed,
-            output=output,
-            jobs=jobs,
-            max_memory=max_memory,
-            deadline=deadline,
-            again=again,
-            make=make,
-            settings=settings,
-            policy=policy,
-            arguments=list_run.handed_on(ctx),
-            debug=debug,
-        )
-        with no_report_but_ours([junit], "./"):
-            run.judge()
-            run.write(junit)
-        run.show(json=json, github=github)
-        return
-    if ref is None:
-        raise UsageError("name a repository, or a list of them: --all FILE --output DIR")
-    if any(opt.is_typed(ctx, name) for name in OF_A_LIST):
-        raise UsageError("--output, --jobs, --max-memory and --again are for --all FILE")
-    refuse_files_of_the_judged({"--settings": settings, "--policy": policy}, ref)
-    with no_report_but_ours((junit, sarif, html), ref):
-        report = _judge(
-            make,
+    def judged(reference: str) -> Report:
+        return judgement(
+            replace(make, ref=reference),
             policy,
             deadline,
             quiet=json or github,
@@ -257,6 +194,31 @@ def check(
             tasks=lambda envs: [one[:2] for one in opt.select_envs(envs, suite, task)],
             pictures=html is not None,
         )
+
+    if listed is not None:
+        _refuse_beside_a_list(ref=ref, sarif=sarif, html=html)
+        _arguments(make, policy)  # what cannot be is said before anything is judged
+        from envhub_sandbox.cli.check.list_run import ListRun
+
+        run = ListRun(
+            file=listed,
+            judge=judged,
+            least=least,
+            allowed=allowed,
+            settings=settings,
+            policy=policy,
+            debug=debug,
+        )
+        with no_report_but_ours([junit], "./"):
+            run.run()
+            run.write(junit)
+        run.show(json=json, github=github)
+        return
+    if ref is None:
+        raise UsageError("name a repository, or a list of them: --all FILE")
+    refuse_files_of_the_judged({"--settings": settings, "--policy": policy}, ref)
+    with no_report_but_ours((junit, sarif, html), ref):
+        report = judged(ref)
         failures = report.failures(least, allowed)
         _write(report, failures, junit, sarif, html)
     from envhub_sandbox.check import reports
@@ -280,8 +242,7 @@ def _refuse_beside_a_list(*, ref: str | None, **files: Path | None) -> None:
     for name, path in files.items():
         if path is not None:
             raise UsageError(
-                f"--{name} is about one repository; with --all, --output DIR has a page and a "
-                "JSON document for each, and --junit FILE has all"
+                f"--{name} is about one repository; with --all, --json and --junit FILE have all"
             )
 
 
@@ -296,22 +257,17 @@ def _known(names: Sequence[str]) -> Sequence[str]:
     return names
 
 
-def _judge(
+def judgement(
     make: opt.MakeOptions, policy: Path | None, deadline_s: float, *, quiet: bool, **play: Any
 ) -> Report:
     """What comes of it until the deadline; ``play`` is what else ``JudgeOptions`` says."""
-    arguments = make.arguments()
-    del arguments["cfg"]
-    arguments["prewarm"] = 0  # a jail started ahead would be one more at once
     from envhub_sandbox.check import settings
     from envhub_sandbox.check.findings import Report
     from envhub_sandbox.check.judge import judge
 
-    if policy is not None:
-        arguments["policy"] = settings.merged_settings(
-            settings.read_file(policy), arguments["policy"]
-        )
-
+    arguments = _arguments(make, policy)
+    del arguments["cfg"]
+    arguments["prewarm"] = 0  # a jail started ahead would be one more at once
     report, doing = Report(make.ref, folder=settings.folder_below_here(make.ref)), ["starting"]
     with ProgressBar(quiet=quiet, long_s=_LONG_S) as bar, says_what_is_seen():
 
@@ -326,6 +282,18 @@ def _judge(
         except DeadlineReached:
             report.stopped(deadline_s, doing[-1])
     return report
+
+
+def _arguments(make: opt.MakeOptions, policy: Path | None) -> dict[str, Any]:
+    """Those of ``make_env``, the policy checked. Raises ``UsageError`` or ``PolicyError``."""
+    from envhub_sandbox.check import settings
+    from envhub_sandbox.settings.policy import policy_from
+
+    arguments = make.arguments()
+    says = {} if policy is None else settings.read_file(policy)
+    arguments["policy"] = settings.merged_settings(says, arguments["policy"])
+    policy_from(arguments["policy"], None)
+    return arguments
 
 
 def _write(report: Report, failures: list[Finding], *files: Path | None) -> None:

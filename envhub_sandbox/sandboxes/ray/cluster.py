@@ -99,22 +99,6 @@ def _check_address(address: str, there: str) -> None:
         )
 
 
-def shared_address() -> str:
-    """The address for other processes that are to use the same cluster; raises as ``connect``."""
-    import ray
-
-    connect()
-    return str(ray.get_runtime_context().gcs_address)
-
-
-def cpus() -> int:
-    """How many the cluster has, at least one; raises as ``connect``."""
-    import ray
-
-    connect()
-    return max(1, int(ray.cluster_resources().get("CPU", 0)))
-
-
 def job() -> str | None:
     """This process's connection to Ray, which each ``ray.init`` makes anew; None without one."""
     import ray

@@ -21,6 +21,7 @@ from typer.testing import CliRunner
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.cli.check.deadline import DeadlineReached, deadline_alarm
 from envhub_sandbox.hub.sources import parser
+from tests.corpus.entries import Entry
 from tests.hub.stub_hub import StubHub
 from tests.support.command_line import envhub
 from tests.support.packages.wheels import Index
@@ -182,21 +183,18 @@ def test_a_parser_that_hangs_is_ended(tmp_path: Path, monkeypatch: pytest.Monkey
     assert eventually(lambda: descendants() <= before)
 
 
-def test_one_of_a_list_says_what_was_not_judged(tmp_path: Path) -> None:
-    """Its page is kept, and the next run judges it again."""
+def test_one_of_a_list_ends_no_other(tmp_path: Path) -> None:
+    """What takes too long is not judged to its end, and the next is judged as ever."""
     folder = hanging(tmp_path, "STEP")
-    (tmp_path / "list").write_text(f"{folder}\n")
-    command = ["check", "--all", tmp_path / "list", "--output", tmp_path / "out", "--steps", "5"]
-    done = envhub(*command, "--deadline", "1")
+    Entry(group="honest").write(tmp_path / "quick")
+    (tmp_path / "list").write_text(f"{folder}\n{tmp_path / 'quick'}\n")
+    short = ("--steps", "2", "--resets", "0", "--deadline", "25", "--json")
+    done = envhub("check", "--all", tmp_path / "list", *short)
     assert done.returncode == 10, done.stderr
-    assert "ended after 1 s, at: " in done.stdout
-    [row] = json.loads((tmp_path / "out" / "index.json").read_text())["results"]
-    assert (row["verdict"], row["fails"]) == ("not judged", [])
-    assert "not judged to its end" in (tmp_path / "out" / row["page"]).read_text()
-    write_repository(folder, _ENV)
-    again = envhub(*command, "--deadline", "200")
-    assert json.loads((tmp_path / "out" / "index.json").read_text())["counts"]["passed"] == 1
-    assert again.returncode == 0, again.stderr
+    late, quick = json.loads(done.stdout)["results"]
+    assert (late["verdict"], quick["verdict"]) == ("not judged", "passed")
+    assert "ended after 25 s, at: " in late["report"]["findings"][0]["message"]
+    assert late["report"]["unjudged"]["tasks"]
 
 
 def wait_for_ever() -> None:

@@ -7,8 +7,6 @@ from html.parser import HTMLParser
 import numpy as np
 
 from envhub_sandbox.check.findings import Finding, Report
-from envhub_sandbox.check.many.entries import ListEntry
-from envhub_sandbox.check.many.results import Result, Verdict
 from envhub_sandbox.check.play.confinement import Confinement
 from envhub_sandbox.check.play.episodes import Episode
 from envhub_sandbox.check.play.plays import Film, Play
@@ -89,21 +87,3 @@ def report_of(text: str) -> Report:
         for total in (1.0, float("inf"))
     ]
     return made
-
-
-def results_of(text: str) -> list[Result]:
-    """Results in which every word is somebody's."""
-    one = ListEntry(text, f"{text}@main", 1)
-    return [
-        Result(
-            listed=one,
-            verdict=Verdict.FAILED,
-            commit=text,
-            found={"error": 1},
-            fails=(("runs", text),),
-            ended=text,
-        ),
-        Result(listed=one, verdict=Verdict.UNJUDGED, said=text, ended="then"),
-        Result(listed=one, verdict=Verdict.WAITING),
-        Result(listed=one, verdict=Verdict.PASSED, found={}),
-    ]

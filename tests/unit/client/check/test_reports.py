@@ -154,7 +154,6 @@ def test_the_most_severe_stands_first_in_every_form() -> None:
     order = ["runs", "seeding", "slow-steps", "denied-files", "card", "licence"]
     told = reports.document(made, failures)
     assert [one["check"] for one in told["findings"]] == order
-    assert [one.id for one in reports.read_report(told)[0].findings] == order
     cases = [one.attrib["name"] for one in ElementTree.fromstring(reports.junit(made, failures))]
     assert cases == [*order, "loads"]
     [run] = json.loads(reports.sarif(made, failures))["runs"]
@@ -229,8 +228,6 @@ def test_what_was_not_judged_is_told_in_every_form() -> None:
     told = reports.document(made, [])
     assert told["unjudged"]["tasks"] == ["a / 0", "b / 1"]
     assert not set(told["unjudged"]["checks"]) & {"runs", "card", "loads", "deadline"}
-    again, _ = reports.read_report({**told, "passed": True})
-    assert (again.unmade, again.waiting) == (made.unmade, made.waiting)
     root = ElementTree.fromstring(reports.junit(made, []))
     skipped = [one.attrib for one in root if one.find("skipped") is not None]
     assert {"classname": "b / 1", "name": "*"} in skipped

@@ -269,7 +269,7 @@ def test_nobody_gets_at_a_snapshot_before_it_is_complete(snapshot_store: Path) -
 def test_a_file_is_replaced_and_nothing_stays_beside_it(tmp_path: Path) -> None:
     path = tmp_path / "file"
     for data in (b"one", b"two"):
-        write_whole_file(path, data, durable=data == b"two")
+        write_whole_file(path, data)
         assert path.read_bytes() == data
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
     assert os.listdir(tmp_path) == ["file"]

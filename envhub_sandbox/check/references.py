@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
 from typing import IO
 
 from envhub_sandbox.errors import EnvHubError, HubReferenceError
@@ -22,7 +20,6 @@ MOST = 2_000
 """References: a page of as many rows is one that people can read."""
 _LONGEST = 4_096
 _SHOWN = 20
-_SLUG = 48
 
 
 @dataclass(frozen=True)
@@ -37,20 +34,6 @@ class ListEntry:
     reference: str
     meaning: str
     line: int
-
-    @property
-    def name(self) -> str:
-        """What its files are called: a part that people know, and a hash that no other has.
-
-        Of the reference's own characters only letters and digits are left, so that nothing in it
-        is a path, hidden, an option or markup; on disks that ignore case, too.
-        """
-        known = self.meaning.partition("@")[0]
-        if self.meaning.startswith("/"):
-            known = "/".join(Path(self.meaning.partition(":")[0]).parts[-2:])
-        slug = re.sub(r"[^a-z0-9]+", "-", known.lower()).strip("-")[:_SLUG].strip("-")
-        digest = hashlib.sha256(self.meaning.encode("utf-8", "surrogatepass")).hexdigest()[:16]
-        return f"{slug}-{digest}" if slug else digest
 
 
 def read_entries(file: IO[bytes], title: str) -> list[ListEntry]:

@@ -1,1 +1,0 @@
-"""A list of repositories, each judged in a process of its own: ``envhub check --all``."""
