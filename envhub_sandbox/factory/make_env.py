@@ -88,10 +88,9 @@ def make_env(
         trust_remote_code: Only for ``sandbox=None``.
         sandbox: Where the code runs: ``"process"``; ``"docker"``, ``"docker:IMAGE"`` or a
             ``DockerSandbox``; ``"ray"`` or a ``RaySandbox``; ``"tcp://HOST:PORT"`` or a
-            ``RemoteSandbox``. A list of these, ``"file:PATH"``, ``"dns://HOST:PORT"`` or a
-            ``Fleet`` spreads the sub-environments of each environment over several places
-            (``docs/scaling.md``). None runs the code in this process without protection, as
-            LeRobot does.
+            ``RemoteSandbox``. A list of these, or a ``Fleet``, spreads the sub-environments of each
+            environment over several places (``docs/scaling.md``). None runs the code in this
+            process without protection, as LeRobot does.
         env_kwargs: Further keyword arguments for the repository's ``make_env``.
         policy: What the code may reach; see ``Policy``.
         timeouts: How long operations may take; see ``Timeouts``.

@@ -35,13 +35,11 @@ T = TypeVar("T")
 _SOON_S = 0.1
 _SLICE_S = 0.1
 _AGAIN_S = 1.0
-FILE, DNS = "file:", "dns://"
-"""What a fleet's place begins with that names a list of places."""
 
 
 def is_list(text: str) -> bool:
-    """Whether a text names several places, or where they are listed."""
-    return "," in text or text.startswith((FILE, DNS))
+    """Whether a text names several places."""
+    return "," in text
 
 
 class Sandbox:

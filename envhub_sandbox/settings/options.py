@@ -205,8 +205,8 @@ class Options:
     sandbox: Any = _option(
         "process",
         "--sandbox",
-        "Where it runs; several places are separated by commas, or listed in a file or by DNS.",
-        metavar="process|docker[:IMAGE]|ray|tcp://HOST:PORT|file:PATH|dns://HOST:PORT",
+        "Where it runs; several places are separated by commas.",
+        metavar="process|docker[:IMAGE]|ray|tcp://HOST:PORT",
         panel=_LIMITS,
     )
     server_key: str | None = _option(

@@ -24,7 +24,6 @@ from envhub_sandbox.dependencies import environments, interpreters, modules, res
 from envhub_sandbox.factory import make_env
 from envhub_sandbox.sandboxes import remote
 from envhub_sandbox.sandboxes.docker import container
-from envhub_sandbox.sandboxes.fleet import fleet
 from envhub_sandbox.session import env_session
 from envhub_sandbox.session import launcher as launcher_module
 from envhub_sandbox.session.counters import Ledger
@@ -81,11 +80,6 @@ def leases(env: Any) -> list[Lease]:
 
 def state(env: Any) -> State:
     return session(env).lifecycle.state
-
-
-def freshness_of_dns() -> Spot:
-    """For how long an answer about a fleet's places holds."""
-    return fleet, "_FRESH_S"
 
 
 def choice_of_runtime() -> Spot:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -104,14 +104,14 @@ class Placement:
     """The places of the workers of one ``make_env``. Thread-safe.
 
     Args:
-        places: Gives those that there are now.
+        places: As the caller names them.
         resolve: Makes a sandbox of a place's name.
         runtime: Makes what the jails of a place run on.
     """
 
     def __init__(
         self,
-        places: Callable[[], list[str | Sandbox]],
+        places: Sequence[str | Sandbox],
         resolve: Resolve,
         runtime: Callable[[Member], Runtime],
     ) -> None:
@@ -120,7 +120,7 @@ class Placement:
         self._runtime = runtime
         self._lock = threading.RLock()  # interruption.md, rule 12
         self._known: dict[object, Member] = {}
-        self._last: list[Member] = []
+        self._members: list[Member] = []
         self._at: dict[int, Member] = {}
         self._placed_s: dict[int, float] = {}
         self._repository: ForRepository | None = None
@@ -128,27 +128,19 @@ class Placement:
         self._run_by: tuple[list[Member], Runtime] | None = None
 
     def members(self) -> list[Member]:
-        """The places that there are now, each once, with its weight.
-
-        Raises ``EnvHubError``: one is none, at first. Later it is left out.
-        """
+        """The places, each once, with its weight. Raises ``EnvHubError``: one is none."""
         with self._lock:
-            found: dict[Member, int] = {}
-            for entry in self._places():
-                try:
+            if not self._members:
+                found: dict[Member, int] = {}
+                for entry in self._places:
                     member = self._member(entry if isinstance(entry, str) else id(entry), entry)
                     while member in found and member.sandbox.is_placed_anew:
                         member = self._member(member, entry)
-                except EnvHubError as error:
-                    if not self._last:
-                        raise
-                    WORKER.warning("a place of the fleet is left out: %s", error)
-                    continue
-                found[member] = found.get(member, 0) + 1
-            for member, weight in found.items():
-                member.weight = weight
-            self._last = list(found) or self._last
-            return list(self._last)
+                    found[member] = found.get(member, 0) + 1
+                for member, weight in found.items():
+                    member.weight = weight
+                self._members = list(found)
+            return list(self._members)
 
     def _member(self, key: object, entry: str | Sandbox) -> Member:
         if key not in self._known:
@@ -163,7 +155,7 @@ class Placement:
     def open_for(self, repository: ForRepository, memory_bytes: int) -> None:
         """Make the places of a repository.
 
-        One that is absent, or joins the list later, is made when a worker is to go there.
+        One that is absent is made when a worker is to go there.
         ``memory_bytes``: as of ``Rooms``.
         """
         with self._lock:
@@ -184,7 +176,7 @@ class Placement:
 
     def retry_s(self) -> float:
         """For how long a worker waits for room: the longest of all places."""
-        return max(member.retry_s for member in self._last or self.members())
+        return max(member.retry_s for member in self._members or self.members())
 
     def at(self, number: int) -> Member:
         """Where a worker is, or will be as far as is known."""
@@ -228,14 +220,13 @@ class Placement:
         raise AssertionError("there are no places")
 
     def _open_ones(self) -> list[Member]:
-        """Those of the list, as it was last read, that are made, else those that were; before that
-        all."""
-        members = self._last or self.members()
+        """Those that are made for the repository; before that all."""
+        members = self._members or self.members()
         opened = [one for one in members if one.is_open]
-        return opened or [one for one in list(self._known.values()) if one.is_open] or members
+        return opened or members
 
     def _opens(self, number: int, member: Member) -> bool:
-        """Whether a worker can go there; a place that has joined is made for the repository."""
+        """Whether a worker can go there; one that was absent is made for the repository."""
         try:
             if self._repository is not None:
                 member.open_for(self._repository)

@@ -103,8 +103,8 @@ def test_a_help_has_all_words_of_an_option(name: str) -> None:
         ("check x --fail-on ", {"error", "warning", "note"}),
         ("inspect x --fail-on w", {"warning"}),
         ("run x --dependencies ", {"auto", "declared", "host"}),
-        ("run x --sandbox ", {"process", "docker", "ray", "tcp://", "file:", "dns://", "none"}),
-        ("check x --sandbox ", {"process", "docker", "ray", "tcp://", "file:", "dns://"}),
+        ("run x --sandbox ", {"process", "docker", "ray", "tcp://", "none"}),
+        ("check x --sandbox ", {"process", "docker", "ray", "tcp://"}),
     ],
 )
 def test_values_are_completed(words: str, completed: set[str]) -> None:

@@ -11,7 +11,6 @@ from envhub_sandbox.dependencies.packages import PackageSet
 from envhub_sandbox.dependencies.request import PackageRequest
 from envhub_sandbox.errors import DependencyError, PolicyError
 from envhub_sandbox.sandboxes.fleet import placement as module
-from envhub_sandbox.sandboxes.fleet.fleet import PlaceList
 from envhub_sandbox.sandboxes.fleet.member import FleetPackages, Member
 from envhub_sandbox.sandboxes.fleet.placement import Placement, Room
 from envhub_sandbox.sandboxes.sandbox import Sandbox
@@ -59,7 +58,7 @@ def _placement(names: list[str]) -> Placement:
     def resolve(place: Any) -> Sandbox:
         return known[place]
 
-    return Placement(PlaceList(names).read, resolve, lambda member: Runtime(""))
+    return Placement(names, resolve, lambda member: Runtime(""))
 
 
 def _opened(names: list[str]) -> Placement:
@@ -169,27 +168,6 @@ def test_servers_that_do_not_answer_are_not_all_asked(
     assert _first(_opened(names), 0) == "far099"  # the control
     monkeypatch.setattr(module, "ASK_S", 0)
     assert _first(_opened(names), 0) == "far000"
-
-
-def test_a_place_that_is_wrong_later_is_left_out(tmp_path: Path, rooms: dict[str, Room]) -> None:
-    """A line that is half written when it is read ends no worker that can go elsewhere."""
-    known = {name: _Place(name) for name in "ab"}
-
-    def resolve(place: Any) -> Sandbox:
-        if place not in known:
-            raise PolicyError(f"sandbox is {place!r}")
-        return known[place]
-
-    path = tmp_path / "places"
-    path.write_text("b\n")
-    made = Placement(PlaceList(path).read, resolve, lambda member: Runtime(""))
-    made.members()
-    path.write_text("a\ntcp://10.0.\nb\n")
-    assert [member.name for member in made.members()] == ["a", "b"]
-    path.write_text("tcp://10.0.\n")
-    assert [member.name for member in made.members()] == ["a", "b"], "the last ones hold"
-    with pytest.raises(PolicyError, match="10"):
-        Placement(PlaceList(path).read, resolve, lambda member: Runtime("")).members()
 
 
 # --- A repository's packages on each place of a fleet, as that place makes them
