@@ -17,7 +17,6 @@ import contextlib
 import errno
 import os
 import re
-import select
 import shutil
 import stat
 import subprocess
@@ -45,6 +44,7 @@ from envhub_sandbox.system.platform import (
     boot_id,
     has_ended,
     pidfd,
+    readable_within,
     user_id,
 )
 from envhub_worker.protocol.runtime import OWN, Runtime, site_options
@@ -252,7 +252,7 @@ def _environment() -> dict[str, str]:
 
 
 def _wait_until_ready(ready: int, server: LocalServer) -> None:
-    readable, _, _ = select.select([ready], [], [], _STARTUP_S)
+    readable = readable_within(ready, _STARTUP_S)
     if readable and os.read(ready, 16):
         return
     log = (server.folder / "server.log").read_text("utf-8", "replace")[-4000:]

@@ -192,6 +192,15 @@ if not IS_LINUX:
     run_after_fork(_forget_pipe)
 
 
+def readable_within(fd: int, timeout_s: float) -> bool:
+    """Whether there is something to read, or the other end has gone; waits for it."""
+    if sys.platform == "win32":
+        return bool(select.select([fd], [], [], timeout_s)[0])
+    poll = select.poll()  # of descriptors beyond 1023, too
+    poll.register(fd, select.POLLIN)
+    return bool(poll.poll(timeout_s * 1000))
+
+
 def end_with(parent: int, patience_s: float) -> None:
     """End this process as soon as another has ended, and with it the group that it leads.
     ``parent``: a pidfd of the other.
@@ -204,9 +213,7 @@ def end_with(parent: int, patience_s: float) -> None:
 
 def _watch(parent: int, patience_s: float) -> None:
     if sys.platform != "win32":
-        poll = select.poll()  # of descriptors beyond 1023, too
-        poll.register(parent, select.POLLIN)
-        while not poll.poll():
+        while not readable_within(parent, 3600.0):
             pass
         if patience_s > 0:
             # of all threads the one whose system call it has to interrupt

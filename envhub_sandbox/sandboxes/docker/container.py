@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import secrets
-import select
 import subprocess
 import sys
 from dataclasses import dataclass, replace
@@ -21,7 +20,7 @@ from envhub_sandbox.sandboxes.pool import ServerPool, ServerUse, WorkerServer
 from envhub_sandbox.sandboxes.process import CONTAINER, LocalServer
 from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.settings.policy import Policy
-from envhub_sandbox.system.platform import cores, pidfd, user_id
+from envhub_sandbox.system.platform import cores, pidfd, readable_within, user_id
 from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_worker.protocol import messages as m
@@ -223,7 +222,7 @@ def _user(sockets: Path) -> tuple[int, int]:
 
 def _answer(ready: int) -> bytes:
     """The monitor's one line."""
-    readable, _, _ = select.select([ready], [], [], STARTUP_S)
+    readable = readable_within(ready, STARTUP_S)
     answer = os.read(ready, _ANNOUNCEMENT_BYTES + 1) if readable else b""
     if not answer:
         what = "ended" if readable else f"did not come up in {STARTUP_S:.0f} s"

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import json
 import os
-import select
 import subprocess
 import sys
 import tempfile
@@ -21,7 +20,7 @@ from typing import Any
 from envhub_sandbox.dependencies import index
 from envhub_sandbox.sandboxes.process import worker_program
 from envhub_sandbox.system.folders import cache_root
-from envhub_sandbox.system.platform import pidfd
+from envhub_sandbox.system.platform import pidfd, readable_within
 
 STARTUP_S = 120.0
 _LINE_BYTES = 4096
@@ -68,7 +67,7 @@ class WorkerActor:
                 self._process = self._executed(f"tcp://{host}:*", client_key, ready_end)
             finally:
                 os.close(ready_end)
-            readable, _, _ = select.select([answer], [], [], STARTUP_S)
+            readable = readable_within(ready, STARTUP_S)
             words = answer.readline(_LINE_BYTES).decode().split() if readable else []
         if len(words) != 2:
             what = "ended" if readable else f"was not ready after {STARTUP_S:.0f} s"

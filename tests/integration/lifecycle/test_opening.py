@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import os
+import resource
 from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 
 from envhub_sandbox import make_env
+from envhub_sandbox.sandboxes.pool import stop_idle
 from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.jail import JailHandle
 from envhub_worker.protocol import messages as m
@@ -48,6 +52,26 @@ def test_all_shards_start_and_load_side_by_side(asked: list[str], shards: int) -
         assert len(suites.env.call("get_wrapper_attr", "spec")) == 3
         asked_until_now = Counter(asked)
     assert asked_until_now == {"Hello": 1, "OpenJail": 1, "ShareSlabs": 1, "Relay": 5}
+
+
+def test_many_descriptors_are_no_obstacle(tmp_path: Path) -> None:
+    """Of a caller, where select() knows no more of them; and a server has all that it may have."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    folder = write_repository(tmp_path, STILL)
+    stop_idle()  # a server of our own
+    resource.setrlimit(resource.RLIMIT_NOFILE, (min(hard, 1500), hard))
+    files = [os.open(os.devnull, os.O_RDONLY) for _ in range(1100)]
+    try:
+        with make_env(folder) as suites:
+            suites.env.reset()
+            may_have = psutil.Process(inside.server(suites.env).process.pid).rlimit(
+                psutil.RLIMIT_NOFILE
+            )
+            assert may_have == (min(hard, 65_536), hard)
+    finally:
+        for file in files:
+            os.close(file)
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
 def test_a_request_in_between_takes_no_descriptors(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -43,10 +43,10 @@ from envhub_worker.cli.state_folder import Note, ServerNote, state_folder
 from envhub_worker.lockdown import probe
 from envhub_worker.lockdown.mechanisms import landlock, locked_folder
 from envhub_worker.lockdown.mechanisms.locked_folder import LockedFolder
+from envhub_worker.lockdown.mechanisms.process import raise_file_limit
 from envhub_worker.protocol.confinement import Surroundings
 from envhub_worker.server import Server
 
-_MAX_OPEN_FILES = 65_536
 add_arguments = add_options
 
 Publish = Callable[[Mapping[str, Any]], None]
@@ -73,7 +73,7 @@ def _listen(arguments: argparse.Namespace, state: Path) -> int:
     why = unusable(identity.profile, arguments.weakest_profile)
     if why:
         log.say("no_jail_possible", "error", why=why)
-    _raise_file_limit()
+    raise_file_limit()  # connections of strangers shall not take the descriptors that jails need
     with _watched(arguments.metrics, log, usable=not why) as publish:
         return _serve(arguments, state, identity, log, publish, around)
 
@@ -174,14 +174,6 @@ def _watched(metrics: str | None, log: Log, *, usable: bool) -> Iterator[Publish
         yield page.publish
     finally:
         port.close()
-
-
-def _raise_file_limit() -> None:
-    """Connections of strangers shall not take the descriptors that jails need."""
-    _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
-    wanted = _MAX_OPEN_FILES if hard == resource.RLIM_INFINITY else min(hard, _MAX_OPEN_FILES)
-    with contextlib.suppress(OSError, ValueError):
-        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
 def most_connections(wanted: int) -> int:

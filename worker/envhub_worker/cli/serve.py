@@ -60,8 +60,10 @@ def _client_has_gone(arguments: argparse.Namespace) -> bool:
 def _serve_in(arguments: argparse.Namespace) -> int:
     ahead = _ahead(arguments)  # before anything heavy is imported: both are at it at once
     gc.disable()  # as in the zygote: what is imported stays
+    from envhub_worker.lockdown.mechanisms.process import raise_file_limit
     from envhub_worker.server import Server
 
+    raise_file_limit()
     gc.freeze()
     gc.enable()
     announced = _announced() if arguments.announce else None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import re
+import sys
 
 _KEPT = "\n\t"
 MARGIN = "  | "
@@ -98,7 +99,7 @@ def _escaped(char: str) -> str:
 
 _SPACE = "free space, or remove files if their number is used up (df -h; df -i)"
 _CURES = {
-    errno.EMFILE: "raise the limit on open files (ulimit -n; of a service LimitNOFILE=)",
+    errno.EMFILE: "raise the limit{} on open files (ulimit -n; of a service LimitNOFILE=)",
     errno.ENFILE: "raise the machine's limit on open files (sysctl fs.file-max)",
     errno.ENOSPC: _SPACE,
     errno.EDQUOT: _SPACE,
@@ -121,4 +122,12 @@ def shortage(error: BaseException, where: str) -> str:
         return ""
     name = getattr(error, "filename", None)
     file = f" ({name})" if name else ""
-    return f"{getattr(error, 'strerror', error)}{file} {where}: {cure}"
+    return f"{getattr(error, 'strerror', error)}{file} {where}: {cure.format(_file_limit())}"
+
+
+def _file_limit() -> str:
+    if sys.platform == "win32":
+        return ""
+    import resource  # which Windows has not, and few need
+
+    return f" of {resource.getrlimit(resource.RLIMIT_NOFILE)[0]:,}"

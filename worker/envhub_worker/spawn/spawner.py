@@ -178,7 +178,9 @@ class Spawner:
         code = self._process.wait()
         if self._pidfd >= 0:
             # Under namespaces it is a child of the process that we started, killed with it.
-            select.select([self._pidfd], [], [], _END_S)
+            poller = select.poll()  # of descriptors beyond 1023, too
+            poller.register(self._pidfd, select.POLLIN)
+            poller.poll(_END_S * 1000)
             os.close(self._pidfd)
             self._pidfd = -1
         return code

@@ -5,6 +5,7 @@ A jail that keeps a capability remounts /usr writable, so all of them go.
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import os
 import resource
@@ -23,6 +24,16 @@ _PR_CAP_AMBIENT, _PR_CAP_AMBIENT_CLEAR_ALL = 47, 4
 _CAP_SETPCAP = 8
 
 _LAST_FD = 2**31 - 1
+_MAX_OPEN_FILES = 65_536
+
+
+def raise_file_limit() -> None:
+    """Open as many files as this user may: each runner takes a server some descriptors."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = _MAX_OPEN_FILES if hard == resource.RLIM_INFINITY else min(hard, _MAX_OPEN_FILES)
+    if 0 <= soft < wanted:
+        with contextlib.suppress(OSError, ValueError):
+            resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
 def die_with_parent(parent: int, signum: int = signal.SIGKILL) -> None:
