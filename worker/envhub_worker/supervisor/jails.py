@@ -60,6 +60,9 @@ MAX_LOST = 4096
 """Runners of a kept jail that may die: their deaths are remembered."""
 MAX_IDLE_ZYGOTES = 2
 """Without a jail, when another is started. A client mostly has one policy, or two in turns."""
+MAX_REMOTE_ZYGOTES = 16
+"""That the open jails of one client on another host need: each is an interpreter, in no jail's
+limit of memory. Clients of this host are its user."""
 _OF_POLICY = ("profile", "network", "readable", "gpu", "record_denials")
 
 _Zygote = tuple[Any, ...]  # its name: a runtime, variables, and these parts of a policy
@@ -129,6 +132,7 @@ class Jails:
         started_with = frozenset(at_start(confinement.environment).items())
         of_policy = (getattr(confinement, name) for name in _OF_POLICY)
         zygote = (request.runtime, started_with, *of_policy)
+        self._check_zygotes(asker, zygote)
         jail = self._spawner(zygote, request.runtime, confinement).spawn(spec)
         entry = JailRecord(
             number=secrets.randbits(62),
@@ -149,6 +153,16 @@ class Jails:
         if len(entry.lost) > MAX_LOST:
             raise RefusedError("WorkerError", f"{len(entry.lost)} of its runners have died")
         self._start_runners(asker, entry, request.runners)
+
+    def _check_zygotes(self, asker: Asker, wanted: _Zygote) -> None:
+        held = {entry.zygote for entry in self.open_ones(asker.key)}
+        if not self._local and wanted not in held and len(held) >= MAX_REMOTE_ZYGOTES:
+            raise RefusedError(
+                "WorkerError",
+                f"your key has jails of {len(held)} kinds, by their packages, policies and "
+                "variables that are read at a start, which is as many as a server starts "
+                "interpreters for: close environments of some kind, or give them the same",
+            )
 
     def _check_runners(self, more: int, there: int) -> None:
         most = MAX_RUNNERS if self._local else MAX_REMOTE_RUNNERS

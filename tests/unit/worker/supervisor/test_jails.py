@@ -245,3 +245,25 @@ def test_zygotes_without_a_jail_are_few(ours: Jails) -> None:
     opened(ours, readable=("/held",))
     assert held.zygote in {one.zygote for one in ours.open_ones()}
     assert len(_Spawner.alive) == jails.MAX_IDLE_ZYGOTES + 2
+
+
+@pytest.mark.parametrize("local", [True, False])
+def test_another_hosts_client_has_few_zygotes(local: bool) -> None:
+    """Each is an interpreter, whose memory no limit of a jail counts; a user may have more."""
+    of, most = served(Path("server"), local=local), jails.MAX_REMOTE_ZYGOTES
+
+    def tried(first: int, stop: int) -> None:
+        for number in range(first, stop):
+            opened(of, environment={"TZ": f"UTC+{number}"})
+
+    tried(0, most)
+    tried(0, most)  # again, with the same ones
+    if local:
+        tried(most, most + 1)
+    else:
+        with pytest.raises(RefusedError, match="close environments of some kind"):
+            tried(most, most + 1)
+    for entry in of.open_ones():
+        entry.closing.append(MINE)
+    tried(most, most + 1)
+    of.close()
