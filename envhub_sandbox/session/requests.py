@@ -191,6 +191,15 @@ class RequestOrder(ABC):
         if isinstance(error, WorkerDiedError):
             self.refuse_if_closed()
 
+    def note_answered(self, kind: object = None) -> None:
+        """A request was answered, by messages of this ``kind``: what is asked now is the next one.
+
+        A reset is answered once ``finish_reset`` is done: that may ask for its infos again, and
+        looks at which processes came back in it.
+        """
+        if self.after_request is not None and kind is not m.ResetDone:
+            self.after_request()
+
     def show_warnings(self) -> None:
         """Show the repository's new warnings.
 
@@ -362,8 +371,7 @@ class Requests(RequestOrder):
         except BaseException as error:
             self.explain(error)
             raise
-        if self.after_request is not None:
-            self.after_request()
+        self.note_answered(kind)
         self.show_warnings()
         return replies
 
@@ -392,7 +400,7 @@ class Requests(RequestOrder):
     ) -> tuple[Any, dict[Any, Any]]:
         """What ``VectorEnv.reset`` returns, of the replies to one; raises as ``collect`` does."""
         try:
-            return self.results.reset(replies)
+            result = self.results.reset(replies)
         except BaseException as error:
             with self.use.judging("a request"):  # on failure only: it costs some us
                 if not isinstance(error, batches.Misfit):
@@ -400,7 +408,9 @@ class Requests(RequestOrder):
                 infos = self._infos_apart(deadline_of(timeout))
                 if self._recovery is not None:
                     infos = self._recovery.mark(infos)
-                return self.results.reset(replies, infos)
+                result = self.results.reset(replies, infos)
+        self.note_answered()
+        return result
 
     # --- steps ---------------------------------------------------------------------------------
 

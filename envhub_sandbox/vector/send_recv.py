@@ -128,8 +128,7 @@ class SendRecv(VectorEnv[Any, Any, Any]):
         deadline = Deadline(timeout)
         with held_in_time(self._requests.use.flight, deadline):
             received = self._in_flight().recv(self.num_envs if wanted is None else wanted, deadline)
-            if self._requests.after_request is not None:
-                self._requests.after_request()
+            self._requests.note_answered()
             return received
 
     def _send_draws(self) -> None:

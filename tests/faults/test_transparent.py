@@ -212,6 +212,7 @@ def test_infos_that_differ_in_kind_survive_a_death(tmp_path: Path, lane: str, di
     with make_env(str(folder), n_envs=4, use_async_envs=True, **options) as suites:
         env = suites.env
         _, expected = env.reset()
+        kept = [one.np_random for one in env.envs]  # which the client asks for after each request
         info = env.step(LAST_DIES)[4] if dies_in == "step" else env.reset(options={"exit": 1})[1]
         assert restarted(info)
         assert {key: info[key] for key in expected}.keys() == expected.keys() > {"k", "_k"}
@@ -219,6 +220,7 @@ def test_infos_that_differ_in_kind_survive_a_death(tmp_path: Path, lane: str, di
         assert repr({key: info[key] for key in expected}) == repr(expected)
         assert env.sandbox.stats()["state"] == "READY"
         assert repr(env.step(ALL_LIVE)[4]) == repr(expected)
+        assert len(kept) == 4
 
 
 _MIXED = """

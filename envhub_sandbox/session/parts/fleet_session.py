@@ -233,8 +233,7 @@ class FleetRequests(RequestOrder):
                 with self._parts[at].naming():
                     return self._each[at].ask_one(name, index, message)
             finally:
-                if self.after_request is not None:
-                    self.after_request()
+                self.note_answered()
 
     # --- requests ------------------------------------------------------------------------------
 
@@ -261,8 +260,7 @@ class FleetRequests(RequestOrder):
         """See ``Requests.collect``: the replies of all parts, in order."""
         deadline = deadline_of(timeout)
         replies = self._of_all(lambda at: self._each[at].collect(deadline, kind))
-        if self.after_request is not None:
-            self.after_request()
+        self.note_answered(kind)
         return [reply for some in replies for reply in some]
 
     def one_each(self, what: str, replies: list[m.Value] | list[m.WatchDone]) -> tuple[Any, ...]:
@@ -277,9 +275,11 @@ class FleetRequests(RequestOrder):
         """See ``Requests.finish_reset``."""
         parts = self._of_all(lambda at: self._each[at].finish_reset([replies[at]], timeout))
         try:
-            return self.results.joined_resets(parts)
+            result = self.results.joined_resets(parts)
         except batches.Misfit:
-            return self.results.joined_resets(parts, self._infos_apart(deadline_of(timeout)))
+            result = self.results.joined_resets(parts, self._infos_apart(deadline_of(timeout)))
+        self.note_answered()
+        return result
 
     # --- steps ---------------------------------------------------------------------------------
 
@@ -325,8 +325,7 @@ class FleetRequests(RequestOrder):
             result = self.results.joined_steps(parts)
         except batches.Misfit:
             result = self.results.joined_steps(parts, self._infos_apart(deadline))
-        if self.after_request is not None:
-            self.after_request()
+        self.note_answered()
         return result
 
     def _collect_step(self, deadline: Deadline, at: int) -> StepResult:
