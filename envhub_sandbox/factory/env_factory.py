@@ -12,10 +12,11 @@ import hashlib
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
-from functools import partial
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from envhub_sandbox.dependencies.bounds import walk
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.sandboxes.sandbox import retry_while_busy
@@ -116,7 +117,7 @@ def manifest_key(snapshot: Snapshot, load: m.Load, policy: Policy, runtime: Runt
     except (EnvHubError, TypeError):
         return None
     facts = (
-        *(_FORMAT, m.VERSION, _stamp(Path(protocol.__file__).parent.parent)),
+        *(_FORMAT, m.VERSION, _code_of(Path(protocol.__file__).parent.parent)),
         *(snapshot.repo_type, snapshot.repo_id, snapshot.commit, snapshot.path),
         [copy[:3] for copy in snapshot.hub_copies],
         *(policy.profile, policy.network, policy.readable, policy.gpu, policy.environment),
@@ -128,6 +129,16 @@ def manifest_key(snapshot: Snapshot, load: m.Load, policy: Policy, runtime: Runt
     digest.update(repr(facts).encode())
     digest.update(b"".join(map(bytes, encode(policy.confinement().environment))))
     return digest.hexdigest()
+
+
+@lru_cache(maxsize=8)
+def _code_of(worker: Path) -> str:
+    """A digest of when each module of the worker was changed: a manifest is what they made of it.
+    A change of a module changes no folder, where the package is used as it lies.
+    """
+    code = [path for path in walk(worker) if path.suffix == ".py"]
+    changes = sorted((str(path.relative_to(worker)), _stamp(path)) for path in code)
+    return hashlib.sha256(repr(changes).encode()).hexdigest()
 
 
 def _facts_of(python: str, packages: str) -> tuple[object, ...]:

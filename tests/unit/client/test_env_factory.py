@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -21,6 +22,7 @@ from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.settings.policy import Policy, Timeouts
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.results import Results
+from envhub_worker import protocol
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest.manifest import Manifest, encode_env, encode_manifest
 from envhub_worker.protocol.runtime import OWN
@@ -75,6 +77,24 @@ def test_the_second_time_no_jail_is_opened(launcher: Launcher, server: LyingServ
         assert second.env.single_action_space == ACTION
         second.env.reset()
         assert (asked(server, m.OpenJail), asked(server, m.Load)) == (2, 1)
+
+
+def test_other_code_of_the_worker_describes_it_anew(
+    launcher: Launcher, server: LyingServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Wherever it lies, it is the same if none of its modules was changed."""
+    described = list[int]()
+    for name, changed in (("first", 1), ("same", 1), ("other", 2)):
+        worker = tmp_path / name
+        for module in ("protocol/__init__.py", "runner/manifest.py"):
+            (worker / module).parent.mkdir(parents=True)
+            (worker / module).touch()
+        os.utime(worker / "runner/manifest.py", (changed, changed))
+        os.utime(worker / "protocol/__init__.py", (1, 1))
+        monkeypatch.setattr(protocol, "__file__", str(worker / "protocol" / "__init__.py"))
+        with suites(launcher):
+            described.append(asked(server, m.Load))
+    assert described == [1, 1, 2]
 
 
 def test_what_does_not_agree_leaves_no_jail(launcher: Launcher, server: LyingServer) -> None:
