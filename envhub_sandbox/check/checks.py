@@ -103,7 +103,7 @@ error seed-ignored
     In one process, the same seed and actions give the same results again; so do the resets
     without a seed that follow. (Gymnasium's check_env requires this, too.)
     Cure: Let reset start anew: call super().reset(seed=seed), draw only from self.np_random,
-    and keep nothing of past episodes (running statistics, curricula).
+    and keep nothing of past episodes (a curriculum, running statistics other than Gymnasium's).
 note seed-constant
     Another seed starts another episode.
     Cure: If nothing is random, change nothing. Otherwise draw from self.np_random.

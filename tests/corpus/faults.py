@@ -182,6 +182,9 @@ _SEEDS = {
         "def reset(self, *, seed=None, options=None):\n    super().reset(seed=seed)\n"
         "    if seed:\n        self.random = np.random.default_rng(seed)\n"
         "    self.at = float(self.random.normal())\n    return self.observation(), {}",
+        "a seed that is ignored below running statistics": "def __init__(self):\n"
+        "    self.random = np.random.default_rng(3)\n"
+        "def move(self, action):\n    self.at += self.random.normal() * int(action)",
         "a generator for resets without a seed": "random = np.random.default_rng(3)\n"
         "def reset(self, *, seed=None, options=None):\n    super().reset(seed=seed)\n"
         "    self.at = float((self.np_random if seed is not None else self.random).normal())\n"
@@ -418,6 +421,11 @@ _PARTICULAR: dict[str, dict[str, Any]] = {
     "a close that raises": {
         "found": frozenset(),
         "why": "its processes are ended, whatever `close` does.",
+    },
+    "a seed that is ignored below running statistics": {
+        "code": "def one():\n    return gym.wrappers.NormalizeReward(Env())\n"
+        "def make_env(n_envs=1, use_async_envs=False):\n"
+        "    return gym.vector.SyncVectorEnv([one] * n_envs)"
     },
     "no end": {"settings": {"episode_steps": 300}},
     "a step without an end": {"arguments": _SHORT},

@@ -26,6 +26,13 @@ def _mode(name: str, class_: str = "SyncVectorEnv") -> Entry:
     return _vector(f"gym.vector.{class_}([Env] * n_envs, {mode})")
 
 
+def _normalised(*wrappers: str) -> Entry:
+    made = "Env()"
+    for name in reversed(wrappers):
+        made = f"gym.wrappers.{name}({made})"
+    return _vector(f"gym.vector.SyncVectorEnv([lambda: {made}] * n_envs)")
+
+
 _OWN_VECTOR = """
 class Batch(gym.vector.VectorEnv):
     metadata = {"autoreset_mode": gym.vector.AutoresetMode.NEXT_STEP}
@@ -459,6 +466,9 @@ HONEST: dict[str, Entry] = {
         """,
         head="import sqlite3\n",
     ),
+    "Gymnasium's running statistics": _normalised("NormalizeObservation"),
+    "running statistics of rewards": _normalised("NormalizeReward"),
+    "running statistics around others": _normalised("NormalizeReward", "NormalizeObservation"),
     "an optional package": _env(
         head="try:\n    import cupy\nexcept ImportError:\n    cupy = None\n"
     ),

@@ -118,7 +118,7 @@ def lerobot_lacks(env: VectorEnv[Any, Any, Any]) -> Iterator[str]:
         )
     if not isinstance(actions, spaces.Box) or len(actions.shape) != 1:
         lacks.append(f"a vector (Box) as action, not {_named(actions)}")
-    if not _has(env, "_max_episode_steps"):
+    if not has(env, "_max_episode_steps"):
         lacks.append("_max_episode_steps (gymnasium.wrappers.TimeLimit has it)")
     if lacks:
         yield f"LeRobot cannot evaluate it, which needs {'; '.join(lacks)}"
@@ -133,7 +133,8 @@ def _named(space: spaces.Space[Any]) -> str:
     return printable(str(space), _LONGEST)
 
 
-def _has(env: Any, name: str) -> bool:
+def has(env: Any, name: str) -> bool:
+    """Whether its sub-environments have an attribute of that name, or a wrapper around them."""
     try:
         env.get_attr(name)
     except (AttributeError, RemoteEnvError):

@@ -39,6 +39,8 @@ _EPISODE_S = 30.0
 """How long is looked for the end of an episode."""
 _BEGUN = 4
 """Steps after each of the resets after which is counted what is left."""
+_STATISTICS = ("obs_rms", "return_rms")
+"""What Gymnasium's NormalizeObservation and NormalizeReward learn of all episodes."""
 _ALONE = 5
 """Steps of one sub-environment by itself."""
 
@@ -188,7 +190,9 @@ class TaskJudge:
 
     def _replay(self, env: Env, mode: str | None, before: Trace) -> None:
         """In one process: the same seed, another, none; other actions; and on to an end."""
-        seed = self._asked.seed
+        seed, learning = self._asked.seed, self._learning(env)
+        if learning is not None:
+            before = self._played(env, mode)
         self._tell("the same play in the same process")
         again = self._played(env, mode, like=before)
         self._tell("another seed, and other actions")
@@ -203,7 +207,8 @@ class TaskJudge:
         self._holds("slow-resets", took <= most, slow)
         self._tell("resets without a seed")
         at, is_drawn = before.differs_from(again), before.differs_from(other) == 0
-        self._seeded(env, at, _UNSEEDED if is_drawn else 2)
+        if at is None or not learning:
+            self._seeded(env, at, _UNSEEDED if is_drawn else 2)
         if any(trace.episodes for trace in (before, again, other, acted)):
             self._say("endless", [])
         else:
@@ -212,6 +217,18 @@ class TaskJudge:
             ended = self._ends(env, steps, time.monotonic() + _EPISODE_S)
             if ended is not None:  # else there was no time to find out
                 self._holds("endless", ended, f"no episode ended in {steps:,} steps")
+
+    def _learning(self, env: Env) -> int | None:
+        """How many of Gymnasium's running statistics go on learning, and None where there are none.
+
+        They are honest, and outlive each reset: so they stop for the plays that are compared. Of
+        wrappers around each other only the outermost can be stopped from here.
+        """
+        found = sum(probes.has(env, name) for name in _STATISTICS)
+        if found and probes.has(env, "update_running_mean"):
+            env.set_attr("update_running_mean", [False] * env.num_envs)  # type: ignore[attr-defined]
+            return found - 1
+        return found or None
 
     def _seeded(self, env: Env, at: int | None, most: int) -> None:
         if at is not None:
