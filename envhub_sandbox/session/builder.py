@@ -77,6 +77,7 @@ class SharedJail(JailSource):
 
     def __init__(self, launcher: Launcher, forget_manifest: Callable[[], None]) -> None:
         super().__init__(launcher, forget_manifest)
+        launcher.plays = False  # what came of that is in the manifest
         self._lock = threading.RLock()  # interruption.md, rule 12
         self._owner = OwnerProcess()
         self._first: LoadedJail | None = None

@@ -131,6 +131,8 @@ class Launcher:
     Attributes:
         runs_on: What runs it where it runs; a remembered manifest holds for this only.
         retry_s: For how long to ask again, where a server has no room.
+        plays: Whether a jail that describes sub-environments plays them, to see whether they are
+            independent: not where that is known.
         server_hold: Keeps the server while an environment may need it again.
     """
 
@@ -147,6 +149,7 @@ class Launcher:
         self._worker = len(repository.places)
         repository.places.append(place.address)
         ours = object()
+        self.plays = True
         hold, let_go = partial(repository.hold, ours), partial(repository.let_go, ours)
         self.server_hold = ServerHold(self._acquire, hold, let_go)
 
@@ -302,7 +305,8 @@ class Launcher:
         runner = jail.runners[0]
         left_s = deadline.left_s()
         play_ms = _MOST_PLAY_MS if left_s is None else int(left_s * 1000 * _PLAY_SHARE)
-        load = m.replace(self.repository.arguments, play_ms=min(play_ms, _MOST_PLAY_MS))
+        play_ms = min(play_ms, _MOST_PLAY_MS) if self.plays else 0
+        load = m.replace(self.repository.arguments, play_ms=play_ms)
         [reply] = jail.exchange("make_env", [(runner, load)], deadline)
         if not isinstance(reply, m.LoadDone):
             raise LoadError(f"the worker answered Load with {type(reply).__name__}")

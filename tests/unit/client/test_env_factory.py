@@ -120,6 +120,11 @@ def test_a_suite_shares_a_jail_unless_it_is_lazy(
             made["env"][task].reset()
         assert asked(server, m.OpenJail) == (3 if lazy else 1)
     assert asked(server, m.CloseJail) == asked(server, m.OpenJail)
+    with suites(launcher) as again:  # of what is remembered
+        again["env"][0].reset()
+    plays = [one.play_ms for one in server.asked if isinstance(one, m.Load)]
+    assert plays[0] > 0
+    assert plays[1:] == ([] if lazy else [0]), "what came of that is remembered as well"
 
 
 @pytest.mark.parametrize(

@@ -152,7 +152,7 @@ class Runner:
         tasks = self._load(request)
         until = min(latest, monotonic() + _PLAY_S)
         for task in tasks:
-            if task.may_share:
+            if task.may_share and request.play_ms > 0:
                 task.independent = are_independent(task, self._snapshot, until, self._play_bytes)
         made = manifest.describe(tasks)
         return m.LoadDone(encode_manifest(made))
