@@ -42,7 +42,7 @@ from envhub_sandbox.dependencies.request import DATE, PackageRequest
 from envhub_sandbox.errors import DependencyError, PackagesTooLargeError, RequirementError
 from envhub_sandbox.system import locks
 from envhub_sandbox.system.folders import CACHE_VARIABLE, remove_tree
-from envhub_sandbox.system.platform import end_with, pidfd
+from envhub_sandbox.system.platform import end_with, pidfd, program
 from envhub_worker.protocol.text import printable
 
 BLOCK_BYTES = 4096
@@ -55,6 +55,7 @@ _CLEANING_S = 2 * _WAIT_S
 _WHERE_CHARS = 200
 _SAID_CHARS = 3800
 _NICE = 10
+_PROGRAM = "envhub_sandbox.dependencies.for_a_server"
 _PIDFD = "--server-pidfd="
 
 
@@ -179,10 +180,9 @@ def _watched(order: Mapping[str, Any], ended: int | None) -> dict[str, Any]:
 
 def _worked(order: Mapping[str, Any], held: int) -> bool:
     """Whether it has come to an end that leaves nothing half-made."""
-    program = [sys.executable, "-I", "-m", "envhub_sandbox.dependencies.for_a_server"]
     with pidfd() as ourselves:
         process = subprocess.Popen(
-            [*program, "make", f"{_PIDFD}{ourselves}"],
+            [*program(_PROGRAM), "make", f"{_PIDFD}{ourselves}"],
             stdin=subprocess.PIPE,
             pass_fds=(held, ourselves),
             start_new_session=True,  # uv is in it, too

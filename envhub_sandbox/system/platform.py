@@ -32,6 +32,8 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from envhub_worker import protocol
+
 if TYPE_CHECKING:
     import subprocess
 
@@ -190,6 +192,19 @@ def _forget_pipe() -> None:
 
 if not IS_LINUX:
     run_after_fork(_forget_pipe)
+
+
+def program(module: str) -> list[str]:
+    """The command that runs a module of ours: this very code, which need not be installed, as in a
+    checkout. Neither the working directory nor a variable adds to what it may import.
+    """
+    packages = Path(__file__).parents[1], Path(protocol.__file__).parents[1]
+    folders = sorted({str(package.parent) for package in packages})
+    code = (
+        f"import runpy, sys; sys.path[3:3] = {folders}; "  # behind the standard library
+        f"runpy.run_module({module!r}, run_name='__main__', alter_sys=True)"
+    )
+    return [sys.executable, "-I", "-c", code]
 
 
 def readable_within(fd: int, timeout_s: float) -> bool:

@@ -18,7 +18,7 @@ from envhub_sandbox import errors
 from envhub_sandbox.dependencies.builds import download, trees, wheels
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.errors import DependencyError, EnvHubError, PackageIntegrityError
-from envhub_sandbox.system.platform import end_with, pidfd
+from envhub_sandbox.system.platform import end_with, pidfd, program
 from envhub_worker.protocol.text import printable
 
 if sys.platform == "linux":
@@ -48,7 +48,7 @@ def _asked(order: dict[str, Any], title: str) -> str:
     with pidfd() as ourselves:
         try:
             done = subprocess.run(
-                [sys.executable, "-I", "-m", __name__, str(ourselves)],
+                [*program(__name__), str(ourselves)],
                 input=json.dumps(order).encode(),
                 capture_output=True,
                 pass_fds=(ourselves,),

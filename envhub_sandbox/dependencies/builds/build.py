@@ -10,7 +10,6 @@ import itertools
 import json
 import os
 import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -30,7 +29,7 @@ from envhub_sandbox.dependencies.request import PackageRequest, Tell
 from envhub_sandbox.dependencies.resolve import Lock
 from envhub_sandbox.errors import DependencyError, RequirementError, ResolutionError
 from envhub_sandbox.hub.logins import without_login
-from envhub_sandbox.system.platform import pidfd
+from envhub_sandbox.system.platform import pidfd, program
 from envhub_worker.protocol.runtime import OWN
 from envhub_worker.protocol.text import printable
 
@@ -75,7 +74,7 @@ def _run(order: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     (folder / "order.json").write_text(json.dumps(whole))
     with pidfd() as ourselves:
         done = subprocess.run(
-            [sys.executable, "-I", "-m", _PROGRAM, str(folder), str(ourselves)],
+            [*program(_PROGRAM), str(folder), str(ourselves)],
             stdin=subprocess.DEVNULL,
             capture_output=True,
             pass_fds=(ourselves,),

@@ -14,6 +14,8 @@ from pathlib import Path
 import psutil
 import pytest
 
+import envhub_sandbox
+import envhub_worker
 from envhub_sandbox.system.platform import OwnerProcess, fork_error_text, pidfd
 from envhub_sandbox.system.threads import Calls
 from tests.support.command_line import runs
@@ -163,3 +165,22 @@ def test_a_wait_may_end_before_the_calls() -> None:
     go_on.set()
     assert calls.wait(DEADLINE_S)
     assert Calls([]).wait(), "nothing to do is done, without any thread"
+
+
+def test_a_program_of_ours_is_this_code_and_need_not_be_installed(tmp_path: Path) -> None:
+    """A checkout, here links to one, is found by a variable, which a program of ours ignores."""
+    for package in (envhub_sandbox, envhub_worker):
+        (tmp_path / package.__name__).symlink_to(Path(package.__file__).parent)
+    (tmp_path / "told.py").write_text(
+        "import envhub_sandbox, sys\nprint(envhub_sandbox.__file__, __name__, *sys.argv[1:])"
+    )
+    start = "import subprocess\nfrom envhub_sandbox.system.platform import program\n"
+    start += "subprocess.run([*program('told'), 'word'], check=True)"
+    done = subprocess.run(
+        [sys.executable, "-c", start],
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        stdout=subprocess.PIPE,
+        text=True,
+        check=True,
+    )
+    assert done.stdout.split() == [f"{tmp_path}/envhub_sandbox/__init__.py", "__main__", "word"]
