@@ -205,6 +205,9 @@ class RemoteServer(WorkerServer):
         client: WorkerConnection | None = None
         every_s = _FIRST_S
         while not self._stop.wait(every_s):
+            with contextlib.suppress(RuntimeError):  # another thread has just connected
+                for link in self.far.links:
+                    link.read_ahead()
             try:
                 if client is None:
                     client = self._connection()

@@ -108,6 +108,8 @@ class WorkerConnection:
         if self._link is not None:
             self._poller.register(self._link.monitor, zmq.POLLIN)
         self._sent: dict[int, tuple[int, list[Buffer]]] = {}
+        if self._link is not None:
+            self._link.awaited = self._sent
         self._packed: tuple[m.Message | None, list[Buffer]] = (None, [])
         self._latest: Buffer = b""
         self._arrived: dict[int, _Received | EnvHubError] = {}
@@ -163,7 +165,8 @@ class WorkerConnection:
     def _send(self, request_id: int, frames: list[Buffer]) -> None:
         travelling = frames
         if self._link is not None:
-            self._sent[request_id] = self._link.next_number(), frames
+            with self._link.lock:
+                self._sent[request_id] = self._link.next_number(), frames
             if self._compression:
                 travelling = compression.pack_frames(frames, self._compression)
         size = sum(map(len, travelling))

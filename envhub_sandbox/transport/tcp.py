@@ -6,14 +6,17 @@ that is out look alike. Its monitor knows; this turns what it says into errors.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Collection
 from dataclasses import field
 from time import monotonic
+from weakref import WeakSet
 
 import zmq
 from zmq.utils import z85
 
 from envhub_sandbox.errors import EnvHubError, SandboxUnavailableError, WorkerDiedError
+from envhub_sandbox.system.platform import OwnerProcess
 from envhub_sandbox.transport.replies import UnreachableError
 from envhub_worker.protocol.records import dataclass
 
@@ -47,6 +50,7 @@ class TcpServer:
         client_key: Our secret key; None likewise.
         heartbeat_s: After so long without a sign of life a connection counts as lost.
         held: The numbers of the jails that we have open there.
+        links: The connections to it; ``TcpLink.read_ahead`` is called of each every few seconds.
         why_ended: Says what is known of its end, as the rest of a sentence; may wait some seconds.
     """
 
@@ -54,6 +58,7 @@ class TcpServer:
     client_key: bytes | None = field(repr=False)
     heartbeat_s: float = 30.0
     held: set[int] = field(default_factory=set, compare=False)
+    links: WeakSet[TcpLink] = field(default_factory=WeakSet, compare=False, repr=False)
     why_ended: Callable[[], str] = field(default=str, compare=False, repr=False)
 
     def public_key(self) -> str:
@@ -70,7 +75,13 @@ def new_keys() -> tuple[bytes, bytes]:
 
 
 class TcpLink:
-    """What is known of one socket's connection. To be made before it connects."""
+    """What is known of one socket's connection. To be made before it connects.
+
+    Attributes:
+        awaited: The requests that are not answered. While there are any, the socket's owner alone
+            reads what has happened.
+        lock: Held where there may come to be some.
+    """
 
     def __init__(self, socket: zmq.Socket[bytes], endpoint: str, far: TcpServer) -> None:
         self._endpoint = endpoint
@@ -81,11 +92,16 @@ class TcpLink:
         self._number = 0
         self._lost = 0
         self._cut_since = 0.0
+        self._refusal: EnvHubError | None = None
+        self._owner = OwnerProcess()
+        self.awaited: Collection[int] = ()
+        self.lock = threading.RLock()  # interruption.md, rule 12
         self._set_options(socket, far)
         self.monitor = socket.get_monitor_socket(_EVENTS)
         # a server that ends every connection makes a dozen events a second; where they have no
         # room, libzmq's thread waits, and with it all connections of this process
         self.monitor.setsockopt(zmq.RCVHWM, 0)
+        far.links.add(self)
 
     def _set_options(self, socket: zmq.Socket[bytes], far: TcpServer) -> None:
         heartbeat_ms = max(1, int(far.heartbeat_s * 1000))
@@ -105,6 +121,22 @@ class TcpLink:
         self.drain()
         return self._number if self._up else self._number + 1
 
+    def read_ahead(self) -> None:
+        """Read what has happened to a connection that nobody uses; any thread. Else it would pile
+        up, where the server ends each new connection; what it says of us is raised by the next use.
+        """
+        if not self._owner.is_here or not self.lock.acquire(blocking=False):
+            return
+        try:
+            while not (self.awaited or self.monitor.closed):
+                try:
+                    self._read()
+                    return
+                except EnvHubError as error:
+                    self._refusal = error
+        finally:
+            self.lock.release()
+
     def drain(self) -> None:
         """Read what has happened.
 
@@ -112,6 +144,12 @@ class TcpLink:
             SandboxUnavailableError: The server does not let us in, or is another one.
             WorkerDiedError: The same, after it had let us in before.
         """
+        if self._refusal is not None:
+            refusal, self._refusal = self._refusal, None
+            raise refusal
+        self._read()
+
+    def _read(self) -> None:
         if not int(self.monitor.getsockopt(_EVENTS_NOW)) & _READABLE:
             return  # as nearly always, and without the exception that says so
         from zmq.utils.monitor import parse_monitor_message  # brings asyncio, and that ssl
@@ -125,7 +163,7 @@ class TcpLink:
 
     def _happened(self, event: int) -> None:
         if event == zmq.EVENT_HANDSHAKE_SUCCEEDED:
-            self._up = True
+            self._up, self._refusal = True, None
             self._number += 1
         elif event == zmq.EVENT_DISCONNECTED:
             if self._up:
@@ -191,5 +229,6 @@ class TcpLink:
 
     def close(self) -> None:
         """Stop watching."""
-        self._socket.disable_monitor()
-        self.monitor.close(0)
+        with self.lock:
+            self._socket.disable_monitor()
+            self.monitor.close(0)

@@ -12,6 +12,7 @@ import zmq
 from zmq.utils import z85
 
 from envhub_sandbox.errors import SandboxUnavailableError
+from envhub_sandbox.sandboxes.remote import RemoteServer
 from envhub_sandbox.transport.replies import UnreachableError
 from envhub_sandbox.transport.tcp import TcpLink, TcpServer
 from tests.support import inside
@@ -98,3 +99,37 @@ def test_one_that_ends_every_connection_holds_up_no_other() -> None:
             while is_held_up and link.monitor.poll(1_000):  # or ``close`` would wait, too
                 link.monitor.recv_multipart()
     assert not is_held_up
+
+
+def test_what_happens_to_a_connection_that_nobody_uses_is_read() -> None:
+    """By the thread that says that we live; while an answer is awaited, by its owner alone."""
+    far = TcpServer(None, None)
+    with zmq.Context() as context, context.socket(zmq.ROUTER) as server:
+        server.linger = 0
+        port = server.bind_to_random_port("tcp://127.0.0.1")
+        with linked(port, far) as idle, linked(port, far) as used:
+            used.awaited = {1: "a request"}
+            assert eventually(lambda: bool(used.monitor.poll(0)))
+            with contextlib.ExitStack() as stack:
+                stack.callback(RemoteServer(f"tcp://127.0.0.1:{port}", far).stop)
+                assert eventually(lambda: inside.link_is_up(idle))
+            assert not inside.link_is_up(used)
+
+
+def test_what_was_read_of_a_refusal_is_raised_by_the_next_use(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(*inside.cut_s(), 0.0)
+    far = TcpServer(None, None)
+    with (
+        socket.create_server(("127.0.0.1", 0)) as listener,
+        linked(listener.getsockname()[1], far) as link,
+    ):
+        for _ in range(2):
+            hangs_up(listener)
+        assert link.monitor.poll(60_000)
+        link.read_ahead()
+        assert not link.monitor.poll(0)
+        with pytest.raises(SandboxUnavailableError, match="both"):
+            link.drain()
+        link.drain()
