@@ -66,7 +66,7 @@ def test_a_repository_is_read(tmp_path: Path) -> None:
     assert [one["check"] for one in refused["findings"]] == ["requirements", "source-dynamic"]
     shown = envhub("inspect", "--static", folder).stdout
     assert "make_env(n_envs=1, use_async_envs=False, size=8)" in shown
-    assert "note         source-dynamic: env.py:5: calls eval" in shown
+    assert "note         source-dynamic: env.py:5: uses eval" in shown
 
 
 def test_nothing_of_it_runs(tmp_path: Path) -> None:
@@ -164,7 +164,7 @@ def test_each_change_is_told_as_what_it_is(tmp_path: Path) -> None:
     texts = [text for _, _, text in found]
     assert "numpy>=1, now numpy>=2" in texts
     assert "env.py:2: imports socket" in texts
-    assert texts.count("env.py:5: calls eval") == 2, "the line was changed: it is told again"
+    assert texts.count("env.py:5: uses eval") == 2, "the line was changed: it is told again"
 
 
 @pytest.mark.parametrize(

@@ -140,9 +140,12 @@ def test_the_workers_group_is_what_the_worker_imports(project: dict[str, Any]) -
 
 def test_the_image_can_be_watched(project: dict[str, Any]) -> None:
     """It installs what the worker imports, and what its figures need, word for word."""
-    installed = re.findall(r"--group (\S+)", (CHECKOUT / "Dockerfile").read_text())
+    installed = re.findall(
+        r"--require-hashes -r /build/(\S+)", (CHECKOUT / "Dockerfile").read_text()
+    )
     group = project["dependency-groups"]["image"]
-    assert installed == ["image"]
+    assert installed == ["image.txt"]
+    assert "--group image --output" in (CHECKOUT / ".ci/lock.sh").read_text()
     assert {"include-group": "worker"} in group
     assert set(project["project"]["optional-dependencies"]["metrics"]) <= {
         one for one in group if isinstance(one, str)
@@ -153,7 +156,7 @@ def test_nothing_but_the_worker_goes_into_the_image() -> None:
     """What is not listed never reaches the engine: no tests, no client, no history."""
     lines = (CHECKOUT / ".dockerignore").read_text().splitlines()
     rules = [line for line in lines if line and not line.startswith("#")]
-    assert rules == ["*", "!pyproject.toml", "!worker", "**/__pycache__"]
+    assert rules == ["*", "!.ci/locks/image.txt", "!worker", "**/__pycache__"]
 
 
 def test_the_image_runs_as_nobody_and_carries_the_projects_version() -> None:
