@@ -40,18 +40,10 @@ _COMMANDS: dict[str, tuple[str, str | Where]] = {
         "Compare two commits: files, packages, imports and findings; with --run, tasks and spaces.",
         "diff:diff",
     ),
-    "prefetch": (
-        "Download a repository and install its packages, without running the repository.",
-        "prefetch:prefetch",
-    ),
     "lock": (
         "Record commit, file hashes, packages, Python and spaces in a file for "
-        "make_env(lock=FILE).",
+        "make_env(lock=FILE); with --check, compare a repository with one.",
         "lock:lock",
-    ),
-    "verify": (
-        "Compare a repository with its lock file; exit code 7 if something differs.",
-        "lock:verify",
     ),
     "init": (
         "Write a new environment's repository: env.py, requirements, card, licence, test, CI "

@@ -1,6 +1,7 @@
 """``envhub inspect``: the environments that a repository makes, without playing them.
 
-With ``--static``: what it would do, read without running it.
+With ``--static``: what it would do, read without running it. With ``--download``: for later use
+without network.
 """
 
 from __future__ import annotations
@@ -25,7 +26,8 @@ _SPACES = ("single_observation_space", "single_action_space", "observation_space
 _SPACE_TEXT = 2000
 _SHOWN = 40
 _OF_STATIC = {"sarif", "fail_on"}
-_OF_BOTH = {"ref", "static", "json", "token", "endpoint", "hub_cache_dir", "allow_secrets", "debug"}
+_OF_DOWNLOAD = {"upgrade", "dependencies", "lock", "assets"}
+_OF_ALL = {"ref", "json", "token", "endpoint", "hub_cache_dir", "allow_secrets", "debug"}
 _PLAIN = ("Python", "text")
 _OPTIONS = [key for key in opt.ALL if key not in ("num_workers", "output")]
 
@@ -43,6 +45,20 @@ def inspect(
         typer.Option(metavar="FILE", help="With --static: the findings as SARIF 2.1.0."),
     ] = None,
     fail_on: FailOn = None,
+    download: Annotated[
+        bool,
+        typer.Option(
+            "--download",
+            help="Only download it and install its packages; the printed reference then works "
+            "without network.",
+        ),
+    ] = False,
+    upgrade: Annotated[
+        bool,
+        typer.Option(
+            "--upgrade", help="With --download: choose versions again, the newest that fit."
+        ),
+    ] = False,
     json: opt.Json = False,
     suite: opt.Suite = None,
     task: opt.Task = None,
@@ -52,8 +68,14 @@ def inspect(
 
     The repository's make_env runs in the sandbox, unless its answer is cached. With --static
     nothing runs: files, entry, packages and imports are read as data, and findings are printed.
+    With --download nothing of the repository runs either.
     """
-    _check_options(context, static=static)
+    _check_options(context, static=static, download=download)
+    if download:
+        from envhub_sandbox.cli.download import download as download_all
+
+        download_all(make, upgrade=upgrade, as_json=json)
+        return
     if static:
         inspect_static(ref, as_json=json, sarif=sarif, fail_on=fail_on, make=make)
         return
@@ -110,12 +132,17 @@ def _print(found: list[dict[str, Any]], provenance: dict[str, Any], *, in_proces
 # --- --static ---------------------------------------------------------------------------------
 
 
-def _check_options(context: typer.Context, *, static: bool) -> None:
+def _check_options(context: typer.Context, *, static: bool, download: bool) -> None:
     """Refuse options that would mean nothing. Raises ``UsageError``: there is one."""
-    means = _OF_BOTH | _OF_STATIC if static else set(context.params) - _OF_STATIC
+    if static:
+        means, why = _OF_ALL | _OF_STATIC | {"static"}, "with --static nothing runs"
+    elif download:
+        means, why = _OF_ALL | _OF_DOWNLOAD | {"download"}, "with --download nothing runs"
+    else:
+        means = set(context.params) - _OF_STATIC - {"upgrade"}
+        why = "it needs --static or --download"
     for one in context.command.params:
         if one.name not in means and opt.is_typed(context, one.name or ""):
-            why = "with --static nothing runs" if static else "it needs --static"
             raise UsageError(f"{one.opts[0]} means nothing here: {why}")
 
 

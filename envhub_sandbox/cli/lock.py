@@ -1,4 +1,4 @@
-"""``envhub lock`` and ``envhub verify``: what a repository was, and whether it still is."""
+"""``envhub lock``: what a repository was, and with ``--check`` whether it still is."""
 
 from __future__ import annotations
 
@@ -51,7 +51,27 @@ NoSpaces = Annotated[
 @opt.with_options("dependencies", "env_kwargs", "assets", *opt.SOURCE)
 def lock(
     *,
-    ref: opt.Ref,
+    context: typer.Context,
+    ref: Annotated[
+        str | None,
+        typer.Argument(
+            metavar="REF",
+            help="What to lock, a hub reference or a folder; with --check what to compare, by "
+            "default the locked commit.",
+        ),
+    ] = None,
+    check: Annotated[
+        Path | None,
+        typer.Option(
+            "--check",
+            metavar="FILE",
+            help="Compare with this lock file instead; exit code 7 if something differs.",
+        ),
+    ] = None,
+    no_index: Annotated[
+        bool,
+        typer.Option("--no-index", help="With --check: do not ask the package index for files."),
+    ] = False,
     output: Output = None,
     upgrade: Annotated[
         bool,
@@ -63,12 +83,23 @@ def lock(
     json: opt.Json = False,
     make: opt.MakeOptions,
 ) -> None:
-    """Record commit, file hashes, packages, Python and spaces in a file for make_env(lock=FILE).
+    """Record commit, file hashes, packages, Python and spaces in a file for make_env(lock=FILE);
+    with --check, compare a repository with one.
 
     It installs the packages in a separate environment, and loads the repository in the sandbox to
-    record its spaces.
+    record its spaces. With --check it writes nothing, and compares files, the index's files of
+    each package, Python and spaces; a branch as REF shows whether it has changed, and for a locked
+    folder REF is required.
+
+    [bold]envhub lock --check pylock.NAME.toml[/bold]
     """
     _check_platform()
+    _check_options(context, is_check=check is not None)
+    if check is not None:
+        _verify(check, ref, make, no_spaces=no_spaces, no_index=no_index, json=json)
+        return
+    if ref is None:
+        raise UsageError("name what to lock: envhub lock REF")
     with ProgressBar(quiet=json) as bar:
         bar.begin(f"locking {ref}")
         from envhub_sandbox.dependencies.locks import lockfile, making
@@ -87,30 +118,16 @@ def lock(
     _print(path, made, changes, old is not None, as_json=json)
 
 
-@opt.with_options(*opt.SOURCE)
-def verify(
-    *,
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="A lock file of 'envhub lock'.")],
-    ref: Annotated[
-        str | None,
-        typer.Argument(
-            metavar="[REF]",
-            help="The reference to compare; by default the locked commit. With a branch, shows "
-            "whether it has changed. For a locked folder it is required.",
-        ),
-    ] = None,
-    no_spaces: NoSpaces = False,
-    no_index: Annotated[
-        bool, typer.Option("--no-index", help="Do not ask the package index for the files.")
-    ] = False,
-    json: opt.Json = False,
+def _verify(
+    file: Path,
+    ref: str | None,
     make: opt.MakeOptions,
+    *,
+    no_spaces: bool,
+    no_index: bool,
+    json: bool,
 ) -> None:
-    """Compare a repository with its lock file; exit code 7 if something differs.
-
-    It compares files, the index's files of each package, Python and spaces.
-    """
-    _check_platform()
+    """``--check``: compare files, the index's files of each package, Python and spaces."""
     with ProgressBar(quiet=json) as bar:
         bar.begin(f"verifying {file}")
         from envhub_sandbox.dependencies.locks import lockfile, making
@@ -132,14 +149,24 @@ def verify(
         say(f"{snapshot.label} is as it was locked in {file}.", GOOD)
 
 
+def _check_options(context: typer.Context, *, is_check: bool) -> None:
+    """Refuse options that would mean nothing. Raises ``UsageError``: there is one."""
+    of_a_new_lock = {"output", "upgrade", "dependencies", "env_kwargs", "assets"}
+    idle = of_a_new_lock if is_check else {"no_index"}
+    for one in context.command.params:
+        if one.name in idle and opt.is_typed(context, one.name):
+            why = "--check writes nothing" if is_check else "it needs --check FILE"
+            raise UsageError(f"{one.opts[0]} means nothing here: {why}")
+
+
 def _check_platform() -> None:
     """Raise ``SandboxUnavailableError``: no interpreter of this platform can be locked."""
     if not IS_LINUX:
         raise SandboxUnavailableError(
-            f"envhub lock and envhub verify are for --sandbox process, which needs Linux, and this "
-            f"is {NAME}: run this on a Linux machine, or in a container of one. With --sandbox "
-            "docker an image is locked by its digest, and with --sandbox tcp://HOST:PORT the "
-            "server's operator chooses the packages"
+            f"envhub lock is for --sandbox process, which needs Linux, and this is {NAME}: run "
+            "this on a Linux machine, or in a container of one. With --sandbox docker an image is "
+            "locked by its digest, and with --sandbox tcp://HOST:PORT the server's operator "
+            "chooses the packages"
         )
 
 
@@ -162,7 +189,7 @@ def _old(path: Path, upgrade: bool) -> LockFile | None:
     if not upgrade:
         raise UsageError(
             f"{path} exists. 'envhub lock --upgrade' chooses versions again and shows what "
-            "differs; 'envhub verify' compares it with the repository"
+            "differs; 'envhub lock --check' compares it with the repository"
         )
     from envhub_sandbox.dependencies.locks import lockfile
 
@@ -209,7 +236,7 @@ def _reference(ref: str | None, locked: LockFile, file: Path) -> str:
 
     found = ref or lockfile.reference_of(locked)
     if found is None:
-        raise UsageError(f"{file} locks a folder; name it: envhub verify {file} ./FOLDER")
+        raise UsageError(f"{file} locks a folder; name it: envhub lock --check {file} ./FOLDER")
     return found
 
 

@@ -79,7 +79,7 @@ _MEANINGS: tuple[tuple[str, type[DependencyError], str], ...] = (
         PackageIntegrityError,
         "A package has another hash than the one that is known: it was replaced on the index or "
         "during the download. It was not kept. If the index is right, resolve again: envhub "
-        "prefetch --upgrade REF",
+        "inspect --download --upgrade REF",
     ),
     (r"network was disabled", IndexUnavailableError, _NO_INDEX),
     (r"\b(401 Unauthorized|403 Forbidden|407 Proxy)", IndexUnavailableError, _NO_LOGIN),

@@ -1,4 +1,4 @@
-"""``envhub cache`` and ``envhub prefetch``."""
+"""``envhub cache`` and ``envhub inspect --download``."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ def environment(index: Index, tmp_path: Path) -> str:
     """A repository whose packages have been made ready by the command; its environment's name."""
     make_wheel(index.folder, "wanted")
     folder = write_repository(tmp_path / "repo", "X = 1\n", requirements__txt="wanted\n")
-    done = RUNNER.invoke(app, ["prefetch", str(folder), "--json"])
+    done = RUNNER.invoke(app, ["inspect", "--download", str(folder), "--json"])
     assert done.exit_code == 0, done.stderr
     made = json.loads(done.stdout)["environment"]
     assert "wanted==1.0" in made["packages"]
@@ -176,19 +176,24 @@ def test_newer_versions_are_chosen_when_asked_for(
     """And then the next ``make_env`` has them, too."""
     make_wheel(index.folder, "wanted", "2.0")
     folder = str(tmp_path / "repo")
-    same = json.loads(RUNNER.invoke(app, ["prefetch", folder, "--json"]).stdout)
+    same = json.loads(RUNNER.invoke(app, ["inspect", "--download", folder, "--json"]).stdout)
     assert Path(same["environment"]["folder"]).name == environment
-    newer = json.loads(RUNNER.invoke(app, ["prefetch", folder, "--upgrade", "--json"]).stdout)
+    newer = json.loads(
+        RUNNER.invoke(app, ["inspect", "--download", folder, "--upgrade", "--json"]).stdout
+    )
     assert "wanted==2.0" in newer["environment"]["packages"]
 
 
 def test_a_repository_that_needs_nothing_is_only_downloaded(tmp_path: Path) -> None:
     folder = write_repository(tmp_path / "repo", "X = 1\n", requirements__txt="numpy\n")
-    done = RUNNER.invoke(app, ["prefetch", str(folder)])
+    done = RUNNER.invoke(app, ["inspect", "--download", str(folder)])
     assert done.exit_code == 0
     assert str(folder) in done.stdout
     assert "this interpreter" in done.stderr
-    assert RUNNER.invoke(app, ["prefetch", str(folder), "--dependencies", "{"]).exit_code == 2
+    assert (
+        RUNNER.invoke(app, ["inspect", "--download", str(folder), "--dependencies", "{"]).exit_code
+        == 2
+    )
 
 
 # --- ``envhub cache gc``, as a user runs it

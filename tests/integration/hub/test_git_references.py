@@ -136,8 +136,8 @@ def test_commands_know_it(ref: str, repository: Path, tmp_path: Path) -> None:
     newest = f"{ref}@{git(repository, 'rev-parse', 'main')}:envs/env.py"
     lock = str(tmp_path / "pylock.x.toml")
     assert envhub("lock", pin, "-o", lock, "--no-spaces")["reference"] == pin
-    assert envhub("verify", lock, "--no-index", "--no-spaces")["drift"] == []
-    drift = envhub("verify", lock, newest, "--no-index", "--no-spaces", code=7)["drift"]
+    assert envhub("lock", "--check", lock, "--no-index", "--no-spaces")["drift"] == []
+    drift = envhub("lock", "--check", lock, newest, "--no-index", "--no-spaces", code=7)["drift"]
     assert "file later.txt: new" in drift
     changes = envhub("diff", pin, newest, code=7)
     assert "later.txt" in json.dumps(changes)

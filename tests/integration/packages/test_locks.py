@@ -1,4 +1,4 @@
-"""``make_env(lock=)``, ``envhub lock``, ``envhub verify``: what was locked runs, and only that."""
+"""``make_env(lock=)`` and ``envhub lock [--check]``: what was locked runs, and only that."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ def path_of(folder: Path) -> Path:
 
 
 def verify(folder: Path, *options: str, code: int) -> str:
-    """What ``envhub verify`` says."""
-    done = RUNNER.invoke(app, ["verify", str(path_of(folder)), str(folder), *options])
+    """What ``envhub lock --check`` says."""
+    done = RUNNER.invoke(app, ["lock", "--check", str(path_of(folder)), str(folder), *options])
     assert done.exit_code == code, done.output
     return " ".join(done.output.split())
 
@@ -137,7 +137,9 @@ def test_other_arguments_say_something_else(folder: Path) -> None:
 
 def test_what_a_lock_needs_is_fetched_ahead(packages: Index, folder: Path) -> None:
     lock(folder, "--no-spaces")
-    done = RUNNER.invoke(app, ["prefetch", str(folder), "--lock", str(path_of(folder)), "--json"])
+    done = RUNNER.invoke(
+        app, ["inspect", "--download", str(folder), "--lock", str(path_of(folder)), "--json"]
+    )
     assert "not-here==1.0" in json.loads(done.stdout)["environment"]["packages"]
     asked = len(packages.asked)
     done = RUNNER.invoke(app, ["inspect", str(folder), "--lock", str(path_of(folder)), "--json"])

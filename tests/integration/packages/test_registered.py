@@ -160,8 +160,8 @@ def test_commands_know_it(packages: Index, tmp_path: Path) -> None:
     locked = envhub("lock", ref, "-o", lock)
     assert locked["reference"] == ref
     assert "walled==1.0" in locked["packages"]
-    assert envhub("verify", lock)["drift"] == []
-    assert envhub("verify", lock, newer, "--no-spaces", code=7)["drift"]
+    assert envhub("lock", "--check", lock)["drift"] == []
+    assert envhub("lock", "--check", lock, newer, "--no-spaces", code=7)["drift"]
     assert "walled" in json.dumps(envhub("diff", ref, newer, code=7))
     assert envhub("inspect", ref)["provenance"]["repo_type"] == "pypi"
     played = envhub("run", ref, "--episodes", "1", "--steps", "5")

@@ -47,13 +47,16 @@ def said(*words: str) -> tuple[int, str]:
 _NO_FOLDER = "there is no such folder or file here"
 _REFUSED = [
     ("lock a/b/c/d", 2, "the path comes after a colon"),
-    ("verify ./gone.toml", 2, "'envhub lock REF' writes one"),
+    ("lock --check ./gone.toml", 2, "'envhub lock REF' writes one"),
     ("image build ./gone", 3, _NO_FOLDER),
     ("replay ./gone", 2, "cannot be read as a crash bundle"),
     ("diff ./gone ./gone", 3, _NO_FOLDER),
     ("run ./gone", 3, _NO_FOLDER),
     ("run 'no spaces allowed'", 2, "Error: hub reference 'no spaces allowed'"),
-    ("prefetch ./gone", 3, _NO_FOLDER),
+    ("inspect --download ./gone", 3, _NO_FOLDER),
+    ("inspect ./gone --upgrade", 2, "it needs --static or --download"),
+    ("lock ./gone --no-index", 2, "it needs --check FILE"),
+    ("lock", 2, "name what to lock"),
     ("cache remove gone", 2, "the cache has nothing named 'gone'"),
     ("doctor --profile gone", 2, "it is one of strict, no-userns, container"),
     ("doctor tcp://host", 2, "a remote server is tcp://HOST:PORT"),

@@ -1,10 +1,8 @@
-"""``envhub prefetch``: everything that an environment needs, for a machine without network."""
+"""``envhub inspect --download``: all that an environment needs, for use without network."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any
-
-import typer
+from typing import TYPE_CHECKING, Any
 
 from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import ProgressBar, out, print_json, safe_line, show
@@ -15,25 +13,13 @@ if TYPE_CHECKING:
     from envhub_sandbox.hub.snapshot import Snapshot
 
 
-@opt.with_options("dependencies", "lock", "assets", *opt.SOURCE)
-def prefetch(
-    *,
-    ref: opt.Ref,
-    upgrade: Annotated[
-        bool, typer.Option("--upgrade", help="Choose versions again, the newest that fit.")
-    ] = False,
-    json: opt.Json = False,
-    make: opt.MakeOptions,
-) -> None:
-    """Download a repository and install its packages, without running the repository.
-
-    It prints the pinned reference, which then works without network.
-    """
-    with ProgressBar(quiet=json) as bar:
-        bar.begin(f"reading {ref}")
-        snapshot = make.snapshot_with_assets(ref)
+def download(make: opt.MakeOptions, *, upgrade: bool, as_json: bool) -> None:
+    """Download a repository and install its packages, without running the repository."""
+    with ProgressBar(quiet=as_json) as bar:
+        bar.begin(f"reading {make.ref}")
+        snapshot = make.snapshot_with_assets(make.ref)
         environment = _environment(snapshot, make, upgrade)
-    if json:
+    if as_json:
         print_json(_document(snapshot, environment))
     else:
         _print(snapshot, environment)
