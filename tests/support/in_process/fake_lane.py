@@ -32,14 +32,13 @@ class FakeLane:
         count: How many sub-environments it has.
 
     Attributes:
-        infos: Of the next steps.
         sent: The messages that came, in order.
         answer: What a request other than a reset is answered.
         fails: Raised by the next wait.
         owed: What was sent and not answered.
         silent: Whether it has not answered yet.
         listened: Whether it was asked what to poll.
-        on_look, on_listen: Called before it is asked whether it has answered, and what to poll.
+        on_listen: Called before it is asked what to poll.
     """
 
     name = "fake"
@@ -51,18 +50,15 @@ class FakeLane:
         self.jail = JailHandle(cast("Any", client), 1, [1], [], DEFAULT_LIMITS)
         self.runners, self.number, self.elapsed_ns = [1], 7, 1
         self._count = count
-        self.infos: dict[Any, Any] = {}
         self.sent: list[m.Message] = []
         self.answer: m.Message = m.Value((None,) * NUM_ENVS)
         self.fails: BaseException | None = None
         self.owed: m.Message | None = None
         self.closed = self.silent = self.listened = False
-        self.on_look: Callable[[], object] = lambda: None
         self.on_listen: Callable[[], object] = lambda: None
         self._bell: list[int] = []
 
     def answered(self) -> bool:
-        self.on_look()
         return not self.silent
 
     def sources(self) -> list[int]:
@@ -97,7 +93,7 @@ class FakeLane:
 
     def result(self, infos: dict[Any, Any] | None = None) -> StepResult:
         no = np.zeros(self._count, np.bool_)
-        return _observation(self._count), np.zeros(self._count), no, no, self.infos
+        return _observation(self._count), np.zeros(self._count), no, no, {}
 
     def replies(self, deadline: Deadline) -> list[m.Message]:
         asked = self.owed

@@ -10,8 +10,10 @@ import pytest
 from envhub_sandbox.errors import (
     LocalProtocolError,
     WorkerDiedError,
+    WorkerError,
 )
 from envhub_sandbox.session.parts.fleet_session import FleetRequests, FleetSession
+from envhub_sandbox.session.parts.in_flight import InFlight
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.lifecycle import State
 from tests.support.in_process.fake_lane import FakeLane, fleet_over
@@ -81,3 +83,19 @@ def test_one_sub_environment_is_asked_of_its_worker_alone(
     lanes[1].fails = WorkerDiedError("gone")
     with pytest.raises(WorkerDiedError, match="sub-environment 1 of 2"):
         requests.ask_one("act", 1, message)
+
+
+def test_a_torn_connection_is_refused_until_a_reset(
+    session: FleetSession, lanes: list[FakeLane]
+) -> None:
+    """What the next message would be taken for is not known; nothing more is sent or taken."""
+    flight, action = InFlight(session.requests, session.parts), np.zeros(1, np.int64)
+    flight.send(flight.rows([0, 1]), ACTIONS)
+    lanes[1].jail.client.torn = True
+    with pytest.raises(WorkerError, match="interrupted"):
+        flight.recv(1, 0)
+    with pytest.raises(WorkerError, match="interrupted"):
+        flight.send(flight.rows([0]), action)
+    flight.drop()
+    assert lanes[0].owed is None
+    assert lanes[1].owed is not None, "a reset gives it up"

@@ -1,4 +1,4 @@
-"""What a jail was denied and how its server is waited for; a jail that several share."""
+"""How a jail ends, once, whatever interrupts it; and what is taken of its server's words."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from envhub_sandbox.errors import EnvHubError, ServerBusyError, WorkerDiedError,
 from envhub_sandbox.sandboxes import sandbox as module
 from envhub_sandbox.sandboxes.sandbox import Sandbox, retry_while_busy
 from envhub_sandbox.session.builder import JailSource, SharedJail
-from envhub_sandbox.session.launcher import Launcher
+from envhub_sandbox.session.launcher import Launcher, LoadedJail
 from envhub_sandbox.transport import connection
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
 from envhub_worker.protocol import messages as m
@@ -83,6 +83,45 @@ def launcher(client: _Client, place: _Place) -> Launcher:
     repository.runtime = cast("Any", SimpleNamespace(python="", packages=""))
     repository.places = []
     return Launcher(repository, place, Path())
+
+
+def opened(launcher: Launcher, client: _Client, place: _Place) -> Any:
+    waits: list[object] = []
+    jail = SimpleNamespace(
+        number=7,
+        client=client,
+        waits=waits,
+        ask_to_close=lambda: waits.append,
+        before_end=lambda: None,
+        drop=lambda: None,
+    )
+    use = place.acquire(None)
+    return LoadedJail(cast("Any", jail), cast("Any", None), {}, set(), use, launcher.close)
+
+
+def test_a_jail_is_closed_once(launcher: Launcher, client: _Client, place: _Place) -> None:
+    loaded = opened(launcher, client, place)
+    for _ in range(2):
+        launcher.close(loaded)
+    assert loaded.closed
+    assert (len(loaded.jail.waits), place.released) == (1, 1)
+
+
+def test_an_interrupted_close_goes_on_over_another_connection(
+    launcher: Launcher, client: _Client, place: _Place
+) -> None:
+    loaded = opened(launcher, client, place)
+
+    def interrupted() -> Any:
+        raise KeyboardInterrupt
+
+    loaded.jail.ask_to_close = interrupted
+    with pytest.raises(KeyboardInterrupt):
+        launcher.close(loaded)
+    assert (loaded.closed, place.released) == (False, 0)
+    launcher.close(loaded)
+    assert client.asked == [m.CloseJail(7)]
+    assert (loaded.closed, place.released) == (True, 1)
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""What an environment asks of its jail's server, and what is started ahead of its use."""
+"""An environment's hold on a jail: whatever interrupts it, the jail is given back, once."""
 
 from __future__ import annotations
 
@@ -9,11 +9,12 @@ from typing import Any, cast
 
 import pytest
 
+from envhub_sandbox.errors import ServerBusyError, WorkerDiedError
 from envhub_sandbox.session import lease as lease_module
 from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.session.prewarm import Prewarm, SuitePrewarm
 from envhub_sandbox.transport.deadline import StartupDeadline
-from envhub_worker.protocol.lifecycle import Lifecycle, State
+from envhub_worker.protocol.lifecycle import Event, Lifecycle, State
 from tests.support.in_process.fake_lane import FakeLane, session_over
 
 
@@ -24,21 +25,28 @@ class _Jails:
 
     def __init__(self, launcher: Any) -> None:
         self.done: list[str] = []
+        self.fails: dict[str, list[BaseException]] = {}
         self.launcher = launcher
         launcher.note_denied = lambda *_: None
         launcher.hold = lambda: lambda: self.done.append("server released")
         self.launcher.retry_s = 0.0
         self.built = 0
 
+    def do(self, what: str) -> None:
+        """Note it, and fail where it is to fail."""
+        self.done.append(what)
+        if self.fails.get(what):
+            raise self.fails[what].pop()
+
     def take(self, deadline: object) -> Any:
-        self.done.append("take")
+        self.do("take")
         return SimpleNamespace(jail=SimpleNamespace(number=1, report=[]), server=None)
 
     def end(self, loaded: object) -> None:
-        self.done.append("end")
+        self.do("end")
 
     def give_back(self, loaded: object, *, wait: bool = True) -> None:
-        self.done.append("give back")
+        self.do("give back")
 
 
 @pytest.fixture
@@ -48,7 +56,7 @@ def taken(monkeypatch: pytest.MonkeyPatch) -> tuple[Lease, _Jails]:
     session = session_over(lane)
     hold = SimpleNamespace(enter=lambda: lambda: None, settle=lambda: False)
     jails = _Jails(SimpleNamespace(repository=session.repository, server_hold=hold))
-    building = SimpleNamespace(build=lambda *_: jails.done.append("build") or lane)
+    building = SimpleNamespace(build=lambda *_: jails.do("build") or lane)
     monkeypatch.setattr(lease_module, "Builder", lambda *_: building)
     session.lifecycle.state = State.IDLE
     lease = Lease(
@@ -85,6 +93,46 @@ def test_only_words_are_taken_of_a_status(
     assert lease.states() == words
 
 
+def test_a_jail_is_taken_built_in_and_given_back_once(taken: tuple[Lease, _Jails]) -> None:
+    lease, jails = taken
+    acquire(lease)
+    assert lease.lane is not None
+    for _ in range(2):
+        lease.let_go()
+    assert jails.done == ["take", "build", "give back"]
+    assert (lease.loaded, lease.lane) == (None, None)
+    jails.done.clear()
+    acquire(lease)
+    lease.abandon()  # as a fork does: the jail is its parent's
+    assert (jails.done, lease.lane) == (["take", "build"], None)
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), WorkerDiedError("it died")])
+def test_what_cannot_be_built_is_given_back(
+    taken: tuple[Lease, _Jails], error: BaseException
+) -> None:
+    lease, jails = taken
+    jails.fails["build"] = [error]
+    with pytest.raises(type(error)):
+        acquire(lease)
+    assert jails.done == ["take", "build", "give back"]
+    assert lease.loaded is None
+    acquire(lease)
+    assert lease.loaded is not None
+
+
+def test_an_interrupted_return_is_done_again(taken: tuple[Lease, _Jails]) -> None:
+    lease, jails = taken
+    acquire(lease)
+    jails.fails["give back"] = [KeyboardInterrupt()]
+    with pytest.raises(KeyboardInterrupt):
+        lease.let_go()
+    assert lease.loaded is not None
+    lease.let_go()
+    assert jails.done[2:] == ["give back", "give back"]
+    assert lease.loaded is None
+
+
 def test_a_server_is_held_until_the_next_jail_is_there(taken: tuple[Lease, _Jails]) -> None:
     lease, jails = taken
     acquire(lease)
@@ -92,6 +140,27 @@ def test_a_server_is_held_until_the_next_jail_is_there(taken: tuple[Lease, _Jail
     lease.leave()
     acquire(lease)
     assert jails.done == ["end", "give back", "take", "build", "server released"]
+
+
+def test_a_full_server_is_asked_again_once_there_is_room(taken: tuple[Lease, _Jails]) -> None:
+    lease, jails = taken
+    full = ServerBusyError("full", quota="jails", used=1, limit=1, retry_s=0.1)
+    jails.fails["take"] = [full]
+    with pytest.raises(ServerBusyError):
+        acquire(lease)
+    jails.fails["take"] = [full]
+    lease.make_room = lambda: True
+    acquire(lease)
+    assert lease.loaded is not None
+
+
+def test_a_jail_that_comes_after_close_is_refused(taken: tuple[Lease, _Jails]) -> None:
+    lease, jails = taken
+    lease.lifecycle.on(Event.CLOSE)
+    with pytest.raises(WorkerDiedError, match="closed during make_env"):
+        acquire(lease)
+    lease.let_go()
+    assert jails.done == ["take", "build", "give back"]
 
 
 # --- What is started ahead is a favour: a request for something else does not fail for it

@@ -68,6 +68,16 @@ def test_deaths_come_with_the_answers_of_the_others() -> None:
     assert type(told.value) is WorkerDiedError
 
 
+def test_a_runners_word_is_no_death() -> None:
+    """A ``Death`` in the place of a living runner is an answer, and an illegal one."""
+    said = jail(m.RelayDonePartly((1, 1), (1,)), DIED, DIED)
+    with pytest.raises(RunnersDiedError) as caught:
+        said.receive(sent(said), Deadline(1))
+    assert list(caught.value.deaths) == [1]
+    with pytest.raises(RemoteProtocolError, match="a runner sent Death"):
+        jail(m.RelayDone((1, 1)), m.Value(7), DIED).exchange("step", ASKED, Deadline(1))
+
+
 @pytest.mark.parametrize(
     ("reply", "parts"),
     [
@@ -124,6 +134,15 @@ def test_resets_of_the_fresh_are_those_of_the_dead() -> None:
     first, second = resets(m.Reset(1, None, {"a": 1}, mask), [8, 9])
     assert first == m.Reset(1, [8, 9], None, None)
     assert cast("m.Reset", second).mask is mask
+
+
+def test_rows_of_the_dead_are_truncated_whatever_the_fresh_say() -> None:
+    yes = np.ones(2, np.bool_)
+    said = m.StepDone(np.zeros((2, 1)), np.full((2, 3), 9.0), yes, ~yes, {"worker_restarted": ~yes})
+    row = revived_step(said, 2)
+    assert row.rewards.tolist() == [[0.0] * 3] * 2  # type: ignore[attr-defined]
+    assert (row.terminations.tolist(), row.truncations.tolist()) == ([False] * 2, [True] * 2)  # type: ignore[attr-defined]
+    assert row.info["worker_restarted"].tolist() == [True, True]  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize("shape", [(2, 2), (2, 2**31 - 1)])

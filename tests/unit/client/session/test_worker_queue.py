@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from gymnasium.error import AlreadyPendingCallError
 
-from envhub_sandbox.errors import LocalProtocolError
+from envhub_sandbox.errors import LocalProtocolError, RemoteProtocolError
 from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.parts.worker_queue import WorkerQueue
 from envhub_sandbox.transport.results import StepResult
+from envhub_worker.protocol.lifecycle import State
 from envhub_worker.protocol.limits import MAX_IN_FLIGHT
 from tests.support.in_process.fake_lane import FakeLane, fleet_over
 
@@ -83,3 +84,22 @@ def test_what_could_not_be_sent_is_raised_where_it_is_received(
     assert not queue.busy
     step(queue)
     assert taken(queue)[1].tolist() == [0.0]
+
+
+def test_rewards_of_a_worker_among_others_are_one_number_each() -> None:
+    """Else they cannot be joined with others'; alone, a worker may give any shape."""
+
+    class Wide(FakeLane):
+        def result(self, infos: dict[Any, Any] | None = None) -> StepResult:
+            observation, _, *rest = super().result(infos)
+            return (observation, np.zeros((1, 2)), *rest)
+
+    session = fleet_over([FakeLane(1), Wide(1)]).parts[1]
+    alone = WorkerQueue(session, session.rows, sliced=False)
+    step(alone)
+    assert taken(alone)[1].shape == (1, 2)
+    among = WorkerQueue(session, session.rows, sliced=True)
+    step(among)
+    with pytest.raises(RemoteProtocolError, match="one number each"):
+        taken(among)
+    assert session.lifecycle.state is State.DEAD

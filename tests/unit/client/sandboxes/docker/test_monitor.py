@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import select
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -25,6 +26,7 @@ echo $$ >{log}.pid
 {what}
 """
 _ANNOUNCES = """echo '{"envhub-worker": "0"}'"""
+_SERVES = f"echo 'WARNING: something that engines say' >&2; {_ANNOUNCES}; cat >/dev/null"
 
 
 @dataclass
@@ -74,12 +76,32 @@ def kept(tmp_path: Path, what: str, script: Path | None = None) -> Iterator[Kept
         client.communicate()
 
 
+@pytest.mark.parametrize("how", ["the client exits", "the client is killed", "it is told to"])
+def test_the_container_ends_with_its_client(tmp_path: Path, how: str) -> None:
+    with kept(tmp_path, _SERVES) as made:
+        assert made.said == {"envhub-worker": "0"}
+        if how == "it is told to":
+            made.monitor.terminate()
+        elif how == "the client is killed":
+            made.client.kill()
+        else:
+            made.client.communicate()
+        assert made.ends()
+
+
 @pytest.mark.parametrize("code", [0, 137])
 def test_the_monitor_ends_as_its_container_did(tmp_path: Path, code: int) -> None:
     """So that the client can tell how that was: 137 is SIGKILL inside."""
     with kept(tmp_path, f"{_ANNOUNCES}; exit {code}") as made:
         assert made.ends()
         assert made.monitor.returncode == code
+
+
+def test_the_lifeline_is_cut_when_the_monitor_is_killed(tmp_path: Path) -> None:
+    with kept(tmp_path, _SERVES) as made:
+        pid = int((tmp_path / "calls.pid").read_text())
+        made.monitor.send_signal(signal.SIGKILL)
+        assert eventually(lambda: not os.path.exists(f"/proc/{pid}"))
 
 
 def test_an_engine_that_fails_is_quoted(tmp_path: Path) -> None:
