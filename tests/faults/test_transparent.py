@@ -18,6 +18,7 @@ from gymnasium.error import ClosedEnvironmentError
 from envhub_sandbox import errors, make_env
 from envhub_sandbox.session.recovery import derived_seed
 from envhub_worker.protocol.lifecycle import State
+from tests.faults.endurance.monkey import same
 from tests.faults.mortal import (
     ALL_LIVE,
     CRASH,
@@ -27,7 +28,6 @@ from tests.faults.mortal import (
     MEMORY,
     RAISE,
     SEED,
-    SLOW,
     SPIN,
     oracle,
 )
@@ -57,15 +57,6 @@ def made(
         env_kwargs=env_kwargs or {},
         **more,
     )
-
-
-def same(got: Any, expected: Any) -> bool:
-    """Whether two results of a step are equal, all infos included."""
-    *arrays, infos = got
-    *expected_arrays, expected_infos = expected
-    pairs = [*zip(arrays, expected_arrays, strict=True)]
-    pairs += [(infos[key], expected_infos[key]) for key in expected_infos]
-    return infos.keys() == expected_infos.keys() and all(np.array_equal(a, b) for a, b in pairs)
 
 
 def fresh(restart: int, rows: slice = DEAD) -> Any:
@@ -449,12 +440,6 @@ def test_a_late_sibling_is_a_timeout_all_the_same(env: Any) -> None:
     observation, _ = env.reset(seed=SEED)
     assert np.array_equal(observation, oracle().reset(seed=SEED)[0])
     assert env.step(ALL_LIVE)[0][:, 1].tolist() == [1, 1, 1, 1]
-
-
-def test_a_slow_sibling_is_waited_for(env: Any) -> None:
-    observation, _, _, truncated, _ = env.step([SLOW, LIVE, LIVE, EXIT])
-    assert observation[:, 1].tolist() == [1, 1, 0, 0]
-    assert truncated.tolist() == [False, False, True, True]
 
 
 def test_budget_ends_in_the_death_itself() -> None:

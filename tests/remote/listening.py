@@ -23,6 +23,7 @@ from tests.support import inside
 from tests.support.processes import eventually
 
 _BOOTSTRAP = Path(envhub_worker.protocol.__file__).parent.parent / "bootstrap.py"
+ANY_PORT = "tcp://127.0.0.1:*"
 WORKER = (sys.executable, "-I", str(_BOOTSTRAP), "worker")
 
 
@@ -131,7 +132,7 @@ class Listening:
 
 @contextlib.contextmanager
 def listening(
-    folder: Path, *options: str, bind: str = "tcp://127.0.0.1:*", prefix: Sequence[str] = ()
+    folder: Path, *options: str, bind: str = ANY_PORT, prefix: Sequence[str] = ()
 ) -> Iterator[Listening]:
     """Start a server and end it; ``prefix`` runs it elsewhere."""
     folder.mkdir(parents=True, exist_ok=True)
@@ -139,8 +140,8 @@ def listening(
     arguments = [*prefix, *WORKER, "listen", "--bind", bind, "--state-dir", str(state), *options]
     with log.open("wb") as out:
         process = subprocess.Popen(arguments, stdin=subprocess.DEVNULL, stdout=out, stderr=out)
+    server = Listening(process, "", "", state, log)
     try:
-        server = Listening(process, "", "", state, log)
         assert eventually(lambda: server.noted().endswith("\n") or process.poll() is not None)
         assert process.poll() is None, server.said()
         # for programs, and with a list of clients, it says nothing that a client is to paste
@@ -150,5 +151,5 @@ def listening(
         server.client_key = key.read_text().strip() if key.exists() else ""
         yield server
     finally:
-        process.terminate()
-        process.wait(120)
+        server.process.terminate()  # a test may have started another in its place
+        server.process.wait(120)

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import pytest
-import zmq
 
 from envhub_sandbox.errors import VersionMismatchError
 from envhub_sandbox.sandboxes.process import PROCESS
 from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_worker.protocol import messages as m
+from tests.attacks.client.lying_server import lying
 
 ANOTHER = m.VERSION + 1
 
@@ -35,38 +31,10 @@ def test_a_server_refuses_a_client_of_another_version(tmp_path: Path, version: i
     assert f"protocol {version}, this worker {m.VERSION}" in reply.message
 
 
-@contextmanager
-def worker_of_another_version(tmp_path: Path) -> Iterator[tuple[str, int]]:
-    """A worker that welcomes everybody: its endpoint, and a descriptor that never ends."""
-    endpoint = f"ipc://{tmp_path}/other"
-    context: zmq.Context[Any] = zmq.Context()
-    router = context.socket(zmq.ROUTER)
-    router.bind(endpoint)
-    stop = threading.Event()
-
-    def serve() -> None:
-        while not stop.is_set():
-            if router.poll(50):
-                identity, header = router.recv_multipart()
-                number, request = m.unpack_header(header)
-                assert isinstance(request, m.Hello)
-                reply = m.Welcome(ANOTHER, "9.9.9", 4242)
-                router.send_multipart([identity, *m.pack_header(reply, number)])
-
-    thread = threading.Thread(target=serve)
-    thread.start()
-    never = context.socket(zmq.PAIR)
-    try:
-        yield endpoint, int(never.getsockopt(zmq.FD))
-    finally:
-        stop.set()
-        thread.join()
-        context.destroy(0)
-
-
-def test_a_client_refuses_a_worker_of_another_version(tmp_path: Path) -> None:
-    with worker_of_another_version(tmp_path) as (endpoint, never):
-        client = WorkerConnection(endpoint, never)
+def test_a_client_refuses_a_worker_of_another_version() -> None:
+    with lying() as server:
+        server.lies[m.Hello] = lambda asked: [asked.answer(m.Welcome(ANOTHER, "9.9.9", 4242))]
+        client = WorkerConnection(server.endpoint, server.process_fd)
         try:
             text = f"protocol {m.VERSION}, the worker {ANOTHER}: install the same release"
             with pytest.raises(VersionMismatchError, match=text):

@@ -9,22 +9,22 @@ something grew.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
 import os
-import re
 import subprocess
 import sys
 import tempfile
-import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import psutil
 
 from envhub_sandbox import RemoteSandbox, make_env
-from envhub_sandbox.sandboxes.process import BOOTSTRAP
+from tests.remote.listening import ANY_PORT, Listening, listening, worker
+from tests.support.processes import eventually
 from tests.support.samples import sample
 
 _REPOSITORY = sample("cartpole")
@@ -47,7 +47,7 @@ def main(words: Sequence[str] | None = None) -> int:
     arguments = parser.parse_args(words)
     if arguments.client:
         return _client(*arguments.client)
-    with tempfile.TemporaryDirectory(prefix="clients-") as folder, Server(Path(folder)) as server:
+    with tempfile.TemporaryDirectory(prefix="clients-") as folder, serving(Path(folder)) as server:
         found = in_a_row(server, arguments.in_a_row)
     grown = more(found["after_a_tenth"], found["at_the_end"])
     print(json.dumps({**found, "grown": grown}, indent=2))
@@ -85,80 +85,40 @@ def _client(endpoint: str, server_key: str) -> int:
 
 
 class Server:
-    """A server on loopback, with a temporary folder of its own."""
+    """A server on loopback.
 
-    def __init__(self, folder: Path, *options: str) -> None:
-        self._folder = folder
-        self._state, self._place = folder / "state", folder / "place"
-        self._place.mkdir(mode=0o711)
-        folder.chmod(0o711)
-        self._options = options
-        self._endpoint = "tcp://127.0.0.1:*"
-        self._start()
-        self._public = (self._state / "server.pub").read_text().strip()
-        self._variables = {
-            **os.environ,
-            "ENVHUB_CLIENT_KEY": str(self._state / "client.key"),
-            "ENVHUB_CACHE": str(folder / "cache"),
-        }
+    Attributes:
+        place: Its folder for temporary files.
+    """
 
-    def _start(self) -> None:
-        command = [sys.executable, "-I", str(BOOTSTRAP), "worker", "listen"]
-        options = ["--bind", self._endpoint, "--state-dir", str(self._state), *self._options]
-        more = ["--max-sessions", "1024", "--max-jails", "256", "--log-level", "error"]
-        variables = {**os.environ, "TMPDIR": str(self._place)}
-        self.process = subprocess.Popen(
-            [*command, *options, *more], stdout=subprocess.PIPE, env=variables, text=True
-        )
-        assert self.process.stdout is not None
-        said = ""
-        while "ENVHUB_SERVER_KEY" not in said:
-            line = self.process.stdout.readline()
-            if not line:
-                raise RuntimeError(f"the server has ended: {said}")
-            said += line
-        threading.Thread(target=self.process.stdout.read, daemon=True).start()
-        found = re.search(r"tcp://\S+", said)
-        assert found is not None
-        self._endpoint = found[0]
+    def __init__(self, listens: Listening, place: Path) -> None:
+        self._listens, self.place = listens, place
+        self.endpoint = listens.endpoint
+
+    @property
+    def process(self) -> subprocess.Popen[bytes]:
+        return self._listens.process
 
     def killed_and_started(self) -> None:
         """End it without a warning, and start another at its address, with its keys."""
         self.process.kill()
         self.process.wait()
-        self._start()
-
-    @property
-    def endpoint(self) -> str:
-        """Where it listens."""
-        return self._endpoint
-
-    def __enter__(self) -> Server:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.process.terminate()
-        self.process.wait(60)
-
-    @property
-    def place(self) -> Path:
-        """Its folder for temporary files."""
-        return self._place
+        words = [self.endpoint if word == ANY_PORT else word for word in self.process.args]
+        self._listens.process = subprocess.Popen(words, stdin=subprocess.DEVNULL)
+        asks = ("health", "--state-dir", self._listens.state)
+        assert eventually(lambda: worker(*asks).returncode == 0)
 
     def sandbox(self) -> RemoteSandbox:
         """The way to it, for this process."""
-        return RemoteSandbox(
-            self._endpoint,
-            self._public,
-            (self._state / "client.key").read_text(),
-            retry_s=_RETRY_S,
-        )
+        return self._listens.sandbox(retry_s=_RETRY_S)
 
     def short(self) -> None:
         """A client that comes, steps and goes."""
         command = [sys.executable, "-m", "tests.faults.endurance.clients"]
-        words = ["--client", self._endpoint, self._public]
-        subprocess.run([*command, *words], check=True, env=self._variables, timeout=600)
+        words = ["--client", self.endpoint, self._listens.public]
+        cache = self.place.with_name("cache")
+        variables = {"ENVHUB_CLIENT_KEY": self._listens.client_key, "ENVHUB_CACHE": str(cache)}
+        subprocess.run([*command, *words], check=True, env=os.environ | variables, timeout=600)
 
     def settled(self, before: Mapping[str, float] | None = None) -> dict[str, float]:
         """What it has, once all clients have gone: waits for their ends, but not for ever.
@@ -178,33 +138,30 @@ class Server:
     def _look(self) -> dict[str, float]:
         process = psutil.Process(self.process.pid)
         return {
-            "server_pss_mib": _mib(_pss(self.process)),
+            "server_pss_mib": round(process.memory_full_info().pss / _MIB, 1),
             "descriptors": process.num_fds(),
             "threads": process.num_threads(),
             "processes": len(process.children(recursive=True)),
-            "jails": self._jails(),
-            "folders": entries(self._place),
-            "stored_files": entries(self._state / "store"),
+            "jails": self._listens.jails(),
+            "folders": entries(self.place),
+            "stored_files": entries(self._listens.state / "store"),
         }
 
-    def _jails(self) -> int:
-        command = [sys.executable, "-I", str(BOOTSTRAP), "worker", "status", "--json"]
-        command += ["--state-dir", str(self._state)]
-        done = subprocess.run(command, check=True, capture_output=True, timeout=120)
-        return sum(len(one["jails"]) for one in json.loads(done.stdout)["sessions"])
+
+@contextlib.contextmanager
+def serving(folder: Path) -> Iterator[Server]:
+    """A server with a temporary folder of its own, which ends with this."""
+    place = folder / "place"
+    place.mkdir(mode=0o711)
+    folder.chmod(0o711)
+    options = ("--max-sessions", "1024", "--max-jails", "256", "--log-level", "error")
+    with listening(folder, *options, prefix=("env", f"TMPDIR={place}")) as listens:
+        yield Server(listens, place)
 
 
 def entries(folder: Path) -> int:
     """What is below a folder, of which some goes while one looks."""
     return sum(len(folders) + len(files) for _, folders, files in os.walk(folder))
-
-
-def _pss(process: subprocess.Popen[Any]) -> int:
-    return int(psutil.Process(process.pid).memory_full_info().pss)
-
-
-def _mib(size: int) -> float:
-    return round(size / _MIB, 1)
 
 
 if __name__ == "__main__":

@@ -37,13 +37,16 @@ import psutil
 
 from envhub_sandbox import errors, make_env
 from tests.faults.endurance import clients
-from tests.faults.endurance.soak import EXIT, HANG, LIVE, MIB, SLOW, SLOW_S, same
 from tests.support import inside
 from tests.support.samples import make_env_of, sample
 
 PLACES = ("process", "tcp", "fleet")
 
 NAMES = ("walk", "cartpole")
+MIB = 1 << 20
+LIVE, SLOW, HANG, EXIT = 0, 4, 5, 6
+"""Actions of ``walk``."""
+SLOW_S = 0.02
 _WARM_UP = 0.1
 _SETTLE_S = 60.0
 _HANG_S = 300.0
@@ -104,6 +107,22 @@ def _servers(subject: Subject) -> list[Any]:
     """Those that it has a jail in."""
     loaded = [one.loaded for one in inside.leases(subject.env)]
     return [one.server for one in loaded if one is not None]
+
+
+def same(got: Any, expected: Any) -> bool:
+    """Whether two steps gave the very same arrays and infos."""
+    *arrays, infos = got
+    *expected_arrays, expected_infos = expected
+    pairs = zip(arrays, expected_arrays, strict=True)
+    return (
+        all(_equal(a, b) for a, b in pairs)
+        and infos.keys() == expected_infos.keys()
+        and all(_equal(infos[key], expected_infos[key]) for key in infos)
+    )
+
+
+def _equal(a: Any, b: Any) -> bool:
+    return bool(a.dtype == b.dtype and a.shape == b.shape and np.array_equal(a, b))
 
 
 class Mismatch(Exception):
@@ -429,14 +448,14 @@ def _place(name: str) -> Iterator[Place]:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="monkey-")))
         folder.chmod(0o711)  # a jail has another user where this one is root
         if name == "tcp":
-            server = stack.enter_context(clients.Server(folder))
+            server = stack.enter_context(clients.serving(folder))
             yield Place(server.place, server)
             return
         if name == "fleet":
             folders = [folder / name for name in ("stays", "a", "b")]
             for one in folders:
                 one.mkdir()
-            found = [stack.enter_context(clients.Server(one)) for one in folders]
+            found = [stack.enter_context(clients.serving(one)) for one in folders]
             yield Place(found[0].place, found[0], found[1:])
             return
         # of this process, which was started for it alone

@@ -1,4 +1,4 @@
-"""Short forms of ``soak``, ``monkey`` and ``clients``, and that they notice what they look for."""
+"""Short forms of ``monkey`` and ``clients``, and that they notice what they look for."""
 
 from __future__ import annotations
 
@@ -8,32 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.faults.endurance import clients, monkey, soak
-from tests.support import inside
-
-
-@pytest.mark.usefixtures("neighbour")
-@pytest.mark.parametrize(
-    ("lane", "workers", "restart"),
-    [("auto", 2, "transparent"), ("frames", 1, "on_reset")],
-)
-def test_short_soak(
-    lane: str,
-    workers: int,
-    restart: str,
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    """Deaths, kills, stalls and time-outs among many steps: no result differs, nothing grows."""
-    monkeypatch.setattr(*inside.LATE_REPLY_GRACE, 0.2)
-    short = ["--steps", "400", "--fault-every", "20", "--seed", "3", "--restart", restart]
-    code = soak.main([*short, "--lane", lane, "--num-workers", str(workers)])
-    found = json.loads(capsys.readouterr().out)[lane]
-    assert code == 0, found
-    assert found["mismatches"] == 0
-    done = [name for name in ("slow", "late", "stalls", "hangs", "exits", "kills") if found[name]]
-    assert len(done) == 6, found
-    assert bool(found["revived_rows"]) is (restart == "transparent")
+from tests.faults.endurance import clients, monkey
 
 
 def _result(**changes: Any) -> Any:
@@ -42,15 +17,10 @@ def _result(**changes: Any) -> Any:
 
 
 def test_a_difference_would_be_noticed() -> None:
-    assert soak.same(_result(), _result())
-    assert not soak.same(_result(), _result(infos={}))
-    assert not soak.same(_result(), _result(second=np.zeros(2)))
-    assert not soak.same(_result(), _result(first=np.zeros(2, np.float32)))
-    flat = {"processes": 4, "client_descriptors": 9, "client_mib": 80.0}
-    found: dict[str, Any] = {"mismatches": 0, "after_warm_up": flat, "at_the_end": flat}
-    assert soak.passed(found)
-    assert not soak.passed({**found, "mismatches": 1})
-    assert not soak.passed({**found, "at_the_end": {**flat, "processes": 5}})
+    assert monkey.same(_result(), _result())
+    assert not monkey.same(_result(), _result(infos={}))
+    assert not monkey.same(_result(), _result(second=np.zeros(2)))
+    assert not monkey.same(_result(), _result(first=np.zeros(2, np.float32)))
 
 
 def test_a_short_hour(capsys: pytest.CaptureFixture[str]) -> None:
