@@ -60,6 +60,9 @@ def test_another_clients_jail_is_not_there(alice: Any, mallory: Peer) -> None:
         m.StartRunners(jail.number, 1),
         m.ReadOutput(jail.number, ""),
         m.KeepJail(jail.number),
+        m.ShareSlabs(jail.number, ()),
+        m.ExpireIdle(jail.number, 1),
+        m.FollowOutput(jail.number, 0),
         m.Relay(jail.number, "step", ((jail.runners[0], 1),)),
     ):
         payload = (b"x",) if isinstance(request, m.Relay) else ()

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import signal
 from collections.abc import Iterator
 from typing import Any
 
@@ -11,7 +9,6 @@ import numpy as np
 import pytest
 
 from envhub_sandbox import RaySandbox
-from envhub_sandbox.errors import WorkerDiedError
 from tests.compliance.conftest import pytest_generate_tests as pytest_generate_tests
 from tests.compliance.pair import Pair
 from tests.compliance.vector_env import Case, VectorEnvCompliance, paired
@@ -64,19 +61,3 @@ def test_a_lost_node_loses_its_rows_alone(cluster: Any) -> None:
     assert eventually(lambda: not servers())
     for node in (*more, spare):
         cluster.remove_node(node)
-
-
-def test_a_killed_actor_of_a_fleet_is_named(cluster: Any) -> None:
-    """By its node, and in the numbers of its rows; a reset brings it back."""
-    places = [RaySandbox(num_cpus=0.5)] * 3
-    policy = {"restart": "on_reset", "crash_history": 0}
-    options = {"n_envs": 6, "sandbox": places, "policy": policy, "timeouts": AT_ONCE}
-    with started(sample("mortal"), **options) as env:
-        assert eventually(lambda: len(servers()) == 3)
-        os.kill(servers()[0].ppid(), signal.SIGKILL)
-        with pytest.raises(WorkerDiedError, match="Ray says: The actor died"):  # noqa: PT012
-            while True:
-                env.step([LIVE] * 6)
-        env.reset(seed=0)
-        assert env.step([LIVE] * 6)[0][:, 1].tolist() == [1.0] * 6
-        assert eventually(lambda: len(servers()) == 3)

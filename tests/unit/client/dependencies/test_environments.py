@@ -139,17 +139,6 @@ def test_what_lost_its_content_is_made_again(index: Index, tmp_path: Path, damag
     assert left_behind() == []
 
 
-def test_newer_versions_come_when_they_are_asked_for(index: Index, tmp_path: Path) -> None:
-    """And not by themselves: the same repository gets what it got."""
-    folder = repository(tmp_path / "repo", "wanted")
-    make_wheel(index.folder, "wanted", "1.0")
-    first = made(folder)
-    make_wheel(index.folder, "wanted", "2.0")
-    assert made(folder).home == first.home
-    assert "wanted==2.0" in made(folder, upgrade=True).pins
-    assert "wanted==2.0" in made(folder).pins
-
-
 MAKER = """\
 import sys
 from tests.unit.client.dependencies.test_environments import made

@@ -68,43 +68,6 @@ class _Echo(gym.Env[Any, Any]):
         return action, 0.0, False, False, {}
 
 
-def play(env: gym.Env[Any, Any]) -> list[Any]:
-    """Four episodes, each begun by the caller."""
-    seen: list[Any] = []
-    for episode in range(4):
-        observation, info = env.reset(seed=5 if episode == 0 else None)
-        seen.append((observation.tolist(), info))
-        ended = False
-        while not ended:
-            observation, reward, terminated, truncated, info = env.step(len(seen) % 4)
-            ended = terminated or truncated
-            info = {key: np.asarray(value).tolist() for key, value in info.items() if key != "deep"}
-            seen.append((observation.tolist(), reward, terminated, truncated, info))
-    return seen
-
-
-@pytest.mark.parametrize("mode", list(AutoresetMode))
-def test_episodes_are_those_of_the_environment_itself(mode: AutoresetMode) -> None:
-    """Observations, rewards, ends, infos, draws, and no reset that was not asked for."""
-    vector = SyncVectorEnv([_Story], autoreset_mode=mode)
-    assert play(SingleEnv(vector)) == play(_Story())
-
-
-def test_a_last_observation_is_the_last_one() -> None:
-    """Also where the vector environment has begun the next episode in the same step."""
-    env = SingleEnv(SyncVectorEnv([_Story], autoreset_mode=AutoresetMode.SAME_STEP))
-    env.reset(seed=1)
-    env.step(0)
-    env.step(1)
-    observation, _, terminated, _, info = env.step(2)
-    assert terminated
-    assert observation.tolist() == [1, 3]
-    assert (info["step"], info["deep"]["action"]) == (3, 2)
-    observation, info = env.reset()
-    assert observation.tolist() == [2, 0]
-    assert info["reset"] == 2
-
-
 @pytest.mark.parametrize("space", _SPACES, ids=str)
 def test_actions_and_observations_are_of_the_single_spaces(space: spaces.Space[Any]) -> None:
     """One action becomes a batch of one, and a batch of one an observation."""

@@ -138,23 +138,6 @@ def test_a_jail_whose_runner_cannot_be_asked_for_ends(
     assert ours.open_ones() == []
 
 
-def test_a_jail_is_its_sessions(ours: Jails) -> None:
-    entry = opened(ours)
-    for ask, request in (
-        (ours.start_more, m.StartRunners(entry.number, 1)),
-        (ours.share, m.ShareSlabs(entry.number, ())),
-        (ours.keep, m.KeepJail(entry.number)),
-        (ours.expire, m.ExpireIdle(entry.number, 1)),
-        (ours.read_output, m.ReadOutput(entry.number, "")),
-        (ours.follow_output, m.FollowOutput(entry.number, 0)),
-    ):
-        with pytest.raises(RefusedError, match="there is no jail"):
-            ask(THEIRS, request)  # type: ignore[operator]
-    assert ours.status(THEIRS, m.GetStatus()) == m.Status(())
-    assert ours.close_jail(THEIRS, m.CloseJail(entry.number)) == m.Done()
-    assert ours.open_ones() == [entry]
-
-
 @pytest.mark.parametrize(
     ("parts", "frames"),
     [
