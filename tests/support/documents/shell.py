@@ -24,7 +24,7 @@ from tests.support.documents.blocks import CHECKOUT, RUN, Block, tested
 NEW, APPROVED = "c0ffee" + "0" * 34, "decade" + "0" * 34
 _READ_AS = {
     " && ": "\n",  # the first of them that fails ends the shell
-    "OWNER/my-env@<commit>": "OWNER/my-env@main",  # what was just pushed
+    "OWNER/my-env@<commit>": "OWNER/my-env@main",  # what was just uploaded
     "<commit>": NEW,
     "<new>": NEW,
     "<approved>": APPROVED,
@@ -81,6 +81,11 @@ python3() {
 pip() {
   [ "$*" = "install ." ] && [ -f pyproject.toml ]
 }
+
+# The Hub has OWNER/my-env already.
+hf() {
+  [ "$1 $2" = "upload OWNER/my-env" ] && [ -f "$3/env.py" ]
+}
 """
 # An engine that has no containers.
 _DOCKER = """#!/bin/sh
@@ -124,6 +129,7 @@ def execute(
         (clone / within / path).parent.mkdir(parents=True, exist_ok=True)
         (clone / within / path).write_bytes(content)
     repository = hub.add("org/repo", texts)
+    hub.add("OWNER/my-env", texts)
     repository.earlier[APPROVED] = {**new, "env.py": new["env.py"].replace(b"0.05", b"0.1")}
     (clone / within / "references.txt").write_text(f"org/repo@{NEW}\n")
     return _bash(_script(blocks), clone / within, _environment(folder, hub, docker))

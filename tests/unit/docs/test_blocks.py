@@ -24,7 +24,7 @@ pytestmark = pytest.mark.same_for("users", "versions")
 
 # Programs of others, whose options are theirs; and what begins a line that is no command.
 _OTHERS = {"docker", "pip", "lerobot-eval", "lerobot-train", "lerobot-eval-sandboxed", "ruff"}
-_OTHERS |= {"sbatch"}
+_OTHERS |= {"hf", "sbatch"}
 _SHELL = "tests/support/documents/shell.py"
 _RUN_BY = {
     "README.md": "tests/unit/docs/test_docs.py",
