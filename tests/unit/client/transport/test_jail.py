@@ -107,6 +107,14 @@ def found(lanes: list[FakeLane], timeout_s: float | None) -> list[int]:
     return answered_first(cast("list[Any]", lanes), Deadline(timeout_s))
 
 
+def test_who_has_answered_is_found_at_once(lanes: list[FakeLane]) -> None:
+    """All of them, in order, also where the deadline has passed; nothing is listened to."""
+    lanes[0].silent = lanes[2].silent = False
+    assert found(lanes, 0) == [0, 2]
+    assert found(lanes, None) == [0, 2]
+    assert not any(lane.listened for lane in lanes)
+
+
 def test_a_ring_ends_the_sleep(lanes: list[FakeLane], monkeypatch: pytest.MonkeyPatch) -> None:
     """Whichever lane it comes from: without it, this would take an hour."""
     monkeypatch.setattr("envhub_sandbox.transport.lane.LOOK_MS", 3_600_000)
