@@ -26,23 +26,17 @@ from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
 from envhub_sandbox.sandboxes.process import CONTAINER, RuntimeFolder
 from tests.containers.kit import IMAGE, container_of, containers_of, folders, nothing_left, pids_in
 from tests.support.processes import descendants, eventually
-from tests.support.repositories import write_repository
+from tests.support.repositories import STILL, write_repository
 from tests.support.samples import sample
 from tests.support.started import started
 
-_HOG = """
-import gymnasium as gym
-
-class Hog(gym.Env):
-    observation_space = action_space = gym.spaces.Discrete(2)
-    def reset(self, *, seed=None, options=None):
-        return 0, {}
+_HOG = f"""{STILL}
+class Hog(Still):
     def step(self, action):
         self.held = b"x" * (2 << 30)
-        return 0, 0.0, False, False, {}
 
 def make_env(n_envs=1, use_async_envs=False):
-    return gym.vector.SyncVectorEnv([Hog])
+    return vector(Hog, 1)
 """
 _CLIENT = """
 import json, os, sys

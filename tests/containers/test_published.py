@@ -26,7 +26,7 @@ from tests.containers.kit import IMAGE, container_of, folders, nothing_left
 from tests.support import inside
 from tests.support.elsewhere.kit import SYSTEMS, command, ran
 from tests.support.processes import eventually
-from tests.support.repositories import write_repository
+from tests.support.repositories import STILL, importing, write_repository
 from tests.support.samples import sample
 from tests.support.started import started
 
@@ -52,37 +52,21 @@ try:
 except OSError as error:
     print(error)
 """
-_NETWORKER = """
+_NETWORKER = f"""{STILL}
 import socket
-import gymnasium as gym
 
-class Networker(gym.Env):
-    observation_space = action_space = gym.spaces.Discrete(2)
+class Networker(Still):
     def reach(self, host, port):
         try:
             socket.create_connection((host, port), 10).sendall(b"reached")
         except OSError as error:
             return str(error)
         return "reached"
-    def reset(self, *, seed=None, options=None):
-        return 0, {}
-    def step(self, action):
-        return 0, 0.0, False, False, {}
 
 def make_env(n_envs=1, use_async_envs=False):
-    return gym.vector.SyncVectorEnv([Networker])
+    return vector(Networker, 1)
 """
-_NEEDS_SIX = """
-import gymnasium as gym
-import six
-
-class Told(gym.Wrapper):
-    def version(self):
-        return six.__version__
-
-def make_env(n_envs=1, use_async_envs=False):
-    return gym.vector.SyncVectorEnv([lambda: Told(gym.make("CartPole-v1"))] * n_envs)
-"""
+_NEEDS_SIX = importing("six", version="six.__version__")
 
 
 @pytest.fixture

@@ -34,20 +34,9 @@ from tests.remote.listening import Listening, listening
 from tests.support.command_line import below, gone
 from tests.support.packages.wheels import Index, make_wheel
 from tests.support.processes import eventually
-from tests.support.repositories import write_repository
+from tests.support.repositories import importing, write_repository
 
-ENV = """
-import sys
-import gymnasium as gym
-import wanted
-
-class Told(gym.Wrapper):
-    def version(self):
-        return wanted.VERSION
-
-def make_env(n_envs=1, use_async_envs=False):
-    return gym.vector.SyncVectorEnv([lambda: Told(gym.make("CartPole-v1"))] * n_envs)
-"""
+ENV = importing("wanted", version="wanted.VERSION")
 
 
 @pytest.fixture(scope="module")

@@ -21,7 +21,7 @@ from tests.support import inside
 from tests.support.packages.wheels import Index, make_wheel
 from tests.support.ports import lasting_port
 from tests.support.processes import eventually, halted
-from tests.support.repositories import write_repository
+from tests.support.repositories import importing, write_repository
 from tests.support.samples import sample
 from tests.support.started import started
 
@@ -115,17 +115,7 @@ def test_a_list_that_is_none_is_refused(rows: Path, places: Any) -> None:
         make_env(rows, sandbox=places)
 
 
-ENV = """
-import gymnasium as gym
-import listed
-
-class Told(gym.Wrapper):
-    def where(self):
-        return listed.__file__
-
-def make_env(n_envs=1, use_async_envs=False):
-    return gym.vector.SyncVectorEnv([lambda: Told(gym.make("CartPole-v1"))] * n_envs)
-"""
+ENV = importing("listed", where="listed.__file__")
 
 
 @pytest.fixture(scope="module")
