@@ -12,7 +12,7 @@ import pytest
 
 from envhub_sandbox import errors
 from envhub_sandbox.session.error_text import add_author_line
-from envhub_sandbox.transport.replies import death, raised, refusal
+from envhub_sandbox.transport.replies import check_reply, death, expect_reply, raised, refusal
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.confinement import REASONS
 from envhub_worker.runner.described import raised as described
@@ -95,6 +95,21 @@ def test_a_missing_package_is_an_import_error() -> None:
     assert issubclass(errors.DependencyError, ImportError)
 
 
+@pytest.mark.parametrize(
+    "changed",
+    [
+        *({"builtin": one} for one in ("KeyboardInterrupt", "SystemExit", "Oops", "", "open")),
+        *(
+            {"builtin": "Nothing", "type_name": f"gymnasium.{name}"}
+            for name in ("error.logger", "error.Nothing", "error_")
+        ),
+    ],
+)
+def test_other_names_mean_nothing(changed: dict[str, str]) -> None:
+    """A worker cannot choose what is raised beyond a fixed table."""
+    assert type(raised(a_raised(**changed))) is errors.RemoteEnvError
+
+
 class Own(gym.error.InvalidAction):
     """An error of a repository's own, that is one of Gymnasium's."""
 
@@ -172,6 +187,14 @@ SERVERS = [
 ]
 
 
+@pytest.mark.parametrize("message", SERVERS, ids=lambda message: type(message).__name__)
+def test_a_runner_cannot_speak_in_the_servers_name(message: m.Message) -> None:
+    """A death or a refusal inside a runner's reply is a broken rule, not news."""
+    with pytest.raises(errors.RemoteProtocolError, match="a runner sent") as caught:
+        check_reply(message)
+    assert "\x1b" not in str(caught.value)
+
+
 def test_the_kinds_of_both_conversations_are_apart() -> None:
     """What runners may send begins at one number."""
     runners = {cls.__name__ for kind, cls in m.KINDS.items() if kind >= m.FIRST_RUNNER_KIND}
@@ -216,6 +239,21 @@ def test_refusals_come_from_a_table(name: str, expected: type[Exception]) -> Non
     assert type(refusal(m.Refusal(name, "text", "", ""))) is expected
     error = refusal(m.Refusal("SandboxUnavailableError", "it is off", "landlock", "turn it on"))
     assert str(error) == "this host cannot enforce landlock: it is off\nturn it on"
+
+
+def test_other_replies_than_expected_break_the_rules() -> None:
+    """A reply of another kind is the worker's fault; deaths and refusals are told as such."""
+    check_reply(m.Value(3))
+    assert expect_reply(m.Done(), m.Done) == m.Done()
+    for reply, kind, said in (
+        (m.Output(""), errors.RemoteProtocolError, "with Output where Done belongs"),
+        (SERVERS[0], errors.WorkerDiedError, "died"),
+        (m.Refusal("WorkerError", "no", "", ""), errors.WorkerError, "no"),
+    ):
+        with pytest.raises(kind, match=said):
+            expect_reply(reply, m.Done)
+    with pytest.raises(errors.RemoteEnvError):
+        check_reply(a_raised())
 
 
 def test_every_reason_of_a_death_is_told() -> None:
