@@ -17,6 +17,7 @@ from envhub_sandbox.hub.git.checkout import top_of
 from envhub_sandbox.hub.local import split_local
 from envhub_sandbox.hub.snapshot import is_here
 from envhub_sandbox.hub.sources import toml
+from envhub_sandbox.settings.options import nearest
 from envhub_worker.protocol.text import printable, size_text
 
 if TYPE_CHECKING:
@@ -72,7 +73,13 @@ def read_settings(path: Path, known: Collection[str]) -> dict[str, Any]:
     file that lies there would let him say what he may do and what fails him.
     Raises ``PolicyError``: the file cannot be read, or says what there is not.
     """
-    table = read_file(path).get("check", {})
+    document = read_file(path)
+    if tables := sorted(set(document) - {"check"}):
+        raise PolicyError(
+            f"{path} has {', '.join(tables)}{nearest(tables[0], ['check'])}; all that is read is "
+            "[check], and below it a line for each option"
+        )
+    table = document.get("check", {})
     if not isinstance(table, Mapping):
         raise PolicyError(
             f"check in {path} is not a table; write [check] and below it a line for each option"
@@ -80,9 +87,11 @@ def read_settings(path: Path, known: Collection[str]) -> dict[str, Any]:
     asked = {name.replace("-", "_"): value for name, value in table.items()}
     unknown = sorted(set(asked) - set(known))
     if unknown:
-        names = ", ".join(name.replace("_", "-") for name in sorted(known))
+        names = [name.replace("_", "-") for name in sorted(known)]
+        near = nearest(unknown[0].replace("_", "-"), names)
         raise PolicyError(
-            f"[check] in {path} has no option {', '.join(unknown)}; there are {names}"
+            f"[check] in {path} has no option {', '.join(unknown)}{near}; there are "
+            f"{', '.join(names)}"
         )
     return asked
 

@@ -6,10 +6,10 @@ import json as json_module
 import os
 import shutil
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Union
 
 import typer
 
@@ -20,8 +20,10 @@ from envhub_sandbox.hub.grammar import FOLDER
 from envhub_worker.protocol.text import counted, size_text
 
 if TYPE_CHECKING:
+    from envhub_sandbox.dependencies.builds.wheels import KeptWheel
     from envhub_sandbox.dependencies.environments import Environment
 
+Stored = Union["StoredSnapshot", "Environment", "KeptWheel"]
 _DAY_S = 24 * 3600.0
 _SHOWN = 18
 """Characters of a commit: twelve digits behind local-, as errors show it; --json has all."""
@@ -101,17 +103,19 @@ def _repository(document: dict[str, Any]) -> str:
 def list_(
     json: opt.Json = False,
 ) -> None:
-    """List snapshots and environments of packages, last used first."""
+    """List snapshots, environments of packages and wheels built here, last used first."""
     from envhub_sandbox.dependencies import environments
+    from envhub_sandbox.dependencies.builds import wheels
     from envhub_sandbox.system.folders import cache_root
 
-    found, made = stored_snapshots(), environments.every()
+    found, made, built = stored_snapshots(), environments.every(), wheels.every()
     if json:
         names = ("repository", "commit", "revision", "folder")
         own = _documents(found, **dict(zip(names, names, strict=True)))
         theirs = _documents(made, name="key", python="python", version="version", packages="pins")
         folder = str(cache_root())
-        print_json({"folder": folder, "snapshots": own, "environments": theirs})
+        kept = _documents(built, file="file")
+        print_json({"folder": folder, "snapshots": own, "environments": theirs, "wheels": kept})
         return
     if found:
         snapshots = [
@@ -127,16 +131,22 @@ def list_(
             (one.key[:12], one.version, *_when_and_size(one), " ".join(one.pins)) for one in made
         ]
         show_rows([("environment", "Python", "last used", "size", "packages"), *rows], right=(3,))
-    say(f"{_told(found, made)}, in {cache_root()}")
+    if built:
+        out()
+        files = [(one.file, *_when_and_size(one)) for one in built]
+        show_rows([("wheel built here", "last used", "size"), *files], right=(2,))
+    say(f"{_told(found, made, built)}, in {cache_root()}")
 
 
-def _told(found: list[StoredSnapshot], made: list[Environment]) -> str:
-    total = sum(one.size for one in found) + sum(one.size for one in made)
-    snapshots, environments = counted(len(found), "snapshot"), counted(len(made), "environment")
-    return f"{snapshots}, {environments}, {size_text(total)}"
+def _told(found: list[StoredSnapshot], made: list[Environment], built: list[KeptWheel]) -> str:
+    everything: list[Stored] = [*found, *made, *built]
+    total = sum(one.size for one in everything)
+    texts = [counted(len(found), "snapshot"), counted(len(made), "environment")]
+    texts += [counted(len(built), "wheel")] if built else []
+    return f"{', '.join(texts)}, {size_text(total)}"
 
 
-def _documents(found: Sequence[StoredSnapshot | Environment], **named: str) -> list[dict[str, Any]]:
+def _documents(found: Sequence[Stored], **named: str) -> list[dict[str, Any]]:
     """What is stored as data: by name, which attribute; and what all have."""
     return [
         {
@@ -148,7 +158,7 @@ def _documents(found: Sequence[StoredSnapshot | Environment], **named: str) -> l
     ]
 
 
-def _when_and_size(one: StoredSnapshot | Environment) -> tuple[str, str]:
+def _when_and_size(one: Stored) -> tuple[str, str]:
     return time.strftime("%F", time.localtime(one.used)), size_text(one.size)
 
 
@@ -158,8 +168,8 @@ def remove(
         list[str] | None,
         typer.Argument(
             metavar="[NAME]...",
-            help="A repository, repository@commit, a folder that is here, or at least 7 characters "
-            "of a commit or of an environment.",
+            help="A repository, repository@commit, a folder that is here, at least 7 characters of "
+            "a commit or of an environment, or the package of a wheel that was built here.",
         ),
     ] = None,
     everything: Annotated[
@@ -170,21 +180,26 @@ def remove(
         typer.Option(metavar="DAYS", min=0, help="What was not used for this many days."),
     ] = None,
 ) -> None:
-    """Remove snapshots and environments of packages that are not in use."""
+    """Remove snapshots and environments of packages that are not in use, and built wheels."""
     from envhub_sandbox.dependencies import environments
+    from envhub_sandbox.dependencies.builds import wheels
     from envhub_sandbox.system.folders import cache_root
 
-    found, made = stored_snapshots(), environments.every()
+    found, made, built = stored_snapshots(), environments.every(), wheels.every()
     if everything:
         for folder in ("manifests", "resolutions"):
             shutil.rmtree(cache_root() / folder, ignore_errors=True)
     else:
-        found, made = _chosen(found, made, names or [], unused_for)
+        is_chosen = _chooser([*found, *made, *built], names or [], unused_for)
+        found, made = [*filter(is_chosen, found)], [*filter(is_chosen, made)]
+        built = [*filter(is_chosen, built)]
     kept = {one.commit: why for one in found if (why := _users_of(one))}
     kept |= {one.key: why for one in made if (why := environments.remove(one))}
     environments.remove_abandoned()
+    for wheel in built:
+        wheel.remove()
     gone = [one for one in found if one.commit not in kept]
-    say(f"Removed {_told(gone, [one for one in made if one.key not in kept])}.")
+    say(f"Removed {_told(gone, [one for one in made if one.key not in kept], built)}.")
     if kept and names:
         raise UsageError("; ".join(kept.values()))
     for why in kept.values():
@@ -204,22 +219,21 @@ def _users_of(one: StoredSnapshot) -> str:
     )
 
 
-def _chosen(
-    found: list[StoredSnapshot], made: list[Environment], names: list[str], unused_for: float | None
-) -> tuple[list[StoredSnapshot], list[Environment]]:
-    everyone: list[StoredSnapshot | Environment] = [*found, *made]
+def _chooser(
+    everyone: Sequence[Stored], names: list[str], unused_for: float | None
+) -> Callable[[Stored], bool]:
     for name in names:
         if not any(one.answers_to(name) for one in everyone):
             raise UsageError(f"the cache has nothing named {name!r}; see: envhub cache list")
     oldest = None if unused_for is None else time.time() - unused_for * _DAY_S
-    if not names and oldest is None:
-        return [], []
 
-    def is_chosen(one: StoredSnapshot | Environment) -> bool:
+    def is_chosen(one: Stored) -> bool:
+        if not names and oldest is None:
+            return False
         meant = not names or any(one.answers_to(name) for name in names)
         return meant and (oldest is None or one.used < oldest)
 
-    return [one for one in found if is_chosen(one)], [one for one in made if is_chosen(one)]
+    return is_chosen
 
 
 @opt.with_options()

@@ -7,13 +7,14 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 from envhub_sandbox.errors import PolicyError
 from envhub_sandbox.hub.snapshot import Snapshot
-from envhub_sandbox.settings.options import option_name
+from envhub_sandbox.settings.options import nearest, option_name
 from envhub_worker.protocol.records import dataclass
 
 if TYPE_CHECKING:  # they cost time, and most repositories need none of them
@@ -25,6 +26,8 @@ Tell = Callable[[str], None]
 DATE = r"\d{4}-\d{2}-\d{2}(T\d{2}:\d{2}:\d{2}(Z|[+-]\d{2}:\d{2}))?"
 _DECLARE = ("requirements.txt", "pyproject.toml")
 _SCRIPT, _LOOKED_AT = b"# /// script", 1024 * 1024  # as ``declared.py`` has them
+_ALIKE = 0.85
+"""From here on a name is a misspelt one: mujoco and mujoco-py are less alike."""
 _NAMES = ("extra", "only", "without", "override", "python", "fetch_python", "exclude_newer")
 
 
@@ -97,7 +100,8 @@ def _adjusted(given: Mapping[str, Any]) -> Choice:
     unknown = sorted(str(name) for name in given if name not in _NAMES)
     if unknown:
         raise PolicyError(
-            f"dependencies has no key {', '.join(unknown)}; it takes {', '.join(_NAMES)}"
+            f"dependencies has no key {', '.join(unknown)}{nearest(unknown[0], _NAMES)}; it takes "
+            f"{', '.join(_NAMES)}"
         )
     fetch = given.get("fetch_python", False)
     if not isinstance(fetch, bool):
@@ -207,6 +211,9 @@ def request_of(snapshot: Snapshot, choice: Choice, *, gpu: bool = False) -> Pack
     if auto and found is None and not guesses:
         return None
     says = (found.wanted if found else ()) if choice.only is None else choice.only
+    if choice.without:
+        every = _guesses(snapshot, replace(choice, without=()))
+        _refuse_misspelt(choice.without, (*says, *choice.extra), every)
     argument = "what it imports" if auto else "the argument dependencies"
     return PackageRequest(
         source=found.source if found else argument,
@@ -222,6 +229,22 @@ def request_of(snapshot: Snapshot, choice: Choice, *, gpu: bool = False) -> Pack
         fetch_python=choice.fetch_python,
         gpu=gpu,
     )
+
+
+def _refuse_misspelt(
+    without: Sequence[str], wanted: Sequence[WantedPackage], guesses: Sequence[Guess]
+) -> None:
+    """Refuse names that are nearly, and not, those of packages that it has. A name that is like
+    none may be that of a package which another one needs.
+    """
+    from packaging.utils import canonicalize_name
+
+    known = {str(canonicalize_name(one.requirement.name)) for one in wanted}
+    known |= {name for one in guesses for name in one.brought_by}
+    for name in set(without) - known:
+        others = sorted(one for one in known if not name.startswith(one))
+        if near := nearest(name, others, _ALIKE):
+            raise PolicyError(f"without in dependencies has {name!r}{near}, which nothing declares")
 
 
 def _guesses(snapshot: Snapshot, choice: Choice) -> tuple[Guess, ...]:

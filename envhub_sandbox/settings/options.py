@@ -15,7 +15,7 @@ import json
 import operator
 import os
 import shlex
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import field, fields, replace
 from keyword import iskeyword
 from pathlib import Path
@@ -419,6 +419,14 @@ _spelling: Spelling = in_python
 def option_name(key: str, value: Any = _NO_VALUE) -> str:
     """An option, with a value to give to it, as it is written where the user is."""
     return _spelling(OPTIONS[key], value)
+
+
+def nearest(name: object, known: Iterable[str], cutoff: float = 0.6) -> str:
+    """A question in brackets about the known name that is most like another; empty for none."""
+    import difflib
+
+    close = difflib.get_close_matches(str(name), list(known), 1, cutoff)
+    return f" (did you mean {close[0]!r}?)" if close else ""
 
 
 @contextlib.contextmanager

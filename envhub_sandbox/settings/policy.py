@@ -13,7 +13,7 @@ from numbers import Real
 from typing import Any, TypeVar
 
 from envhub_sandbox.errors import PolicyError
-from envhub_sandbox.settings.options import option_name
+from envhub_sandbox.settings.options import nearest, option_name
 from envhub_worker.protocol.confinement import DISPLAYS, NETWORKS, PROFILES, Confinement, Limits
 from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.start_variables import fixed_hash_seed, why_not
@@ -220,7 +220,8 @@ def _from(cls: type[T], value: T | Mapping[str, Any] | None, what: str) -> T:
     unknown = [name for name in value if name not in known]
     if unknown:
         raise PolicyError(
-            f"{what} has no field {', '.join(map(str, unknown))}; it has {', '.join(known)}"
+            f"{what} has no field {', '.join(map(str, unknown))}{nearest(unknown[0], known)}; it "
+            f"has {', '.join(known)}"
         )
     made = dict(value)
     if cls is Policy and isinstance(made.get("limits"), Mapping):

@@ -32,6 +32,10 @@ from envhub_worker.supervisor.records import AnsweredError, Asker, RefusedError
 
 _RCVHWM = 64
 _ROUND = 64
+_NO_HELLO = (
+    "a request before the Hello of its connection: a client that lost its connection, or whose "
+    "server was started anew, says Hello on the new one and asks again"
+)
 """Messages that are served before the jails have their turn."""
 _LAST_WORDS_MS = 500
 """For how long what was said last is sent on after a drain."""
@@ -177,7 +181,7 @@ class Server:
             return self._hello(request, arrived)
         payload = arrived.frames[1:]
         if not asker.session:
-            raise RefusedError("HelloError", "say Hello first")
+            raise RefusedError("HelloError", _NO_HELLO)
         request = self._gate.authorize(asker, request, payload)
         if isinstance(request, m.Relay):
             self._jails.relay(asker, request, payload)

@@ -206,8 +206,43 @@ def _whole(record: Path) -> Path | None:
     with contextlib.suppress(OSError, ValueError, HashMismatch):
         [wheel] = record.parent.glob("*.whl")
         built = describe(wheel)
-        return wheel if built is not None and _hash(wheel) == f"sha256:{built.wheel}" else None
+        if built is not None and _hash(wheel) == f"sha256:{built.wheel}":
+            with contextlib.suppress(OSError):
+                os.utime(record)
+            return wheel
     return None
+
+
+@dataclass(frozen=True)
+class KeptWheel:
+    """A wheel that was built here; ``used``: Unix time (seconds) when it was last asked for."""
+
+    file: str
+    size: int
+    used: float
+    home: Path
+
+    def answers_to(self, name: str) -> bool:
+        """Whether a name means it: its file's, or that of its package."""
+        return name == self.file or canonicalize_name(name) == parse_wheel_filename(self.file)[0]
+
+    def remove(self) -> None:
+        """It is built again where it is needed."""
+        remove_tree(self.home)
+        with contextlib.suppress(OSError):  # of another build environment there is one more
+            self.home.parent.rmdir()
+
+
+def every() -> list[KeptWheel]:
+    """All of them, the latest used first."""
+    found = []
+    for record in root().glob("*/[!.]*/built.json"):
+        with contextlib.suppress(OSError, ValueError):
+            [wheel] = record.parent.glob("*.whl")
+            parse_wheel_filename(wheel.name)
+            size, used = wheel.stat().st_size, record.stat().st_mtime
+            found.append(KeptWheel(wheel.name, size, used, record.parent))
+    return sorted(found, key=lambda one: -one.used)
 
 
 def describe(wheel: Path) -> WheelOrigin | None:

@@ -60,6 +60,25 @@ def test_list_shows_what_is_stored(stored: list[str]) -> None:
     assert [one.commit for one in stored_snapshots()] == stored[1:]
 
 
+def test_wheels_that_were_built_here_are_listed_and_removed(stored: list[str]) -> None:
+    """By their package, or with what was not used for so long; nothing else goes with one."""
+    for number, name in enumerate(("one-wheel", "other")):
+        home = cache_root() / "wheels" / f"source{number}" / "environment"
+        home.mkdir(parents=True)
+        make_wheel(home, name)
+        (home / "built.json").write_text("{}")
+    os.utime(home / "built.json", (1e9, 1e9))
+    listed = json.loads(RUNNER.invoke(app, ["cache", "list", "--json"]).stdout)["wheels"]
+    names = ["one_wheel-1.0-py3-none-any.whl", "other-1.0-py3-none-any.whl"]
+    assert [one["file"] for one in listed] == names
+    assert all(name in RUNNER.invoke(app, ["cache", "list"]).stdout for name in names)
+    for words in (["one-wheel"], ["--unused-for", "30"]):
+        done = RUNNER.invoke(app, ["cache", "remove", *words])
+        assert "Removed 0 snapshots, 0 environments, 1 wheel, " in done.stderr
+    assert list((cache_root() / "wheels").iterdir()) == []
+    assert len(stored_snapshots()) == 3
+
+
 def test_hub_repositories_are_named_as_they_are_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

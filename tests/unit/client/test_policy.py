@@ -30,9 +30,12 @@ def test_values_are_frozen_and_by_name_only(cls: type) -> None:
 @pytest.mark.parametrize(
     ("make", "complaint"),
     [
-        (lambda: policy_from({"netwrok": "host"}, None), "policy has no field netwrok; it has"),
-        (lambda: limits_from({"memory": 1}), "limits has no field memory; it has memory_bytes"),
-        (lambda: timeouts_from({"step": 1}), "timeouts has no field step; it has startup_s"),
+        (
+            lambda: policy_from({"netwrok": "host"}, None),
+            r"netwrok \(did you mean 'network'\?\); it has",
+        ),
+        (lambda: limits_from({"memory": 1}), r"no field memory \(did you mean 'memory_bytes'\?\)"),
+        (lambda: timeouts_from({"step": 1}), r"step \(did you mean 'step_s'\?\); it has startup_s"),
         (lambda: policy_from({"limits": {"memory": 1}}, None), "limits has no field memory"),
         (lambda: policy_from({1: 2}, None), "policy has no field 1"),
     ],

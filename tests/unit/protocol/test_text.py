@@ -101,6 +101,8 @@ def test_sizes_are_read(text: str, unit: str, size: int) -> None:
 def test_what_is_no_size_is_told(text: str) -> None:
     with pytest.raises(ValueError, match=r"512M, 1\.5GiB or 4G"):
         parse_size(text)
+    with pytest.raises(ValueError, match="16 bytes: name a unit, 16M, 16G or 16B"):
+        parse_size("16")
 
 
 @pytest.mark.parametrize(

@@ -59,6 +59,8 @@ def duration_text(seconds: float) -> str:
 
 
 _SIZE = r"(?a)(\d+(?:\.\d+)?) *([kmgt]?)(i?b|bytes?)?"
+_LEAST_BARE = 2**20
+"""Bytes: who writes fewer without a unit has left it out."""
 SIZES = "a size such as 512M, 1.5GiB or 4G; units are powers of 1024"
 """What ``parse_size`` takes, for errors and help."""
 
@@ -71,13 +73,18 @@ def parse_size(text: str, unit: str = "") -> int:
         unit: Of a bare number: ``""`` for bytes, ``"m"``, ``"g"``.
 
     Raises:
-        ValueError: It is no size; the text says what is one.
+        ValueError: It is no size, or lacks a unit; the text says what is one.
     """
     found = re.fullmatch(_SIZE, text.strip().lower())
     if found is None:
         raise ValueError(f"it takes {SIZES}")
     number, prefix, rest = found.groups()
-    return int(float(number) * 1024 ** " kmgt".index(prefix or ("" if rest else unit) or " "))
+    size = int(float(number) * 1024 ** " kmgt".index(prefix or ("" if rest else unit) or " "))
+    if not (prefix or rest or unit) and size < _LEAST_BARE:
+        raise ValueError(
+            f"that is {size_text(size)}: name a unit, {number}M, {number}G or {number}B"
+        )
+    return size
 
 
 def continued(text: str) -> str:

@@ -15,7 +15,7 @@ from envhub_sandbox.dependencies.modules import MissingModule, guessed
 from envhub_sandbox.dependencies.packages import packages_for
 from envhub_sandbox.dependencies.request import AUTO, DECLARED, PackageRequest, chosen, request_of
 from envhub_sandbox.dependencies.resolve import Lock, Target
-from envhub_sandbox.errors import ResolutionError
+from envhub_sandbox.errors import PolicyError, ResolutionError
 from envhub_sandbox.hub.snapshot import Snapshot, local
 from envhub_sandbox.hub.sources import parsing
 from tests.support import inside
@@ -151,12 +151,15 @@ def test_what_is_here_is_not_installed(index: Index, tmp_path: Path) -> None:
         ({"only": []}, [], []),
         ({"extra": ["b"]}, ["a", "b"], ["chess"]),
         ({"without": ["chess"]}, ["a"], []),
+        ({"without": ["needed-by-a"]}, ["a"], ["chess"]),
     ],
 )
 def test_the_caller_has_the_last_word(
     tmp_path: Path, dependencies: Any, wanted: list[str], guessed: list[str]
 ) -> None:
     found = snapshot(tmp_path / "r", "import chess" + MAKE, requirements__txt="a\n")
+    with pytest.raises(PolicyError, match=r"has 'ches' \(did you mean 'chess'\?\)"):
+        request_of(found, chosen({"without": ["ches"]}, None)[0])
     request = request_of(found, chosen(dependencies, None)[0])
     assert list(map(str, request.wanted)) == wanted
     assert [one.module for one in request.guesses] == guessed
