@@ -12,10 +12,14 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-import torch
 from gymnasium.wrappers.vector import RecordEpisodeStatistics
 
 from envhub_sandbox import make_env
+
+try:
+    import torch
+except ModuleNotFoundError as error:
+    raise SystemExit(f"{error}. Run: pip install torch") from None
 
 CARTPOLE = str(Path(__file__).with_name("cartpole"))
 

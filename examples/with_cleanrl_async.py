@@ -13,9 +13,13 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 
 from envhub_sandbox import make_env
+
+try:
+    import torch
+except ModuleNotFoundError as error:
+    raise SystemExit(f"{error}. Run: pip install torch") from None
 
 CARTPOLE = str(Path(__file__).with_name("cartpole"))
 LENGTH, GAMMA, CLIP = 32, 0.99, 0.2

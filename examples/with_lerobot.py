@@ -8,9 +8,12 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from lerobot.envs.factory import make_env
+try:
+    from lerobot.envs.factory import make_env
 
-from envhub_sandbox.integrations.lerobot import install
+    from envhub_sandbox.integrations.lerobot import install
+except ModuleNotFoundError as error:
+    raise SystemExit(f"{error}. Run: pip install lerobot") from None
 
 if __name__ == "__main__":
     install()

@@ -10,8 +10,11 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import ray
-from ray.rllib.algorithms.ppo import PPOConfig
+try:
+    import ray
+    from ray.rllib.algorithms.ppo import PPOConfig
+except ModuleNotFoundError as error:
+    raise SystemExit(f"{error}. Run: pip install 'ray[rllib]' torch") from None
 
 CARTPOLE = str(Path(__file__).with_name("cartpole"))
 

@@ -13,9 +13,12 @@ import argparse
 import os
 from pathlib import Path
 
-import ray
-from ray.cluster_utils import Cluster
-from ray.rllib.algorithms.ppo import PPOConfig
+try:
+    import ray
+    from ray.cluster_utils import Cluster
+    from ray.rllib.algorithms.ppo import PPOConfig
+except ModuleNotFoundError as error:
+    raise SystemExit(f"{error}. Run: pip install 'ray[rllib]' torch") from None
 
 CARTPOLE = str(Path(__file__).with_name("cartpole"))
 REWARD = 150.0

@@ -7,9 +7,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from stable_baselines3 import PPO
+try:
+    from stable_baselines3 import PPO
 
-from envhub_sandbox.integrations.sb3 import SandboxVecEnv
+    from envhub_sandbox.integrations.sb3 import SandboxVecEnv
+except ModuleNotFoundError as error:
+    raise SystemExit(f"{error}. Run: pip install stable-baselines3") from None
 
 if __name__ == "__main__":
     env = SandboxVecEnv.make(Path(__file__).with_name("cartpole"), n_envs=4)

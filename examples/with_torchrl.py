@@ -7,9 +7,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from torchrl.envs import GymWrapper
-
 from envhub_sandbox import SandboxEnv
+
+try:
+    from torchrl.envs import GymWrapper
+except ModuleNotFoundError as error:
+    raise SystemExit(f"{error}. Run: pip install torchrl") from None
 
 if __name__ == "__main__":
     env = GymWrapper(SandboxEnv(Path(__file__).with_name("cartpole")))

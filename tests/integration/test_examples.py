@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -29,6 +31,18 @@ def test_example_repository(name: str, tasks: dict[str, list[int]], frame: tuple
             env.step(env.action_space.sample())
             for picture in env.render():
                 assert (picture.shape, picture.dtype) == (frame, np.uint8)
+
+
+def test_what_an_example_needs_is_a_line_with_the_command() -> None:
+    """Instead of a traceback of imports."""
+    needed = ("torch", "lerobot", "ray", "stable_baselines3", "torchrl")
+    code = f"import runpy, sys; sys.modules.update(dict.fromkeys({needed})); "
+    scripts = sorted(EXAMPLES.glob("with_*.py"))
+    assert len(scripts) > 5
+    for script in scripts:
+        done = python("-c", f"{code}runpy.run_path({str(script)!r})", code=1)
+        [line] = done.stderr.splitlines()
+        assert re.fullmatch(r"(import of|No module named) .*\. Run: pip install \S.*", line)
 
 
 @pytest.mark.parametrize(
