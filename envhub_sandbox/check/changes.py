@@ -7,10 +7,13 @@ file that was changed: a pickle, an archive, or source of which not all was read
 
 from __future__ import annotations
 
+import difflib
+import itertools
 import re
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from envhub_sandbox.check.checks import Severity
@@ -23,6 +26,8 @@ from envhub_worker.protocol.text import printable, size_text
 
 _MOST_BYTES = 1 << 20
 _LONGEST = 500
+_AROUND, _COMPARED, _MOST_LINES, _WIDEST = 2, 500, 60, 200
+"""Of the lines that changed: equal ones around them; from the first on; shown; characters."""
 
 
 @dataclass(frozen=True)
@@ -33,12 +38,14 @@ class Change:
         what: ``"file"``, ``"entry"``, ``"python"``, ``"package"``, ``"import"``, ``"finding"`` or
             ``"environment"``.
         how: ``"new"``, ``"gone"``, ``"changed"`` or ``"renamed"``.
+        lines: Of a changed file of text: as ``diff -u`` has them, escaped and bounded.
     """
 
     what: str
     how: str
     text: str
     finding: Finding | None = None
+    lines: tuple[str, ...] = ()
 
     def weighs(self, least: Severity) -> bool:
         """Whether it is a new finding of at least this severity."""
@@ -84,11 +91,31 @@ def _files(then: Static, now: Static, other: Collection[str]) -> Iterator[Change
     for path in sorted({*before, *after}):
         if path in other:
             sizes = f"{size_text(before[path].size)}, now {size_text(after[path].size)}"
-            yield Change("file", "changed", _shown(f"{path}: {sizes}"))
+            lines = _changed_lines(then.snapshot.root / path, now.snapshot.root / path)
+            yield Change("file", "changed", _shown(f"{path}: {sizes}"), lines=lines)
         elif path in gone and path not in moved:
             yield Change("file", "gone", _shown(path))
         elif path not in before:
             yield _new(after[path], was)
+
+
+def _changed_lines(then: Path, now: Path) -> tuple[str, ...]:
+    """None of what is no text. Of a stranger's lines so few are compared that it takes no time."""
+    try:
+        before, after = (bytes_of(path, _MOST_BYTES).decode().splitlines() for path in (then, now))
+    except UnicodeDecodeError:
+        return ()
+    pairs = zip(before, after, strict=False)
+    same = next(
+        (at for at, (old, new) in enumerate(pairs) if old != new), min(len(before), len(after))
+    )
+    start = max(0, same - _AROUND)
+    old, new = (lines[start : start + _COMPARED] for lines in (before, after))
+    found = difflib.unified_diff(old, new, lineterm="", n=_AROUND)
+    lines = [printable(line, _WIDEST) for line in itertools.islice(found, 2, _MOST_LINES + 3)]
+    if len(lines) > _MOST_LINES or max(len(before), len(after)) > start + _COMPARED:
+        lines[_MOST_LINES:] = ["... there may be more, from here on not compared"]
+    return tuple(lines)
 
 
 def _new(record: FileRecord, was: Mapping[str, str]) -> Change:
@@ -186,6 +213,7 @@ def document(then: Static, now: Static, found: list[Change]) -> dict[str, Any]:
                 "change": one.how,
                 "text": one.text,
                 "finding": one.finding and one.finding.document(),
+                "lines": list(one.lines),
             }
             for one in found
         ],

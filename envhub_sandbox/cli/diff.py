@@ -13,13 +13,14 @@ from envhub_sandbox.cli.shared.console import (
     ProgressBar,
     out,
     print_json,
+    safe_line,
     say,
     show,
     show_rows,
 )
 from envhub_sandbox.cli.shared.exits import Exit
 from envhub_sandbox.cli.shared.findings import STYLES, FailOn, level
-from envhub_worker.protocol.text import counted
+from envhub_worker.protocol.text import MARGIN, counted
 
 if TYPE_CHECKING:
     from envhub_sandbox.check.changes import Change
@@ -103,4 +104,10 @@ def _print(then: str, now: str, found: list[Change]) -> None:
             styles[len(rows)] = STYLES[what]
         rows.append((one.how, what, text))
     show_rows(rows, styles=styles)
+    for one in found:
+        if one.lines:
+            out()
+            out(safe_line(one.text, 500), "bold")
+        for line in one.lines:  # which is a stranger's
+            out(f"{MARGIN}{safe_line(line, 300)}", {"+": GOOD, "-": DOUBTFUL}.get(line[:1]))
     say(f"{counted(len(found), 'change')}.", DOUBTFUL)

@@ -36,7 +36,8 @@ Output = Annotated[
         "--output",
         "-o",
         metavar="FILE",
-        help="The file; by default pylock.NAME.toml in this folder.",
+        help="The file; by default pylock.NAME.toml in this folder, or beside what is locked if "
+        "that is this folder.",
     ),
 ]
 NoSpaces = Annotated[
@@ -174,13 +175,19 @@ def _path(output: Path | None, snapshot: Snapshot) -> Path:
     if output is None:
         name = re.sub(r"[^A-Za-z0-9_-]+", "-", Path(snapshot.repo_id).name).strip("-") or "env"
         output = Path(f"pylock.{name}.toml")
+        if _is_inside(Path.cwd(), snapshot):  # a file in there would be one more to lock
+            output = Path(snapshot.repo_id).parent / output
     path = Path(os.path.abspath(output))
-    inside = Path(snapshot.repo_id).resolve() in path.parent.resolve().joinpath("x").parents
-    if snapshot.is_local and inside:
+    if _is_inside(path.parent, snapshot):
         raise UsageError(
             f"{path} would be inside the folder that it locks; name another place: --output FILE"
         )
     return path
+
+
+def _is_inside(folder: Path, snapshot: Snapshot) -> bool:
+    folder = folder.resolve()
+    return snapshot.is_local and Path(snapshot.repo_id).resolve() in (folder, *folder.parents)
 
 
 def _old(path: Path, upgrade: bool) -> LockFile | None:

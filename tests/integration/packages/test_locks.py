@@ -117,7 +117,7 @@ def test_a_package_that_was_replaced_is_refused(
         wheel.write_bytes(before)
 
 
-def test_other_arguments_say_something_else(folder: Path) -> None:
+def test_other_arguments_say_something_else(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     lock(folder, "--no-spaces")
     for other in ({"python": "/usr/bin/python3"}, {"dependencies": "host"}, {"dependencies": {}}):
         with pytest.raises(PolicyError, match="has the packages already"):
@@ -133,6 +133,10 @@ def test_other_arguments_say_something_else(folder: Path) -> None:
     done = RUNNER.invoke(app, ["lock", str(folder), "-o", str(inside)])
     assert (done.exit_code, inside.exists()) == (2, False)
     assert "inside the folder that it locks" in " ".join(done.output.split())
+    path_of(folder).unlink()
+    monkeypatch.chdir(folder)  # beside it, not inside
+    assert RUNNER.invoke(app, ["lock", ".", "--no-spaces"]).exit_code == 0
+    assert path_of(folder).exists()
 
 
 def test_what_a_lock_needs_is_fetched_ahead(packages: Index, folder: Path) -> None:

@@ -109,9 +109,12 @@ def test_options_that_mean_nothing_are_refused(
 
 def test_a_repository_paints_and_commands_nothing(tmp_path: Path) -> None:
     """Neither a terminal nor GitHub's runner: not by names, not by texts, not by what differs."""
-    old = repository(tmp_path / "old")
+    quoted = "\n'''\n::error::forged\n##[error]forged\n'''\n"
+    old = repository(tmp_path / "old", f"{_ENTRY}{quoted}")
     text = "##[error]forged ::error::forged\x9b2J" + " " * 60
-    spoken = f"open('~/' + '\\x1b[2J')\nopen({'~/' + text!r})\ndef make_env(a={text!r}): pass\n"
+    spoken = (
+        f"open('~/' + '\\x1b[2J')\nopen({'~/' + text!r})\ndef make_env(a={text!r}): pass\n{quoted}"
+    )
     new = repository(tmp_path / "new", spoken)
     names = ("##[error]forged", "::error::forged", "::error::" + "a" * 200 + "::error::b")
     for name in names:
@@ -143,6 +146,8 @@ def test_what_is_the_same_differs_in_nothing(tmp_path: Path) -> None:
     assert differing(tmp_path / "a") == []
     moved = differing(tmp_path / "b", f"# a comment\n{_ENTRY}")
     assert [row[:2] for row in moved] == [("file", "changed")]
+    done = envhub("diff", tmp_path / "b" / "old", tmp_path / "b" / "new")
+    assert f"  | @@ -1,2 +1,3 @@\n  | +# a comment\n  |  {_ENTRY.splitlines()[0]}\n" in done.stdout
     old, new = repository(tmp_path / "old", a__txt="1"), repository(tmp_path / "new", b__txt="1")
     [one] = changes(static(local(old)), static(local(new)))
     assert (one.what, one.how, one.text) == ("file", "renamed", "b.txt: was a.txt")
