@@ -22,6 +22,7 @@ from gymnasium.wrappers import TimeAwareObservation
 
 from envhub_sandbox import SandboxEnv, make_env
 from envhub_sandbox.errors import ActionError, LoadError
+from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 from tests.support.compare import assert_same
 from tests.support.repositories import write_repository
@@ -226,21 +227,32 @@ def make_env(n_envs=1, use_async_envs=False):
 
 
 @pytest.mark.parametrize("lane", ["auto", "frames"])
-def test_a_reward_that_is_no_number_comes_as_it_is(tmp_path: Path, lane: str) -> None:
-    """From a single environment. A vector environment says whose it is, and can be used on."""
+def test_a_reward_that_is_no_number_comes_as_it_is(
+    tmp_path: Path, lane: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """From a single environment, with the step. A vector environment says whose it is, and can be
+    used on.
+    """
+    asked = list[object]()
+    send = WorkerConnection.send
+    noted = lambda self, *request: (asked.append(request), send(self, *request))[1]  # noqa: E731
     folder = write_repository(tmp_path / "rewards", _REWARDS)
     here = make_env_of(folder)().envs[0]
     with contextlib.closing(SandboxEnv(folder, lane=lane)) as env:
         env.reset()
-        for action in range(9):
+        monkeypatch.setattr(WorkerConnection, "send", noted)
+        for action in (1, 1, 3, 1, 5, *range(9)):  # also where infos have become columns
             expected = here.step(action)
             seen = env.step(action)
             if action > 2:
                 assert_same(expected, seen)
             assert_same(expected[2:], seen[2:])
             assert action > 2 or (type(seen[1]), seen[1]) == (float, expected[1])
+        assert lane == "frames" or not asked, "a step was more than one request"
         env.reset()
-        with pytest.raises(ValueError, match=r"sub-environment 0 is of type list: \[1.0, 2\]"):
+        with pytest.raises(
+            ValueError, match=r"sub-environment 0 returned list \[1.0, 2\] as reward"
+        ):
             env.vector.step([3])
     for is_async, workers in ((False, None), (True, 1), (True, 2)):
         with make_env(
@@ -249,7 +261,8 @@ def test_a_reward_that_is_no_number_comes_as_it_is(tmp_path: Path, lane: str) ->
             suites.env.reset()
             for action, kind in ((3, "list"), (5, "dict"), (8, "str")):
                 with pytest.raises(
-                    (ValueError, TypeError), match=rf"sub-environment 2 is of type {kind}.*number"
+                    (ValueError, TypeError),
+                    match=rf"sub-environment 2 returned {kind} .* as reward.*number",
                 ):
                     suites.env.step([action] * 3)
             assert suites.env.step([1] * 3)[1].tolist() == [1.0, 1.0, 0.5]

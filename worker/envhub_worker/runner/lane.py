@@ -157,11 +157,9 @@ class Lane:
             pairs = self._pairs = self._env.run_step(actions)
             if (self._watched or self._warned) and self._has_more_to_say():
                 return slabs.FETCH, 0
-            if self._env.reward:  # it is sent with the infos, and is no column
-                return slabs.FETCH, 0
-            integers = self._env.integers
-            if pairs or True in integers:
-                return self._writer.write(pairs, integers)
+            integers, reward = self._env.integers, self._env.reward
+            if pairs or True in integers or reward:
+                return self._writer.write(pairs, integers, encoded=bool(reward))
             return slabs.DONE, 0
         except BaseException as error:
             frame = _raised_frame(self._raised(error, "step"))
@@ -256,11 +254,15 @@ class InfoWriter:
         self._masks: list[Any] = []
         self._fresh = False
 
-    def write(self, pairs: Pairs, integers: Sequence[bool] = ()) -> tuple[int, int]:
+    def write(
+        self, pairs: Pairs, integers: Sequence[bool] = (), *, encoded: bool = False
+    ) -> tuple[int, int]:
         """The outcome and the length for the reply's header. Raises ``ProtocolError``.
-        ``integers``: what ``joined`` says of the observation, which is part of the schema.
+        ``integers``: what ``joined`` says of the observation, which is part of the schema;
+        ``encoded``: whether it says what is no column, as of a reward that is no number.
         """
-        if self._keys is not None and integers == self._integers and self._write_columns(pairs):
+        known = self._keys is not None and integers == self._integers and not encoded
+        if known and self._write_columns(pairs):
             return slabs.COLUMNS, 0
         infos = self._joined(pairs)
         frames = self._pack(m.Value(infos))
