@@ -259,7 +259,7 @@ def test_a_crowd_of_readers_does_not_hold_the_clients(one: Watched, good: Any) -
 
 def test_a_newcomer_takes_the_place_of_the_oldest(monkeypatch: pytest.MonkeyPatch) -> None:
     """Also of one that says something at that moment; one that will say no more is not kept."""
-    monkeypatch.setattr(http_port, "PATIENCE_S", float("inf"))
+    monkeypatch.setattr(http_port, "PATIENCE_S", 3600.0)
     asked, both_came = threading.Event(), threading.Event()
 
     def answer(path: str) -> http_port.Reply:

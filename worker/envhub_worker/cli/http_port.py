@@ -1,28 +1,27 @@
 """A port that answers GET, for monitoring: small, slow and bounded.
 
-One thread, one poll, a page made beforehand. Who sends much, sends slowly or comes in crowds gets
-little: a request has a size and a time, and a newcomer takes the place of the connection that has
-been there the longest. Nothing of it touches the server's own loop.
+Who sends much, sends slowly or comes in crowds gets little: a request has a size and a time, and a
+newcomer takes the place of the connection that has been there the longest. Nothing of it touches
+the server's own loop.
 """
 
 from __future__ import annotations
 
 import contextlib
 import ipaddress
-import selectors
 import socket
 import threading
+import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from http import HTTPStatus
-from time import monotonic
+from socketserver import BaseRequestHandler, ThreadingTCPServer
 from traceback import format_exc
+from typing import Any
 
 MAX_REQUEST_BYTES = 8192
 MAX_CONNECTIONS = 32
 PATIENCE_S = 5.0
 """From a connection's beginning to its end."""
-_LOOK_S = 0.5
 _PAUSE_S = 0.5
 _PIECE_BYTES = 4096
 _ENDS = (b"\r\n\r\n", b"\n\n")
@@ -31,20 +30,17 @@ Reply = tuple[int, str, bytes]
 """Status, content type, body."""
 
 
-@dataclass(eq=False)
-class _Connection:
-    sock: socket.socket
-    since: float = field(default_factory=monotonic)
-    asked: bytearray = field(default_factory=bytearray)
-    left: memoryview | None = None
-
-
-class HttpPort:
+class HttpPort(ThreadingTCPServer):
     """Listens until it is closed; on any port that is free if that is 0.
 
     ``answer`` gives the page of a path; what it raises is a 500, and ``failed`` gets the traceback.
     Raises ``OSError``: the address is not to be had.
     """
+
+    allow_reuse_address = True
+    daemon_threads = True
+    block_on_close = False
+    request_queue_size = MAX_CONNECTIONS
 
     def __init__(
         self,
@@ -55,101 +51,63 @@ class HttpPort:
     ) -> None:
         self._answer = answer
         self._failed = failed
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        self._listener = socket.create_server((host, port), family=family, backlog=MAX_CONNECTIONS)
-        self._listener.setblocking(False)
-        self._selector = selectors.DefaultSelector()
-        self._selector.register(self._listener, selectors.EVENT_READ)
-        self._connections: dict[_Connection, None] = {}  # the oldest first
-        self._stopped = threading.Event()
-        self._thread = threading.Thread(target=self._run, name="envhub metrics", daemon=True)
+        self._lock = threading.Lock()
+        self._answering = threading.Lock()
+        self._connections: dict[socket.socket, None] = {}  # the oldest first
+        self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
+        super().__init__((host, port), _Handler)
+        self._thread = threading.Thread(
+            target=self.serve_forever, name="envhub metrics", daemon=True
+        )
         self._thread.start()
 
     @property
     def address(self) -> str:
         """``HOST:PORT``, with the port that was found."""
-        host, port = self._listener.getsockname()[:2]
+        host, port = self.socket.getsockname()[:2]
         return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
     def close(self) -> None:
         """Stop listening, and drop who is there."""
-        self._stopped.set()
-        self._thread.join(2 * _LOOK_S)
+        self.shutdown()
+        self.server_close()
+        with self._lock:
+            while self._connections:
+                self._cut_oldest()
 
-    def _run(self) -> None:
+    def get_request(self) -> tuple[socket.socket, Any]:
+        """A connection; where no descriptor is left, who knocks goes on knocking."""
         try:
-            while not self._stopped.is_set():
-                self._round()
-        finally:
-            for connection in list(self._connections):
-                self._drop(connection)
-            self._selector.close()
-            self._listener.close()
+            return super().get_request()
+        except OSError:
+            time.sleep(_PAUSE_S)
+            raise
 
-    def _round(self) -> None:
-        for key, _ in self._selector.select(_LOOK_S):
-            if key.fileobj is self._listener:
-                self._accept()
-            elif key.data in self._connections:  # else it made room for another just now
-                self._serve(key.data)
-        late = monotonic() - PATIENCE_S
-        for connection in [one for one in self._connections if one.since < late]:
-            self._drop(connection)
+    def process_request(self, request: Any, client_address: Any) -> None:
+        """Serve a connection in a thread, in the place of the oldest where there are many."""
+        with self._lock:
+            if len(self._connections) >= MAX_CONNECTIONS:
+                self._cut_oldest()
+            self._connections[request] = None
+        super().process_request(request, client_address)
 
-    def _accept(self) -> None:
-        try:
-            sock, _ = self._listener.accept()
-        except BlockingIOError:
-            return
-        except OSError:  # no descriptor is left: who knocks goes on knocking
-            self._stopped.wait(_PAUSE_S)
-            return
-        if len(self._connections) >= MAX_CONNECTIONS:
-            self._drop(next(iter(self._connections)))
-        sock.setblocking(False)
-        connection = _Connection(sock)
-        self._connections[connection] = None
-        self._selector.register(sock, selectors.EVENT_READ, connection)
+    def _cut_oldest(self) -> None:
+        oldest = next(iter(self._connections))
+        del self._connections[oldest]
+        with contextlib.suppress(OSError):
+            oldest.shutdown(socket.SHUT_RDWR)  # its thread then closes it
 
-    def _drop(self, connection: _Connection) -> None:
-        del self._connections[connection]
-        self._selector.unregister(connection.sock)
-        connection.sock.close()
+    def shutdown_request(self, request: Any) -> None:
+        """Close a connection that was served."""
+        with self._lock:
+            self._connections.pop(request, None)
+        super().shutdown_request(request)
 
-    def _serve(self, connection: _Connection) -> None:
-        try:
-            if connection.left is None:
-                self._read(connection)
-            if connection.left is not None:
-                self._write(connection)
-        except BlockingIOError:
-            return
-        except OSError:  # it has gone
-            self._drop(connection)
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Who sends too slowly, or has gone, is no error."""
 
-    def _read(self, connection: _Connection) -> None:
-        piece = connection.sock.recv(_PIECE_BYTES)
-        connection.asked += piece
-        if any(end in connection.asked for end in _ENDS):
-            connection.left = memoryview(self._reply(bytes(connection.asked)))
-        elif len(connection.asked) > MAX_REQUEST_BYTES:
-            connection.left = memoryview(_bytes(431, "text/plain", b""))
-        elif not piece:
-            raise ConnectionError
-        else:
-            return
-        self._selector.modify(connection.sock, selectors.EVENT_WRITE, connection)
-
-    def _write(self, connection: _Connection) -> None:
-        assert connection.left is not None
-        sent = connection.sock.send(connection.left)
-        connection.left = connection.left[sent:]
-        if not connection.left:
-            with contextlib.suppress(OSError):
-                connection.sock.shutdown(socket.SHUT_WR)
-            self._drop(connection)
-
-    def _reply(self, asked: bytes) -> bytes:
+    def reply(self, asked: bytes) -> bytes:
+        """The answer to a whole request."""
         line = asked.split(b"\n", 1)[0].decode("latin-1").split()
         if len(line) != 3 or not line[2].startswith("HTTP/1."):
             return _bytes(400, "text/plain", b"")
@@ -157,11 +115,31 @@ class HttpPort:
         if method not in ("GET", "HEAD"):
             return _bytes(405, "text/plain", b"")
         try:
-            status, kind, body = self._answer(target.partition("?")[0])
+            with self._answering:  # a page is made once, however many ask
+                status, kind, body = self._answer(target.partition("?")[0])
         except Exception:
             self._failed(format_exc())
             return _bytes(500, "text/plain", b"")
         return _bytes(status, kind, body, head=method == "HEAD")
+
+
+class _Handler(BaseRequestHandler):
+    server: HttpPort
+
+    def handle(self) -> None:
+        until, asked = time.monotonic() + PATIENCE_S, b""
+        while not any(end in asked for end in _ENDS):
+            if len(asked) > MAX_REQUEST_BYTES:
+                self.request.sendall(_bytes(431, "text/plain", b""))
+                return
+            self.request.settimeout(max(until - time.monotonic(), 0.001))
+            piece = self.request.recv(_PIECE_BYTES)
+            if not piece:
+                return
+            asked += piece
+        reply = self.server.reply(asked)
+        self.request.settimeout(max(until - time.monotonic(), 0.001))
+        self.request.sendall(reply)
 
 
 def _bytes(status: int, kind: str, body: bytes, *, head: bool = False) -> bytes:
