@@ -16,6 +16,7 @@ from envhub_sandbox.errors import (
     WorkerDiedError,
     remote_error,
 )
+from envhub_sandbox.session.lease import AttributeCache
 from envhub_sandbox.session.use_lock import UseLock
 from envhub_worker.protocol.lifecycle import State
 from tests.attacks.client.lying_server import NUM_ENVS
@@ -58,6 +59,39 @@ def test_only_counts_are_taken_for_usage(lie: dict[str, object]) -> None:
     session = session_over(FakeLane(1))
     session.lease = Mock(status=lambda: {**true, **lie, "more": "words"})
     assert session.usage() == ({} if lie else true)
+
+
+# --- An attribute that is read after each step is watched, and then needs no request
+
+
+def test_the_second_read_is_watched_and_the_third_is_free() -> None:
+    """Once a step: a second read in the same step is a request."""
+    session = session_over(FakeLane())
+    cache = AttributeCache(session.lease)
+    assert cache.get("task") is None
+    assert not cache.should_watch("task")
+    session.counters.stepped(1)
+    assert cache.should_watch("task")
+    cache.put("task", ("a", "b"), watched=True)
+    assert cache.get("task") is None
+    session.counters.stepped(1)
+    assert cache.get("task") == ("a", "b")
+    assert cache.get("task") is None
+
+
+@pytest.mark.parametrize(("values", "watched"), [(("a", "b"), False), (([], []), True)])
+def test_what_is_not_watched_is_not_asked_for_again(values: tuple[Any, ...], watched: bool) -> None:
+    """The runners say so, or its values can change without them: a list."""
+    session = session_over(FakeLane())
+    cache = AttributeCache(session.lease)
+    for _ in range(2):
+        cache.should_watch("name")
+        session.counters.stepped(1)
+    assert cache.should_watch("name")
+    cache.put("name", values, watched=watched)
+    session.counters.stepped(1)
+    assert cache.get("name") is None
+    assert not cache.should_watch("name")
 
 
 # --- One use of an environment at a time, and what is done where a close or a lie came meanwhile
