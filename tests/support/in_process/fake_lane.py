@@ -38,7 +38,7 @@ class FakeLane:
         owed: What was sent and not answered.
         silent: Whether it has not answered yet.
         listened: Whether it was asked what to poll.
-        on_listen: Called before it is asked what to poll.
+        on_look, on_listen: Called before it is asked whether it has answered, and what to poll.
     """
 
     name = "fake"
@@ -55,10 +55,12 @@ class FakeLane:
         self.fails: BaseException | None = None
         self.owed: m.Message | None = None
         self.closed = self.silent = self.listened = False
+        self.on_look: Callable[[], object] = lambda: None
         self.on_listen: Callable[[], object] = lambda: None
         self._bell: list[int] = []
 
     def answered(self) -> bool:
+        self.on_look()
         return not self.silent
 
     def sources(self) -> list[int]:

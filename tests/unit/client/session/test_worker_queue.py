@@ -1,4 +1,4 @@
-"""What one worker owes: how much it may, and what could not be sent."""
+"""What one worker owes: how much it may, what a failure leaves, and what an interrupt shows."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from envhub_sandbox.errors import LocalProtocolError, RemoteProtocolError
 from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.parts.worker_queue import WorkerQueue
 from envhub_sandbox.transport.results import StepResult
+from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.lifecycle import State
 from envhub_worker.protocol.limits import MAX_IN_FLIGHT
 from tests.support.in_process.fake_lane import FakeLane, fleet_over
@@ -42,6 +43,10 @@ def taken(queue: WorkerQueue) -> StepResult:
     return result
 
 
+def reset(number: int, bounds: tuple[int, int]) -> m.Reset:
+    return m.Reset(number, None, None, None)
+
+
 def step(queue: WorkerQueue) -> None:
     queue.prepare()
     queue.step(ACTIONS)
@@ -61,6 +66,23 @@ def test_so_many_may_be_owed_and_no_more(queue: WorkerQueue, lane: FakeLane) -> 
         taken(queue)
     assert not queue.busy
     assert len(lane.sent) == MAX_IN_FLIGHT + 1
+
+
+def test_a_reset_waits_for_nothing_and_nobody(queue: WorkerQueue, part: EnvSession) -> None:
+    """It is refused while an answer is owed; its own has rewards of 0 and no flags."""
+    step(queue)
+    with pytest.raises(AlreadyPendingCallError, match="send_reset"):
+        queue.prepare_reset()
+    taken(queue)
+    queue.prepare_reset()
+    queue.reset(reset)
+    reset_s = part.repository.timeouts.reset_s
+    assert reset_s is not None
+    assert 0 < (queue.left_s or 0) <= reset_s
+    observation, rewards, terminations, truncations, infos = taken(queue)
+    assert (observation.shape, rewards.tolist(), infos) == ((1, 3), [0.0], {})
+    assert not terminations.any()
+    assert terminations is not truncations, "the caller may write into one of them"
 
 
 def test_what_could_not_be_sent_is_raised_where_it_is_received(
@@ -84,6 +106,18 @@ def test_what_could_not_be_sent_is_raised_where_it_is_received(
     assert not queue.busy
     step(queue)
     assert taken(queue)[1].tolist() == [0.0]
+
+
+def test_an_interrupt_in_an_answer_shows(queue: WorkerQueue, lane: FakeLane) -> None:
+    """Until it is forgotten: ``drop`` takes no further answer out of what is half taken."""
+    step(queue)
+    lane.fails = KeyboardInterrupt()
+    with pytest.raises(KeyboardInterrupt):
+        taken(queue)
+    assert (queue.taking, queue.interrupted, queue.busy) == (True, True, True)
+    queue.drop()
+    assert (queue.taking, queue.interrupted, queue.busy) == (False, False, False)
+    assert lane.owed is not None, "a reset catches up with it"
 
 
 def test_rewards_of_a_worker_among_others_are_one_number_each() -> None:

@@ -115,6 +115,12 @@ def test_who_has_answered_is_found_at_once(lanes: list[FakeLane]) -> None:
     assert not any(lane.listened for lane in lanes)
 
 
+def test_a_deadline_ends_the_wait(lanes: list[FakeLane]) -> None:
+    assert found(lanes, 0.05) == []
+    lanes[1].silent = False
+    assert found(lanes, 0) == [1]
+
+
 def test_a_ring_ends_the_sleep(lanes: list[FakeLane], monkeypatch: pytest.MonkeyPatch) -> None:
     """Whichever lane it comes from: without it, this would take an hour."""
     monkeypatch.setattr("envhub_sandbox.transport.lane.LOOK_MS", 3_600_000)
@@ -134,3 +140,12 @@ def test_a_ring_ends_the_sleep(lanes: list[FakeLane], monkeypatch: pytest.Monkey
 def test_an_answer_that_crosses_with_the_listening_is_found(lanes: list[FakeLane]) -> None:
     lanes[2].on_listen = lambda: setattr(lanes[2], "silent", False)
     assert found(lanes, None) == [2]
+
+
+def test_endless_rings_hide_no_other(lanes: list[FakeLane]) -> None:
+    """A hostile runner rings and never answers: another's answer is found, and the deadline is."""
+    lanes[0].ring()  # and it stays readable
+    assert found(lanes, 0.05) == []
+    looks = iter(range(20))
+    lanes[1].on_look = lambda: setattr(lanes[1], "silent", next(looks) < 10)
+    assert found(lanes, None) == [1]
