@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
@@ -148,23 +149,45 @@ def test_ctrl_c_ends_a_command(system: str, server: Listening, tmp_path: Path) -
     assert eventually(lambda: not server.jails())
 
 
+_COMMANDS = """
+import json, sys
+from envhub_sandbox.cli import main
+for sys.argv[1:] in json.loads(sys.argv[1]):
+    try:
+        main()
+    except SystemExit as ended:
+        assert not ended.code, (sys.argv, ended.code)
+"""
+
+
+def commands(
+    system: str, *several: tuple[str | Path, ...], **variables: str
+) -> subprocess.CompletedProcess[str]:
+    """Run commands that succeed one after the other, in one process: each import takes seconds."""
+    words = json.dumps([[str(word) for word in one] for one in several])
+    return ran(system, "-c", _COMMANDS, words, **variables)
+
+
 def test_commands_work(system: str, server: Listening, tmp_path: Path) -> None:
     """``run``, ``inspect``, ``check`` with its reports, ``doctor`` of a server, and ``cache``."""
     with_keys = variables(server) | {"ENVHUB_CACHE": str(tmp_path / "cache")}
     where = ("--sandbox", server.endpoint)
-    run = ran(system, *_ENVHUB, "run", sample("cartpole"), "--episodes", "1", *where, **with_keys)
-    assert "confined by  strict" in run.stdout
-    shown = ran(system, *_ENVHUB, "inspect", sample("cartpole"), *where, **with_keys)
-    assert "Discrete(2)" in shown.stdout
     reports = ("--html", tmp_path / "page.html", "--junit", tmp_path / "junit.xml")
-    checked = ran(system, *_ENVHUB, "check", sample("cartpole"), *where, *reports, **with_keys)
-    assert "passed" in checked.stderr
+    done = commands(
+        system,
+        ("run", sample("cartpole"), "--episodes", "1", *where),
+        ("inspect", sample("cartpole"), *where),
+        ("check", sample("cartpole"), *where, *reports),
+        ("doctor", server.endpoint),
+        ("cache", "list"),
+        ("cache", "remove", "--all"),
+        **with_keys,
+    )
+    for text in ("confined by  strict", "Discrete(2)", "it knows our key"):
+        assert text in done.stdout
+    for text in ("passed", "\n1 snapshot", "Removed 1 snapshot"):
+        assert text in done.stderr
     assert (tmp_path / "page.html").read_text("utf-8").startswith("<!doctype html>")
-    asked = ran(system, *_ENVHUB, "doctor", server.endpoint, **with_keys)
-    assert "it knows our key" in asked.stdout
-    assert "1 snapshot" in ran(system, *_ENVHUB, "cache", "list", **with_keys).stderr
-    removed = ran(system, *_ENVHUB, "cache", "remove", "--all", **with_keys)
-    assert "Removed 1 snapshot" in removed.stderr
     assert not list((tmp_path / "cache").rglob("env.py"))
 
 
@@ -190,8 +213,9 @@ def test_doctor_says_what_there_is(system: str, tmp_path: Path) -> None:
 
 
 def test_help_is_there(system: str) -> None:
-    for words in ((), ("run",), ("check",), ("doctor",), ("cache", "list"), ("image", "build")):
-        assert "Usage:" in ran(system, *_ENVHUB, *words, "--help").stdout
+    asked = ("", "run", "check", "doctor", "cache list", "image build")
+    done = commands(system, *((*words.split(), "--help") for words in asked))
+    assert done.stdout.count("Usage:") == len(asked)
 
 
 def test_a_client_leaves_nothing_but_its_cache(
