@@ -170,9 +170,9 @@ def bar_plot(name: str, values: Sequence[float]) -> str:
         shown.append(_bar(box, f"{which}: {number(value)}"))
     marks = [*_level(high, low, high), *_level(low, low, high)]
     foot = f"{len(known)}" if each == 1 else f"{len(known)}, mean of {each} each"
-    return _svg(
-        name, [*shown, *marks, *_below([(0.0, "1"), (1.0, foot)] if len(known) > 1 else [])]
-    )
+    feet = [(0.5, "1"), (len(heights) - 0.5, foot)] if len(known) > 1 else []
+    ends = [(at * wide / (_WIDTH - _LEFT - _RIGHT), word) for at, word in feet]
+    return _svg(name, [*shown, *marks, *_below(ends)])
 
 
 def histogram_plot(name: str, seconds: Sequence[float]) -> str:
@@ -180,9 +180,10 @@ def histogram_plot(name: str, seconds: Sequence[float]) -> str:
     known = np.maximum(finite(seconds), 1e-7)
     if not len(known):
         return ""
-    edges = np.geomspace(known.min() / 1.05, known.max() * 1.05, _BINS + 1)
+    bins = min(_BINS, max(3, len(known) // 2))  # a bar of a pixel is no share of a few values
+    edges = np.geomspace(known.min() / 1.05, known.max() * 1.05, bins + 1)
     counts, _ = np.histogram(known, edges)
-    wide, most = (_WIDTH - _LEFT - _RIGHT) / _BINS, float(counts.max())
+    wide, most = (_WIDTH - _LEFT - _RIGHT) / bins, float(counts.max())
     shown = []
     for index, count in enumerate(counts.tolist()):
         if count:
@@ -198,7 +199,7 @@ def histogram_plot(name: str, seconds: Sequence[float]) -> str:
         aside = -4 if anchor == "end" else 4
         shown.append(_line(at, _TOP - 4, at, _HEIGHT - _BOTTOM, "mark"))
         shown.append(_word(at + aside, _TOP - 4 + (0 if share < 0.9 else 12), word, anchor))
-    ends = [(0.0, duration_text(known.min())), (1.0, duration_text(known.max()))]
+    ends = [(0.0, duration_text(edges[0])), (1.0, duration_text(edges[-1]))]
     return _svg(name, [*shown, *_below(ends)])
 
 
@@ -221,7 +222,7 @@ def line_plot(name: str, values: Sequence[float], parts: Sequence[tuple[int, str
     for count, word in parts:
         done += count
         share = (done - 1) / last
-        if count and share > 0.15:
+        if count and share > ends[-1][0] + 0.15:  # or its word would lie on the one before
             ends.append((share, word))
             if share < 1:
                 shown.append(_line(_x(share), _TOP, _x(share), _HEIGHT - _BOTTOM, "mark"))
@@ -278,8 +279,10 @@ def _level(value: float, low: float, high: float) -> Iterator[str]:
     """A line at a height, and its number above it."""
     y = _y(value, low, high)
     yield _line(_LEFT, y, _WIDTH - _RIGHT, y, "grid")
-    if value:
-        yield _word(_LEFT, y - 4 if value > 0 else y - 3, number(value), "start")
+    if value > 0:
+        yield _word(_LEFT, y - 4, number(value), "start")
+    elif value:  # at the other end: few bars begin at the left
+        yield _word(_WIDTH - _RIGHT, y - 3, number(value), "end")
 
 
 def _below(words: Sequence[tuple[float, str]]) -> Iterator[str]:

@@ -105,6 +105,19 @@ def test_nothing_is_drawn_of_nothing(kind: str) -> None:
     assert _DRAWN[kind]([float("nan")]) == ""
 
 
+@pytest.mark.parametrize("count", [2, 3, 7])
+def test_few_values_have_wide_bars_with_their_labels_below(count: int) -> None:
+    """Of bars at the left no label stands at the right; a share of two values is no thin line."""
+    drawn = ElementTree.fromstring(bar_plot("x", [1.0] * count))
+    bars = [one for one in drawn if one.tag == "rect"]
+    feet = {one.text: float(one.attrib["x"]) for one in drawn if one.attrib.get("y") == "146.0"}
+    for name, bar in (("1", bars[0]), (str(count), bars[-1])):
+        left, width = float(bar.attrib["x"]), float(bar.attrib["width"])
+        assert left <= feet[name] <= left + width
+    drawn = ElementTree.fromstring(histogram_plot("x", [0.001 * (at + 1) for at in range(count)]))
+    assert all(float(one.attrib["width"]) > 100 for one in drawn if one.tag == "rect")
+
+
 def test_bars_stand_for_their_numbers() -> None:
     high, low, below = (
         one for one in ElementTree.fromstring(bar_plot("x", [4, 2, -2])) if len(one)
