@@ -18,6 +18,7 @@ from envhub_sandbox.hub.local import split_local
 from envhub_sandbox.hub.snapshot import is_here
 from envhub_sandbox.hub.sources import toml
 from envhub_sandbox.settings.options import nearest
+from envhub_sandbox.settings.policy import policy_from
 from envhub_worker.protocol.text import printable, size_text
 
 if TYPE_CHECKING:
@@ -191,8 +192,20 @@ def refuse_files_of_the_judged(
             )
 
 
+def read_policy(path: Path) -> dict[str, Any]:
+    """The fields of a ``Policy`` in a caller's file.
+    Raises ``PolicyError``: it cannot be read, or a field is wrong; the text names the file.
+    """
+    fields = read_file(path)
+    try:
+        policy_from(fields, None)
+    except PolicyError as error:
+        raise PolicyError(f"{path}: {error}") from error
+    return fields
+
+
 def read_file(path: Path) -> dict[str, Any]:
-    """A caller's TOML, such as the fields of a ``Policy``, which ``make_env`` then checks.
+    """A caller's TOML.
     Raises ``PolicyError``: it cannot be read.
     """
     try:

@@ -9,13 +9,14 @@ from __future__ import annotations
 import contextlib
 import importlib
 import inspect as python
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from envhub_sandbox.cli.shared.console import guarded, out, say
+from envhub_sandbox.cli.shared.console import expects_json, guarded, out, print_json_error, say
 from envhub_sandbox.cli.shared.exits import EXIT_CODES, Exit, reported
 from envhub_sandbox.settings.options import on_command_line, use_option_names
 
@@ -85,10 +86,11 @@ class Program(TyperGroup):
             self.commands[args[0]] = whole_command(args[0])
         return super().resolve_command(ctx, args)
 
-    def main(self, *args: Any, **options: Any) -> Any:
+    def main(self, args: Any = None, *more: Any, **options: Any) -> Any:
         """Run a command."""
-        with guarded():
-            return super().main(*args, **options)
+        words = sys.argv[1:] if args is None else list(args)
+        with guarded(), expects_json(words):
+            return super().main(args, *more, **options)
 
     def make_context(self, *args: Any, **options: Any) -> Any:
         """Parse what stands before a command."""
@@ -113,7 +115,9 @@ def _wrong_usage() -> Iterator[None]:
             raise
         end = "" if text[-1] in ".?!)" else "."
         path = getattr(getattr(error, "ctx", None), "command_path", "envhub")
-        say(f"Error: {text}{end} Try '{path} --help'.", style="red")
+        said = f"{text}{end} Try '{path} --help'."
+        say(f"Error: {said}", style="red")
+        print_json_error("UsageError", said, Exit.USAGE)
         raise typer.Exit(Exit.USAGE) from None
 
 

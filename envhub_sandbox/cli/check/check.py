@@ -228,8 +228,11 @@ def check(
         annotate(reports.workflow_commands(report), reports.summary(report, failures))
     if json:
         print_json(reports.document(report, failures))
-    elif not github:
-        _print(report, failures)
+    else:
+        if not github:
+            _print(report, failures)
+        unsure = DOUBTFUL if report.is_unjudged(failures) else BAD
+        say(f"{report.verdict(failures)}.", unsure if failures else GOOD)
     if failures:
         raise typer.Exit(Exit.UNJUDGED if report.is_unjudged(failures) else Exit.ENVIRONMENT)
 
@@ -290,7 +293,7 @@ def _arguments(make: opt.MakeOptions, policy: Path | None) -> dict[str, Any]:
     from envhub_sandbox.settings.policy import policy_from
 
     arguments = make.arguments()
-    says = {} if policy is None else settings.read_file(policy)
+    says = {} if policy is None else settings.read_policy(policy)
     arguments["policy"] = settings.merged_settings(says, arguments["policy"])
     policy_from(arguments["policy"], None)
     return arguments
@@ -320,8 +323,6 @@ def _print(report: Report, failures: list[Finding]) -> None:
         show_rows([_FIGURES, *map(_figures, report.figures.items())], right=range(1, 5))
     out()
     _print_confinement(report)
-    unsure = DOUBTFUL if report.is_unjudged(failures) else BAD
-    say(f"{report.verdict(failures)}.", unsure if failures else GOOD)
 
 
 def _figures(of: tuple[str, Mapping[str, float]]) -> list[str]:

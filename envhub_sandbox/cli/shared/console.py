@@ -22,6 +22,7 @@ import threading
 import time
 import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any
 
 from envhub_sandbox.system.log import progress_shown_by, told_by
@@ -214,8 +215,29 @@ def safe_line(text: object, limit: int = _LINE) -> str:
     return line if len(line) <= limit else f"{line[: limit - 1]}…"
 
 
+_json_left: ContextVar[bool] = ContextVar("_json_left", default=False)
+"""Whether a document was asked for, and has not been printed."""
+
+
+@contextlib.contextmanager
+def expects_json(arguments: Sequence[str]) -> Iterator[None]:
+    """Whether a command line has ``--json``, also where its parser refuses the rest of it."""
+    token = _json_left.set("--json" in arguments)
+    try:
+        yield
+    finally:
+        _json_left.reset(token)
+
+
+def print_json_error(kind: str, message: str, code: int) -> None:
+    """Print an error as the document that was asked for, if no other has been printed."""
+    if _json_left.get():
+        print_json({"error": {"type": kind, "message": message, "exit_code": code}})
+
+
 def print_json(document: Mapping[str, Any]) -> None:
     """Print one document on stdout, as JSON that every parser takes."""
+    _json_left.set(False)
     text = json.dumps(plain(document), indent=2, allow_nan=False, ensure_ascii=True)
     # what CI systems obey in the middle of a line can only stand in texts, where JSON has escapes
     text = re.sub(r"#(?=#\w{0,16}\[)|_(?=(?:start|end):)", lambda one: _escaped(one[0]), text)

@@ -12,7 +12,7 @@ from enum import IntEnum
 
 import typer
 
-from envhub_sandbox.cli.shared.console import safe_text, say
+from envhub_sandbox.cli.shared.console import print_json_error, safe_text, say
 from envhub_worker.protocol.errors import EnvHubError
 from envhub_worker.protocol.text import quoted
 
@@ -117,6 +117,7 @@ def reported(*, debug: bool) -> Iterator[None]:
     except KeyboardInterrupt:
         with _ignoring_full_or_closed_output():
             say("Interrupted.")
+            print_json_error("KeyboardInterrupt", "interrupted", Exit.INTERRUPTED)
         raise typer.Exit(Exit.INTERRUPTED) from None
     except Exception as error:
         # a repository's own pipe is not our output
@@ -125,6 +126,7 @@ def reported(*, debug: bool) -> Iterator[None]:
             raise typer.Exit(Exit.PIPE) from None
         with _ignoring_full_or_closed_output():
             _explain(error, debug)
+            print_json_error(type(error).__name__, describe(error), code_for(error))
         raise typer.Exit(code_for(error)) from None
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import json
 import re
 import sys
 from collections.abc import Iterator
@@ -192,6 +193,8 @@ def test_wrong_usage_is_one_message(words: list[str], says: str) -> None:
     done = CliRunner().invoke(app, ["run", *words])
     assert (done.exit_code, done.stdout) == (2, "")
     assert done.stderr == f"Error: {says}\n"
+    document = json.loads(CliRunner().invoke(app, ["run", *words, "--json"]).stdout)
+    assert document == {"error": {"type": "UsageError", "message": says, "exit_code": 2}}
 
 
 def test_one_place_writes() -> None:
