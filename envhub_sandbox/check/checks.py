@@ -92,6 +92,10 @@ warning infos
     Infos with a mask, and the mask, have an entry for each sub-environment.
     Cure: Let Gymnasium's vector environments collect the infos; a mask '_name' has one boolean
     for each.
+note info-types
+    Infos are numbers, texts, arrays, and lists and dicts of them. Of anything else only a
+    description leaves the sandbox.
+    Cure: Put plain values into infos, or offer a method that is called when needed.
 warning large-infos
     Half of the steps have less than 512 KiB of info for each sub-environment.
     Cure: Put arrays into the observation, or return them from a method that is called when
@@ -114,8 +118,14 @@ warning actions-ignored
     Other actions give other results.
     Cure: Apply the action that step receives.
 warning endless
-    With random actions an episode ends within 10,000 steps, or within 30 seconds of them.
+    With random actions an episode ends within 10,000 steps, or does so by its TimeLimit or
+    max_episode_steps if these take longer than 30 seconds.
     Cure: Terminate or truncate, for example with gymnasium.wrappers.TimeLimit.
+note endless-unknown
+    It was seen within 30 seconds whether an episode ends, or a TimeLimit or
+    max_episode_steps says when.
+    Cure: If steps have to be slow, change nothing; a limit of gymnasium.wrappers.TimeLimit
+    counts as an end.
 error workers
     The results do not depend on the number of processes.
     Cure: Share nothing among sub-environments: no module-level state, no common generator.
@@ -137,7 +147,7 @@ note lerobot
     LeRobot's policies can play it, not only code for Gymnasium's vector environments.
     Cure: If it is not for LeRobot, change nothing. Otherwise see what `envhub init --lerobot`
     writes: observations agent_pos and pixels, a Box of one dimension as action,
-    _max_episode_steps.
+    _max_episode_steps, and info['is_success'] at the end of an episode.
 warning slow-steps
     Half of the steps take at most --slow-step, one second by default.
     Cure: Compute less in a step, or once in reset; do not wait for a clock.

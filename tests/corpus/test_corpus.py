@@ -22,6 +22,7 @@ _ENTRIES = {**HONEST, **FAULTS}
 _ELSEWHERE = {
     "card": "test_findings.py",
     "deadline": "test_deadline.py",
+    "endless-unknown": "test_findings.py",
     "lerobot": "test_findings.py",
     "licence": "test_findings.py",
     "limits-reached": "test_findings.py",

@@ -39,7 +39,8 @@ def check_observations(
             each = batches.members(single, batched, observations, env.num_envs)
             members = dict(enumerate(each))
         except Exception as error:  # a vector environment of the repository's own returned it
-            text = f"{operation} returned no batch of observations for {batched}"
+            seen = batches.shown(observations)
+            text = f"{operation} returned {seen}, which is no batch of observations for {batched}"
             raise OutsideSpaceError(text) from error
         _check(single, operation, members)
     if isinstance(final_obs, np.ndarray) and final_obs.dtype == object:

@@ -6,13 +6,15 @@ Leaks are counted from outside. Followed for LeRobot: ``preprocess_observation``
 
 from __future__ import annotations
 
+import contextlib
 import itertools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from typing import Any
 
 from gymnasium import spaces
 from gymnasium.vector import VectorEnv
 
+from envhub_sandbox.check.play.episodes import Episode
 from envhub_sandbox.errors import RemoteEnvError
 from envhub_sandbox.vector.pictures import is_frame
 from envhub_worker.protocol.spaces.batches import shown
@@ -108,8 +110,20 @@ _SEEN = ("agent_pos", "environment_state", "pixels")
 _LONGEST = 100
 
 
-def lerobot_lacks(env: VectorEnv[Any, Any, Any]) -> Iterator[str]:
-    """At most one text: what an evaluation by LeRobot would miss."""
+def step_limit(env: Any) -> int | None:
+    """The steps after which it says that it ends an episode. Trust: the worker's word."""
+    stated = [getattr(env.spec, "max_episode_steps", None)]
+    with contextlib.suppress(AttributeError, RemoteEnvError, TypeError):
+        stated += env.get_attr("_max_episode_steps")
+    return next((one for one in stated if type(one) is int and one > 0), None)
+
+
+def lerobot_lacks(
+    env: VectorEnv[Any, Any, Any], episodes: Sequence[Episode] = (), keys: Collection[str] = ()
+) -> Iterator[str]:
+    """At most one text: what an evaluation by LeRobot would miss.
+    ``keys``: of infos at ends of episodes, which may tell a success by another name.
+    """
     observations, actions = env.single_observation_space, env.single_action_space
     lacks = []
     if not isinstance(observations, spaces.Dict) or not {*_SEEN} & {*observations.spaces}:
@@ -120,6 +134,11 @@ def lerobot_lacks(env: VectorEnv[Any, Any, Any]) -> Iterator[str]:
         lacks.append(f"a vector (Box) as action, not {_named(actions)}")
     if not has(env, "_max_episode_steps"):
         lacks.append("_max_episode_steps (gymnasium.wrappers.TimeLimit has it)")
+    if episodes and all(episode.success is None for episode in episodes):
+        alike = (key for key in keys if "succe" in key.lower() and not key.startswith("_"))
+        others = ", ".join(sorted(map(repr, alike)))
+        instead = f", not {printable(others, _LONGEST)}" if others else ""
+        lacks.append(f"info['is_success'] at the end of an episode{instead}")
     if lacks:
         yield f"LeRobot cannot evaluate it, which needs {'; '.join(lacks)}"
 

@@ -95,14 +95,14 @@ class TaskJudge:
         self._tell("first play")
         first = self._played(self._env, mode, **seen)
         self._play.episodes = first.counted
-        for check in ("observation-finite", "rewards", "infos"):
+        for check in ("observation-finite", "rewards", "infos", "info-types"):
             self._say(check, first.notes[check])
         self._large(first)
         if stated:
             self._say("autoreset", first.notes["autoreset"])
         self._tell("rendering")
         self._render()
-        self._say("lerobot", probes.lerobot_lacks(self._env))
+        self._say("lerobot", probes.lerobot_lacks(self._env, first.counted, first.ends))
         self._tell("one sub-environment by itself")
         self._alone()
         self._compare(first, mode)
@@ -160,18 +160,24 @@ class TaskJudge:
             env = self._of(suites)
             second = self._played(env, mode)
             self._note_times(second)
-            at = first.differs_from(second)
-            self._same("seeding", at, "in two processes")
-            if at is None:
+            differs = self._same("seeding", first, second, "in two processes")
+            if not differs:
                 self._replay(env, mode, second)
-        if at is None and self._env.num_envs > 1:
+        if not differs and self._env.num_envs > 1:
             self._tell("the same play, spread over two processes")
             with self._make(num_workers=2) as suites:
                 spread = self._played(self._of(suites), mode, like=second)
-            self._same("workers", first.differs_from(spread), "with one worker and with two")
+            self._same("workers", first, spread, "with one worker and with two")
 
-    def _same(self, check: str, at: int | None, where: str) -> None:
-        self._holds(check, at is None, f"{f'step {at}' if at else 'the reset'} differs {where}")
+    def _same(self, check: str, one: Trace, other: Trace, where: str) -> bool:
+        """Judge whether two plays are the same, and return whether they are not."""
+        at = one.differs_from(other)
+        if at is None:
+            self._say(check, [])
+            return False
+        step = f"step {at}" if at else "the reset"
+        self._say(check, [f"{step} differs {where}{one.difference(other, at)}"])
+        return True
 
     def _played(self, env: Env, mode: str | None, **changes: Any) -> Trace:
         given = {"seed": self._asked.seed, "steps": self._asked.steps, **changes}
@@ -206,17 +212,16 @@ class TaskJudge:
         slow = f"a reset takes {took:.1f} s, where {most:g} s are set"
         self._holds("slow-resets", took <= most, slow)
         self._tell("resets without a seed")
-        at, is_drawn = before.differs_from(again), before.differs_from(other) == 0
-        if at is None or not learning:
-            self._seeded(env, at, _UNSEEDED if is_drawn else 2)
+        if before.differs_from(again) is None:
+            self._unseeded(env, _UNSEEDED if before.differs_from(other) == 0 else 2)
+        elif not learning:
+            self._same("seed-ignored", before, again, "in one process")
         if any(trace.episodes for trace in (before, again, other, acted)):
-            self._say("endless", [])
+            for check in ("endless", "endless-unknown"):
+                self._say(check, [])
         else:
             self._tell("on to the end of an episode")
-            steps = self._asked.episode_steps
-            ended = self._ends(env, steps, time.monotonic() + _EPISODE_S)
-            if ended is not None:  # else there was no time to find out
-                self._holds("endless", ended, f"no episode ended in {steps:,} steps")
+            self._endless(env)
 
     def _learning(self, env: Env) -> int | None:
         """How many of Gymnasium's running statistics go on learning, and None where there are none.
@@ -230,26 +235,37 @@ class TaskJudge:
             return found - 1
         return found or None
 
-    def _seeded(self, env: Env, at: int | None, most: int) -> None:
-        if at is not None:
-            self._same("seed-ignored", at, "in one process")
-            return
+    def _endless(self, env: Env) -> None:
+        """Look for an end of an episode; where there is no time, for a limit that is stated."""
+        most, limit = self._asked.episode_steps, probes.step_limit(env)
+        ended, played = self._ends(env, most, time.monotonic() + _EPISODE_S)
+        text = f"no episode ended in {played:,} steps"
+        known = ended or played == most or limit is not None
+        self._holds("endless-unknown", known, f"{text}, for which there were {_EPISODE_S:g} s")
+        if known:
+            will_end = limit is not None and played < limit <= most
+            said = "" if limit is None else f", where its limit is {limit:,}"
+            self._holds("endless", ended or will_end, f"{text}{said}")
+
+    def _unseeded(self, env: Env, most: int) -> None:
+        """Judge the resets without a seed."""
         begun, again = self._begun(env, most), self._begun(env, most)
-        differ = "the resets without a seed after one with a seed differ in one process"
-        self._holds("seed-ignored", begun == again, differ)
-        is_fixed = len(begun) == _UNSEEDED and len(set(begun)) == 1
+        at = begun.differs_from(again)
+        words = "the resets without a seed after one with a seed differ in one process"
+        self._holds("seed-ignored", at is None, f"{words}{begun.difference(again, at or 0)}")
+        is_fixed = len(begun.steps) == _UNSEEDED and len(set(begun.steps)) == 1
         same = f"{_UNSEEDED} resets without a seed begin the same episode"
         self._holds("seed-fixed", not is_fixed, same)
 
-    def _begun(self, env: Env, most: int) -> list[str]:
+    def _begun(self, env: Env, most: int) -> Trace:
         """The episodes that follow a seeded one, up to one that differs.
 
         Followed: ``check_reset_seed_determinism`` of Gymnasium's ``check_env``.
         """
         env.reset(seed=self._asked.seed)
-        begun: list[str] = []
-        while len(begun) < most and len(set(begun)) < 2:
-            begun.append(traces.digest(env.reset()[0]))
+        begun = Trace()
+        while len(begun.steps) < most and len(set(begun.steps)) < 2:
+            begun.add([env.reset()[0]])
         return begun
 
     def _unmoved(self, before: Trace, acted: Trace) -> Iterator[str]:
@@ -259,16 +275,16 @@ class TaskJudge:
             if different:
                 yield f"{different} steps with other actions give the same results"
 
-    def _ends(self, env: Env, steps: int, until: float = math.inf) -> bool | None:
-        """Whether an episode ends within so many steps; None where the time was over before."""
+    def _ends(self, env: Env, steps: int, until: float = math.inf) -> tuple[bool, int]:
+        """Whether an episode ends within so many steps, and how many were made until then."""
         env.reset(seed=self._asked.seed)
-        for _ in range(steps):
+        for played in range(1, steps + 1):
             _, _, terminations, truncations, _ = env.step(env.action_space.sample())
             if np.any(terminations) or np.any(truncations):
-                return True
+                return True, played
             if time.monotonic() > until:
-                return None
-        return False
+                return False, played
+        return False, steps
 
     # --- in the process that was played first --------------------------------------------------
 

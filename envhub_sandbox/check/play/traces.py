@@ -9,7 +9,8 @@ import hashlib
 import itertools
 import time
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -18,10 +19,15 @@ from gymnasium.vector import VectorEnv
 
 from envhub_sandbox.check.play.episodes import Episode, EpisodeCounter, RolloutError, on_cpu
 from envhub_sandbox.check.play.members import check_observations
+from envhub_worker.protocol.codec.inert import RemoteObject
+from envhub_worker.protocol.spaces import batches
+from envhub_worker.protocol.text import printable
 
 Env = VectorEnv[Any, Any, Any]
-_NOTED = 3
+_NOTED, _LONGEST = 3, 200
 _LAST = ("final_obs", "final_observation")
+_KEPT_BYTES = 32 << 20
+_PARTS = ("the observation", "the reward", "terminated", "truncated")
 
 
 @dataclass
@@ -38,6 +44,8 @@ class Trace:
         counted: The episodes that ended, to be looked at; fewer, where its rewards are such that
             they cannot be counted.
         spent: Seconds of each step.
+        ends: Keys of the infos of steps that ended an episode.
+        results: What the reset and each step returned, without infos, up to a size in all.
     """
 
     steps: list[str] = field(default_factory=list)
@@ -48,6 +56,17 @@ class Trace:
     times: dict[str, float] = field(default_factory=dict)
     counted: list[Episode] = field(default_factory=list)
     spent: list[float] = field(default_factory=list)
+    ends: set[str] = field(default_factory=set)
+    results: list[dict[str, Any]] = field(default_factory=list)
+    _left: int = _KEPT_BYTES
+
+    def add(self, result: Sequence[Any], resumed: str = "") -> None:
+        """Take a reset's observations, or also what else a step returned."""
+        self.steps.append(resumed + digest(result[0] if len(result) == 1 else tuple(result)))
+        parts = dict(itertools.chain.from_iterable(map(_named, _PARTS, result)))
+        self._left -= sum(map(_weight, parts.values()))
+        if self._left >= 0:
+            self.results.append({name: copy(value) for name, value in parts.items()})
 
     def note(self, check: str, text: str) -> None:
         """Keep what was seen, if there is not enough of it for the check."""
@@ -58,6 +77,12 @@ class Trace:
         """The first step of both that differs, 0 for the reset; None if none does."""
         pairs = enumerate(zip(self.steps, other.steps, strict=False))
         return next((number for number, (one, two) in pairs if one != two), None)
+
+    def difference(self, other: Trace, at: int) -> str:
+        """What differs in the results of a step, where both are kept: ``": "`` and the words."""
+        kept = at < min(len(self.results), len(other.results))
+        seen = differing(self.results[at], other.results[at]) if kept else ""
+        return f": {seen}" if seen else ""
 
 
 def play(
@@ -88,7 +113,7 @@ def play(
     trace.times = {"reset_s": time.perf_counter() - began}
     check_observations(env, "reset", first)
     _look_at(trace, first, "the reset")
-    trace.steps.append(digest(first))
+    trace.add([first])
     observe(0)
     for number in range(1, steps + 1):
         if like is not None and trace.steps[-1] != like.steps[len(trace.steps) - 1]:
@@ -104,7 +129,7 @@ def play(
         result = env.step(actions)
         trace.spent.append(time.perf_counter() - begun)
         check_observations(env, "step", result[0], result[4].get("final_obs"))
-        trace.steps.append(resumed + digest(result[:4]))  # infos may hold times
+        trace.add(result[:4], resumed)  # infos may hold times
         ended = _judge(trace, result, ended, mode, number)
         if counts:
             try:
@@ -134,8 +159,12 @@ def _judge(trace: Trace, result: tuple[Any, ...], ended: Any, mode: str | None, 
     trace.heavy.append(_bytes_of(infos) / max(len(rewards), 1))
     for text in _masks(infos, len(rewards)):
         trace.note("infos", f"step {number}: {text}")
+    for text in itertools.islice(_foreign(infos), 1):
+        trace.note("info-types", f"step {number}: {text}")
     done = np.logical_or(np.asarray(terminations, bool), np.asarray(truncations, bool))
     trace.episodes += int(done.sum())
+    if done.any():
+        trace.ends |= {key for one in (infos, infos.get("final_info")) for key in _texts(one)}
     if not np.isfinite(np.asarray(rewards, np.float64)).all():
         trace.note("rewards", f"step {number}: {np.asarray(rewards).tolist()}")
     if mode == "NextStep":
@@ -170,6 +199,50 @@ def _leaves(value: Any, without: Collection[str] = ()) -> Iterator[Any]:
             yield from _leaves(one, without)
     else:
         yield value
+
+
+def _foreign(infos: Mapping[Any, Any]) -> Iterator[str]:
+    """What of infos is but described here: neither a number nor a text, and none is in it."""
+    for name, value in infos.items():
+        for leaf in _leaves(value, _LAST) if name not in _LAST else ():
+            if isinstance(leaf, RemoteObject):
+                yield f"info {name!r} has a {leaf.type_name}: {leaf.text}"
+
+
+def _texts(infos: Any) -> set[str]:
+    return {key for key in infos if isinstance(key, str)} if isinstance(infos, Mapping) else set()
+
+
+def _named(name: str, value: Any) -> Iterator[tuple[str, Any]]:
+    """The leaves of a result, each with its name."""
+    if isinstance(value, Mapping):
+        for key in value:
+            yield from _named(f"{name}[{key!r}]", value[key])
+    elif isinstance(value, (list, tuple)):
+        for index, one in enumerate(value):
+            yield from _named(f"{name}[{index}]", one)
+    else:
+        yield name, on_cpu(value)
+
+
+def differing(one: Mapping[str, Any], other: Mapping[str, Any]) -> str:
+    """The first part of two results that differs, in words. Trust: the worker's values."""
+    for name, value in one.items():
+        another = other.get(name)
+        if digest(value) != digest(another):
+            return f"{printable(name, _LONGEST)}{_values(value, another)}"
+    return ""
+
+
+def _values(one: Any, other: Any) -> str:
+    """The first of two arrays' values that differs, with its row; else the two, in short."""
+    arrays = isinstance(one, np.ndarray) and isinstance(other, np.ndarray)
+    if arrays and one.ndim and one.shape == other.shape and one.dtype == other.dtype != object:
+        same = (one == other) | ((one != one) & (other != other))
+        for row, *rest in np.argwhere(~same)[:1].tolist():
+            at = (row, *rest)
+            return f"{rest or ''} of sub-environment {row} is {one[at]!s} and {other[at]!s}"
+    return f" is {batches.shown(one)} and {batches.shown(other)}"
 
 
 def _unbounded(observations: Any) -> Iterator[str]:

@@ -37,6 +37,9 @@ length = _max_episode_steps = 10
 def reward(self):
     return 1.0
 
+def info(self):
+    return {"is_success": self.is_late()}
+
 def render(self):
     return np.zeros((4, 6, 3), np.uint8)
 """
@@ -99,6 +102,14 @@ def test_for_whom_it_is_playable_is_noted(tmp_path: Path) -> None:
         assert part in finding.message
 
 
+def test_a_success_by_another_name_is_noted(tmp_path: Path) -> None:
+    """LeRobot would count none; the honest one is the control."""
+    text = _HONEST.replace('{"is_success": self.is_late()}', '{"success": self.is_late()}')
+    [finding] = judged(repository(tmp_path / "walk", text), resets=0).findings
+    assert finding.id == "lerobot"
+    assert finding.message.endswith("info['is_success'] at the end of an episode, not 'success'")
+
+
 def test_each_mode_that_is_declared_is_rendered(tmp_path: Path) -> None:
     """Where make_env takes one; the control is the honest one of the corpus."""
     text = HONEST["several modes of rendering"].source()
@@ -138,12 +149,24 @@ def test_other_suites_each_time_are_told(suite: str, found: set[str], tmp_path: 
     assert all("another result than the first time" in one.message for one in failures)
 
 
-@pytest.mark.parametrize("is_slow_for_ever", [False, True])
+@pytest.mark.parametrize(
+    ("is_slow_for_ever", "limit", "found"),
+    [
+        (False, "1e9", {"endless-unknown"}),
+        (False, "40", set()),
+        (False, "60", {"endless"}),
+        (True, "40", {"slow-resets", "endless"}),
+    ],
+)
 def test_a_machine_that_is_slow_for_a_while_fails_nobody(
-    is_slow_for_ever: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    is_slow_for_ever: bool,
+    limit: str,
+    found: set[str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Nor is an end looked for without one: by then there is no finding, and no check that holds.
-    The controls: each reset is slow, and there is time to look.
+    """Where there is no time to look for an end, its limit says when it is; without one that is a
+    note, and no check that holds. The control: each reset is slow, and there is time to look.
     """
     play, plays = traces.play, list[str]()
 
@@ -156,12 +179,12 @@ def test_a_machine_that_is_slow_for_a_while_fails_nobody(
 
     monkeypatch.setattr(traces, "play", slow)
     monkeypatch.setattr(*inside.PATIENCE_FOR_AN_END, 1e9 if is_slow_for_ever else -1.0)
-    text = _HONEST.replace("length = _max_episode_steps = 10", "length = _max_episode_steps = 1e9")
+    endless = f"_max_episode_steps = {limit}; length = 1e9"
+    text = _HONEST.replace("length = _max_episode_steps = 10", endless)
     report = judged(repository(tmp_path / "walk", text), 5, resets=0, episode_steps=50)
     assert len(plays) == 6
-    found = {"slow-resets", "endless"} if is_slow_for_ever else set()
     assert {one.id for one in report.findings} == found
-    assert "endless" not in {check for check, _ in report.passed}
+    assert ("endless" in {check for check, _ in report.passed}) is (found == set())
 
 
 def test_one_task_is_closed_before_the_next(
@@ -289,10 +312,14 @@ def test_the_command_line_judges(tmp_path: Path) -> None:
     assert result["locations"][0]["physicalLocation"]["region"]["startLine"] > 1
     policy = tmp_path / "policy.toml"
     policy.write_text('profile = "nothing"')
-    refused = envhub("check", folder, "--policy", policy)
+    refused = envhub("check", folder, "--policy", policy, "--json")
     assert (refused.returncode, "'nothing'" in refused.stderr) == (2, True), refused.stderr
+    error = json.loads(refused.stdout)["error"]
+    assert (error["type"], error["exit_code"]) == ("PolicyError", 2)
+    assert f"{policy}: " in error["message"]
     allowed = envhub("check", folder, "--steps", "5", "--allow", "runs", "--github")
     assert allowed.returncode == 0, allowed.stderr
+    assert allowed.stderr.endswith(": passed.\n")
     [command] = obeyed(allowed.stdout)
     line = _HONEST.partition("self.reward()")[0].count("\n") + 1
     assert command.startswith(f"::error file=env.py,line={line},title=envhub check%3A runs")

@@ -201,6 +201,7 @@ def test_a_verdict_is_a_sentence(found: list[str], allowed: list[str], says: str
         ("FileNotFoundError", "Put the file into"),
         ("out-of-memory", "--memory"),
         ("timeout", "--timeout"),
+        ("returned", "Return what the spaces say"),
         ("ZeroDivisionError", CHECKS["runs"].cure),
         ("", CHECKS["runs"].cure),
     ],
@@ -208,7 +209,7 @@ def test_a_verdict_is_a_sentence(found: list[str], allowed: list[str], says: str
 def test_advice_follows_from_the_error(cause: str, says: str) -> None:
     """In every form that has advice; else it is that of the check."""
     made = Report("./walk:env.py")
-    made.judged("runs", ["it broke"], cause=cause)
+    made.add(Finding("runs", "it broke", cause=cause))
     [told] = reports.document(made, [])["findings"]
     assert says in told["cure"]
     assert says in next(iter(reports.workflow_commands(made)))

@@ -67,6 +67,39 @@ def test_what_a_reset_between_gives_is_compared() -> None:
     assert first.differs_from(played("Disabled", [0.0, 2.0], _MORE, _END, _MORE)) == 3
 
 
+def traced(seen: Any, rewards: Sequence[float] = (0.0, 0.0)) -> Trace:
+    trace = Trace()
+    trace.add([seen])
+    trace.add([seen, np.array(rewards), np.zeros(2, bool), np.zeros(2, bool)])
+    return trace
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "at", "words"),
+    [
+        ((np.zeros((2, 3)),), (np.eye(3)[1:],), 0,
+            "the observation[1] of sub-environment 0 is 0.0 and 1.0"),
+        ((np.zeros(2), (0.5, 0.25)), (np.zeros(2), (0.5, 1.0)), 1,
+            "the reward of sub-environment 1 is 0.25 and 1.0"),
+        (({"a": np.zeros(2), "b": ("x", "y")},), ({"a": np.zeros(2), "b": ("x", "z")},), 0,
+            "the observation['b'][1] is str 'y' and str 'z'"),
+        ((np.zeros(2, np.float32),), (np.zeros(2),), 0,
+            "the observation is float32 (2,) and float64 (2,)"),
+        ((np.zeros(5 << 20),), (np.ones(5 << 20),), 0, ""),
+    ],
+    ids=["row", "reward", "text", "dtype", "too large to be kept"],
+)  # fmt: skip
+def test_what_differs_is_told_with_its_row_and_values(
+    one: Any, other: Any, at: int, words: str
+) -> None:
+    """Of results that are kept; that they differ is told of all."""
+    first, second = traced(*one), traced(*other)
+    assert first.differs_from(second) == at
+    told = first.difference(second, at)
+    assert told.startswith(f": {words}") if words else told == ""
+    assert first.difference(traced(*one), at) == "", "the control"
+
+
 _BOTH = np.ones(2, bool)
 
 
