@@ -141,10 +141,13 @@ def test_a_command_that_is_not_there_is_found(wrong: str) -> None:
 
 
 def test_what_ci_takes_has_inputs_and_hooks_that_there_are(checkout: Any) -> None:
-    workflow, hooks = (yaml.safe_load(block.text) for block in blocks.tested(PARSED))
-    step = workflow["jobs"]["check"]["steps"][1]
+    parsed = [yaml.safe_load(block.text) for block in blocks.tested(PARSED)]
+    workflows = [document for document in parsed if "jobs" in document]
+    [hooks] = [document for document in parsed if "repos" in document]
     action = yaml.safe_load((checkout / "action.yml").read_text())
-    assert set(step["with"]) <= set(action["inputs"])
+    for workflow in workflows:
+        step = workflow["jobs"]["check"]["steps"][-1]
+        assert set(step["with"]) <= set(action["inputs"])
     there = yaml.safe_load((checkout / ".pre-commit-hooks.yaml").read_text())
     assert {one["id"] for one in hooks["repos"][0]["hooks"]} <= {one["id"] for one in there}
 
