@@ -30,7 +30,6 @@ from envhub_sandbox.transport.values import to_tensor
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.inert import one_line
 from envhub_worker.protocol.errors import FAULTS
-from envhub_worker.protocol.shared_memory.slabs import DTYPE_CODES
 from envhub_worker.protocol.stream import StreamReader
 from envhub_worker.protocol.text import printable
 
@@ -123,7 +122,7 @@ def _bundle(folder: Path, document: dict[str, Any]) -> Bundle:
         arguments=arguments,
         task=None if task is None else _task(task),
         doubts=tuple(_doubts(document, history, arguments)),
-        requests=Requests(partial(_requests, folder, requests, _member(history, "requests", list))),
+        requests=Requests(partial(_requests, requests, _member(history, "requests", list))),
     )
 
 
@@ -198,55 +197,33 @@ def _packets(data: bytes) -> Iterator[m.Message]:
         yield m.unpack(packet.frames, tensors=to_tensor)
 
 
-def _requests(folder: Path, data: bytes, index: list[Any]) -> Iterator[m.Message]:
+def _requests(data: bytes, index: list[Any]) -> Iterator[m.Message]:
     packets = _packets(data)
-    arrays: dict[str, Any] = {}
     left = MAX_REQUESTS
     for entry in index:
         if type(entry) is not dict:
             raise BundleError("a request is not a mapping")
-        if "steps" not in entry:
-            left -= 1
-            try:
-                yield next(packets)
-            except StopIteration:
-                raise BundleError("it has fewer requests than it says") from None
-            continue
-        name = _member(entry, "of", str)
-        if name not in arrays:
-            arrays[name] = _array(folder, name)
-        rows = arrays[name][_slice(entry["steps"], len(arrays[name]))]
-        left -= len(rows)
+        message = next(packets, None)
+        if message is None:
+            raise BundleError("it has fewer requests than it says")
+        rows = None if "steps" not in entry else _rows(message, _member(entry, "steps", int))
+        left -= 1 if rows is None else len(rows)
         if left < 0:
             raise BundleError(f"it has more than {MAX_REQUESTS} requests")
-        for actions in rows:
-            yield m.Step(0, actions)
+        if rows is None:
+            yield message
+        else:
+            yield from (m.Step(0, actions) for actions in rows)
     if next(packets, None) is not None:
         raise BundleError("it has more requests than it says")
 
 
-def _slice(value: Any, length: int) -> slice:
-    if type(value) is not list or [type(item) for item in value] != [int, int]:
-        raise BundleError("the bounds of its steps are not two numbers")
-    start, stop = value
-    if not 0 <= start < stop <= length:
-        raise BundleError("it has fewer steps than it says")
-    return slice(start, stop)
-
-
-def _array(folder: Path, name: str) -> Any:
-    """A file of actions, mapped: a size that is claimed and not there costs nothing."""
-    dtypes = {f"actions-{dtype.name}.npy": dtype for dtype in DTYPE_CODES}
-    if name not in dtypes:
-        raise BundleError(f"{printable(name, 100)!r} is no file of actions")
-    _check_file(folder / name)
-    try:
-        array = np.lib.format.open_memmap(folder / name, mode="r")
-    except Exception as error:  # numpy reads the header with Python's own tokenizer and parser
-        raise BundleError(f"{name} is no file of actions: {error}") from error
-    if array.dtype != dtypes[name] or not array.ndim:
-        raise BundleError(f"{name} is not what its header says")
-    return np.array(array)
+def _rows(message: m.Message, count: int) -> Any:
+    """The actions of so many steps."""
+    actions = message.actions if isinstance(message, m.Step) else None
+    if not isinstance(actions, np.ndarray) or actions.shape[:1] != (count,):
+        raise BundleError("it has other steps than it says")
+    return actions
 
 
 def _read(folder: Path, name: str, most: int = MAX_FILE_BYTES) -> bytes:

@@ -6,8 +6,7 @@
         README.txt            in words: what died, and how to try again
         bundle.json           everything but the values below
         arguments.bin         make_env's own arguments: one packet of the wire
-        requests.bin          requests that are no plain steps: a packet each
-        actions-<dtype>.npy   (steps, num_envs, ...), one file a dtype
+        requests.bin          what was asked: a packet for each request, or for steps in a row
 
 Nothing in it is pickled. It is built under another name and renamed into place; only its owner
 may read it; the oldest give way to the newest. ``bundle_reader`` reads it.
@@ -16,7 +15,6 @@ may read it; the oldest give way to the newest. ``bundle_reader`` reads it.
 from __future__ import annotations
 
 import contextlib
-import io
 import json
 import os
 import re
@@ -28,8 +26,6 @@ from dataclasses import asdict
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from envhub_sandbox.errors import WorkerDiedError, WorkerTimeoutError
 from envhub_sandbox.hub.logins import without_login
@@ -134,7 +130,6 @@ def _write(folder: Path, crash: Crash) -> None:
         "arguments.bin": _packet(encoded(crash.load).frames),
         "requests.bin": b"".join(map(_packet, requests.packets)),
         "README.txt": str(_concealed(_in_words(crash), crash)).encode(),
-        **{name: _array_file(rows) for name, rows in requests.arrays.items()},
     }
     for name, data in content.items():
         folders.write_private(folder / name, data)
@@ -163,20 +158,12 @@ def _secrets(policy: Any) -> list[tuple[str, str]]:
     return sorted(found.items(), key=lambda one: len(one[0]), reverse=True)
 
 
-def _array_file(rows: list[Any]) -> bytes:
-    file = io.BytesIO()
-    np.lib.format.write_array(file, np.concatenate(rows), allow_pickle=False)
-    return file.getvalue()
-
-
 class _Requests:
     """An index of requests, in order, and what it points to."""
 
     def __init__(self, recording: Recording) -> None:
         self.index: list[dict[str, Any]] = []
         self.packets: list[Sequence[Buffer]] = []
-        self.arrays: dict[str, list[Any]] = {}
-        self._lengths: dict[str, int] = {}
         self.steps = 0
         for request in recording.requests:
             if isinstance(request, Steps):
@@ -185,11 +172,8 @@ class _Requests:
                 self._add(request)
 
     def _add_steps(self, actions: Any) -> None:
-        name = f"actions-{actions.dtype.name}.npy"
-        self.arrays.setdefault(name, []).append(actions)
-        start = self._lengths.get(name, 0)
-        self._lengths[name] = start + len(actions)
-        self.index.append({"steps": [start, start + len(actions)], "of": name})
+        self.packets.append(encoded(m.Step(0, actions)).frames)
+        self.index.append({"steps": len(actions)})
         self.steps += len(actions)
 
     def _add(self, request: RecordedRequest) -> None:
