@@ -205,9 +205,7 @@ class RemoteServer(WorkerServer):
         client: WorkerConnection | None = None
         every_s = _FIRST_S
         while not self._stop.wait(every_s):
-            with contextlib.suppress(RuntimeError):  # another thread has just connected
-                for link in self.far.links:
-                    link.read_ahead()
+            self._read_ahead()
             try:
                 if client is None:
                     client = self._connection()
@@ -219,6 +217,11 @@ class RemoteServer(WorkerServer):
                 _close(client)
                 client = None
         _close(client)
+
+    def _read_ahead(self) -> None:
+        with contextlib.suppress(RuntimeError):  # another thread has just connected
+            for link in self.far.links:
+                link.read_ahead()
 
     def _close_jails(self) -> None:
         """Whatever is open there still: at the end of a process that closed nothing."""

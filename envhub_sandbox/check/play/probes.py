@@ -17,6 +17,7 @@ from gymnasium.vector import VectorEnv
 from envhub_sandbox.check.play.episodes import Episode
 from envhub_sandbox.errors import RemoteEnvError
 from envhub_sandbox.vector.pictures import is_frame
+from envhub_worker.protocol.codec.inert import RemoteObject
 from envhub_worker.protocol.spaces.batches import shown
 from envhub_worker.protocol.text import printable, size_text
 
@@ -159,3 +160,13 @@ def has(env: Any, name: str) -> bool:
     except (AttributeError, RemoteEnvError):
         return False
     return True
+
+
+def is_statistics(env: Any, name: str) -> bool:
+    """Whether a wrapper around its sub-environments has running statistics of Gymnasium's so."""
+    try:
+        [value, *_] = env.get_attr(name)
+    except (AttributeError, RemoteEnvError, ValueError):
+        return False
+    kind = value.type_name if isinstance(value, RemoteObject) else type(value).__name__
+    return kind.rpartition(".")[2] == "RunningMeanStd"

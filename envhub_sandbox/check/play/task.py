@@ -229,8 +229,8 @@ class TaskJudge:
         They are honest, and outlive each reset: so they stop for the plays that are compared. Of
         wrappers around each other only the outermost can be stopped from here.
         """
-        found = sum(probes.has(env, name) for name in _STATISTICS)
-        if found and probes.has(env, "update_running_mean"):
+        found = sum(probes.is_statistics(env, name) for name in _STATISTICS)
+        if found and probes.has(env, "update_running_mean"):  # which older ones have not
             env.set_attr("update_running_mean", [False] * env.num_envs)  # type: ignore[attr-defined]
             return found - 1
         return found or None

@@ -153,14 +153,18 @@ class Places:
             self.lines["jails"].leave(key, asker.session)
 
     def for_slabs(self, asker: Asker, request: m.ShareSlabs) -> None:
-        """Hold slabs, of which some replace others, against the quota of memory."""
+        """Hold slabs, of which some replace others, against the quota of memory.
+
+        Steps are possible without them: no session ends for slabs, and none waits in line.
+        """
         parts = [part for part in request.slabs if type(part) is tuple and len(part) == 4]
         replaced = {part[0] for part in parts if type(part[0]) is int}
         sizes = [size for part in parts for size in part[2:] if type(size) is int and size > 0]
         for entry in self._jails.open_ones(asker.session):
             if entry.number == request.jail:
                 more = sum(sizes) + entry.shared_bytes(replaced) - entry.shared_bytes()
-                self.for_jail(asker, {"memory_bytes": max(more, 0)})
+                more_use = {"memory_bytes": max(more, 0)}
+                check_jail(self._uses(asker.key), more_use, self._quotas)
 
     def _uses(self, key: bytes) -> list[Use]:
         return [
