@@ -72,6 +72,15 @@ def _first(placement: Placement, number: int) -> str:
     return next(placement.candidates(number)).name
 
 
+def test_they_are_spread(rooms: dict[str, Room]) -> None:
+    """One each by default; evenly, by how often a place is in the list."""
+    assert len(_placement(["a", "b", "a"]).seats(None)) == 3
+    assert len(_placement(["a", "b"]).seats(5)) == 5
+    placement = _opened(["a", "b", "a"])
+    found = [_first(placement, number) for number in range(6)]
+    assert sorted(found) == ["a", "a", "a", "a", "b", "b"]
+
+
 def test_the_place_with_most_room_comes_first(rooms: dict[str, Room]) -> None:
     """Then what is full, and what does not answer; room that was given away since is gone."""
     rooms |= {"a": Room(workers=1), "b": Room(workers=9)}
@@ -198,6 +207,21 @@ def _packages(*places: _Maker) -> tuple[FleetPackages, list[Member]]:
     members = [Member(place, packages.runtime_of) for place in places]
     packages.members = lambda: members
     return packages, members
+
+
+def test_each_place_runs_on_its_own() -> None:
+    """A folder here, a name over there; the facts of each are kept, and told once if alike."""
+    here = _Maker("here", PackageSet("/made/here", {"lock": "a"}, "/python"), here=True)
+    there = _Maker("there", PackageSet("name", {"lock": "b"}))
+    packages, members = _packages(here, there)
+    made = packages.make(_request(), print)
+    assert made is not None
+    assert packages.runtime_of(members[0]) == Runtime("/python", "/made/here")
+    assert packages.runtime_of(members[1]) == Runtime("", "name")
+    assert made.facts["places"] == {"here": {"lock": "a"}, "there": {"lock": "b"}}
+    there.will_make(PackageSet("name", {"lock": "a"}))
+    made = packages.make(_request(), print)
+    assert made.facts == {"lock": "a"}
 
 
 def test_what_a_place_has_is_not_made() -> None:

@@ -112,6 +112,20 @@ def test_what_fails_in_its_start_ends_it(server: LocalServer) -> None:
     assert (second.stopped, second.folder.exists()) == (True, False)
 
 
+def test_a_fork_of_its_owner_ends_nothing(server: LocalServer) -> None:
+    with server.starting(sleeping):
+        pass
+    child = os.fork()
+    if child == 0:
+        try:
+            server.stop()
+        finally:
+            os._exit(0)
+    os.waitpid(child, 0)
+    assert server.process.poll() is None
+    assert server.folder.exists()
+
+
 # --- What ``envhub cache gc`` takes for left behind, and what it leaves alone
 
 

@@ -22,6 +22,8 @@ from envhub_sandbox.sandboxes.ray import cluster, sandbox
 from envhub_sandbox.sandboxes.ray.actor import WorkerActor
 from envhub_sandbox.settings.policy import Policy
 from envhub_worker.protocol.runtime import OWN, Runtime
+from tests.support.command_line import runs
+from tests.support.processes import eventually
 
 
 @pytest.mark.parametrize(
@@ -122,6 +124,14 @@ def test_a_local_ray_is_started_where_none_runs(monkeypatch: pytest.MonkeyPatch)
     assert ray.asked == ["10.0.0.1:6379"]
 
 
+def test_another_cluster_than_the_connected_one_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    use(Ray(connected="10.0.0.1:6379"), monkeypatch)
+    for good in ("", "auto", "10.0.0.1:6379"):
+        cluster.connect(good)
+    with pytest.raises(PolicyError, match=r"10\.0\.0\.1:6379"):
+        cluster.connect("10.0.0.2:6379")
+
+
 # --- The actor of a node, in this process: it starts a server and says what has become of it
 
 
@@ -143,6 +153,22 @@ def servers() -> Iterator[list[psutil.Process]]:
     for process in set(psutil.Process().children()) - before:
         process.kill()
         process.wait(60)
+
+
+@pytest.mark.usefixtures("servers")
+def test_a_server_is_started_and_its_end_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In plain data: where it listens, its public key, what Ray has assigned."""
+    monkeypatch.setitem(sys.modules, "ray", node())
+    actor, before = WorkerActor(), set(psutil.Process().children())
+    said = json.loads(actor.start("ab" * 32))
+    assert said["endpoint"].startswith("tcp://127.0.0.1:")
+    assert len(bytes.fromhex(said["key"])) == 32
+    assert (said["node"], said["gpus"]) == ("ab12", [2])
+    [server] = set(psutil.Process().children()) - before
+    assert runs(server)
+    server.terminate()
+    assert json.loads(actor.wait()) == {"code": 0, "log": ""}
+    assert eventually(lambda: not runs(server))
 
 
 @pytest.mark.usefixtures("servers")

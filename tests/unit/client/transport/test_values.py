@@ -27,7 +27,7 @@ from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 from envhub_worker.protocol.messages.prefix import WARNINGS
 from envhub_worker.protocol.spaces.spaces import OpaqueSpace
 from envhub_worker.runner.described import described
-from tests.support.compare import assert_same_space
+from tests.support.compare import assert_same, assert_same_space
 from tests.support.wire import ext, packed
 
 SPACES: list[gym.Space[Any]] = [
@@ -41,6 +41,7 @@ SPACES: list[gym.Space[Any]] = [
     spaces.Graph(spaces.Box(0, 1, (2,)), spaces.Discrete(3)),
     spaces.OneOf([spaces.Discrete(2), spaces.MultiBinary(3)]),
 ]
+BITS = ("PCG64", "PCG64DXSM", "MT19937", "Philox", "SFC64")
 
 
 def arrived(value: object, limits: WireLimits = DEFAULT_LIMITS) -> Any:
@@ -76,6 +77,27 @@ def test_what_only_its_owner_knows_is_told() -> None:
         deep = spaces.Tuple([deep])
     for value in (deep, Own(np.random.PCG64()), np.random.RandomState(1), spaces.Discrete):
         assert isinstance(arrived(value), RemoteObject)
+
+
+@pytest.mark.parametrize("bits", BITS)
+def test_generators_arrive(bits: str) -> None:
+    """They go on where the worker's stand, and are the caller's own."""
+    original = np.random.Generator(getattr(np.random, bits)(3))
+    original.integers(0, 9, 5, np.int32)
+    found = arrived((original, None))[0]
+    assert_same(original, found, "it")
+    assert found.random() == copy.deepcopy(original).random()
+
+
+def test_specs_arrive_as_facts() -> None:
+    """What would make something stays behind; they copy and pickle."""
+    given = EnvSpec("a/B-v1", entry_point="os:system", kwargs={"a": 1}, max_episode_steps=7)
+    found = arrived(given)
+    assert (found.id, found.max_episode_steps, found.name) == ("a/B-v1", 7, "B")
+    for spec in (found, copy.deepcopy(found), pickle.loads(pickle.dumps(found))):
+        assert "system" not in repr(spec)
+        with pytest.raises(gym.error.Error, match="in a sandbox"):
+            gym.make(spec)
 
 
 def test_a_message_has_one_budget() -> None:

@@ -222,6 +222,21 @@ def test_nothing_of_this_machine_is_mounted(tmp_path: Path) -> None:
 # --- with mounts, in place of a port
 
 
+def test_a_container_that_is_mounted_serves_until_it_is_given_back(
+    sandbox: Callable[..., Any], tmp_path: Path
+) -> None:
+    """Its layers are those that hold; then its processes and its folder are gone."""
+    before = descendants()
+    use = sandbox("serves", mounts=True).acquire(tmp_path)
+    server = use.server
+    assert server.runs
+    assert server.profile == "container"
+    assert all(layer["enforced"] for layer in server.layers)
+    use.release()
+    assert not server.folder.exists()
+    assert eventually(lambda: descendants() <= before)
+
+
 def test_an_order_names_assets_as_they_lie_inside(sandbox: Callable[..., Any]) -> None:
     place = replace(sandbox("serves", mounts=True), assets=(Path("/c/a"), Path("/c/b")))
     own, *others = (("models--org--r", "", ""), ("datasets--a--b", "/c/b", "asset-1"))
