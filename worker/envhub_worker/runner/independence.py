@@ -5,7 +5,8 @@ none touches what a process has once. No list of names shows that, so it is trie
 runner play the sub-environments, once all together and once each alone, with equal seeds and
 actions. They may share a process if every observation, reward, flag and info is equal to the last
 bit, and nothing that ``SharedState`` looks at has changed. What cannot be played within its time
-is heavy, and has no need to share.
+is heavy, and has no need to share; nor has what waits instead of computing, for those that share a
+process wait one after the other.
 
 The forks begin between the return of ``make_env`` and the first sub-environment that is built,
 where ``AsyncVectorEnv`` forks too, and one at a time: no more sub-environments live at once than
@@ -52,10 +53,12 @@ _BUILD_S = 2.0
 _LEAST_STEPS, _MOST_STEPS = 16, 256
 _LEAST_STEPS_S, _MOST_STEPS_S = 1.0, 0.25
 """Processor time in which the first are made, or it is heavy, and after which no further one is."""
-_LONGEST_STEPS_S = 2.0
-"""Of time that passes, also while it waits, after which no further one is."""
 _LONGEST_SLEEP_S = 60.0
 """In one call, by the clock of a play: who waits for what no play brings would wait for ever."""
+_WAIT_S, _LEAST_SHARE = 2.0, 8
+"""Time in which plays may wait, beyond so many times what they compute: on a busy machine a play
+waits for a processor, too.
+"""
 _STEPS_AFTER_RESET = 8
 _ALONE = 4
 """So many of the first sub-environments, and of the last, are played alone."""
@@ -68,24 +71,48 @@ _ADDRESS = re.compile(rb"0x[0-9a-f]{4,}")
 """In the text of an object that has no other."""
 
 
-def are_independent(task: Task, root: str, until: float, most_bytes: int) -> bool:
+class Budget:
+    """What all plays of a ``make_env`` may take.
+
+    Args:
+        until: When to give up, by ``time.monotonic``.
+        most_bytes: Of memory that a play may take: more could be the end of the whole jail.
+
+    Attributes:
+        most_bytes: As given.
+    """
+
+    def __init__(self, until: float, most_bytes: int) -> None:
+        self._until, self._wait_s, self.most_bytes = until, _WAIT_S, most_bytes
+
+    def left_s(self, began: float, pid: int) -> float:
+        """Time in which the fork that ``began`` then may go on without computing anything."""
+        now, computed_s = monotonic(), 0.0
+        with contextlib.suppress(OSError):  # it has ended. Followed: clock_getcpuclockid(3)
+            computed_s = time.clock_gettime(~pid << 3 | 2)
+        return min(self._until - now, self._wait_s - (now - began) + _LEAST_SHARE * computed_s)
+
+    def take(self, left_s: float) -> None:
+        """A fork is over, with so much time left."""
+        self._wait_s = min(self._wait_s, left_s)
+
+
+def are_independent(task: Task, root: str, budget: Budget) -> bool:
     """Play a task's sub-environments together and apart, and compare.
 
     Args:
         task: Of a recording, of which nothing has been built.
         root: The repository's folder.
-        until: When to give up, by ``time.monotonic``.
-        most_bytes: Of memory that a play may take: more could be the end of the whole jail.
+        budget: What the plays may take.
     """
     count = task.num_envs
-    play = partial(in_fork, until=until, most_bytes=most_bytes)
-    together = play(partial(_play, task, range(count), None, root), count)
+    together = in_fork(partial(_play, task, range(count), None, root), count, budget)
     if together is None:
         return False
     steps = int.from_bytes(together[:_STEP_BYTES], "little")
     digests = [together[at:][:_DIGEST_BYTES] for at in _offsets(count)]
     for index in sorted({*range(count)[:_ALONE], *range(count)[-_ALONE:]}):
-        alone = play(partial(_play, task, [index], steps, root), 1)
+        alone = in_fork(partial(_play, task, [index], steps, root), 1, budget)
         if alone is None or alone[_STEP_BYTES:] != digests[index]:
             return False
     return True
@@ -95,7 +122,7 @@ def _offsets(count: int) -> Iterable[int]:
     return range(_STEP_BYTES, _STEP_BYTES + count * _DIGEST_BYTES, _DIGEST_BYTES)
 
 
-def in_fork(play: Callable[[], bytes], count: int, until: float, most_bytes: int) -> bytes | None:
+def in_fork(play: Callable[[], bytes], count: int, budget: Budget) -> bytes | None:
     """What it returns in a fork of this process: the steps, and digests of ``count``.
     None where that fails, or takes too long or too much.
     """
@@ -109,11 +136,13 @@ def in_fork(play: Callable[[], bytes], count: int, until: float, most_bytes: int
         os.close(sink)
         return None
     if pid == 0:
-        _play_and_exit(play, sink, most_bytes)
+        _play_and_exit(play, sink, budget.most_bytes)
     os.close(sink)
+    left_s = partial(budget.left_s, monotonic(), pid)
     try:
-        return _read(source, _STEP_BYTES + count * _DIGEST_BYTES, until)
+        return _read(source, _STEP_BYTES + count * _DIGEST_BYTES, left_s)
     finally:
+        budget.take(left_s())
         os.close(source)
         with contextlib.suppress(OSError):  # with all that it has started
             os.killpg(pid, signal.SIGKILL)
@@ -144,15 +173,15 @@ def _bound_memory(most_bytes: int) -> None:
     resource.setrlimit(resource.RLIMIT_DATA, (most if hard < 0 else min(most, hard), hard))
 
 
-def _read(source: int, size: int, until: float) -> bytes | None:
+def _read(source: int, size: int, left_s: Callable[[], float]) -> bytes | None:
     """So many bytes; None if they do not come in time. The end may be held open by processes that
     the repository has started.
     """
     data = b""
     poller = select.poll()
     poller.register(source, select.POLLIN)
-    while len(data) < size and (left_s := until - monotonic()) > 0:
-        if poller.poll(left_s * 1000 + 1):
+    while len(data) < size and (wait_s := left_s()) > 0:
+        if poller.poll(wait_s * 1000 + 1):
             part = os.read(source, size - len(data))
             if not part:
                 return None
@@ -216,13 +245,12 @@ class _Play:
             for _ in range(steps):
                 self.step()
             return steps
-        began, began_s = monotonic(), process_time()
+        began_s = process_time()
         for made in range(_MOST_STEPS):
             passed_s = process_time() - began_s
             if made < _LEAST_STEPS and passed_s > _LEAST_STEPS_S:
                 raise HeavyError
-            late = passed_s > _MOST_STEPS_S or monotonic() - began > _LONGEST_STEPS_S
-            if made >= _LEAST_STEPS and late:
+            if made >= _LEAST_STEPS and passed_s > _MOST_STEPS_S:
                 return made
             self.step()
         return _MOST_STEPS

@@ -29,7 +29,7 @@ from envhub_worker.runner import generators, loader, manifest
 from envhub_worker.runner import gymnasium_compat as compat
 from envhub_worker.runner.copies import taken
 from envhub_worker.runner.described import described, raised
-from envhub_worker.runner.independence import are_independent
+from envhub_worker.runner.independence import Budget, are_independent
 from envhub_worker.runner.lane import Lane
 from envhub_worker.runner.prefixes import WarningLog, Watches
 from envhub_worker.runner.recording import standing_in
@@ -150,10 +150,10 @@ class Runner:
         """Import the repository, call ``make_env``, describe what came back."""
         latest = monotonic() + request.play_ms / 1000
         tasks = self._load(request)
-        until = min(latest, monotonic() + _PLAY_S)
+        budget = Budget(min(latest, monotonic() + _PLAY_S), self._play_bytes)
         for task in tasks:
             if task.may_share and request.play_ms > 0:
-                task.independent = are_independent(task, self._snapshot, until, self._play_bytes)
+                task.independent = are_independent(task, self._snapshot, budget)
         made = manifest.describe(tasks)
         return m.LoadDone(encode_manifest(made))
 
