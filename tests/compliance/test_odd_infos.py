@@ -110,6 +110,7 @@ BY_ROW: dict[str, list[dict[Any, Any]]] = {
     "a member later": [{"a": 1}, {"a": Level.LOW}, {"a": 2.5}],
     "members as keys": [{Mode.FAST: 1}, {Level.LOW: 2.5, "b": {Mode.FAST: 1}}, {"fast": 2.5}],
     "an object of no dimension": [_WITHOUT, {"a": np.array(None)}, {"b": {"c": np.array(None)}}],
+    "one after None": [{"a": None}, _WITHOUT, _WITHOUT, {"a": np.array(None)}],
     "one beside None": [{"a": None}, {"a": np.array(None)}, _WITHOUT],
     "its own mask": [_WITHOUT, {"_a": 1, "a": "x"}, _WITHOUT],
 }

@@ -267,14 +267,12 @@ def _join_part(
         size = window.stop - window.start
         if len(value) != size:  # or its other dimensions cost nothing
             raise ValueError("an entry does not have one value per sub-environment")
+        if value.dtype == object and _is_after_mask(key, part):
+            raise ValueError("an entry is 0 where other shards may have None")
         array = joined.get(key)
         if array is None:
             room.take(value, count)
-            zeros = _is_after_mask(key, part)
-            mask = joined.pop(f"_{key}") if zeros else None
-            array = joined[key] = _blank(value, count, zeros=zeros)
-            if zeros:
-                joined[f"_{key}"] = mask
+            array = joined[key] = _blank(value, count)
         if (array.dtype, array.shape[1:]) != (value.dtype, value.shape[1:]):
             raise ValueError("an entry is of another dtype or shape in another shard")
         array[window] = value
@@ -364,14 +362,14 @@ def _has(infos: dict[Any, Any], key: Any, index: int) -> bool:
     return not is_mask or bool(mask[index])
 
 
-def _blank(value: Any, count: int, *, zeros: bool = False) -> Any:
-    if value.dtype == object and value.ndim == 1 and not zeros:
+def _blank(value: Any, count: int) -> Any:
+    if value.dtype == object and value.ndim == 1:
         return np.full(count, None, dtype=object)
     return np.zeros((count, *value.shape[1:]), dtype=value.dtype)
 
 
 def _is_after_mask(key: Any, part: dict[Any, Any]) -> bool:
-    """Whether a slice says by the order that rows without this entry are 0: see ``join_slice``."""
+    """Whether a slice says by the order that rows without an entry are 0: see ``join_slice``."""
     mask = f"_{key}"
     return f"_{mask}" not in part and next(k for k in part if k in (key, mask)) == mask
 
@@ -384,7 +382,7 @@ Column = Callable[[Any, int], Any]
 _SCALARS = frozenset({int, float, bool})
 _NO_FORMS: Forms = {}
 _NO_FORM: tuple[str, bool, Forms] = ("", False, _NO_FORMS)
-_SAME = frozenset({*_SCALARS, str, bytes, type(None), list, tuple, np.ndarray, np.bool_})
+_SAME = _SCALARS | {str, bytes, type(None), list, tuple, dict, np.ndarray, np.bool_}
 """Values of these classes are joined alike on both sides."""
 
 
@@ -395,7 +393,7 @@ def forms_of(info: dict[Any, Any]) -> Forms:
     forms: Forms = {}
     for key, value in info.items():
         inner = forms_of(value) if isinstance(value, dict) else {}
-        if inner or type(key) is not str or not (inner or type(value) in _SAME | {dict}):
+        if inner or type(key) is not str or type(value) not in _SAME:
             is_array = isinstance(value, (dict, np.ndarray)) or is_scalar(type(value))
             forms[key] = (f"_{key}", not is_array, inner)
     return forms
@@ -445,7 +443,8 @@ def join_slice(pairs: Pairs, count: int) -> dict[Any, Any]:
     """``join_pairs`` of some of the sub-environments.
 
     The column of an array of objects without dimensions is 0 where a row has no such entry, others
-    of objects are None. Rows elsewhere may all have none: the mask of such a column comes first.
+    of objects are None. Which it is is decided by rows elsewhere, too, which ``join_infos`` does
+    not see: the mask of such a column comes first, and it raises ``Misfit``.
     """
     zeros: list[Any] = []
 
