@@ -35,6 +35,12 @@ WRAPS: dict[str, Wrap] = {
     ),
     "TransformReward": lambda env: wrappers.TransformReward(env, lambda reward: reward**2),
     "TransformAction": lambda env: wrappers.TransformAction(env, lambda action: action / 2),
+    "VectorizeTransformAction": lambda env: wrappers.VectorizeTransformAction(
+        env, gym.wrappers.RescaleAction, min_action=-0.5, max_action=0.5
+    ),
+    "VectorizeTransformObservation": lambda env: wrappers.VectorizeTransformObservation(
+        env, gym.wrappers.ReshapeObservation, shape=(3, 1)
+    ),
     "VectorizeTransformReward": lambda env: wrappers.VectorizeTransformReward(
         env, gym.wrappers.ClipReward, min_reward=-0.5
     ),
