@@ -131,11 +131,9 @@ def _doubts(
 ) -> Iterator[str]:
     dropped = _member(history, "dropped", int)
     if dropped:
-        yield f"{dropped} requests had been forgotten before it died (crash_history of the policy)"
-    elif history.get("mixed"):
         yield (
-            "attributes and calls before a transparent restart may not apply to all "
-            "sub-environments"
+            f"{dropped} requests had been forgotten before it died (crash_history of the policy), "
+            "or were lost by a transparent restart"
         )
     elif not _member(history, "exact", bool):
         yield (

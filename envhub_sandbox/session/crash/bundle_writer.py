@@ -120,7 +120,6 @@ def _write(folder: Path, crash: Crash) -> None:
             "exact": recording.exact,
             "seeded": recording.seeded,
             "dropped": recording.dropped,
-            "mixed": recording.mixed,
             "steps": requests.steps,
             "requests": requests.index,
         },

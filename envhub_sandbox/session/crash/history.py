@@ -66,20 +66,19 @@ class Recording:
         seeded: Whether every sub-environment was seeded, once, since the jail started.
         requests: Everything since the last reset that seeded all, or since the start; before it
             what lasts beyond a reset: calls, and attributes that were set.
-        dropped: Requests that were forgotten in between, for their number or size.
-        mixed: Whether some sub-environments have lost what lasts, by a transparent restart.
+        dropped: Requests that were forgotten in between, for their number or size, or that some
+            sub-environments have lost by a transparent restart.
     """
 
     seeded: bool = False
     requests: tuple[Steps | RecordedRequest, ...] = ()
     dropped: int = 0
-    mixed: bool = False
 
     @property
     def exact(self) -> bool:
         """Whether the same requests again are all there was."""
         plain = all(one.exact for one in self.requests if isinstance(one, RecordedRequest))
-        return plain and not self.dropped and not self.mixed
+        return plain and not self.dropped
 
 
 class History:
@@ -109,7 +108,7 @@ class History:
         """A fresh jail: what was asked of another is of no concern."""
         self._lasting.clear()
         self._forgotten = 0
-        self._mixed = self._seeded = False
+        self._seeded = False
         self._restart()
 
     def revived(self) -> None:
@@ -117,7 +116,7 @@ class History:
 
         The fresh ones have lost attributes that were set, the others have not.
         """
-        self._mixed = self._mixed or bool(self._lasting)
+        self._forgotten += len(self._lasting)
         self._seeded = False
         self._restart()
 
@@ -214,7 +213,6 @@ class History:
             seeded=self._seeded,
             requests=tuple(self._runs()),
             dropped=self._dropped + self._forgotten,
-            mixed=self._mixed,
         )
 
     def _runs(self) -> list[Steps | RecordedRequest]:
