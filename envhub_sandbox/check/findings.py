@@ -15,7 +15,9 @@ from envhub_sandbox.check.play.plays import Play
 from envhub_sandbox.errors import EnvHubError, RemoteEnvError, WorkerDiedError, WorkerTimeoutError
 from envhub_worker.protocol.text import counted, duration_text, printable
 
-_RETURNED = re.compile(r"(?:reset|step) of sub-environment \d+ returned ")
+_RETURNED = re.compile(
+    r"(?:reset|step) of sub-environment \d+ returned |\S{1,200} \([^()]{1,200}\) does not return "
+)
 _LONGEST = 1_000
 _MOST = 500
 """Findings: a repository of ten thousand files is no reason for as many lines."""

@@ -159,6 +159,10 @@ def test_the_api_of_old_is_named_with_its_line(tmp_path: Path, text: str) -> Non
         with pytest.raises(RemoteEnvError, match=_RESETS[text]) as caught:
             _ = suites.env.step([0]) if "step" in _RESETS[text] else suites.env.reset()
     assert "0.26" in str(caught.value)
+    assert (caught.value.file, caught.value.line) == (
+        "env.py",
+        12 if "step" in _RESETS[text] else 9,
+    )
 
 
 _OF_OLD = """

@@ -37,6 +37,7 @@ from gymnasium.vector.utils import batch_space, iterate
 from envhub_worker.protocol.manifest.names import CONVERTED
 from envhub_worker.protocol.spaces import batches
 from envhub_worker.runner import gymnasium_compat as compat
+from envhub_worker.runner import returned
 from envhub_worker.runner.described import facts_of
 from envhub_worker.runner.gymnasium_compat import names, parameters_of, takes
 
@@ -341,10 +342,10 @@ def explained(error: Exception, env: Any, method: str) -> Exception:
     theirs = any(function and one.filename == function.co_filename for one in frames)
     if function is None or theirs or not unpacked:
         return error
-    return type(error)(
-        f"{_where(env.unwrapped, method)} does not return {_RETURNS[method]}. That is the API "
-        f"before Gymnasium 0.26; see {_GUIDE} ({text})"
-    )
+    told = f"{_where(env.unwrapped, method)} does not return {_RETURNS[method]}"
+    if "got 4" in text or (method == "reset" and "non-iterable" not in text):
+        told = f"{told}. That is the API before Gymnasium 0.26; see {_GUIDE}"
+    return returned.raised_at(type(error)(f"{told} ({text})"), env, method)
 
 
 def _where(env: Any, method: str) -> str:

@@ -21,7 +21,7 @@ from envhub_worker.protocol.errors import FAULTS, MessageTooLargeError, RemotePr
 from envhub_worker.protocol.spaces.spaces import ARRAY_SPACES, OneOf
 
 Bounds = Sequence[tuple[int, int]]
-_SHOWN = 100
+_SHOWN, _KEYS = 100, 20
 
 
 def even_bounds(count: int, parts: int) -> list[tuple[int, int]]:
@@ -171,12 +171,14 @@ def reward_misfit(reward: Any, index: int, shape: tuple[int, ...] = ()) -> str:
 
 
 def shown(value: Any) -> str:
-    """The dtype and shape of an array; of anything else its class and the beginning of its repr."""
+    """The dtype and shape of an array, the keys of a dict, or the class and how its repr begins."""
     if isinstance(value, gym.Space):
         return f"the space {one_line(str(value), _SHOWN)}"
     if hasattr(value, "dtype") and hasattr(value, "shape"):
         kind = "" if isinstance(value, (np.ndarray, np.generic)) else f"{type(value).__name__} "
         return one_line(f"{kind}{value.dtype} {tuple(value.shape)}", _SHOWN)
+    if type(value) is dict:
+        return f"dict with {one_line(', '.join(map(repr, itertools.islice(value, _KEYS))), _SHOWN)}"
     inert = inert_copy(value)
     return f"{inert.type_name} {one_line(inert.text, _SHOWN)}"
 
