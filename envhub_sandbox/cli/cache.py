@@ -187,7 +187,7 @@ def remove(
 
     found, made, built = stored_snapshots(), environments.every(), wheels.every()
     if everything:
-        for folder in ("manifests", "resolutions"):
+        for folder in ("imports", "manifests", "resolutions"):
             shutil.rmtree(cache_root() / folder, ignore_errors=True)
     else:
         is_chosen = _chooser([*found, *made, *built], names or [], unused_for)

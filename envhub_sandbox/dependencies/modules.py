@@ -134,7 +134,8 @@ def is_here(guess: Guess) -> bool:
     own.update(map(os.path.abspath, os.environ.get("PYTHONPATH", "").split(os.pathsep)))
     if program and sys.path[0] == os.path.dirname(os.path.abspath(program)):
         own.add(sys.path[0])
-    return bool(_path_here(guess.module, [path for path in sys.path if path not in own]))
+    folders = [path for path in sys.path if path not in own]
+    return not _built_on_import(guess.module) and bool(_path_here(guess.module, folders))
 
 
 def _path_here(module: str, folders: Sequence[str]) -> str:
@@ -257,7 +258,8 @@ class MissingModule:
         project = project or next((one for one in folders if (one / "setup.py").is_file()), None)
         editable = "" if _built_on_import(module) else "-e "
         if project is not None:
-            return f"{here}. Install it: {python} -m pip install {editable}{project}"
+            words = f"{python} -m pip install {editable}{project}"
+            return f"{here}. If you trust its code, which then runs here, too, install it: {words}"
         folder = folders[Path(path).stem == "__init__"]
         return (
             f"{here}: it has the packages of {python} alone. Copy the module into the repository, "

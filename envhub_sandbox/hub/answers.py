@@ -81,7 +81,7 @@ def _judge(response: Any, *_: object, **__: object) -> None:
 
 
 _LONGEST_QUOTE = 200
-_LOGIN = re.compile(r"//[^/?#\s]*@")
+_LOGIN = re.compile(r"(?<=//)[^/?#\s]*(?=@)|(?<=\?)\S+")
 _LOG_IN = "log in with `hf auth login` (`huggingface-cli login` before 1.0) or pass a token"
 
 
@@ -227,7 +227,7 @@ def explain(
 def _reason(error: BaseException) -> str:
     """The class, and what the system said: of all that wraps it the innermost that has a text."""
     texts = [str(link) for link in chain(error) if isinstance(link, OSError) and str(link)]
-    text = _LOGIN.sub("//***@", printable([str(error), *texts][-1])[:_LONGEST_QUOTE])
+    text = _LOGIN.sub("***", printable([str(error), *texts][-1])[:_LONGEST_QUOTE])
     text = " ".join(text.split())
     return f"{type(error).__name__}: {text}" if text else type(error).__name__
 

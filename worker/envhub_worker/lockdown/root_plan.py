@@ -106,7 +106,12 @@ def plan_root(
         network: ``"host"`` adds what name resolution and TLS read.
     """
     links: dict[str, str] = dict(_DEV_LINKS)
-    wanted = [path for path in interpreter if not any(within(one, path) for one in private)]
+    named = {path: {path, resolve(path, host, {})} for path in interpreter}  # and what it leads to
+    wanted = [
+        path
+        for path, both in named.items()
+        if not any(within(one, other) for one in private for other in both)
+    ]
     trees = [*wanted, *readable, *_ETC_FOLDERS, *_SYS_FOLDERS, *_SYSTEM]
     copies = list(_ETC_FILES)
     texts = dict(_TEXTS)

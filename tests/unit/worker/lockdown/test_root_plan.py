@@ -20,7 +20,13 @@ FOLDERS = {
     "/sys/devices/system/cpu",
 }
 FILES = {"/etc/ld.so.cache", "/etc/resolv.conf", "/etc/hosts"}
-LINKS = {"/bin": "usr/bin", "/lib": "usr/lib", "/python": "/opt/py", "/opt/py/current": "lib"}
+LINKS = {
+    "/bin": "usr/bin",
+    "/lib": "usr/lib",
+    "/python": "/opt/py",
+    "/opt/py/current": "lib",
+    "/all": "home",
+}
 HOST = HostFiles(
     exists=lambda path: path in FOLDERS | FILES,
     readlink=LINKS.get,
@@ -66,9 +72,11 @@ def test_interpreter_appears_where_it_is() -> None:
     assert plan.links["/python"] == "/opt/py"
 
 
-@pytest.mark.parametrize("path", ["/", "/home", "/home/ann", "/run", "/run/envhub"])
+@pytest.mark.parametrize("path", ["/", "/home", "/home/ann", "/run", "/run/envhub", "/all"])
 def test_interpreter_cannot_open_a_home(path: str) -> None:
-    """A sys.path entry at or above a home is left out; a project below it is not."""
+    """A sys.path entry at or above a home is left out, or one that leads there; a project below it
+    is not.
+    """
     assert root(interpreter=(path, "/home/ann/proj")).trees == (
         "/etc/fonts",
         "/home/ann/proj",
