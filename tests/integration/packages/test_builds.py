@@ -140,11 +140,14 @@ def test_a_repository_whose_package_has_no_wheel(real_index: Index, tmp_path: Pa
     assert lockfile.read(path) == lock
     [origin] = [one.origin for one in lock.packages if one.name == "sourced"]
     assert origin is not None
-    for name in ("wheels", "environments", "resolutions"):
+    for name in ("environments", "resolutions"):
         remove_tree(cache_root() / name)
+    [kept] = wheels.root().glob("*/*/sourced-*.whl")
+    remove_tree(kept.parent)
     with make_env(folder, lock=path, timeouts=at_once) as suites:
         assert suites.env.call("origin") == ("a source",)
-    remove_tree(cache_root() / "wheels")
+    assert kept.exists(), "it was built again"
+    remove_tree(kept.parent)
     remove_tree(cache_root() / "environments")
     real_index.replaced["sourced-1.0.tar.gz"] = b"another"
     with pytest.raises(PackageIntegrityError, match="it was replaced"):
