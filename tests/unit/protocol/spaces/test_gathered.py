@@ -136,10 +136,11 @@ _ODD = st.sampled_from(
     ]
 )
 _KEYS = st.sampled_from([None, 0, 1.5, "", "_", "x", "_x", "__x", b"x", ("x",)])
-_LIES = st.dictionaries(_KEYS, st.recursive(_ODD, lambda some: st.dictionaries(_KEYS, some)))
+_DEEPER = st.recursive(_ODD, lambda some: st.dictionaries(_KEYS, some, max_size=3), max_leaves=8)
+_LIES = st.dictionaries(_KEYS, _DEEPER, max_size=5)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(st.lists(_LIES, min_size=2, max_size=4))
 def test_nothing_that_is_let_in_keeps_others_back(lies: list[dict[Any, Any]]) -> None:
     """Whatever workers say, if it has a row for each of their sub-environments, it is gathered."""
