@@ -75,6 +75,18 @@ def why_file_unwritable(error: BaseException, root: str) -> str:
     )
 
 
+def why_no_terminal(error: BaseException) -> str:
+    """A sentence for an error about a pseudo terminal, which names none; empty for any other."""
+    name = str(getattr(error, "filename", ""))
+    asked = name.startswith(("/dev/ptmx", "/dev/tty")) or "pty devices" in str(error)
+    if not isinstance(error, OSError) or not asked:
+        return ""
+    return (
+        'A jail of profile "strict" has at most 64 pseudo terminals, one of another profile has '
+        "none; no jail has /dev/tty"
+    )
+
+
 def _place(path: str, root: str) -> str:
     if root and _within(path, root):
         return "the repository"

@@ -18,7 +18,7 @@ import gymnasium as gym
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
-from envhub_worker.file_access import why_file_hidden, why_file_unwritable
+from envhub_worker.file_access import why_file_hidden, why_file_unwritable, why_no_terminal
 from envhub_worker.protocol.codec.wire import GENERATOR, SPACE, SPEC
 from envhub_worker.protocol.errors import EnvHubError
 from envhub_worker.protocol.messages import RaisedException
@@ -66,7 +66,7 @@ def raised(error: BaseException, stage: str, root: str = "") -> RaisedException:
         denied = PermissionError(f"{_text(error)}, but {hidden}")
         error = denied.with_traceback(error.__traceback__)
     with contextlib.suppress(Exception):  # the error may be of a class of the repository's
-        why = _usage(error) or why_file_unwritable(error, root)
+        why = _usage(error) or why_no_terminal(error) or why_file_unwritable(error, root)
     kind = type(error)
     name = kind.__qualname__
     if kind.__module__ not in ("builtins", "__main__"):
