@@ -323,13 +323,3 @@ def test_the_files_that_a_page_on_the_inside_names_are_there(page: str) -> None:
     named = re.findall(r"`([a-z_/-]+\.py)`", text)
     assert named
     assert [one for one in named if not any(file.endswith(f"/{one}") for file in files)] == []
-
-
-def test_the_tests_that_ci_names_are_there() -> None:
-    """A name of what has moved would end a step, or leave nothing out."""
-    printed = 'printf "%s\\n" "${differs_by_user[@]}" "${same_for_versions[@]}"'
-    command = ["bash", "-euc", f". .ci/lib.sh; {printed}"]
-    done = subprocess.run(command, cwd=CHECKOUT, capture_output=True, text=True, check=True)
-    named_tests = done.stdout.split()
-    assert len(named_tests) > 20
-    assert [name for name in named_tests if not (CHECKOUT / name).exists()] == []
