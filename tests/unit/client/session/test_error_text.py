@@ -62,7 +62,7 @@ def test_the_authors_last_line_is_in_the_text(snapshot: Snapshot, place: str, st
     assert 'File "/usr/lib/python3/numpy/linalg.py", line 561' in notes(error)
     remote = error if stage == "step" else error.__cause__
     assert isinstance(remote, errors.RemoteEnvError)
-    assert remote.where == last
+    assert (remote.where, remote.file, remote.line) == (last, "lib/a.py", 2)
     assert remote.traceback.rstrip() in notes(error)
     before = str(error), notes(error)
     add_author_line(error, snapshot)
@@ -82,6 +82,8 @@ def test_only_files_of_the_snapshot_are_pointed_at(name: str) -> None:
     """A worker fills in which of them; it cannot send the reader anywhere else."""
     error = failed(f'Traceback:\n  File "{name}", line 3, in x\n    y\nValueError: no\n')
     assert str(error) == "ValueError: no"
+    assert isinstance(error, RemoteEnvError)
+    assert (error.file, error.line) == ("", 0)
 
 
 @pytest.mark.parametrize(
