@@ -165,7 +165,7 @@ result = {
     assert {"passwd", "group", "hosts"} <= set(seen["etc"])
     assert not {"shadow", "ssh", "sudoers", "machine-id"} & set(seen["etc"])
     nodes = {"null", "full", "random", "urandom"}
-    assert set(seen["dev"]) == nodes | {"fd", "stdin", "stdout", "stderr", "shm"}
+    assert set(seen["dev"]) == nodes | {"fd", "stdin", "stdout", "stderr", "shm", "pts", "ptmx"}
     assert seen["net"] == ["lo"]
     assert max(seen["pids"]) < 100
     assert os.getpid() in unconfined(source)["result"]["pids"]
