@@ -13,6 +13,7 @@ from __future__ import annotations
 import contextlib
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, TypeVar
 
 from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError
@@ -516,12 +517,20 @@ class Requests(RequestOrder):
 
     def _infos_apart(self, deadline: Deadline) -> dict[Any, Any]:
         """The last infos once more, of shards whose infos do not fit together."""
-        return self.results.joined_own(self.own_infos(deadline))
+        own = self.own_infos(deadline)
+        try:
+            return self.results.joined_own(own)
+        except RemoteEnvError:
+            self.own_infos(deadline, failed=True)
+            raise
 
-    def own_infos(self, deadline: Deadline) -> list[m.Value]:
-        """The last infos of each sub-environment as it gave them, by shards."""
+    def own_infos(self, deadline: Deadline, *, failed: bool = False) -> list[m.Value]:
+        """The last infos of each sub-environment as it gave them, by shards.
+
+        ``failed`` tells them that those could not be joined; then there are none.
+        """
         lane = self._lane()
-        self._send("step", lane.send_for_infos)
+        self._send("step", partial(lane.send_for_infos, failed=failed))
         try:
             replies = self._finish(lane.replies, deadline)
         except RunnersDiedError as deaths:
@@ -529,10 +538,10 @@ class Requests(RequestOrder):
             raise deaths.first from None
         return all_replies(replies, m.Value)
 
-    def checked_own_infos(self, deadline: Deadline) -> list[m.Value]:
+    def checked_own_infos(self, deadline: Deadline, *, failed: bool = False) -> list[m.Value]:
         """``own_infos`` of one worker of several: one that gives those of others is given up."""
         with self.use.judging("a request"):
-            replies = self.own_infos(deadline)
+            replies = self.own_infos(deadline, failed=failed)
             self.results.own_pairs(replies)
             return replies
 

@@ -166,13 +166,15 @@ class Lane:
             raise
         self._sending = False
 
-    def send_for_infos(self) -> None:
+    def send_for_infos(self, *, failed: bool = False) -> None:
         """Ask for the last infos as each sub-environment gave them; ``replies`` has them.
+
+        Or say that the step has ``failed``, since those cannot be joined.
 
         Raises:
             EnvHubError: Nothing was sent.
         """
-        packed = [self.jail.pack(m.FetchInfosApart(self.number))] * len(self.runners)
+        packed = [self.jail.pack(m.FetchInfosApart(self.number, failed))] * len(self.runners)
         self.send_some("step", self.runners, packed)
 
     def replies(self, deadline: Deadline) -> list[Any]:

@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import pytest
-from gymnasium.vector import SyncVectorEnv
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
 
 from envhub_sandbox import SandboxEnv, make_env
 from envhub_sandbox.errors import RemoteEnvError
@@ -129,14 +129,17 @@ class Tells(gym.Env[Any, Any]):
         return 0, self.infos
 
     def step(self, action: Any) -> Any:
-        return 1, 0.0, False, False, self.infos
+        return 1, 0.0, len(self.infos) > 1, False, self.infos
 
 
-@pytest.mark.parametrize(
+SEVERAL = pytest.mark.parametrize(
     "options",
     [{"num_workers": 3}, {"num_workers": 3, "lane": "frames"}, {"sandbox": ["process"] * 2}],
     ids=str,
 )
+
+
+@SEVERAL
 def test_classes_that_the_wire_changes_decide_as_in_gymnasium(options: dict[str, Any]) -> None:
     """Which column a value makes, what a mask is called, and what rows without it hold."""
     for name, rows in BY_ROW.items():
@@ -147,3 +150,19 @@ def test_classes_that_the_wire_changes_decide_as_in_gymnasium(options: dict[str,
                 expected = getattr(reference, name_of_call)(*args)[-1]
                 infos = getattr(env, name_of_call)(*args)[-1]
                 assert_same(without_members(expected), infos, name)
+
+
+@SEVERAL
+def test_a_step_whose_infos_cannot_be_joined_notes_no_end(options: dict[str, Any]) -> None:
+    """With autoreset disabled the next step is one, as in Gymnasium."""
+    make = [lambda row=row: Tells({"b": row}) for row in range(3)]
+    mode: dict[str, Any] = {"autoreset_mode": AutoresetMode.DISABLED}
+    reference = SyncVectorEnv(make, **mode)
+    with by_value(), contextlib.closing(vector(make, options=options, **mode)) as env:
+        for one in (reference, env):
+            one.reset()
+            one.set_attr("infos", [{"a": 1}, {"a": 2}, {"a": "text", "ends": True}])
+            with pytest.raises(ValueError, match="text"):
+                one.step([0] * 3)
+            one.set_attr("infos", {"a": 3})
+        assert_same(reference.step([0] * 3), env.step([0] * 3))

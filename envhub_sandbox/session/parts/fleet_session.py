@@ -19,7 +19,12 @@ from itertools import chain
 from time import perf_counter_ns
 from typing import Any, TypeVar
 
-from envhub_sandbox.errors import LocalProtocolError, WorkerError, WorkerTimeoutError
+from envhub_sandbox.errors import (
+    LocalProtocolError,
+    RemoteEnvError,
+    WorkerError,
+    WorkerTimeoutError,
+)
 from envhub_sandbox.session.counters import LEDGER, FleetCounters, Labels
 from envhub_sandbox.session.crash.history import History
 from envhub_sandbox.session.env_session import GRACE_S, EnvSession
@@ -338,7 +343,11 @@ class FleetRequests(RequestOrder):
     def _infos_apart(self, deadline: Deadline) -> dict[Any, Any]:
         """The last infos once more, of all parts: theirs do not fit together."""
         own = self._of_all(lambda at: self._each[at].checked_own_infos(deadline))
-        infos = self.results.joined_own([reply for some in own for reply in some])
+        try:
+            infos = self.results.joined_own([reply for some in own for reply in some])
+        except RemoteEnvError:
+            self._of_all(lambda at: self._each[at].checked_own_infos(deadline, failed=True))
+            raise
         pairs = zip(self._each, self.results.bounds, strict=True)
         fresh = [bounds for one, bounds in pairs if one.came_back]
         return mark_revived(infos, self.results.count, fresh) if fresh else infos

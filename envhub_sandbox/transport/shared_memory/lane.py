@@ -284,10 +284,10 @@ class SharedMemoryLane(Lane):
         """See ``Lane``."""
         self.observations.leave()
 
-    def send_for_infos(self) -> None:
+    def send_for_infos(self, *, failed: bool = False) -> None:
         """See ``Lane``."""
         self._asked = _BY_SERVER
-        super().send_for_infos()
+        super().send_for_infos(failed=failed)
 
     def replies(self, deadline: Deadline) -> list[m.Message]:
         """See ``Lane``."""

@@ -239,6 +239,9 @@ class Runner:
         env = self._envs[request.env]
         if not isinstance(env, SubEnvs):
             return m.Value(())
+        if request.failed:
+            env.forget_ends()
+            return m.Value(())
         # arrays without their class, as in a column: a masked one would be a text
         each = ((index, taken(info), batches.forms_of(info)) for index, info in env.pairs)
         return m.Value(tuple(each))

@@ -406,9 +406,13 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
         except Exception:
             if self.sliced:
                 return dict(batches.APART)
-            if self._sync:  # whose step ends here, before it notes what has ended
-                self._done = self._done_before
+            self.forget_ends()
             raise
+
+    def forget_ends(self) -> None:
+        """The infos cannot be joined: ``SyncVectorEnv`` fails before it notes what has ended."""
+        if self._sync:
+            self._done = self._done_before
 
     def _copier(self) -> Callable[[Any], Any] | None:
         """What keeps an info as it is, where a sibling that comes next may fill the same."""

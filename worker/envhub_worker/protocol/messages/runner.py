@@ -203,9 +203,13 @@ class Revive(Message, kind=84):
 
 
 class FetchInfosApart(Message, kind=85):
-    """Ask for the last infos as each sub-environment gave them. Reply: ``Value`` of pairs."""
+    """Ask for the last infos as each sub-environment gave them. Reply: ``Value`` of triples.
+
+    ``failed``: those cannot be joined, and the step that they are of has failed. None are sent.
+    """
 
     env: int
+    failed: bool = False
 
 
 class TakeApart(Message, kind=93):
