@@ -32,6 +32,7 @@ class FakeLane:
         count: How many sub-environments it has.
 
     Attributes:
+        infos: Of the next steps.
         sent: The messages that came, in order.
         answer: What a request other than a reset is answered.
         fails: Raised by the next wait.
@@ -50,6 +51,7 @@ class FakeLane:
         self.jail = JailHandle(cast("Any", client), 1, [1], [], DEFAULT_LIMITS)
         self.runners, self.number, self.elapsed_ns = [1], 7, 1
         self._count = count
+        self.infos: dict[Any, Any] = {}
         self.sent: list[m.Message] = []
         self.answer: m.Message = m.Value((None,) * NUM_ENVS)
         self.fails: BaseException | None = None
@@ -95,7 +97,7 @@ class FakeLane:
 
     def result(self, infos: dict[Any, Any] | None = None) -> StepResult:
         no = np.zeros(self._count, np.bool_)
-        return _observation(self._count), np.zeros(self._count), no, no, {}
+        return _observation(self._count), np.zeros(self._count), no, no, self.infos
 
     def replies(self, deadline: Deadline) -> list[m.Message]:
         asked = self.owed

@@ -9,6 +9,8 @@ import pytest
 
 from envhub_sandbox.errors import (
     LocalProtocolError,
+    RemoteEnvError,
+    RemoteProtocolError,
     WorkerDiedError,
     WorkerError,
 )
@@ -85,17 +87,50 @@ def test_one_sub_environment_is_asked_of_its_worker_alone(
         requests.ask_one("act", 1, message)
 
 
+# --- What was sent to workers and not received
+
+
+@pytest.fixture
+def flight(session: FleetSession) -> InFlight:
+    return InFlight(session.requests, session.parts)
+
+
+def send(flight: InFlight, *ids: int) -> None:
+    rows = flight.rows(list(ids))
+    flight.send(rows, np.zeros(len(ids), np.int64))
+
+
+def received(flight: InFlight, min_ready: int = 1) -> list[int]:
+    found: list[int] = flight.recv(min_ready, 0).env_ids.tolist()
+    return found
+
+
 def test_a_torn_connection_is_refused_until_a_reset(
-    session: FleetSession, lanes: list[FakeLane]
+    flight: InFlight, lanes: list[FakeLane]
 ) -> None:
     """What the next message would be taken for is not known; nothing more is sent or taken."""
-    flight, action = InFlight(session.requests, session.parts), np.zeros(1, np.int64)
-    flight.send(flight.rows([0, 1]), ACTIONS)
+    send(flight, 0, 1)
     lanes[1].jail.client.torn = True
     with pytest.raises(WorkerError, match="interrupted"):
         flight.recv(1, 0)
     with pytest.raises(WorkerError, match="interrupted"):
-        flight.send(flight.rows([0]), action)
+        send(flight, 0)
     flight.drop()
     assert lanes[0].owed is None
     assert lanes[1].owed is not None, "a reset gives it up"
+
+
+def test_infos_that_break_a_rule_end_their_worker_alone(
+    flight: InFlight, lanes: list[FakeLane], session: FleetSession
+) -> None:
+    lanes[0].infos = {"x": [1]}
+    send(flight, 0, 1)
+    with pytest.raises(RemoteProtocolError):
+        flight.recv(2, 0)
+    assert [part.lifecycle.state for part in session.parts] == [State.DEAD, State.PENDING]
+    assert received(flight, 2) == [1]
+    lanes[1].infos = {None: None}
+    send(flight, 1)
+    with pytest.raises(RemoteEnvError, match="do not go together"):  # as Gymnasium's
+        flight.recv(1, 0)
+    assert session.parts[1].lifecycle.state is State.READY
