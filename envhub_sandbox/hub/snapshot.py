@@ -99,25 +99,6 @@ def _warn_of_two_meanings(reference: str) -> None:
         )
 
 
-def commit_of(reference: str, *, allow_secrets: bool = False, **hub: Any) -> str:
-    """The commit that a reference means now; raises as ``snapshot_named`` does.
-
-    Nothing is downloaded or copied, and a full commit costs no request. Whether it has the entry
-    file is not looked at.
-    """
-    if is_here(reference):
-        from envhub_sandbox.hub.local import split_local
-
-        _, listing = split_local(reference).listed(allow_secrets=allow_secrets)
-        return f"{FOLDER}-{content_digest(listing.records)}"
-    ref = HubRef.parse(reference)
-    if ref.repo_type == registered.KIND:
-        return fetch(ref).commit
-    if ref.is_pinned and ref.revision is not None:
-        return ref.revision
-    return _first(_candidates(ref, **hub), _Candidate.resolved)
-
-
 def fetch(
     ref: HubRef,
     *,

@@ -13,7 +13,7 @@ import pytest
 
 from envhub_sandbox.errors import RepositoryUnavailableError
 from envhub_sandbox.hub.reference import HubRef
-from envhub_sandbox.hub.snapshot import Snapshot, commit_of, fetch
+from envhub_sandbox.hub.snapshot import Snapshot, fetch
 from tests.hub.olah_server import GitRepository, OlahServer
 from tests.hub.stub_hub import git_blob_id
 
@@ -143,23 +143,6 @@ def test_branch_is_asked_for_every_time(olah: OlahServer, get: Fetch) -> None:
     assert len(olah.requests()) == before + 1
     repository.commit({"env.py": "2"})
     assert contents(get("org/moving")) == {"env.py": b"2"}
-
-
-def test_a_commit_is_named_without_a_download(
-    olah: OlahServer, get: Fetch, hub_cache: Path
-) -> None:
-    """What a branch means now; a full commit means itself, also where there is no Hub."""
-    repository = make(olah, "named")
-    where = {"hub_cache_dir": hub_cache, "token": False, "endpoint": olah.endpoint}
-    first = repository.commit(FILES)
-    assert commit_of("org/named", **where) == first
-    second = repository.commit({"env.py": "# changed"})
-    assert commit_of("org/named@main", **where) == second
-    assert commit_of(f"org/named@{first}", endpoint="http://127.0.0.1:1") == first
-    assert not list(hub_cache.rglob("env.py"))
-    assert get("org/named").commit == second
-    with pytest.raises(RepositoryUnavailableError):
-        commit_of("org/nowhere", **where)
 
 
 def test_missing_entry_lists_the_python_files_before_downloading(

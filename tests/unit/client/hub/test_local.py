@@ -26,11 +26,9 @@ from envhub_sandbox.hub.local import LeftOut, split_local
 from envhub_sandbox.hub.snapshot import (
     Snapshot,
     SnapshotLimits,
-    commit_of,
     is_here,
     local,
     snapshot_named,
-    store,
 )
 from tests.support.interpreter import needs
 
@@ -132,17 +130,6 @@ def test_a_folder_that_is_here_comes_before_the_hub(
     assert not any(map(is_here, others))
 
 
-def test_a_folders_commit_is_named_without_a_copy(folder: Path) -> None:
-    (folder / "new.py").write_text("new = 1")
-    named = commit_of(str(folder))
-    alone = commit_of(f"{folder}/new.py")
-    assert named == commit_of(f"{folder}:new.py") != alone
-    assert store.commits(store.folder_of("local")) == []
-    assert (local(folder).commit, local(folder / "new.py").commit) == (named, alone)
-    (folder / "new.py").write_text("new = 2")
-    assert commit_of(str(folder)) != named
-
-
 @pytest.mark.parametrize("path", ["envs.py", "../my-env/env.py", "/etc/passwd", "sub"])
 def test_missing_entry_lists_the_python_files(folder: Path, path: str) -> None:
     """And a missing folder the forms that exist."""
@@ -236,7 +223,7 @@ def test_programs_stay_programs(folder: Path) -> None:
     (folder / "sub/other.py").chmod(0o755)
     snapshot = local(folder)
     assert [one.executable for one in snapshot.files] == [False, True]
-    assert snapshot.commit == commit_of(str(folder)) != plain.commit
+    assert snapshot.commit != plain.commit
     program = snapshot.root / "sub/other.py"
     assert [path.stat().st_mode & 0o777 for path in (snapshot.root / "env.py", program)] == [
         0o444,
