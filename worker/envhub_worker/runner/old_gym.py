@@ -338,6 +338,8 @@ def explained(error: Exception, env: Any, method: str) -> Exception:
     text = str(error)
     unpacked = "to unpack" in text or "cannot unpack" in text
     frames = traceback.extract_tb(error.__traceback__)
+    if frames and frames[-1].name == f"env_{method}_passive_checker":  # of what it returned
+        return returned.raised_at(error, env, method)
     function = getattr(getattr(type(env.unwrapped), method, None), "__code__", None)
     theirs = any(function and one.filename == function.co_filename for one in frames)
     if function is None or theirs or not unpacked:

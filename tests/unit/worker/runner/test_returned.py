@@ -155,3 +155,11 @@ def test_what_gymnasium_accepts_is_not_refused(seen: Any, later: Any) -> None:
     each = zip([batch.rewards, batch.terminations, batch.truncations], numbers, strict=True)
     assert batch.observation().tobytes() == seen.tobytes()
     assert all(one.tobytes() == other.tobytes() for one, other in each)
+
+
+def test_what_gymnasiums_checker_refuses_leads_to_the_method() -> None:
+    """It is in environments of ``gymnasium.make``, and looks at what has been returned."""
+    checked = gym.wrappers.PassiveEnvChecker
+    env = SubEnvs([lambda: checked(Returning(BOX, SEEN, *whole(), info=[1]))], "NextStep", True)
+    frames = traceback.extract_tb(raised(env, AssertionError).__traceback__)
+    assert [one.name for one in frames if one.filename == __file__][-1] == "step"
