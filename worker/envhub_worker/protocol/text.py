@@ -80,7 +80,7 @@ def parse_size(text: str, unit: str = "") -> int:
         raise ValueError(f"it takes {SIZES}")
     number, prefix, rest = found.groups()
     size = int(float(number) * 1024 ** " kmgt".index(prefix or ("" if rest else unit) or " "))
-    if not (prefix or rest or unit) and size < _LEAST_BARE:
+    if not (prefix or rest or unit) and 0 < size < _LEAST_BARE:
         raise ValueError(
             f"that is {size_text(size)}: name a unit, {number}M, {number}G or {number}B"
         )
