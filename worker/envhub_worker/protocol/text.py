@@ -22,7 +22,7 @@ def printable(text: str, limit: int = 16_384) -> str:
         text = (
             f"{text[:half]}\n[... {len(text) - 2 * half} characters left out ...]\n{text[-half:]}"
         )
-    if text.isprintable():
+    if text.replace("\n", "").replace("\t", "").isprintable():  # as most tracebacks are
         return text
     return "".join(char if char in _KEPT or char.isprintable() else _escaped(char) for char in text)
 
