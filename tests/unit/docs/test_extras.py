@@ -1,0 +1,156 @@
+"""The core imports no extra, but for what the list still permits, and an extra few others.
+
+The core is what a newcomer reads: processes as the sandbox, the Hub and folders, both lanes,
+Gymnasium's interface, the confinement. Each extra is a feature that the core could do without.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from graphlib import TopologicalSorter
+
+import pytest
+
+from tests.unit.docs.test_imports import below, imported, modules
+
+pytestmark = pytest.mark.same_for("users", "versions")
+
+# Each extra, and the packages and modules of it. Whatever is named in none of them is core.
+EXTRAS = {
+    "check": {
+        *("envhub_sandbox.check", "envhub_sandbox.cli.check"),
+        *("envhub_sandbox.cli.diff", "envhub_sandbox.cli.init"),
+    },
+    "crash": {"envhub_sandbox.cli.replay", "envhub_sandbox.session.crash"},
+    "denials": {f"envhub_worker.lockdown.seccomp.{name}" for name in ("evidence", "notify")},
+    "docker": {"envhub_sandbox.cli.image", "envhub_sandbox.sandboxes.docker"},
+    "fleet": {
+        *("envhub_sandbox.sandboxes.fleet", "envhub_sandbox.session.parts"),
+        "envhub_sandbox.vector.send_recv",
+    },
+    "libraries": {"envhub_sandbox.integrations"},
+    "old gym": {"envhub_worker.runner.old_gym"},
+    "packages": {
+        *("envhub_sandbox.cli.download", "envhub_sandbox.cli.lock", "envhub_sandbox.dependencies"),
+    },
+    "ray": {"envhub_sandbox.sandboxes.ray"},
+    "remote": {
+        *(f"envhub_sandbox.sandboxes.{name}" for name in ("remote", "remote_keys")),
+        *("envhub_sandbox.sandboxes.remote_repository", "envhub_sandbox.transport.tcp"),
+        "envhub_worker.access",
+        *(f"envhub_worker.cli.{name}" for name in ("drain", "health", "http_port", "identity")),
+        *(f"envhub_worker.cli.{name}" for name in ("keygen", "listen", "listen_options")),
+        *(f"envhub_worker.cli.{name}" for name in ("metrics", "state_folder", "status")),
+    },
+    "served steps": {
+        "envhub_sandbox.transport.shared_memory.served_lane",
+        "envhub_worker.supervisor.served_slabs",
+    },
+    "sources": {  # of snapshots, beside the Hub and folders
+        *("envhub_sandbox.hub.git", "envhub_sandbox.hub.registered"),
+        "envhub_sandbox.hub.sources.assets",
+    },
+}
+# The extras that an extra may import.
+EXTRAS_OF_EXTRAS = {
+    "check": {"packages", "sources"},
+    "docker": {"packages", "remote"},
+    "fleet": {"crash", "packages", "remote"},
+    "packages": {"sources"},
+    "ray": {"packages", "remote"},
+    "remote": {"packages"},
+}
+# What modules of the core import of extras today, in the same package: this list only gets shorter.
+CORE_IMPORTS_EXTRAS = {
+    "envhub_sandbox.cli.cache": {
+        *("dependencies.builds.wheels", "dependencies.environments", "sandboxes.docker.leftovers"),
+    },
+    "envhub_sandbox.cli.doctor": {"cli.init", "sandboxes.docker.engines", "sandboxes.remote"},
+    "envhub_sandbox.cli.inspect": {
+        *("check.contents", "check.findings", "check.play.episodes", "check.reports"),
+        *("check.settings", "check.static", "cli.download"),
+    },
+    "envhub_sandbox.cli.run": {"check.play.episodes", "check.play.plays"},
+    "envhub_sandbox.cli.shared.console": {"check.play.episodes"},
+    "envhub_sandbox.cli.shared.exits": {"check.play.plays"},
+    "envhub_sandbox.cli.shared.findings": {"check.checks", "check.findings", "check.settings"},
+    "envhub_sandbox.cli.shared.options": {"hub.sources.assets"},
+    "envhub_sandbox.cli.shared.results": {"check.play.confinement", "check.play.episodes"},
+    "envhub_sandbox.factory.env_factory": {
+        *("dependencies.bounds", "session.crash.history", "session.parts.fleet_session"),
+    },
+    "envhub_sandbox.factory.make_env": {
+        *("dependencies.locks.lockfile", "dependencies.modules", "dependencies.packages"),
+        *("dependencies.request", "hub.sources.assets", "sandboxes.docker.sandbox"),
+        *("sandboxes.fleet.fleet", "sandboxes.ray.sandbox", "sandboxes.remote"),
+    },
+    "envhub_sandbox.hub.local": {"hub.git.checkout"},
+    "envhub_sandbox.hub.reference": {"hub.git.address", "hub.registered"},
+    "envhub_sandbox.hub.snapshot": {"hub.git.address", "hub.git.commits", "hub.registered"},
+    "envhub_sandbox.sandboxes.pool": {"transport.tcp"},
+    "envhub_sandbox.sandboxes.process": {"dependencies.packages"},
+    "envhub_sandbox.sandboxes.sandbox": {"dependencies.packages"},
+    "envhub_sandbox.session.builder": {"transport.shared_memory.served_lane"},
+    "envhub_sandbox.session.env_session": {"session.crash.history"},
+    "envhub_sandbox.session.failures": {"session.crash.history"},
+    "envhub_sandbox.session.prewarm": {"session.crash.history"},
+    "envhub_sandbox.session.recovery": {"session.crash.history"},
+    "envhub_sandbox.session.repository": {"session.crash.bundle_writer", "session.crash.history"},
+    "envhub_sandbox.session.requests": {"session.crash.history"},
+    "envhub_sandbox.transport.connection": {"transport.tcp"},
+    "envhub_sandbox.vector.sandbox_view": {"session.parts.fleet_session"},
+    "envhub_sandbox.vector.vector_env": {"session.parts.fleet_session", "vector.send_recv"},
+    "envhub_worker.__main__": {"cli.drain", "cli.health", "cli.keygen", "cli.listen", "cli.status"},
+    "envhub_worker.lockdown.seccomp.policy": {"lockdown.seccomp.evidence"},
+    "envhub_worker.lockdown.stages.runner": {"lockdown.seccomp.evidence"},
+    "envhub_worker.runner.recording": {"runner.old_gym"},
+    "envhub_worker.runner.sync_envs": {"runner.old_gym"},
+    "envhub_worker.runner.tasks": {"runner.old_gym"},
+    "envhub_worker.server": {"access.gate", "access.sessions"},
+    "envhub_worker.spawn.jail_init": {"lockdown.seccomp.evidence", "lockdown.seccomp.notify"},
+    "envhub_worker.supervisor.jail_events": {"supervisor.served_slabs"},
+    "envhub_worker.supervisor.jails": {"supervisor.served_slabs"},
+    "envhub_worker.supervisor.runner_stream": {"supervisor.served_slabs"},
+}
+
+
+def extra_of(module: str) -> str | None:
+    """The extra that a module belongs to; None of the core."""
+    for extra, parts in EXTRAS.items():
+        if any(below(module, part) for part in parts):
+            return extra
+    return None
+
+
+def imports_of_extras() -> Iterator[tuple[str, str]]:
+    """What imports a module of an extra that is not its own, and that module.
+
+    Without the package's public names: it finds these when they are used.
+    """
+    for name in modules().keys() - {"envhub_sandbox"}:
+        for target in imported(name) & modules().keys():
+            if extra_of(target) not in (None, extra_of(name)):
+                yield name, target
+
+
+def test_the_core_imports_no_further_extra() -> None:
+    """A new import of an extra is refused, and one that is gone leaves the list."""
+    found: dict[str, set[str]] = {}
+    for name, target in imports_of_extras():
+        if extra_of(name) is None:
+            found.setdefault(name, set()).add(target.partition(".")[2])
+    assert found == CORE_IMPORTS_EXTRAS
+
+
+def test_an_extra_imports_few_others() -> None:
+    found: dict[str, set[str]] = {}
+    for name, target in imports_of_extras():
+        if (extra := extra_of(name)) is not None:
+            found.setdefault(extra, set()).add(str(extra_of(target)))
+    assert found == EXTRAS_OF_EXTRAS
+    TopologicalSorter(found).prepare()  # raises CycleError
+
+
+def test_what_belongs_to_an_extra_exists() -> None:
+    """A name that is gone would leave its successor in the core."""
+    assert {part for parts in EXTRAS.values() for part in parts} <= modules().keys()
