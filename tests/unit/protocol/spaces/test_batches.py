@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import gymnasium as gym
@@ -233,3 +234,29 @@ def test_few_bytes_make_no_large_column() -> None:
     assert batches.join_pairs(pairs, 2, 2000)["a"].nbytes == 2000
     with pytest.raises(MessageTooLargeError):
         batches.join_pairs(pairs, 3, 2000)
+
+
+def test_many_entries_are_each_looked_at_once() -> None:
+    """A worker chooses how many columns of objects it sends, and the client joins each of them."""
+
+    class Counted(dict[str, Any]):
+        looks = 0
+
+        def __iter__(self) -> Iterator[str]:
+            for key in dict.__iter__(self):
+                self.looks += 1
+                yield key
+
+        def values(self) -> Any:
+            self.looks += len(self)
+            return dict.values(self)
+
+    column = np.array([None], object)
+    part = Counted({f"{number}": column for number in range(300)})
+    own = 300 * column.nbytes
+    assert batches.join_infos([part, {}], [1, 1], own).keys() == part.keys()
+    assert part.looks <= 2 * len(part)
+    with pytest.raises(batches.Misfit, match="more than"):  # the controls
+        batches.join_infos([part, {}], [1, 1], own - 1)
+    with pytest.raises(batches.Misfit, match="other shards may have None"):
+        batches.join_infos([{"_a": np.array([True]), "a": column}], [1])

@@ -240,13 +240,15 @@ class _Room:
     """What the columns of joined infos may take: see ``join_infos``."""
 
     def __init__(self, parts: Sequence[dict[Any, Any]], max_bytes: int | None) -> None:
-        self._parts, self._max_bytes, self._taken = parts, max_bytes, 0
+        self._parts, self._max_bytes, self._taken, self._own = parts, max_bytes, 0, 0
 
     def take(self, value: Any, count: int) -> None:
         """Before a column of such values is made."""
         self._taken += value.nbytes * count // len(value)
         most = self._max_bytes
-        if most is not None and self._taken > most and self._taken > most + _bytes(*self._parts):
+        if most is not None and self._taken > most:
+            self._own = self._own or _bytes(*self._parts)
+        if most is not None and self._taken > most + self._own:
             raise ValueError(f"they take more than {most} bytes beyond their own")
 
 
@@ -260,7 +262,9 @@ def _bytes(*parts: dict[Any, Any]) -> int:
 def _join_part(
     joined: dict[Any, Any], part: dict[Any, Any], window: slice, count: int, room: _Room
 ) -> None:
+    passed: set[Any] = set()
     for key, value in part.items():
+        passed.add(key)
         if type(key) is int and f"_{key}" not in part:
             raise ValueError("an entry has no mask")
         if isinstance(value, dict):
@@ -269,7 +273,8 @@ def _join_part(
         size = window.stop - window.start
         if len(value) != size:  # or its other dimensions cost nothing
             raise ValueError("an entry does not have one value per sub-environment")
-        if value.dtype == object and _is_after_mask(key, part):
+        # its mask came before it: see join_slice
+        if value.dtype == object and f"_{key}" in passed and f"__{key}" not in part:
             raise ValueError("an entry is 0 where other shards may have None")
         array = joined.get(key)
         if array is None:
@@ -368,12 +373,6 @@ def _blank(value: Any, count: int) -> Any:
     if value.dtype == object and value.ndim == 1:
         return np.full(count, None, dtype=object)
     return np.zeros((count, *value.shape[1:]), dtype=value.dtype)
-
-
-def _is_after_mask(key: Any, part: dict[Any, Any]) -> bool:
-    """Whether a slice says by the order that rows without an entry are 0: see ``join_slice``."""
-    mask = f"_{key}"
-    return f"_{mask}" not in part and next(k for k in part if k in (key, mask)) == mask
 
 
 Forms = dict[Any, Any]
