@@ -7,6 +7,7 @@ file that was changed: a pickle, an archive, or source of which not all was read
 
 from __future__ import annotations
 
+import codecs
 import difflib
 import itertools
 import re
@@ -102,7 +103,7 @@ def _files(then: Static, now: Static, other: Collection[str]) -> Iterator[Change
 def _changed_lines(then: Path, now: Path) -> tuple[str, ...]:
     """None of what is no text. Of a stranger's lines so few are compared that it takes no time."""
     try:
-        before, after = (bytes_of(path, _MOST_BYTES).decode().splitlines() for path in (then, now))
+        before, after = map(_lines, (then, now))
     except UnicodeDecodeError:
         return ()
     pairs = zip(before, after, strict=False)
@@ -113,9 +114,19 @@ def _changed_lines(then: Path, now: Path) -> tuple[str, ...]:
     old, new = (lines[start : start + _COMPARED] for lines in (before, after))
     found = difflib.unified_diff(old, new, lineterm="", n=_AROUND)
     lines = [printable(line, _WIDEST) for line in itertools.islice(found, 2, _MOST_LINES + 3)]
-    if len(lines) > _MOST_LINES or max(len(before), len(after)) > start + _COMPARED:
+    longest = max(path.stat().st_size for path in (then, now))
+    is_long = longest > _MOST_BYTES or max(len(before), len(after)) > start + _COMPARED
+    if is_long or len(lines) > _MOST_LINES:
         lines[_MOST_LINES:] = ["... there may be more, from here on not compared"]
     return tuple(lines)
+
+
+def _lines(path: Path) -> list[str]:
+    """Only a line feed ends one. ``splitlines`` would take a form feed, which is a blank to Python,
+    for the line feed that makes code of the rest of a comment.
+    """
+    text = codecs.getincrementaldecoder("utf-8")().decode(bytes_of(path, _MOST_BYTES))
+    return text.removesuffix("\n").split("\n") if text else []
 
 
 def _new(record: FileRecord, was: Mapping[str, str]) -> Change:

@@ -153,6 +153,20 @@ def test_what_is_the_same_differs_in_nothing(tmp_path: Path) -> None:
     assert (one.what, one.how, one.text) == ("file", "renamed", "b.txt: was a.txt")
 
 
+@pytest.mark.parametrize("blank", ["\f", "\x1c", "\x85", "\u2028"])
+def test_no_change_hides_behind_another(blank: str, tmp_path: Path) -> None:
+    """What ends no line for Python ends none here, and what is not read is not called equal."""
+    comment, code = (f"x = {x}\n#{end}import os\n" for x, end in ((1, blank), (2, "\n")))
+    assert "os" not in compile(comment, "", "exec").co_names, "the control: it is a comment"
+    assert "os" in compile(code, "", "exec").co_names
+    old, new = repository(tmp_path / "old", comment), repository(tmp_path / "new", code)
+    for folder, name in ((old, "old"), (new, "new")):
+        (folder / "long.txt").write_text(f"{name}\n{'é' * (1 << 19)}\n{name}\n", "utf-8")
+    entry, long = changes(static(local(old)), static(local(new)))[:2]
+    assert "+import os" in entry.lines
+    assert (entry.lines[-1], long.lines[-1][:17]) == ("+import os", "... there may be ")
+
+
 def test_each_change_is_told_as_what_it_is(tmp_path: Path) -> None:
     entry = _ENTRY.replace("import yaml", "import socket, torch").replace("size=8", "size=9")
     entry = entry.replace("'CartPole-v1'", "'Other-v1'")
