@@ -129,10 +129,10 @@ _STEPS = {
         "an end in an array": _LATE + "np.array([self.count >= 12])",
         "an end that is None": _LATE + "True if self.count >= 12 else None",
         "an end that is a number": _LATE + "int(self.count >= 12)",
-        "infos that are None": _INFO + "None",
     },
     "runs": {
         "infos that are a list": _INFO + "[1]",
+        "infos that are None": _INFO + "None",
         "four things of a step": _STEP
         + "one, two, three, _, five = super().step(action)\n    return one, two, three, five",
         "a step that raises": _STEP + "raise RuntimeError('it broke')",

@@ -1,7 +1,7 @@
 """What is wrong with a result that ``reset`` or ``step`` returned, and the line that returned it.
 
-Gymnasium writes results into arrays, whose errors name neither the call nor the space. By then the
-call is over, so its line is read off the source: no environment is called a second time.
+Gymnasium writes results into arrays, and numpy's errors name neither the call nor the space. The
+call is over by then, so the line is read from the source: no environment is called a second time.
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ def misfit(
     space: gym.Space[Any],
     reward_shape: tuple[int, ...] = (),
 ) -> Exception:
-    """The error of writing a result into a batch, as one that says what does not fit, and where.
+    """An error that says what does not fit, and where, in place of that of writing into a batch.
 
     Args:
-        index: Of the sub-environment, among all.
-        result: What it returned: observation and info, and between them what else is known.
-        space: Its observation space, as it was when it was made.
+        index: The sub-environment's, counted over all workers.
+        result: Observation and info; of a step also reward, terminated and truncated between them.
+        space: The observation space that the sub-environment had when it was made.
     """
     call = f"{method} of sub-environment {index} returned"
     for part, text in _misfits(call, env, index, result, space, reward_shape):
@@ -75,24 +75,18 @@ def _misfits(
 
 
 def misfit_in_vector(error: Exception, env: Any, method: str) -> Exception:
-    """Likewise of a vector environment that is derived from Gymnasium's, if an observation of one
-    of its sub-environments is what does not fit.
+    """The same for a vector environment of a class derived from Gymnasium's, if an observation of a
+    sub-environment does not fit.
     """
     with contextlib.suppress(Exception):
         for layer in _layers(env):
             members = zip(layer.envs, layer._env_obs, strict=True) if hasattr(layer, "envs") else ()
             for index, (member, observation) in enumerate(members):
                 space = layer.single_observation_space
-                told = misfit(error, member, method, index, (observation, {}), space)
-                if told is not error:
-                    return told
+                named = misfit(error, member, method, index, (observation, {}), space)
+                if named is not error:
+                    return named
     return error
-
-
-def check_info(info: Any) -> None:
-    """Raise ``TypeError`` if ``VectorEnv._add_info`` cannot take it."""
-    if not hasattr(info, "items"):
-        raise TypeError("the info is no dict")
 
 
 def _fits(value: Any, shape: tuple[int, ...], dtype: Any) -> bool:
@@ -104,7 +98,7 @@ def _fits(value: Any, shape: tuple[int, ...], dtype: Any) -> bool:
 
 
 def parts(space: Any, value: Any, path: str = "") -> Iterator[tuple[str, Any, str]]:
-    """The parts of an observation that cannot be written: path, space, and what is there."""
+    """The parts of an observation that cannot be written: path, space and description of each."""
     keys: Any = ()
     if isinstance(space, spaces.Dict):
         keys = space.spaces
@@ -125,7 +119,7 @@ def parts(space: Any, value: Any, path: str = "") -> Iterator[tuple[str, Any, st
 
 
 def _changed(env: Any, space: Any) -> str:
-    """What an environment says of its space now, if that is another one."""
+    """A clause about the environment's present space, if it differs from the first one."""
     try:
         now = env.observation_space
         return "" if now == space else f", and has become {one_line(str(now), _SPACE_CHARS)}"
@@ -138,9 +132,8 @@ def raised_at(
 ) -> Exception:
     """The error with the line of the method's ``return`` at the end of its traceback.
 
-    It is the method of the outermost layer whose code is neither ours nor Gymnasium's, since its
-    result was taken; of two ``return`` the one whose literals are in the result, or else the
-    method's first line.
+    The outermost layer whose code is neither ours nor Gymnasium's made the result. Of several
+    ``return`` the literals in them choose one; if they cannot, it is the method's first line.
     """
     with contextlib.suppress(Exception):  # it is an environment's, which may have any attribute
         for layer in _layers(env):
@@ -160,7 +153,7 @@ def _layers(env: Any) -> Iterator[Any]:
 
 
 def _passed_on(result: Sequence[Any]) -> Sequence[Any]:
-    """What no wrapper of Gymnasium's changes: only whether an episode has terminated."""
+    """The result without what Gymnasium's wrappers may have changed: ``terminated`` alone stays."""
     return [value if at == 2 else ... for at, value in enumerate(result)]
 
 
@@ -196,7 +189,7 @@ def _is_of(node: Any, code: CodeType) -> bool:
 
 
 def _returns(function: Any) -> Iterator[ast.Return]:
-    """Its own ones."""
+    """The ``return`` statements of a function, without those of functions inside it."""
     for node in ast.iter_child_nodes(function):
         if isinstance(node, ast.Return):
             yield node

@@ -234,8 +234,9 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
                 observation, info = self.driven[index].reset(seed=seed, options=options)
                 result = (observation, info)
                 self.batch.store(index, observation)
+                if type(info) is not dict:
+                    self._check_info(info)
                 if info:
-                    returned.check_info(info)
                     infos.append((index, copied(info) if copied else info))
             except Exception as error:
                 self._refuse(error, index, "reset", result)
@@ -320,9 +321,9 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
                     row[...] = observation
                 else:
                     store(index, observation)
+                if type(info) is not dict:
+                    self._check_info(info)
                 if info:
-                    if type(info) is not dict:
-                        returned.check_info(info)
                     infos.append((index, copied(info) if copied else info))
         except BaseException as error:
             batch.carry(index)  # who was not asked any more has his last observation still
@@ -355,6 +356,12 @@ class SubEnvs(SyncBase):  # type: ignore[misc]
     def resets_nothing(self) -> bool:
         """Whether an episode that has ended stays so until a reset is asked for."""
         return self._mode == "Disabled"
+
+    def _check_info(self, info: Any) -> None:
+        """Raise ``TypeError`` if ``VectorEnv._add_info`` cannot take it."""
+        empty = self._single and not info  # nothing is joined, and None says as much as {}
+        if not empty and not hasattr(info, "items"):
+            raise TypeError("the info is no dict")
 
     def _refuse(
         self, error: Exception, index: int, method: str, result: Sequence[Any] = ()

@@ -26,7 +26,7 @@ class Returning(gym.Env[Any, Any]):
 
     def __init__(self, space: Any, first: Any, *later: Any, info: Any = None) -> None:
         self.observation_space = space
-        self.first, self.later, self.info = first, later, info or {}
+        self.first, self.later, self.info = first, later, {} if info is None else info
 
     def reset(self, *, seed: Any = None, options: Any = None) -> Any:
         return self.first, {}  # first
@@ -64,7 +64,7 @@ KINDS: dict[str, tuple[Any, Any, tuple[Any, ...], Any, str, str]] = {
     "the space": (BOX, BOX, whole(), None, "first",
         "reset of sub-environment 0 returned the space Box(-10.0, 10.0, (4,), float32), its"),
     "nothing": (BOX, SEEN, whole(None), None, "later",
-        "step of sub-environment 0 returned NoneType None, its observation_space is Box(-10.0"),
+        "step of sub-environment 0 returned None, its observation_space is Box(-10.0"),
     "agents": (BOX, SEEN, whole(AGENTS), None, "later",
         "returned dict with 'agent_0', 'agent_1', its observation_space is Box(-10.0"),
     "a key too few": (NESTED, {"near": SEEN}, whole(), None, "first",
@@ -82,6 +82,8 @@ KINDS: dict[str, tuple[Any, Any, tuple[Any, ...], Any, str, str]] = {
         "step of sub-environment 0 returned bool (2,) as terminated, which has to be one bool"),
     "a list of infos": (BOX, SEEN, whole(), [1], "later",
         "step of sub-environment 0 returned list [1] as info, which has to be a dict"),
+    "no infos": (BOX, SEEN, whole(), (), "later",
+        "step of sub-environment 0 returned tuple () as info, which has to be a dict"),
 }  # fmt: skip
 
 

@@ -177,6 +177,8 @@ def shown(value: Any) -> str:
     if hasattr(value, "dtype") and hasattr(value, "shape"):
         kind = "" if isinstance(value, (np.ndarray, np.generic)) else f"{type(value).__name__} "
         return one_line(f"{kind}{value.dtype} {tuple(value.shape)}", _SHOWN)
+    if value is None:
+        return "None"
     if type(value) is dict:
         return f"dict with {one_line(', '.join(map(repr, itertools.islice(value, _KEYS))), _SHOWN)}"
     inert = inert_copy(value)
