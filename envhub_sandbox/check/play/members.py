@@ -28,9 +28,11 @@ class OutsideSpaceError(Exception):
 def check_observations(
     env: VectorEnv[Any, Any, Any], operation: str, observations: Any, final_obs: Any = None
 ) -> None:
-    """Raise ``OutsideSpaceError``; also for what ended in this step. Trust: the worker's values."""
+    """Raise ``OutsideSpaceError`` if an observation, or one in ``final_obs``, is outside its space.
+    Trust: the values are the worker's.
+    """
     single, batched = env.single_observation_space, env.observation_space
-    if not batches.is_batch(batched, single, env.num_envs):  # a vector environment's own batch
+    if not batches.is_batch(batched, single, env.num_envs):  # the repository's own vector class
         _check(batched, operation, {0: observations})
     elif isinstance(single, OpaqueSpace):
         return  # its members are not known here
@@ -38,7 +40,7 @@ def check_observations(
         try:
             each = batches.members(single, batched, observations, env.num_envs)
             members = dict(enumerate(each))
-        except Exception as error:  # a vector environment of the repository's own returned it
+        except Exception as error:  # from a vector class of the repository's own
             seen = batches.shown(observations)
             text = f"{operation} returned {seen}, which is no batch of observations for {batched}"
             raise OutsideSpaceError(text) from error
