@@ -66,6 +66,13 @@ _COMMANDS: dict[str, tuple[str, str | Where]] = {
     "image": ("Build container images for repositories.", {"build": "image:build"}),
 }
 
+_REPLACED = {
+    "push": "envhub check . && hf upload OWNER/NAME .",
+    "verify": "envhub lock --check FILE",
+    "prefetch": "envhub inspect --download REF",
+}
+"""What to use instead of commands that there were."""
+
 
 class Program(TyperGroup):
     """``envhub``: CI systems obey nothing of what it prints, usage errors included.
@@ -82,6 +89,8 @@ class Program(TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """The command that is called, with its options."""
+        if args[0] in _REPLACED:
+            ctx.fail(f"There is no command {args[0]!r} any more: use '{_REPLACED[args[0]]}'.")
         if args[0] in _COMMANDS:
             self.commands[args[0]] = whole_command(args[0])
         return super().resolve_command(ctx, args)
@@ -99,12 +108,12 @@ class Program(TyperGroup):
 
     def invoke(self, ctx: Any) -> Any:
         """Parse a command's options, and call it."""
-        with _wrong_usage():
+        with _wrong_usage(ctx):
             return super().invoke(ctx)
 
 
 @contextlib.contextmanager
-def _wrong_usage() -> Iterator[None]:
+def _wrong_usage(ctx: Any = None) -> Iterator[None]:
     """Report what the parser refuses as every other error: one message, without a box."""
     try:
         yield
@@ -114,7 +123,9 @@ def _wrong_usage() -> Iterator[None]:
         if not text:  # another error; or a command without arguments, which prints its help
             raise
         end = "" if text[-1] in ".?!)" else "."
-        path = getattr(getattr(error, "ctx", None), "command_path", "envhub")
+        # an option without its value has no context: the command is known by its name
+        command = " ".join(filter(None, ["envhub", getattr(ctx, "invoked_subcommand", None)]))
+        path = getattr(getattr(error, "ctx", None), "command_path", command)
         said = f"{text}{end} Try '{path} --help'."
         say(f"Error: {said}", style="red")
         print_json_error("UsageError", said, Exit.USAGE)

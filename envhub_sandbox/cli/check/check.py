@@ -251,11 +251,13 @@ def _refuse_beside_a_list(*, ref: str | None, **files: Path | None) -> None:
 
 def _known(names: Sequence[str]) -> Sequence[str]:
     from envhub_sandbox.check.checks import CHECKS
+    from envhub_sandbox.settings.options import nearest
 
     for name in names:
         if name not in CHECKS:
             raise UsageError(
-                f"--allow {name!r}: there is no such check; there are: {', '.join(CHECKS)}"
+                f"--allow {name!r}: there is no such check{nearest(name, CHECKS)}; there are: "
+                f"{', '.join(CHECKS)}"
             )
     return names
 

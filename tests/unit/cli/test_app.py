@@ -185,15 +185,21 @@ def test_nothing_is_folded(capsys: pytest.CaptureFixture[str], monkeypatch: Any)
 @pytest.mark.parametrize(
     ("words", "says"),
     [
-        ([], "Missing argument 'REF'. Try 'envhub run --help'."),
-        (["--bad", "."], "No such option: --bad. Try 'envhub run --help'."),
+        (["run"], "Missing argument 'REF'. Try 'envhub run --help'."),
+        (["run", "--bad", "."], "No such option: --bad. Try 'envhub run --help'."),
+        (["run", "--seed"], "Option '--seed' requires an argument. Try 'envhub run --help'."),
+        (
+            ["verify", "FILE"],
+            "There is no command 'verify' any more: use 'envhub lock --check FILE'. "
+            "Try 'envhub --help'.",
+        ),
     ],
 )
 def test_wrong_usage_is_one_message(words: list[str], says: str) -> None:
-    done = CliRunner().invoke(app, ["run", *words])
+    done = CliRunner().invoke(app, words)
     assert (done.exit_code, done.stdout) == (2, "")
     assert done.stderr == f"Error: {says}\n"
-    document = json.loads(CliRunner().invoke(app, ["run", *words, "--json"]).stdout)
+    document = json.loads(CliRunner().invoke(app, [words[0], "--json", *words[1:]]).stdout)
     assert document == {"error": {"type": "UsageError", "message": says, "exit_code": 2}}
 
 

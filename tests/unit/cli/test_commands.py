@@ -65,6 +65,7 @@ _REFUSED = [
     ("inspect ./gone", 3, _NO_FOLDER),
     ("inspect ./gone --sarif x", 2, "--sarif means nothing here"),
     ("inspect ./gone --static --render", 2, "No such option"),
+    ("check ./gone --allow seeding_", 2, "did you mean 'seeding'?"),
 ]
 
 
