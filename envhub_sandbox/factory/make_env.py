@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
@@ -18,7 +19,7 @@ from envhub_sandbox.dependencies.packages import (
     packages_for,
 )
 from envhub_sandbox.dependencies.request import Choice, chosen
-from envhub_sandbox.errors import PolicyError
+from envhub_sandbox.errors import PolicyError, SandboxUnavailableError
 from envhub_sandbox.factory.env_factory import EnvFactory
 from envhub_sandbox.hub.snapshot import Snapshot, snapshot_named
 from envhub_sandbox.hub.sources.assets import with_assets
@@ -307,16 +308,14 @@ def sandbox_of(sandbox: str | Sandbox | list[str | Sandbox], server_key: str | N
     """
     fleet: Any = sandbox
     if isinstance(sandbox, (list, tuple)) or (isinstance(sandbox, str) and is_list(sandbox)):
-        from envhub_sandbox.sandboxes.fleet.fleet import Fleet
-
-        fleet = Fleet(sandbox)
+        fleet = _extra("fleet.fleet", "Fleet")(sandbox)
+    place: Sandbox
     if callable(getattr(fleet, "opened", None)):
-        opened: Sandbox = fleet.opened(partial(sandbox_of, server_key=None), server_key)
-        return opened
+        place = fleet.opened(partial(sandbox_of, server_key=None), server_key)
+        return place
     if isinstance(sandbox, str) and sandbox.startswith("tcp://"):
-        from envhub_sandbox.sandboxes.remote import RemoteSandbox
-
-        return RemoteSandbox(sandbox, server_key=server_key)
+        place = _extra("remote", "RemoteSandbox")(sandbox, server_key=server_key)
+        return place
     if server_key is not None:
         raise PolicyError(
             f"{option_name('server_key')} is for {option_name('sandbox', 'tcp://HOST:PORT')}; a "
@@ -326,21 +325,36 @@ def sandbox_of(sandbox: str | Sandbox | list[str | Sandbox], server_key: str | N
         if isinstance(sandbox, list) or not callable(getattr(sandbox, "for_repository", None)):
             raise _unknown(sandbox)
         return sandbox
+    kind, _, image = sandbox.partition(":")
     if sandbox == "process":
         from envhub_sandbox.sandboxes.process import PROCESS, check_platform
 
         check_platform()  # before anything is downloaded for it
         return PROCESS
     if sandbox == "ray":
-        from envhub_sandbox.sandboxes.ray.sandbox import RAY
+        place = _extra("ray.sandbox", "RAY")
+    elif kind == "docker":
+        place = _extra("docker.sandbox", "DockerSandbox")(**{"image": image} if image else {})
+    else:
+        raise _unknown(sandbox)
+    return place
 
-        return RAY
-    kind, _, image = sandbox.partition(":")
-    if kind == "docker":
-        from envhub_sandbox.sandboxes.docker.sandbox import DockerSandbox
 
-        return DockerSandbox(image=image) if image else DockerSandbox()
-    raise _unknown(sandbox)
+def _extra(module: str, name: str) -> Any:
+    """What makes a place that is no part of the core, which therefore imports it by its name.
+    Raises ``SandboxUnavailableError``: this installation lacks it.
+    """
+    module = f"envhub_sandbox.sandboxes.{module}"
+    try:
+        return getattr(importlib.import_module(module), name)
+    except ModuleNotFoundError as error:
+        if error.name is None or not f"{module}.".startswith(f"{error.name}."):
+            raise  # the module is there, and lacks something itself
+        raise SandboxUnavailableError(
+            f"{option_name('sandbox')} needs {module}, which this installation of "
+            "envhub-sandbox lacks: install the whole package, or use "
+            f"{option_name('sandbox', 'process')}"
+        ) from None
 
 
 def _unknown(sandbox: object) -> PolicyError:

@@ -6,6 +6,7 @@ import ast
 import dataclasses
 import inspect
 import re
+import sys
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,8 +17,8 @@ import pytest
 
 from envhub_sandbox import Limits, Policy, Timeouts, make_env
 from envhub_sandbox.cli.app import whole_command
-from envhub_sandbox.errors import PolicyError, RepositoryUnavailableError
-from envhub_sandbox.factory.make_env import interpreter
+from envhub_sandbox.errors import PolicyError, RepositoryUnavailableError, SandboxUnavailableError
+from envhub_sandbox.factory.make_env import interpreter, sandbox_of
 from envhub_sandbox.session.repository import plain_config
 from envhub_sandbox.settings.options import (
     OPTIONS,
@@ -69,6 +70,26 @@ def test_what_cannot_be_is_refused(
     monkeypatch.setattr(*inside.MAKER, None)
     with pytest.raises(error, match=words):
         make_env(**{"cfg": sample("cartpole"), **given})
+
+
+@pytest.mark.parametrize(
+    ("sandbox", "extra"),
+    [("docker:python", "docker"), ("ray", "ray"), ("tcp://a:1", "remote"), (["process"], "fleet")],
+)
+def test_a_place_that_is_not_installed_is_named(
+    sandbox: Any, extra: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As where the package was installed without its module; with it, there is such a place."""
+    lacking = f"envhub_sandbox.sandboxes.{extra}"
+    for name in [name for name in sys.modules if name.startswith(f"{lacking}.")]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, lacking, None)
+    with pytest.raises(
+        SandboxUnavailableError, match=rf"sandbox needs {lacking}.*, which .*'process'"
+    ):
+        make_env(sample("cartpole"), sandbox=sandbox)
+    monkeypatch.undo()
+    assert sandbox_of(sandbox, None).name
 
 
 @pytest.mark.parametrize(

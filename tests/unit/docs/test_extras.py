@@ -81,8 +81,7 @@ CORE_IMPORTS_EXTRAS = {
     },
     "envhub_sandbox.factory.make_env": {
         *("dependencies.locks.lockfile", "dependencies.modules", "dependencies.packages"),
-        *("dependencies.request", "hub.sources.assets", "sandboxes.docker.sandbox"),
-        *("sandboxes.fleet.fleet", "sandboxes.ray.sandbox", "sandboxes.remote"),
+        *("dependencies.request", "hub.sources.assets"),
     },
     "envhub_sandbox.hub.local": {"hub.git.checkout"},
     "envhub_sandbox.hub.reference": {"hub.git.address", "hub.registered"},
