@@ -17,7 +17,7 @@ from envhub_sandbox.hub.git.checkout import top_of
 from envhub_sandbox.hub.local import split_local
 from envhub_sandbox.hub.snapshot import is_here
 from envhub_sandbox.hub.sources import toml
-from envhub_sandbox.settings.options import nearest
+from envhub_sandbox.settings.options import in_python, nearest, use_option_names
 from envhub_sandbox.settings.policy import policy_from
 from envhub_worker.protocol.text import printable, size_text
 
@@ -198,7 +198,8 @@ def read_policy(path: Path) -> dict[str, Any]:
     """
     fields = read_file(path)
     try:
-        policy_from(fields, None)
+        with use_option_names(in_python):  # the file has those names, not the command line's
+            policy_from(fields, None)
     except PolicyError as error:
         raise PolicyError(f"{path}: {error}") from error
     return fields

@@ -99,6 +99,7 @@ def test_a_report_that_is_not_written_is_not_there(judged: Judged) -> None:
         ("--all list --memory much", "takes a size"),
         ("--all nowhere", "cannot be read"),
         ("--all list --policy nowhere.toml", "cannot be read"),
+        ("--all list --policy unit", "unit: limits: memory_bytes is '2'; that is 2 bytes"),
         ("--all list --policy env/envhub.toml", "is inside the repository that is checked, ./env"),
         ("./env --policy env/x", "--policy env/x is inside the repository that is checked, ./env"),
         ("./env --settings env/envhub.toml", "is inside the repository that is checked, ./env"),
@@ -110,6 +111,7 @@ def test_a_report_that_is_not_written_is_not_there(judged: Judged) -> None:
 )
 def test_what_cannot_be_is_told_first(arguments: str, says: str, judged: Judged) -> None:
     Path("wrong").write_text("org/repo\nrepo\n")
+    Path("unit").write_text('[limits]\nmemory_bytes = "2"\n')
     done = called(*arguments.split())
     assert done.exit_code == Exit.USAGE, done.output
     assert says in " ".join(done.output.split())
