@@ -28,7 +28,7 @@ from envhub_worker.protocol.text import printable, size_text
 _MOST_BYTES = 1 << 20
 _LONGEST = 500
 _AROUND, _COMPARED, _MOST_LINES, _WIDEST = 2, 500, 60, 200
-"""Of the lines that changed: equal ones around them; from the first on; shown; characters."""
+"""Lines around a change; lines compared from the first change on; lines and characters shown."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,10 @@ def _files(then: Static, now: Static, other: Collection[str]) -> Iterator[Change
 
 
 def _changed_lines(then: Path, now: Path) -> tuple[str, ...]:
-    """None of what is no text. Of a stranger's lines so few are compared that it takes no time."""
+    """How a file's lines differ, as ``diff -u`` shows it; nothing for a file that is no text.
+
+    Few lines are compared, so that no stranger's file can take long.
+    """
     try:
         before, after = map(_lines, (then, now))
     except UnicodeDecodeError:

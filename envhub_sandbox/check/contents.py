@@ -242,7 +242,7 @@ def _absolute(one: ImportStatement) -> Sequence[str]:
 
 
 def _bare(name: str) -> str:
-    """As ``_os``, by which ``random`` holds ``os``, is meant; ``__dict__`` is no private name."""
+    """A name without leading underscores: ``random._os`` is ``os``. ``__dict__`` stays as it is."""
     return name if name.startswith("__") else name.lstrip("_")
 
 
@@ -261,7 +261,7 @@ def _used(parsed: ParsedFile) -> Iterator[tuple[int, str, str]]:
 
 
 def _meant(parts: list[str]) -> Iterator[tuple[str, str]]:
-    """What a dotted name is in the table: by its end, of which the first may be private."""
+    """Entries of the table that a dotted name ends in: their check, and their name there."""
     bare = [*map(_bare, parts)]
     ends = [".".join(bare[start:]) for start in range(len(parts) - 1)] or parts
     if len(parts) != 2 or parts[0] not in ("self", "cls"):

@@ -234,8 +234,8 @@ def request_of(snapshot: Snapshot, choice: Choice, *, gpu: bool = False) -> Pack
 def _refuse_misspelt(
     without: Sequence[str], wanted: Sequence[WantedPackage], guesses: Sequence[Guess]
 ) -> None:
-    """Refuse names that are nearly, and not, those of packages that it has. A name that is like
-    none may be that of a package which another one needs.
+    """Refuse a name that is nearly that of a package which the repository declares or imports. Any
+    other unknown name passes: such a package may be needed by another package.
     """
     from packaging.utils import canonicalize_name
 

@@ -50,7 +50,7 @@ _CLEAN_S = 60.0
 CACHE_WAIT_S = 10.0
 """For how long to wait for others who use uv's cache."""
 LISTEN_S = 10.0
-"""For what it has written on stderr, once it has ended: another process may hold that open."""
+"""How long to read stderr after uv has ended: another process may hold it open for ever."""
 _SHOWN = 4000
 _KEPT_LINES = 400
 

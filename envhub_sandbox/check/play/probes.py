@@ -163,7 +163,7 @@ def has(env: Any, name: str) -> bool:
 
 
 def is_statistics(env: Any, name: str) -> bool:
-    """Whether a wrapper around its sub-environments has running statistics of Gymnasium's so."""
+    """Whether this attribute of the sub-environments is one of Gymnasium's running statistics."""
     try:
         [value, *_] = env.get_attr(name)
     except (AttributeError, RemoteEnvError, ValueError):

@@ -225,13 +225,13 @@ class TaskJudge:
             self._endless(env)
 
     def _learning(self, env: Env) -> int | None:
-        """How many of Gymnasium's running statistics go on learning, and None where there are none.
+        """Stop Gymnasium's running statistics. Returns how many still learn; None if it has none.
 
-        They are honest, and outlive each reset: so they stop for the plays that are compared. Of
-        wrappers around each other only the outermost can be stopped from here.
+        They outlive each reset by design, so they are stopped while plays are compared. Of nested
+        wrappers only the outermost can be stopped from here.
         """
         found = sum(probes.is_statistics(env, name) for name in _STATISTICS)
-        if found and probes.has(env, "update_running_mean"):  # which older ones have not
+        if found and probes.has(env, "update_running_mean"):  # older releases lack it
             env.set_attr("update_running_mean", [False] * env.num_envs)  # type: ignore[attr-defined]
             return found - 1
         return found or None
@@ -277,7 +277,7 @@ class TaskJudge:
                 yield f"{different} steps with other actions give the same results"
 
     def _ends(self, env: Env, steps: int, until: float = math.inf) -> tuple[bool, int]:
-        """Whether an episode ends within so many steps, and how many were made until then."""
+        """Whether an episode ends within so many steps, and the number of steps that were made."""
         env.reset(seed=self._asked.seed)
         for played in range(1, steps + 1):
             _, _, terminations, truncations, _ = env.step(env.action_space.sample())

@@ -79,7 +79,7 @@ class Trace:
         return next((number for number, (one, two) in pairs if one != two), None)
 
     def difference(self, other: Trace, at: int) -> str:
-        """What differs in the results of a step, where both are kept: ``": "`` and the words."""
+        """``": "`` and what differs in the results of a step; empty if either has not kept them."""
         kept = at < min(len(self.results), len(other.results))
         seen = differing(self.results[at], other.results[at]) if kept else ""
         return f": {seen}" if seen else ""
@@ -202,7 +202,7 @@ def _leaves(value: Any, without: Collection[str] = ()) -> Iterator[Any]:
 
 
 def _foreign(infos: Mapping[Any, Any]) -> Iterator[str]:
-    """What of infos is but described here: neither a number nor a text, and none is in it."""
+    """A text for each value in infos that crossed as a description only."""
     for name, value in infos.items():
         for leaf in _leaves(value, _LAST) if name not in _LAST else ():
             if isinstance(leaf, RemoteObject):

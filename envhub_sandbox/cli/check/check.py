@@ -290,7 +290,7 @@ def judgement(
 
 
 def _arguments(make: opt.MakeOptions, policy: Path | None) -> dict[str, Any]:
-    """Those of ``make_env``, the policy checked. Raises ``UsageError`` or ``PolicyError``."""
+    """Arguments of ``make_env``, with a valid policy. Raises ``UsageError``, ``PolicyError``."""
     from envhub_sandbox.check import settings
     from envhub_sandbox.settings.policy import policy_from
 

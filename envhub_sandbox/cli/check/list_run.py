@@ -165,7 +165,7 @@ class ListRun:
             raise UsageError(f"--all {self.file} cannot be read: {error.strerror}") from error
 
     def _warn_of_own_list(self, entries: Iterable[ListEntry]) -> None:
-        """Who is judged could leave out of the list what would fail."""
+        """Warn if a listed repository holds the list, since its author could shorten it."""
         for entry in entries:
             if self.file != "-" and is_in_its_checkout(Path(self.file), entry.reference):
                 text = (

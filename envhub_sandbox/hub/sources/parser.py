@@ -310,7 +310,7 @@ class _Meanings:
         return self._item(owner, text) if name in ("get", "pop") and text else [f"{function}()"]
 
     def _item(self, base: str, key: str) -> list[str]:
-        """What a dict, by what it is, has by a key; else what is in a container."""
+        """What a key may lead to: in a namespace what has that name, else the container itself."""
         if base in ("globals()", "locals()", "vars()") and key:
             return self._named(key)
         if base == "sys.modules" and key:

@@ -54,10 +54,10 @@ _LEAST_STEPS, _MOST_STEPS = 16, 256
 _LEAST_STEPS_S, _MOST_STEPS_S = 1.0, 0.25
 """Processor time in which the first are made, or it is heavy, and after which no further one is."""
 _LONGEST_SLEEP_S = 60.0
-"""In one call, by the clock of a play: who waits for what no play brings would wait for ever."""
+"""Longest sleep of one call, by a play's own clock: nothing wakes who waits for another process."""
 _WAIT_S, _LEAST_SHARE = 2.0, 8
-"""Time in which plays may wait, beyond so many times what they compute: on a busy machine a play
-waits for a processor, too.
+"""How long all plays may wait, in seconds and as a multiple of their processor time: on a busy
+machine a play waits for a processor, too.
 """
 _STEPS_AFTER_RESET = 8
 _ALONE = 4
@@ -86,14 +86,14 @@ class Budget:
         self._until, self._wait_s, self.most_bytes = until, _WAIT_S, most_bytes
 
     def left_s(self, began: float, pid: int) -> float:
-        """Time in which the fork that ``began`` then may go on without computing anything."""
+        """How long the fork that ``began`` then may still wait without computing anything."""
         now, computed_s = monotonic(), 0.0
         with contextlib.suppress(OSError):  # it has ended. Followed: clock_getcpuclockid(3)
             computed_s = time.clock_gettime(~pid << 3 | 2)
         return min(self._until - now, self._wait_s - (now - began) + _LEAST_SHARE * computed_s)
 
     def take(self, left_s: float) -> None:
-        """A fork is over, with so much time left."""
+        """Note that a fork has ended with so much time left."""
         self._wait_s = min(self._wait_s, left_s)
 
 
@@ -165,7 +165,7 @@ def _play_and_exit(play: Callable[[], bytes], sink: int, most_bytes: int) -> Non
 
 
 def _bound_memory(most_bytes: int) -> None:
-    """Refuse this process, from now on, more than so much beyond what it has."""
+    """Let this process take at most so many more bytes of memory."""
     with open("/proc/self/statm") as file:
         data_pages = int(file.read().split()[5])
     _, hard = resource.getrlimit(resource.RLIMIT_DATA)
