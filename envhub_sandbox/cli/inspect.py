@@ -137,7 +137,7 @@ def _check_options(context: typer.Context, *, static: bool, download: bool) -> N
     if static:
         means, why = _OF_ALL | _OF_STATIC | {"static"}, "with --static nothing runs"
     elif download:
-        means, why = _OF_ALL | _OF_DOWNLOAD | {"download"}, "with --download nothing runs"
+        means, why = _OF_ALL | _OF_DOWNLOAD | {"download"}, "--download does not run the repository"
     else:
         means = set(context.params) - _OF_STATIC - {"upgrade"}
         why = "it needs --static or --download"

@@ -195,8 +195,8 @@ def _old(path: Path, upgrade: bool) -> LockFile | None:
         return None
     if not upgrade:
         raise UsageError(
-            f"{path} exists. 'envhub lock --upgrade' chooses versions again and shows what "
-            "differs; 'envhub lock --check' compares it with the repository"
+            f"{path} exists. 'envhub lock --upgrade REF' chooses versions again and shows what "
+            "differs; 'envhub lock --check FILE' compares it with the repository"
         )
     from envhub_sandbox.dependencies.locks import lockfile
 

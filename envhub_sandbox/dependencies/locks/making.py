@@ -55,7 +55,7 @@ def refuse(found: Sequence[str], label: str) -> None:
     lines = "\n".join(f"  {line}" for line in [*found[:_SHOWN], *more])
     raise LockDriftError(
         f"{label}: differs from its lock:\n{lines}\nUse what was locked, or lock the present "
-        "state: envhub lock --upgrade",
+        "state: envhub lock --upgrade REF",
         tuple(found),
     )
 

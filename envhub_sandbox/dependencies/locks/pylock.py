@@ -95,7 +95,7 @@ def described(lock: Lock, python: str) -> tuple[PylockPackage, ...]:
         if not wheels:
             raise PackageIntegrityError(
                 f"the index has {package.name}=={package.version}, but no file of it for {python} "
-                "with the hash that was chosen. Choose again: envhub lock --upgrade"
+                "with the hash that was chosen. Choose again: envhub lock --upgrade REF"
             )
         kept.append(PylockPackage(package.name, package.version, wheels))
     return tuple(kept)
