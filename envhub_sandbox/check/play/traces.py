@@ -26,7 +26,9 @@ from envhub_worker.protocol.text import printable
 Env = VectorEnv[Any, Any, Any]
 _NOTED, _LONGEST = 3, 200
 _LAST = ("final_obs", "final_observation")
-_KEPT_BYTES = 32 << 20
+_KEPT_BYTES, _PART_BYTES = 32 << 20, 400
+"""Of results that are kept: in all, and what Python takes beside the values of each part."""
+_MOST_ENDS = 1000
 _PARTS = ("the observation", "the reward", "terminated", "truncated")
 
 
@@ -44,7 +46,7 @@ class Trace:
         counted: The episodes that ended, to be looked at; fewer, where its rewards are such that
             they cannot be counted.
         spent: Seconds of each step.
-        ends: Keys of the infos of steps that ended an episode.
+        ends: Keys of the infos of steps that ended an episode: short ones, and not all of many.
         results: What the reset and each step returned, without infos, up to a size in all.
     """
 
@@ -64,7 +66,7 @@ class Trace:
         """Take a reset's observations, or also what else a step returned."""
         self.steps.append(resumed + digest(result[0] if len(result) == 1 else tuple(result)))
         parts = dict(itertools.chain.from_iterable(map(_named, _PARTS, result)))
-        self._left -= sum(map(_weight, parts.values()))
+        self._left -= sum(_PART_BYTES + len(name) + _weight(part) for name, part in parts.items())
         if self._left >= 0:
             self.results.append({name: copy(value) for name, value in parts.items()})
 
@@ -164,7 +166,8 @@ def _judge(trace: Trace, result: tuple[Any, ...], ended: Any, mode: str | None, 
     done = np.logical_or(np.asarray(terminations, bool), np.asarray(truncations, bool))
     trace.episodes += int(done.sum())
     if done.any():
-        trace.ends |= {key for one in (infos, infos.get("final_info")) for key in _texts(one)}
+        keys = {key for one in (infos, infos.get("final_info")) for key in _texts(one)}
+        trace.ends |= set(itertools.islice(keys, _MOST_ENDS - len(trace.ends)))
     if not np.isfinite(np.asarray(rewards, np.float64)).all():
         trace.note("rewards", f"step {number}: {np.asarray(rewards).tolist()}")
     if mode == "NextStep":
@@ -210,14 +213,15 @@ def _foreign(infos: Mapping[Any, Any]) -> Iterator[str]:
 
 
 def _texts(infos: Any) -> set[str]:
-    return {key for key in infos if isinstance(key, str)} if isinstance(infos, Mapping) else set()
+    keys = infos if isinstance(infos, Mapping) else ()
+    return {key for key in keys if isinstance(key, str) and len(key) <= _LONGEST}
 
 
 def _named(name: str, value: Any) -> Iterator[tuple[str, Any]]:
-    """The leaves of a result, each with its name."""
+    """The leaves of a result, each with its name: how long keys are is the worker's choice."""
     if isinstance(value, Mapping):
         for key in value:
-            yield from _named(f"{name}[{key!r}]", value[key])
+            yield from _named(f"{name}[{key!r}]"[:_LONGEST], value[key])
     elif isinstance(value, (list, tuple)):
         for index, one in enumerate(value):
             yield from _named(f"{name}[{index}]", one)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import tracemalloc
 from collections.abc import Sequence
 from types import SimpleNamespace
 from typing import Any
@@ -98,6 +99,22 @@ def test_what_differs_is_told_with_its_row_and_values(
     told = first.difference(second, at)
     assert told.startswith(f": {words}") if words else told == ""
     assert first.difference(traced(*one), at) == "", "the control"
+
+
+@pytest.mark.parametrize("wide", [True, False], ids=["long name", "many parts"])
+def test_what_is_kept_of_results_is_bounded(wide: bool) -> None:
+    """By names as by values; a worker chooses how long the one and how many the others are."""
+    parts: Any = {str(number): np.zeros(1) for number in range(1000)}
+    trace = Trace()
+    tracemalloc.start()
+    try:
+        for _ in range(3 if wide else 300):
+            trace.add([{"k" * 100_000: parts} if wide else parts])
+        most = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert most < 48 << 20
+    assert trace.results, "the control: something is kept"
 
 
 _BOTH = np.ones(2, bool)
