@@ -100,8 +100,6 @@ CORE_IMPORTS_EXTRAS = {
     "envhub_sandbox.vector.sandbox_view": {"session.parts.fleet_session"},
     "envhub_sandbox.vector.vector_env": {"session.parts.fleet_session", "vector.send_recv"},
     "envhub_worker.__main__": {"cli.drain", "cli.health", "cli.keygen", "cli.listen", "cli.status"},
-    "envhub_worker.lockdown.seccomp.policy": {"lockdown.seccomp.evidence"},
-    "envhub_worker.lockdown.stages.runner": {"lockdown.seccomp.evidence"},
     "envhub_worker.runner.recording": {"runner.old_gym"},
     "envhub_worker.runner.sync_envs": {"runner.old_gym"},
     "envhub_worker.runner.tasks": {"runner.old_gym"},

@@ -95,3 +95,18 @@ class JailContext:
     processes: int
     measured: bool
     joins: list[int]
+
+
+@dataclass(frozen=True, kw_only=True)
+class OwnPaths:
+    """What a jail's processes may do by name.
+
+    Attributes:
+        changed: Folders and files that they may change.
+        read: Those that they may read.
+        scratch: Folders in which they can have made links.
+    """
+
+    changed: tuple[str, ...] = ()
+    read: tuple[str, ...] = ()
+    scratch: tuple[str, ...] = ()

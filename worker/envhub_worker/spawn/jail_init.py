@@ -38,6 +38,7 @@ from envhub_worker.lockdown.limits.watchdog import Watchdog
 from envhub_worker.lockdown.mechanisms import process, procfs, reap
 from envhub_worker.lockdown.plan import plan
 from envhub_worker.lockdown.seccomp import evidence, notify
+from envhub_worker.lockdown.seccomp.syscalls import NAMED
 from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.lockdown.stages import jail
 from envhub_worker.lockdown.stages.runner import runner_paths
@@ -218,7 +219,7 @@ class Init:
         if runner is not None and runner.status is not None:
             return
         call = request.call
-        if call not in evidence.NAMED or call not in self._common.watched:
+        if call not in NAMED or call not in self._common.watched:
             detail = notify.detail(request)
             if detail or not notify.is_own_affair(call, self._common.watched):
                 self._report_denied(call, detail)

@@ -16,9 +16,9 @@ import struct
 from collections.abc import Callable, Collection, Sequence
 from typing import BinaryIO
 
+from envhub_worker.lockdown.context import OwnPaths
 from envhub_worker.lockdown.mechanisms import procfs
-from envhub_worker.lockdown.seccomp.syscalls import c_int
-from envhub_worker.protocol.records import dataclass
+from envhub_worker.lockdown.seccomp.syscalls import NAMED, NAMING, SIGNUM, WHICH, c_int
 from envhub_worker.protocol.text import printable
 
 _LONGEST_PATH = 4096
@@ -28,25 +28,6 @@ _AT_FDCWD = -100
 _AF_UNIX = 1
 _SOCKET_ADDRESS = 110
 
-_Where = tuple[tuple[int | None, int], ...]
-
-# Where the descriptor of a folder is among a call's arguments (None: there is none), and the path.
-_AT: _Where = ((0, 1),)
-_PLAIN: _Where = ((None, 0),)
-_TWO_AT: _Where = ((0, 1), (2, 3))
-_TWO: _Where = ((None, 0), (None, 1))
-_CALLS: tuple[tuple[str, _Where], ...] = (
-    ("openat mkdirat unlinkat fchmodat fchmodat2 fchownat utimensat", _AT),
-    ("open creat mkdir rmdir unlink truncate chmod chown lchown", _PLAIN),
-    ("setxattr lsetxattr removexattr lremovexattr", _PLAIN),
-    ("renameat renameat2 linkat", _TWO_AT),
-    ("rename link", _TWO),
-    ("symlink", ((None, 1),)),
-    ("symlinkat", ((1, 2),)),
-    ("connect sendto", ()),
-)
-#: What opens and changes files by name.
-NAMED: dict[str, _Where] = {name: where for names, where in _CALLS for name in names.split()}
 _FLAGS = {"open": 1, "openat": 2}
 _ADDRESS = {"connect": (1, 2), "sendto": (4, 5)}
 _CHANGING = os.O_ACCMODE | os.O_CREAT | os.O_TRUNC
@@ -68,21 +49,6 @@ _FLAGS_OF_AT = {"fchmodat2": 3, "utimensat": 3, "fchownat": 4}
 _FOLLOWING = "creat truncate chmod fchmodat chown setxattr removexattr"
 _HARMLESS = ("/var/run/nscd/socket", "/run/nscd/socket")
 """The C library asks there who a user is."""
-
-
-@dataclass(frozen=True, kw_only=True)
-class OwnPaths:
-    """What a jail's processes may do by name.
-
-    Attributes:
-        changed: Folders and files that they may change.
-        read: Those that they may read.
-        scratch: Folders in which they can have made links.
-    """
-
-    changed: tuple[str, ...] = ()
-    read: tuple[str, ...] = ()
-    scratch: tuple[str, ...] = ()
 
 
 def asked(
@@ -240,13 +206,6 @@ def _shown(path: str) -> str:
     return text.replace("\n", "\\n").replace("\t", "\\t")
 
 
-_PRETENDED = "sched_setscheduler sched_setparam sched_setattr sched_setaffinity"
-_WHICH = {"setpriority": 0, "ioprio_set": 1}  # and what says there that a process is meant
-_SIGNUM = {"kill": 1, "tkill": 1, "tgkill": 2, "rt_sigqueueinfo": 1, "rt_tgsigqueueinfo": 2}
-#: What does nothing and says that it worked, where it is not permitted.
-PRETENDED = frozenset(_PRETENDED.split())
-#: Calls that name a process, and which of their arguments does.
-NAMING = dict.fromkeys((*_SIGNUM, "pidfd_open", *PRETENDED), 0) | dict.fromkeys(_WHICH, 1)
 #: The detail of a call that names another process.
 OTHER = "OTHER_PROCESS"
 
@@ -258,9 +217,9 @@ def is_another_target(call: str, arguments: Sequence[int], caller: int, init: in
     """Whether a call, one of ``NAMING``, is about a process outside of its jail, as its init is.
     ``arguments``: the first three, as C integers.
     """
-    if call in _WHICH and arguments[0] != _WHICH[call]:
+    if call in WHICH and arguments[0] != WHICH[call]:
         return False
-    if call in _SIGNUM and arguments[_SIGNUM[call]] == 0:
+    if call in SIGNUM and arguments[SIGNUM[call]] == 0:
         return False  # it only looks whether somebody is there
     number = arguments[NAMING[call]]
     if call == "kill" and number < 0:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import errno
 from collections.abc import Iterable, Mapping
 
-from envhub_worker.lockdown.seccomp.evidence import NAMED, NAMING, PRETENDED
+from envhub_worker.lockdown.seccomp.syscalls import NAMED, NAMING, PRETENDED
 from envhub_worker.protocol.records import dataclass
 
 _ERRNO = 0x00050000

@@ -104,6 +104,34 @@ def _numbered(names: str) -> dict[str, int]:
 #: Machine (as ``os.uname`` says it) to name to number.
 NUMBERS = {"x86_64": _numbered(_X86_64), "aarch64": _numbered(_AARCH64)}
 
+_Where = tuple[tuple[int | None, int], ...]
+
+# Where the descriptor of a folder is among a call's arguments (None: there is none), and the path.
+_AT: _Where = ((0, 1),)
+_PLAIN: _Where = ((None, 0),)
+_TWO_AT: _Where = ((0, 1), (2, 3))
+_TWO: _Where = ((None, 0), (None, 1))
+_CALLS: tuple[tuple[str, _Where], ...] = (
+    ("openat mkdirat unlinkat fchmodat fchmodat2 fchownat utimensat", _AT),
+    ("open creat mkdir rmdir unlink truncate chmod chown lchown", _PLAIN),
+    ("setxattr lsetxattr removexattr lremovexattr", _PLAIN),
+    ("renameat renameat2 linkat", _TWO_AT),
+    ("rename link", _TWO),
+    ("symlink", ((None, 1),)),
+    ("symlinkat", ((1, 2),)),
+    ("connect sendto", ()),
+)
+#: What opens and changes files by name.
+NAMED: dict[str, _Where] = {name: where for names, where in _CALLS for name in names.split()}
+
+_PRETENDED = "sched_setscheduler sched_setparam sched_setattr sched_setaffinity"
+WHICH = {"setpriority": 0, "ioprio_set": 1}  # and what says there that a process is meant
+SIGNUM = {"kill": 1, "tkill": 1, "tgkill": 2, "rt_sigqueueinfo": 1, "rt_tgsigqueueinfo": 2}
+#: What does nothing and says that it worked, where it is not permitted.
+PRETENDED = frozenset(_PRETENDED.split())
+#: Calls that name a process, and which of their arguments does.
+NAMING = dict.fromkeys((*SIGNUM, "pidfd_open", *PRETENDED), 0) | dict.fromkeys(WHICH, 1)
+
 
 def syscall_number(name: str) -> int:
     """The number of ``name`` on this machine.

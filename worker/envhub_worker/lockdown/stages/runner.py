@@ -13,13 +13,12 @@ import socket
 from collections.abc import Callable, Iterable
 from functools import partial
 
-from envhub_worker.lockdown.context import JailContext
+from envhub_worker.lockdown.context import JailContext, OwnPaths
 from envhub_worker.lockdown.layers import LayerUnavailableError
 from envhub_worker.lockdown.mechanisms import kernel, landlock, process
 from envhub_worker.lockdown.mechanisms.landlock import LandlockRule
 from envhub_worker.lockdown.root_plan import TERMINALS
 from envhub_worker.lockdown.seccomp import filter
-from envhub_worker.lockdown.seccomp.evidence import OwnPaths
 from envhub_worker.protocol.confinement import Limits
 
 # What the C library and numerical libraries read; nothing here is about a person.

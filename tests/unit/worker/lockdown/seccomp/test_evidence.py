@@ -16,12 +16,8 @@ from pathlib import Path
 
 import pytest
 
-from envhub_worker.lockdown.seccomp.evidence import (
-    OwnPaths,
-    asked,
-    is_another_target,
-    never_a_target,
-)
+from envhub_worker.lockdown.context import OwnPaths
+from envhub_worker.lockdown.seccomp.evidence import asked, is_another_target, never_a_target
 
 _OWN = OwnPaths(changed=("/sandbox/work", "/dev/null"), read=("/home/me/python",))
 _HERE = -100 & 0xFFFFFFFFFFFFFFFF
