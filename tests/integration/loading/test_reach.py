@@ -171,6 +171,7 @@ def test_a_granted_home_does_not_break_loading(
 
 def test_terminals_that_are_used_up_are_told(env: Any) -> None:
     """``pty`` says 'out of pty devices'; here there is a number of them, and it is the jail's."""
+    env.reset()
     code = "import os, pty\nkept = [os.openpty() for _ in range(64)]\n"
     with pytest.raises(RemoteEnvError, match=r"out of pty devices\. A jail .* at most 64 pseudo"):
         env.call("run", f"{code}pty.fork()")

@@ -104,6 +104,16 @@ def large_pipe(size):
     fcntl.fcntl(kept[-1][1], 1031, size)  # F_SETPIPE_SZ
 
 
+def terminals(count):
+    """Open pseudo terminals, which the kernel counts for all users together, and keep them."""
+    for number in range(count):
+        try:
+            kept.append(os.openpty())
+        except OSError as error:
+            return [number, str(error)]
+    return [count, ""]
+
+
 def use_up(kind, name):
     """Use up what the kernel gives to a user, all programs together."""
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
