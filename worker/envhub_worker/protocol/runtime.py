@@ -5,6 +5,7 @@ And what it finds in its cache of the Hub: see ``HubCopy``.
 
 from __future__ import annotations
 
+import os
 import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping
@@ -69,8 +70,10 @@ def mapped_modules(finders: Iterable[object]) -> dict[str, tuple[str, ...]]:
     found: dict[str, tuple[str, ...]] = {}
     for table in _tables(finders):
         for name, paths in table.items():
-            each = (paths,) if isinstance(paths, str) else tuple(map(str, paths))
-            found[name] = found.get(name, ()) + each
+            each = paths if isinstance(paths, (list, tuple, set)) else (paths,)
+            texts = tuple(os.fspath(one) for one in each if isinstance(one, (str, os.PathLike)))
+            if isinstance(name, str) and texts:  # any finder may have a table of this name
+                found[name] = found.get(name, ()) + texts
     return found
 
 
