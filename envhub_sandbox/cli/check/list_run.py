@@ -36,6 +36,7 @@ from envhub_sandbox.cli.shared.console import (
 )
 from envhub_sandbox.cli.shared.exits import Exit, UsageError
 from envhub_sandbox.cli.shared.findings import annotate, write_report
+from envhub_worker.protocol.errors import EnvHubError
 from envhub_worker.protocol.text import duration_text, printable
 
 if TYPE_CHECKING:
@@ -181,9 +182,9 @@ class ListRun:
         report, error = None, ""
         try:
             report = self.judge(entry.reference)
-        except BrokenPipeError:
-            raise  # what is printed has no reader any more
         except Exception as caught:
+            if isinstance(caught, BrokenPipeError) and not isinstance(caught, EnvHubError):
+                raise  # what is printed has no reader any more; a repository's own pipe is not that
             error = printable(f"{caught}" or type(caught).__name__)
             if self.debug:
                 say(safe_text(traceback.format_exc()))

@@ -25,7 +25,7 @@ from envhub_sandbox.cli.check.deadline import DeadlineReached, deadline_alarm
 from envhub_sandbox.cli.check.list_run import ListRun
 from envhub_sandbox.cli.shared.console import guarded
 from envhub_sandbox.cli.shared.exits import Exit
-from envhub_sandbox.errors import SnapshotError
+from envhub_sandbox.errors import SnapshotError, remote_error
 from envhub_sandbox.hub.git.checkout import make_checkout
 from tests.support.output.pages import HOSTILE
 
@@ -118,7 +118,7 @@ def test_what_cannot_be_is_told_first(arguments: str, says: str, judged: Judged)
     assert judged == []
 
 
-PASSES, FAILS, LATE, ABSENT = "passes", "fails", "late", "absent"
+PASSES, FAILS, LATE, ABSENT, PIPE = "passes", "fails", "late", "absent", "pipe"
 
 
 def run_of(outcomes: Sequence[str], text: str = "it broke") -> ListRun:
@@ -128,6 +128,10 @@ def run_of(outcomes: Sequence[str], text: str = "it broke") -> ListRun:
         report, outcome = Report(text), reference.partition("/")[2]
         if outcome == ABSENT:
             raise SnapshotError(text)
+        if outcome == PIPE:
+            raise remote_error("BrokenPipeError", "BrokenPipeError", text)
+        if outcome == "no reader":
+            raise BrokenPipeError
         if outcome == LATE:
             report.stopped(1, text)
         report.judged("runs", [text] if outcome == FAILS else [], text)
@@ -147,6 +151,7 @@ def run_of(outcomes: Sequence[str], text: str = "it broke") -> ListRun:
     [
         ([PASSES, PASSES], Exit.OK),
         ([PASSES, ABSENT], Exit.UNJUDGED),
+        ([PIPE, FAILS], Exit.ENVIRONMENT),  # which ends no other, as a reader that has gone does
         ([LATE, PASSES], Exit.UNJUDGED),
         ([ABSENT, FAILS, PASSES], Exit.ENVIRONMENT),
         ([], Exit.UNJUDGED),
@@ -154,6 +159,8 @@ def run_of(outcomes: Sequence[str], text: str = "it broke") -> ListRun:
 )
 def test_the_worst_counts(outcomes: list[str], code: Exit) -> None:
     assert run_of(outcomes).exit is code
+    with pytest.raises(BrokenPipeError):  # the control: of what is printed
+        run_of([*outcomes, "no reader"])
 
 
 @pytest.mark.parametrize("text", HOSTILE)
