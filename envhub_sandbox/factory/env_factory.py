@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import os
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
@@ -16,7 +17,6 @@ from functools import lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from envhub_sandbox.dependencies.bounds import walk
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.sandboxes.sandbox import retry_while_busy
@@ -136,7 +136,8 @@ def _code_of(worker: Path) -> str:
     """A digest of when each module of the worker was changed: a manifest is what they made of it.
     A change of a module changes no folder, where the package is used as it lies.
     """
-    code = [path for path in walk(worker) if path.suffix == ".py"]
+    files = (Path(folder, name) for folder, _, names in os.walk(worker) for name in names)
+    code = [path for path in files if path.suffix == ".py"]
     changes = sorted((str(path.relative_to(worker)), _stamp(path)) for path in code)
     return hashlib.sha256(repr(changes).encode()).hexdigest()
 

@@ -76,9 +76,7 @@ CORE_IMPORTS_EXTRAS = {
     "envhub_sandbox.cli.shared.findings": {"check.checks", "check.findings", "check.settings"},
     "envhub_sandbox.cli.shared.options": {"hub.sources.assets"},
     "envhub_sandbox.cli.shared.results": {"check.play.confinement", "check.play.episodes"},
-    "envhub_sandbox.factory.env_factory": {
-        *("dependencies.bounds", "session.crash.history", "session.parts.fleet_session"),
-    },
+    "envhub_sandbox.factory.env_factory": {"session.crash.history", "session.parts.fleet_session"},
     "envhub_sandbox.factory.make_env": {
         *("dependencies.locks.lockfile", "dependencies.modules", "dependencies.packages"),
         *("dependencies.request", "hub.sources.assets"),
