@@ -10,6 +10,7 @@
         RepositoryUnavailableError (OSError)
       PolicyError (ValueError)
       BundleError (ValueError)
+      VideoError
       LockError (ValueError)
         LockDriftError
       ActionError (ValueError)
@@ -90,6 +91,10 @@ class PolicyError(EnvHubError, ValueError):
 
 class BundleError(EnvHubError, ValueError):
     """This is not a valid crash bundle."""
+
+
+class VideoError(EnvHubError):
+    """No video can be written: of these frames, to this place, or with what is installed."""
 
 
 class LockError(EnvHubError, ValueError):

@@ -20,7 +20,7 @@ import numpy as np
 from gymnasium.vector import VectorEnv
 
 from envhub_sandbox.check.play.episodes import Episode
-from envhub_sandbox.errors import EnvHubError, RemoteEnvError
+from envhub_sandbox.errors import EnvHubError, RemoteEnvError, VideoError
 from envhub_sandbox.vector.pictures import Frame, png, small_picture
 from envhub_worker.protocol.codec.inert import one_line
 from envhub_worker.protocol.text import printable
@@ -40,10 +40,6 @@ MIN_FPS = 0.1
 """Below, the times of frames are more than some containers can write."""
 MAX_FPS = 240.0
 SUFFIXES = (".mp4", ".mkv", ".mov")
-
-
-class VideoError(EnvHubError):
-    """No video can be written: of these frames, to this place, or with what is installed."""
 
 
 def check_target(path: Path) -> None:

@@ -64,14 +64,13 @@ def code_for(error: BaseException) -> Exit:
         return Exit.INTERRUPTED
     if not isinstance(error, EnvHubError):
         return Exit.USAGE if _is_full(error) else Exit.BUG
-    # imported here: only a failure pays for multiprocessing and numpy
+    # imported here: only a failure pays for multiprocessing
     from envhub_sandbox import errors
-    from envhub_sandbox.check.play.plays import VideoError
 
     codes = {
         Exit.DIFFERENT: (errors.LockDriftError,),  # before the error of which it is one
         Exit.USAGE: (
-            *(UsageError, VideoError, errors.HubReferenceError, errors.PolicyError),
+            *(UsageError, errors.VideoError, errors.HubReferenceError, errors.PolicyError),
             *(errors.BundleError, errors.LockError),
         ),
         Exit.SNAPSHOT: (errors.SnapshotError,),

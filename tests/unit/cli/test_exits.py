@@ -17,7 +17,6 @@ import typer
 
 from envhub_sandbox import errors
 from envhub_sandbox.check.play.episodes import Episode, Rollout, RolloutError
-from envhub_sandbox.check.play.plays import VideoError
 from envhub_sandbox.cli.shared.console import plain, print_json, safe_line
 from envhub_sandbox.cli.shared.exits import Exit, UsageError, code_for, describe, reported
 from envhub_sandbox.cli.shared.results import TaskResult, returns_of, statistics, task_document
@@ -25,7 +24,7 @@ from envhub_sandbox.errors import EnvHubError
 from envhub_worker.protocol.text import quoted
 
 CODES = {
-    2: (errors.HubReferenceError, errors.PolicyError, UsageError, VideoError),
+    2: (errors.HubReferenceError, errors.PolicyError, UsageError, errors.VideoError),
     3: (
         *(errors.SnapshotError, errors.SnapshotTooLargeError, errors.SnapshotIntegrityError),
         errors.RepositoryUnavailableError,

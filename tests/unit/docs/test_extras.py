@@ -72,7 +72,6 @@ CORE_IMPORTS_EXTRAS = {
     },
     "envhub_sandbox.cli.run": {"check.play.episodes", "check.play.plays"},
     "envhub_sandbox.cli.shared.console": {"check.play.episodes"},
-    "envhub_sandbox.cli.shared.exits": {"check.play.plays"},
     "envhub_sandbox.cli.shared.findings": {"check.checks", "check.findings", "check.settings"},
     "envhub_sandbox.cli.shared.options": {"hub.sources.assets"},
     "envhub_sandbox.cli.shared.results": {"check.play.confinement", "check.play.episodes"},

@@ -14,14 +14,13 @@ from numpy.typing import NDArray
 
 from envhub_sandbox.check.play.plays import (
     MAX_SIDE,
-    VideoError,
     check_target,
     first_frame,
     fps_of,
     frame_of,
     video_writer,
 )
-from envhub_sandbox.errors import RemoteEnvError
+from envhub_sandbox.errors import RemoteEnvError, VideoError
 from envhub_sandbox.vector.pictures import png, small_picture
 
 imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
