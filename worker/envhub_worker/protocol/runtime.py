@@ -5,7 +5,6 @@ And what it finds in its cache of the Hub: see ``HubCopy``.
 
 from __future__ import annotations
 
-import os
 import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping
@@ -71,7 +70,8 @@ def mapped_modules(finders: Iterable[object]) -> dict[str, tuple[str, ...]]:
     for table in _tables(finders):
         for name, paths in table.items():
             each = paths if isinstance(paths, (list, tuple, set)) else (paths,)
-            texts = tuple(os.fspath(one) for one in each if isinstance(one, (str, os.PathLike)))
+            known = (one for one in each if isinstance(one, str) or hasattr(one, "__fspath__"))
+            texts = tuple(map(str, known))
             if isinstance(name, str) and texts:  # any finder may have a table of this name
                 found[name] = found.get(name, ()) + texts
     return found
