@@ -35,6 +35,16 @@ def figure(path: str, name: str) -> int:
     return 0
 
 
+def terminals(run: Run) -> int:
+    """Pseudo terminals that a run's processes hold, by their masters."""
+    links = [
+        os.readlink(f"/proc/{pid}/fd/{fd}")
+        for pid in run.pids()
+        for fd in os.listdir(f"/proc/{pid}/fd")
+    ]
+    return sum(link.endswith("/ptmx") for link in links)
+
+
 def in_pipes(run: Run) -> int:
     """What waits in the pipes of a run."""
     held = {}

@@ -30,7 +30,7 @@ from tests.attacks.harness import (
     new_alias,
     start_control,
 )
-from tests.attacks.resources.accounts import figure, in_pipes, of_processes, tasks
+from tests.attacks.resources.accounts import figure, in_pipes, of_processes, tasks, terminals
 from tests.support.processes import eventually, most_grown, resident
 from tests.support.turns import LONGEST_S, turn
 
@@ -45,7 +45,7 @@ DISK, FILL = 16 * MIB, 64 * MIB
 FILES, INODES = 300, 1500
 CPU_S, SPIN_S = 1, 3.0
 TERMINALS = 80
-"""A jail may have 64; programs beside these tests open some."""
+"""More than the 64 that a jail may have."""
 
 
 @pytest.mark.short("strict-fork")
@@ -61,15 +61,9 @@ def test_fork_bomb_stops_at_the_limit(arena: Arena, title: str, payload: str) ->
 
 
 def test_pseudo_terminals_stop_at_a_number(arena: Arena) -> None:
-    """Each is some memory of the kernel in no account. The host counts those of all users."""
-    total = Path("/proc/sys/kernel/pty/nr")
-    before = [0]
+    """Each is some memory of the kernel in no account."""
     arena.attack(
-        "pseudo terminals",
-        "terminals",
-        lambda run: int(total.read_text()) - before[0] > TERMINALS,
-        before=lambda: before.__setitem__(0, int(total.read_text())),
-        count=2 * TERMINALS,
+        "pseudo terminals", "terminals", lambda run: terminals(run) > TERMINALS, count=2 * TERMINALS
     )
 
 
