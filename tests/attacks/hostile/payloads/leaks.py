@@ -24,26 +24,23 @@ def environment():
 
 def environment_of_others(pid):
     """Read the environment of every process that can be seen, and of the client."""
-    found, errors = [], []
-    for name in [str(pid), *filter(str.isdigit, os.listdir("/proc"))]:
-        try:
-            with open(f"/proc/{name}/environ", "rb") as file:
-                found.append(file.read().decode("utf-8", "replace"))
-        except OSError as error:
-            errors.append(str(error))
-    return [found, errors[:10]]
+    return _of_each_process(pid, "environ")
 
 
 def command_lines_of_others(pid):
-    """Read the command line of every process that can be seen."""
-    found = []
+    """Read the command line of every process that can be seen, and of the client."""
+    return _of_each_process(pid, "cmdline")
+
+
+def _of_each_process(pid, file):
+    found, errors = [], []
     for name in [str(pid), *filter(str.isdigit, os.listdir("/proc"))]:
         try:
-            with open(f"/proc/{name}/cmdline", "rb") as file:
-                found.append(file.read().decode("utf-8", "replace"))
+            with open(f"/proc/{name}/{file}", "rb") as opened:
+                found.append(opened.read().decode("utf-8", "replace"))
         except OSError as error:
-            found.append(str(error))
-    return found
+            errors.append(str(error))
+    return [found, errors[:10]]
 
 
 def inherited_descriptors():
