@@ -133,8 +133,9 @@ def manifest_key(snapshot: Snapshot, load: m.Load, policy: Policy, runtime: Runt
 
 @lru_cache(maxsize=8)
 def _code_of(worker: Path) -> str:
-    """A digest of when each module of the worker was changed: a manifest is what they made of it.
-    A change of a module changes no folder, where the package is used as it lies.
+    """A digest of the paths and change times of the worker's modules, which made the manifest.
+
+    The folder's own change time does not tell: editing a module in a checkout leaves it as it is.
     """
     files = (Path(folder, name) for folder, _, names in os.walk(worker) for name in names)
     code = [path for path in files if path.suffix == ".py"]

@@ -122,8 +122,10 @@ class TcpLink:
         return self._number if self._up else self._number + 1
 
     def read_ahead(self) -> None:
-        """Read what has happened to a connection that nobody uses; any thread. Else it would pile
-        up, where the server ends each new connection; what it says of us is raised by the next use.
+        """Read the events of a connection that is idle; may be called from any thread.
+
+        Unread events take memory without a bound if the server ends each new connection. A refusal
+        that is read here is raised by the next use.
         """
         if not self._owner.is_here or not self.lock.acquire(blocking=False):
             return

@@ -54,7 +54,8 @@ _LEAST_STEPS, _MOST_STEPS = 16, 256
 _LEAST_STEPS_S, _MOST_STEPS_S = 1.0, 0.25
 """Processor time in which the first are made, or it is heavy, and after which no further one is."""
 _LONGEST_SLEEP_S = 60.0
-"""Longest sleep of one call, by a play's own clock: nothing wakes who waits for another process."""
+"""Longest sleep of one call by a play's own clock. A call that polls for another process
+would never end, because sleeping takes no real time in a play."""
 _WAIT_S, _LEAST_SHARE = 2.0, 8
 """How long all plays may wait, in seconds and as a multiple of their processor time: on a busy
 machine a play waits for a processor, too.

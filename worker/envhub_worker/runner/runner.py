@@ -42,8 +42,8 @@ _ANCILLARY_BYTES = socket.CMSG_SPACE(8 * array("i").itemsize)
 _RECHECK_MS = 2
 _MOST_WRAPPERS = 100
 _PLAY_S, _PLAY_MEMORY = 20.0, 0.5
-"""In which sub-environments of all tasks are played, to see whether they are independent, and the
-share of the jail's memory that they may take."""
+"""Seconds and share of the jail's memory that playing the sub-environments of all tasks may take,
+to see whether they are independent."""
 
 
 def main(stream: socket.socket, spec: JailSpec, fds: list[int]) -> int:

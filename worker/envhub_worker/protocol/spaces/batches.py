@@ -445,9 +445,10 @@ def join_pairs(
 def join_slice(pairs: Pairs, count: int) -> dict[Any, Any]:
     """``join_pairs`` of some of the sub-environments.
 
-    The column of an array of objects without dimensions is 0 where a row has no such entry, others
-    of objects are None. Which it is is decided by rows elsewhere, too, which ``join_infos`` does
-    not see: the mask of such a column comes first, and it raises ``Misfit``.
+    Rows without an entry are 0 in the column of an array of objects without dimensions, and None
+    in other columns of objects. Rows of other shards decide which of the two it is, and
+    ``join_infos`` does not see them. So the mask of such a column is put before it, from which
+    ``join_infos`` knows to raise ``Misfit``.
     """
     zeros: list[Any] = []
 
