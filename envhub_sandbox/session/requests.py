@@ -10,10 +10,9 @@ lifecycle moves before a message goes out and after its replies are in.
 
 from __future__ import annotations
 
-import contextlib
 from abc import ABC, abstractmethod
-from collections.abc import Callable
-from functools import partial
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from typing import TYPE_CHECKING, Any, NamedTuple, NoReturn, TypeVar
 
 from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError, NoAsyncCallError
@@ -185,7 +184,7 @@ class RequestOrder(ABC):
         Ctrl-C.
         Raises ``ClosedEnvironmentError``: a ``close`` in another thread is the reason.
         """
-        with contextlib.suppress(RemoteEnvWarning):
+        with suppress(RemoteEnvWarning):
             self.show_warnings()
         if self.after_request is not None and isinstance(error, RemoteEnvError):
             self.after_request()
@@ -272,15 +271,28 @@ class Requests(RequestOrder):
         """
         if self.before_request is not None:
             self.before_request()
-        self._sending(operation, lambda: self._submit(operation, message_for, instead))
+        with self._sending(operation):
+            if self.lifecycle.state is not State.READY:
+                self._make_ready(operation)
+            try:
+                packed = self.pack(operation, message_for, instead)
+            except LocalProtocolError:
+                if len(self.results.bounds) > 1:
+                    self.refuse_whole(operation, message_for, self.results.manifest.num_envs)
+                raise
+            self._send_packed(operation, packed)
+            self._history.requested(packed.request)
 
     def make_ready(self, operation: str, start: Callable[[], object] | None = None) -> None:
         """With the lock held, open the jail if there is none; raises as ``submit`` does.
 
         ``start`` does so, or raises why it could not, where that was begun already.
         """
-        if start is not None or self.lifecycle.state is not State.READY:
-            self._sending(operation, start or (lambda: self._make_ready(operation)))
+        with self._sending(operation):
+            if start is not None:
+                start()
+            elif self.lifecycle.state is not State.READY:
+                self._make_ready(operation)
 
     def pack(
         self, operation: str, message_for: MessageFor, instead: MessageFor | None = None
@@ -293,36 +305,12 @@ class Requests(RequestOrder):
 
     def submit_packed(self, operation: str, packed: Packed) -> None:
         """The second half, which leaves the history to the caller; raises as ``submit`` does."""
-        self._sending(operation, lambda: self._submit_packed(operation, packed))
+        with self._sending(operation):
+            self._send_packed(operation, packed)
 
-    def _sending(self, operation: str, send: Callable[[], object]) -> None:
-        try:
-            try:
-                send()
-            except BaseException:
-                with self.use.hold(operation):  # on failure only: it costs some us
-                    raise
-            if self.lifecycle.state is State.CLOSED:
-                self._lease.let_go()
-        except WorkerDiedError:
-            self.refuse_if_closed()  # a close() in another thread ended it
-            raise
-
-    def _submit(self, operation: str, message_for: MessageFor, instead: MessageFor | None) -> None:
-        if self.lifecycle.state is not State.READY:
-            self._make_ready(operation)
-        try:
-            packed = self.pack(operation, message_for, instead)
-        except LocalProtocolError:
-            if len(self.results.bounds) > 1:
-                self.refuse_whole(operation, message_for, self.results.manifest.num_envs)
-            raise
-        self._submit_packed(operation, packed)
-        self._history.requested(packed.request)
-
-    def _submit_packed(self, operation: str, packed: Packed) -> None:
-        lane = self._lane()
-        self._send(operation, lambda: lane.send(packed.sent))
+    def _send_packed(self, operation: str, packed: Packed) -> None:
+        with self._outgoing(operation):
+            self._lane().send(packed.sent)
         if self._recovery is not None:
             self._recovery.sent(packed.request)
         if self._prewarm.first_use is not None:
@@ -332,15 +320,9 @@ class Requests(RequestOrder):
         """With the lock held, send the only runner of ``lane`` a request, while other runners, or
         it, may owe answers to earlier ones; raises as ``submit`` does.
         """
-
-        def send() -> None:
+        ready = self.lifecycle.state is State.READY  # otherwise a request is pending already
+        with self._sending(operation), self._outgoing(operation, submit=ready):
             lane.send_some(operation, lane.runners, [lane.jail.pack(message)], ahead=True)
-
-        if self.lifecycle.state is State.READY:
-            self._sending(operation, lambda: self._send(operation, send))
-        else:
-            self._sending(operation, send)
-            self._counters.requests += 1
 
     def _request(self, lane: Lane, operation: str, message_for: MessageFor) -> Request:
         bounds = self.results.bounds
@@ -366,9 +348,8 @@ class Requests(RequestOrder):
         ``ClosedEnvironmentError``: a ``close`` in another thread came first.
         """
         try:
-            replies = self._judged(lambda: self._collect(deadline_of(timeout), kind, lane))
-            if self.lifecycle.state is State.CLOSED:
-                self._lease.let_go()
+            with self._incoming():
+                replies = self._collect(deadline_of(timeout), kind, lane)
         except BaseException as error:
             self.explain(error)
             raise
@@ -394,18 +375,17 @@ class Requests(RequestOrder):
 
     def one_each(self, what: str, replies: list[m.Value] | list[m.WatchDone]) -> tuple[Any, ...]:
         """See ``RequestOrder``."""
-        return self._judged(lambda: self.results.one_each(what, replies))
+        with self._incoming():
+            return self.results.one_each(what, replies)
 
     def finish_reset(
         self, replies: list[m.ResetDone], timeout: float | Deadline | None
     ) -> tuple[Any, dict[Any, Any]]:
         """What ``VectorEnv.reset`` returns, of the replies to one; raises as ``collect`` does."""
-        try:
-            result = self.results.reset(replies)
-        except BaseException as error:
-            with self.use.judging("a request"):  # on failure only: it costs some us
-                if not isinstance(error, batches.Misfit):
-                    raise
+        with self._incoming():
+            try:
+                result = self.results.reset(replies)
+            except batches.Misfit:
                 infos = self._infos_apart(deadline_of(timeout))
                 if self._recovery is not None:
                     infos = self._recovery.mark(infos)
@@ -530,7 +510,8 @@ class Requests(RequestOrder):
         ``failed`` tells them that those could not be joined; then there are none.
         """
         lane = self._lane()
-        self._send("step", partial(lane.send_for_infos, failed=failed))
+        with self._outgoing("step"):
+            lane.send_for_infos(failed=failed)
         try:
             replies = self._finish(lane.replies, deadline)
         except RunnersDiedError as deaths:
@@ -547,13 +528,47 @@ class Requests(RequestOrder):
 
     # --- out and back --------------------------------------------------------------------------
 
-    def _judged(self, handle: Callable[[], T]) -> T:
-        """What the handling of replies gives; what it raises is judged."""
+    @contextmanager
+    def _sending(self, operation: str) -> Iterator[None]:
+        """Around all that a request needs before its message, and the message: what fails in it
+        because of a ``close`` in another thread says so.
+        """
         try:
-            return handle()
+            try:
+                yield
+            except BaseException:
+                with self.use.hold(operation):  # on failure only: it costs some us
+                    raise
+            if self.lifecycle.state is State.CLOSED:
+                self._lease.let_go()
+        except WorkerDiedError:
+            self.refuse_if_closed()
+            raise
+
+    @contextmanager
+    def _outgoing(self, operation: str, *, submit: bool = True) -> Iterator[None]:
+        """Around the sending of a message; ``submit`` unless another request is pending."""
+        if submit:
+            self.lifecycle.request = operation
+            self.lifecycle.on(Event.SUBMIT)  # interruption.md, rule 1: first
+        try:
+            yield
+        except EnvHubError as error:
+            if submit:
+                self._nothing_was_sent(error)
+            raise
+        self._counters.requests += 1
+
+    @contextmanager
+    def _incoming(self) -> Iterator[None]:
+        """Around the handling of replies: a worker that breaks a rule in them is given up."""
+        try:
+            yield
         except BaseException:
             with self.use.judging("a request"):  # on failure only: it costs some us
                 raise
+        if self.lifecycle.state is State.CLOSED:
+            self._lease.let_go()
 
     def _make_ready(self, operation: str) -> None:
         state, restart = self.lifecycle.state, self._repository.policy.restart
@@ -565,16 +580,6 @@ class Requests(RequestOrder):
             raise refused
         self._prewarm.note_use()  # already: the next one starts beside this
         self._prewarm.start_on_demand()
-
-    def _send(self, operation: str, send: Callable[[], None]) -> None:
-        self.lifecycle.request = operation
-        self.lifecycle.on(Event.SUBMIT)  # interruption.md, rule 1: first
-        try:
-            send()
-        except EnvHubError as error:
-            self._nothing_was_sent(error)
-            raise
-        self._counters.requests += 1
 
     def _nothing_was_sent(self, error: BaseException) -> None:
         """Go back to where we were, if nothing was sent: interruption.md, rule 2."""
