@@ -231,14 +231,15 @@ class EnvFactory:
         repository = self._repository
         alone = manifest.lazy or len(manifest.envs) == 1
         shared = None if alone else self._shared(loaded)
-        sessions = [self._session(manifest, env, shared) for env in manifest.envs]
+        makers = [partial(self._session, manifest, env, shared) for env in manifest.envs]
+        sessions = [make() for make in makers]
         if loaded is not None and shared is None:
             self._use(loaded, sessions)
         envs: dict[str, dict[Any, Any]] = {}
         suites: dict[str, list[TaskPrewarm]] = {}
-        for session in sessions:
+        for session, again in zip(sessions, makers, strict=True):
             env = session.manifest
-            envs.setdefault(env.suite, {})[env.task] = SandboxVectorEnv(session)
+            envs.setdefault(env.suite, {})[env.task] = SandboxVectorEnv(session, again)
             suites.setdefault(env.suite, []).append(session.prewarm)
         if shared is None and self._prewarm != 0:
             SuitePrewarm(list(suites.values()), self._prewarm)

@@ -36,7 +36,7 @@ from envhub_sandbox.settings.options import Options, option_name
 from envhub_sandbox.settings.policy import Limits, Policy, Timeouts, policy_from, timeouts_from
 from envhub_sandbox.system.folders import cache_root
 from envhub_sandbox.system.platform import occupy_streams
-from envhub_sandbox.vector.suites import EnvSuites
+from envhub_sandbox.vector.suites import EnvSuites, opened_again
 from envhub_sandbox.vector.tracebacks import short_traceback
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.records import dataclass
@@ -86,7 +86,8 @@ def make_env(
         n_envs: Number of sub-environments, passed to the repository's ``make_env``.
         use_async_envs: Also passed to it; if True, sub-environments may run in several processes.
         hub_cache_dir: huggingface_hub's ``cache_dir``.
-        trust_remote_code: Only for ``sandbox=None``.
+        trust_remote_code: Needed for ``sandbox=None`` only. If True, a ``reset`` after ``close``
+            opens the environment again, as one of LeRobot's ``make_env``.
         sandbox: Where the code runs: ``"process"``; ``"docker"``, ``"docker:IMAGE"`` or a
             ``DockerSandbox``; ``"ray"`` or a ``RaySandbox``; ``"tcp://HOST:PORT"`` or a
             ``RemoteSandbox``. A list of these, or a ``Fleet``, spreads the sub-environments of each
@@ -198,12 +199,13 @@ def _make(cfg: Any, given: Options) -> EnvSuites:
             snapshot, wanted.place.name, wanted.choice.where, wanted.python, own
         ).advice,
     )
-    return EnvFactory(
+    suites = EnvFactory(
         _launchers(repository, wanted.place, options),
         options.num_workers,
         _ahead(wanted, options),
         lock_checker(wanted.lock, snapshot.label, load.env_kwargs, config),
     ).make()
+    return opened_again(suites) if options.trust_remote_code else suites
 
 
 def _launchers(repository: Repository, place: Sandbox, options: Options) -> list[Launcher]:

@@ -108,7 +108,8 @@ class RequestOrder(ABC):
         """Refuse every request after ``close``. Raises ``ClosedEnvironmentError``: it is closed."""
         if self.closed:
             raise ClosedEnvironmentError(
-                f"Trying to operate on `{self.face}`, after a call to `close()`."
+                f"Trying to operate on `{self.face}`, after a call to `close()`. "
+                f"{self._repository.label}: make_env makes another"
             )
 
     def end_wait(self, operation: str) -> None:

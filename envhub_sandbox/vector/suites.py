@@ -156,6 +156,16 @@ def closed_if_it_fails(suites: EnvSuites) -> Iterator[EnvSuites]:
         raise
 
 
+def opened_again(suites: EnvSuites) -> EnvSuites:
+    """The same, where a ``reset`` after ``close`` opens an environment anew, as LeRobot's lazy ones
+    do: an evaluation closes each, and may come again.
+    """
+    for env in [env for tasks in suites.values() for env in tasks.values()]:
+        if isinstance(env, SandboxVectorEnv):
+            env._session.repository.opens_again = True
+    return suites
+
+
 def choose(
     suites: EnvSuites, suite: str | None = None, task: int | str | None = None
 ) -> VectorEnv[Any, Any, Any]:

@@ -20,6 +20,7 @@ from gymnasium.vector import VectorEnv
 
 from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.session.requests import SENT, MessageFor
+from envhub_sandbox.system.platform import OwnerProcess
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.remote_warnings import level_of_the_caller
 from envhub_sandbox.transport.replies import typed_reply
@@ -78,8 +79,10 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
         sandbox: What confines it, and what that holds, was denied and has done.
     """
 
-    def __init__(self, session: AnySession) -> None:
+    def __init__(self, session: AnySession, again: Callable[[], AnySession] | None = None) -> None:
         super().__init__(session)
+        self._again = again
+        self._owner = OwnerProcess()
         manifest = self._manifest
         self._requests.face = type(self).__name__
         self._timeouts = session.repository.timeouts
@@ -102,7 +105,8 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
             self.env_fns = [made_there] * manifest.num_envs
             self.observation_mode = "same"
         # processes end with the last reference to the proxy; interruption.md, rule 13
-        weakref.finalize(self, session.finalize).atexit = False
+        self._finalizer = weakref.finalize(self, session.finalize)
+        self._finalizer.atexit = False
         self._warn_of_hidden_names()
 
     def _warn_of_hidden_names(self) -> None:
@@ -186,9 +190,22 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
 
     def _note_first_use(self) -> None:
         """Before the lock, which a start ahead has: meanwhile the next one may start."""
+        self._open_again()
         prewarm = self._session.prewarm
         if prewarm.starting is not None and not self.closed:
             prewarm.note_use()
+
+    def _open_again(self) -> None:
+        """After a ``close`` that ``opens_again``: another life, with what it is and was told here.
+
+        A fork does not: the place that the next one would start in is its parent's.
+        """
+        if not (self.closed and self._again and self._session.repository.opens_again):
+            return
+        with self._requests.use.lock:
+            if self.closed and self._owner.is_here:
+                self._finalizer.detach()
+                SandboxVectorEnv.__init__(self, self._again(), self._again)
 
     def _refuse_if_busy_for_reset(self, options: dict[str, Any] | None) -> None:
         """A reset of all drops what was sent and not received."""
@@ -291,6 +308,7 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
     @short_traceback
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
         """Call a method, or read an attribute, of every sub-environment: a tuple of results."""
+        self._open_again()
         with self._requests.use.lock:
             self._requests.refuse_if_busy("call_async")
             if not (args or kwargs) and self._manifest.shardable:
@@ -430,7 +448,10 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
         return SandboxView(self._session)
 
     def close(self, **kwargs: Any) -> None:
-        """Close the sub-environments and end their processes, in bounded time. Idempotent."""
+        """Close the sub-environments and end their processes, in bounded time. Idempotent.
+
+        Later requests are refused; of LeRobot's callers, ``reset`` and ``call`` open it again.
+        """
         if self._requests.waiting not in (None, SENT) and not self.closed:
             warnings.warn(
                 f"Calling `close` while waiting for a pending call to `{self._requests.waiting}` "

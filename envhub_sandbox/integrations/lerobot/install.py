@@ -17,7 +17,7 @@ import lerobot.envs.factory
 from envhub_sandbox.factory.make_env import make_env
 from envhub_sandbox.integrations.lerobot.config import ASKS_CONFIGS, SandboxedEnvConfig
 from envhub_sandbox.settings.options import OPTIONS
-from envhub_sandbox.vector.suites import EnvSuites
+from envhub_sandbox.vector.suites import EnvSuites, opened_again
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 
 _HELPERS = ("_download_hub_file", "_import_hub_module", "_call_make_env")
@@ -89,13 +89,14 @@ class _Routing:
         """The environments, from the sandbox."""
         if isinstance(cfg, SandboxedEnvConfig):
             return cfg.create_envs(n_envs, use_async_envs)
-        return make_env(
+        suites = make_env(
             module.reference if cfg is None else cfg,
             n_envs=n_envs,
             use_async_envs=use_async_envs,
             hub_cache_dir=module.hub_cache_dir,
             **self.options,
         )
+        return opened_again(suites)
 
 
 class _AsyncOrSandboxed(type):

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from gymnasium.error import ClosedEnvironmentError
 
 from envhub_sandbox import make_env
 from tests.support.compare import assert_same
@@ -69,13 +70,22 @@ def test_rollout_is_the_same(mode: str, use_async_envs: bool) -> None:
 def test_evaluation_of_a_suite_is_the_same(
     repository: Path, use_async_envs: bool, max_parallel_tasks: int
 ) -> None:
-    """Metrics of every task agree, one by one and from a pool of threads."""
+    """Metrics of every task agree, one by one and from a pool of threads; also a second time, for
+    which what the first one closed is opened again. For a caller of Gymnasium it stays closed.
+    """
     expected = lerobot.evaluate_all(make_env_of(repository)(n_envs=2), policy, 3, 1)
-    envs = make_env(repository, n_envs=2, use_async_envs=use_async_envs)
-    actual = lerobot.evaluate_all(envs, policy, 3, max_parallel_tasks)
-    assert_same(expected, dict(sorted(actual.items())))
+    options: Any = {"n_envs": 2, "use_async_envs": use_async_envs}
+    envs = make_env(repository, **options, trust_remote_code=True)
+    for _ in range(2):
+        actual = lerobot.evaluate_all(envs, policy, 3, max_parallel_tasks)
+        assert_same(expected, dict(sorted(actual.items())))
+        assert all(env.closed and not env.sandbox.report() for env in envs["pendulum"].values())
     lerobot.close_envs(envs)
     envs.close()
+    with make_env(repository, **options) as refusing:
+        env = refusing["pendulum"][0]
+    with pytest.raises(ClosedEnvironmentError, match=r"pendulum_suite.*: make_env makes another"):
+        env.reset(seed=0)
 
 
 def test_missing_task_falls_back_as_in_lerobot() -> None:
