@@ -48,7 +48,7 @@ exec $engine "${{words[@]}}"
 def ours() -> list[Block]:
     """What ``blocks.APART`` leaves to this."""
     here = Path(__file__).relative_to(blocks.CHECKOUT).as_posix()
-    return [one for one in blocks.tested(blocks.OWN) if one.listed(blocks.APART) == here]
+    return [one for one in blocks.tested(blocks.OWN) if one.apart == here]
 
 
 def of_this_engine(block: Block) -> Block:

@@ -66,7 +66,7 @@ READ_AS |= {"=...": "=robots/policy", '{"gpu": true}': "{}", '{"gpu": True}': "{
 def written() -> tuple[list[list[str]], str]:
     """The commands of LeRobot's, and the Python, that ``blocks.APART`` leaves to this."""
     here = Path(__file__).relative_to(blocks.CHECKOUT).as_posix()
-    ours = [one for one in blocks.tested(blocks.OWN) if one.listed(blocks.APART) == here]
+    ours = [one for one in blocks.tested(blocks.OWN) if one.apart == here]
     texts = {"sh": "", "python": ""}
     for one in ours:
         texts[one.language] += one.text.replace("\\\n", " ")

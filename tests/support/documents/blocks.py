@@ -1,14 +1,13 @@
-"""The blocks of code in the documents, and what executes them: none is left out by itself.
+"""The blocks of code in the documents, and what executes them.
 
-Shell and Python are executed, but for what ``APART`` and ``NOT_EXECUTED`` name by its beginning;
-other languages as ``TABLE`` says of the document. Whoever adds a block that cannot be executed says
-here why, or what executes it.
+Shell and Python are executed with the others of their document, but for what ``APART`` and
+``NOT_EXECUTED`` name by its beginning.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,9 +24,7 @@ DOCUMENTS = tuple(
 RUN = "executed with the others of its document"
 OWN = "executed by a test of its own"
 HELD = "not executed: each command, option and script in it is one that there is"
-PARSED = "parsed, and held against what it is about"
-SHOWN = "what is printed, or a drawing: its commands are ones that there are"
-DRAWN = "the site's build takes it, and the browser draws it"
+OTHER = "neither shell nor Python"
 
 # What executes blocks of shell and Python that the tests in tests/integration/documents do not: by
 # document and beginning.
@@ -47,37 +44,17 @@ APART = {
     ("docs/ray.md", "envhub run"): _RAY,
     ("plugins/lerobot_env_envhub_sandbox/README.md", "lerobot-"): _LEROBOT,
 }
-# Why others are not executed as they stand there.
-_INSTALLS = "installs gigabytes, or into the reader's own interpreter"
-_LONG = "is for minutes to hours; its arguments are taken by its own parser"
-_DERIVED = (
-    "needs an engine, Debian's mirror and minutes; tests/containers/test_image.py derives others"
-)
+# Others are not executed as they stand there: they install, need servers, or take hours.
 NOT_EXECUTED = {
-    ("CONTRIBUTING.md", "python3 -m venv .venv"): _INSTALLS,
-    ("CONTRIBUTING.md", ".venv/bin/ruff"): "is what CI does: .ci/steps/lint.sh, .ci/steps/tests.sh",
-    ("docs/internals/tests.md", ".venv/bin/python -m"): _LONG,
-    ("benchmarks/README.md", "python -m"): _LONG,
-    ("docs/deployment.md", "envhub image build"): _DERIVED,
-    ("docs/lerobot.md", "pip install"): _INSTALLS,
-    ("docs/ray.md", "pip install"): _INSTALLS,
-    ("docs/benchmarks.md", "python -m benchmarks"): _LONG,
-    (
-        "docs/scaling.md",
-        "envhub run org",
-    ): "needs servers; tests/integration/fleet runs lists of them",
-}
-_EVERYWHERE = {"sh": RUN, "": SHOWN, "text": SHOWN, "mermaid": DRAWN}
-TABLE = {
-    ("docs/ci.md", "yaml"): PARSED,
-    **{
-        (document, "python"): RUN
-        for document in (
-            *("README.md", "docs/async.md", "docs/authors.md", "docs/concepts.md"),
-            *("docs/deployment.md", "docs/integrations.md", "docs/observing.md"),
-            *("docs/quickstart.md", "docs/scaling.md"),
-        )
-    },
+    ("CONTRIBUTING.md", "python3 -m venv .venv"),
+    ("CONTRIBUTING.md", ".venv/bin/ruff"),
+    ("docs/internals/tests.md", ".venv/bin/python -m"),
+    ("benchmarks/README.md", "python -m"),
+    ("docs/deployment.md", "envhub image build"),
+    ("docs/lerobot.md", "pip install"),
+    ("docs/ray.md", "pip install"),
+    ("docs/benchmarks.md", "python -m benchmarks"),
+    ("docs/scaling.md", "envhub run org"),
 }
 
 
@@ -90,18 +67,25 @@ class Block:
     text: str
 
     @property
-    def way(self) -> str | None:
-        if self.listed(APART):
+    def way(self) -> str:
+        if self.language not in ("sh", "python"):
+            return OTHER
+        if self.named_in(APART):
             return OWN
-        if self.listed(NOT_EXECUTED):
-            return HELD
-        return _EVERYWHERE.get(self.language) or TABLE.get((self.document, self.language))
+        return HELD if self.named_in(NOT_EXECUTED) else RUN
 
-    def listed(self, table: Mapping[tuple[str, str], str]) -> str | None:
-        for (document, beginning), said in table.items():
-            if document == self.document and self.text.startswith(beginning):
-                return said
-        return None
+    @property
+    def apart(self) -> str:
+        """The file that executes it."""
+        return APART[self.named_in(APART)[0]]
+
+    def named_in(self, table: Collection[tuple[str, str]]) -> list[tuple[str, str]]:
+        """The document and the beginning by which a table names it."""
+        return [
+            (document, beginning)
+            for document, beginning in table
+            if document == self.document and self.text.startswith(beginning)
+        ]
 
 
 def blocks() -> Iterator[Block]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import re
 import shlex
@@ -194,17 +193,6 @@ def test_the_hook_that_reads_fails_for_what_hides(
     assert CliRunner().invoke(app, words(checkout, "envhub-static")).exit_code == code
 
 
-def test_the_site_has_every_document(checkout: Path) -> None:
-    """Its table of contents; whether links lead anywhere there, its strict build says."""
-    listed = re.findall(
-        r"^ *- (?:[^:\n]+: )?([\w/-]+\.md)$", (checkout / "mkdocs.yml").read_text(), re.MULTILINE
-    )
-    beside = ["index.md", "SECURITY.md", "CONTRIBUTING.md", "CHANGELOG.md"]
-    beside.append("internals/benchmarks-how.md")  # benchmarks/README.md
-    documents = [str(path.relative_to(checkout / "docs")) for path in checkout.glob("docs/**/*.md")]
-    assert sorted(listed) == sorted(documents + beside)
-
-
 def test_what_is_named_exists(checkout: Path) -> None:
     """The options that all three pass are those of the commands, by their own help."""
     texts = [
@@ -286,46 +274,6 @@ def test_the_action_and_the_image_install_what_is_locked(checkout: Path) -> None
 # --- The documents' site loads nothing from elsewhere: what CI asks of it would find it
 
 
-_PAGE = "<head><meta http-equiv='Content-Security-Policy' content=\"default-src 'self'\">%s</head>"
-
-
-@pytest.fixture(scope="module")
-def loads(checkout: Path) -> Any:
-    spec = importlib.util.spec_from_file_location("loads", checkout / ".ci" / "loads.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-@pytest.mark.parametrize(
-    ("name", "text"),
-    [
-        ("a.html", _PAGE % '<script src="https://cdn.example/x.js"></script>'),
-        ("a.html", _PAGE % '<link rel="stylesheet" href="//cdn.example/x.css">'),
-        ("a.html", _PAGE % '<img srcset="x.png, https://cdn.example/y.png 2x">'),
-        ("a.html", _PAGE % "<style>@import 'https://cdn.example/x.css'</style>"),
-        ("a.html", _PAGE % '<p style="background: url(https://cdn.example/x.png)">'),
-        ("a.html", _PAGE % "<script>fetch('https://cdn.example/x')</script>"),
-        ("a.html", "<head></head>"),
-        ("a.css", "p { background: url('//cdn.example/x.png') }"),
-        ("a.js", 'import("https://cdn.example/x.js")'),
-    ],
-)
-def test_what_a_page_loads_from_elsewhere_is_found(
-    loads: Any, tmp_path: Path, name: str, text: str
-) -> None:
-    """Each way to load something, and a page that does not forbid it.
-
-    The site's own files, a link that a reader follows, and names of XML's vocabularies are none.
-    """
-    own = '<script src="../x.js"></script><a href="https://example.com/">there</a>'
-    (tmp_path / "own.html").write_text(_PAGE % own)
-    (tmp_path / "own.js").write_text('of("http://www.w3.org/2000/svg") // see https://x.example')
-    (tmp_path / name).write_text(text)
-    [line] = loads.foreign(tmp_path)
-    assert line.startswith(f"{name}: ")
-
-
 def test_the_steps_of_ci_name_tests_that_there_are(checkout: Path) -> None:
     """A step that names a folder which was moved runs no test of it, or leaves nothing out."""
     lists = 'echo "${differs_by_user[@]}" "${same_for_versions[@]}"'
@@ -378,11 +326,3 @@ def test_what_failed_is_run_again_alone_three_times(
         f"{once}_an_attack_fails_in_its_first_run",
         "FAILED AGAIN: test_it.py::test_fails_in_its_fourth_run_too",
     ]
-
-
-def test_a_run_whose_failures_pass_alone_has_passed(checkout: Path, tmp_path: Path) -> None:
-    (tmp_path / "test_it.py").write_text(_FAILS % 0)
-    (tmp_path / "fourth").write_text("....")
-    pytest_again = f"bash {checkout}/.ci/again.sh {sys.executable} -m pytest -q -p xdist.plugin"
-    done = run(pytest_again, tmp_path, PYTEST_DISABLE_PLUGIN_AUTOLOAD="1")
-    assert (done.returncode, done.stdout.count("FAILED ONCE")) == (0, 2)

@@ -114,60 +114,6 @@ def fenced(text: str, language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
 
 
-def test_readme_opens_with_one_command_to_try_and_one_to_test() -> None:
-    first, second = fenced(README, "sh")[:2]
-    assert first.count("\n") == second.count("\n") == 1
-    assert "envhub run ./examples/" in first
-    assert second == "./test\n"
-    introduction = README.split("\n\n")[1]
-    assert introduction.count("\n") <= 5
-
-
-def test_readme_shows_the_first_command_with_what_it_prints() -> None:
-    """The picture is of a run of it, and names no machine."""
-    drawn = (CHECKOUT / "docs" / "assets" / "run.svg").read_text()
-    assert "](docs/assets/run.svg)" in README
-    command = fenced(README, "sh")[0].rpartition("/bin/")[2].strip()
-    assert f"<title>{command}: " in drawn
-    assert "wrote cartpole.mp4" in drawn
-    assert not _FORBIDDEN.search(drawn)
-
-
-def test_ci_runs_the_commands_of_the_readme() -> None:
-    """Both word for word, read off it; and the second for every test."""
-    steps = CHECKOUT / ".ci" / "steps"
-    assert "README.md | head -2" in (steps / "readme.sh").read_text()
-    _, second, *_ = fenced(README, "sh")
-    assert second.strip() == "./test"
-    full = r'^with_summary tests \./test --full -n "\$\(processes\)"$'
-    assert re.search(full, (steps / "tests.sh").read_text(), re.M)
-
-
-def test_a_page_names_every_step_and_every_folder_of_tests() -> None:
-    text = (CHECKOUT / "docs" / "internals" / "tests.md").read_text()
-    tables = rows(section(text, "CI"))
-    steps = {step.stem for step in (CHECKOUT / ".ci" / "steps").iterdir()}
-    assert {name for row in tables for name in code_words(row[0])} == steps
-    folders = {f"tests/{one.name}" for one in CHECKOUT.glob("tests/*") if one.is_dir()}
-    listed = {name for row in rows(section(text, "Where tests go")) for name in code_words(row[0])}
-    assert listed == {name for name in folders if "__pycache__" not in name}
-
-
-def test_contributing_names_twenty_modules_to_read_first() -> None:
-    first = section((CHECKOUT / "CONTRIBUTING.md").read_text(), "Where to begin")
-    page = (CHECKOUT / "docs" / "internals" / "map.md").read_text()
-    symptoms = section(page, "From a symptom to a module")
-    modules = [code_words(module)[0] for module, _ in rows(first)]
-    assert len(modules) == len(set(modules)) == 20
-    begins = [[word for word in code_words(cell) if "/" in word] for _, cell in rows(symptoms)]
-    assert len(begins) > 10
-    assert all(begins)
-    for name in [*modules, *(name for names in begins for name in names)]:
-        top, _, rest = name.removeprefix("worker/").partition("/")
-        root = CHECKOUT / top if top == "docs" else folder(top)
-        assert (root / rest).is_file(), name
-
-
 @pytest.mark.parametrize("document", ["README.md", "docs/integrations.md"])
 def test_the_python_of_a_document_runs(document: str) -> None:
     blocks = fenced((CHECKOUT / document).read_text(), "python")
@@ -291,35 +237,3 @@ def test_error_tree_is_the_tree() -> None:
 def test_what_is_written_from_the_source_is_up_to_date(page: Any) -> None:
     """``python -m tests.support.documents.NAME`` writes it."""
     assert page.DOCUMENT.read_text() == page.document()
-
-
-def test_the_rules_of_interruption_are_those_that_the_source_names() -> None:
-    """Each rule is named where a line depends on it, and no rule that there is not."""
-    page = (CHECKOUT / "docs" / "internals" / "interruption.md").read_text()
-    rules = {int(found) for found in re.findall(r"^\*\*Rule (\d+):", page, re.MULTILINE)}
-    named: set[int] = set()
-    for path in folder("envhub_sandbox").rglob("*.py"):
-        text = path.read_text()
-        for found in (
-            re.findall(r"\brules? (\d[\d, toand]*)", text) if "interruption.md" in text else ()
-        ):
-            numbers = [int(number) for number in re.findall(r"\d+", found)]
-            named.update(range(numbers[0], numbers[-1] + 1) if " to " in found else numbers)
-    assert named == rules == set(range(1, len(rules) + 1))
-
-
-@pytest.mark.parametrize("page", ["a-step", "interruption"])
-def test_the_files_that_a_page_on_the_inside_names_are_there(page: str) -> None:
-    text = (CHECKOUT / "docs" / "internals" / f"{page}.md").read_text()
-    files = [
-        f"/{prefix}{one.relative_to(root.parent)}"
-        for prefix, root in (
-            ("", folder("envhub_sandbox")),
-            ("worker/", folder("envhub_worker")),
-            ("", CHECKOUT / "tests"),
-        )
-        for one in root.rglob("*.py")
-    ]
-    named = re.findall(r"`([a-z_/-]+\.py)`", text)
-    assert named
-    assert [one for one in named if not any(file.endswith(f"/{one}") for file in files)] == []

@@ -125,14 +125,6 @@ IMPORTERS = {
 # the modules of LeRobot's package that import make_env
 _LEROBOT = ("lerobot.config", "lerobot.install")
 
-# where tests and benchmarks may name what starts with an underscore, and others' names that they do
-SEAM = "tests/support/inside.py"
-PRIVATE_NAMES_OF_OTHERS = {
-    *("_add_info", "_autoreset_envs", "_env_obs", "_terminations", "_truncations"),  # Gymnasium's
-    *("_exit", "_getframe", "_resource_tracker"),  # the standard library's
-    "_ensure",  # what LeRobot looks for
-}
-
 
 def folder(package: str) -> Path:
     spec = importlib.util.find_spec(package)
@@ -380,42 +372,6 @@ def loaded_by(source: str) -> set[str]:
         timeout=120,
     )
     return {name.split(".")[0] for name in done.stdout.split()}
-
-
-def test_tests_reach_inside_in_one_place(checkout: Path) -> None:
-    """Who needs a private name asks ``tests.support.inside`` for what it gives."""
-    ours = [*checkout.glob("tests/**/*.py"), *checkout.glob("benchmarks/**/*.py")]
-    found = [
-        f"{path.relative_to(checkout)}:{node.lineno}: {ast.unparse(node)}"
-        for path in ours
-        if not {"samples", "hostile", ".venvs"} & set(path.parts) and path != checkout / SEAM
-        for node in ast.walk(ast.parse(path.read_text()))
-        if reaches_inside(node)
-    ]
-    assert checkout / SEAM in ours
-    assert found == [], f"add what they need to {SEAM}"
-    wrong = ("env._session", "from a import _b", "patch.setattr(a, '_b', 1)", "setattr('a._b', 1)")
-    right = ("self._own", "env.remote", "env._add_info({}, {}, 0)", "setattr('a.b', 1)", "a.__b__")
-    seen = {one for one in wrong + right if any(map(reaches_inside, ast.walk(ast.parse(one))))}
-    assert seen == set(wrong), "the control"
-
-
-def reaches_inside(node: ast.AST) -> bool:
-    """Whether this names something private of somebody else, or puts another in its place."""
-    if isinstance(node, ast.Attribute):
-        own = isinstance(node.value, ast.Name) and node.value.id in ("self", "cls")
-        return private(node.attr) and not own
-    if isinstance(node, ast.ImportFrom):
-        return any(private(alias.name) for alias in node.names)
-    if isinstance(node, ast.Call) and ast.unparse(node.func).endswith("setattr"):
-        texts = [one.value for one in node.args[:2] if isinstance(one, ast.Constant)]
-        return any(private(str(text).rpartition(".")[2]) for text in texts)
-    return False
-
-
-def private(name: str) -> bool:
-    """Whether a name is for its own module only."""
-    return name.startswith("_") and name[:2] != "__" and name not in PRIVATE_NAMES_OF_OTHERS
 
 
 def test_the_package_imports_nothing_heavy() -> None:
