@@ -24,7 +24,7 @@ REPOSITORY = SAMPLES / "old_gym"
 STEPS = 60
 NEWEST = ("gym==0.26.2", "gymnasium", "numpy==1.26.4")
 OLDER = ("gym==0.23.1", "gymnasium", "numpy==1.26.4")
-WITHOUT_BOOL8 = ("gym==0.26.2", "gymnasium", "numpy>=2")
+NEWEST_NUMPY = ("gym==0.26.2", "gymnasium", "numpy>=2")
 CASES = [(OLDER, "wrapped"), (NEWEST, "walk"), (NEWEST, "cartpole")]
 BY_HAND = """
 import json, sys
@@ -150,13 +150,14 @@ def test_it_is_bit_for_bit_what_a_user_of_gym_has(
     ) == 1
 
 
-def test_gyms_own_checks_run_without_what_numpy_2_took_away(runtimes: Any) -> None:
-    """``np.bool8``, which ``gym.make`` uses in each step: by hand, it fails."""
-    runtime, actions = runtimes(WITHOUT_BOOL8), some_actions("cartpole")
-    with pytest.raises(RuntimeError, match="bool8"):
-        by_hand(runtime, "cartpole", 5, actions)
+def test_code_of_gym_has_what_numpy_took_away(runtimes: Any) -> None:
+    """``np.int``, and ``np.bool8``, which ``gym.make`` uses in each step: by hand, both fail."""
+    runtime, actions = runtimes(NEWEST_NUMPY), some_actions("cartpole")
+    for kind, name in (("cartpole", "bool8"), ("old_names", "int")):
+        with pytest.raises(RuntimeError, match=f"attribute '{name}'"):
+            by_hand(runtime, kind, 5, actions)
     expected = by_hand(runtimes(NEWEST), "cartpole", 5, actions)
-    assert sandboxed(runtime, 5, actions, kind="cartpole")[0] == expected
+    assert sandboxed(runtime, 5, actions, kind="old_names")[0] == expected
 
 
 def test_vectors_of_gym_reset_in_the_step_that_ends(runtimes: Any) -> None:

@@ -23,7 +23,7 @@ from tests.support.compare import assert_same
 from tests.support.packages.environments import installed_once, running_on
 from tests.support.samples import reference, sample
 
-OLDEST = ("gymnasium==0.26.3", "numpy==1.26.4")
+OLDEST = ("gymnasium==0.26.3", "numpy==1.23.5")
 OLD = ("gymnasium==0.29.1", "numpy==1.26.4")
 FIRST = ("gymnasium==1.0.0", "numpy==1.26.4")
 NEW = ("gymnasium>=1.1", "numpy>=2")

@@ -66,7 +66,14 @@ def cartpole():
     return gym.make("CartPole-v1")
 
 
-MAKERS = {"walk": Walk, "wrapped": wrapped, "cartpole": cartpole}
+def old_names():
+    """With what numpy 1.24 and 2 have taken away."""
+    assert np.int(np.float_(np.float(1)))
+    assert [np.bool, np.object, np.Inf]
+    return cartpole()
+
+
+MAKERS = {"walk": Walk, "wrapped": wrapped, "cartpole": cartpole, "old_names": old_names}
 
 
 def make_env(n_envs=1, use_async_envs=False, kind="walk", around="nothing"):

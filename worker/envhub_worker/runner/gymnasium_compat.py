@@ -15,8 +15,10 @@ What they lack is added here, so that no other module asks for a version:
 
 from __future__ import annotations
 
+import builtins
 import inspect
 from collections.abc import Callable, Iterator, Mapping
+from importlib.util import find_spec
 from typing import Any
 
 import gymnasium as gym
@@ -24,6 +26,7 @@ import numpy as np
 from gymnasium.vector import SyncVectorEnv, VectorEnv
 
 from envhub_worker.protocol.spaces import batches
+from envhub_worker.protocol.spaces.spaces import entropy_of
 from envhub_worker.runner import returned
 
 _MODES: Any = getattr(gym.vector, "AutoresetMode", None)
@@ -188,7 +191,7 @@ class _OldSyncVectorEnv(_WithMode):
 
     @property
     def np_random_seed(self) -> Any:
-        return tuple(one.bit_generator.seed_seq.entropy for one in self.np_random)
+        return tuple(entropy_of(one.bit_generator) for one in self.np_random)
 
 
 def owner(env: Any, name: str) -> Any:
@@ -239,3 +242,24 @@ def names(parameters: Parameters, name: str) -> bool:
     """Whether it has a parameter of this name, which can be given by keyword."""
     parameter = parameters.get(name)
     return parameter is not None and parameter.kind is not inspect.Parameter.POSITIONAL_ONLY
+
+
+_NUMPYS_OLD_NAMES = {
+    name: getattr(builtins, name) for name in ("bool", "complex", "float", "int", "object", "str")
+} | {
+    "bool8": np.bool_,
+    "complex_": np.complex128,
+    "float_": np.float64,
+    "unicode_": np.str_,
+    "Inf": np.inf,
+    "NaN": np.nan,
+    "infty": np.inf,
+}
+"""What numpy 1.24 and 2 have taken away, and code of ``gym`` still uses."""
+
+
+def restore_numpys_names() -> None:
+    """Define them where ``gym`` can be imported, before any of its code runs."""
+    if find_spec("gym") is not None:
+        for name, value in _NUMPYS_OLD_NAMES.items():
+            vars(np).setdefault(name, value)

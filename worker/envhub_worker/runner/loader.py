@@ -25,7 +25,12 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from envhub_worker.protocol.messages import CONFIG_CLASS, Load, LoadTask
-from envhub_worker.runner.gymnasium_compat import Parameters, parameters_of, takes
+from envhub_worker.runner.gymnasium_compat import (
+    Parameters,
+    parameters_of,
+    restore_numpys_names,
+    takes,
+)
 
 
 class ConfigMapping(dict[str, Any]):
@@ -116,6 +121,7 @@ def import_entry(snapshot: str, entry: str, scratch: str) -> Callable[..., Any]:
     root = Path(snapshot)
     folder, parts = _package_of(root, path)
     _make_importable(root, root / path.parent, scratch, folder)
+    restore_numpys_names()
     module = importlib.import_module(".".join([PACKAGE, *parts]))
     make_env = getattr(module, "make_env", None)
     if not callable(make_env):

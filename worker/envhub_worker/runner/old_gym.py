@@ -106,8 +106,6 @@ def adapted_vector(env: Any) -> Any:
 
 
 def _warned(adapter: Callable[[Any], Any], env: Any) -> Any:
-    if not hasattr(np, "bool8"):  # numpy 2 has taken away what gym's own checks of a step use
-        np.bool8 = np.bool_  # type: ignore[attr-defined]
     release = getattr(sys.modules.get("gym"), "__version__", "of an unknown release")
     warnings.warn(
         f"make_env returns environments of gym {release}, which is not maintained. They run as "

@@ -182,6 +182,12 @@ def _may_be_batched(space: Space) -> bool:
     )
 
 
+def entropy_of(bits: Any) -> Any:
+    """What a bit generator was seeded with; before numpy 1.25 the name was another."""
+    sequence = getattr(bits, "seed_seq", None) or getattr(bits, "_seed_seq", None)
+    return getattr(sequence, "entropy", None)
+
+
 def _state(space: Space) -> Any:
     """The state of its generator; None if there is none, or it starts anywhere."""
     generator = getattr(space, "_np_random", None)
@@ -190,8 +196,7 @@ def _state(space: Space) -> Any:
     bits = generator.bit_generator
     if type(bits) not in BIT_GENERATORS:
         return None
-    sequence = getattr(bits, "seed_seq", None) or getattr(bits, "_seed_seq", None)
-    entropy = getattr(sequence, "entropy", None)
+    entropy = entropy_of(bits)
     if entropy is None or (isinstance(entropy, int) and entropy.bit_length() > _CHANCE_BITS):
         return None
     return bits.state
