@@ -9,6 +9,7 @@ others, and nothing that has drifted.
 from __future__ import annotations
 
 import os
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Protocol
@@ -121,10 +122,17 @@ def packages_for(
                 DEPENDENCIES.warning("%s: nothing is installed for it: %s", snapshot.label, error)
                 return None
     except DependencyError as error:
-        if snapshot.repo_type == registered.KIND and isinstance(error, ResolutionError):
+        if snapshot.repo_type == registered.KIND and _is_unknown(snapshot.repo_id, error):
             error.args = (f"{error}\n{_CHECK_REFERENCE}", *error.args[1:])
         name_source(error, snapshot.label)
         raise
+
+
+def _is_unknown(repo_id: str, error: DependencyError) -> bool:
+    """Whether the index does not have the package that a reference names, or not that version."""
+    name = re.escape(re.sub(r"[-_.]+", "-", re.split(r"[\[#]", repo_id)[0]).lower())
+    said = rf"no version of {name}\b|\b{name} was not found"
+    return isinstance(error, ResolutionError) and re.search(said, str(error)) is not None
 
 
 def opened_lock(

@@ -6,6 +6,7 @@ packages on this machine until newer ones are asked for, and needs no index a se
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
@@ -21,9 +22,9 @@ from packaging.utils import parse_wheel_filename
 from envhub_sandbox.dependencies import index, interpreters, resolve
 from envhub_sandbox.dependencies.declared import Source, of_git, parse_requirement
 from envhub_sandbox.dependencies.interpreters import Interpreter
-from envhub_sandbox.dependencies.request import PackageRequest, Tell
+from envhub_sandbox.dependencies.request import PackageRequest, Tell, chosen
 from envhub_sandbox.dependencies.resolve import WORKERS, Lock, Target
-from envhub_sandbox.errors import ResolutionError
+from envhub_sandbox.errors import DependencyError, ResolutionError
 from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.system import folders
 
@@ -101,8 +102,27 @@ def _chosen(request: PackageRequest, first: Interpreter, refresh: bool, tell: Te
                 failed.append(error)
                 if not resolve.is_about_python(error):
                     break
-    what = resolve.advice(request.python, list(dict.fromkeys(tried)), failed[0])
+    cure = _cure(request, failed[0], first)
+    what = resolve.advice(request.python, list(dict.fromkeys(tried)), failed[0], cure)
     raise ResolutionError(f"{failed[0]}\n{what}") from failed[0]
+
+
+def _cure(
+    request: PackageRequest, error: ResolutionError, interpreter: Interpreter
+) -> dict[str, list[str]] | None:
+    """Keys of ``dependencies`` with which there are versions, as wheels, after all."""
+    for keys in resolve.cures(error):
+        changed = chosen(keys, None)[0]
+        asked = replace(
+            request,
+            guesses=(),
+            without=(*request.without, *changed.without),
+            override=(*request.override, *changed.override),
+        )
+        with contextlib.suppress(DependencyError):
+            resolve.resolve(asked, Target(python=interpreter.path))
+            return keys
+    return None
 
 
 def _attempts(request: PackageRequest) -> Iterator[tuple[PackageRequest, Builder | None]]:

@@ -6,6 +6,7 @@ import contextlib
 import hashlib
 import os
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -25,9 +26,9 @@ from envhub_sandbox.errors import (
 from envhub_sandbox.hub.sources import toml
 from envhub_sandbox.settings.options import option_name
 
-WORKERS = ("cloudpickle>=3", "gymnasium>=0.26", "msgpack>=1.0.5", "numpy>=1.26")
+WORKERS = ("cloudpickle>=3", "gymnasium>=0.26", "msgpack>=1.0.5", "numpy>=1.21")
 """What the worker's jails import besides: the repository's versions must be among these.
-Gymnasium may be older in a jail than outside."""
+Gymnasium and numpy may be older in a jail than outside."""
 _RESOLVE_S = 600.0
 _TORCH = ("torch", "torchvision", "torchaudio")
 _CPU_INDEX = ("--torch-backend", "cpu")
@@ -36,6 +37,11 @@ _IS_PYTHON = re.compile(
     r"does not satisfy Python|with a matching Python|no usable wheels|requires? Python"
 )
 _NOT_FOUND = "not found in the package registry"
+REQUIRED = "What is required of these packages:"
+_BOUNDED = re.compile(
+    r"(?<![\w.-])(?!python\b)([A-Za-z][A-Za-z0-9._-]*)(?:\[[\w,-]+\])?[<>=!~]=?\d", re.I
+)
+_MOST_CURES = 4
 _NO_WHEELS = re.compile(r"Wheels are required for `([A-Za-z0-9._-]+)`")
 _NEEDS_PYTHON = re.compile(r"does not satisfy Python>=(3\.\d+)")
 _HASH = re.compile(r"    --hash=(sha(?:256|384|512):[0-9a-f]+)( \\)?")
@@ -166,24 +172,32 @@ def sources_of(
 
     What each needs is not known yet: it counts once there is a wheel of it.
     """
-    tables = "".join(
-        f'[[dependency-metadata]]\nname = "{name}"\nrequires-dist = []\n' for name in names
-    )
-    quoted = ", ".join(f'"{name}"' for name in names)
-    settings = f"no-build = true\nno-binary-package = [{quoted}]\n{tables}"
-    text = _compiled(
-        request,
-        target,
-        ["--config-file", "uv.toml", "--format", "pylock.toml", *links],
-        lambda line: None,
-        {"uv.toml": settings},
-    )
+    words = ["--config-file", "uv.toml", "--format", "pylock.toml", *links]
+    known = sorted(names)
+    while True:
+        try:
+            text = _compiled(request, target, words, lambda line: None, _may_be_built(known))
+            break
+        except ResolutionError as error:  # it names one at a time
+            further = set(without_wheels(error)).difference(known)
+            if not further:
+                raise
+            known = sorted(further.union(known))
     rows = toml.loads(text, len(text), generated=True).get("packages", [])
     return [
         Source(row["name"], row["version"], sdist["url"], sdist["hashes"]["sha256"])
         for row in rows
         if (sdist := row.get("sdist")) and not row.get("wheels")
     ]
+
+
+def _may_be_built(names: Iterable[str]) -> dict[str, str]:
+    """uv's settings with which these are chosen as sources."""
+    tables = "".join(
+        f'[[dependency-metadata]]\nname = "{name}"\nrequires-dist = []\n' for name in names
+    )
+    quoted = ", ".join(f'"{name}"' for name in names)
+    return {"uv.toml": f"no-build = true\nno-binary-package = [{quoted}]\n{tables}"}
 
 
 def _lines(wanted: Iterable[WantedPackage]) -> str:
@@ -253,7 +267,7 @@ def _what_is_required(said: str, every: Sequence[WantedPackage]) -> str:
         f"  {one.requirement}  ({one.where}{_from_a_folder(one.requirement.name)})"
         for one in (named or every)[:20]
     ]
-    return "\n".join(["What is required of these packages:", *lines])
+    return "\n".join([REQUIRED, *lines])
 
 
 def _from_a_folder(name: str) -> str:
@@ -263,9 +277,23 @@ def _from_a_folder(name: str) -> str:
     return f"; installed here from {folder}, which {host} uses" if folder else ""
 
 
-def advice(asked: str, tried: Sequence[str], error: ResolutionError) -> str:
+def cures(error: ResolutionError) -> Iterator[dict[str, list[str]]]:
+    """Keys of ``dependencies`` that may help against what uv says, by the packages it speaks of."""
+    said = str(error).partition(REQUIRED)[0]
+    unknown = re.findall(rf"([A-Za-z0-9][A-Za-z0-9._-]*) was {_NOT_FOUND}", said)
+    yield from ({"without": [name]} for name in unknown)
+    words = Counter(name.lower() for name in _BOUNDED.findall(said))
+    ours = {line.partition(">")[0]: line for line in WORKERS}
+    for name, _ in words.most_common(_MOST_CURES):
+        yield {"override": [ours.get(name, name)]}
+
+
+def advice(
+    asked: str, tried: Sequence[str], error: ResolutionError, cure: Mapping[str, list[str]] | None
+) -> str:
     """What to do where nothing satisfies all requirements, by the Python that was asked for, the
-    versions that were tried, and the error of the first of them.
+    versions that were tried, the error of the first of them, and keys of ``dependencies`` that are
+    known to help.
     """
     others = ""
     needed = _NEEDS_PYTHON.findall(str(error))
@@ -275,10 +303,11 @@ def advice(asked: str, tried: Sequence[str], error: ResolutionError) -> str:
     elif needed:
         others = f" name another Python, {option_name('dependencies', {'python': max(needed)})};"
     also = f"Python {', '.join(tried)} of this machine were tried. " if len(tried) > 1 else ""
-    change = option_name("dependencies", {"override": ["NAME<2"], "without": ["NAME"]})
+    change = option_name("dependencies", cure or {"override": ["NAME<2"], "without": ["NAME"]})
+    known = ", for which there are versions" if cure else ""
     return (
-        f"{also}Change one of them in the repository, or for this run with {change};{others} or "
-        f"use an interpreter that has the packages, with {option_name('python', 'PATH')}"
+        f"{also}Change one of them in the repository, or for this run with {change}{known};{others}"
+        f" or use an interpreter that has the packages, with {option_name('python', 'PATH')}"
     )
 
 

@@ -98,6 +98,17 @@ def test_what_is_named_beside_another_is_built_in_its_turn(
     assert "deeper-source" in {one.name for one in built}
 
 
+def test_two_packages_without_wheels_in_one_file(
+    index: Index, tmp_path: Path, built: list[Source]
+) -> None:
+    """uv names one at a time, and chooses no versions as long as another has none."""
+    for name in ("only-source", "deeper-source", "third-source"):
+        source_distribution(index.folder, name, "1.5", tmp_path / "ran")
+    found = resolution_for(request("third-source==1.5", "only-source==1.5")).lock.packages
+    assert {"only-source==1.5", "deeper-source==1.5", "third-source==1.5"} <= set(found)
+    assert len(built) == len({one.name for one in built})
+
+
 def test_without_a_builder_there_are_wheels_alone(
     index: Index, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

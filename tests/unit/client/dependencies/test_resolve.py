@@ -5,21 +5,23 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import os
+import re
 import signal
 import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from envhub_sandbox.dependencies import index as places
-from envhub_sandbox.dependencies import interpreters, uv
+from envhub_sandbox.dependencies import interpreters, resolutions, uv
 from envhub_sandbox.dependencies import resolve as module
 from envhub_sandbox.dependencies.declared import parse_requirement
-from envhub_sandbox.dependencies.request import PackageRequest
+from envhub_sandbox.dependencies.request import PackageRequest, chosen
 from envhub_sandbox.dependencies.resolve import Lock, Target
 from envhub_sandbox.errors import (
     DependencyError,
@@ -98,9 +100,13 @@ def test_no_interpreter_of_somebody_elses_is_asked(
 
 
 def test_what_jails_import_is_what_the_image_installs(project: dict[str, Any]) -> None:
-    """But for ZeroMQ, which no jail has, and Gymnasium, which may be older in one."""
-    group = set(project["dependency-groups"]["worker"]) - {"pyzmq>=25", "gymnasium>=1.1"}
-    assert set(module.WORKERS) == {*group, "gymnasium>=0.26"}
+    """But for ZeroMQ, which no jail has, and what may be older in one."""
+    group = set(project["dependency-groups"]["worker"]) - {
+        "pyzmq>=25",
+        "gymnasium>=1.1",
+        "numpy>=1.26",
+    }
+    assert set(module.WORKERS) == {*group, "gymnasium>=0.26", "numpy>=1.21"}
 
 
 def test_a_contradiction_names_both_lines(index: Index) -> None:
@@ -117,10 +123,29 @@ def test_a_contradiction_names_both_lines(index: Index) -> None:
     assert "you require" not in said
 
 
-def test_what_the_worker_needs_can_be_in_the_way(index: Index) -> None:
-    make_wheel(index.folder, "gymnasium", "0.21")
-    with pytest.raises(ResolutionError, match=r"gymnasium>=.*the worker of envhub-sandbox"):
-        resolve("gymnasium<0.22")
+@pytest.mark.parametrize(
+    ("lines", "cure"),
+    [
+        (("numpy<1.20",), {"override": ["numpy>=1.21"]}),  # the worker's own line
+        (("one", "shared>=2"), {"override": ["shared"]}),
+        (("one", "nowhere"), {"without": ["nowhere"]}),
+    ],
+)
+def test_the_advice_is_one_with_which_there_are_versions(
+    index: Index, monkeypatch: pytest.MonkeyPatch, lines: tuple[str, ...], cure: dict[str, Any]
+) -> None:
+    monkeypatch.setattr(interpreters, "others", lambda declared, first: [])
+    make_wheel(index.folder, "numpy", "1.19")
+    make_wheel(index.folder, "one", requires=["shared<2"])
+    for version in ("1.0", "2.0"):
+        make_wheel(index.folder, "shared", version)
+    wanted = tuple(parse_requirement(line, "requirements.txt") for line in lines)
+    asked = PackageRequest("requirements.txt", wanted)
+    with pytest.raises(ResolutionError, match=re.escape(f"dependencies={cure}")):
+        resolutions.resolution_for(asked)
+    changed = chosen(cure, None)[0]
+    cured = replace(asked, override=changed.override, without=changed.without)
+    assert resolutions.resolution_for(cured).lock.packages
 
 
 def test_requirements_are_left_out_replaced_and_constrained(index: Index) -> None:
