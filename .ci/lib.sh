@@ -48,24 +48,6 @@ with_summary() {
   } >"$CI_WORK/$name.summary"
 }
 
-# The attacks on jails, also those of a folder that is new, and the tests of what confines, is confined and
-# installed, and of whose files are trusted: for these it matters who runs them. What the client makes of
-# hostile answers, and both sides of hostile bytes, is the same for all.
-differs_by_user=()
-for folder in tests/attacks/*/; do
-  case $folder in
-    tests/attacks/client/ | tests/attacks/protocol/) ;;
-    *) differs_by_user+=("${folder%/}") ;;
-  esac
-done
-differs_by_user+=(tests/integration/{confinement,lifecycle,loading,packages})
-differs_by_user+=(tests/unit/worker/{lockdown,spawn,cli,access/store,test_file_access.py})
-differs_by_user+=(tests/unit/client/{system,dependencies/builds,dependencies/test_environments.py})
-differs_by_user+=(tests/unit/client/{hub/test_{store,checkout,local},sandboxes/test_{process,pool}}.py)
-
-# No other package decides what these do, and the types say that each interpreter has what they call.
-same_for_versions=(tests/unit/{docs,client/sandboxes,worker/{access,lockdown,supervisor}})
-
 # processes: for tests that start much and wait for it: twice as many as there are cores, which three
 # processes for two still leave idle for a third of the time. Not beyond eight, as in ./test.
 processes() {
@@ -108,9 +90,9 @@ wheel() {
   echo "$found"
 }
 
-# smoke NAME PYTHON [OPTION...]: the wheel in an environment of its own, with a reduced set of
-# tests: the unit tests, but for those that are the same for versions, and real environments that
-# need nothing beyond gymnasium.
+# smoke NAME PYTHON [OPTION...]: the wheel in an environment of its own, with a case of each test of
+# what Python, Gymnasium, numpy, the Hub's client and the others are asked for: messages and spaces,
+# the commands, references, a repository's own words, and real environments over both lanes.
 smoke() {
   local name=$1 python=$2 built
   shift 2
@@ -126,8 +108,9 @@ smoke() {
   (
     cd "$CI_WORK/$name/checkout"
     with_summary "$name" bash "$CI_AGAIN" "$CI_WORK/$name/bin/python" -m pytest \
-      -n "$(processes)" --dist worksteal --differs-by versions "${same_for_versions[@]/#/--ignore=}" \
-      tests/unit tests/integration/test_examples.py
+      -n "$(processes)" --dist worksteal --one-case \
+      tests/unit/{cli,protocol,client/{hub,transport,vector},worker/runner} tests/integration/hub \
+      tests/integration/test_examples.py tests/compliance/test_parity.py::TestCounter
   )
 }
 

@@ -1,5 +1,5 @@
-# As a plain user, who has no right to anything here: what confines and what is confined. Proves
-# that nothing of it needs root. The
+# As a plain user, who has no right to anything here: what confines and what is confined, a case of
+# each. Proves that nothing of it needs root. The
 # interpreter is Debian's own: those of root's pyenv lie below /root, which is closed to others.
 set -euo pipefail
 . "$(dirname "${BASH_SOURCE[0]}")/../lib.sh"
@@ -12,9 +12,14 @@ export ENVHUB_CI=1 ENVHUB_CI_WITHOUT_CGROUPS=1
 unset ENVHUB_TEST_DIR  # each part has its own
 export PYTHON=/usr/bin/python3
 
-# What is marked as the same for users has been run. What the client makes of a worker's answers, and what
-# commands print, does not depend on who runs it either; the plain user of the step "readme" runs the short
-# form of these.
+# Every kind of attack on jails, under each profile, and what opens or starts something as the user who
+# runs it. What the client makes of answers, of archives and of names is the same for all.
+tests=(tests/attacks/{files,kernel,network,processes,resources,runner})
+tests+=(tests/attacks/packages/test_{builds,packages}.py)
+tests+=(tests/integration/confinement tests/integration/lifecycle/test_{lingering,umask}.py)
+tests+=(tests/integration/packages/test_builds.py)
+tests+=(tests/unit/worker/{lockdown,spawn,access/store,test_file_access.py})
+tests+=(tests/unit/client/{system,hub/test_{store,checkout,local}.py,sandboxes/test_{process,pool}.py})
 
 # part NUMBER ARGUMENT...: these tests, by one process of a user of their own: some limits count what a
 # user runs, and two processes would count each other's. What the step "tests" installed serves here
@@ -27,12 +32,12 @@ part() {
     cp -R "$made/checkout" "$CI_WORK/user-$number"
     cd "$CI_WORK/user-$number"
     with_summary "user-$number" "${again[@]}" "$made/venv/bin/python" -m pytest -n 1 \
-      --differs-by users "$@"
+      --one-case "$@"
   else
     cp -R . "$CI_WORK/user-$number"
     cd "$CI_WORK/user-$number"
     export ENVHUB_TEST_RUNNER="${again[*]}"
-    with_summary "user-$number" ./test -n 1 --differs-by users "$@"
+    with_summary "user-$number" ./test -n 1 --one-case "$@"
   fi
 }
 
@@ -45,8 +50,8 @@ begin() {
 }
 for number in 0 1 2; do
   of_part=()
-  for at in "${!differs_by_user[@]}"; do
-    [ $((at % 3)) != $number ] || of_part+=("${differs_by_user[at]}")
+  for at in "${!tests[@]}"; do
+    [ $((at % 3)) != $number ] || of_part+=("${tests[at]}")
   done
   begin $((number + 1)) "${of_part[@]}"
 done

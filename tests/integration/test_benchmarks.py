@@ -12,8 +12,6 @@ import pytest
 
 from tests.support.command_line import python
 
-pytestmark = pytest.mark.same_for("users")
-
 SHORT = {
     "auto --workloads cartpole --sizes 2 --rounds 1 --seconds 0.01 --busy 1": "| CartPole | 2 |",
     "remote 0.01 plain": "| plain, n=1 |",

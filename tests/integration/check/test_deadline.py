@@ -28,8 +28,6 @@ from tests.support.packages.wheels import Index
 from tests.support.processes import descendants, eventually
 from tests.support.repositories import STILL, write_repository
 
-pytestmark = pytest.mark.same_for("users")
-
 _LONG_S = 3600
 """So long that no test would wait for it."""
 _NAME = b"it-hangs"

@@ -141,9 +141,7 @@ for sys.argv[1:] in json.loads(sys.argv[1]):
 """One process for all: its imports take longer than most of them."""
 
 
-@pytest.mark.parametrize(
-    ("columns", "each"), [(20, 1), pytest.param(None, 8, marks=pytest.mark.same_for("users"))]
-)
+@pytest.mark.parametrize(("columns", "each"), [(20, 1), (None, 8)])
 def test_no_command_of_a_repository_is_obeyed(columns: int | None, each: int, place: Path) -> None:
     """By what every command prints to a narrow terminal, and some into a pipe; ours are, with
     ``--github``.

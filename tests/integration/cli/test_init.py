@@ -16,8 +16,6 @@ from envhub_sandbox.cli.init import starter
 from envhub_sandbox.hub.local import LocalFolder
 from tests.support.command_line import COMMAND
 
-pytestmark = pytest.mark.same_for("users")
-
 PLUGIN = "envhub_sandbox.integrations.pytest_plugin"
 
 

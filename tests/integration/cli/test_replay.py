@@ -17,8 +17,6 @@ from tests.support.output.bundles import crashed
 from tests.support.repositories import STILL, write_repository
 from tests.support.samples import sample
 
-pytestmark = pytest.mark.same_for("users")
-
 
 def test_the_pinned_commit_runs_again(
     olah: OlahServer, hub_cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -18,8 +18,6 @@ from tests.support.command_line import document, envhub, program
 from tests.support.repositories import CARTPOLE, STILL, write_repository
 from tests.support.samples import EXAMPLES, sample
 
-pytestmark = pytest.mark.same_for("users")
-
 _PRINTS = f"""
 import os
 print("printed by Python")

@@ -18,8 +18,6 @@ from tests.support.processes import eventually
 from tests.support.repositories import STILL
 from tests.support.samples import EXAMPLES, sample
 
-pytestmark = pytest.mark.same_for("users")
-
 _STEPPING = f"""{STILL}
 import time
 

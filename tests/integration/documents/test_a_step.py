@@ -17,8 +17,6 @@ from envhub_worker.protocol import messages as m
 from tests.support.in_process.runner_here import RunnerHere
 from tests.support.samples import SAMPLES
 
-pytestmark = pytest.mark.same_for("users")
-
 ACTIONS = np.zeros(2, np.int64)
 
 

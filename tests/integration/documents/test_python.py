@@ -17,8 +17,6 @@ from tests.support.documents import blocks
 from tests.support.documents.notebook import DOCUMENT
 from tests.support.samples import EXAMPLES
 
-pytestmark = pytest.mark.same_for("users")
-
 # No block may take a port that another program has.
 _ANY_PORT = """
 import prometheus_client

@@ -18,8 +18,6 @@ from tests.support.documents import blocks
 from tests.support.documents.blocks import Block
 from tests.support.documents.shell import execute, executed
 
-pytestmark = pytest.mark.same_for("users")
-
 # What is about a repository is run within one.
 _WITHIN = {"docs/ci.md": "my-env"}
 # What is in no plain installation.

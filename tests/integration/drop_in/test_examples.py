@@ -9,8 +9,6 @@ import pytest
 from tests.support.command_line import python
 from tests.support.samples import EXAMPLES, sample
 
-pytestmark = pytest.mark.same_for("users")
-
 PRINTED = {
     "with_cleanrl.py": "the weights are the same, to the last bit: True",
     "with_cleanrl_async.py": "episodes: the first last",

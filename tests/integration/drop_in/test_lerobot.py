@@ -13,8 +13,6 @@ from tests.support.compare import assert_same
 from tests.support.repositories import write_repository
 from tests.support.samples import Frozen, make_env_of, reference, sample
 
-pytestmark = pytest.mark.same_for("users")
-
 torch = pytest.importorskip("torch")
 lerobot = pytest.importorskip("tests.support.lerobot")
 

@@ -25,8 +25,6 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor  # noqa: E4
 
 from envhub_sandbox.integrations.sb3 import SandboxVecEnv  # noqa: E402
 
-pytestmark = pytest.mark.same_for("users")
-
 _MODES = ("NextStep", "SameStep", "Disabled")
 _DESCRIBED = ("mode",)  # no plain value: it arrives as text
 _PLACES = [

@@ -16,8 +16,6 @@ from envhub_sandbox import make_env
 from tests.support.compare import assert_same
 from tests.support.samples import reference, sample
 
-pytestmark = pytest.mark.same_for("users")
-
 Wrap = Callable[[VectorEnv[Any, Any, Any]], VectorEnv[Any, Any, Any]]
 
 WRAPS: dict[str, Wrap] = {

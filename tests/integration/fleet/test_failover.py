@@ -193,7 +193,6 @@ def far() -> Iterator[OtherHost]:
         yield host
 
 
-@pytest.mark.same_for("users")  # it needs root for a cable between namespaces
 def test_a_partition_moves_the_rows(
     rows: Path, far: OtherHost, stays: Listening, serve: Serve
 ) -> None:

@@ -26,7 +26,6 @@ from tests.support.processes import eventually, halted
 from tests.support.started import started
 
 pytestmark = [
-    pytest.mark.same_for("users"),
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
 ]
 lanes = pytest.mark.parametrize("lane", ["auto", "frames"])

@@ -25,8 +25,6 @@ from tests.support.command_line import python
 from tests.support.processes import eventually
 from tests.support.repositories import STILL
 
-pytestmark = pytest.mark.same_for("users")
-
 TOKEN = "hf_SECRETSECRETSECRET"
 INTERRUPTED = """
 from envhub_sandbox import make_env

@@ -17,8 +17,6 @@ from envhub_sandbox.hub.snapshot import Snapshot, fetch
 from tests.hub.olah_server import GitRepository, OlahServer
 from tests.hub.stub_hub import git_blob_id
 
-pytestmark = pytest.mark.same_for("users")
-
 FILES = {
     "env.py": "from pkg.maker import make_env\n",
     "pkg/maker.py": "def make_env(n_envs=1, use_async_envs=False): ...\n",

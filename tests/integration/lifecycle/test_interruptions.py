@@ -19,7 +19,6 @@ from tests.support.samples import sample
 from tests.support.started import nothing_more_held
 
 pytestmark = [
-    pytest.mark.same_for("users"),
     pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
 ]
 

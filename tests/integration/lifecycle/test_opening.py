@@ -21,9 +21,6 @@ from tests.support import inside
 from tests.support.repositories import STILL, write_repository
 from tests.support.samples import sample
 
-# what is asked of a server is up to the client, whoever that is
-pytestmark = pytest.mark.same_for("users")
-
 
 @pytest.fixture
 def asked(monkeypatch: pytest.MonkeyPatch) -> list[str]:

@@ -28,9 +28,6 @@ from tests.support.processes import descendants, eventually
 from tests.support.repositories import STILL, write_repository
 from tests.support.samples import sample
 
-# when a jail is started and given up is up to the client, whoever that is
-pytestmark = pytest.mark.same_for("users")
-
 # every task says when it was constructed; one fails, if it is told to
 SUITE = """
 import time

@@ -15,9 +15,6 @@ from envhub_worker.protocol.text import MARGIN
 from tests.hub.stub_hub import StubHub
 from tests.support.repositories import write_repository
 
-# a traceback has the same lines, whoever runs it
-pytestmark = pytest.mark.same_for("users")
-
 PACKAGE = str(Path(envhub_sandbox.__file__).parent)
 ENV = """
 import gymnasium as gym

@@ -14,9 +14,6 @@ import pytest
 from envhub_sandbox import make_env
 from tests.support.repositories import STILL, write_repository
 
-# what a config holds is copied by the same code, whoever runs it
-pytestmark = pytest.mark.same_for("users")
-
 _PARTS = """
 from dataclasses import dataclass, field
 from enum import Enum

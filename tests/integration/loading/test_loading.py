@@ -23,8 +23,6 @@ from tests.support.compare import assert_same
 from tests.support.repositories import CARTPOLE, CARTPOLES, STILL, write_repository
 from tests.support.samples import make_env_of, reference, sample
 
-pytestmark = pytest.mark.same_for("users")
-
 
 def roll(env: VectorEnv[Any, Any, Any], steps: int = 5) -> Any:
     """Reset with a seed, step with seeded actions, return the last result."""

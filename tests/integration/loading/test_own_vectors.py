@@ -14,9 +14,6 @@ from envhub_sandbox.errors import ActionError, LoadError
 from tests.support.compare import assert_same
 from tests.support.repositories import write_repository
 
-# whoever runs it, the same code describes spaces and takes steps
-pytestmark = pytest.mark.same_for("users")
-
 _OWN = """
 import gymnasium as gym
 import numpy as np

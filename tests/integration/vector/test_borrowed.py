@@ -13,8 +13,6 @@ from envhub_sandbox.transport.shared_memory.client_slabs import RING
 from tests.support.compare import assert_same
 from tests.support.samples import sample
 
-pytestmark = pytest.mark.same_for("users")
-
 STEPS = 40
 
 

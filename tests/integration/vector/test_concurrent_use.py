@@ -17,8 +17,6 @@ from envhub_worker.protocol.lifecycle import State
 from tests.support import inside
 from tests.support.samples import SAMPLES
 
-pytestmark = pytest.mark.same_for("users")
-
 ACTIONS = np.zeros(2, np.int64)
 DEADLINE_S = 60.0
 

@@ -20,8 +20,6 @@ from tests.support.compare import assert_same
 from tests.support.repositories import write_repository
 from tests.support.samples import make_env_of
 
-pytestmark = pytest.mark.same_for("users")
-
 _ENV = '''
 import gymnasium as gym
 import numpy as np

@@ -27,7 +27,6 @@ from tests.support.in_process.interrupts import before_line
 from tests.support.objects.gates import DIE, Gates, ids, send
 from tests.support.processes import eventually
 
-pytestmark = pytest.mark.same_for("users")
 lanes = pytest.mark.parametrize("lane", ["auto", "frames"])
 
 

@@ -22,8 +22,6 @@ from tests.support.objects.pipelines import changing, one_by_one, several_at_onc
 from tests.support.repositories import STILL, write_repository
 from tests.support.started import started
 
-pytestmark = pytest.mark.same_for("users")
-
 REPOSITORY = '''
 LARGE = 2 * 65536
 

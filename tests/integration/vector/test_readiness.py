@@ -19,7 +19,7 @@ from tests.support import inside
 from tests.support.objects.gates import Gates
 from tests.support.processes import eventually
 
-pytestmark = [pytest.mark.same_for("users"), pytest.mark.parametrize("lane", ["auto", "frames"])]
+pytestmark = pytest.mark.parametrize("lane", ["auto", "frames"])
 
 
 @pytest.fixture

@@ -24,8 +24,6 @@ from envhub_sandbox.errors import (
 from tests.support import inside
 from tests.support.objects.gates import DIE, LARGE, RAISE, Gates, ids, send
 
-pytestmark = pytest.mark.same_for("users")
-
 
 @pytest.fixture(params=["auto", "frames"])
 def lane(request: pytest.FixtureRequest) -> str:

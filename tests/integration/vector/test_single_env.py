@@ -28,8 +28,6 @@ from tests.support.compare import assert_same
 from tests.support.repositories import write_repository
 from tests.support.samples import EXAMPLES, make_env_of
 
-pytestmark = pytest.mark.same_for("users")
-
 _ID = "envhub_sandbox.integrations.gym:Hub-v0"
 
 

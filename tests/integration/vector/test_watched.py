@@ -17,8 +17,6 @@ from tests.support.compare import assert_same
 from tests.support.processes import eventually
 from tests.support.repositories import STILL
 
-pytestmark = pytest.mark.same_for("users")
-
 ENVS = 3
 _TOLD = '''
 import os

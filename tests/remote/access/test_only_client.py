@@ -20,8 +20,6 @@ from tests.remote.listening import WORKER, worker
 from tests.support.ports import lasting_port
 from tests.support.samples import sample
 
-pytestmark = pytest.mark.same_for("versions")
-
 
 @pytest.fixture
 def keys() -> tuple[str, str]:

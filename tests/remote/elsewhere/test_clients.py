@@ -18,7 +18,7 @@ from tests.support.processes import eventually
 from tests.support.repositories import write_repository
 from tests.support.samples import sample
 
-pytestmark = [pytest.mark.parametrize("system", SYSTEMS), pytest.mark.same_for("versions")]
+pytestmark = pytest.mark.parametrize("system", SYSTEMS)
 
 # the compliance suite and everything else that a client of such a server is asked
 _SUITES = {

@@ -5,9 +5,8 @@ Without a path, ``-k``, ``-m`` or ``--full``, the short form is run: what bears 
 function's cases, those whose parameters' id starts so. It is to be some hundred tests: the main
 job, an attack of each kind with its control, parity over both lanes, and the commands.
 
-CI repeats tests as another user (``--differs-by users``), and with other versions of Python and
-of packages (``--differs-by versions``). ``@pytest.mark.same_for("users", "versions")`` says for
-which of these a test proves the same again: it is left out there.
+CI repeats some tests as another user and with other versions of Python and of packages, there with
+``--one-case``: of a test's cases the first, for each profile and each lane that it names.
 """
 
 from __future__ import annotations
@@ -16,16 +15,16 @@ from pathlib import Path
 
 import pytest
 
-REPEATED = ("users", "versions")
-"""What CI repeats tests for."""
+_NAMED = {"strict", "no-userns", "auto", "frames"}
+"""Profiles and lanes, of which ``--one-case`` keeps each."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """``--full`` and ``--differs-by``."""
+    """``--full`` and ``--one-case``."""
     text = "run every test, and not only what is marked as short"
     parser.addoption("--full", action="store_true", help=text)
-    text = "leave out what is marked as the same for them"
-    parser.addoption("--differs-by", choices=REPEATED, help=text)
+    text = "of each test's cases only the first, for each profile and lane"
+    parser.addoption("--one-case", action="store_true", help=text)
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
@@ -36,22 +35,21 @@ def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool 
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Leave out what need not be repeated, and what is not in the short form.
+    """Leave out what is not in the short form, and with ``--one-case`` all but first cases.
 
     Raises:
-        UsageError: A marker names cases of which there is none, or what is no reason to repeat.
+        UsageError: A marker names cases of which there is none.
     """
-    if wrong := sorted({str(one) for x in items for one in _same_for(x) - set(REPEATED)}):
-        raise pytest.UsageError(
-            f"same_for names {', '.join(wrong)}; CI repeats for {' and '.join(REPEATED)}"
-        )
-    _keep(config, items, [one for one in items if config.option.differs_by not in _same_for(one)])
-    if not is_short(config):
-        return
-    if idle := sorted(_named(items) - _named(items, met=True)):
-        text = ", ".join(f"{start!r} of {test}" for test, start in idle)
-        raise pytest.UsageError(f"the short selection names no case by {text}")
-    _keep(config, items, [x for x in items if _is_marked(x)])
+    kept = list(items)
+    if is_short(config):
+        if idle := sorted(_named(items) - _named(items, met=True)):
+            text = ", ".join(f"{start!r} of {test}" for test, start in idle)
+            raise pytest.UsageError(f"the short selection names no case by {text}")
+        kept = [item for item in items if _is_marked(item)]
+    if config.option.one_case:
+        kept = _first_cases(kept)
+    config.hook.pytest_deselected(items=list(set(items).difference(kept)))
+    items[:] = kept
 
 
 def pytest_terminal_summary(
@@ -68,14 +66,13 @@ def is_short(config: pytest.Config) -> bool:
     return not (asked or config.option.full)
 
 
-def _keep(config: pytest.Config, items: list[pytest.Item], kept: list[pytest.Item]) -> None:
-    others = set(items).difference(kept)
-    config.hook.pytest_deselected(items=[one for one in items if one in others])
-    items[:] = kept
-
-
-def _same_for(item: pytest.Item) -> set[object]:
-    return {name for mark in item.iter_markers("same_for") for name in mark.args}
+def _first_cases(items: list[pytest.Item]) -> list[pytest.Item]:
+    first: dict[tuple[str, frozenset[str]], pytest.Item] = {}
+    for item in items:
+        values = item.callspec.params.values() if hasattr(item, "callspec") else ()
+        named = frozenset(one for one in values if isinstance(one, str) and one in _NAMED)
+        first.setdefault((item.nodeid.partition("[")[0], named), item)
+    return list(first.values())
 
 
 def _is_marked(item: pytest.Item) -> bool:

@@ -14,8 +14,6 @@ from benchmarks.reach import control
 from benchmarks.reach.cases import cases
 from envhub_sandbox.dependencies.declared import declared
 
-pytestmark = pytest.mark.same_for("users", "versions")
-
 CASES = cases()
 COUNTER = """
 import gymnasium as gym

@@ -19,8 +19,6 @@ from envhub_sandbox.cli.app import app
 from tests.support.documents import blocks
 from tests.support.documents.blocks import APART, CHECKOUT, NOT_EXECUTED, Block
 
-pytestmark = pytest.mark.same_for("users", "versions")
-
 # Programs of others, whose options are theirs.
 _OTHERS = {"docker", "pip", "lerobot-eval", "lerobot-train", "lerobot-eval-sandboxed", "ruff"}
 _OTHERS |= {"hf", "sbatch"}

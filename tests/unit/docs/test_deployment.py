@@ -19,8 +19,6 @@ from envhub_worker.access.keys import AuthorizedClients
 from envhub_worker.access.quotas import Permissions, Quotas, Rules
 from envhub_worker.cli import identity, listen_options, metrics
 
-pytestmark = pytest.mark.same_for("users", "versions")
-
 ROOT = Path(__file__).parents[3]
 UNIT = ROOT / "examples" / "deployment" / "envhub-worker.service"
 DASHBOARD = ROOT / "examples" / "deployment" / "grafana-dashboard.json"

@@ -23,8 +23,6 @@ import envhub_sandbox
 import envhub_worker
 from tests.unit.docs.test_imports import WORKERS_OWN
 
-pytestmark = pytest.mark.same_for("users", "versions")
-
 NAME = "lerobot_env_envhub_sandbox"
 BUILD = """
 import sys

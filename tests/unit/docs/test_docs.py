@@ -22,8 +22,6 @@ from envhub_worker.protocol.manifest.names import MAX_NAME
 from tests.support.documents import checks, settings
 from tests.unit.docs.test_imports import folder
 
-pytestmark = pytest.mark.same_for("users")
-
 CHECKOUT = Path(__file__).resolve().parents[3]
 DOCUMENTS = sorted([*CHECKOUT.glob("*.md"), *(CHECKOUT / "docs").rglob("*.md")])
 README = (CHECKOUT / "README.md").read_text()

@@ -9,11 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from graphlib import TopologicalSorter
 
-import pytest
-
 from tests.unit.docs.test_imports import below, imported, modules
-
-pytestmark = pytest.mark.same_for("users", "versions")
 
 # Each extra, and the packages and modules of it. Whatever is named in none of them is core.
 EXTRAS = {

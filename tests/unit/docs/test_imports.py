@@ -16,8 +16,6 @@ import pytest
 import envhub_sandbox
 from tests.support.samples import sample
 
-pytestmark = pytest.mark.same_for("users", "versions")
-
 WORKERS_OWN = {"cloudpickle", "envhub_worker", "gymnasium", "msgpack", "numpy", "zmq"}
 CLIENTS_OWN = {
     *("cloudpickle", "envhub_sandbox", "envhub_worker", "gymnasium", "huggingface_hub", "msgpack"),

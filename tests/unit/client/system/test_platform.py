@@ -24,8 +24,6 @@ from tests.support.elsewhere.caseless import without_case
 from tests.support.elsewhere.kit import SYSTEMS, command, elsewhere
 from tests.support.processes import eventually
 
-pytestmark = pytest.mark.same_for("versions")
-
 _SETTINGS = Path(__file__).parents[4] / ".ci" / "elsewhere.ini"
 _FACES = ("envhub_sandbox.integrations",)  # of libraries that look at the platform themselves
 _LOOKS = """

@@ -41,8 +41,6 @@ from tests.support.objects.curious import names_asked_for
 from tests.support.objects.protocol_names import names_that_libraries_call
 from tests.unit.protocol.manifest.test_manifest import an_env, read, with_env
 
-pytestmark = pytest.mark.same_for("users")
-
 ASKED = {
     "pandas": {"toDict", "dtype", "ndim", "read", "write", "keys"},
     "matplotlib": {"shape", "values", "index", "to_numpy"},

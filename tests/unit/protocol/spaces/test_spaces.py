@@ -24,8 +24,6 @@ from tests.support.compare import assert_same
 from tests.support.decode import decode
 from tests.support.wire import decode_space
 
-pytestmark = pytest.mark.same_for("users")
-
 Space = gym.Space[Any]
 INF = float("inf")
 MANY = 10**6

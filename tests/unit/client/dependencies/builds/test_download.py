@@ -24,8 +24,6 @@ from tests.support.packages.git_server import git as run_git
 from tests.support.packages.wheels import served
 from tests.support.ports import QuietHandler, serving
 
-pytestmark = pytest.mark.same_for("versions")
-
 
 @pytest.fixture
 def repository(tmp_path: Path) -> Path:

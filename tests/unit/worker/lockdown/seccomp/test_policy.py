@@ -31,8 +31,6 @@ from envhub_worker.lockdown.seccomp.policy import (
 from envhub_worker.lockdown.seccomp.syscalls import NUMBERS
 from tests.unit.worker.lockdown.seccomp.bpf_machine import listing, run
 
-pytestmark = pytest.mark.same_for("users", "versions")
-
 GOLDEN = Path(__file__).parents[3] / "golden"
 ARCH = {"x86_64": 0xC000003E, "aarch64": 0xC00000B7}
 I386 = 0x40000003
