@@ -39,8 +39,8 @@ Grant = Annotated[
     bool,
     typer.Option(
         "--grant",
-        help="Grant what the bundle needs beyond an ordinary run: its network, readable paths, "
-        "variables, limits, interpreter, packages, Hub. Only for bundles that you trust.",
+        help="Use the bundle's own policy, limits, timeouts, interpreter, packages and Hub, where "
+        "they differ from an ordinary run. Only for bundles that you trust.",
     ),
 ]
 
@@ -73,14 +73,11 @@ def replay(
     wanted = [wish for wish in wishes if wish.partition("=")[0] not in given]
     if wanted and not grant:
         raise UsageError(
-            f"the bundle needs more permissions than an ordinary run: {', '.join(wanted)}. If "
-            "you trust its source, add --grant"
+            f"the bundle needs more than an ordinary run: {', '.join(wanted)}. If you trust its "
+            "source, add --grant"
         )
     for doubt in loaded.doubts:
         show("not exact", doubt, "yellow", stderr=True)
-    place = loaded.arguments.get("sandbox")
-    if place != sandbox:
-        show("sandbox", f"it died in {place}; this is {sandbox}", "yellow", stderr=True)
     options = bundle_reader.replayed_arguments(loaded, granted=grant)
     if "profile" in given:
         options["policy"] = {**options["policy"], "profile": given.pop("profile")}
@@ -134,7 +131,7 @@ def _made(
     if bundle.task is None:
         opt.select_envs(envs, None, None)[0][2].np_random  # noqa: B018  # starts it, and changes nothing
         return None
-    bar.begin(f"repeating {len(bundle.requests)} requests")
+    bar.begin(f"repeating {bundle.count} requests")
     suite, task = bundle.task["suite"], bundle.task["task"]
     env = envs.get(suite, {}).get(task)
     if env is None or env.num_envs != bundle.task["num_envs"]:
@@ -151,7 +148,7 @@ def _print(bundle: Bundle, replayed: ReplayResult) -> None:
     show_rows(
         [
             ("", "request", "step", "how it ended"),
-            _row("recorded", len(bundle.requests), bundle.steps, bundle.death),
+            _row("recorded", bundle.count, bundle.steps, bundle.death),
             _row("replayed", replayed.requests, replayed.steps, replayed.death),
         ],
         right=(1, 2),
@@ -171,7 +168,7 @@ def _document(
         "verdict": replayed.verdict.value,
         "changed_files": [safe_line(path) for path in changed],
         "doubts": list(bundle.doubts),
-        "recorded": {"requests": len(bundle.requests), **bundle.death},
+        "recorded": {"requests": bundle.count, **bundle.death},
         "replayed": {
             "requests": replayed.requests,
             "steps": replayed.steps,

@@ -21,10 +21,10 @@ from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.sandboxes.sandbox import retry_while_busy
 from envhub_sandbox.session.builder import JailSource, SharedJail
-from envhub_sandbox.session.crash.history import History
 from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.launcher import ExpectedManifest, Launcher, LoadedJail
 from envhub_sandbox.session.prewarm import SuitePrewarm, TaskPrewarm
+from envhub_sandbox.session.recorder import recorder_for
 from envhub_sandbox.settings.policy import Policy
 from envhub_sandbox.system import folders
 from envhub_sandbox.system.folders import cache_root, write_whole_file
@@ -280,12 +280,13 @@ class EnvFactory:
         seats = list(zip(self._launchers, bounds))  # noqa: B905 - there may be more places
         if self._num_workers is None and not trials.may_share(env):
             seats = [seat for launcher, rows in seats for seat in _each(launcher, *rows)]
-        history, unnoted = History(env, self._repository.policy.crash_history), ShardTrials(None)
+        recorder = recorder_for(self._repository.policy.crash_history)
+        unnoted = ShardTrials(None)
         parts = [
-            EnvSession(source(launcher, 1), env, [rows], unnoted, history)
+            EnvSession(source(launcher, 1), env, [rows], unnoted, recorder)
             for launcher, rows in seats
         ]
-        return FleetSession(parts, history)
+        return FleetSession(parts, recorder)
 
     def _use(self, loaded: LoadedJail, sessions: list[AnySession]) -> None:
         """The jail that gave the manifest becomes the only task's; a suite closes it."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import os
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
@@ -34,6 +33,7 @@ from envhub_sandbox.session.repository import (
 )
 from envhub_sandbox.settings.options import Options, option_name
 from envhub_sandbox.settings.policy import Limits, Policy, Timeouts, policy_from, timeouts_from
+from envhub_sandbox.system import extras
 from envhub_sandbox.system.folders import cache_root
 from envhub_sandbox.system.platform import occupy_streams
 from envhub_sandbox.vector.suites import EnvSuites, opened_again
@@ -347,16 +347,14 @@ def _extra(module: str, name: str) -> Any:
     Raises ``SandboxUnavailableError``: this installation lacks it.
     """
     module = f"envhub_sandbox.sandboxes.{module}"
-    try:
-        return getattr(importlib.import_module(module), name)
-    except ModuleNotFoundError as error:
-        if error.name is None or not f"{module}.".startswith(f"{error.name}."):
-            raise  # the module is there, and lacks something itself
+    place = extras.find(module, name)
+    if place is None:
         raise SandboxUnavailableError(
             f"{option_name('sandbox')} needs {module}, which this installation of "
             "envhub-sandbox lacks: install the whole package, or use "
             f"{option_name('sandbox', 'process')}"
-        ) from None
+        )
+    return place
 
 
 def _unknown(sandbox: object) -> PolicyError:

@@ -23,10 +23,10 @@ from envhub_sandbox.errors import (
 )
 from envhub_sandbox.session.builder import JailSource
 from envhub_sandbox.session.counters import LEDGER, Counters, Labels
-from envhub_sandbox.session.crash.history import History, PartHistory
 from envhub_sandbox.session.failures import Failures, Restarts
 from envhub_sandbox.session.lease import Lease
 from envhub_sandbox.session.prewarm import INTERRUPT_S, LOOK_S, Prewarm
+from envhub_sandbox.session.recorder import Recorder, recorder_for
 from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.session.requests import Requests
 from envhub_sandbox.session.use_lock import UseLock
@@ -55,7 +55,7 @@ class EnvSession:
     Args:
         bounds: The slices of its sub-environments, one for each shard.
         trials: Takes note of what its steps took.
-        whole: Where it is one worker of a fleet: the history of the whole environment. The fleet
+        whole: Where it is one worker of a fleet: the recorder of the whole environment. The fleet
             then counts for all of them.
     """
 
@@ -65,7 +65,7 @@ class EnvSession:
         manifest: EnvManifest,
         bounds: Sequence[tuple[int, int]],
         trials: ShardTrials,
-        whole: History | None = None,
+        whole: Recorder | None = None,
     ) -> None:
         self.repository: Repository = jails.launcher.repository
         policy = self.repository.policy
@@ -73,21 +73,22 @@ class EnvSession:
         self.bounds = list(bounds)
         self.lifecycle = Lifecycle()
         self.counters = counters = Counters()
-        history = History(manifest, policy.crash_history)
-        self.history = history = history if whole is None else PartHistory(manifest, whole)
+        self.recorder = recorder = (
+            recorder_for(policy.crash_history) if whole is None else whole.of_part()
+        )
         results = Results(manifest, self.bounds)
         self.lease = lease = Lease(jails, results, self.lifecycle, counters, trials)
         self.report, self.denials = lease.report, lease.denials
         self._restarts = Restarts(policy, counters)
-        self._failures = failures = Failures(lease, history)
+        self._failures = failures = Failures(lease, recorder)
         self.use = use = UseLock(lease, failures)
         recovery = None
         if policy.restart == "transparent":
             from envhub_sandbox.session.recovery import Recovery  # which few need
 
-            recovery = Recovery(lease, self._restarts, failures, history)
-        self.prewarm = Prewarm(lease, use, history, recovery)
-        self.requests = Requests(lease, use, self.prewarm, history, failures, recovery)
+            recovery = Recovery(lease, self._restarts, failures, recorder)
+        self.prewarm = Prewarm(lease, use, recorder, recovery)
+        self.requests = Requests(lease, use, self.prewarm, recorder, failures, recovery)
         labels = Labels(self.repository.label, manifest.suite, str(manifest.task))
         if whole is None:
             LEDGER.add(self, labels, counters, self.lifecycle)

@@ -10,8 +10,8 @@ import time
 
 from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerError, WorkerTimeoutError
 from envhub_sandbox.session.counters import Counters
-from envhub_sandbox.session.crash.history import History
 from envhub_sandbox.session.lease import Lease, closed_during
+from envhub_sandbox.session.recorder import Recorder
 from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.settings.policy import Policy
 from envhub_sandbox.system.log import WORKER
@@ -126,11 +126,11 @@ class Failures:
     the last late reply has another reason.
     """
 
-    def __init__(self, lease: Lease, history: History) -> None:
+    def __init__(self, lease: Lease, recorder: Recorder) -> None:
         self._lease = lease
         self._counters = lease.counters
         self._label = lease.repository.label
-        self._history = history
+        self._recorder = recorder
         self.interruption: str | None = None
 
     def timed_out(self, operation: str, deadline: Deadline) -> WorkerTimeoutError:
@@ -215,6 +215,6 @@ class Failures:
             "shards": len(results.bounds),
             "lane": None if lease.lane is None else lease.lane.name,
         }
-        recording, loaded = self._history.recording(), lease.loaded
+        loaded = lease.loaded
         of_jail = () if loaded is None else (loaded.manifest, loaded.jail.report)
-        lease.repository.keep_crash(error, recording, task, *of_jail, shared=lease.shared)
+        lease.repository.keep_crash(error, self._recorder, task, *of_jail, shared=lease.shared)

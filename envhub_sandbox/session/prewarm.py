@@ -17,9 +17,9 @@ from itertools import chain
 from typing import TYPE_CHECKING
 
 from envhub_sandbox.errors import EnvHubError
-from envhub_sandbox.session.crash.history import History
 from envhub_sandbox.session.launcher import LoadedJail
 from envhub_sandbox.session.lease import Lease, closed_during
+from envhub_sandbox.session.recorder import Recorder
 from envhub_sandbox.session.use_lock import UseLock
 from envhub_sandbox.system.log import WORKER
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
@@ -50,7 +50,7 @@ class Prewarm:
         self,
         lease: Lease,
         use: UseLock,
-        history: History,
+        recorder: Recorder,
         recovery: Recovery | None,
     ) -> None:
         self.lifecycle = lease.lifecycle
@@ -59,7 +59,7 @@ class Prewarm:
         self._lease = lease
         self._use = use
         self._counters = lease.counters
-        self._history = history
+        self._recorder = recorder
         self._recovery = recovery
         self._timeouts = lease.repository.timeouts
         self.starting: StartupDeadline | None = None
@@ -88,7 +88,7 @@ class Prewarm:
             self._started()
 
     def _started(self) -> None:
-        self._history.started()
+        self._recorder.started()
         if self._recovery is not None:
             self._recovery.started()
         self.lifecycle.on(Event.START)

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from envhub_sandbox.errors import EnvHubError, WorkerDiedError, WorkerError, WorkerTimeoutError
-from envhub_sandbox.session.crash.history import History
 from envhub_sandbox.session.failures import Failures, Restarts
 from envhub_sandbox.session.lease import Lease
+from envhub_sandbox.session.recorder import Recorder
 from envhub_sandbox.system.log import WORKER
 from envhub_sandbox.transport.deadline import Deadline, StartupDeadline
 from envhub_sandbox.transport.replies import RunnersDiedError, check_reply, typed_reply
@@ -50,7 +50,7 @@ class Recovery:
         lease: Lease,
         restarts: Restarts,
         failures: Failures,
-        history: History,
+        recorder: Recorder,
     ) -> None:
         manifest = lease.results.manifest
         self._lease = lease
@@ -59,7 +59,7 @@ class Recovery:
         self._restarts = restarts
         self._failures = failures
         self._counters = lease.counters
-        self._history = history
+        self._recorder = recorder
         self._seeds = SeedBook(manifest.num_envs, manifest.shardable)
         self._settings: dict[Any, list[list[bytes]]] = {}  # what was set, as shards were sent it
         self._setting: tuple[Any, list[list[bytes]]] | None = None  # what is being set
@@ -174,7 +174,7 @@ class Recovery:
         lifecycle.request = None
         self.fresh = tuple(fresh)
         self._counters.deaths += len(fresh)
-        self._history.revived()
+        self._recorder.revived()
         lifecycle.moved(Event.REVIVAL)
         merged = [fresh.get(index, reply) for index, reply in enumerate(replies)]
         return [reply for reply in merged if reply is not None]

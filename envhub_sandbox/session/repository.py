@@ -33,8 +33,8 @@ from envhub_sandbox.errors import (
 from envhub_sandbox.hub.client import default_endpoint
 from envhub_sandbox.hub.logins import without_login
 from envhub_sandbox.hub.snapshot import Snapshot
-from envhub_sandbox.session.crash.history import Recording
 from envhub_sandbox.session.error_text import add_author_line, add_reach_advice, why_missing
+from envhub_sandbox.session.recorder import Crash, Recorder, recorder_for
 from envhub_sandbox.settings.options import Options, option_name
 from envhub_sandbox.settings.policy import Limits, Policy, Timeouts
 from envhub_sandbox.system.folders import cache_root
@@ -114,7 +114,7 @@ class Recipe:
             ENV_ID,
             entry_point=f"{_MAKERS}:make_again",
             vector_entry_point=f"{_MAKERS}:make_vector",
-            kwargs={"ref": self._cfg, "suite": suite, "task": task, **self._differing()},
+            kwargs={"ref": self._cfg, "suite": suite, "task": task, **self.differing},
             **{**known, "nondeterministic": bool(known.get("nondeterministic"))},
         )
 
@@ -131,7 +131,8 @@ class Recipe:
             options["endpoint"] = None  # it may come with a login here
         return options
 
-    def _differing(self) -> dict[str, Any]:
+    @property
+    def differing(self) -> dict[str, Any]:
         """The options that are not the default ones, as JSON has them where it can."""
         default = Options()
         return {
@@ -329,7 +330,7 @@ class Repository:
     def keep_crash(
         self,
         error: WorkerDiedError | WorkerTimeoutError,
-        recording: Recording | None = None,
+        recorder: Recorder | None = None,
         task: dict[str, Any] | None = None,
         manifest: Manifest | None = None,
         report: list[dict[str, Any]] | None = None,
@@ -340,34 +341,33 @@ class Repository:
 
         ``shared``: whether others lived in its jail. All else is None before there is a jail.
         """
-        ours = self.policy.crash_history and error.bundle is None
-        if not ours or getattr(error, "reason", "") in ("killed", "idle", "gone", "connection"):
+        ended = getattr(error, "reason", "") in ("killed", "idle", "gone", "connection")
+        if ended or not self.policy.crash_history or error.bundle is not None:
             return
-        from envhub_sandbox.session.crash.bundle_writer import Crash, write_bundle
-
         crash = Crash(
             error=error,
             label=self.label,
             provenance=self.provenance(manifest, report),
             load=self.arguments,
-            options=self.recipe.options,
+            options=self.recipe.differing,
             task=task,
             shared=shared,
-            recording=recording or Recording(),
         )
+        folder = Path(self.policy.crash_folder or cache_root() / "crashes").absolute()
         try:
-            folder = self.policy.crash_folder or cache_root() / "crashes"
-            bundle = write_bundle(Path(folder).absolute(), crash)
+            bundle = (recorder or recorder_for(self.policy.crash_history)).write(folder, crash)
         except Exception as problem:
             CRASHES.warning("%s: no crash bundle could be written: %s", self.label, problem)
-        else:
-            error.bundle = str(bundle)
-            # of a folder, a bundle elsewhere than in the cache might be anybody's
-            elsewhere = self.snapshot.is_local and self.policy.crash_folder
-            options = " --grant" if elsewhere else ""
-            again = f"To try the same again: envhub replay {shlex.quote(error.bundle)}{options}"
-            error.args = (f"{error.args[0]}\n{again}", *error.args[1:])
-            CRASHES.info("%s: crash bundle %s", self.label, bundle)
+            return
+        if bundle is None:
+            return
+        error.bundle = str(bundle)
+        # of a folder, a bundle elsewhere than in the cache might be anybody's
+        elsewhere = self.snapshot.is_local and self.policy.crash_folder
+        options = " --grant" if elsewhere else ""
+        again = f"To try the same again: envhub replay {shlex.quote(error.bundle)}{options}"
+        error.args = (f"{error.args[0]}\n{again}", *error.args[1:])
+        CRASHES.info("%s: crash bundle %s", self.label, bundle)
 
 
 # --- a caller's config object

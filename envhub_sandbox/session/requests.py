@@ -26,10 +26,10 @@ from envhub_sandbox.errors import (
     WorkerError,
     WorkerTimeoutError,
 )
-from envhub_sandbox.session.crash.history import History
 from envhub_sandbox.session.failures import Failures, refusal
 from envhub_sandbox.session.lease import AttributeCache, FleetAttributes, Lease
 from envhub_sandbox.session.prewarm import Prewarm
+from envhub_sandbox.session.recorder import Recorder
 from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.session.use_lock import FleetUse, UseLock
 from envhub_sandbox.transport.deadline import Deadline, StepDeadline, deadline_of
@@ -229,7 +229,7 @@ class Requests(RequestOrder):
         lease: Lease,
         use: UseLock,
         prewarm: Prewarm,
-        history: History,
+        recorder: Recorder,
         failures: Failures,
         recovery: Recovery | None,
     ) -> None:
@@ -238,7 +238,7 @@ class Requests(RequestOrder):
         self._lease = lease
         self._prewarm = prewarm
         self._counters = lease.counters
-        self._history = history
+        self._recorder = recorder
         self._failures = failures
         self._recovery = recovery
 
@@ -256,7 +256,7 @@ class Requests(RequestOrder):
     def note_sent(self, actions: Any | None) -> None:
         """See ``RequestOrder``; a step to all of them is noted where it is submitted."""
         if actions is None:
-            self._history.skip()
+            self._recorder.skip()
 
     # --- requests ------------------------------------------------------------------------------
 
@@ -265,7 +265,7 @@ class Requests(RequestOrder):
     ) -> None:
         """With the lock held, send a request to every shard; opens the jail if there is none.
 
-        ``instead`` makes what is sent in the place of what the history keeps, if the answer is to
+        ``instead`` makes what is sent in the place of what is recorded, if the answer is to
         say more.
         Raises ``LocalProtocolError``: it cannot be sent; nothing was; ``WorkerError``: the
         environment is not in a state to take it.
@@ -282,7 +282,7 @@ class Requests(RequestOrder):
                     self.refuse_whole(operation, message_for, self.results.manifest.num_envs)
                 raise
             self._send_packed(operation, packed)
-            self._history.requested(packed.request)
+            self._recorder.requested(packed.request)
 
     def make_ready(self, operation: str, start: Callable[[], object] | None = None) -> None:
         """With the lock held, open the jail if there is none; raises as ``submit`` does.
@@ -305,7 +305,7 @@ class Requests(RequestOrder):
         return Packed(request, sent)
 
     def submit_packed(self, operation: str, packed: Packed) -> None:
-        """The second half, which leaves the history to the caller; raises as ``submit`` does."""
+        """The second half, which the caller records; raises as ``submit`` does."""
         with self._sending(operation):
             self._send_packed(operation, packed)
 
@@ -424,7 +424,7 @@ class Requests(RequestOrder):
                     self._nothing_was_sent(error)
                     raise
             self._counters.requests += 1
-            self._history.step(actions)  # while the jail is at it
+            self._recorder.step(actions)  # while the jail is at it
         except WorkerDiedError:
             self.refuse_if_closed()  # a close() in another thread ended it
             raise
@@ -445,7 +445,7 @@ class Requests(RequestOrder):
         with self.use.hold("step"):
             self._lane().send_step(actions, ahead=True)
             self._counters.requests += 1
-            self._history.step(actions)
+            self._recorder.step(actions)
 
     def owe(self, operation: str = "step") -> None:
         """After an answer: what was sent besides is pending now."""

@@ -116,7 +116,7 @@ class Policy:
     restart_backoff_s: float = 0.1
     output: str = "tail"
     record_denials: bool = False
-    crash_history: int = 100_000
+    crash_history: int = 10_000
     crash_folder: str | None = None
 
     def __post_init__(self) -> None:

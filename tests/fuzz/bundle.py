@@ -9,6 +9,7 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 from envhub_sandbox.errors import BundleError, EnvHubError
 from envhub_sandbox.session.crash.bundle_reader import load_bundle, replayed_arguments, wishes
@@ -25,6 +26,8 @@ class _Dummy:
 
     def __init__(self) -> None:
         self.action_space = None
+        self.num_envs = 2
+        self._requests = Mock()
 
     def reset(self, **options: Any) -> None:
         """Done."""
@@ -58,9 +61,9 @@ def bundles(dice: Dice) -> None:
             raise
         for wish in wishes(found):
             demand(wish.isprintable(), "a wish that a terminal obeys")
-        for granted in (False, True):
-            arguments = replayed_arguments(found, granted=granted)
-            demand(granted or not {"python", "endpoint"} & set(arguments), "taken without asking")
+        arguments = replayed_arguments(found, granted=False)
+        demand(not {"python", "endpoint"} & set(arguments), "taken without asking")
+        replayed_arguments(found, granted=True)
         try:
             replay(_Dummy, found)
         except (AttributeError, TypeError, ValueError) as error:

@@ -28,6 +28,7 @@ from envhub_sandbox.session import env_session
 from envhub_sandbox.session import launcher as launcher_module
 from envhub_sandbox.session.counters import Ledger
 from envhub_sandbox.session.crash import bundle_writer
+from envhub_sandbox.session.crash.recording import RecordedRequest
 from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.launcher import Launcher, LoadedJail
 from envhub_sandbox.session.lease import Lease
@@ -397,7 +398,7 @@ def living(ledger: Ledger) -> Any:
 
 def packet(frames: Sequence[Buffer]) -> bytes:
     """A message as a crash bundle keeps it."""
-    return bundle_writer._packet(frames)
+    return bundle_writer._packet(RecordedRequest([*map(bytes, frames)], exact=True))
 
 
 def monitor_script() -> Path:

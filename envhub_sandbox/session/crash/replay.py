@@ -51,7 +51,7 @@ def replay(make: Callable[[], Any], bundle: Bundle) -> ReplayResult:
     if env is None:
         return ReplayResult(verdict=Verdict.SURVIVED, requests=0, steps=0)
     steps = 0
-    for done, message in enumerate(bundle.requests, start=1):
+    for done, message in enumerate(bundle.requests(), start=1):
         steps += isinstance(message, m.Step)
         try:
             ended = _ask(env, message)
@@ -60,7 +60,7 @@ def replay(make: Callable[[], Any], bundle: Bundle) -> ReplayResult:
             return ReplayResult(verdict=Verdict.DIFFERENT, requests=done, steps=steps, note=note)
         if ended is not None:
             return _ended(ended, bundle, done, steps)
-    return ReplayResult(verdict=Verdict.SURVIVED, requests=len(bundle.requests), steps=steps)
+    return ReplayResult(verdict=Verdict.SURVIVED, requests=bundle.count, steps=steps)
 
 
 def _ask(env: Any, message: m.Message) -> WorkerDiedError | WorkerTimeoutError | None:
@@ -81,8 +81,7 @@ def _ended(
 ) -> ReplayResult:
     death = death_of(error)
     how = {name: death[name] for name in ("reason", "exit_code", "signal")}
-    there = requests == len(bundle.requests)
-    same = there and all(how[name] == bundle.death[name] for name in how)
+    same = requests == bundle.count and all(how[name] == bundle.death[name] for name in how)
     return ReplayResult(
         verdict=Verdict.SAME if same else Verdict.DIFFERENT,
         requests=requests,
@@ -98,46 +97,27 @@ def _reset(env: Any, message: m.Reset) -> None:
     env.reset(seed=message.seeds, options=options)
 
 
-def _call_own(env: Any, message: m.CallOwn) -> None:
-    if _is_remote(env, message.name):
-        getattr(env, message.name)(*message.args, **message.kwargs)
+def _set_random(env: Any, message: m.SetRandom) -> None:
+    env._generators.write(message.states, new=message.new)
 
 
-def _get_own(env: Any, message: m.GetOwn) -> None:
-    if _is_remote(env, message.name) or message.name == "np_random_seed":
-        getattr(env, message.name)
+def _ask_own(env: Any, message: m.GetOwn | m.CallOwn) -> None:
+    """Ask about the repository's vector environment itself: no name is looked up in the proxy."""
+    call = (message.args, message.kwargs) if isinstance(message, m.CallOwn) else ()
+    env._requests.ask_own(message.name, type(message), message.name, *call)
 
 
-def _call_one(env: Any, message: m.CallOne) -> None:
-    if message.name == "__setattr__":
-        name, value = message.args
-        one = _one(env, message)
-        if one is not None and str(name) not in vars(one):  # those are the proxy's own
-            setattr(one, str(name), value)
-        return
-    method = _one(env, message, message.name)
-    if method is not None:
-        method(*message.args, **message.kwargs)
+def _ask_one(env: Any, message: m.GetOne | m.CallOne) -> None:
+    """Ask about one sub-environment, likewise; other shards are sent no arguments."""
 
+    def message_for(number: int, index: int | None) -> m.Message:
+        changes: dict[str, Any] = {"env": number, "index": index}
+        if index is None and isinstance(message, m.CallOne):
+            changes |= {"args": (), "kwargs": {}}
+        return m.replace(message, **changes)
 
-def _one(env: Any, message: m.GetOne | m.CallOne, name: str | None = None) -> Any:
-    """The sub-environment that was asked, or what it has under a name; None for one of ours."""
-    index, depth = message.index, message.depth
-    if index is None or not 0 <= index < env.num_envs or (name or "").startswith("_"):
-        return None
-    one = env.envs[index]
-    if depth is None:
-        one = one.unwrapped
-    elif depth < 0:
-        return one if name is None else one.get_wrapper_attr(name)
-    for _ in range(depth or 0):
-        one = one.env
-    return one if name is None else getattr(one, name)
-
-
-def _is_remote(env: Any, name: str) -> bool:
-    """Whether a name means the repository's: a bundle has no business with the proxy's own."""
-    return not name.startswith("_") and name not in vars(env) and not hasattr(type(env), name)
+    if message.index is not None and 0 <= message.index < env.num_envs:
+        env._requests.ask_one(message.name, message.index, message_for)
 
 
 _REPEATED: dict[type[m.Message], Callable[[Any, Any], object]] = {
@@ -146,12 +126,12 @@ _REPEATED: dict[type[m.Message], Callable[[Any, Any], object]] = {
     m.Call: lambda env, message: env.call(message.name, *message.args, **message.kwargs),
     m.SetAttr: lambda env, message: env.set_attr(message.name, list(message.values)),
     m.Render: lambda env, message: env.render(),
-    m.CallOwn: _call_own,
-    m.GetOwn: _get_own,
-    m.CallOne: _call_one,
-    m.GetOne: lambda env, message: _one(env, message, message.name),
+    m.CallOwn: _ask_own,
+    m.GetOwn: _ask_own,
+    m.CallOne: _ask_one,
+    m.GetOne: _ask_one,
     m.GetRandom: lambda env, message: env.np_random,
-    m.SetRandom: lambda env, message: env._generators.write(message.states, new=message.new),
+    m.SetRandom: _set_random,
 }
 
 

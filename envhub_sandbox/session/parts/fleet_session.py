@@ -26,10 +26,10 @@ from envhub_sandbox.errors import (
     WorkerTimeoutError,
 )
 from envhub_sandbox.session.counters import LEDGER, FleetCounters, Labels
-from envhub_sandbox.session.crash.history import History
 from envhub_sandbox.session.env_session import GRACE_S, EnvSession
 from envhub_sandbox.session.lease import FleetAttributes
 from envhub_sandbox.session.prewarm import FleetPrewarm
+from envhub_sandbox.session.recorder import Recorder
 from envhub_sandbox.session.recovery import mark_revived
 from envhub_sandbox.session.requests import (
     MessageFor,
@@ -64,10 +64,10 @@ class FleetSession:
 
     Args:
         parts: One for each worker, in the order of their sub-environments.
-        history: Of the whole environment; the parts were made with it.
+        recorder: Of the whole environment; the parts were made with it.
     """
 
-    def __init__(self, parts: Sequence[EnvSession], history: History) -> None:
+    def __init__(self, parts: Sequence[EnvSession], recorder: Recorder) -> None:
         self.parts = list(parts)
         self.repository = parts[0].repository
         self.manifest = manifest = parts[0].manifest
@@ -77,7 +77,7 @@ class FleetSession:
         self.prewarm = FleetPrewarm([part.prewarm for part in parts])
         results = Results(manifest, self.bounds)
         results.max_bytes = self.repository.wire_limits.message_bytes
-        self.requests = FleetRequests(self.parts, results, history, self.counters)
+        self.requests = FleetRequests(self.parts, results, recorder, self.counters)
         labels = Labels(self.repository.label, manifest.suite, str(manifest.task))
         LEDGER.add(self, labels, self.counters, self.lifecycle)
 
@@ -182,7 +182,7 @@ class FleetRequests(RequestOrder):
     Args:
         parts: One for each worker, in the order of their sub-environments.
         results: Joins what the parts give; its bounds are theirs.
-        history: That of the whole environment.
+        recorder: That of the whole environment.
         counters: Likewise.
     """
 
@@ -192,7 +192,7 @@ class FleetRequests(RequestOrder):
         self,
         parts: Sequence[EnvSession],
         results: Results,
-        history: History,
+        recorder: Recorder,
         counters: FleetCounters,
     ) -> None:
         self._parts = parts
@@ -200,7 +200,7 @@ class FleetRequests(RequestOrder):
         use = FleetUse([part.use for part in parts])
         attributes = FleetAttributes([one.attributes for one in self._each], results.bounds)
         super().__init__(parts[0].repository, results, use, attributes)
-        self._history = history
+        self._recorder = recorder
         self._counters = counters
         self._space = results.manifest.single_action_space
         self._may_not_fit = slabs.layout_of(self._space, 1) is None
@@ -223,9 +223,9 @@ class FleetRequests(RequestOrder):
         """See ``RequestOrder``."""
         self._counters.requests += 1
         if actions is None:
-            self._history.skip()
+            self._recorder.skip()
         else:
-            self._history.step(actions)
+            self._recorder.step(actions)
 
     def ask_one(self, name: str, index: int, message: OneMessageFor) -> m.Message:
         """Ask the part that has the sub-environment; the others are not asked."""
@@ -257,7 +257,7 @@ class FleetRequests(RequestOrder):
             raise
         self._send(lambda at: self._each[at].submit_packed(operation, packed[at]))
         self._counters.requests += 1
-        self._history.requested(_joined(packed, self.results.bounds))
+        self._recorder.requested(_joined(packed, self.results.bounds))
 
     def collect(
         self, timeout: float | Deadline | None, kind: type[m.M] | tuple[type[m.M], ...]
@@ -301,7 +301,7 @@ class FleetRequests(RequestOrder):
         self._sent_ns = perf_counter_ns()
         self._send(lambda at: self._each[at].submit_step(rows[at], packed[at]))
         self._counters.requests += 1
-        self._history.step(actions)
+        self._recorder.step(actions)
 
     def _packed(self, actions: Any, rows: Sequence[Any]) -> Sequence[Packed | None]:
         """Each worker's, before others are sent theirs.
@@ -441,7 +441,7 @@ def _step(actions: Any, number: int, bounds: tuple[int, int]) -> m.Message:
 
 
 def _joined(packed: Sequence[Packed], bounds: Sequence[tuple[int, int]]) -> Request:
-    """The parts' requests as one, for the history."""
+    """The parts' requests as one, to be recorded."""
     requests = [one.request for one in packed]
     return Request(
         requests[0].operation,

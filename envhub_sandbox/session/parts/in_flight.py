@@ -157,7 +157,7 @@ class InFlight:
             of_all = len(queues) == len(self._queues)
             self._order.note_sent(actions if of_all else None)
             if of_all and self._shared:
-                queues[0].part.history.step(actions)
+                queues[0].part.recorder.step(actions)
 
     def send_reset(self, rows: Rows, message_for: MessageFor) -> None:
         """Send each worker a reset of all of its sub-environments; raises as ``send``."""

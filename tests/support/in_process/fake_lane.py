@@ -10,9 +10,9 @@ from typing import Any, cast
 import numpy as np
 
 from envhub_sandbox.errors import WorkerTimeoutError
-from envhub_sandbox.session.crash.history import History
 from envhub_sandbox.session.env_session import EnvSession
 from envhub_sandbox.session.parts.fleet_session import FleetSession
+from envhub_sandbox.session.recorder import Recorder, recorder_for
 from envhub_sandbox.session.repository import Repository
 from envhub_sandbox.settings.policy import Policy, Timeouts
 from envhub_sandbox.transport.deadline import Deadline
@@ -143,18 +143,18 @@ def _observation(count: int) -> Any:
 def fleet_over(lanes: Sequence[FakeLane]) -> FleetSession:
     """A session over two workers, with a sub-environment each."""
     repository = FakeRepository()
-    history = History(env_manifest(), repository.policy.crash_history)
+    recorder = recorder_for(repository.policy.crash_history)
     parts = [
-        session_over(lane, (row, row + 1), repository, history) for row, lane in enumerate(lanes)
+        session_over(lane, (row, row + 1), repository, recorder) for row, lane in enumerate(lanes)
     ]
-    return FleetSession(parts, history)
+    return FleetSession(parts, recorder)
 
 
 def session_over(
     lane: FakeLane,
     rows: tuple[int, int] = (0, NUM_ENVS),
     repository: FakeRepository | None = None,
-    whole: History | None = None,
+    whole: Recorder | None = None,
 ) -> EnvSession:
     """A session that is READY, with its environment behind this lane."""
     repository = repository or FakeRepository()

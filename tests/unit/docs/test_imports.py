@@ -111,7 +111,7 @@ WITHOUT_IO = {"asyncio", "multiprocessing", "os", "select", "socket", "subproces
 IMPORTERS = {
     "envhub_sandbox": "our own public names",
     "envhub_sandbox.cli.app": "our own commands",
-    "envhub_sandbox.factory.make_env": "our own places",
+    "envhub_sandbox.system.extras": "our own extras",
     "envhub_sandbox.sandboxes.inprocess": "the repository's, where sandbox=None trusts it",
     "envhub_worker.bootstrap": "our own programs",
     "envhub_worker.runner.loader": "the repository's",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import sys
+from pathlib import Path
 from typing import Any
 from unittest.mock import MagicMock
 
@@ -10,6 +12,8 @@ import pytest
 from envhub_sandbox.errors import WorkerDiedError, WorkerError, WorkerTimeoutError
 from envhub_sandbox.session.counters import Counters, FleetCounters
 from envhub_sandbox.session.failures import Failures, backoff_s, refusal
+from envhub_sandbox.session.recorder import Recorder, recorder_for
+from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.lifecycle import State
 from tests.support.in_process.fake_lane import FakeLane, session_over
 
@@ -115,3 +119,15 @@ def test_a_straggler_is_who_was_waited_for(counters: FleetCounters, parts: list[
     assert (straggler["timeouts"], straggler["sent_bytes"]) == (2, 20)
     assert "requests" not in straggler, "a worker's requests are those of the whole"
     assert counters.of_worker(0)["waited_s"] == {"total": 0.0, "max": 0.0}
+
+
+def test_without_the_extra_nothing_is_recorded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An installation may lack it: requests and deaths are as ever, and no bundle is named."""
+    assert type(recorder_for(8)) is not Recorder  # the control
+    for missing in ("envhub_sandbox.session.crash", "envhub_sandbox.session.crash.history"):
+        monkeypatch.setitem(sys.modules, missing, None)
+    lane = FakeLane()
+    session = session_over(lane)
+    assert type(session.recorder) is Recorder
+    assert session.requests.ask("render", lambda number, _: m.Render(number)) == [lane.answer]
+    assert session.recorder.of_part().write(Path("nowhere"), MagicMock()) is None

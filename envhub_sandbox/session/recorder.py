@@ -1,0 +1,71 @@
+"""Records what an environment is asked, and what led to a death.
+
+The core's recorder records nothing. The extra ``session.crash`` has one that writes crash bundles.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from envhub_sandbox.errors import WorkerDiedError, WorkerTimeoutError
+from envhub_sandbox.system import extras
+from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.records import dataclass
+
+if TYPE_CHECKING:
+    from envhub_sandbox.transport.jail import Request
+
+
+@dataclass(frozen=True, kw_only=True)
+class Crash:
+    """What is known of one death.
+
+    Attributes:
+        error: What the user gets.
+        load: The arguments of the repository's ``make_env``.
+        options: The other arguments that differ from the default ones.
+        task: ``suite``, ``task``, ``num_envs``, ``shards``, ``lane``; None before ``make_env`` has
+            returned.
+        shared: Whether other environments lived in the same jail.
+    """
+
+    error: WorkerDiedError | WorkerTimeoutError
+    label: str
+    provenance: dict[str, Any]
+    load: m.Load
+    options: dict[str, Any]
+    task: dict[str, Any] | None
+    shared: bool
+
+
+class Recorder:
+    """Records nothing. Not thread-safe: the environment that owns it holds a lock."""
+
+    def started(self) -> None:
+        """A fresh jail."""
+
+    def revived(self) -> None:
+        """Some sub-environments are in a fresh process, others are not."""
+
+    def step(self, actions: Any) -> None:
+        """A step of all sub-environments, with its validated batch of actions."""
+
+    def skip(self) -> None:
+        """A step or reset of some workers only, which is not recorded."""
+
+    def requested(self, request: Request) -> None:
+        """Another request, as it was sent."""
+
+    def of_part(self) -> Recorder:
+        """The recorder of one worker of a fleet, which has this one for the whole environment."""
+        return self
+
+    def write(self, folder: Path, crash: Crash) -> Path | None:
+        """Write a crash bundle; returns its folder. Raises ``OSError``."""
+
+
+def recorder_for(limit: int) -> Recorder:
+    """A recorder of at most ``limit`` requests."""
+    history = extras.find("envhub_sandbox.session.crash.history", "History") if limit else None
+    return Recorder() if history is None else history(limit)
