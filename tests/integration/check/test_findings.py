@@ -25,11 +25,10 @@ from tests.corpus.entries import Entry
 from tests.corpus.faults import FAULTS
 from tests.corpus.honest import HONEST
 from tests.support import inside
-from tests.support import judged as corpus
 from tests.support.command_line import envhub, python
 from tests.support.output.ci import obeyed
 from tests.support.repositories import write_repository
-from tests.support.samples import EXAMPLES, SAMPLES
+from tests.support.samples import EXAMPLES
 
 _BODY = """
 length = _max_episode_steps = 10
@@ -397,31 +396,3 @@ def test_where_recording_is_refused_it_is_judged_and_told(
     last = [*report.confinement.lines()][-1]
     why = "this host cannot enforce seccomp: no listener"
     assert last == f"not recorded: denied attempts: {why}"
-
-
-# --- Some of the hostile payloads and samples; ``tests.support.judged`` has them all
-
-
-def test_every_payload_and_every_sample_has_its_judgement() -> None:
-    """Who adds one says what has to be told of it."""
-    assert {*corpus.ATTACKS, *corpus.NO_ATTACKS} == set(corpus.KINDS)
-    samples = {path.name for path in SAMPLES.iterdir() if (path / "env.py").exists()}
-    assert {*corpus.HONEST, *corpus.FAILING} == samples | {"sub_folder"}
-    assert len(corpus.HONEST) >= 20
-    for attack in corpus.ATTACKS.values():
-        by_layers = ("denied-", "limits-", "survives", "leaks-")
-        assert attack.check.startswith(by_layers) or attack.unseen
-
-
-@pytest.mark.parametrize("payload", ["foreign_abi", "unix_stream"])
-def test_a_hostile_payload_is_reported_with_what_it_tried(payload: str) -> None:
-    attack = corpus.ATTACKS[payload]
-    found = corpus.told_of(payload, attack)
-    assert corpus.is_told(found, attack), [one.text for one in found]
-
-
-@pytest.mark.parametrize("name", ["exits", "src_layout"])
-def test_a_sample_is_judged_as_it_is(name: str) -> None:
-    """Honest ones pass, and of others what fails is what is wrong with them."""
-    found = corpus.failing(name)
-    assert corpus.is_as_it_stands(name, found), [one.text for one in found]
