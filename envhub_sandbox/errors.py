@@ -16,14 +16,7 @@
       ActionError (ValueError)
         ActionTypeError (TypeError)
       SandboxUnavailableError
-      DependencyError (ImportError)
-        RequirementError
-        ResolutionError
-        IndexUnavailableError
-        PackageIntegrityError
-        PackagesTooLargeError
-        InterpreterUnavailableError
-        MissingModuleError (ModuleNotFoundError)
+      DependencyError (ModuleNotFoundError)
       LoadError
         LoadAttributeError (AttributeError), LoadValueError (ValueError), ...
       WorkerError
@@ -51,7 +44,7 @@ import builtins
 import multiprocessing
 import sys
 from functools import cache
-from typing import Any
+from typing import Any, Literal, get_args
 
 from envhub_worker.protocol.confinement import Reason
 from envhub_worker.protocol.errors import EnvHubError as EnvHubError
@@ -61,6 +54,10 @@ from envhub_worker.protocol.errors import ProtocolError as ProtocolError
 from envhub_worker.protocol.errors import RemoteProtocolError as RemoteProtocolError
 from envhub_worker.protocol.errors import VersionMismatchError as VersionMismatchError
 from envhub_worker.protocol.text import continued
+
+DependencyReason = Literal[
+    "requirement", "resolution", "index", "integrity", "size", "interpreter", "module", "other"
+]
 
 
 class HubReferenceError(EnvHubError, ValueError):
@@ -125,40 +122,23 @@ class SandboxUnavailableError(EnvHubError):
     """This host cannot enforce the policy; the text names the layer, the reason and the fix."""
 
 
-class DependencyError(EnvHubError, ImportError):
-    """A package that the repository needs is missing; the repository does not run."""
+class DependencyError(EnvHubError, ModuleNotFoundError):
+    """A package that the repository needs is missing; the repository does not run.
+
+    Attributes:
+        reason: ``"requirement"``: a declared requirement is not supported; ``"resolution"``: no
+            versions satisfy all requirements; ``"index"``: the package index did not answer;
+            ``"integrity"``: a package does not have the expected hash; ``"size"``: the packages
+            have more bytes or files than permitted; ``"interpreter"``: no interpreter of this
+            machine fits; ``"module"``: the repository imports a module that its interpreter does
+            not have; ``"other"``: the text says it.
+    """
+
+    def __init__(self, message: str, *, reason: DependencyReason = "other") -> None:
+        super().__init__(message)
+        self.reason: DependencyReason = reason
 
     __str__ = Exception.__str__  # ImportError's does not look at args
-
-
-class RequirementError(DependencyError):
-    """A declared requirement is not supported; the text names the file and the line."""
-
-
-class ResolutionError(DependencyError):
-    """No versions satisfy all requirements; the text names those that conflict."""
-
-
-class IndexUnavailableError(DependencyError):
-    """The package index did not answer."""
-
-
-class PackageIntegrityError(DependencyError):
-    """A package does not have the expected hash. It was not kept."""
-
-
-class PackagesTooLargeError(DependencyError):
-    """The packages have more bytes or files than permitted. Nothing was installed."""
-
-
-class InterpreterUnavailableError(DependencyError):
-    """No interpreter of this machine fits the repository."""
-
-
-class MissingModuleError(DependencyError, ModuleNotFoundError):
-    """The repository imports a module that its interpreter does not have."""
-
-    __str__ = Exception.__str__
 
 
 class LoadError(EnvHubError):
@@ -404,6 +384,11 @@ def load_error(builtin: str, message: str) -> LoadError:
     """The exception for a repository that raised while it was loaded, which is that builtin too."""
     error: LoadError = _nearest(LoadError, builtin)(message)
     return error
+
+
+def known_reason(text: str) -> DependencyReason:
+    """The reason of a ``DependencyError`` that another process names."""
+    return next((reason for reason in get_args(DependencyReason) if reason == text), "other")
 
 
 def name_source(error: EnvHubError, label: str) -> None:

@@ -31,11 +31,8 @@ from envhub_sandbox.errors import (
     DependencyError,
     EnvHubError,
     LoadError,
-    PackageIntegrityError,
     RemoteEnvError,
     RemoteProtocolError,
-    RequirementError,
-    ResolutionError,
     SandboxUnavailableError,
     SnapshotError,
     WorkerDiedError,
@@ -159,7 +156,9 @@ class _Judge:
                     packages = Path(made.packages)
                     inferred = made.facts.get("inferred", ())
                     taken = {one["module"]: one["where"] for one in inferred}
-        except (RequirementError, ResolutionError, PackageIntegrityError) as error:
+        except DependencyError as error:
+            if error.reason not in ("requirement", "resolution", "integrity"):
+                raise
             self._report.judged("requirements", [str(error)])
             raise _StoppedError from error
         self._report.judged("requirements", [])

@@ -24,7 +24,7 @@ from envhub_sandbox.check.findings import Finding
 from envhub_sandbox.dependencies import interpreters
 from envhub_sandbox.dependencies.declared import DeclaredPackages, declared
 from envhub_sandbox.dependencies.resolve import WORKERS
-from envhub_sandbox.errors import RequirementError, SnapshotError
+from envhub_sandbox.errors import DependencyError, SnapshotError
 from envhub_sandbox.hub.git.checkout import Checkout, is_unread
 from envhub_sandbox.hub.listing import FileRecord
 from envhub_sandbox.hub.local import IGNORED, REPOSITORY, LocalFolder
@@ -298,7 +298,7 @@ def static(snapshot: Snapshot) -> Static:
     findings, says = surveyed.findings, None
     try:
         says = declared(snapshot.root, snapshot.path)
-    except RequirementError as error:
+    except DependencyError as error:
         findings = [Finding("requirements", str(error)), *findings]
     return Static(
         snapshot=snapshot,

@@ -16,7 +16,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from envhub_sandbox.errors import DependencyError, PackageIntegrityError, PackagesTooLargeError
+from envhub_sandbox.errors import DependencyError
 from envhub_worker.protocol.text import size_text
 
 BYTES_VARIABLE = "ENVHUB_ENVIRONMENT_BYTES"
@@ -42,16 +42,18 @@ class Bounds:
         return cls(_number(BYTES_VARIABLE, MAX_BYTES), _number(FILES_VARIABLE, MAX_FILES))
 
     def check(self, size: int, files: int, what: str) -> None:
-        """Refuse more with ``PackagesTooLargeError``."""
+        """Refuse more with ``DependencyError``."""
         if size > self.bytes:
-            raise PackagesTooLargeError(
+            raise DependencyError(
                 f"{what} {size_text(size)}; at most {size_text(self.bytes)} are installed. No "
-                f"environment was made. If you accept the size, set {BYTES_VARIABLE} to more bytes"
+                f"environment was made. If you accept the size, set {BYTES_VARIABLE} to more bytes",
+                reason="size",
             )
         if files > self.files:
-            raise PackagesTooLargeError(
+            raise DependencyError(
                 f"{what} {files} files; at most {self.files} are installed. No environment was "
-                f"made. If you accept the size, set {FILES_VARIABLE} to more"
+                f"made. If you accept the size, set {FILES_VARIABLE} to more",
+                reason="size",
             )
 
 
@@ -106,12 +108,13 @@ def measured(folder: Path) -> tuple[int, int]:
 
 
 def checked(folder: Path) -> tuple[int, int]:
-    """The same for a folder that does not change. Raises ``PackageIntegrityError``."""
+    """The same for a folder that does not change. Raises ``DependencyError``."""
     for path in walk(folder):
         mode = path.lstat().st_mode
         if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
-            raise PackageIntegrityError(
-                f"a package has {str(path.relative_to(folder))!r}, which is not a file"
+            raise DependencyError(
+                f"a package has {str(path.relative_to(folder))!r}, which is not a file",
+                reason="integrity",
             )
     return measured(folder)
 

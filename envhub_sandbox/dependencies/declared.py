@@ -22,7 +22,7 @@ from packaging.specifiers import InvalidSpecifier, SpecifierSet
 from packaging.utils import canonicalize_name
 from packaging.version import InvalidVersion, Version
 
-from envhub_sandbox.errors import RequirementError
+from envhub_sandbox.errors import DependencyError
 from envhub_sandbox.hub.sources import toml
 from envhub_sandbox.hub.sources.toml import table
 from envhub_sandbox.settings.options import option_name
@@ -131,7 +131,7 @@ class DeclaredPackages:
 
 
 def declared(root: Path, entry: str) -> DeclaredPackages | None:
-    """What the files say; None where they say nothing. Raises ``RequirementError``."""
+    """What the files say; None where they say nothing. Raises ``DependencyError``."""
     script = _script(root / entry, entry)
     if script is not None:
         return script
@@ -151,7 +151,7 @@ def optional(root: Path) -> dict[str, WantedPackage]:
         extras = table(pyproject(root), "project", "optional-dependencies")
         where = f"[project.optional-dependencies] of {PROJECT}"
         found = [wanted for row in extras.values() for wanted in _list(row, where)]
-    except RequirementError:
+    except DependencyError:
         return {}
     return {canonicalize_name(one.requirement.name): one for one in found}
 
@@ -162,7 +162,7 @@ def not_read(root: Path, entry: str) -> list[str]:
     found = [name for name in _NOT_READ if (beside / name).is_file() or (root / name).is_file()]
     try:
         data = pyproject(root)
-    except RequirementError:
+    except DependencyError:
         return found
     if "poetry" in table(data, "tool"):
         found.append(f"[tool.poetry] of {PROJECT}")
@@ -173,10 +173,13 @@ def not_read(root: Path, entry: str) -> list[str]:
 
 
 def parse_requirement(text: str, where: str) -> WantedPackage:
-    """A requirement that somebody wrote, with the hashes behind it. Raises ``RequirementError``."""
+    """A requirement that somebody wrote, with the hashes behind it. Raises ``DependencyError``."""
     plain, *hashes = map(str.strip, re.split(r"(?<=\s)(?=--hash[= ])", text))
     if len(plain) > MAX_LINE:
-        raise RequirementError(f"{where} has {len(plain)} characters; at most {MAX_LINE} are read")
+        raise DependencyError(
+            f"{where} has {len(plain)} characters; at most {MAX_LINE} are read",
+            reason="requirement",
+        )
     found = [_HASH.fullmatch(one.strip()) for one in hashes]
     try:
         requirement = Requirement(plain)
@@ -185,15 +188,17 @@ def parse_requirement(text: str, where: str) -> WantedPackage:
         if not _is_literal(plain):
             raise InvalidRequirement("a text that would be printed as something else")
     except (InvalidRequirement, RecursionError) as error:
-        raise RequirementError(
+        raise DependencyError(
             f"{where} is {text[:200]!r}. Only plain requirements such as 'numpy>=2' are supported, "
             "with or without hashes: options, links, paths and files can run code during the "
-            f"installation. {_advice()}"
+            f"installation. {_advice()}",
+            reason="requirement",
         ) from error
     if requirement.url is not None and of_git(requirement, where) is None:
-        raise RequirementError(
+        raise DependencyError(
             f"{where} takes {requirement.name} from {requirement.url[:200]!r}; only packages of "
-            f"the index are installed. {_advice()}"
+            f"the index are installed. {_advice()}",
+            reason="requirement",
         )
     return WantedPackage(requirement, where, tuple(one[1] for one in found if one))
 
@@ -236,7 +241,9 @@ def read(root: Path, name: str) -> tuple[list[WantedPackage], list[WantedPackage
                 (constraints if constrains else wanted).append(parse_requirement(line, where))
         _bounded(len(wanted) + len(constraints), name)
         if len(seen) > MAX_FILES:
-            raise RequirementError(f"{name} includes more than {MAX_FILES} files. {_advice()}")
+            raise DependencyError(
+                f"{name} includes more than {MAX_FILES} files. {_advice()}", reason="requirement"
+            )
     return wanted, constraints
 
 
@@ -244,9 +251,10 @@ def _of_itself(root: Path, extras: str, where: str) -> Iterator[WantedPackage]:
     """What ``-e .`` brings besides the repository, whose modules are there already."""
     project = pyproject(root).get("project")
     if not isinstance(project, dict):
-        raise RequirementError(
+        raise DependencyError(
             f"{where} installs the repository itself, but its requirements are read only from "
-            f"[project] of {PROJECT}, which does not exist. {_advice()}"
+            f"[project] of {PROJECT}, which does not exist. {_advice()}",
+            reason="requirement",
         )
     yield from _list(project.get("dependencies", []), f"[project] of {PROJECT}")
     for name in filter(None, map(str.strip, extras.split(","))):
@@ -259,8 +267,9 @@ def _beside(root: Path, file: str, named: str, where: str) -> str:
     path = os.path.normpath(os.path.join(os.path.dirname(file), named))
     inside = not os.path.isabs(path) and path.split(os.sep)[0] != ".." and "://" not in named
     if not inside or not _is_file(root / path):
-        raise RequirementError(
-            f"{where} names {named[:200]!r}, which is not a file of the repository. {_advice()}"
+        raise DependencyError(
+            f"{where} names {named[:200]!r}, which is not a file of the repository. {_advice()}",
+            reason="requirement",
         )
     return path
 
@@ -295,13 +304,15 @@ def _script(path: Path, name: str) -> DeclaredPackages | None:
         with path.open("rb") as file:
             lines = file.read(_LOOKED_AT).decode("utf-8", "replace").splitlines()
     except OSError as error:
-        raise RequirementError(f"{name} cannot be read: {error}") from error
+        raise DependencyError(f"{name} cannot be read: {error}", reason="requirement") from error
     starts = [number for number, line in enumerate(lines) if line.rstrip() == _SCRIPT]
     blocks = [block for block in (_block(lines, start) for start in starts) if block is not None]
     if not blocks:
         return None
     if len(blocks) > 1:
-        raise RequirementError(f"{name} has {len(blocks)} blocks {_SCRIPT!r}; one is permitted")
+        raise DependencyError(
+            f"{name} has {len(blocks)} blocks {_SCRIPT!r}; one is permitted", reason="requirement"
+        )
     where = f"the script metadata of {name}"
     data = _toml(blocks[0], where)
     python = _specifier(data.get("requires-python", ""), where)
@@ -338,12 +349,16 @@ def _toml(text: str, where: str) -> dict[str, Any]:
     try:
         return toml.loads(text, MAX_BYTES)
     except ValueError as error:
-        raise RequirementError(f"{where} is not valid TOML: {error}. {_advice()}") from error
+        raise DependencyError(
+            f"{where} is not valid TOML: {error}. {_advice()}", reason="requirement"
+        ) from error
 
 
 def _list(found: object, where: str) -> tuple[WantedPackage, ...]:
     if not isinstance(found, list) or not all(isinstance(item, str) for item in found):
-        raise RequirementError(f"dependencies in {where} is not a list of strings. {_advice()}")
+        raise DependencyError(
+            f"dependencies in {where} is not a list of strings. {_advice()}", reason="requirement"
+        )
     _bounded(len(found), where)
     return tuple(parse_requirement(item, f"{item[:80]!r} in {where}") for item in found)
 
@@ -354,9 +369,10 @@ def _specifier(found: object, where: str) -> str:
             raise InvalidSpecifier("no text")
         return str(SpecifierSet(found))
     except InvalidSpecifier as error:
-        raise RequirementError(
+        raise DependencyError(
             f"requires-python in {where} is {str(found)[:80]!r}, which is not a range of versions "
-            f"such as '>=3.11'. {_advice()}"
+            f"such as '>=3.11'. {_advice()}",
+            reason="requirement",
         ) from error
 
 
@@ -376,8 +392,9 @@ def versions(asked: str) -> SpecifierSet:
 
 def _bounded(count: int, where: str) -> None:
     if count > MAX_REQUIREMENTS:
-        raise RequirementError(
-            f"{where} has {count} requirements; at most {MAX_REQUIREMENTS} are read. {_advice()}"
+        raise DependencyError(
+            f"{where} has {count} requirements; at most {MAX_REQUIREMENTS} are read. {_advice()}",
+            reason="requirement",
         )
 
 
@@ -388,10 +405,11 @@ def _text(path: Path, name: str) -> str:
         # PowerShell writes UTF-16
         text = data.decode(_BYTE_ORDER_MARKS.get(data[:2], "utf-8-sig"))
     except (OSError, UnicodeDecodeError) as error:
-        raise RequirementError(f"{name} cannot be read: {error}") from error
+        raise DependencyError(f"{name} cannot be read: {error}", reason="requirement") from error
     if len(data) > MAX_BYTES:
-        raise RequirementError(
-            f"{name} is too long; at most {MAX_BYTES} bytes are read. {_advice()}"
+        raise DependencyError(
+            f"{name} is too long; at most {MAX_BYTES} bytes are read. {_advice()}",
+            reason="requirement",
         )
     return text
 

@@ -39,7 +39,7 @@ from envhub_sandbox.dependencies import (
 from envhub_sandbox.dependencies.declared import WantedPackage, check_versions, parse_requirement
 from envhub_sandbox.dependencies.modules import Guess
 from envhub_sandbox.dependencies.request import DATE, PackageRequest
-from envhub_sandbox.errors import DependencyError, PackagesTooLargeError, RequirementError
+from envhub_sandbox.errors import DependencyError
 from envhub_sandbox.system import locks
 from envhub_sandbox.system.folders import CACHE_VARIABLE, remove_tree
 from envhub_sandbox.system.platform import end_with, pidfd, program
@@ -77,7 +77,7 @@ def main(words: Sequence[str] | None = None) -> int:
         if "check" in words:
             sys.stderr.write(f"{error}\n")
             return 1
-        said = {"error": type(error).__name__, "said": str(error)[:_SAID_CHARS]}
+        said = {"error": error.reason, "said": str(error)[:_SAID_CHARS]}
     if said:
         _say(said)
     return 0
@@ -125,9 +125,10 @@ def _request(order: Mapping[str, Any]) -> PackageRequest:
         if os.sep in python + order["supports"] or (until and not re.fullmatch(DATE, until)):
             raise ValueError("a path, or no date")
     except ValueError as error:
-        raise RequirementError(
+        raise DependencyError(
             "the client asks for versions of Python that are none, for an interpreter by its path, "
-            "or for a date that is none"
+            "or for a date that is none",
+            reason="requirement",
         ) from error
     left_out = ((name, "without, of the client") for [name] in order["without"])
     return PackageRequest(
@@ -207,10 +208,11 @@ def _worked(order: Mapping[str, Any], held: int) -> bool:
 def _look(order: Mapping[str, Any]) -> None:
     charged = _charged(Path(order["folder"]))
     if charged > order["bytes"]:
-        raise PackagesTooLargeError(
+        raise DependencyError(
             f"the packages of your key have {charged / 2**20:,.0f} MiB there, what is downloaded "
             f"for them included; the server's quota is {order['bytes'] / 2**20:,.0f} MiB "
-            "(--max-packages). Nothing was installed"
+            "(--max-packages). Nothing was installed",
+            reason="size",
         )
 
 

@@ -31,7 +31,7 @@ from packaging.version import InvalidVersion, Version
 from envhub_sandbox.dependencies import uv
 from envhub_sandbox.dependencies.declared import versions
 from envhub_sandbox.dependencies.request import PackageRequest
-from envhub_sandbox.errors import DependencyError, InterpreterUnavailableError
+from envhub_sandbox.errors import DependencyError
 from envhub_sandbox.settings.options import option_name
 
 _ASK_S = 60.0
@@ -106,10 +106,11 @@ def find(asked: str, declared: str = "", *, fetch: bool = False) -> Interpreter:
     why = f"you ask for Python {asked!r}" if asked else f"it runs in Python {declared}"
     named = option_name("dependencies", {"python": "/path/to/python3"})
     fetched = option_name("dependencies", {"python": asked or "3.12", "fetch_python": True})
-    raise InterpreterUnavailableError(
+    raise DependencyError(
         f"{why}, and this machine has no such interpreter of 3.10 or later; this one is "
         f"{ours.version} ({ours.path}). Install one ('uv python install'), let uv download it with "
-        f"{fetched}, or name one: {named}"
+        f"{fetched}, or name one: {named}",
+        reason="interpreter",
     )
 
 
@@ -136,8 +137,8 @@ def _at(path: str) -> Interpreter:
         implementation, version, *facts, real = map(str, json.loads(done.stdout))
         Version(release(version))
     except (OSError, ValueError, subprocess.SubprocessError) as error:
-        raise InterpreterUnavailableError(
-            f"{path} does not work as an interpreter: {error}"
+        raise DependencyError(
+            f"{path} does not work as an interpreter: {error}", reason="interpreter"
         ) from error
     return Interpreter(real, implementation, release(version), *facts)
 
@@ -165,7 +166,7 @@ def _others(wanted: SpecifierSet) -> list[Interpreter]:
 
 def _answering(paths: Iterable[str]) -> Iterator[Interpreter]:
     for path in dict.fromkeys(map(os.path.realpath, paths)):
-        with contextlib.suppress(InterpreterUnavailableError):
+        with contextlib.suppress(DependencyError):
             yield _at(path)
 
 

@@ -19,7 +19,7 @@ from importlib.machinery import PathFinder
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from envhub_sandbox.errors import RequirementError
+from envhub_sandbox.errors import DependencyError
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.system.folders import cache_root, keep, recall
@@ -210,7 +210,7 @@ class MissingModule:
         module = found[1] if (found := re.search(_MISSING, said)) else ""
         try:
             says = declared(self.snapshot.root, self.snapshot.path)
-        except RequirementError as error:
+        except DependencyError as error:
             return f"What it declares cannot be taken: {error}"
         return f"{_what(says, self.snapshot)}.{self._where(module)} {self._cure(module, says)}"
 

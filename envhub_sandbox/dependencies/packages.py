@@ -17,10 +17,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 from envhub_sandbox.dependencies.request import Choice, PackageRequest, Tell, request_of
 from envhub_sandbox.errors import (
     DependencyError,
-    IndexUnavailableError,
     LockError,
     PolicyError,
-    ResolutionError,
     name_source,
 )
 from envhub_sandbox.hub import registered
@@ -115,8 +113,9 @@ def packages_for(
         with log.progress_shown("packages") as tell:
             try:
                 return target.make(request, tell)
-            except (ResolutionError, IndexUnavailableError) as error:
-                if request.wanted or request.always:
+            except DependencyError as error:
+                unavailable = error.reason in ("resolution", "index")
+                if request.wanted or request.always or not unavailable:
                     raise
                 # what it imports was read, and not said: it may do without
                 DEPENDENCIES.warning("%s: nothing is installed for it: %s", snapshot.label, error)
@@ -132,7 +131,7 @@ def _is_unknown(repo_id: str, error: DependencyError) -> bool:
     """Whether the index does not have the package that a reference names, or not that version."""
     name = re.escape(re.sub(r"[-_.]+", "-", re.split(r"[\[#]", repo_id)[0]).lower())
     said = rf"no version of {name}\b|\b{name} was not found"
-    return isinstance(error, ResolutionError) and re.search(said, str(error)) is not None
+    return error.reason == "resolution" and re.search(said, str(error)) is not None
 
 
 def opened_lock(

@@ -67,7 +67,7 @@ def chosen(
     """The choice, and the interpreter whose packages are used, if it is one of the caller's.
 
     Both as ``make_env`` takes them; ``python`` wins over ``"auto"``.
-    Raises ``PolicyError`` and ``RequirementError``.
+    Raises ``PolicyError`` and ``DependencyError``.
     """
     if isinstance(dependencies, Mapping):
         if python is not None:

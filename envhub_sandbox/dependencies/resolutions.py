@@ -24,7 +24,7 @@ from envhub_sandbox.dependencies.declared import Source, of_git, parse_requireme
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.dependencies.request import PackageRequest, Tell, chosen
 from envhub_sandbox.dependencies.resolve import WORKERS, Lock, Target
-from envhub_sandbox.errors import DependencyError, ResolutionError
+from envhub_sandbox.errors import DependencyError
 from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.system import folders
 
@@ -64,8 +64,8 @@ def resolution_for(
 ) -> Resolution:
     """Versions for an interpreter of this machine: remembered, or chosen.
 
-    Raises ``ResolutionError``, with what to change, or ``DependencyError`` where there is no
-    interpreter, no index or no uv.
+    Raises ``DependencyError``, with what to change: there are no versions, no interpreter, no
+    index or no uv.
     """
     first = interpreters.find(request.python, request.supports, fetch=request.fetch_python)
     key = key_of(request, first)
@@ -89,7 +89,7 @@ def resolution_for(
 def _chosen(request: PackageRequest, first: Interpreter, refresh: bool, tell: Tell) -> Resolution:
     """By the first interpreter that has versions, of wheels alone if that can be."""
     tried: list[str] = []
-    failed: list[ResolutionError] = []
+    failed: list[DependencyError] = []
     for asked, builder in _attempts(request):
         failed.clear()
         for one in _candidates(first, request):
@@ -98,17 +98,19 @@ def _chosen(request: PackageRequest, first: Interpreter, refresh: bool, tell: Te
             try:
                 found, taken = versions_for(asked, lock)
                 return Resolution(found, one, tuple(guess.module for guess in taken))
-            except ResolutionError as error:
+            except DependencyError as error:
+                if error.reason != "resolution":
+                    raise
                 failed.append(error)
                 if not resolve.is_about_python(error):
                     break
     cure = _cure(request, failed[0], first)
     what = resolve.advice(request.python, list(dict.fromkeys(tried)), failed[0], cure)
-    raise ResolutionError(f"{failed[0]}\n{what}") from failed[0]
+    raise DependencyError(f"{failed[0]}\n{what}", reason="resolution") from failed[0]
 
 
 def _cure(
-    request: PackageRequest, error: ResolutionError, interpreter: Interpreter
+    request: PackageRequest, error: DependencyError, interpreter: Interpreter
 ) -> dict[str, list[str]] | None:
     """Keys of ``dependencies`` with which there are versions, as wheels, after all."""
     for keys in resolve.cures(error):
@@ -158,9 +160,9 @@ def _lock_for(
         try:
             lock = resolve.resolve(request, target, options=links, refresh=refresh, tell=tell)
             break
-        except ResolutionError as error:
+        except DependencyError as error:
             names = sorted(set(resolve.without_wheels(error)) - built)
-            if builder is None or not names:
+            if error.reason != "resolution" or builder is None or not names:
                 raise
             # what one needs is known once it is built: then others may be chosen
             sources = resolve.sources_of(request, target, names, links)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import os
 import re
@@ -19,9 +18,6 @@ from envhub_sandbox.dependencies.declared import Source, WantedPackage, parse_re
 from envhub_sandbox.dependencies.request import PackageRequest, Tell
 from envhub_sandbox.errors import (
     DependencyError,
-    PackageIntegrityError,
-    RequirementError,
-    ResolutionError,
 )
 from envhub_sandbox.hub.sources import toml
 from envhub_sandbox.settings.options import option_name
@@ -117,8 +113,8 @@ def resolve(
 
     What the worker needs comes on top; guesses are not looked at. The installation needs the
     ``options``, too. With ``refresh`` the index is asked anew for what uv has seen a moment ago.
-    Raises ``ResolutionError``; and ``PackageIntegrityError`` for a version that is there, but not
-    with a hash that was asked for.
+    Raises ``DependencyError``, also for a version that is there, but not with a hash that was
+    asked for (``reason`` is then ``"integrity"``).
     """
     words = [*uv.NO_BUILDS, "--generate-hashes", *options, *(["--refresh"] if refresh else [])]
     text = _compiled(request, target, words, tell)
@@ -157,12 +153,22 @@ def _compiled(
     )
     try:
         return ask(tell=tell)
-    except ResolutionError as error:
+    except DependencyError as error:
+        if error.reason != "resolution":
+            raise
         if _NOT_FOUND in str(error) and index.hides_refusals():
-            with contextlib.suppress(ResolutionError):  # this strategy says why one did not answer
-                ask(variables={"UV_INDEX_STRATEGY": "first-index"})
+            _raise_refusal(ask)
         what = _what_is_required(str(error), [*every, *request.constraints, *request.override])
-        raise ResolutionError(f"{error}\n{what}") from error
+        raise DependencyError(f"{error}\n{what}", reason="resolution") from error
+
+
+def _raise_refusal(ask: Callable[..., str]) -> None:
+    """Raise why an index did not answer: this strategy says so, and the others do not."""
+    try:
+        ask(variables={"UV_INDEX_STRATEGY": "first-index"})
+    except DependencyError as error:
+        if error.reason != "resolution":
+            raise
 
 
 def sources_of(
@@ -178,9 +184,9 @@ def sources_of(
         try:
             text = _compiled(request, target, words, lambda line: None, _may_be_built(known))
             break
-        except ResolutionError as error:  # it names one at a time
+        except DependencyError as error:  # it names one at a time
             further = set(without_wheels(error)).difference(known)
-            if not further:
+            if error.reason != "resolution" or not further:
                 raise
             known = sorted(further.union(known))
     rows = toml.loads(text, len(text), generated=True).get("packages", [])
@@ -204,19 +210,20 @@ def _lines(wanted: Iterable[WantedPackage]) -> str:
     wanted = list(wanted)
     for one in wanted:
         if one.requirement.url is not None:
-            raise RequirementError(
+            raise DependencyError(
                 f"{one.where} takes {one.requirement.name} from {one.requirement.url[:200]!r}, "
-                "which is not built here; only packages of the index are installed"
+                "which is not built here; only packages of the index are installed",
+                reason="requirement",
             )
     return "".join(f"{one.requirement}\n" for one in wanted)
 
 
-def is_about_python(error: ResolutionError) -> bool:
+def is_about_python(error: DependencyError) -> bool:
     """Whether another Python may help, as far as uv's text says."""
     return _IS_PYTHON.search(str(error)) is not None
 
 
-def without_wheels(error: ResolutionError) -> list[str]:
+def without_wheels(error: DependencyError) -> list[str]:
     """Packages without a wheel, as far as uv's text says; none if it asks for another Python."""
     return [] if _NEEDS_PYTHON.search(str(error)) else _NO_WHEELS.findall(str(error))
 
@@ -230,9 +237,10 @@ def _pins(text: str) -> list[tuple[str, str, list[str]]]:
         elif (hashed := _HASH.fullmatch(line)) and found:
             found[-1][2].append(hashed[1])
         else:
-            raise ResolutionError(
+            raise DependencyError(
                 f"uv returned {line[:200]!r}, which is not a pinned package with hashes: the index "
-                "must list the hashes of its packages"
+                "must list the hashes of its packages",
+                reason="resolution",
             )
     return found
 
@@ -251,9 +259,10 @@ def _with_their_hashes(
         among, where = permitted.get(canonicalize_name(name), (set(hashes), ""))
         kept = [known for known in hashes if known in among]
         if not kept:
-            raise PackageIntegrityError(
+            raise DependencyError(
                 f"the index has {name}=={version}, but no file of it with a hash that {where} "
-                "names. It was replaced there, or the hash is another file's"
+                "names. It was replaced there, or the hash is another file's",
+                reason="integrity",
             )
         lines.append(" \\\n".join([f"{name}=={version}", *(f"    --hash={k}" for k in kept)]))
     return "".join(f"{line}\n" for line in lines)
@@ -277,7 +286,7 @@ def _from_a_folder(name: str) -> str:
     return f"; installed here from {folder}, which {host} uses" if folder else ""
 
 
-def cures(error: ResolutionError) -> Iterator[dict[str, list[str]]]:
+def cures(error: DependencyError) -> Iterator[dict[str, list[str]]]:
     """Keys of ``dependencies`` that may help against what uv says, by the packages it speaks of."""
     said = str(error).partition(REQUIRED)[0]
     unknown = re.findall(rf"([A-Za-z0-9][A-Za-z0-9._-]*) was {_NOT_FOUND}", said)
@@ -289,7 +298,7 @@ def cures(error: ResolutionError) -> Iterator[dict[str, list[str]]]:
 
 
 def advice(
-    asked: str, tried: Sequence[str], error: ResolutionError, cure: Mapping[str, list[str]] | None
+    asked: str, tried: Sequence[str], error: DependencyError, cure: Mapping[str, list[str]] | None
 ) -> str:
     """What to do where nothing satisfies all requirements, by the Python that was asked for, the
     versions that were tried, the error of the first of them, and keys of ``dependencies`` that are

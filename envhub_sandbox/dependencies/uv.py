@@ -22,13 +22,7 @@ from typing import IO
 
 from envhub_sandbox.dependencies import index
 from envhub_sandbox.dependencies.request import Tell
-from envhub_sandbox.errors import (
-    DependencyError,
-    IndexUnavailableError,
-    PackageIntegrityError,
-    PackagesTooLargeError,
-    ResolutionError,
-)
+from envhub_sandbox.errors import DependencyError, DependencyReason
 from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.system import locks
 from envhub_sandbox.system.folders import remove_tree
@@ -67,33 +61,33 @@ _NO_LOGIN = (
 )
 
 # What uv says, and what that means for the user; the first that is found counts.
-_MEANINGS: tuple[tuple[str, type[DependencyError], str], ...] = (
+_MEANINGS: tuple[tuple[str, DependencyReason, str], ...] = (
     (
         r"No space left|os error 28|Disk quota|os error 122",
-        DependencyError,
+        "other",
         "The disk is full; 'envhub cache remove --unused-for 30' removes what was not used for "
         "30 days, 'uv cache prune' cleans uv's cache",
     ),
     (
         r"Hash mismatch|hash mismatch",
-        PackageIntegrityError,
+        "integrity",
         "A package has another hash than the one that is known: it was replaced on the index or "
         "during the download. It was not kept. If the index is right, resolve again: envhub "
         "inspect --download --upgrade REF",
     ),
-    (r"network was disabled", IndexUnavailableError, _NO_INDEX),
-    (r"\b(401 Unauthorized|403 Forbidden|407 Proxy)", IndexUnavailableError, _NO_LOGIN),
+    (r"network was disabled", "index", _NO_INDEX),
+    (r"\b(401 Unauthorized|403 Forbidden|407 Proxy)", "index", _NO_LOGIN),
     (
         r"yanked",
-        ResolutionError,
+        "resolution",
         "A release was yanked by its authors. Use another version, or name this one exactly: "
         "'name==version'",
     ),
-    (r"No solution found|unsatisfiable", ResolutionError, ""),
+    (r"No solution found|unsatisfiable", "resolution", ""),
     (
         r"Failed to fetch|error sending request|Request failed|Connection|dns error|timed out"
         r"|certificate|Failed to download|HTTP status",
-        IndexUnavailableError,
+        "index",
         _NO_INDEX,
     ),
 )
@@ -156,7 +150,7 @@ def run(
                 _wait(process, timeout_s, watch)
             except subprocess.TimeoutExpired:
                 text = f"{what}: uv was not done after {timeout_s:.0f} s"
-                raise IndexUnavailableError(text) from None
+                raise DependencyError(text, reason="index") from None
             finally:
                 process.kill()
                 listener.join(LISTEN_S)
@@ -164,8 +158,8 @@ def run(
                 if listener.is_alive():
                     process.stderr = None  # closing it would wait for the listener
         if sys.platform != "win32" and process.returncode == -signal.SIGXFSZ:
-            raise PackagesTooLargeError(
-                f"{what}: a file was about to have more than {file_bytes} bytes"
+            raise DependencyError(
+                f"{what}: a file was about to have more than {file_bytes} bytes", reason="size"
             )
         if process.returncode != 0:
             raise _error(what, "\n".join(lines))
@@ -242,12 +236,12 @@ def _check_release(path: str) -> None:
 
 def _error(what: str, said: str) -> DependencyError:
     text = _in_the_users_words(said)[-_SHOWN:]
-    for pattern, kind, meaning in _MEANINGS:
+    for pattern, reason, meaning in _MEANINGS:
         if re.search(pattern, said):
             host = option_name("dependencies", "host")
             offline = f", and {host} takes the packages of this interpreter as they are"
             cure = f" {meaning}{offline * (meaning == _NO_INDEX)}." if meaning else ""
-            return kind(f"{what}.{cure}\n{text}")
+            return DependencyError(f"{what}.{cure}\n{text}", reason=reason)
     return DependencyError(f"{what}; uv says:\n{text}")
 
 
@@ -268,9 +262,9 @@ def cleared_after_refusal(pins: Sequence[str]) -> Iterator[None]:
     begun = time.time()
     try:
         yield
-    except IndexUnavailableError:
-        raise  # what has come is worth keeping
-    except DependencyError:
+    except DependencyError as error:
+        if error.reason == "index":
+            raise  # what has come is worth keeping
         # from the file system's clock, which may be some milliseconds behind
         if _remove_unfinished(index.uv_cache(), begun - 1):
             names = sorted({pin.partition("==")[0] for pin in pins})

@@ -13,21 +13,15 @@ from typing import Any
 from envhub_sandbox.errors import (
     DependencyError,
     EnvHubError,
-    IndexUnavailableError,
-    InterpreterUnavailableError,
-    MissingModuleError,
-    PackageIntegrityError,
-    PackagesTooLargeError,
     PolicyError,
     RemoteProtocolError,
-    RequirementError,
-    ResolutionError,
     SandboxUnavailableError,
     ServerBusyError,
     SnapshotIntegrityError,
     VersionMismatchError,
     WorkerDiedError,
     WorkerError,
+    known_reason,
     load_error,
     remote_error,
 )
@@ -139,16 +133,13 @@ def refusal(reply: m.Refusal) -> Exception:
         return ServerBusyError(
             message, quota=busy.quota, used=busy.used, limit=busy.limit, retry_s=busy.retry_s
         )
+    if reply.error == "DependencyError":
+        return DependencyError(message, reason=known_reason(reply.missing))
     return _REFUSALS.get(reply.error, WorkerError)(message)
 
 
 _REFUSALS: dict[str, type[Exception]] = {
-    kind.__name__: kind
-    for kind in (
-        *(PolicyError, SnapshotIntegrityError, VersionMismatchError, DependencyError),
-        *(IndexUnavailableError, InterpreterUnavailableError, PackageIntegrityError),
-        *(PackagesTooLargeError, RequirementError, ResolutionError),
-    )
+    kind.__name__: kind for kind in (PolicyError, SnapshotIntegrityError, VersionMismatchError)
 }
 
 
@@ -213,7 +204,7 @@ def raised(reply: m.RaisedException) -> EnvHubError:
         return load_error("ValueError", said)
     cause: Any = remote_error(reply.builtin, reply.type_name, reply.message, reply.traceback)
     if reply.builtin == "ModuleNotFoundError":
-        error: EnvHubError = MissingModuleError(f"{what}: {said}")
+        error: EnvHubError = DependencyError(f"{what}: {said}", reason="module")
     elif reply.type_name.endswith(_LOADERS_OWN):
         return load_error(reply.builtin, said)
     else:

@@ -18,11 +18,7 @@ import pytest
 from envhub_sandbox import make_env
 from envhub_sandbox.dependencies.builds import download
 from envhub_sandbox.errors import (
-    IndexUnavailableError,
-    MissingModuleError,
     PolicyError,
-    RequirementError,
-    ResolutionError,
 )
 from envhub_sandbox.sandboxes import remote
 from envhub_worker.access import packages as server_side
@@ -32,6 +28,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.supervisor.records import RefusedError
 from tests.remote.listening import Listening, listening
 from tests.support.command_line import below, gone
+from tests.support.packages.refusals import refused_dependency
 from tests.support.packages.wheels import Index, make_wheel
 from tests.support.processes import eventually
 from tests.support.repositories import importing, write_repository
@@ -93,7 +90,7 @@ def test_what_cannot_be_made_is_told_here(
 ) -> None:
     """With the lines of the repository that it is about; and a version is asked for, not a path."""
     folder = write_repository(tmp_path / "repo", ENV, requirements__txt="wanted==3.0\n")
-    with pytest.raises(ResolutionError, match=r"line 1 of requirements\.txt") as caught:
+    with refused_dependency("resolution", match=r"line 1 of requirements\.txt") as caught:
         make_env(folder, sandbox=permitting.sandbox())
     assert "repo" in str(caught.value)
     with pytest.raises(PolicyError, match="name a version"):
@@ -109,7 +106,7 @@ def test_nothing_is_built_there(
         url = f"https://127.0.0.1:{host.getsockname()[1]}/org/repo"
         declared = f"wanted @ git+{url}@{'0' * 40}\n"
         folder = write_repository(tmp_path / "repo", ENV, requirements__txt=declared)
-        with pytest.raises(RequirementError, match="not built here"):
+        with refused_dependency("requirement", match="not built here"):
             make_env(folder, sandbox=permitting.sandbox())
         host.setblocking(False)
         with pytest.raises(BlockingIOError):
@@ -117,7 +114,7 @@ def test_nothing_is_built_there(
         host.setblocking(True)
         asked = threading.Thread(target=lambda: host.accept()[0].close())
         asked.start()
-        with pytest.raises(IndexUnavailableError):
+        with refused_dependency("index"):
             download.check_out(url, "0" * 40, tmp_path, print)
         asked.join()
 
@@ -125,7 +122,7 @@ def test_nothing_is_built_there(
 def test_a_server_that_makes_none_says_so(server: Listening, tmp_path: Path) -> None:
     """Its own packages are used; who asks for others, or lacks one, hears of the option."""
     folder = write_repository(tmp_path / "repo", ENV, requirements__txt="wanted==1.0\n")
-    with pytest.raises(MissingModuleError, match="--dependencies"):
+    with refused_dependency("module", match="--dependencies"):
         make_env(folder, sandbox=server.sandbox())
     with pytest.raises(PolicyError, match="--dependencies"):
         make_env(folder, sandbox=server.sandbox(), dependencies={"extra": ["wanted"]})
@@ -200,7 +197,7 @@ def test_what_nobody_asks_for_any_more_is_given_up(
         try:
             return idle.need(b"a", order("first"), ()).state != "making"
         except RefusedError as error:
-            return error.error == "IndexUnavailableError"
+            return error.missing == "index"
 
     idle.look(())
     assert eventually(begun)
@@ -247,7 +244,7 @@ def test_an_order_that_takes_too_long_is_ended(
             try:
                 found.need(b"a", order("first"), ())
             except RefusedError as error:
-                return error.error == "IndexUnavailableError" and "--packages-s" in str(error)
+                return error.missing == "index" and "--packages-s" in str(error)
             return False
 
         assert eventually(is_refused)

@@ -14,10 +14,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from envhub_sandbox import errors
 from envhub_sandbox.dependencies.builds import download, trees, wheels
 from envhub_sandbox.dependencies.interpreters import Interpreter
-from envhub_sandbox.errors import DependencyError, EnvHubError, PackageIntegrityError
+from envhub_sandbox.errors import DependencyError, EnvHubError, known_reason
 from envhub_sandbox.system.platform import end_with, pidfd, program
 from envhub_worker.protocol.text import printable
 
@@ -56,8 +55,9 @@ def _asked(order: dict[str, Any], title: str) -> str:
                 timeout=DEADLINE_S,
             )
         except subprocess.TimeoutExpired:
-            raise PackageIntegrityError(
-                f"{title} was not fetched and read within {DEADLINE_S:.0f} s, and is not taken"
+            raise DependencyError(
+                f"{title} was not fetched and read within {DEADLINE_S:.0f} s, and is not taken",
+                reason="integrity",
             ) from None
     try:
         said: dict[str, str] = json.loads(done.stdout)
@@ -67,7 +67,7 @@ def _asked(order: dict[str, Any], title: str) -> str:
             f"{title} cannot be read: the process that reads it ended ({done.returncode}).\n{shown}"
         ) from None
     if "error" in said:
-        raise getattr(errors, said["error"])(said["said"])
+        raise DependencyError(said["error"], reason=known_reason(said["reason"]))
     return said["answer"]
 
 
@@ -80,7 +80,7 @@ def main(owner: int) -> int:
     try:
         said = {"answer": _carried_out(order)}
     except EnvHubError as error:
-        said = {"error": type(error).__name__, "said": str(error)}
+        said = {"error": str(error), "reason": getattr(error, "reason", "")}
     print(json.dumps(said))
     return 0
 

@@ -27,7 +27,7 @@ from envhub_sandbox.dependencies.declared import Source, parse_requirement
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.dependencies.request import PackageRequest, Tell
 from envhub_sandbox.dependencies.resolve import Lock
-from envhub_sandbox.errors import DependencyError, RequirementError, ResolutionError
+from envhub_sandbox.errors import DependencyError
 from envhub_sandbox.hub.logins import without_login
 from envhub_sandbox.system.platform import pidfd, program
 from envhub_worker.protocol.runtime import OWN
@@ -114,9 +114,9 @@ def build_wheels(
 ) -> list[Path]:
     """A wheel of each: kept from before, or built in a jail without network.
 
-    ``choose`` gives versions of what they are built with. Raises ``ResolutionError`` where one
-    cannot be built, with what is missing here; ``DependencyError`` where sources or a wheel are
-    refused, or this host has no jail.
+    ``choose`` gives versions of what they are built with. Raises ``DependencyError`` where one
+    cannot be built, with what is missing here, where sources or a wheel are refused, or where this
+    host has no jail.
     """
     if not _UNDER_WAY.get():
         _BUILDS.set(itertools.count(1))
@@ -143,12 +143,15 @@ def _under_way(source: Source) -> Iterator[None]:
     above = _UNDER_WAY.get()
     chain = (*above, source.name)
     if source.name in above or len(chain) > _DEEPEST:
-        raise ResolutionError(
+        raise DependencyError(
             f"{source.name} cannot be built: its build requirement has no wheel, and is built with "
-            f"it in turn ({' <- '.join(chain)})"
+            f"it in turn ({' <- '.join(chain)})",
+            reason="resolution",
         )
     if next(_BUILDS.get()) > _MOST:
-        raise ResolutionError(f"{chain[0]} needs more than {_MOST} packages to be built")
+        raise DependencyError(
+            f"{chain[0]} needs more than {_MOST} packages to be built", reason="resolution"
+        )
     token = _UNDER_WAY.set(chain)
     try:
         yield
@@ -172,8 +175,9 @@ def _below(tree: Path, source: Source) -> Path:
     found = tree
     for step in filter(None, source.subdirectory.split("/")):
         if step in (".", "..") or not (found / step).is_dir():
-            raise RequirementError(
-                f"{_title(source)} has no folder {source.subdirectory[:200]!r}. {source.where}"
+            raise DependencyError(
+                f"{_title(source)} has no folder {source.subdirectory[:200]!r}. {source.where}",
+                reason="requirement",
             )
         found = found / step
     return found
@@ -198,7 +202,7 @@ class _Build:
     _choose: Choose
 
     def wheel(self) -> Path:
-        """Built, checked and kept. Raises ``ResolutionError``."""
+        """Built, checked and kept. Raises ``DependencyError``."""
         further: tuple[str, ...] = ()
         while True:
             try:
@@ -271,13 +275,14 @@ class _Build:
         environment = environments.provide(lock, self._interpreter, self._tell)
         return environment.python, str(environment.packages)
 
-    def _failed(self, log: str) -> ResolutionError:
+    def _failed(self, log: str) -> DependencyError:
         source, said = self._source, project.advice(log)
         needed_by = f" ({source.where})" if source.where else ""
-        return ResolutionError(
+        return DependencyError(
             f"{_title(source)}{needed_by} has no wheel for Python {self._interpreter.version}, and "
             f"building its source in a jail failed. {said + '. ' if said else ''}The build says:\n"
-            f"{log}"
+            f"{log}",
+            reason="resolution",
         )
 
 

@@ -27,10 +27,6 @@ from envhub_sandbox.dependencies.request import Tell
 from envhub_sandbox.errors import (
     DependencyError,
     HubReferenceError,
-    IndexUnavailableError,
-    PackageIntegrityError,
-    PackagesTooLargeError,
-    RequirementError,
     SnapshotError,
     SnapshotTooLargeError,
 )
@@ -54,13 +50,14 @@ def download(url: str, sha256: str, target: Path) -> None:
         with _opened(url) as source, target.open("wb") as file:
             size = copy_bounded(source, file, MAX_BYTES, digest)
     except (OSError, http.client.HTTPException, ValueError) as error:
-        raise IndexUnavailableError(f"{shown} cannot be downloaded: {error}") from error
+        raise DependencyError(f"{shown} cannot be downloaded: {error}", reason="index") from error
     if size > MAX_BYTES:
-        raise PackagesTooLargeError(f"{shown} has more than {size_text(MAX_BYTES)}")
+        raise DependencyError(f"{shown} has more than {size_text(MAX_BYTES)}", reason="size")
     if (found := digest.hexdigest()) != sha256:
-        raise PackageIntegrityError(
+        raise DependencyError(
             f"{shown} has the SHA-256 {found}, and the index or the lock says {sha256}: it was "
-            "replaced. Nothing of it was kept"
+            "replaced. Nothing of it was kept",
+            reason="integrity",
         )
 
 
@@ -146,10 +143,10 @@ def _as_of_a_package() -> Iterator[None]:
     try:
         yield
     except HubReferenceError as error:
-        raise RequirementError(str(error)) from error
+        raise DependencyError(str(error), reason="requirement") from error
     except HubFailure as failure:
-        raise IndexUnavailableError(f"{failure.what}. {failure.advice}") from failure
+        raise DependencyError(f"{failure.what}. {failure.advice}", reason="index") from failure
     except SnapshotTooLargeError as error:
-        raise PackagesTooLargeError(str(error)) from error
+        raise DependencyError(str(error), reason="size") from error
     except SnapshotError as error:
         raise DependencyError(str(error)) from error

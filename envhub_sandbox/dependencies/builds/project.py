@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from envhub_sandbox.dependencies.declared import WantedPackage, parse_requirement, pyproject
-from envhub_sandbox.errors import RequirementError
+from envhub_sandbox.errors import DependencyError
 
 _LEGACY = ("setuptools", "wheel")
 _LEGACY_BACKEND = "setuptools.build_meta:__legacy__"
@@ -30,22 +30,24 @@ def read(tree: Path, title: str) -> Project:
     where = f"[build-system] of {title}"
     said = pyproject(tree, where).get("build-system", {})
     if not isinstance(said, dict):
-        raise RequirementError(f"{where} is no table")
+        raise DependencyError(f"{where} is no table", reason="requirement")
     requires = _texts(said.get("requires", list(_LEGACY)), where)
     backend = said.get("build-backend", _LEGACY_BACKEND)
     paths = _texts(said.get("backend-path", []), where)
     if not isinstance(backend, str) or not all(
         map(str.isidentifier, backend.replace(":", ".", 1).split("."))
     ):
-        raise RequirementError(f"{where}: {str(backend)[:200]!r} is not a build backend")
+        raise DependencyError(
+            f"{where}: {str(backend)[:200]!r} is not a build backend", reason="requirement"
+        )
     return Project(tuple(parse_requirement(text, where) for text in requires), backend, paths)
 
 
 def _texts(found: object, where: str) -> tuple[str, ...]:
     if not isinstance(found, list) or len(found) > _MOST:
-        raise RequirementError(f"{where} has no list of at most {_MOST} texts")
+        raise DependencyError(f"{where} has no list of at most {_MOST} texts", reason="requirement")
     if not all(isinstance(item, str) and item.isprintable() for item in found):
-        raise RequirementError(f"{where} holds something else than texts")
+        raise DependencyError(f"{where} holds something else than texts", reason="requirement")
     return tuple(found)
 
 

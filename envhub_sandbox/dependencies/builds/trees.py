@@ -25,7 +25,7 @@ from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
-from envhub_sandbox.errors import PackageIntegrityError, PackagesTooLargeError, SnapshotError
+from envhub_sandbox.errors import DependencyError, SnapshotError
 from envhub_sandbox.hub.listing import FileRecord, check_listing_names, copy_bounded
 from envhub_sandbox.system import folders
 from envhub_worker.protocol.text import size_text
@@ -72,7 +72,7 @@ def write_tree(members: Iterable[Member], folder: Path, title: str) -> None:
         try:
             check_listing_names([FileRecord(path, 0, "") for path in kept], title)
         except SnapshotError as error:
-            raise PackageIntegrityError(str(error)) from error
+            raise DependencyError(str(error), reason="integrity") from error
         for number, path in enumerate(kept):
             folders.make((folder / path).parent)
             Path(numbered, str(number)).rename(folder / path)
@@ -81,7 +81,9 @@ def write_tree(members: Iterable[Member], folder: Path, title: str) -> None:
 def _write(member: Member, path: Path, title: str) -> None:
     with member.open() as source, path.open("xb") as target:
         if copy_bounded(source, target, member.size) != member.size:
-            raise PackageIntegrityError(f"{title}: {member.path!r} has not the size that it says")
+            raise DependencyError(
+                f"{title}: {member.path!r} has not the size that it says", reason="integrity"
+            )
     path.chmod(0o755 if member.executable else 0o644)
 
 
@@ -90,9 +92,10 @@ def _bounded(members: Iterable[Member], title: str) -> Iterator[Member]:
     for count, member in enumerate(members, start=1):
         size += member.size
         if size > MAX_BYTES or count > MAX_FILES:
-            raise PackagesTooLargeError(
+            raise DependencyError(
                 f"{title} has more than {size_text(MAX_BYTES)} or {MAX_FILES} files; it is not "
-                "unpacked"
+                "unpacked",
+                reason="size",
             )
         yield member
 
@@ -103,12 +106,13 @@ def unpack_tree(archive: Path, folder: Path, title: str) -> Path:
         with _members(archive, title) as members:
             write_tree(members, folder, title)
     except (*_BROKEN, *_BROKEN_ZIP) as error:
-        raise PackageIntegrityError(f"{title} cannot be unpacked: {error}") from error
+        raise DependencyError(f"{title} cannot be unpacked: {error}", reason="integrity") from error
     tops = list(folder.iterdir())
     if len(tops) != 1 or not tops[0].is_dir():
-        raise PackageIntegrityError(
+        raise DependencyError(
             f"{title} is not a source distribution, which has a single folder: this has "
-            f"{len(tops)} entries"
+            f"{len(tops)} entries",
+            reason="integrity",
         )
     return tops[0]
 
@@ -122,8 +126,9 @@ def _members(archive: Path, title: str) -> Iterator[Iterator[Member]]:
         elif opener := _TARS.get(archive.suffix):
             yield _of_tar(_ForwardStream(stack.enter_context(opener(archive, "rb")), title), title)
         else:
-            raise PackageIntegrityError(
-                f"{title} is packed as {archive.suffix!r}; .tar.gz, .tar.bz2 and .zip are read"
+            raise DependencyError(
+                f"{title} is packed as {archive.suffix!r}; .tar.gz, .tar.bz2 and .zip are read",
+                reason="integrity",
             )
 
 
@@ -158,7 +163,7 @@ class BoundedStream(io.RawIOBase):
 
     def _check(self, count: int, most: int) -> None:
         if count > most:
-            raise PackagesTooLargeError(f"{self._title} is too large to be unpacked")
+            raise DependencyError(f"{self._title} is too large to be unpacked", reason="size")
 
 
 class _ForwardStream:
@@ -174,10 +179,12 @@ class _ForwardStream:
     def take(self, size: int, *, may_end: bool = False) -> bytes:
         """The next so many bytes; none at the end, where that may be here."""
         if size > AT_ONCE or self.at + size > _FAR:
-            raise PackagesTooLargeError(f"{self._title} is too large to be unpacked")
+            raise DependencyError(f"{self._title} is too large to be unpacked", reason="size")
         found = self._stream.read(size)
         if len(found) != size and (found or not may_end):
-            raise PackageIntegrityError(f"{self._title} cannot be unpacked: its end is missing")
+            raise DependencyError(
+                f"{self._title} cannot be unpacked: its end is missing", reason="integrity"
+            )
         self.at += len(found)
         return found
 
@@ -220,7 +227,7 @@ def _of_tar(stream: _ForwardStream, title: str) -> Iterator[Member]:
     said: dict[str, str] = {}
     for count in itertools.count():
         if count > 4 * MAX_FILES:  # a folder and a file, with a header for each
-            raise PackagesTooLargeError(f"{title} has more than {MAX_FILES} files")
+            raise DependencyError(f"{title} has more than {MAX_FILES} files", reason="size")
         block = stream.take(_TAR_BLOCK, may_end=count > 0)
         if not block.strip(b"\0"):
             return
@@ -245,8 +252,8 @@ def _size_of(header: tarfile.TarInfo, said: dict[str, str], title: str) -> int:
     """The bytes behind a header; of a file, what the header before it may have said."""
     size = said.get("size", "") if header.type in _REGULAR else ""
     if header.size < 0 or not re.fullmatch(r"[0-9]{0,20}", size):
-        raise PackageIntegrityError(
-            f"{title} holds {header.name[:200]!r}, of which the size is none"
+        raise DependencyError(
+            f"{title} holds {header.name[:200]!r}, of which the size is none", reason="integrity"
         )
     return int(size or header.size)
 
@@ -263,12 +270,16 @@ def _said(kind: bytes, data: bytes, title: str) -> dict[str, str]:
             break
         name = record[2].decode("utf-8", "replace")
         if name.startswith("GNU.sparse") or (kind == tarfile.XGLTYPE and name in ("path", "size")):
-            raise PackageIntegrityError(f"{title} is packed with {name}, which is not read")
+            raise DependencyError(
+                f"{title} is packed with {name}, which is not read", reason="integrity"
+            )
         if name in ("path", "size"):
             said[name] = data[record.end() : end - 1].decode("utf-8", "surrogateescape")
         at = end
     if data[at:].strip(b"\0"):
-        raise PackageIntegrityError(f"{title} cannot be unpacked: a header of it is none")
+        raise DependencyError(
+            f"{title} cannot be unpacked: a header of it is none", reason="integrity"
+        )
     return said
 
 
@@ -280,12 +291,15 @@ def check_zip(members: Sequence[zipfile.ZipInfo], title: str) -> None:
         if stat.S_IFMT(member.external_attr >> 16) not in kinds:
             raise _no_file(title, member.filename)
         if member.compress_type not in _PACKINGS:
-            raise PackageIntegrityError(
-                f"{title} holds {member.filename[:200]!r}, packed in another way, which is not read"
+            raise DependencyError(
+                f"{title} holds {member.filename[:200]!r}, packed in another way, which is not "
+                "read",
+                reason="integrity",
             )
         if member.header_offset < end:
-            raise PackageIntegrityError(
-                f"{title} holds {member.filename[:200]!r}, which lies within another file"
+            raise DependencyError(
+                f"{title} holds {member.filename[:200]!r}, which lies within another file",
+                reason="integrity",
             )
         end = member.header_offset + _LEAST_HEADER + member.compress_size
 
@@ -300,7 +314,8 @@ def _of_zip(archive: zipfile.ZipFile, title: str) -> Iterator[Member]:
             yield Member(member.filename, member.file_size, bool(mode & stat.S_IXUSR), opened)
 
 
-def _no_file(title: str, name: str) -> PackageIntegrityError:
-    return PackageIntegrityError(
-        f"{title} holds {name[:200]!r}, which is a link or a device; only files are unpacked"
+def _no_file(title: str, name: str) -> DependencyError:
+    return DependencyError(
+        f"{title} holds {name[:200]!r}, which is a link or a device; only files are unpacked",
+        reason="integrity",
     )

@@ -31,7 +31,7 @@ from packaging.version import InvalidVersion, Version
 from envhub_sandbox.dependencies.builds.trees import MAX_TABLE, BoundedStream, check_zip
 from envhub_sandbox.dependencies.declared import Source
 from envhub_sandbox.dependencies.interpreters import Interpreter
-from envhub_sandbox.errors import DependencyError, PackageIntegrityError, SnapshotError
+from envhub_sandbox.errors import DependencyError, SnapshotError
 from envhub_sandbox.hub.listing import (
     SHA256,
     FileRecord,
@@ -68,13 +68,13 @@ class WheelOrigin:
 def check(wheel: Path, name: str, version: str, interpreter: Interpreter) -> None:
     """Refuse a wheel, under the name that its builder gave it, that is not what was asked for.
 
-    An empty version stands for any. Raises ``PackageIntegrityError``.
+    An empty version stands for any. Raises ``DependencyError``.
     """
     try:
         found = named(wheel.name, name, version)
         _fits(wheel.name, interpreter)
         if wheel.stat().st_size > MAX_BYTES:
-            raise PackageIntegrityError(f"it has more than {size_text(MAX_BYTES)}")
+            raise DependencyError(f"it has more than {size_text(MAX_BYTES)}", reason="integrity")
         with (
             wheel.open("rb") as file,
             zipfile.ZipFile(BoundedStream(file, "it", MAX_TABLE)) as archive,
@@ -84,21 +84,24 @@ def check(wheel: Path, name: str, version: str, interpreter: Interpreter) -> Non
             _record(archive, f"{info}/RECORD")
     except (*_UNREADABLE, SnapshotError, DependencyError) as error:
         said = printable(str(error), 300)
-        raise PackageIntegrityError(
+        raise DependencyError(
             f"the wheel {printable(wheel.name, 200)!r} that was built for {name} is not taken: "
-            f"{said}"
+            f"{said}",
+            reason="integrity",
         ) from error
 
 
 def named(file: str, name: str, version: str) -> Version:
-    """The version of a wheel, by the name of its file. Raises ``PackageIntegrityError``."""
+    """The version of a wheel, by the name of its file. Raises ``DependencyError``."""
     try:
         found, number, _, _ = parse_wheel_filename(file)
         wanted = Version(version) if version else number
     except (InvalidWheelFilename, InvalidVersion) as error:
-        raise PackageIntegrityError(f"its name says nothing: {error}") from error
+        raise DependencyError(f"its name says nothing: {error}", reason="integrity") from error
     if found != canonicalize_name(name) or number != wanted:
-        raise PackageIntegrityError(f"it is {found} {number}, and not {name} {wanted}")
+        raise DependencyError(
+            f"it is {found} {number}, and not {name} {wanted}", reason="integrity"
+        )
     return number
 
 
@@ -112,14 +115,16 @@ def _fits(file: str, interpreter: Interpreter) -> None:
         *tags.compatible_tags((major, minor), interpreter=short, platforms=platforms),
     }
     if fitting.isdisjoint(found):
-        raise PackageIntegrityError(f"it does not fit Python {interpreter.version} on this machine")
+        raise DependencyError(
+            f"it does not fit Python {interpreter.version} on this machine", reason="integrity"
+        )
 
 
 def _files(archive: zipfile.ZipFile) -> None:
     members = archive.infolist()
     if len(members) > MAX_FILES or sum(one.file_size for one in members) > MAX_UNPACKED:
-        raise PackageIntegrityError(
-            f"it holds more than {MAX_FILES} files or {size_text(MAX_UNPACKED)}"
+        raise DependencyError(
+            f"it holds more than {MAX_FILES} files or {size_text(MAX_UNPACKED)}", reason="integrity"
         )
     check_zip(members, "it")
     names = (one.filename + "_" * one.is_dir() for one in members)  # a folder as a file in it
@@ -131,15 +136,19 @@ def _info(archive: zipfile.ZipFile, name: str, version: Version) -> str:
     tops = {one.partition("/")[0] for one in archive.namelist()}
     found = [top for top in tops if top.endswith(".dist-info")]
     if len(found) != 1:
-        raise PackageIntegrityError(f"it holds {len(found)} folders .dist-info")
+        raise DependencyError(f"it holds {len(found)} folders .dist-info", reason="integrity")
     stem, _, number = found[0].removesuffix(".dist-info").rpartition("-")
     if canonicalize_name(stem) != canonicalize_name(name) or Version(number) != version:
-        raise PackageIntegrityError(f"its metadata are those of {found[0]!r}")
+        raise DependencyError(f"its metadata are those of {found[0]!r}", reason="integrity")
     fields = _fields(_small(archive, f"{found[0]}/METADATA"))
     if canonicalize_name(fields.get("name", "")) != canonicalize_name(name):
-        raise PackageIntegrityError(f"its metadata name the package {fields.get('name', '')!r}")
+        raise DependencyError(
+            f"its metadata name the package {fields.get('name', '')!r}", reason="integrity"
+        )
     if Version(fields.get("version", "")) != version:
-        raise PackageIntegrityError(f"its metadata name the version {fields.get('version', '')!r}")
+        raise DependencyError(
+            f"its metadata name the version {fields.get('version', '')!r}", reason="integrity"
+        )
     return found[0]
 
 
@@ -159,7 +168,9 @@ def _small(archive: zipfile.ZipFile, path: str) -> bytes:
     with archive.open(path) as file:
         data = file.read(MAX_TABLE + 1)
     if len(data) > MAX_TABLE:
-        raise PackageIntegrityError(f"{path} in it has more than {size_text(MAX_TABLE)}")
+        raise DependencyError(
+            f"{path} in it has more than {size_text(MAX_TABLE)}", reason="integrity"
+        )
     return data
 
 
@@ -170,10 +181,12 @@ def _record(archive: zipfile.ZipFile, path: str) -> None:
     there = {one.filename for one in archive.infolist() if not one.is_dir()}
     signatures = {path, f"{path}.jws", f"{path}.p7s"}
     if there - said.keys() - signatures or said.keys() - there - signatures:
-        raise PackageIntegrityError("its RECORD lists other files than it has")
+        raise DependencyError("its RECORD lists other files than it has", reason="integrity")
     for name in sorted(there - signatures):
         if said[name] != _digest(archive, name):
-            raise PackageIntegrityError(f"{name[:200]!r} is not the file that its RECORD says")
+            raise DependencyError(
+                f"{name[:200]!r} is not the file that its RECORD says", reason="integrity"
+            )
 
 
 def _digest(archive: zipfile.ZipFile, name: str) -> str:

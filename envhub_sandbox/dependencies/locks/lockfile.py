@@ -19,7 +19,7 @@ from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.dependencies.locks import pylock
 from envhub_sandbox.dependencies.locks.pylock import PylockPackage, as_toml, rows
 from envhub_sandbox.dependencies.request import DATE
-from envhub_sandbox.errors import LockError, RequirementError
+from envhub_sandbox.errors import DependencyError, LockError
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.hub.sources.toml import table
 from envhub_sandbox.system.folders import write_whole_file
@@ -224,7 +224,7 @@ class _Reader:
                 str(parse_requirement(text, f"{text[:80]!r} in {self._where}"))
                 for text in self._texts(name)
             )
-        except RequirementError as error:
+        except DependencyError as error:
             raise LockError(str(error)) from error
 
     def _spaces(self) -> Spaces | None:

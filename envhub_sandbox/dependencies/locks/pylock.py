@@ -24,7 +24,7 @@ from envhub_sandbox.dependencies import index, uv
 from envhub_sandbox.dependencies.builds.wheels import WheelOrigin, describe
 from envhub_sandbox.dependencies.declared import Source, of_git
 from envhub_sandbox.dependencies.resolve import Lock, Target, torch_options
-from envhub_sandbox.errors import LockError, PackageIntegrityError
+from envhub_sandbox.errors import DependencyError, LockError
 from envhub_sandbox.hub.logins import without_login
 from envhub_sandbox.hub.sources import toml
 from envhub_sandbox.hub.sources.toml import table
@@ -79,7 +79,7 @@ def pins(packages: Sequence[PylockPackage]) -> Lock:
 def described(lock: Lock, python: str) -> tuple[PylockPackage, ...]:
     """The pins with their files, as the index has them now, for the interpreter at this path.
 
-    Raises ``PackageIntegrityError`` where no file of a package is one that the pins permit.
+    Raises ``DependencyError`` where no file of a package is one that the pins permit.
     """
     versions = [line.partition(" ")[0] for line in lock.text.splitlines()]
     found = listed(versions, python, lock.options)
@@ -93,9 +93,10 @@ def described(lock: Lock, python: str) -> tuple[PylockPackage, ...]:
             continue
         wheels = tuple(wheel for wheel in package.wheels if wheel.sha256 in permitted)
         if not wheels:
-            raise PackageIntegrityError(
+            raise DependencyError(
                 f"the index has {package.name}=={package.version}, but no file of it for {python} "
-                "with the hash that was chosen. Choose again: envhub lock --upgrade REF"
+                "with the hash that was chosen. Choose again: envhub lock --upgrade REF",
+                reason="integrity",
             )
         kept.append(PylockPackage(package.name, package.version, wheels))
     return tuple(kept)

@@ -41,7 +41,6 @@ from envhub_sandbox.dependencies.resolutions import versions_for
 from envhub_sandbox.dependencies.resolve import Lock, Target, resolve
 from envhub_sandbox.errors import (
     DependencyError,
-    InterpreterUnavailableError,
     SandboxUnavailableError,
 )
 from envhub_sandbox.sandboxes.docker.engines import (
@@ -122,28 +121,33 @@ def image_packages(engine: Engine, image: str) -> tuple[Interpreter, dict[str, I
 
 def interpreter_fitting(theirs: Interpreter, request: PackageRequest) -> Interpreter:
     """An interpreter of this machine whose packages the image's can import.
-    Raises ``InterpreterUnavailableError``: there is none.
+    Raises ``DependencyError``: there is none.
     """
     asked = SpecifierSet(request.supports)
     if not theirs.fits(asked) or (request.python and not _is_asked(theirs, request.python)):
         wanted = request.python or str(asked)
-        raise InterpreterUnavailableError(
+        raise DependencyError(
             f"it needs Python {wanted}, and the image has {theirs.version}: build envhub-worker "
-            "from another base (docs/deployment.md)"
+            "from another base (docs/deployment.md)",
+            reason="interpreter",
         )
     minor = ".".join(theirs.version.split(".")[:2])
     try:
         ours = find(minor)
-    except InterpreterUnavailableError as error:
-        raise InterpreterUnavailableError(
+    except DependencyError as error:
+        if error.reason != "interpreter":
+            raise
+        raise DependencyError(
             f"packages for the image's Python {minor} need the same Python on this machine, which "
-            f"does not have it. {_remedy()}"
+            f"does not have it. {_remedy()}",
+            reason="interpreter",
         ) from error
     alike = (ours.implementation, ours.machine) == (theirs.implementation, theirs.machine)
     if not alike or not ours.libc or not theirs.libc or Version(ours.libc) > Version(theirs.libc):
-        raise InterpreterUnavailableError(
+        raise DependencyError(
             f"packages of this machine ({ours.machine}, glibc {ours.libc or 'unknown'}) cannot be "
-            f"used in the image ({theirs.machine}, glibc {theirs.libc or 'unknown'}). {_remedy()}"
+            f"used in the image ({theirs.machine}, glibc {theirs.libc or 'unknown'}). {_remedy()}",
+            reason="interpreter",
         )
     return ours
 
@@ -257,9 +261,10 @@ def derived(
 def _check_python(request: PackageRequest, target: Target) -> None:
     asked = versions(request.python) & SpecifierSet(request.supports)
     if os.sep in request.python or not asked.contains(f"{target.version}.99"):
-        raise InterpreterUnavailableError(
+        raise DependencyError(
             f"{request.source} asks for Python {request.python or request.supports}, and the image "
-            f"has {target.version}: build envhub-worker from another base (docs/deployment.md)"
+            f"has {target.version}: build envhub-worker from another base (docs/deployment.md)",
+            reason="interpreter",
         )
 
 

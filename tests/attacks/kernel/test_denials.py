@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from envhub_sandbox import make_env
-from envhub_sandbox.errors import LoadError, MissingModuleError, WorkerDiedError
+from envhub_sandbox.errors import DependencyError, LoadError, WorkerDiedError
 from tests.attacks.repositories import PLAIN, write_environment
 from tests.support import inside
 from tests.support.interpreter import profiles
@@ -295,7 +295,7 @@ def test_files_that_are_asked_for_are_told(tmp_path: Path) -> None:
 
 _ENDINGS = {
     "raises": ("raise RuntimeError('it failed')", LoadError, ""),
-    "wants more": ("import nothing_of_this_name", MissingModuleError, ""),
+    "wants more": ("import nothing_of_this_name", DependencyError, ""),
     "is killed": ("os.kill(os.getpid(), 9)", WorkerDiedError, "signal"),
     "crashes": ("ctypes.string_at(0)", WorkerDiedError, "signal"),
     "breaks the rules": (

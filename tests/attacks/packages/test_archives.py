@@ -19,8 +19,9 @@ from pathlib import Path
 import pytest
 
 from envhub_sandbox.dependencies.builds import apart
-from envhub_sandbox.errors import DependencyError, PackageIntegrityError
+from envhub_sandbox.errors import DependencyError
 from tests.attacks.packages.test_git_references import dripping
+from tests.support.packages.refusals import refused_dependency
 from tests.support.processes import eventually
 
 _BLOCK = 512
@@ -58,7 +59,7 @@ def test_a_size_below_zero_leads_nowhere(tmp_path: Path) -> None:
     archive = archived(tmp_path, data + bytes(2 * _BLOCK))
     with contextlib.suppress(tarfile.TarError), tarfile.open(archive) as opened:
         assert len(list(islice(opened, 1000))) == 1000, "the control failed"
-    with pytest.raises(PackageIntegrityError, match=r"x-1\.0/b.*size"):
+    with refused_dependency("integrity", match=r"x-1\.0/b.*size"):
         fetched(archive)
     assert not list((tmp_path / "place").rglob("b")), "it keeps what it refuses"
 
@@ -86,7 +87,7 @@ def test_a_map_that_never_ends_is_not_read(tmp_path: Path) -> None:
         assert tracemalloc.get_traced_memory()[1] > 5_000_000, "the control failed"
     finally:
         tracemalloc.stop()
-    with pytest.raises(PackageIntegrityError, match="only files are unpacked"):
+    with refused_dependency("integrity", match="only files are unpacked"):
         fetched(archive)
 
 

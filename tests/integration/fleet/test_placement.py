@@ -14,10 +14,11 @@ import psutil
 import pytest
 
 from envhub_sandbox import Fleet, make_env
-from envhub_sandbox.errors import MissingModuleError, PolicyError, ServerBusyError
+from envhub_sandbox.errors import PolicyError, ServerBusyError
 from tests.integration.fleet.conftest import places, serving
 from tests.remote.listening import Listening
 from tests.support import inside
+from tests.support.packages.refusals import refused_dependency
 from tests.support.packages.wheels import Index, make_wheel
 from tests.support.ports import lasting_port
 from tests.support.processes import eventually, halted
@@ -146,7 +147,7 @@ def test_a_place_that_lacks_one(packages: Index, stays: Listening, tmp_path: Pat
     folder = write_repository(tmp_path / "repository", ENV, requirements__txt="listed\n")
     with (
         make_env(folder, n_envs=4, sandbox=["process", stays.sandbox()]) as suites,
-        pytest.raises(MissingModuleError, match="No module named 'listed'") as caught,
+        refused_dependency("module", match="No module named 'listed'") as caught,
     ):
         suites.env.reset()
     assert f"of 4, on {stays.endpoint}" in str(caught.value)

@@ -16,11 +16,12 @@ from envhub_sandbox.dependencies.locks import lockfile
 from envhub_sandbox.dependencies.locks.making import locked
 from envhub_sandbox.dependencies.request import Choice
 from envhub_sandbox.dependencies.resolutions import build
-from envhub_sandbox.errors import DependencyError, PackageIntegrityError, ResolutionError
+from envhub_sandbox.errors import DependencyError
 from envhub_sandbox.hub.git import address
 from envhub_sandbox.hub.snapshot import local
 from envhub_sandbox.system.folders import cache_root, remove_tree
 from tests.support.packages.git_server import git_served, make_repository
+from tests.support.packages.refusals import refused_dependency
 from tests.support.packages.sdists import backend, make_sdist
 from tests.support.packages.wheels import Index, make_wheel
 from tests.support.repositories import importing, write_repository
@@ -97,7 +98,7 @@ def test_a_build_that_fails(packages: Index, tmp_path: Path) -> None:
     log = "error: command 'gcc' failed: No such file or directory"
     further = f"def further():\n    print('noise')\n    raise SystemExit({log!r})\n"
     source = make_sdist(tmp_path, "fails", files=backend("fails", further=further))
-    with pytest.raises(ResolutionError) as caught:
+    with refused_dependency("resolution") as caught:
         built([source])
     for words in ("fails 1.0 (line 1 of x.txt)", "apt-get install gcc", "noise"):
         assert words in str(caught.value)
@@ -150,14 +151,14 @@ def test_a_repository_whose_package_has_no_wheel(real_index: Index, tmp_path: Pa
     remove_tree(kept.parent)
     remove_tree(cache_root() / "environments")
     real_index.replaced["sourced-1.0.tar.gz"] = b"another"
-    with pytest.raises(PackageIntegrityError, match="it was replaced"):
+    with refused_dependency("integrity", match="it was replaced"):
         make_env(folder, lock=path)
 
 
 def test_what_is_needed_to_build_itself(index: Index, tmp_path: Path) -> None:
     make_sdist(index.folder, "one", files=backend("one", needs=["two"]))
     source = make_sdist(index.folder, "two", files=backend("two", needs=["one"]))
-    with pytest.raises(ResolutionError, match="two <- one <- two"):
+    with refused_dependency("resolution", match="two <- one <- two"):
         built([source])
 
 

@@ -15,10 +15,11 @@ from typing import Any
 import pytest
 
 from envhub_sandbox import make_env
-from envhub_sandbox.errors import DependencyError, RequirementError, ResolutionError
+from envhub_sandbox.errors import DependencyError, DependencyReason
 from envhub_sandbox.sandboxes.process import BOOTSTRAP
 from envhub_sandbox.system.log import DEPENDENCIES
 from tests.support.compare import assert_same, rolled
+from tests.support.packages.refusals import refused_dependency
 from tests.support.packages.wheels import Index, make_wheel
 from tests.support.repositories import CARTPOLE, CARTPOLES, importing, write_repository
 
@@ -182,12 +183,12 @@ def test_nothing_is_made_where_nothing_is_missing(
 
 
 @pytest.mark.parametrize(
-    ("requirements", "error", "said"),
+    ("requirements", "reason", "said"),
     [
-        ("numpy\n-e .\n", RequirementError, "line 2 of requirements.txt"),
+        ("numpy\n-e .\n", "requirement", "line 2 of requirements.txt"),
         (
             "not-here>=3\n",
-            ResolutionError,
+            "resolution",
             "line 1 of requirements.txt; installed here from file://",
         ),
     ],
@@ -196,7 +197,7 @@ def test_an_error_names_the_repository_and_runs_nothing(
     packages: Index,
     tmp_path: Path,
     requirements: str,
-    error: type[Exception],
+    reason: DependencyReason,
     said: str,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -207,7 +208,7 @@ def test_an_error_names_the_repository_and_runs_nothing(
     (metadata / "direct_url.json").write_text('{"dir_info": {}, "url": "file:///not-here"}')
     monkeypatch.syspath_prepend(metadata.parent)
     folder = write_repository(tmp_path / "repo", ENV, requirements__txt=requirements)
-    with pytest.raises(error, match=said) as caught:
+    with refused_dependency(reason, match=said) as caught:
         make_env(folder)
     assert str(caught.value).startswith(f"{folder}:env.py: ")
 

@@ -13,7 +13,8 @@ from typer.testing import CliRunner
 from envhub_sandbox import make_env
 from envhub_sandbox.cli.app import app
 from envhub_sandbox.dependencies import resolutions
-from envhub_sandbox.errors import LockDriftError, LockError, PackageIntegrityError, PolicyError
+from envhub_sandbox.errors import LockDriftError, LockError, PolicyError
+from tests.support.packages.refusals import refused_dependency
 from tests.support.packages.wheels import Index, make_wheel
 from tests.support.repositories import importing, write_repository
 
@@ -110,7 +111,7 @@ def test_a_package_that_was_replaced_is_refused(
     monkeypatch.setenv("ENVHUB_CACHE", str(tmp_path / "cache"))
     make_wheel(packages.folder, "not-here", "1.0", {"not_here/__init__.py": "VERSION = 'evil'\n"})
     try:
-        with pytest.raises(PackageIntegrityError, match="not-here"):
+        with refused_dependency("integrity", match="not-here"):
             make_env(folder, lock=path_of(folder))
         assert "package not-here==1.0: the file with SHA-256" in verify(folder, code=7)
     finally:

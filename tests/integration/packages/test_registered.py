@@ -12,9 +12,10 @@ from typer.testing import CliRunner
 
 from envhub_sandbox import make_env
 from envhub_sandbox.cli.app import app
-from envhub_sandbox.errors import LoadError, ResolutionError, WorkerDiedError
+from envhub_sandbox.errors import LoadError, WorkerDiedError
 from envhub_sandbox.session.crash.bundle_reader import load_bundle
 from tests.support.compare import assert_same, rolled
+from tests.support.packages.refusals import refused_dependency
 from tests.support.packages.wheels import Index, make_wheel
 
 REGISTERS = """
@@ -150,7 +151,7 @@ def test_an_id_that_is_not_there(packages: Index) -> None:
 
 
 def test_a_package_or_version_that_is_not_there(packages: Index) -> None:
-    with pytest.raises(ResolutionError, match=r"(?s)walled==9\.9.*has the index that version"):
+    with refused_dependency("resolution", match=r"(?s)walled==9\.9.*has the index that version"):
         make_env("pypi:walled@9.9#Walled/Maze-v2")
 
 

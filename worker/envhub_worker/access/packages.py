@@ -274,7 +274,7 @@ class Packages:
                 os.utime(Path(made["packages"]).with_name("environment.json"))
             return m.Packages("made", name, made["facts"], "")
         if made is None and monotonic() - when < _FAILED_S:
-            raise RefusedError(str(said["error"]), str(said["said"]))
+            raise RefusedError("DependencyError", str(said["said"]), missing=str(said["error"]))
         del self._outcomes[place]
         return None
 
@@ -334,7 +334,7 @@ class Packages:
             self._at_work[place[0]] = PackageProgram(place, order)
         except OSError as error:  # a full disk, no process left: the client reads it, once
             text = f"the program that makes packages cannot be started: {error.strerror}"
-            self._end(place, {"error": "DependencyError", "said": text}, now)
+            self._end(place, {"error": "other", "said": text}, now)
 
     def _follow(self, work: PackageProgram, now: float) -> None:
         order = self._line[work.place]
@@ -354,10 +354,10 @@ class Packages:
                 f"they were not installed in time: the server permits {self._make_s:.0f} s "
                 "(--packages-s)"
             )
-            said = {"error": "IndexUnavailableError", "said": text}
+            said = {"error": "index", "said": text}
         elif not said.keys() & {"own", "made", "error"}:
             text = f"the program that makes packages ended with {code}; its server's log says why"
-            said = {"error": "DependencyError", "said": text}
+            said = {"error": "other", "said": text}
         self._end(work.place, said, work.since)
 
     def _end(self, place: Place, said: Mapping[str, Any], since: float) -> None:

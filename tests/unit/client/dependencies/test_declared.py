@@ -9,7 +9,7 @@ import pytest
 
 from envhub_sandbox.dependencies import declared as module
 from envhub_sandbox.dependencies.declared import DeclaredPackages, declared, read
-from envhub_sandbox.errors import RequirementError
+from tests.support.packages.refusals import refused_dependency
 
 HASH = "sha256:" + "0a" * 32
 
@@ -72,23 +72,23 @@ def test_hashes_stand_on_the_line_or_on_the_next(tmp_path: Path) -> None:
 )
 def test_whatever_could_run_code_does_not(tmp_path: Path, line: str) -> None:
     """The line is named; an option does not hide behind the end of a line either."""
-    with pytest.raises(RequirementError, match=r"line 2 of requirements\.txt"):
+    with refused_dependency("requirement", match=r"line 2 of requirements\.txt"):
         repository(tmp_path, requirements__txt=f"numpy\n{line}\n")
 
 
 @pytest.mark.parametrize("line", ["-e ./here", "here @ file:///tmp/here", "a" * 3000])
 def test_nor_in_the_other_files(tmp_path: Path, line: str) -> None:
     """Where a list of TOML holds it; nor is a second block taken, which could be another's."""
-    with pytest.raises(RequirementError, match=r"in the script metadata of env\.py"):
+    with refused_dependency("requirement", match=r"in the script metadata of env\.py"):
         repository(tmp_path, env__py=script(f"dependencies = ['{line}']"))
     project = f"[project]\nname = 'x'\ndependencies = ['{line}']\n"
-    with pytest.raises(RequirementError, match=r"in \[project\] of pyproject\.toml"):
+    with refused_dependency("requirement", match=r"in \[project\] of pyproject\.toml"):
         repository(tmp_path, env__py="", pyproject__toml=project)
     for end in (r"\n", r"\r", r"\u2028"):  # which TOML reads before we do
         text = f"""[project]\ndependencies = ["a; os_name == 'x{end}-e .{end}y'"]\n"""
-        with pytest.raises(RequirementError, match=r"in \[project\] of pyproject\.toml"):
+        with refused_dependency("requirement", match=r"in \[project\] of pyproject\.toml"):
             repository(tmp_path, env__py="", pyproject__toml=text)
-    with pytest.raises(RequirementError, match="2 blocks"):
+    with refused_dependency("requirement", match="2 blocks"):
         repository(tmp_path, env__py=script("dependencies = []") + script("dependencies = []"))
 
 
@@ -96,13 +96,13 @@ def test_a_file_that_is_no_text_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "requirements.txt"
     for data in (b"\xff\xfe\x00", b"\x80numpy"):
         path.write_bytes(data)
-        with pytest.raises(RequirementError, match="cannot be read"):
+        with refused_dependency("requirement", match="cannot be read"):
             read(tmp_path, path.name)
     path.write_text("numpy\n" * module.MAX_BYTES)
-    with pytest.raises(RequirementError, match="bytes"):
+    with refused_dependency("requirement", match="bytes"):
         read(tmp_path, path.name)
     path.write_text("numpy\n" * (module.MAX_REQUIREMENTS + 1))
-    with pytest.raises(RequirementError, match="requirements"):
+    with refused_dependency("requirement", match="requirements"):
         read(tmp_path, path.name)
 
 
@@ -127,7 +127,7 @@ def test_further_files_of_the_repository_are_read(tmp_path: Path) -> None:
     ]
     for number in range(module.MAX_FILES + 1):
         (tmp_path / f"{number}.txt").write_text(f"-r {number + 1}.txt\n")
-    with pytest.raises(RequirementError, match="includes more than"):
+    with refused_dependency("requirement", match="includes more than"):
         repository(tmp_path, requirements__txt="-r 0.txt\n")
 
 
@@ -137,7 +137,7 @@ def test_further_files_of_the_repository_are_read(tmp_path: Path) -> None:
 def test_no_file_beyond_the_repository_is_read(tmp_path: Path, named: str) -> None:
     (tmp_path / "outside.txt").write_text("numpy\n")
     (tmp_path / "repo/more").mkdir(parents=True)
-    with pytest.raises(RequirementError, match="not a file of the repository"):
+    with refused_dependency("requirement", match="not a file of the repository"):
         repository(tmp_path / "repo", requirements__txt=f"-r {named}\n")
 
 
@@ -151,7 +151,7 @@ def test_the_repository_itself_is_its_project(tmp_path: Path) -> None:
         wanted, _ = read(tmp_path, "requirements.txt")
         assert [one.requirement.name for one in wanted] == [*names, "d"]
     (tmp_path / "pyproject.toml").unlink()
-    with pytest.raises(RequirementError, match="installs the repository itself"):
+    with refused_dependency("requirement", match="installs the repository itself"):
         read(tmp_path, "requirements.txt")
 
 
@@ -227,7 +227,7 @@ def test_what_declares_nothing(tmp_path: Path, name: str, text: str) -> None:
 )
 def test_a_spoiled_project_is_refused(tmp_path: Path, text: str, said: str) -> None:
     """With what is wrong and what to do; deep or dotted TOML costs no time."""
-    with pytest.raises(RequirementError, match=re.escape(said)) as caught:
+    with refused_dependency("requirement", match=re.escape(said)) as caught:
         repository(tmp_path, pyproject__toml=text)
     assert "pyproject.toml" in str(caught.value)
     assert "dependencies='host'" in str(caught.value)

@@ -23,14 +23,12 @@ from envhub_sandbox.dependencies.packages import ThisMachine
 from envhub_sandbox.dependencies.request import chosen, request_of
 from envhub_sandbox.errors import (
     DependencyError,
-    IndexUnavailableError,
-    PackageIntegrityError,
-    PackagesTooLargeError,
 )
 from envhub_sandbox.hub.snapshot import local
 from envhub_sandbox.system.locks import SharedLock
 from envhub_worker.protocol.runtime import RECORD
 from tests.support import inside
+from tests.support.packages.refusals import refused_dependency
 from tests.support.packages.wheels import Index, make_wheel
 from tests.support.processes import eventually
 
@@ -273,10 +271,10 @@ def test_what_fails_between_choosing_and_installing_leaves_nothing(
     folder = repository(tmp_path / "repo", "wanted")
     known(folder)
     index.replaced[wheel.name] = make_wheel(tmp_path, "wanted", files={"evil.py": ""}).read_bytes()
-    with pytest.raises(PackageIntegrityError, match="replaced"):
+    with refused_dependency("integrity", match="replaced"):
         made(folder)
     index.broken = 503
-    with pytest.raises(IndexUnavailableError):
+    with refused_dependency("index"):
         made(folder)
     assert environments.every() == []
     assert left_behind() == []
@@ -319,7 +317,7 @@ def test_what_is_too_large_is_not_made(
     with monkeypatch.context() as patch:
         patch.setenv(bounds.BYTES_VARIABLE, str(2**20))
         patch.setenv(bounds.FILES_VARIABLE, "60")
-        with pytest.raises(PackagesTooLargeError, match=said):
+        with refused_dependency("size", match=said):
             made(folder)
         assert environments.every() == []
         assert left_behind() == []
@@ -354,9 +352,9 @@ def test_what_another_uv_unpacks_is_left_to_it(
 
 def refused() -> None:
     """An installation of nothing, which is refused."""
-    with contextlib.suppress(PackageIntegrityError), uv.cleared_after_refusal(["none==1"]):
+    with contextlib.suppress(DependencyError), uv.cleared_after_refusal(["none==1"]):
         (index_settings.uv_cache() / ".tmpours").touch()
-        raise PackageIntegrityError("another hash")
+        raise DependencyError("another hash", reason="integrity")
 
 
 def test_what_is_announced_counts_before_it_is_there(tmp_path: Path) -> None:
@@ -366,7 +364,7 @@ def test_what_is_announced_counts_before_it_is_there(tmp_path: Path) -> None:
         watch.hear(line)
     watch.look()
     watch.hear("Downloading torch (1.5GiB)")
-    with pytest.raises(PackagesTooLargeError, match=r"downloads of 1\.53 GiB; at most 1 GiB"):
+    with refused_dependency("size", match=r"downloads of 1\.53 GiB; at most 1 GiB"):
         watch.look()
 
 

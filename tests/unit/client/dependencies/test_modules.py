@@ -15,10 +15,11 @@ from envhub_sandbox.dependencies.modules import MissingModule, guessed
 from envhub_sandbox.dependencies.packages import packages_for
 from envhub_sandbox.dependencies.request import AUTO, DECLARED, PackageRequest, chosen, request_of
 from envhub_sandbox.dependencies.resolve import Lock, Target
-from envhub_sandbox.errors import PolicyError, ResolutionError
+from envhub_sandbox.errors import DependencyError, PolicyError
 from envhub_sandbox.hub.snapshot import Snapshot, local
 from envhub_sandbox.hub.sources import parsing
 from tests.support import inside
+from tests.support.packages.refusals import refused_dependency
 from tests.support.packages.wheels import Index, make_wheel
 
 pytestmark = pytest.mark.usefixtures("snapshot_store")
@@ -133,7 +134,7 @@ def test_a_guess_never_stands_in_the_way(
     assert "declared==1.0" in resolved.facts["packages"]
     assert "inferred" not in resolved.facts
     assert packages_for(snapshot(tmp_path / "s", "import chess" + MAKE), AUTO) is None
-    with pytest.raises(ResolutionError, match="chess"):
+    with refused_dependency("resolution", match="chess"):
         packages_for(snapshot(tmp_path / "s", "import chess" + MAKE), chosen({}, None)[0])
 
 
@@ -192,9 +193,13 @@ def tried(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     def resolve(request: PackageRequest, target: Target, **options: Any) -> Lock:
         found.append(target.python)
         if any(one.requirement.name == "nowhere" for one in request.wanted):
-            raise ResolutionError("Because nowhere was not found in the package registry")
+            raise DependencyError(
+                "Because nowhere was not found in the package registry", reason="resolution"
+            )
         if target.python != "/opt/3.98.0" or request.wanted[0].requirement.name == "never":
-            raise ResolutionError("does not satisfy Python>=3.98 and a depends on Python>=3.98")
+            raise DependencyError(
+                "does not satisfy Python>=3.98 and a depends on Python>=3.98", reason="resolution"
+            )
         return Lock("a==1 \\\n    --hash=sha256:00\n")
 
     monkeypatch.setattr(resolving, "resolve", resolve)
@@ -224,7 +229,7 @@ def test_another_release_is_tried_and_remembered(
 
 
 def test_all_that_were_tried_are_named(tried: list[str]) -> None:
-    with pytest.raises(ResolutionError) as caught:
+    with refused_dependency("resolution") as caught:
         resolutions.resolution_for(request("never"))
     said = str(caught.value)
     assert f"Python {OURS.version}, 3.99.1, 3.98.0 of this machine were tried" in said
@@ -238,7 +243,7 @@ def test_no_other_release_is_tried_in_vain(
     tried: list[str], name: str, fields: dict[str, Any]
 ) -> None:
     """Where Python is not the matter, or the caller has chosen it."""
-    with pytest.raises(ResolutionError) as caught:
+    with refused_dependency("resolution") as caught:
         resolutions.resolution_for(request(name, **fields))
     assert set(tried) == {OURS.path}
     assert ("fetch_python" in str(caught.value)) == bool(fields)
@@ -255,7 +260,7 @@ def test_uv_fetches_an_interpreter_only_where_it_may(monkeypatch: pytest.MonkeyP
         return ""
 
     monkeypatch.setattr(interpreters.uv, "run", run)
-    with pytest.raises(interpreters.InterpreterUnavailableError, match="fetch_python"):
+    with refused_dependency("interpreter", match="fetch_python"):
         interpreters.find("3.99")
     assert asked == []
     assert interpreters.find("3.99", fetch=True) == OTHERS[0]

@@ -25,8 +25,9 @@ from envhub_sandbox.dependencies.request import (
     chosen,
     request_of,
 )
-from envhub_sandbox.errors import InterpreterUnavailableError, PolicyError, RequirementError
+from envhub_sandbox.errors import DependencyError, PolicyError
 from envhub_sandbox.hub.snapshot import Snapshot, local
+from tests.support.packages.refusals import refused_dependency
 from tests.support.packages.wheels import make_wheel
 
 NUMPY = metadata.version("numpy")
@@ -85,7 +86,7 @@ def test_what_nobody_could_have_meant_is_refused(wrong: Any) -> None:
 @pytest.mark.parametrize(
     ("dependencies", "python", "error", "said"),
     [
-        ({"extra": ["a @ file:///tmp/a"]}, None, RequirementError, "in dependencies"),
+        ({"extra": ["a @ file:///tmp/a"]}, None, DependencyError, "in dependencies"),
         ("/opt/python", "/usr/bin/python3", PolicyError, "both"),
         ({"extra": ["scipy"]}, "/usr/bin/python3", PolicyError, "both"),
     ],
@@ -171,7 +172,7 @@ def test_this_interpreter_without_its_packages_comes_first(tmp_path: Path) -> No
     assert found == interpreters.own() == interpreters.find(found.path)
     assert Path(found.path).resolve() == Path(found.path)
     assert found.version == platform.python_version()
-    with pytest.raises(InterpreterUnavailableError, match="does not work as an interpreter"):
+    with refused_dependency("interpreter", match="does not work as an interpreter"):
         interpreters.find(str(tmp_path / "python"))
 
 
@@ -186,7 +187,7 @@ def test_no_interpreter_is_an_error_that_says_what_to_do(
     (tmp_path / "versions/3.99.0/bin/python3").write_text("")
     monkeypatch.setenv("PYENV_ROOT", pyenv.format(tmp_path))
     monkeypatch.setenv("PATH", os.path.dirname(interpreters.own().path))  # each there is asked
-    with pytest.raises(InterpreterUnavailableError, match=r"uv python install"):
+    with refused_dependency("interpreter", match=r"uv python install"):
         interpreters.find(asked, declared)
 
 

@@ -17,7 +17,7 @@ from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.dependencies.request import PackageRequest
 from envhub_sandbox.dependencies.resolutions import resolution_for
 from envhub_sandbox.dependencies.resolve import Lock
-from envhub_sandbox.errors import RequirementError, ResolutionError
+from tests.support.packages.refusals import refused_dependency
 from tests.support.packages.wheels import Index, make_wheel
 
 COMMIT = "0123456789abcdef0123456789abcdef01234567"
@@ -116,9 +116,9 @@ def test_without_a_builder_there_are_wheels_alone(
     monkeypatch.setattr(resolutions, "BUILDER", None)
     monkeypatch.setattr(interpreters, "others", lambda declared, first: [])
     source_distribution(index.folder, "only-source", "1.5", tmp_path / "ran")
-    with pytest.raises(ResolutionError, match=r"(?s)only-source.*wheels"):
+    with refused_dependency("resolution", match=r"(?s)only-source.*wheels"):
         resolutions.resolution_for(request("only-source"))
-    with pytest.raises(RequirementError, match="line 1 takes of-git from"):
+    with refused_dependency("requirement", match="line 1 takes of-git from"):
         resolutions.resolution_for(request(f"of-git @ git+https://git.example/a/b@{COMMIT}"))
     source_distribution(index.folder, "some-wheel", "2.0", tmp_path / "ran")
     make_wheel(index.folder, "some-wheel", "1.0")
@@ -153,7 +153,7 @@ def test_a_repository_becomes_the_version_of_its_wheel(index: Index, built: list
 )
 def test_nothing_else_is_a_repository(url: str) -> None:
     """No other protocol, no login, no option, and no empty revision."""
-    with pytest.raises(RequirementError):
+    with refused_dependency("requirement"):
         parse_requirement(f"a @ {url}", "line 1")
     good = parse_requirement("a @ git+https://git.example/a", "line 1")
     assert of_git(good.requirement, "line 1") is not None

@@ -25,10 +25,8 @@ from envhub_sandbox.dependencies.request import PackageRequest, chosen
 from envhub_sandbox.dependencies.resolve import Lock, Target
 from envhub_sandbox.errors import (
     DependencyError,
-    IndexUnavailableError,
-    PackageIntegrityError,
-    ResolutionError,
 )
+from tests.support.packages.refusals import refused_dependency
 from tests.support.packages.wheels import WORKERS, Index, make_wheel
 from tests.unit.docs.test_distributions import project
 
@@ -68,7 +66,7 @@ def test_another_machines_interpreter_is_described(index: Index) -> None:
         "wanted==1.0"
         in resolve("wanted", target=Target(version="3.10", machine="aarch64")).packages
     )
-    with pytest.raises(ResolutionError):
+    with refused_dependency("resolution"):
         resolve("wanted", target=Target(version="3.10", machine="x86_64"))
 
 
@@ -114,7 +112,7 @@ def test_a_contradiction_names_both_lines(index: Index) -> None:
     make_wheel(index.folder, "innocent")
     make_wheel(index.folder, "shared", "1.0")
     make_wheel(index.folder, "shared", "2.0")
-    with pytest.raises(ResolutionError) as caught:
+    with refused_dependency("resolution") as caught:
         resolve("one", "innocent", "shared>=2")
     said = str(caught.value)
     assert "shared>=2  (line 3 of requirements.txt)" in said
@@ -141,7 +139,7 @@ def test_the_advice_is_one_with_which_there_are_versions(
         make_wheel(index.folder, "shared", version)
     wanted = tuple(parse_requirement(line, "requirements.txt") for line in lines)
     asked = PackageRequest("requirements.txt", wanted)
-    with pytest.raises(ResolutionError, match=re.escape(f"dependencies={cure}")):
+    with refused_dependency("resolution", match=re.escape(f"dependencies={cure}")):
         resolutions.resolution_for(asked)
     changed = chosen(cure, None)[0]
     cured = replace(asked, override=changed.override, without=changed.without)
@@ -160,7 +158,7 @@ def test_requirements_are_left_out_replaced_and_constrained(index: Index) -> Non
     assert not [pin for pin in changed if pin.startswith("unwanted")]
     replaced = (parse_requirement("shared>=2", "an argument"),)
     assert "shared==2.0" in resolve("one", "shared<2", override=replaced, **without).packages
-    with pytest.raises(ResolutionError, match=r"shared<2  \(line 7 of c.txt\)"):
+    with refused_dependency("resolution", match=r"shared<2  \(line 7 of c.txt\)"):
         resolve("one", "shared>1", constraints=held, **without)
 
 
@@ -168,10 +166,10 @@ def test_another_python_is_told_from_another_fault(index: Index) -> None:
     make_wheel(index.folder, "newer", python=">=3.99")
     make_wheel(index.folder, "tagged", tag="cp399-cp399-any")
     for name in ("newer", "tagged"):
-        with pytest.raises(ResolutionError) as caught:
+        with refused_dependency("resolution") as caught:
             resolve(name)
         assert module.is_about_python(caught.value)
-    with pytest.raises(ResolutionError, match=r"no-such-package  \(line 1") as caught:
+    with refused_dependency("resolution", match=r"no-such-package  \(line 1") as caught:
         resolve("no-such-package")
     assert not module.is_about_python(caught.value)
 
@@ -184,13 +182,13 @@ def test_a_hash_of_the_repositorys_is_kept(index: Index) -> None:
     kept = resolve(f"wanted==1.0 --hash=sha256:{hashes[0]}").text
     assert hashes[0] in kept
     assert hashes[1] not in kept
-    with pytest.raises(PackageIntegrityError, match="line 1 of"):
+    with refused_dependency("integrity", match="line 1 of"):
         resolve(f"wanted==1.0 --hash=sha256:{'0' * 64}")
 
 
 def test_a_release_that_was_taken_back(index: Index) -> None:
     index.yanked.add(make_wheel(index.folder, "wanted").name)
-    with pytest.raises(ResolutionError, match=r"(?s)yanked by its authors.*yanked"):
+    with refused_dependency("resolution", match=r"(?s)yanked by its authors.*yanked"):
         resolve("wanted")
 
 
@@ -205,7 +203,7 @@ def test_no_index(
     """One that wants a login is not one without the package, as pip's strategy has it."""
     index.broken = status
     monkeypatch.setenv("UV_INDEX_STRATEGY", strategy)
-    with pytest.raises(IndexUnavailableError, match=f"(?s){said}.*{status} "):
+    with refused_dependency("index", match=f"(?s){said}.*{status} "):
         resolve("numpy")
 
 
@@ -290,7 +288,7 @@ def test_who_holds_the_stderr_of_a_uv_that_has_ended_is_not_waited_for(
 
 def test_a_uv_that_is_late_is_ended(another_uv: Callable[[str], None], tmp_path: Path) -> None:
     another_uv(f"time.sleep(30)\nopen({str(tmp_path / 'went on')!r}, 'w')")
-    with pytest.raises(IndexUnavailableError, match="uv was not done after"):
+    with refused_dependency("index", match="uv was not done after"):
         uv.run(["pip"], what="no", timeout_s=0.1)
     assert not (tmp_path / "went on").exists()
 

@@ -19,10 +19,11 @@ from envhub_sandbox.dependencies.locks.making import fingerprint_of_spaces, fing
 from envhub_sandbox.dependencies.locks.pylock import PylockPackage, Wheel
 from envhub_sandbox.dependencies.packages import lock_checker
 from envhub_sandbox.dependencies.request import chosen
-from envhub_sandbox.errors import EnvHubError, LockDriftError, LockError, PackageIntegrityError
+from envhub_sandbox.errors import EnvHubError, LockDriftError, LockError
 from envhub_sandbox.hub.snapshot import local
 from envhub_worker.protocol.manifest.manifest import Manifest
 from tests.support import wire
+from tests.support.packages.refusals import refused_dependency
 from tests.support.packages.wheels import WORKERS, Index, make_wheel, served
 
 A, B = "a" * 64, "b" * 64
@@ -111,7 +112,7 @@ def test_a_lock_has_every_package_with_its_files(
     [said] = making.differences(lock, making.relisted(lock))
     assert said.startswith("package wanted==1.0: the file with SHA-256 ")
     monkeypatch.setenv("UV_CACHE_DIR", str(tmp_path / "another"))
-    with pytest.raises(PackageIntegrityError, match=r"wanted==1\.0"):
+    with refused_dependency("integrity", match=r"wanted==1\.0"):
         made(tmp_path / "repo", "wanted")
 
 

@@ -49,7 +49,7 @@ LOAD = (errors.LoadError,)
             (*REMOTE, gym.error.ResetNeeded),
             "no",
         ),
-        ({"stage": "import", "builtin": "ModuleNotFoundError"}, (errors.MissingModuleError,), "no"),
+        ({"stage": "import", "builtin": "ModuleNotFoundError"}, (errors.DependencyError,), "no"),
         ({"stage": "import", "builtin": "SyntaxError"}, LOAD, "no"),
         ({"stage": "return"}, LOAD, "no"),
         *(
@@ -89,10 +89,14 @@ def test_errors_are_what_they_were(
         assert isinstance(error.__cause__, kinds[1])
 
 
-def test_a_missing_package_is_an_import_error() -> None:
-    """As it would be in this process, and of the very class where a module is missing."""
-    assert {errors.DependencyError, ModuleNotFoundError} < set(errors.MissingModuleError.mro())
-    assert issubclass(errors.DependencyError, ImportError)
+@pytest.mark.parametrize(("reason", "known"), [("size", "size"), ("of its own", "other")])
+def test_a_missing_package_is_an_import_error(reason: str, known: str) -> None:
+    """As it would be in this process, for a reason that the client knows."""
+    error = refusal(m.Refusal("DependencyError", "text", reason, ""))
+    assert isinstance(error, errors.DependencyError)
+    assert isinstance(error, ModuleNotFoundError)
+    assert (str(error), error.reason) == ("text", known)
+    assert pickle.loads(pickle.dumps(error)).reason == known
 
 
 @pytest.mark.parametrize(
@@ -228,8 +232,6 @@ def test_deaths_say_how(reply: m.Death, text: str) -> None:
         ("SandboxUnavailableError", errors.SandboxUnavailableError),
         ("VersionMismatchError", errors.VersionMismatchError),
         ("WorkerError", errors.WorkerError),
-        ("ResolutionError", errors.ResolutionError),
-        ("PackagesTooLargeError", errors.PackagesTooLargeError),
         ("SystemExit", errors.WorkerError),
         ("LoadError", errors.WorkerError),
     ],

@@ -194,6 +194,8 @@ class Events(Witness):
             fields |= {"quota": found.quota, "used": found.used, "limit": found.limit}
             level = "debug" if (owner, found.quota) in self._in_line else level
             self._in_line.add((owner, found.quota))
+        elif refused.error == "DependencyError":
+            fields |= {"reason": refused.missing}
         elif refused.missing:
             fields |= {"layer": refused.missing, "fix": refused.fix}
         self._client(owner, "refused", level, **fields)

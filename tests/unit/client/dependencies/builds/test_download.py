@@ -12,15 +12,13 @@ import pytest
 
 from envhub_sandbox.dependencies.builds import download, project
 from envhub_sandbox.errors import (
-    IndexUnavailableError,
-    PackageIntegrityError,
-    PackagesTooLargeError,
-    RequirementError,
+    DependencyError,
 )
 from envhub_sandbox.hub.git import address, commits
 from envhub_sandbox.hub.logins import authorization
 from tests.support.packages.git_server import commit, git_served, make_repository
 from tests.support.packages.git_server import git as run_git
+from tests.support.packages.refusals import refused_dependency
 from tests.support.packages.wheels import served
 from tests.support.ports import QuietHandler, serving
 
@@ -70,7 +68,7 @@ def test_the_files_of_a_commit(url: str, repository: Path, target: Path) -> None
     ["v2", "1234567", "main~1", "--upload-pack=x", "a b", "", "a..b", "a@{0}", "-x"],
 )
 def test_what_is_not_there_or_an_option(url: str, revision: str) -> None:
-    with pytest.raises((IndexUnavailableError, RequirementError), match=r"40 digits|not a commit"):
+    with pytest.raises((DependencyError, DependencyError), match=r"40 digits|not a commit"):
         download.resolve(url, revision)
 
 
@@ -83,7 +81,7 @@ def test_what_is_not_there_or_an_option(url: str, revision: str) -> None:
     ],
 )
 def test_only_https_without_a_login(url: str, target: Path) -> None:
-    with pytest.raises(RequirementError, match="not a supported address"):
+    with refused_dependency("requirement", match="not a supported address"):
         download.check_out(url, "a" * 40, target, print)
 
 
@@ -114,7 +112,7 @@ def test_a_name_that_leads_out(url: str, repository: Path, target: Path) -> None
     tree = run_git(repository, "hash-object", "-w", "-t", "tree", "--literally", "tree")
     bad = run_git(repository, "commit-tree", tree, "-m", "x")
     run_git(repository, "branch", "bad", bad)
-    with pytest.raises(PackageIntegrityError, match="backslash"):
+    with refused_dependency("integrity", match="backslash"):
         download.check_out(url, bad, target, print)
     assert not list(target.iterdir())
 
@@ -132,7 +130,7 @@ def test_trees_that_hold_each_other(
     run_git(repository, "branch", "bomb", bomb)
     tracemalloc.start()
     try:
-        with pytest.raises(PackagesTooLargeError, match="files"):
+        with refused_dependency("size", match="files"):
             download.check_out(url, bomb, target, print)
         assert tracemalloc.get_traced_memory()[1] < 6 << 20
         listed = run_git(repository, "ls-tree", "-r", "-l", bomb)
@@ -149,10 +147,10 @@ def test_what_git_writes_is_bounded(
     monkeypatch.setattr(commits, "MAX_BYTES", 3 << 20)
     for number in range(4):
         (repository / f"zeros{number}").write_bytes(bytes(1 << 20))
-    with pytest.raises(PackagesTooLargeError, match="of files"):
+    with refused_dependency("size", match="of files"):
         download.check_out(url, commit(repository), target, print)
     (repository / "random").write_bytes(os.urandom(4 << 20))
-    with pytest.raises(IndexUnavailableError, match="git fetch failed"):
+    with refused_dependency("index", match="git fetch failed"):
         download.check_out(url, commit(repository), target, print)
     assert not list(target.iterdir())
 
@@ -198,7 +196,7 @@ def test_how_it_is_built(
 )
 def test_what_is_not_taken(tmp_path: Path, text: str) -> None:
     (tmp_path / "pyproject.toml").write_text(text)
-    with pytest.raises(RequirementError, match=r"x 1\.0"):
+    with refused_dependency("requirement", match=r"x 1\.0"):
         project.read(tmp_path, "x 1.0")
 
 
@@ -242,16 +240,16 @@ def test_downloads_are_bounded_and_verified(
         download.download(url, known, target)
         assert target.read_bytes() == b"data"
         index.replaced["x-1.tar.gz"] = b"tada" * 9
-        with pytest.raises(PackageIntegrityError, match="it was replaced"):
+        with refused_dependency("integrity", match="it was replaced"):
             download.download(url, known, target)
-        with pytest.raises(IndexUnavailableError, match="404"):
+        with refused_dependency("index", match="404"):
             download.download(url + "x", known, target)
         monkeypatch.setattr(download, "MAX_BYTES", 3)
-        with pytest.raises(PackagesTooLargeError):
+        with refused_dependency("size"):
             download.download(url, known, target)
         assert target.stat().st_size == 4, "it writes what it refuses"
     for other in ("ftp://127.0.0.1/x", "http://127.0.0.1:1/x", "file:///dev/zero"):
-        with pytest.raises(IndexUnavailableError):
+        with refused_dependency("index"):
             download.download(other, known, target)
 
 
@@ -262,7 +260,7 @@ def test_a_login_goes_to_the_host_of_its_index_alone(
     monkeypatch.setenv("NETRC", str(tmp_path / "none"))
     assert download.login_for("https://index.example/x") == ("me", "secret")
     assert download.login_for("https://other.example/x") is None
-    with pytest.raises(IndexUnavailableError) as caught:
+    with refused_dependency("index") as caught:
         download.download("http://me:secret@127.0.0.1:1/x", "", tmp_path / "x")
     assert "secret" not in str(caught.value)
 

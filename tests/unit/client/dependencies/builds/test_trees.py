@@ -16,7 +16,8 @@ from typing import Any
 import pytest
 
 from envhub_sandbox.dependencies.builds import trees
-from envhub_sandbox.errors import DependencyError, PackageIntegrityError, PackagesTooLargeError
+from envhub_sandbox.errors import DependencyError
+from tests.support.packages.refusals import refused_dependency
 from tests.support.packages.sdists import add, make_sdist
 
 
@@ -62,12 +63,12 @@ def test_a_zip_and_what_may_be_executed(tmp_path: Path) -> None:
     assert not found.stat().st_mode & 0o4000
     assert stat.S_ISREG(found.stat().st_mode)
     link = zipped(tmp_path, "x-1.0/link", stat.S_IFLNK | 0o777, "/etc/passwd")
-    with pytest.raises(PackageIntegrityError, match="link"):
+    with refused_dependency("integrity", match="link"):
         trees.unpack_tree(link, tmp_path, "x")
     data = bytearray(zipped(tmp_path, "x-1.0/y", 0, "").read_bytes())
     data[6] = data[data.rindex(b"PK\1\2") + 8] = 1
     link.write_bytes(data)
-    with pytest.raises(PackageIntegrityError, match="encrypted"):
+    with refused_dependency("integrity", match="encrypted"):
         trees.unpack_tree(link, tmp_path, "x")
 
 
@@ -86,7 +87,7 @@ def test_a_zip_and_what_may_be_executed(tmp_path: Path) -> None:
 )
 def test_what_could_lead_out_is_refused(tmp_path: Path, name: str, kind: bytes) -> None:
     archive = packed(tmp_path, ("x/fine", b"1", b"0"), (name, b"", kind))
-    with pytest.raises(PackageIntegrityError):
+    with refused_dependency("integrity"):
         unpacked(archive)
     assert not list((tmp_path / "tree").iterdir())
 
@@ -94,7 +95,7 @@ def test_what_could_lead_out_is_refused(tmp_path: Path, name: str, kind: bytes) 
 @pytest.mark.parametrize("names", [("x/a", "x/a"), ("x/a", "y/a"), ("x",)])
 def test_more_than_one_of_its_kind(tmp_path: Path, names: tuple[str, ...]) -> None:
     """A name twice: two programs could read two files; two tops, or a file: which is the source?"""
-    with pytest.raises(PackageIntegrityError, match=r"twice|[12] entries"):
+    with refused_dependency("integrity", match=r"twice|[12] entries"):
         unpacked(packed(tmp_path, *((name, b"", b"0") for name in names)))
 
 
@@ -107,7 +108,7 @@ def test_bounds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ):
         with monkeypatch.context() as patch:
             patch.setattr(trees, bound, value)
-            with pytest.raises(PackagesTooLargeError):
+            with refused_dependency("size"):
                 trees.unpack_tree(one, tmp_path, "x")
 
 
@@ -127,10 +128,10 @@ def test_a_stream_is_read_neither_far_nor_much_at_once() -> None:
     stream = trees.BoundedStream(source, "x", 10)
     assert len(stream.read(10)) == 10
     for read in (partial(stream.read, 11), stream.read, partial(stream.seek, 1 << 40)):
-        with pytest.raises(PackagesTooLargeError):
+        with refused_dependency("size"):
             read()
     source.at = 1 << 40
-    with pytest.raises(PackagesTooLargeError):
+    with refused_dependency("size"):
         stream.read(1)
 
 
@@ -140,7 +141,7 @@ def test_a_header_that_is_a_bomb(tmp_path: Path) -> None:
     member.type, member.size = tarfile.XHDTYPE, 1 << 32
     path = tmp_path / "x-1.0.tar.gz"
     path.write_bytes(gzip.compress(member.tobuf() + bytes(1024)))
-    with pytest.raises(PackagesTooLargeError):
+    with refused_dependency("size"):
         unpacked(path)
 
 
@@ -152,7 +153,7 @@ def test_a_zip_whose_packing_has_no_bounds(tmp_path: Path, packing: int) -> None
         archive.writestr("x-1.0/setup.py", bytes(64 << 20))
     tracemalloc.start()
     try:
-        with pytest.raises(PackageIntegrityError, match="not read"):
+        with refused_dependency("integrity", match="not read"):
             unpacked(path)
         assert tracemalloc.get_traced_memory()[1] < 32 << 20
         with zipfile.ZipFile(path) as archive, archive.open("x-1.0/setup.py") as file:
@@ -172,7 +173,7 @@ def test_a_zip_whose_files_lie_in_each_other(tmp_path: Path) -> None:
     offset = data.rindex(b"PK\1\2") + 42
     data[offset : offset + 4] = (50).to_bytes(4, "little")
     path.write_bytes(data)
-    with pytest.raises(PackageIntegrityError, match="lies within another"):
+    with refused_dependency("integrity", match="lies within another"):
         unpacked(path)
 
 
@@ -194,7 +195,7 @@ def test_headers_for_all_files_are_kept_once(tmp_path: Path) -> None:
 def test_a_file_that_is_not_as_long_as_it_says(tmp_path: Path) -> None:
     for data in (b"12", b"1" * 99):
         member = trees.Member(f"{len(data)}", 3, False, partial(io.BytesIO, data))
-        with pytest.raises(PackageIntegrityError, match="size"):
+        with refused_dependency("integrity", match="size"):
             trees.write_tree([member], tmp_path, "x")
         assert not list(tmp_path.iterdir()), "it writes what it refuses"
 
@@ -207,5 +208,5 @@ def test_what_is_no_archive(tmp_path: Path, data: bytes) -> None:
         unpacked(path)
     path = tmp_path / "x-1.0.rar"
     path.write_bytes(data)
-    with pytest.raises(PackageIntegrityError, match=r"\.tar\.gz, \.tar\.bz2 and \.zip are read"):
+    with refused_dependency("integrity", match=r"\.tar\.gz, \.tar\.bz2 and \.zip are read"):
         trees.unpack_tree(path, tmp_path, "x")

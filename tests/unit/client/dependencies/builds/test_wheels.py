@@ -15,7 +15,7 @@ from envhub_sandbox.dependencies import interpreters
 from envhub_sandbox.dependencies.builds import wheels
 from envhub_sandbox.dependencies.declared import Source
 from envhub_sandbox.dependencies.interpreters import Interpreter
-from envhub_sandbox.errors import PackageIntegrityError
+from tests.support.packages.refusals import refused_dependency
 from tests.support.packages.wheels import make_wheel
 
 pytestmark = pytest.mark.usefixtures("snapshot_store")
@@ -49,7 +49,7 @@ def test_what_was_asked_for_is_taken(tmp_path: Path) -> None:
 def test_another_package_is_refused(
     tmp_path: Path, name: str, version: str, tag: str, said: str
 ) -> None:
-    with pytest.raises(PackageIntegrityError, match=said):
+    with refused_dependency("integrity", match=said):
         check(make_wheel(tmp_path, name, version, tag=tag))
 
 
@@ -83,7 +83,7 @@ def test_what_no_wheel_has_is_refused(
     wheel = make_wheel(tmp_path, "some-name")
     with zipfile.ZipFile(wheel, "a") as archive:
         change(archive)
-    with pytest.raises(PackageIntegrityError, match=said):
+    with refused_dependency("integrity", match=said):
         check(wheel)
 
 
@@ -91,14 +91,14 @@ def test_what_its_files_say_is_held_against_them(tmp_path: Path) -> None:
     """The hashes of RECORD, the packing, which has bounds, the metadata, and that it is a zip."""
     wheel = make_wheel(tmp_path, "some-name")
     check(wheel)
-    with pytest.raises(PackageIntegrityError, match="not the file that its RECORD says"):
+    with refused_dependency("integrity", match="not the file that its RECORD says"):
         check(rewritten(wheel, b"# changed\n"))
     for packing in (zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA):
-        with pytest.raises(PackageIntegrityError, match="packed in another way"):
+        with refused_dependency("integrity", match="packed in another way"):
             check(rewritten(wheel, packing=packing))
     for name, version in (("another", "1.0"), ("some-name", "2.0")):
         another = make_wheel(tmp_path, name, version).rename(wheel)
-        with pytest.raises(PackageIntegrityError, match="its metadata are those of"):
+        with refused_dependency("integrity", match="its metadata are those of"):
             check(another)
     make_wheel(tmp_path, "some-name")
     for edit, said in (
@@ -107,11 +107,11 @@ def test_what_its_files_say_is_held_against_them(tmp_path: Path) -> None:
         (("/RECORD", b"some_name", b"gone.py,,\nsome_name"), "lists other files"),
         (("/RECORD", b"some_name", b"x" * 200_000), "field larger than"),
     ):
-        with pytest.raises(PackageIntegrityError, match=said):
+        with refused_dependency("integrity", match=said):
             check(rewritten(wheel, edit=edit))
     for data in (b"", b"PK\5\6" + bytes(18), b"no zip"):
         wheel.write_bytes(data)
-        with pytest.raises(PackageIntegrityError, match="is not taken"):
+        with refused_dependency("integrity", match="is not taken"):
             check(wheel)
 
 
@@ -142,7 +142,7 @@ def test_bounds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, bound: str, val
     wheel = make_wheel(tmp_path, "some-name", files={f"some_name/{n}": "" for n in range(300)})
     check(wheel)
     monkeypatch.setattr(wheels, bound, value)
-    with pytest.raises(PackageIntegrityError, match="too large" if value > 1 else None):
+    with refused_dependency("integrity", match="too large" if value > 1 else None):
         check(wheel)
 
 
@@ -152,7 +152,7 @@ def test_metadata_are_read_to_their_bound(tmp_path: Path, monkeypatch: pytest.Mo
     bomb = rewritten(wheel, b"", zipfile.ZIP_DEFLATED, ("/METADATA", b"Name", bytes(32 << 20)))
     tracemalloc.start()
     try:
-        with pytest.raises(PackageIntegrityError, match="more than 1 MiB"):
+        with refused_dependency("integrity", match="more than 1 MiB"):
             check(bomb)
         assert tracemalloc.get_traced_memory()[1] < 16 << 20
     finally:

@@ -12,9 +12,10 @@ from envhub_sandbox.dependencies.interpreters import InstalledPackage
 from envhub_sandbox.dependencies.modules import Guess
 from envhub_sandbox.dependencies.request import PackageRequest
 from envhub_sandbox.dependencies.resolve import Lock
-from envhub_sandbox.errors import DependencyError, InterpreterUnavailableError
+from envhub_sandbox.errors import DependencyError
 from envhub_sandbox.sandboxes.docker import packages
 from envhub_sandbox.sandboxes.docker.packages import interpreter_fitting
+from tests.support.packages.refusals import refused_dependency
 
 OURS = interpreters.own()
 NEWER = replace(OURS, path="/opt/envhub-worker/bin/python", libc="99.0")
@@ -80,7 +81,7 @@ def test_one_of_another_kind_does_not(
 ) -> None:
     """A wheel that was chosen for the one may crash in the other; the text has the other way."""
     monkeypatch.setenv("PATH", "/nowhere")  # each interpreter there would be asked
-    with pytest.raises(InterpreterUnavailableError, match=said) as caught:
+    with refused_dependency("interpreter", match=said) as caught:
         interpreter_fitting(theirs, declares())
     assert "envhub image build" in str(caught.value)
 
@@ -91,7 +92,7 @@ def test_the_images_python_is_the_one_that_there_is() -> None:
         declares(python="/usr/bin/python3"),
         declares(supports=">=3.99"),
     ):
-        with pytest.raises(InterpreterUnavailableError, match="the image has"):
+        with refused_dependency("interpreter", match="the image has"):
             interpreter_fitting(NEWER, request)
 
 
