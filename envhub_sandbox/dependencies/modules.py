@@ -30,10 +30,11 @@ from envhub_worker.protocol.text import printable
 if TYPE_CHECKING:
     from envhub_sandbox.dependencies.declared import DeclaredPackages, WantedPackage
 
-_FORMAT = 1
+_FORMAT = 2
 _READ: dict[tuple[Path, str], tuple[tuple[str, str, int], ...]] = {}
 _MOST = 64
 _SHOWN = 20
+_LONGEST = 100
 _MISSING = r"No module named '([\w.]+)'"
 _WORKERS = {"cloudpickle", "gymnasium", "msgpack", "numpy", "farama_notifications"}
 """Modules that are in every jail."""
@@ -48,8 +49,17 @@ _GYMNASIUM = (
         ("Box2D", "gymnasium[box2d]", "box2d box2d-py"),
     ),
     (r"ALE/.*", ("ale_py", "gymnasium[atari]", "ale-py")),
+    (
+        r"(CartPole|MountainCar|MountainCarContinuous|Pendulum|Acrobot)-v\d drawn",
+        ("pygame", "gymnasium[classic-control]", "pygame pygame-ce"),
+    ),
+    (
+        r"(Blackjack|CliffWalking|CliffWalkingSlippery|FrozenLake|FrozenLake8x8|Taxi)-v\d drawn",
+        ("pygame", "gymnasium[toy-text]", "pygame pygame-ce"),
+    ),
 )
-"""Environments of Gymnasium's that need an extra of it: by the texts of their ids."""
+"""Environments of Gymnasium's that need an extra of it: by the texts of their ids, and whether they
+are drawn."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +107,8 @@ def _guessed(root: Path, rows: tuple[tuple[str, str, int], ...]) -> tuple[Guess,
         if known is not None and len(found) < _MOST:
             module, requirement, brought_by = known
             wanted = parse_requirement(
-                requirement, f"{printable(file, 200)}, line {line}, which needs {module}"
+                requirement,
+                f"{printable(file, 200)}, line {line}, which needs {module}" if line else file,
             )
             found.setdefault(requirement, Guess(module, wanted, tuple(brought_by)))
     return tuple(found.values())
@@ -171,12 +182,35 @@ def read(snapshot: Snapshot) -> tuple[tuple[str, str, int], ...]:
     return _READ[place]
 
 
-def _recalled(snapshot: Snapshot) -> tuple[tuple[str, str, int], ...]:
-    folder = cache_root() / "imports"
+def note_missing(snapshot: Snapshot, said: str) -> bool:
+    """Remember that a repository's packages import a module, by the text of an error; False where
+    that was known, or it is not known what brings it.
+
+    Trust: text from the worker. It chooses among the modules of our table, as an entry file can.
+    """
+    from envhub_sandbox.hub.sources.parsing import of_module
+
+    module = found[1][:_LONGEST] if (found := re.search(_MISSING, said)) else ""
+    known = read(snapshot)
+    names = {name.partition(".")[0] for name, _, _ in known}
+    if not of_module(module) or module.partition(".")[0] in names or len(known) >= _MOST:
+        return False
+    rows = *known, (module, f"a package of it, which imports {module}", 0)
+    _READ[snapshot.root, snapshot.path] = rows
+    keep(*_place(snapshot), json.dumps(rows))
+    return True
+
+
+def _place(snapshot: Snapshot) -> tuple[Path, str]:
+    """The folder and the name of what is remembered of a commit."""
     facts = json.dumps([_FORMAT, sys.version_info[:2], snapshot.commit, snapshot.path])
-    key = hashlib.sha256(facts.encode()).hexdigest()
+    return cache_root() / "imports", hashlib.sha256(facts.encode()).hexdigest()
+
+
+def _recalled(snapshot: Snapshot) -> tuple[tuple[str, str, int], ...]:
+    place = _place(snapshot)
     with contextlib.suppress(ValueError, TypeError):
-        rows = json.loads(recall(folder, key) or "")
+        rows = json.loads(recall(*place) or "")
         return tuple((str(name), str(file), int(line)) for name, file, line in rows)
     from envhub_sandbox.hub.sources import parsing
 
@@ -184,7 +218,7 @@ def _recalled(snapshot: Snapshot) -> tuple[tuple[str, str, int], ...]:
     found = [(one.module, one.file, one.line) for one in parsing.imports(snapshot, files)]
     found = [row for row in found if row[0] not in _WORKERS]
     rows = [*found, *(row for row in parsing.ids(snapshot, files) if _of_id(row[0]))]
-    keep(folder, key, json.dumps(rows))
+    keep(*place, json.dumps(rows))
     return tuple(rows)
 
 
@@ -216,7 +250,7 @@ class MissingModule:
 
     def _where(self, module: str) -> str:
         for name, file, line in read(self.snapshot) if module else ():
-            if name.partition(".")[0] == module.partition(".")[0]:
+            if line and name.partition(".")[0] == module.partition(".")[0]:
                 return f" {printable(file, 200)}, line {line} imports {name}."
         return ""
 

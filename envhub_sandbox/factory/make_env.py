@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from envhub_sandbox.dependencies.modules import MissingModule
+from envhub_sandbox.dependencies.modules import MissingModule, note_missing
 from envhub_sandbox.dependencies.packages import (
     PackageSet,
     lock_checker,
@@ -18,7 +18,7 @@ from envhub_sandbox.dependencies.packages import (
     packages_for,
 )
 from envhub_sandbox.dependencies.request import Choice, chosen
-from envhub_sandbox.errors import PolicyError, SandboxUnavailableError
+from envhub_sandbox.errors import DependencyError, PolicyError, SandboxUnavailableError
 from envhub_sandbox.factory.env_factory import EnvFactory
 from envhub_sandbox.hub.snapshot import Snapshot, snapshot_named
 from envhub_sandbox.hub.sources.assets import with_assets
@@ -163,6 +163,26 @@ def _make(cfg: Any, given: Options) -> EnvSuites:
     snapshot = snapshot_named(reference, **options.source)
     locked = wanted.lock.assets if wanted.lock is not None else ()
     snapshot = with_assets(snapshot, options.assets, options.hub, locked)
+    while True:
+        try:
+            suites = _suites(snapshot, config, wanted, options)
+            break
+        except DependencyError as error:
+            if error.reason != "module" or not _may_infer(wanted):
+                raise
+            if not note_missing(snapshot, str(error)):
+                raise
+    return opened_again(suites) if options.trust_remote_code else suites
+
+
+def _may_infer(wanted: _Plan) -> bool:
+    """Whether packages are ours to choose, and may be more than what is declared."""
+    ours = wanted.lock is None and wanted.place.package_target() is not None
+    return ours and wanted.choice.infer and wanted.choice.where != "host"
+
+
+def _suites(snapshot: Snapshot, config: Any, wanted: _Plan, options: Options) -> EnvSuites:
+    """The environments of a snapshot. Raises ``DependencyError``."""
     packages = _packages(snapshot, wanted)
     load = m.Load(
         n_envs=options.n_envs,
@@ -199,13 +219,12 @@ def _make(cfg: Any, given: Options) -> EnvSuites:
             snapshot, wanted.place.name, wanted.choice.where, wanted.python, own
         ).advice,
     )
-    suites = EnvFactory(
+    return EnvFactory(
         _launchers(repository, wanted.place, options),
         options.num_workers,
         _ahead(wanted, options),
         lock_checker(wanted.lock, snapshot.label, load.env_kwargs, config),
     ).make()
-    return opened_again(suites) if options.trust_remote_code else suites
 
 
 def _launchers(repository: Repository, place: Sandbox, options: Options) -> list[Launcher]:

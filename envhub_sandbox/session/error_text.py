@@ -94,6 +94,15 @@ _HUB = (
     r"[Oo]utgoing traffic has been disabled"
 )
 _INSTALL = r"\b(pip|pip3|uv|conda)\b[^\n]{0,80}\b(install|add|sync)\b"
+_REQUIREMENT = (
+    r"(?<![\w.-])[A-Za-z0-9](?:[\w.-]{0,98}[A-Za-z0-9])?(?:\[[\w.,-]{1,99}\])?"
+    r"(?:[<>=!~]=?[\w.*,<>=!~]{0,98}[\w*])?(?![\w+:/@])"
+)
+_COMMAND = (
+    r"(?P<quote>[`'\"]?)(?:python3? -m )?\b(?:pip3?|uv(?: pip)?|conda) (?:install|add) "
+    rf"(?:(?:-U|-q|--upgrade|--quiet|--user|-y) )*['\"]?(?P<first>{_REQUIREMENT})['\"]?"
+    rf"(?P<more>(?: ['\"]?{_REQUIREMENT}['\"]?)*(?P=quote))?"
+)
 _NO_FAMILY = r"\[Errno 97\]|[Aa]ddress family not supported"
 _DOWNLOAD = (
     r"\bgit\b[^\n]{0,80}\b(clone|fetch|pull|submodule|lfs)\b|\b(wget|curl|aria2c)\b|"
@@ -105,6 +114,9 @@ _DISPLAY = (
     r"(connect|open|find)[^\n]{0,20} (X server|[Xx]?[ -]?display)|Qt platform plugin|"
     r"No available video device|Failed to (initialize GLFW|create window)"
 )
+_INPUT = r"EOFError: EOF when reading a line"
+_NO_LIBRARY = r"(unable|fail|can ?not|could not|no such|not found|not available)"
+_OSMESA = rf"(?i)osmesa[^\n]{{0,80}}{_NO_LIBRARY}|{_NO_LIBRARY}[^\n]{{0,80}}osmesa|glGetError"
 _TEXT_CHARS = 65_536
 
 
@@ -133,7 +145,7 @@ def _advice(text: str, policy: Policy) -> str:
             return (
                 "A jail has no network and cannot install packages: name the packages in the "
                 "repository's requirements.txt, or with "
-                f"{option_name('dependencies', {'extra': ['PACKAGE']})}"
+                f"{option_name('dependencies', {'extra': _to_install(text)})}"
             )
         if re.search(_NO_FAMILY, text) and policy.network == "none":
             return (
@@ -145,7 +157,28 @@ def _advice(text: str, policy: Policy) -> str:
                 "A jail has no network: put what it downloads into the repository, or into one on "
                 f"the Hub that {option_name('assets', ['org/repo@COMMIT'])} names"
             )
+    if re.search(_INPUT, text):
+        return (
+            "It asked for input, and a jail has no terminal: its author puts the answer into a "
+            "file or a variable that the program reads instead; you give a variable with "
+            f"{option_name('policy', {'environment': {'NAME': 'VALUE'}})}"
+        )
+    if re.search(_OSMESA, text):
+        return (
+            "This machine lacks the library that it draws by: install it (on Debian and Ubuntu: "
+            "apt-get install libosmesa6 for MUJOCO_GL=osmesa, libegl1 for egl), or have it draw "
+            f"by EGL, with {option_name('policy', {'environment': {'MUJOCO_GL': 'egl'}})}"
+        )
     return _of_display(text, policy)
+
+
+def _to_install(text: str) -> list[str]:
+    """The packages of a command that a text quotes."""
+    found = re.search(_COMMAND, text.replace("', '", " "))
+    if found is None:
+        return ["PACKAGE"]
+    quoted_whole = found["quote"] and found["more"]
+    return [found["first"], *(re.findall(_REQUIREMENT, found["more"]) if quoted_whole else [])]
 
 
 def _of_display(text: str, policy: Policy) -> str:

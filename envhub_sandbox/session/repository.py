@@ -286,6 +286,8 @@ class Repository:
             advice = "" if "__notes__" in vars(error) else why_missing(error, self.snapshot)
             if isinstance(error, DependencyError) and not str(error).startswith(self.label):
                 error.args = (f"{error}. {advice or self._advice(str(error))}",)
+            elif isinstance(error, ModuleNotFoundError) and "__notes__" not in vars(error):
+                error.args = (f"{error.args[0]}\n{advice or self._advice(str(error))}",)
             elif advice and advice not in str(error):
                 error.args = (f"{error.args[0]}\n{advice}", *error.args[1:])
             name_source(error, self.label)

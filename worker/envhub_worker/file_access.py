@@ -9,7 +9,9 @@ import errno
 import os
 import stat
 import sys
+from importlib import metadata
 
+_PACKAGES = "the packages"
 _REFUSALS = (errno.EACCES, errno.EPERM, errno.EROFS)
 
 
@@ -67,11 +69,17 @@ def why_file_unwritable(error: BaseException, root: str) -> str:
             "another file there, and os.chmod(path, 0o755) makes it this jail's own, to be written "
             "or run: the Hub does not say which of its files are programs"
         )
+    cure = (
+        'use profile "strict" on Linux 5.11 or later, where a jail writes to its own copy of the '
+        "repository and of its packages; `envhub doctor` says what this host lacks"
+    )
+    if place == _PACKAGES and _within(path, sys.prefix):  # an interpreter's, which others share
+        cure = (
+            f"give it packages of its own, with dependencies={{'extra': [{_distribution(path)!r}]}}"
+        )
     return (
         f"{path} is in {place}, which is read-only in this jail. Write to tempfile.mkdtemp(), or "
-        'use profile "strict" on Linux 5.11 or later, where a jail writes to its own copy of '
-        "the repository and of its packages (dependencies=); `envhub doctor` says what this host "
-        "lacks"
+        f"{cure}"
     )
 
 
@@ -90,7 +98,14 @@ def why_no_terminal(error: BaseException) -> str:
 def _place(path: str, root: str) -> str:
     if root and _within(path, root):
         return "the repository"
-    return "the packages" if any(_within(path, folder) for folder in sys.path if folder) else ""
+    return _PACKAGES if any(_within(path, folder) for folder in sys.path if folder) else ""
+
+
+def _distribution(path: str) -> str:
+    """The distribution that has brought the package of a file, or the name of the package."""
+    folder = max((one for one in sys.path if one and _within(path, one)), key=len)
+    package = os.path.relpath(path, folder).split(os.sep)[0]
+    return metadata.packages_distributions().get(package, [package])[0]
 
 
 def _within(path: str, folder: str) -> bool:

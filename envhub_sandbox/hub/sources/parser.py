@@ -42,6 +42,8 @@ _OUTSIDE = re.compile(
     r"|(HF|HUGGING|GITHUB|GH|GITLAB|AWS|AZURE|GOOGLE|OPENAI|ANTHROPIC|WANDB)[A-Z_]*"
     r"_(TOKEN|SECRET|PASSWORD|KEY)[A-Z_]*"
 )
+DRAWN = " drawn"
+"""Behind an id that is made with a ``render_mode``."""
 _ID = re.compile(r"[A-Za-z0-9_./-]{1,80}-v\d{1,3}")
 _ENTRY_POINT = re.compile(r"([A-Za-z_][\w.]*):([A-Za-z_]\w*)")
 _MISSING = {"BaseException", "Exception", "ImportError", "ModuleNotFoundError"}
@@ -142,6 +144,7 @@ def _rows(tree: ast.Module) -> dict[str, list[Any]]:
                 found["imports"].append(
                     [*(0, module, names, id(node) in required, node.lineno), place]
                 )
+            found["ids"] += [[f"{text}{DRAWN}", node.lineno] for text in _drawn(node)]
         elif isinstance(node, ast.Constant) and isinstance(node.value, str):
             found["texts"] += _text(node)
             if _ID.fullmatch(node.value):
@@ -200,6 +203,18 @@ def _imported_by_name(called: list[str], node: ast.Call) -> Iterator[tuple[str, 
         text = value[:LONGEST] if isinstance(value, str) else ""
         if keyword.arg == "entry_point" and (found := _ENTRY_POINT.fullmatch(text)):
             yield found[1], [found[2]]
+
+
+def _drawn(node: ast.Call) -> Iterator[str]:
+    """Ids that a call names beside a ``render_mode``."""
+    given = {keyword.arg: keyword.value for keyword in node.keywords}
+    mode = given.get("render_mode")
+    if mode is None or (isinstance(mode, ast.Constant) and mode.value is None):
+        return
+    for value in (*node.args, *filter(None, [given.get("id")])):
+        text = _constant([value])
+        if text and _ID.fullmatch(text):
+            yield text
 
 
 class _Meanings:

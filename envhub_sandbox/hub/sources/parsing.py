@@ -63,7 +63,7 @@ class ParsedFile:
         uses: Dotted names, called or not; ``[computed]`` for what is got by a computed name.
         texts: ``"outside"`` with a text that names a place beyond, or ``"wordless"``; its length.
         entries: The arguments of each ``make_env``.
-        ids: Texts such as ``"Ant-v5"``.
+        ids: Texts such as ``"Ant-v5"``, or ``"Ant-v5 drawn"`` where it is made with a render mode.
         definitions: The functions and classes at the top, each with the names that it uses; an
             empty one for what is beside them.
         encoding: Where it is neither UTF-8 nor ASCII, and so has not been read: its name, or an

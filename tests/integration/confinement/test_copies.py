@@ -195,7 +195,9 @@ def advice(path, mode):
         open(path, mode)
     except OSError as error:
         return raised(error, "step", {root!r}).message
-result = [advice({root!r} + "/new", "w"), advice({root!r} + "/env.py", "a")]
+import numpy
+places = [({root!r} + "/new", "w"), ({root!r} + "/env.py", "a"), (numpy.__path__[0] + "/new", "w")]
+result = [advice(*one) for one in places]
 """
 
 
@@ -212,7 +214,8 @@ def test_where_nothing_can_be_mounted_the_error_names_file_and_cure(how: str) ->
             cell = new_cell(spawner, make_snapshot(deep), confinement)
             cell.start()
             root = cell.jail.spec.snapshot
-            created, opened = outcome(cell, ADVICE.format(root=root))
+            created, opened, packages = outcome(cell, ADVICE.format(root=root))
+            assert "dependencies={'extra': ['numpy']}" in packages
             for text, path in ((created, f"{root}/new"), (opened, f"{root}/env.py")):
                 assert f"{path} is in the repository, which is read-only in this jail" in text
                 assert "on Linux 5.11 or later" in text
@@ -226,7 +229,7 @@ def test_a_shared_file_that_is_opened_to_write_says_how_to_replace_it(folder: Pa
     """Its mode is that of the store; its folder is the jail's own."""
     with cell_in(folder, STRICT) as cell:
         root = cell.jail.spec.snapshot
-        created, opened = outcome(cell, ADVICE.format(root=root))
+        created, opened, _ = outcome(cell, ADVICE.format(root=root))
         assert created is None
         assert f"{root}/env.py is shared and has mode 0444" in opened
         source = f"import os; os.chmod('env.py', 0o644); open({root!r} + '/env.py', 'a').write('#')"

@@ -99,7 +99,8 @@ PIP = "[sys.executable, '-m', 'pip', 'install', 'no-such-one']"
         ("from huggingface_hub import hf_hub_download as h; h('org/other', 'x')", "with assets="),
         (f"urllib.request.urlopen({URL!r})", "assets=['org/repo@COMMIT'] names"),
         (f"subprocess.run(['git', 'clone', {URL!r}, '/tmp/x'], check=True)", "] names"),
-        (f"subprocess.run({PIP}, check=True)", "dependencies={'extra': ['PACKAGE']}"),
+        (f"subprocess.run({PIP}, check=True)", "dependencies={'extra': ['no-such-one']}"),
+        ("input()", "policy={'environment': {'NAME': 'VALUE'}}"),
         ("subprocess.check_call('pip install -q no-such-one', shell=True)", "requirements.txt"),
         ("socket.create_server(('127.0.0.1', 0))", "policy={'network': 'loopback'}"),
         ("socket.create_connection(('localhost', 1))", "policy={'network': 'loopback'}"),
@@ -112,11 +113,7 @@ def test_what_is_not_there_fails_with_what_brings_it(env: Any, code: str, advice
     with pytest.raises(RemoteEnvError) as caught:
         env.call("run", code)
     assert advice in str(caught.value)
-    assert (
-        str(caught.value).count("a jail has no display")
-        + str(caught.value).count("A jail has no network")
-        == 1
-    )
+    assert str(caught.value).lower().count("a jail has no ") == 1
 
 
 def test_other_errors_get_no_advice(env: Any) -> None:

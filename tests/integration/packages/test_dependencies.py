@@ -8,6 +8,7 @@ import subprocess
 import sys
 import sysconfig
 import venv
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -94,6 +95,33 @@ def test_a_missing_module_and_its_cure(
     assert "NAME-OF" not in str(caught.value)
     with make_env(folder, dependencies={"extra": ["not-here"]}) as suites:
         assert suites.env.call("version") == ("2.0",)
+
+
+def test_what_a_package_imports_undeclared_joins_it(packages: Index, tmp_path: Path) -> None:
+    """Once its import has failed, and if our table knows what brings it: an index is never asked
+    for a name that a jail has made up. The next time it is known.
+    """
+    imports = {"forgets/__init__.py": "import six\nVERSION = six.VERSION\n"}
+    make_wheel(packages.folder, "forgets", files=imports)
+    make_wheel(packages.folder, "six", "1.5")
+    forgets = importing("forgets", version="forgets.VERSION")
+    folder = write_repository(tmp_path / "repo", forgets, requirements__txt="forgets\n")
+    with pytest.warns(UserWarning, match=r"six is installed, .*a package of it, which imports"):
+        made = make_env(folder)
+    with made as suites:
+        assert suites.env.call("version") == ("1.5",)
+        assert [one["module"] for one in suites.provenance["installed"]["inferred"]] == ["six"]
+    with warnings.catch_warnings(), make_env(folder, n_envs=2) as suites:
+        warnings.simplefilter("error")
+        assert suites.env.call("version") == ("1.5", "1.5")
+    with pytest.raises(DependencyError, match=r"dependencies={'extra': \['six'\]}"):
+        make_env(folder, dependencies="declared")
+    make_wheel(packages.folder, "made-up")
+    made_up = "raise ModuleNotFoundError(\"No module named 'made_up'\")\n"
+    asking = write_repository(tmp_path / "asks", made_up, requirements__txt="forgets\n")
+    with pytest.raises(DependencyError, match="made_up"):
+        make_env(asking)
+    assert not [path for path in packages.asked if "made" in path]
 
 
 FINDER = """

@@ -54,6 +54,11 @@ def requirements(found: Snapshot) -> list[str]:
         ("import importlib\nx = importlib.import_module('chess')" + MAKE, ["chess"]),
         ("import gymnasium\nx = gymnasium.make('Ant-v5')" + MAKE, ["gymnasium[mujoco]"]),
         (
+            "import gymnasium as g\ng.make('CartPole-v1', render_mode='human')\n"
+            "g.make('Taxi-v3', render_mode=None), g.make('Pendulum-v1')" + MAKE,
+            ["gymnasium[classic-control]"],
+        ),
+        (
             "x = 'LunarLander-v3', 'ALE/Pong-v5', 'CartPole-v1'" + MAKE,
             ["gymnasium[box2d]", "gymnasium[atari]"],
         ),

@@ -199,7 +199,17 @@ def advised(kind: str, message: str, network: str = "none") -> str:
     [
         ("huggingface_hub.errors.LocalEntryNotFoundError", "outgoing traffic ...", "assets="),
         ("OSError", "We couldn't connect to 'https://huggingface.co' to load", "assets="),
-        ("subprocess.CalledProcessError", "Command '['uv', 'pip', 'install', 'x']' ...", "extra"),
+        ("subprocess.CalledProcessError", "Command '['uv', 'pip', 'install', 'x']' ...", "['x']"),
+        (
+            "gymnasium.error.DependencyNotInstalled",
+            'pygame is not installed, run `pip install "gymnasium[classic-control]"`',
+            "{'extra': ['gymnasium[classic-control]']}",
+        ),
+        ("ImportError", "run `pip3 install -U a b[c]>=2` now", "{'extra': ['a', 'b[c]>=2']}"),
+        ("ImportError", "pip install git+https://x/y", "{'extra': ['PACKAGE']}"),
+        ("EOFError", "EOF when reading a line", "policy={'environment': {'NAME': 'VALUE'}}"),
+        ("ImportError", "('Unable to load OpenGL library', 'OSMesa: cannot open')", "libosmesa6"),
+        ("AttributeError", "'NoneType' object has no attribute 'glGetError'", "libosmesa6"),
         ("OSError", "[Errno 97] Address family not supported by protocol", "'loopback'"),
         ("subprocess.CalledProcessError", "Command '['git', '-C', 'x', 'pull']' ...", "assets="),
         ("socket.gaierror", "[Errno -3] Temporary failure in name resolution", "assets="),
