@@ -2,7 +2,7 @@
 
 A test asks for what it needs by the name of what it gets: ``inside.jail(env)``, and not by where
 that lies today. When the packages are arranged anew this file is changed, and no test is. So a
-test names nothing that starts with an underscore; ``test_imports`` finds who does. What is missing
+test names nothing that starts with an underscore; ruff finds who does. What is missing
 here is added here: a function, or a *spot*, which is an owner and a name, for
 ``monkeypatch.setattr(*inside.ending(env), interrupted)``.
 """
