@@ -237,7 +237,7 @@ class Builder:
         This is the one place that decides which lane an environment has.
         """
         server = loaded.server
-        if not self._manifest.shardable or not self._own:
+        if not self._own:
             return relay  # a runner has one lane, and environments of one jail share theirs
         if server.fd_path is None or self._repository.lane == "frames":
             from envhub_sandbox.transport.shared_memory.served_lane import ServedLane
@@ -245,12 +245,17 @@ class Builder:
             return ServedLane.open(relay, deadline)
         # late, for Linux alone has what they import
         from envhub_sandbox.transport.shared_memory.attachment import Attachment
+        from envhub_sandbox.transport.shared_memory.client_slabs import RING
+        from envhub_sandbox.transport.shared_memory.column_lane import ColumnLane
         from envhub_sandbox.transport.shared_memory.lane import SharedMemoryLane
 
-        attachment = Attachment(server.fd_path, loaded.jail.number, server.process_fd)
-        copy = self._repository.copy
-        lane = SharedMemoryLane.open(relay, attachment, deadline, copy=copy)
-        return lane or relay
+        slots = 1 if self._repository.copy else 1 + RING
+        for kind in (ColumnLane, SharedMemoryLane):
+            attachment = Attachment(server.fd_path, loaded.jail.number, server.process_fd)
+            lane = kind.open(relay, attachment, deadline, slots=slots)
+            if lane is not None:
+                return lane
+        return relay
 
     def _check_manifest(self, loaded: LoadedJail) -> None:
         key = (self._manifest.suite, self._manifest.task)

@@ -95,8 +95,8 @@ class Lane:
         parts = [actions]
         if len(bounds) > 1:
             parts = batches.split(self.declared.manifest.single_action_space, actions, bounds)
-        messages = [m.Step(self.number, part) for part in parts]
-        self.send_some("step", self.runners, list(map(self.jail.pack, messages)), ahead=ahead)
+        packed = [self.jail.pack(m.Step(self.number, part)) for part in parts]
+        self._send_to_all("step", packed, ahead=ahead)
 
     def wait(self, deadline: Deadline) -> None:
         """Until every shard has answered the step, with all that belongs to it.
@@ -136,7 +136,12 @@ class Lane:
             EnvHubError: Nothing was sent.
         """
         self._asked_ns = perf_counter_ns()
-        self.send_some(request.operation, self.runners, request.frames)
+        self._send_to_all(request.operation, request.frames)
+
+    def _send_to_all(
+        self, operation: str, packed: Sequence[Frames], *, ahead: bool = False
+    ) -> None:
+        self.send_some(operation, self.runners, packed, ahead=ahead)
 
     def send_some(
         self,

@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 
 from envhub_sandbox import make_env
-from envhub_sandbox.errors import RemoteEnvError, RemoteEnvWarning
+from envhub_sandbox.errors import RemoteEnvError, RemoteEnvWarning, RemoteProtocolError
+from tests.support import inside
+from tests.support.compare import assert_same
 from tests.support.repositories import write_repository
 
 _TIMED = """
@@ -368,3 +370,98 @@ def test_an_argument_that_gymnasium_refuses_is_refused(given: Any, tmp_path: Pat
     folder = write_repository(tmp_path, _TIMED)
     with pytest.raises(ValueError, match=next(iter(given)).partition("_")[0]):
         make_env(folder, 2, env_kwargs=given)
+
+
+_PLAIN = '''
+import gymnasium as gym
+import numpy as np
+import torch
+
+
+class Batch(gym.vector.VectorEnv):
+    """Steps all at once; what it returns changes its form from step to step."""
+
+    def __init__(self, n, mode, wide):
+        self.num_envs = n
+        self.metadata = {"autoreset_mode": gym.vector.AutoresetMode(mode)}
+        seen = gym.spaces.Dict({
+            "camera": gym.spaces.Box(0, 255, (60, 80, 3), np.uint8),
+            "joints": gym.spaces.Box(-9, 9, (wide,)),
+        })
+        self.single_observation_space = seen
+        self.single_action_space = gym.spaces.Box(-1, 1, (2,))
+        self.observation_space = gym.vector.utils.batch_space(seen, n)
+        self.action_space = gym.vector.utils.batch_space(self.single_action_space, n)
+        self.count, self.wide = 0, wide
+
+    def seen(self):
+        n, at = self.num_envs, self.count
+        camera = np.full((n, 60, 80, 3), at, np.uint8)
+        kinds = np.float32, np.float64, ">f4", np.int64
+        joints = np.full((n, self.wide), at / 7).astype(kinds[at // 9 % 4])
+        is_tensor = at % 2 and at < 9
+        return {"camera": camera, "joints": torch.as_tensor(joints) if is_tensor else joints}
+
+    def reset(self, *, seed=None, options=None):
+        self.count = 0 if seed is None else seed
+        return self.seen(), {"log": {"lr": 0.5}, "text": ["a", None]}
+
+    def step(self, actions):
+        self.count += 1
+        n, at = self.num_envs, self.count
+        if at == 5:
+            raise ValueError(f"no step {at}")
+        rewards = torch.as_tensor(actions).sum(1) if at % 3 else actions.sum(1)
+        done = np.arange(n) == at % n
+        infos = {
+            "distance": np.arange(n) / (at + 1), "_distance": ~done,
+            "log": {"loss": at / 3, "steps": at, "name": "run", "grad": torch.full((2,), at)},
+        }
+        if at % 4 == 1:
+            finals = np.full(n, None, dtype=object)
+            finals[at % n] = {name: part[0] for name, part in self.seen().items()}
+            infos |= {"final_obs": finals, "_final_obs": done, "final_info": {"r": done * 0.5}}
+        if at % 7 == 6:
+            infos["trace"] = np.arange(500_000) + at
+        flags = torch.as_tensor(done) if at % 5 == 2 else done
+        return self.seen(), rewards[:-1] if at == 8 else rewards, flags, ~done, infos
+
+    def call(self, name, *args):
+        return tuple(getattr(self, name) for _ in range(self.num_envs))
+
+
+def make_env(n_envs=1, use_async_envs=False, mode="NextStep", wide=3):
+    return Batch(n_envs, mode, wide)
+'''
+
+
+def _played(env: Any) -> list[Any]:
+    """What it returns and raises, and again once all of it has come."""
+    heard: list[Any] = [env.reset(seed=0)]
+    for number in range(40):
+        try:
+            heard.append(env.step(np.full((2, 2), number, np.float32)))
+        except (RemoteEnvError, RemoteProtocolError) as error:
+            heard.append(f"{type(error).__mro__[1].__name__}: {error}".partition("\n")[0])
+        if number % 10 == 0:
+            heard += [env.call("count"), env.reset() if number == 20 else env.get_attr("wide")]
+    return heard
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
+@pytest.mark.parametrize(("wide", "copy"), [(3, True), (20_000, False)])
+def test_an_own_vector_is_stepped_in_shared_memory_and_returns_the_same(
+    tmp_path: Path, mode: str, wide: int, copy: bool
+) -> None:
+    """Whatever it returns, also where that does not fit, or changes its form; and its errors."""
+    pytest.importorskip("torch")
+    folder = write_repository(tmp_path, _PLAIN)
+    options: dict[str, Any] = {"env_kwargs": {"mode": mode, "wide": wide}, "copy": copy}
+    with make_env(folder, 2, lane="frames", **options) as suites:
+        expected = _played(suites.env)
+    with make_env(folder, 2, **options) as suites:
+        actual = _played(suites.env)
+        assert inside.lane(suites.env) is not None
+    assert_same(expected, actual)
+    errors = [heard for heard in actual if isinstance(heard, str)]
+    assert ["no step 5" in errors[0], "rewards" in errors[1], len(errors)] == [True, True, 4]

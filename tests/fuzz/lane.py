@@ -11,12 +11,13 @@ from envhub_sandbox.transport.results import Results
 from envhub_sandbox.transport.shared_memory.client_slabs import (
     LaneShard,
     ObservationSlab,
+    SlotRing,
     infos_of,
 )
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import UNTRUSTED
 from envhub_worker.protocol.shared_memory import slabs
-from envhub_worker.protocol.stream import pack_packet
+from envhub_worker.protocol.shared_memory.packets import packet_bytes, write_packet
 from tests.attacks.client.lying_server import env_manifest
 from tests.fuzz.oracle import demand, fits, per_env, usable
 from tests.fuzz.targets import Dice, NotSentError, attempt, is_error, parts, spoiled_message
@@ -37,6 +38,8 @@ class Slabs:
         assert layout is not None
         self.observations = ObservationSlab(SPACE, observed)
         self.shard = LaneShard(layout, self.observations.fd)
+        self.slots = SlotRing(1, slabs.INFO_BYTES, slabs.INFO_BYTES)
+        self.slot = memory(self.slots.fd, slabs.INFO_BYTES)
         self.layout = layout
         self.reply = memory(self.shard.fds[1], slabs.REPLY_BYTES)
         self.batch = memory(self.observations.fd, observed.total_bytes)
@@ -71,11 +74,15 @@ def lane(dice: Dice) -> None:
         frames = dice.spoiler.frames(frames, dice.corpus)
     if len(frames) > 1 and rng.random() < 0.8:
         raise NotSentError
-    packet = b"".join(bytes(part) for part in pack_packet(0, frames))
+    packet = bytearray(packet_bytes(frames))
+    write_packet(packet, 0, len(packet), frames)
+    packet = bytes(packet)
     if rng.random() < 0.2:
         packet = dice.spoiler.raw(packet)
-    _put(ours, slabs.INFOS, frames[0])
-    _put(ours, slabs.ANSWER, packet)
+    _put(ours.reply, slabs.INFOS, frames[0])
+    _put(ours.reply, slabs.ANSWER, packet)
+    _put(ours.slot, 0, packet)
+    shard.write_message(m.pack(m.Render(1)), (0, 0, 0), rng.choice((None, ours.slots)))
     words[slabs.OUTCOME] = rng.choice((1, 2, 3, 4, 4, 0, 5, 2**64 - 1))
     in_answer = rng.random() < 0.4
     length = len(packet) if in_answer else len(frames[0])
@@ -100,6 +107,6 @@ def lane(dice: Dice) -> None:
     per_env("truncations", cut, "b", COUNT)
 
 
-def _put(ours: Slabs, start: int, data: bytes) -> None:
+def _put(slab: Any, start: int, data: bytes) -> None:
     room = data[: slabs.INFO_BYTES]
-    ours.reply[start : start + len(room)] = np.frombuffer(room, np.uint8)
+    slab[start : start + len(room)] = np.frombuffer(room, np.uint8)

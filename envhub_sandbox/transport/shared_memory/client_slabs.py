@@ -29,15 +29,17 @@ import numpy as np
 
 from envhub_sandbox.errors import RemoteProtocolError, WorkerDiedError, WorkerTimeoutError
 from envhub_sandbox.transport.deadline import Deadline
+from envhub_sandbox.transport.jail import Frames
 from envhub_sandbox.transport.lane import RECHECK_MS
 from envhub_sandbox.transport.replies import RunnersDiedError
 from envhub_sandbox.transport.results import Results
 from envhub_sandbox.transport.values import unpacked
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import UNTRUSTED
+from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 from envhub_worker.protocol.shared_memory import slabs
+from envhub_worker.protocol.shared_memory.packets import packet_bytes, read_packet, write_packet
 from envhub_worker.protocol.shared_memory.slabs import columns_of, own_infos
-from envhub_worker.protocol.stream import read_packet
 
 if TYPE_CHECKING:
     from envhub_worker.protocol.shared_memory.descriptors import Watch
@@ -62,8 +64,24 @@ def action_layouts(results: Results) -> list[slabs.Layout] | None:
     space = manifest.single_action_space
     found = [slabs.layout_of(space, stop - start) for start, stop in results.bounds]
     known = [layout for layout in found if layout is not None]
-    own = [manifest.own_batch(name) for name in ("action_space", "observation_space")]
-    return known if len(known) == len(found) and own == [None, None] else None
+    return known if manifest.shardable and len(known) == len(found) else None
+
+
+def message_layouts(results: Results, slots: int) -> list[tuple[slabs.Layout, int]] | None:
+    """The same where steps are messages, with the size of a slot for an answer; None where these
+    are too large.
+    """
+    manifest, layouts = results.manifest, []
+    observed, acted = manifest.single_observation_space, manifest.single_action_space
+    for start, stop in results.bounds:
+        count = stop - start
+        if not manifest.shardable:  # its batch may be another than that of the single space
+            observed, acted, count = manifest.observation_space, manifest.action_space, 1
+        layout, slot_bytes = slabs.message_layout(acted, count), slabs.answer_bytes(observed, count)
+        if layout is None or slot_bytes * slots > slabs.MAX_SLAB_BYTES:
+            return None
+        layouts.append((layout, slot_bytes))
+    return layouts
 
 
 class ShardSlabs:
@@ -76,6 +94,9 @@ class ShardSlabs:
         layout: Where everything lies.
         request: The memory of the request slab.
         reply: The memory of the reply slab.
+
+    Attributes:
+        told_bytes, answer_bytes: What messages and their answers have taken so far.
     """
 
     def __init__(self, layout: slabs.Layout, request: Any, reply: Any) -> None:
@@ -91,6 +112,9 @@ class ShardSlabs:
         self._told = False
         self._dtype: Any = None  # of the last actions, where these are one array
         self._only: Any = None  # the slab as such an array
+        self._answers = memoryview(reply)[slabs.ANSWER : slabs.ANSWER + slabs.INFO_BYTES]
+        self._answer_slots: SlotRing | None = None
+        self.told_bytes = self.answer_bytes = 0
 
     def write(self, leaves: Sequence[Any], wishes: Wishes) -> None:
         """Write a shard's actions."""
@@ -125,12 +149,21 @@ class ShardSlabs:
                 self._only = found[1]
                 self._dtype = array.dtype
 
-    def write_message(self, packet: bytes, wishes: Wishes) -> None:
-        """Write a message in the place of actions."""
-        start = self.layout.message
-        self._request[start : start + len(packet)] = packet
+    def has_room(self, frames: Frames) -> bool:
+        """Whether a message fits."""
+        return packet_bytes(frames) <= self.layout.request_bytes - self.layout.message
+
+    def write_message(self, frames: Frames, wishes: Wishes, slots: SlotRing | None = None) -> None:
+        """Write a message that ``has_room`` in the place of actions.
+        ``slots``: where the answer goes, into the chosen one; else it goes into the reply slab.
+        """
+        asks, start = self._asks, self.layout.message
         self._told = True
-        self._asks[slabs.MESSAGE] = len(packet)
+        length = write_packet(self._request, start, self.layout.request_bytes - start, frames)
+        asks[slabs.MESSAGE] = length
+        self.told_bytes += length
+        asks[slabs.TO_SLOT] = 0 if slots is None else 1 + slots.chosen
+        self._answer_slots = slots
         if wishes != self._wishes:
             self._wish(*wishes)
 
@@ -176,19 +209,21 @@ class ShardSlabs:
                 self._learn(message.value)
         return kind, message
 
-    def answer(self) -> m.Message | None:
+    def answer(self, limits: WireLimits = DEFAULT_LIMITS) -> m.Message | None:
         """The answer to a message; None if it did not fit. Trust: as ``outcome``."""
         kind, length = self._tells[slabs.OUTCOME], self._tells[slabs.LENGTH]
         if kind == slabs.FETCH:
             return None
-        if kind not in (slabs.DONE, slabs.RAISED) or length > slabs.INFO_BYTES:
+        slots = self._answer_slots
+        area = self._answers if slots is None else slots.bytes_of_chosen()
+        if kind not in (slabs.DONE, slabs.RAISED) or length > len(area):
             raise RemoteProtocolError("the worker wrote an impossible answer into its slab")
         if kind == slabs.RAISED:
             return self.outcome()[1]
-        start = slabs.ANSWER
+        self.answer_bytes += length
         with UNTRUSTED:
-            packet = read_packet(self._reply[start : start + length])
-        return unpacked(packet.frames)
+            frames = read_packet(area[:length], limits)
+        return unpacked(frames, limits=limits)
 
     def _learn(self, infos: dict[Any, Any]) -> None:
         start = slabs.INFOS
@@ -218,6 +253,7 @@ class ShardSlabs:
         """Give everything back."""
         self._asks.release()
         self._tells.release()
+        self._answers.release()
         # the maps go with the last array over them
 
 
@@ -269,9 +305,9 @@ class LaneShard(ShardSlabs):
         self.write(leaves, wishes)
         self._announce()
 
-    def tell(self, packet: bytes, wishes: Wishes) -> None:
-        """Write a message and announce it."""
-        self.write_message(packet, wishes)
+    def tell(self, frames: Frames, wishes: Wishes, slots: SlotRing | None = None) -> None:
+        """Write a message and announce it; as ``write_message``."""
+        self.write_message(frames, wishes, slots)
         self._announce()
 
     def _announce(self) -> None:
@@ -383,50 +419,39 @@ def by_shard(error: RunnersDiedError, asked: Sequence[int]) -> dict[int, WorkerD
     return {asked[place]: death for place, death in error.deaths.items()}
 
 
-class ObservationSlab:
-    """The slab that all shards write their rows into: observations, rewards and flags.
+class SlotRing:
+    """A slab of slots, of which the next batch goes into one that nobody holds.
 
     Args:
-        space: The single observation space.
-        layout: Where everything lies.
+        count, slot_bytes, total_bytes: Their number, the size of each and of the slab.
         received: Its memory, where that is shared with nobody; there is one slot then.
 
     Attributes:
         fd: Its descriptor, for the runners; -1 where there is none.
-        layout: Where everything lies.
+        count, slot_bytes: As given.
         chosen: The slot of the last batch.
     """
 
     def __init__(
-        self,
-        space: gym.Space[Any],
-        layout: slabs.ObservationLayout,
-        received: memoryview | None = None,
+        self, count: int, slot_bytes: int, total_bytes: int, received: memoryview | None = None
     ) -> None:
-        self.layout = layout
         self._memory: Any = received
+        self.count, self.slot_bytes = count, slot_bytes
         self.fd = -1
         if received is None:
             # late, for Linux alone has what it imports
             from envhub_worker.protocol.shared_memory.descriptors import sealed_memfd
 
-            self._memory, self._file = sealed_memfd("observations", layout.total_bytes)
+            self._memory, self._file = sealed_memfd("observations", total_bytes)
             self.fd = self._file.fileno()
-        self._assemble = slabs.assembler(space)
-        if layout.slots == 1:
+        if count == 1:
             self._slots = [self._memory]
         else:
-            self._slots = [
-                mmap.mmap(self.fd, layout.slot_bytes, offset=index * layout.slot_bytes)
-                for index in range(layout.slots)
-            ]
-        self._copies = [_copier(self._slots[_SPARE], leaf) for leaf in layout.leaves]
-        flat = len(self._copies) == 1 and not layout.leaves[0].path
-        self._single = self._copies[0] if flat else None
+            offsets = range(0, count * slot_bytes, slot_bytes)
+            self._slots = [mmap.mmap(self.fd, slot_bytes, offset=offset) for offset in offsets]
         # counted just as choose() does: a loop's variable would be one more
         self._unheld = [sys.getrefcount(self._slots[index]) for index in range(len(self._slots))]
         self.chosen = _SPARE
-        self._rewards, self._flags = slabs.results(self._memory, layout)
 
     def choose(self) -> int:
         """The slot for the next batch: the lowest that is not held, so that few stay hot."""
@@ -440,6 +465,42 @@ class ObservationSlab:
     def leave(self) -> None:
         """The next batch comes another way: the runners leave the slot that may be held."""
         self.chosen = _SPARE
+
+    def bytes_of_chosen(self) -> memoryview:
+        """The memory of the chosen slot, which counts as held while there is a view of it."""
+        return memoryview(self._slots[self.chosen])[: self.slot_bytes]
+
+    def close(self) -> None:
+        """Give the descriptor back; the memory goes with the last array over it."""
+        self._file.close()
+
+
+class ObservationSlab(SlotRing):
+    """The slab that all shards write their rows into: observations, rewards and flags.
+
+    Args:
+        space: The single observation space.
+        layout: Where everything lies.
+        received: As ``SlotRing`` has it.
+
+    Attributes:
+        layout: Where everything lies.
+    """
+
+    def __init__(
+        self,
+        space: gym.Space[Any],
+        layout: slabs.ObservationLayout,
+        received: memoryview | None = None,
+    ) -> None:
+        super().__init__(layout.slots, layout.slot_bytes, layout.total_bytes, received)
+        self.layout = layout
+        self._assemble = slabs.assembler(space)
+        self._copies = [_copier(self._slots[_SPARE], leaf) for leaf in layout.leaves]
+        flat = len(self._copies) == 1 and not layout.leaves[0].path
+        self._single = self._copies[0] if flat else None
+        self._rewards, self._flags = slabs.results(self._memory, layout)
+        self._unheld = [sys.getrefcount(self._slots[index]) for index in range(len(self._slots))]
 
     def take(self) -> Any:
         """The batch in the chosen slot, in the structure of the space."""
@@ -456,10 +517,6 @@ class ObservationSlab:
         flags = self._flags.astype(np.bool_)
         count = self.layout.count
         return self._rewards.copy(), flags[:count], flags[count:]
-
-    def close(self) -> None:
-        """Give the descriptor back; the memory goes with the last array over it."""
-        self._file.close()
 
 
 def _copier(slot: Any, leaf: slabs.Leaf) -> Callable[[], Any]:

@@ -18,14 +18,19 @@ import pytest
 from gymnasium import spaces
 
 from envhub_sandbox.errors import RemoteProtocolError
-from envhub_sandbox.transport.shared_memory.client_slabs import LaneShard, ObservationSlab
+from envhub_sandbox.transport.shared_memory.client_slabs import (
+    LaneShard,
+    ObservationSlab,
+    SlotRing,
+)
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.shared_memory import slabs
-from envhub_worker.protocol.stream import pack_packet
+from envhub_worker.protocol.shared_memory.packets import packet_bytes, write_packet
 
 pytestmark = pytest.mark.short
 
 WAIT_S = 60
+SLOT = 1 << 16
 
 
 @pytest.fixture
@@ -148,7 +153,7 @@ def test_an_impossible_header_is_refused(
     if asked == "outcome":
         shard.ask([np.zeros((2, 2), np.float32)], (0, 0, 0))
     else:
-        shard.tell(b"".join(pack_packet(0, m.pack(m.Render(1)))), (0, 0, 0))
+        shard.tell(m.pack(m.Render(1)), (0, 0, 0))
     words = f"struct.pack('QQ', {outcome}, {length})"
     attack(shard, f"os.pwrite(reply, {words}, {slabs.OUTCOME * 8})")
     with pytest.raises(RemoteProtocolError):
@@ -156,12 +161,18 @@ def test_an_impossible_header_is_refused(
 
 
 def _packets(*frames: bytes) -> str:
-    return repr(b"".join(b"".join(pack_packet(0, [frame])) for frame in frames))
+    return repr(b"".join(_packet(frame) for frame in frames))
+
+
+def _packet(*frames: bytes) -> bytes:
+    packet = bytearray(packet_bytes(frames))
+    assert write_packet(packet, 0, len(packet), frames) == len(packet)
+    return bytes(packet)
 
 
 def answers(shard: LaneShard, answer: str) -> None:
     """Tell the jail something; it answers with these bytes, a Python literal."""
-    shard.tell(b"".join(pack_packet(0, m.pack(m.Render(1)))), (0, 0, 0))
+    shard.tell(m.pack(m.Render(1)), (0, 0, 0))
     attack(
         shard,
         f"answer = {answer}\n"
@@ -245,3 +256,43 @@ def test_what_the_caller_has_is_not_rewritten(
     assert not terminations.any()
     assert not observation.any()
     assert observations.take().all()
+
+
+@pytest.mark.parametrize(
+    ("size", "spoiled", "refusal"),
+    [
+        (SLOT + 1, b"", "impossible answer"),
+        (2**64 - 1, b"", "impossible answer"),
+        (None, b"\x02", "neither 0 nor 1"),
+        (None, b"\x01", ""),
+    ],
+    ids=["long", "endless", "boolean", "control"],
+)
+def test_the_answer_to_a_step_is_copied_before_it_is_looked_at(
+    size: int | None, spoiled: bytes, refusal: str
+) -> None:
+    """In a slot of its own size, too; the control is read, and is not rewritten afterwards."""
+    layout = slabs.message_layout(spaces.Box(-1, 1, (2,)), 2)
+    assert layout is not None
+    ring = SlotRing(1, SLOT, SLOT)
+    shard = LaneShard(layout, ring.fd)
+    shard.tell(m.pack(m.Step(1, np.zeros((2, 2)))), (0, 0, 0), ring)
+    packet = _packet(*map(bytes, m.pack(m.Value(np.ones(20_000, bool)))))
+    assert len(packet) < SLOT
+    length = len(packet) if size is None else size
+    attack(
+        shard,
+        f"os.pwrite(observations, {packet!r}, 0)\n"
+        f"os.pwrite(observations, {spoiled!r}, {len(packet) - 100})\n"
+        f"os.pwrite(reply, struct.pack('QQ', {slabs.DONE}, {length}), {slabs.OUTCOME * 8})",
+    )
+    if refusal:
+        with pytest.raises(RemoteProtocolError, match=refusal):
+            shard.answer()
+    else:
+        answer = shard.answer()
+        attack(shard, f"os.pwrite(observations, bytes({SLOT}), 0)")
+        assert isinstance(answer, m.Value)
+        assert answer.value.all()
+    shard.close()
+    ring.close()

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from envhub_worker.protocol.errors import MessageTooLargeError, RemoteProtocolError
 from envhub_worker.protocol.limits import WireLimits
-from envhub_worker.protocol.stream import Packet, StreamReader, pack_packet, read_packet
+from envhub_worker.protocol.stream import Packet, StreamReader, pack_packet
 
 Plain = tuple[int, list[bytes]]
 LIMITS = WireLimits(header_bytes=1000, frame_bytes=10_000, message_bytes=12_000, frames=4)
@@ -51,14 +51,6 @@ def cut(data: bytes, cuts: list[int]) -> list[bytes]:
 def test_packets_arrive_whole_however_the_stream_is_cut(sent: list[Plain], cuts: list[int]) -> None:
     """What was packed comes out, in order, also byte by byte, and nothing before it is whole."""
     assert read(cut(on_the_wire(sent), cuts)) == sent
-
-
-def test_the_one_packet_of_a_slab_is_all_that_is_there() -> None:
-    data = on_the_wire([(0, [b"abc"])])
-    assert plain(read_packet(data)) == (0, [b"abc"])
-    for spoiled in (b"", data[:-1], data + b"\0", data * 2):
-        with pytest.raises(RemoteProtocolError):
-            read_packet(spoiled)
 
 
 def test_a_packet_is_whole_and_its_own() -> None:

@@ -36,19 +36,6 @@ def pack_packet(request_id: int, frames: Sequence[Buffer]) -> list[Buffer]:
     return [head + struct.pack(f"<{len(lengths)}Q", *lengths), *frames]
 
 
-def read_packet(data: Buffer, limits: WireLimits = DEFAULT_LIMITS) -> Packet:
-    """The one packet that the data is; its frames lie in the data.
-
-    Raises:
-        RemoteProtocolError: It is something else, or more, or less.
-    """
-    view = memoryview(data)
-    size, packet = _whole(view, limits, None)
-    if packet is None or size != view.nbytes:
-        raise RemoteProtocolError("this is not one packet")
-    return packet
-
-
 def _whole(
     data: memoryview, limits: WireLimits, check: Callable[[int], None] | None
 ) -> tuple[int, Packet | None]:
@@ -94,11 +81,12 @@ def _read_head(
     if check is not None:
         check(request_id)
     lengths = struct.unpack_from(f"<{(size - _PREFIX.size) // 8}Q", data, _PREFIX.size)
-    _check_lengths(lengths, limits)
+    check_lengths(lengths, limits)
     return request_id, lengths
 
 
-def _check_lengths(lengths: tuple[int, ...], limits: WireLimits) -> None:
+def check_lengths(lengths: tuple[int, ...], limits: WireLimits) -> None:
+    """Whether a message may have frames of these lengths. Raises ``MessageTooLargeError``."""
     if lengths[0] > limits.header_bytes:
         raise MessageTooLargeError(
             f"a header of {lengths[0]} bytes is over the limit of {limits.header_bytes}"

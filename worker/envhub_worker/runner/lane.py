@@ -18,9 +18,11 @@ from typing import Any
 import numpy as np
 
 from envhub_worker.protocol import messages as m
+from envhub_worker.protocol.limits import DEFAULT_LIMITS
 from envhub_worker.protocol.shared_memory import slabs
+from envhub_worker.protocol.shared_memory.packets import read_packet, write_packet
 from envhub_worker.protocol.spaces import batches
-from envhub_worker.protocol.stream import Packet, pack_packet, read_packet
+from envhub_worker.protocol.stream import Packet
 from envhub_worker.runner.prefixes import Watches
 from envhub_worker.runner.sync_envs import Pairs, SubEnvs
 
@@ -28,27 +30,30 @@ _RING = (1).to_bytes(8, "little")
 
 
 class Lane:
-    """One environment's steps.
+    """One environment's requests, each of which is a message; steps as well.
 
     Args:
-        attach: Which rows of the batch they are, and how many slots there are.
+        attach: How many slots there are.
         fds: Request slab, reply slab, observation slab, our doorbell, the client's. Owned from
             now on.
+        answer: Makes the frames of the answer to a message.
+        raised: Makes the message for an exception.
         warned: What the repository has warned of, and no reply has taken along: while there is
             something, answers are fetched by the server, with that in front of them.
         watches: What the client has had watched; what has changed of it goes the same way.
 
     Attributes:
+        has_columns: Whether steps have a layout of their own.
         unsent: The frames of the last answer, if it did not fit.
     """
 
+    has_columns = False
+
     def __init__(
         self,
-        env: SubEnvs,
         attach: m.Attach,
         fds: list[int],
         answer: Callable[[Packet], list[Any]],
-        pack: Callable[[m.Message], list[Any]],
         raised: Callable[[BaseException, str], m.RaisedException],
         warned: Sequence[Any],
         watches: Watches,
@@ -60,51 +65,21 @@ class Lane:
         self._warned = warned
         self._watches = watches
         self._watched, self._changed = watches.readings, watches.changed
-        layout = slabs.layout_of(env.single_action_space, env.num_envs)
-        observed = slabs.observation_layout(
-            env.single_observation_space, attach.count, attach.slots
-        )
-        if layout is None or observed is None:
-            raise ValueError("these spaces have no fixed layout")
         *slab_fds, self.bell, self._client_bell = fds
-        self._request = mmap.mmap(slab_fds[0], layout.request_bytes, prot=mmap.PROT_READ)
-        self._reply = mmap.mmap(slab_fds[1], slabs.REPLY_BYTES)
-        self._observations = mmap.mmap(slab_fds[2], observed.total_bytes)
+        request, reply, observations = [os.fstat(fd).st_size for fd in slab_fds]
+        self._request = mmap.mmap(slab_fds[0], request, prot=mmap.PROT_READ)
+        self._reply = mmap.mmap(slab_fds[1], reply)
+        self._observations = mmap.mmap(slab_fds[2], observations)
         for fd in slab_fds:
             os.close(fd)
         os.set_blocking(self.bell, False)
+        self._slot_bytes = observations // attach.slots
+        self._message = slabs.HEADER_BYTES
+        self._requested = memoryview(self._request)
         self._asked = slabs.words(self._request)
         self._told = slabs.words(self._reply)
         self._told[slabs.PARKED] = 1
-        self._layout = layout
-        self._env = env
-        self._assemble = slabs.assembler(env.single_action_space)
-        self._served = 0
-        self._codes: list[int] = []
-        self._takes: list[Callable[[], Any]] = []
-        self._pairs: Pairs = []
-        self._writer = InfoWriter(self._reply, slabs.INFOS, layout.count, pack, env.joined)
-        self._changes = self._cpu = self._spin_ns = 0
-        self._move(attach.start, observed)
-
-    def _move(self, start: int, observed: slabs.ObservationLayout) -> None:
-        """Have the environment write into the slabs."""
-        batch, count, stop = self._env.batch, observed.count, start + self._layout.count
-        rewards, flags = slabs.results(self._observations, observed)
-        bools = flags.view(np.bool_)
-        batch.rewards = rewards[start:stop]
-        batch.terminations = bools[:count][start:stop]
-        batch.truncations = bools[count:][start:stop]
-        bools[:count][start:stop] = bools[count:][start:stop] = False  # another may have died here
-        bases = [slot * observed.slot_bytes for slot in range(observed.slots)]
-        rows = [
-            [
-                slabs.view(self._observations, leaf, base=base)[start:stop]
-                for leaf in observed.leaves
-            ]
-            for base in bases
-        ]
-        batch.write_to(rows)
+        self._served = self._changes = self._cpu = self._spin_ns = 0
 
     def wake(self) -> bool:
         """After the doorbell: silence it, and serve while requests keep coming quickly.
@@ -149,24 +124,14 @@ class Lane:
             if changes != self._changes:
                 self._changes = changes
                 self._change()
-            if self._asked[slabs.MESSAGE]:
-                return self._run_message(self._asked[slabs.MESSAGE])
-            self.unsent = []  # what is fetched after this step are its infos
-            # copied, because an environment may keep its action and the client writes the next one
-            actions = self._assemble([take() for take in self._takes])
-            pairs = self._pairs = self._env.run_step(actions)
-            if (self._watched or self._warned) and self._has_more_to_say():
-                return slabs.FETCH, 0
-            integers, reward = self._env.integers, self._env.reward
-            if pairs or True in integers or reward:
-                return self._writer.write(pairs, integers, encoded=bool(reward))
-            return slabs.DONE, 0
+            length = self._asked[slabs.MESSAGE]
+            return self._run_message(length) if length else self._run_step()
         except BaseException as error:
             frame = _raised_frame(self._raised(error, "step"))
             if (self._watched or self._warned) and self._has_more_to_say():
                 self.unsent = [frame]
                 return slabs.FETCH, 0
-            return slabs.RAISED, self._writer.put(frame)
+            return slabs.RAISED, self._put(frame)
 
     def _has_more_to_say(self) -> bool:
         """After a step: whether there is something to be put in front of its answer."""
@@ -174,31 +139,125 @@ class Lane:
             self._watches.look()
         return bool(self._warned or self._changed)
 
+    def _run_step(self) -> tuple[int, int]:
+        raise ValueError("steps of this environment are messages")
+
+    def _put(self, frame: Any) -> int:
+        size = memoryview(frame).nbytes
+        self._reply[slabs.INFOS : slabs.INFOS + size] = frame
+        return size
+
     def _run_message(self, length: int) -> tuple[int, int]:
-        start = self._layout.message
-        packet = read_packet(self._request[start : start + length])
-        frames = self._answer(packet)
-        data = b"".join(pack_packet(packet.request_id, frames))
-        if self._warned or self._changed or len(data) > slabs.INFO_BYTES:
-            self.unsent = frames
+        start = self._message
+        request = read_packet(self._requested[start : start + length], DEFAULT_LIMITS)
+        frames = self.unsent = self._answer(Packet(0, request))
+        if self._warned or self._changed:
+            return slabs.FETCH, 0
+        slot = self._asked[slabs.TO_SLOT]
+        if slot:
+            start, size = (slot - 1) * self._slot_bytes, self._slot_bytes
+            written = write_packet(self._observations, start, size, frames)
+        else:
+            written = write_packet(self._reply, slabs.ANSWER, slabs.INFO_BYTES, frames)
+        if not written:
             return slabs.FETCH, 0
         self.unsent = []
-        start = slabs.ANSWER
-        self._reply[start : start + len(data)] = data
-        return slabs.DONE, len(data)
+        return slabs.DONE, written
 
     def leave_slot(self) -> None:
-        """Somebody may hold the batch that lies in the slot: write the next one elsewhere."""
+        """The next batch comes another way: do not write where somebody may hold one."""
+
+    def _change(self) -> None:
+        self._spin_ns = self._asked[slabs.SPIN]
+        if self._asked[slabs.CPU] != self._cpu:
+            self._keep_to(self._asked[slabs.CPU])
+
+    def _keep_to(self, cpu: int) -> None:
+        self._cpu = cpu
+        with contextlib.suppress(OSError):  # it may have gone, or not be ours
+            os.sched_setaffinity(0, {cpu - 1} if cpu else range(os.cpu_count() or 1))
+
+    def infos(self) -> dict[Any, Any]:
+        """The last step's infos, where they did not fit."""
+        return {}
+
+
+class ColumnLane(Lane):
+    """The same of plain sub-environments with spaces of a fixed layout: they are stepped out of one
+    slab into another.
+
+    Args:
+        env: What is stepped.
+        attach: Which rows of the batch they are as well.
+        pack: Makes the frames of infos.
+    """
+
+    has_columns = True
+
+    def __init__(
+        self, env: SubEnvs, pack: Callable[[m.Message], list[Any]], attach: m.Attach, *args: Any
+    ) -> None:
+        layout = slabs.layout_of(env.single_action_space, env.num_envs)
+        observed = slabs.observation_layout(
+            env.single_observation_space, attach.count, attach.slots
+        )
+        if layout is None or observed is None:
+            raise ValueError("these spaces have no fixed layout")
+        super().__init__(attach, *args)
+        self._message = layout.message
+        self._layout = layout
+        self._env = env
+        self._assemble = slabs.assembler(env.single_action_space)
+        self._codes: list[int] = []
+        self._takes: list[Callable[[], Any]] = []
+        self._pairs: Pairs = []
+        self._writer = InfoWriter(self._reply, slabs.INFOS, layout.count, pack, env.joined)
+        self._move(attach.start, observed)
+
+    def _move(self, start: int, observed: slabs.ObservationLayout) -> None:
+        """Have the environment write into the slabs."""
+        batch, count, stop = self._env.batch, observed.count, start + self._layout.count
+        rewards, flags = slabs.results(self._observations, observed)
+        bools = flags.view(np.bool_)
+        batch.rewards = rewards[start:stop]
+        batch.terminations = bools[:count][start:stop]
+        batch.truncations = bools[count:][start:stop]
+        bools[:count][start:stop] = bools[count:][start:stop] = False  # another may have died here
+        bases = [slot * observed.slot_bytes for slot in range(observed.slots)]
+        rows = [
+            [
+                slabs.view(self._observations, leaf, base=base)[start:stop]
+                for leaf in observed.leaves
+            ]
+            for base in bases
+        ]
+        batch.write_to(rows)
+
+    def _run_step(self) -> tuple[int, int]:
+        self.unsent = []  # what is fetched after this step are its infos
+        # copied, because an environment may keep its action and the client writes the next one
+        actions = self._assemble([take() for take in self._takes])
+        pairs = self._pairs = self._env.run_step(actions)
+        if (self._watched or self._warned) and self._has_more_to_say():
+            return slabs.FETCH, 0
+        integers, reward = self._env.integers, self._env.reward
+        if pairs or True in integers or reward:
+            return self._writer.write(pairs, integers, encoded=bool(reward))
+        return slabs.DONE, 0
+
+    def _put(self, frame: Any) -> int:
+        return self._writer.put(frame)
+
+    def leave_slot(self) -> None:
+        """See ``Lane``: the next one goes elsewhere."""
         self._env.batch.choose(0, carry=True)
         self._changes = -1
 
     def _change(self) -> None:
+        super()._change()
         asked = self._asked
-        self._spin_ns = asked[slabs.SPIN]
         # a message that moves is a reset: of some of the sub-environments, perhaps
         self._env.batch.choose(asked[slabs.SLOT], carry=bool(asked[slabs.MESSAGE]))
-        if asked[slabs.CPU] != self._cpu:
-            self._keep_to(asked[slabs.CPU])
         codes = asked[slabs.DTYPES : slabs.DTYPES + len(self._layout.actions)].tolist()
         if codes != self._codes:
             self._codes = codes
@@ -211,13 +270,8 @@ class Lane:
         view = slabs.view(self._request, leaf, slabs.ACTION_DTYPES[code])
         return view.tolist if listed else view.copy
 
-    def _keep_to(self, cpu: int) -> None:
-        self._cpu = cpu
-        with contextlib.suppress(OSError):  # it may have gone, or not be ours
-            os.sched_setaffinity(0, {cpu - 1} if cpu else range(os.cpu_count() or 1))
-
     def infos(self) -> dict[Any, Any]:
-        """The last step's infos."""
+        """See ``Lane``."""
         return self._env.joined(self._pairs)
 
 

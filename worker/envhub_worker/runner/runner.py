@@ -30,7 +30,7 @@ from envhub_worker.runner import gymnasium_compat as compat
 from envhub_worker.runner.copies import taken
 from envhub_worker.runner.described import described, raised
 from envhub_worker.runner.independence import Budget, are_independent
-from envhub_worker.runner.lane import Lane
+from envhub_worker.runner.lane import ColumnLane, Lane
 from envhub_worker.runner.prefixes import WarningLog, Watches
 from envhub_worker.runner.recording import standing_in
 from envhub_worker.runner.returned import misfit_in_vector
@@ -135,7 +135,7 @@ class Runner:
                 self.lane.leave_slot()
         try:
             reply = _HANDLERS[type(request)](self, request)
-            if by_lane and isinstance(reply, m.ResetDone):
+            if by_lane and isinstance(reply, m.ResetDone) and self.lane and self.lane.has_columns:
                 reply = m.Value(reply.info)  # the observation lies in the slab already
             return (self._pack_infos if type(request) in _WITH_INFOS else self._pack)(reply)
         except ResultError as error:
@@ -222,12 +222,19 @@ class Runner:
     def attach(self, request: m.Attach) -> m.Message:
         """Serve an environment's steps over slabs from now on."""
         env = self._envs[request.env]
-        if not isinstance(env, SubEnvs) or env.reward_shape:
+        options: tuple[Any, ...] = (
+            self.descriptors,
+            partial(self.reply, by_lane=True),
+            partial(raised, root=self._snapshot),
+            self.warned.pending,
+            self.watches,
+        )
+        if not request.count:
+            self.lane = Lane(request, *options)
+        elif isinstance(env, SubEnvs) and not env.reward_shape:
+            self.lane = ColumnLane(env, self._pack_infos, request, *options)
+        else:
             return m.Value(False)
-        reply = partial(self.reply, by_lane=True)
-        fail = partial(raised, root=self._snapshot)
-        fds, warned = self.descriptors, self.warned.pending
-        self.lane = Lane(env, request, fds, reply, self._pack_infos, fail, warned, self.watches)
         return m.Value(True)
 
     def fetch_infos(self, request: m.FetchInfos) -> m.Message:

@@ -98,7 +98,7 @@ def test_a_runner_is_told_all_after_an_interrupt(what: str, afterwards: tuple[st
             if what == "step":
                 ask(lane, "int32", 1)
             else:
-                lane.tell(b"packet", (1, 0, 0))
+                lane.tell([b"message"], (1, 0, 0))
 
         came = before_line(client_slabs.__file__, line, act)
         assert runner.asked(dtype, slot) == expected

@@ -176,7 +176,8 @@ class Close(Message, kind=81):
 class Attach(Message, kind=82):
     """Serve an environment's steps over the slabs and doorbells that come along. Reply: ``Value``.
 
-    The shard's rows of a batch of ``count`` begin at ``start``. False: it has no fixed layout.
+    The shard's rows of a batch of ``count`` begin at ``start``. If ``count`` is 0, steps are
+    messages, and a slot is for the answer to one. False: it has no fixed layout.
     """
 
     env: int

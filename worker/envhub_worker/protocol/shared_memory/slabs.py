@@ -13,7 +13,9 @@ length that it has not computed or bounded itself.
     reply         header | infos, encoded | the answer to a message, encoded
     observations  slot 0: one area per leaf | slot 1 ... | rewards, terminations, truncations
 
-``step`` goes this way, and messages that are small, both ways.
+``step`` goes this way, and messages that are small, both ways. Where spaces have no fixed layout,
+or the vector environment is the repository's own, a step is a message too: its actions lie where
+messages do, and its answer fills a slot of an observation slab that the shard has to itself.
 
 Infos as columns: the same small dict every step, without a codec.
 
@@ -58,6 +60,8 @@ DTYPE_CODES = {dtype: code for code, dtype in enumerate(ACTION_DTYPES)}
 _ACTION_ITEM_BYTES = 8
 _RESULT_BYTES = 8 + 1 + 1
 """A reward and two flags."""
+_ENV_INFO_BYTES = 256
+"""Room for a sub-environment's results beside its observation, where a step is a message."""
 
 Array = npt.NDArray[Any]
 
@@ -149,13 +153,42 @@ def observation_layout(space: gym.Space[Any], count: int, slots: int) -> Observa
     if None in leaves or len(leaves) > MAX_LEAVES:
         return None
     placed, slot_bytes = _placed(leaves, count, 0, None)
-    if slots > 1:  # each slot is a map of its own in the client
-        slot_bytes = -(-slot_bytes // mmap.ALLOCATIONGRANULARITY) * mmap.ALLOCATIONGRANULARITY
+    if slots > 1:
+        slot_bytes = _paged(slot_bytes)
     results = slot_bytes * slots
     total_bytes = _aligned(results + count * _RESULT_BYTES)
     if total_bytes > MAX_SLAB_BYTES:
         return None
     return ObservationLayout(count, placed, slots, slot_bytes, results, total_bytes)
+
+
+def message_layout(space: gym.Space[Any], count: int) -> Layout | None:
+    """The layout for steps that are messages: room for ``count`` actions of the space."""
+    request_bytes = HEADER_BYTES + INFO_BYTES + _message_bytes(space, count)
+    return (
+        Layout(count, (), HEADER_BYTES, request_bytes) if request_bytes <= MAX_SLAB_BYTES else None
+    )
+
+
+def answer_bytes(space: gym.Space[Any], count: int) -> int:
+    """The size of a slot for the answer to a step of ``count`` members of the space.
+
+    The observation may come twice, for ``final_obs``, and infos beside it. What takes more goes
+    over the server. Pages that are not written cost nothing.
+    """
+    return _paged(2 * _message_bytes(space, count) + count * _ENV_INFO_BYTES + INFO_BYTES)
+
+
+def _message_bytes(space: gym.Space[Any], count: int) -> int:
+    """Numbers may be wider than their space says; what has no fixed layout is not counted."""
+    leaves = [leaf for leaf in _leaves(space) if leaf is not None]
+    wide = ((1 if dtype.itemsize == 1 else _ACTION_ITEM_BYTES, shape) for _, dtype, shape in leaves)
+    return sum(_aligned(count * item_bytes * math.prod(shape)) for item_bytes, shape in wide)
+
+
+def _paged(size: int) -> int:
+    """Each slot of several is a map of its own in the client."""
+    return -(-size // mmap.ALLOCATIONGRANULARITY) * mmap.ALLOCATIONGRANULARITY
 
 
 def _leaves(space: gym.Space[Any], path: tuple[Any, ...] = ()) -> Iterator[Any]:

@@ -35,6 +35,9 @@ MESSAGE = 20
 KNOWN = 21
 """Request: bytes of the infos that the client knows the columns of. For the server alone, where it
 takes the steps: so much it sends of infos that came as columns."""
+TO_SLOT = 22
+"""Request: one more than the slot of the observation slab that the answer to a message is written
+into; 0 for the reply slab."""
 DTYPES = 24
 """Request: the dtype code of each action leaf, one word each, up to ``MAX_LEAVES``."""
 MAX_LEAVES = 64

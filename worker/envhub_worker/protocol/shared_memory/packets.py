@@ -1,0 +1,62 @@
+"""The frames of a message in a slab: their number, their lengths, and each at a cache line.
+
+They begin where arrays may begin, so that an array that came as a frame can be used where it lies.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from itertools import accumulate
+from typing import Any
+
+from envhub_worker.protocol.codec.wire import Buffer
+from envhub_worker.protocol.errors import RemoteProtocolError
+from envhub_worker.protocol.limits import WireLimits
+from envhub_worker.protocol.shared_memory.words import LINE
+from envhub_worker.protocol.stream import check_lengths
+
+_COUNT = struct.Struct("<Q")
+
+
+def _starts(lengths: Sequence[int]) -> list[int]:
+    """Where each frame begins, and one more frame would."""
+    sizes = [_COUNT.size * (1 + len(lengths)), *lengths]
+    return list(accumulate(-(-size // LINE) * LINE for size in sizes))
+
+
+def packet_bytes(frames: Sequence[Buffer]) -> int:
+    """What a packet of these frames takes."""
+    return _starts([memoryview(frame).nbytes for frame in frames])[-1]
+
+
+def write_packet(memory: Any, start: int, room: int, frames: Sequence[Buffer]) -> int:
+    """Write frames into a slab; returns the bytes that they take, or 0 if there is no room."""
+    lengths = [memoryview(frame).nbytes for frame in frames]
+    starts = _starts(lengths)
+    if starts[-1] > room:
+        return 0
+    head = struct.pack(f"<{1 + len(lengths)}Q", len(lengths), *lengths)
+    memory[start : start + len(head)] = head
+    for offset, length, frame in zip(starts, lengths, frames, strict=False):
+        memory[start + offset : start + offset + length] = frame
+    return starts[-1]
+
+
+def read_packet(memory: memoryview, limits: WireLimits) -> list[Buffer]:
+    """The frames of a packet; all but the first lie in the slab.
+
+    Trust: input from a peer that may write meanwhile. Each number is read once.
+    Raises ``RemoteProtocolError``: it is something else, or more, or less.
+    """
+    count = _COUNT.unpack_from(memory)[0] if len(memory) >= _COUNT.size else 0
+    if not 1 <= count <= min(limits.frames, len(memory) // _COUNT.size - 1):
+        raise RemoteProtocolError(f"a packet of {count} frames is outside 1..the limit")
+    lengths = struct.unpack_from(f"<{count}Q", memory, _COUNT.size)
+    check_lengths(lengths, limits)
+    starts = _starts(lengths)
+    if starts[-1] != len(memory):
+        raise RemoteProtocolError("this is not one packet")
+    pairs = zip(starts, lengths, strict=False)
+    header, *buffers = [memory[start : start + length] for start, length in pairs]
+    return [bytes(header), *buffers]
