@@ -147,7 +147,8 @@ note lerobot
     LeRobot's policies can play it, not only code for Gymnasium's vector environments.
     Cure: If it is not for LeRobot, change nothing. Otherwise see what `envhub init --lerobot`
     writes: observations agent_pos and pixels, a Box of one dimension as action,
-    _max_episode_steps, and info['is_success'] at the end of an episode.
+    _max_episode_steps, a whole number as metadata['render_fps'], and info['is_success'] at the end
+    of an episode.
 warning slow-steps
     Half of the steps take at most --slow-step, one second by default.
     Cure: Compute less in a step, or once in reset; do not wait for a clock.

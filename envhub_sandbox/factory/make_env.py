@@ -36,7 +36,7 @@ from envhub_sandbox.settings.policy import Limits, Policy, Timeouts, policy_from
 from envhub_sandbox.system import extras
 from envhub_sandbox.system.folders import cache_root
 from envhub_sandbox.system.platform import occupy_streams
-from envhub_sandbox.vector.suites import EnvSuites, opened_again
+from envhub_sandbox.vector.suites import EnvSuites, for_lerobot
 from envhub_sandbox.vector.tracebacks import short_traceback
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.records import dataclass
@@ -86,8 +86,9 @@ def make_env(
         n_envs: Number of sub-environments, passed to the repository's ``make_env``.
         use_async_envs: Also passed to it; if True, sub-environments may run in several processes.
         hub_cache_dir: huggingface_hub's ``cache_dir``.
-        trust_remote_code: Needed for ``sandbox=None`` only. If True, a ``reset`` after ``close``
-            opens the environment again, as one of LeRobot's ``make_env``.
+        trust_remote_code: Needed for ``sandbox=None`` only. If True, environments are as LeRobot's
+            ``make_env`` gives them: a ``reset`` after ``close`` opens one again, and the
+            ``render_fps`` in their metadata is an integer.
         sandbox: Where the code runs: ``"process"``; ``"docker"``, ``"docker:IMAGE"`` or a
             ``DockerSandbox``; ``"ray"`` or a ``RaySandbox``; ``"tcp://HOST:PORT"`` or a
             ``RemoteSandbox``. A list of these, or a ``Fleet``, spreads the sub-environments of each
@@ -172,7 +173,7 @@ def _make(cfg: Any, given: Options) -> EnvSuites:
                 raise
             if not note_missing(snapshot, str(error)):
                 raise
-    return opened_again(suites) if options.trust_remote_code else suites
+    return for_lerobot(suites) if options.trust_remote_code else suites
 
 
 def _may_infer(wanted: _Plan) -> bool:

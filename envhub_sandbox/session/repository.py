@@ -213,7 +213,7 @@ class Repository:
         places: Where each worker of an environment runs, or is to run.
         jail_numbers: Of the jails whose output goes to files of their own.
         latest_profile: Of that jail; in a container it may be less than the policy names.
-        opens_again: Whether a reset after ``close`` opens an environment anew.
+        for_lerobot: Whether LeRobot's programs use it: see ``serve_lerobot``.
     """
 
     def __init__(
@@ -249,7 +249,7 @@ class Repository:
         self.latest_report: list[dict[str, Any]] = []
         self.latest_profile: str | None = None
         self.places: list[str] = []
-        self.opens_again = False
+        self.for_lerobot = False
         self.recipe = recipe
         self.installed = installed
         self._advice = advice

@@ -14,7 +14,7 @@ from gymnasium.vector import VectorEnv
 from envhub_sandbox.session.repository import Recipe
 from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.system.log import WORKER, progress_shown
-from envhub_sandbox.vector.vector_env import SandboxVectorEnv, leave_suite
+from envhub_sandbox.vector.vector_env import SandboxVectorEnv, leave_suite, serve_lerobot
 from envhub_worker.protocol.text import parse_size, size_text
 
 T = TypeVar("T")
@@ -156,13 +156,11 @@ def closed_if_it_fails(suites: EnvSuites) -> Iterator[EnvSuites]:
         raise
 
 
-def opened_again(suites: EnvSuites) -> EnvSuites:
-    """The same, where a ``reset`` after ``close`` opens an environment anew, as LeRobot's lazy ones
-    do: an evaluation closes each, and may come again.
-    """
+def for_lerobot(suites: EnvSuites) -> EnvSuites:
+    """The same, for LeRobot's programs: see ``serve_lerobot``."""
     for env in [env for tasks in suites.values() for env in tasks.values()]:
         if isinstance(env, SandboxVectorEnv):
-            env._session.repository.opens_again = True
+            serve_lerobot(env)
     return suites
 
 

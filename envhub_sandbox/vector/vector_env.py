@@ -93,7 +93,7 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
         self.single_action_space = manifest.single_action_space
         self.observation_space = manifest.observation_space
         self.action_space = manifest.action_space
-        self.metadata = metadata_of(manifest)
+        self.metadata = metadata_of(manifest, whole=session.repository.for_lerobot)
         self.render_mode = manifest.render_mode
         # as in Gymnasium, where a SyncVectorEnv has none
         self.spec = self._spec_again(manifest.spec) if self._has_spec else None
@@ -196,11 +196,11 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
             prewarm.note_use()
 
     def _open_again(self) -> None:
-        """After a ``close`` that ``opens_again``: another life, with what it is and was told here.
+        """After a ``close`` by LeRobot: another life, with what it is and was told here.
 
         A fork does not: the place that the next one would start in is its parent's.
         """
-        if not (self.closed and self._again and self._session.repository.opens_again):
+        if not (self.closed and self._again and self._session.repository.for_lerobot):
             return
         with self._requests.use.lock:
             if self.closed and self._owner.is_here:
@@ -524,6 +524,14 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
         return VectorApart(self._reset, self._step, self._step_wait, results.own, results.each)
 
 
+def serve_lerobot(env: SandboxVectorEnv) -> None:
+    """Have it be what LeRobot's programs expect: ``reset`` after ``close`` opens it again, as with
+    LeRobot's lazy environments, and ``render_fps`` is an integer.
+    """
+    env._session.repository.for_lerobot = True
+    env.metadata = metadata_of(env._manifest, whole=True)
+
+
 def leave_suite(env: SandboxVectorEnv) -> None:
     """Have its first use start no other task of its suite: ``EnvSuites.map`` does that."""
     env._session.prewarm.on_first_use(lambda: None, lambda: False)
@@ -543,14 +551,22 @@ def refuse_limit(env: SandboxVectorEnv, steps: int | None) -> None:
         )
 
 
-def metadata_of(manifest: EnvManifest) -> dict[str, Any]:
-    """With the autoreset mode as Gymnasium's enum where it has one. Trust: the worker's words."""
+def metadata_of(manifest: EnvManifest, *, whole: bool = False) -> dict[str, Any]:
+    """With the autoreset mode as Gymnasium's enum where it has one. Trust: the worker's words.
+
+    What writes LeRobot's videos takes integers for ``render_fps``: 20.0 is one, and with ``whole``
+    the nearest one to 12.5.
+    """
+    metadata = dict(manifest.metadata)
+    rate = metadata.get("render_fps")
+    if rate is not None and (whole or rate == int(rate)):
+        metadata["render_fps"] = max(1, round(rate))
     mode: Any = manifest.autoreset_mode
     if mode is None:
-        return dict(manifest.metadata)
+        return metadata
     if hasattr(gym.vector, "AutoresetMode"):
         mode = gym.vector.AutoresetMode(mode)
-    return {**manifest.metadata, "autoreset_mode": mode}
+    return {**metadata, "autoreset_mode": mode}
 
 
 def _check_name(name: object) -> None:

@@ -108,6 +108,8 @@ def _fits(one: Any, mode: str) -> bool:
 # --- what LeRobot needs --------------------------------------------------------------------------
 
 _SEEN = ("agent_pos", "environment_state", "pixels")
+_PROCESSED = ("camera_obs", "policy", "robot_state")
+"""What LeRobot's own processors make these of."""
 _LONGEST = 100
 
 
@@ -127,7 +129,9 @@ def lerobot_lacks(
     """
     observations, actions = env.single_observation_space, env.single_action_space
     lacks = []
-    if not isinstance(observations, spaces.Dict) or not {*_SEEN} & {*observations.spaces}:
+    if not isinstance(observations, spaces.Dict) or not (
+        {*_SEEN, *_PROCESSED} & {*observations.spaces}
+    ):
         lacks.append(
             f"observations with {', '.join(_SEEN[:-1])} or {_SEEN[-1]}, not {_named(observations)}"
         )
@@ -140,6 +144,9 @@ def lerobot_lacks(
         others = ", ".join(sorted(map(repr, alike)))
         instead = f", not {printable(others, _LONGEST)}" if others else ""
         lacks.append(f"info['is_success'] at the end of an episode{instead}")
+    rate = getattr(env, "_manifest", env).metadata.get("render_fps")  # as the repository has it
+    if env.render_mode in FILMED and rate is not None and not hasattr(rate, "numerator"):
+        lacks.append(f"a whole number as metadata['render_fps'] for its videos, not {rate}")
     if lacks:
         yield f"LeRobot cannot evaluate it, which needs {'; '.join(lacks)}"
 

@@ -34,7 +34,7 @@ from envhub_sandbox.errors import EnvHubError, HubReferenceError
 from envhub_sandbox.factory.make_env import make_env
 from envhub_sandbox.hub.logins import without_login
 from envhub_sandbox.settings.options import OPTIONS, on_lerobots_command_line, use_option_names
-from envhub_sandbox.vector.suites import EnvSuites, closed_if_it_fails, keep_only, opened_again
+from envhub_sandbox.vector.suites import EnvSuites, closed_if_it_fails, for_lerobot, keep_only
 
 ASKS_CONFIGS = hasattr(EnvConfig, "create_envs")
 """Whether this LeRobot asks a configuration for its environments: 0.6 does, 0.4 and 0.5 do not."""
@@ -196,7 +196,7 @@ class SandboxedEnvConfig(EnvConfig):
     def _made(self, n_envs: int, use_async_envs: bool) -> EnvSuites:
         asked = {"n_envs": n_envs, "use_async_envs": use_async_envs, **self._options()}
         with use_option_names(on_lerobots_command_line()):
-            suites = opened_again(make_env(self.repo, **asked))
+            suites = for_lerobot(make_env(self.repo, **asked))
         with closed_if_it_fails(suites):
             keep_only(suites, self.suite, self.task)
         return suites

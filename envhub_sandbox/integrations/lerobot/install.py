@@ -17,7 +17,7 @@ import lerobot.envs.factory
 from envhub_sandbox.factory.make_env import make_env
 from envhub_sandbox.integrations.lerobot.config import ASKS_CONFIGS, SandboxedEnvConfig
 from envhub_sandbox.settings.options import OPTIONS
-from envhub_sandbox.vector.suites import EnvSuites, opened_again
+from envhub_sandbox.vector.suites import EnvSuites, for_lerobot
 from envhub_sandbox.vector.vector_env import SandboxVectorEnv
 
 _HELPERS = ("_download_hub_file", "_import_hub_module", "_call_make_env")
@@ -96,7 +96,7 @@ class _Routing:
             hub_cache_dir=module.hub_cache_dir,
             **self.options,
         )
-        return opened_again(suites)
+        return for_lerobot(suites)
 
 
 class _AsyncOrSandboxed(type):

@@ -84,14 +84,20 @@ PLAYABLE = spaces.Dict({"agent_pos": spaces.Box(-1, 1, (2,), np.float32)})
 VECTOR = spaces.Box(-1, 1, (2,), np.float32)
 
 
-def vector(observations: Any = PLAYABLE, actions: Any = VECTOR, *, limited: bool = True) -> Any:
+def vector(
+    observations: Any = PLAYABLE, actions: Any = VECTOR, *, limited: bool = True, fps: float = 30
+) -> Any:
     def get_attr(name: str) -> tuple[int, ...]:
         if not limited:
             raise AttributeError(name)
         return (100,)
 
     return SimpleNamespace(
-        single_observation_space=observations, single_action_space=actions, get_attr=get_attr
+        single_observation_space=observations,
+        single_action_space=actions,
+        get_attr=get_attr,
+        metadata={"render_fps": fps},
+        render_mode="rgb_array",
     )
 
 
@@ -103,6 +109,7 @@ def vector(observations: Any = PLAYABLE, actions: Any = VECTOR, *, limited: bool
         (vector(actions=spaces.Discrete(3)), r"a vector \(Box\) as action, not Discrete\(3\)"),
         (vector(actions=spaces.Box(0, 1, (2, 2))), r"not a Box of shape \(2, 2\)"),
         (vector(limited=False), "_max_episode_steps"),
+        (vector(fps=20.0), r"a whole number as metadata\['render_fps'\] for its videos, not 20.0"),
     ],
 )
 def test_what_it_lacks_is_one_text(env: Any, lacking: str) -> None:
