@@ -9,6 +9,7 @@ import json
 import os
 import sys
 import time
+import warnings
 from collections.abc import Callable
 from dataclasses import fields
 from inspect import signature
@@ -20,8 +21,9 @@ from gymnasium.vector import SyncVectorEnv
 from lerobot.configs import parser
 from lerobot.configs.eval import EvalPipelineConfig
 from lerobot.configs.train import TrainPipelineConfig
+from lerobot.configs.types import FeatureType, PolicyFeature
 from lerobot.envs import utils
-from lerobot.envs.configs import EnvConfig, IsaaclabArenaEnv
+from lerobot.envs.configs import EnvConfig, IsaaclabArenaEnv, LiberoEnv
 from lerobot.envs.factory import make_env
 from lerobot.envs.utils import env_to_policy_features, preprocess_observation
 
@@ -126,6 +128,62 @@ def described() -> None:
     envs = make_env(chosen, n_envs=2)
     FOUND["chosen"] = [list(env.get_attr("task")) for env in envs["near"].values()]
     FOUND["chosen shape"] = shape(envs)
+
+
+def processed() -> None:
+    """What a policy is given of observations in the forms of LIBERO and of Isaac Lab Arena: what
+    LeRobot's own configurations of these make of them, in the shapes of the features.
+    """
+    arena = {"state_keys": "robot_joint_pos,fingers", "camera_keys": "robot_pov_cam_rgb"}
+    own = {name: LiberoEnv().get_env_processors()[0] for name in ("libero", "declared")}
+    own["arena"] = IsaaclabArenaEnv(**arena).get_env_processors()[0]
+    for name, theirs in own.items():
+        with warnings.catch_warnings(record=True) as warned:
+            warnings.simplefilter("always")
+            chosen = arena if name == "arena" else {}
+            cfg = ours.SandboxedEnvConfig(repo=f"robots/{name}", **chosen)
+        envs = make_env(cfg, n_envs=2)
+        observation, _ = envs.env.reset(seed=[3, 4])
+        passed_on = preprocess_observation(observation)
+        seen, expected = (
+            {key: it for key, it in made(dict(passed_on)).items() if key.startswith("observation")}
+            for made in (cfg.get_env_processors()[0], theirs)
+        )
+        if name == "declared":
+            expected["observation.images.wrist"] = expected.pop("observation.images.image2")
+        features = env_to_policy_features(cfg)
+        features.pop("action")
+        FOUND[name] = [
+            seen.keys() == expected.keys() and all(seen[k].equal(expected[k]) for k in seen),
+            {key: list(seen[key].shape[1:]) for key in features if key in seen}
+            == {key: list(one.shape) for key, one in features.items()},
+            sorted(features),
+            ["not see scene of" in str(one.message) for one in warned],
+        ]
+        envs.close()
+    try:
+        ours.SandboxedEnvConfig(repo="robots/misdeclared")
+    except ValueError as error:
+        FOUND["misdeclared"] = "rename_observations_processor" in str(error)
+
+
+def merged() -> None:
+    """What is given of features, beside what the spaces say."""
+    names = {"agent_pos": "observation.state.arm"}
+    cfg = ours.SandboxedEnvConfig(repo="robots/reach", features_map=names)
+    FOUND["renamed"] = sorted(env_to_policy_features(cfg))
+    further = PolicyFeature(FeatureType.STATE, (9,))
+    try:
+        ours.SandboxedEnvConfig(repo="robots/reach", features={"touch": further})
+    except ValueError as error:
+        FOUND["unnamed"] = "--env.features_map=" in str(error)
+    touch = {"features": {"touch": further}, "features_map": {"touch": "observation.touch"}}
+    cfg = ours.SandboxedEnvConfig(repo="robots/reach", **touch)
+    FOUND["further"] = sorted(env_to_policy_features(cfg))
+    try:
+        ours.SandboxedEnvConfig(repo="robots/reach", features_map={"agent_psos": "observation.a"})
+    except ValueError as error:
+        FOUND["misspelt feature"] = "agent_pos" in str(error)
 
 
 def fails() -> None:
@@ -314,7 +372,8 @@ if __name__ == "__main__":
         waits,
         freezes,
         fails,
-        *((commands, said_once, written) if ours.config.ASKS_CONFIGS else ()),
+        merged,
+        *((processed, commands, said_once, written) if ours.config.ASKS_CONFIGS else ()),
     ):
         part()
     FOUND["plugin"] = __import__("lerobot_env_envhub_sandbox").SandboxedEnvConfig.__name__

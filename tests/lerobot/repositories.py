@@ -133,6 +133,90 @@ def make_env(n_envs=1, use_async_envs=False):
     return gym.vector.SyncVectorEnv([Seen] * n_envs)
 """
 
+LIBERO = """
+import gymnasium as gym
+import numpy as np
+from gymnasium.spaces import Box, Dict, Text
+
+camera, vector = Box(0, 255, (24, 32, 3), np.uint8), lambda *shape: Box(-1, 1, shape, np.float64)
+
+class Kitchen(gym.Env):
+    metadata = {"render_fps": 80}
+    observation_space = Dict({
+        "pixels": Dict({"image": camera, "image2": camera}),
+        "robot_state": Dict({
+            "eef": Dict({"pos": vector(3), "quat": vector(4), "mat": vector(3, 3)}),
+            "gripper": Dict({"qpos": vector(2), "qvel": vector(2)}),
+            "joints": Dict({"pos": vector(7), "vel": vector(7)}),
+        }),
+        "scene": Text(8),
+    })
+    action_space = Box(-1, 1, (7,))
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.observation_space.seed(seed)
+        return self.observation_space.sample(), {}
+
+def make_env(n_envs=1, use_async_envs=False):
+    return gym.vector.SyncVectorEnv([Kitchen] * n_envs)
+"""
+
+DECLARED = LIBERO.replace(
+    '{"render_fps": 80}',
+    """{"render_fps": 80, "env_preprocessor": {"steps": [
+        {"registry_name": "libero_processor"},
+        {"registry_name": "rename_observations_processor",
+         "config": {"rename_map": {"observation.images.image2": "observation.images.wrist"}}},
+    ]}}""",
+)
+
+ARENA = """
+import gymnasium as gym
+import torch
+from gymnasium.spaces import Box, Dict
+
+camera = Box(0, 255, (16, 24, 3), "uint8")
+
+class Arena(gym.vector.VectorEnv):
+    metadata = {"render_fps": 50, "autoreset_mode": gym.vector.AutoresetMode.SAME_STEP}
+    single_action_space = Box(-1, 1, (3,))
+
+    def __init__(self, num_envs):
+        states = Dict({"robot_joint_pos": Box(-9, 9, (4,)), "fingers": Box(-9, 9, (2, 3))})
+        cameras = Dict({"robot_pov_cam_rgb": camera, "front": camera})
+        self.single_observation_space = Dict({"policy": states, "camera_obs": cameras})
+        self.num_envs = num_envs
+        self.observation_space = gym.vector.utils.batch_space(
+            self.single_observation_space, num_envs
+        )
+        self.action_space = gym.vector.utils.batch_space(self.single_action_space, num_envs)
+
+    def _seen(self):
+        image = (torch.arange(16 * 24 * 3) % 251).to(torch.uint8).reshape(1, 16, 24, 3)
+        images = image.expand(self.num_envs, -1, -1, -1)
+        at = torch.arange(4.0).expand(self.num_envs, 4) + self.steps
+        return {
+            "policy": {"robot_joint_pos": at, "fingers": torch.ones(self.num_envs, 2, 3)},
+            "camera_obs": {"robot_pov_cam_rgb": images, "front": images},
+        }
+
+    def reset(self, *, seed=None, options=None):
+        self.steps = 0
+        return self._seen(), {}
+
+    def step(self, actions):
+        self.steps += 1
+        rewards, ends = torch.full((self.num_envs,), 0.5), torch.full((self.num_envs,), False)
+        return self._seen(), rewards.numpy(), ends.numpy(), (~ends).numpy(), {}
+
+    def call(self, name, *args, **kwargs):
+        return {"_max_episode_steps": (3,) * self.num_envs}[name]
+
+def make_env(n_envs=1, use_async_envs=False, cfg=None):
+    return Arena(n_envs)
+"""
+
 
 def publish(olah: OlahServer) -> dict[str, str]:
     """Everything that the pages load; the commits, by name."""
@@ -145,6 +229,10 @@ def publish(olah: OlahServer) -> dict[str, str]:
         "cartpole": {"env.py": CARTPOLE},
         "pendulum": {"env.py": PENDULUM},
         "cameras": {"env.py": CAMERAS},
+        "libero": {"env.py": LIBERO},
+        "declared": {"env.py": DECLARED},
+        "misdeclared": {"env.py": DECLARED.replace("libero_processor", "os.system")},
+        "arena": {"env.py": ARENA},
         "nothing": {"env.py": "def build():\n    pass\n"},
         "missing": {"env.py": "import gym_pybullet_drones_that_is_not_here\n"},
         "wrong": {"env.py": "def make_env(n_envs=1, use_async_envs=False):\n    return 7\n"},

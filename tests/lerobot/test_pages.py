@@ -36,6 +36,13 @@ EXPECTED = {
     # how many, and async, LeRobot says itself; a token is nothing for what it prints and saves
     "not options": ["cfg", "n_envs", "token", "trust_remote_code", "use_async_envs"],
     "waits": [True, True, False],
+    # what is given of features goes before what the spaces say
+    "renamed": ["action", "observation.environment_state", "observation.state.arm"],
+    "further": [
+        *("action", "observation.environment_state", "observation.state", "observation.touch"),
+    ],
+    "unnamed": True,
+    "misspelt feature": True,
     # its rollouts, beside its own FreezeAfterEpisodeEnd
     "freezes": True,
     "plugin": "SandboxedEnvConfig",
@@ -48,6 +55,11 @@ EXPECTED = {
     "login": True,
     "cures": [True, True, True],
     "executed here": False,
+}
+PROCESSED = {
+    "libero": ["observation.images.image", "observation.images.image2", "observation.state"],
+    "declared": ["observation.images.image", "observation.images.wrist", "observation.state"],
+    "arena": ["observation.images.robot_pov_cam_rgb", "observation.state"],
 }
 FEATURES = {
     "action": ["ACTION", 6],
@@ -93,5 +105,9 @@ def test_the_pages_hold(olah: OlahServer, tmp_path: Path) -> None:
         sandboxed = ["IsaaclabArenaEnv", None, "act"]
         assert found.pop("commands") == [ours, ours, sandboxed, ours]
         assert found.pop("said once") == [True, True, True]
+        for name, names in PROCESSED.items():
+            told = [] if name == "arena" else [True]
+            assert found.pop(name) == [True, True, names, told]
+        assert found.pop("misdeclared")
         assert (found.pop("misspelt"), found.pop("written")) == ("refused", ONE)
     assert found == EXPECTED

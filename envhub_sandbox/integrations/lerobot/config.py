@@ -9,32 +9,32 @@ from __future__ import annotations
 import json
 import sys
 import threading
+import warnings
 from collections.abc import Hashable
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
 import draccus
-from gymnasium import Space
-from gymnasium.spaces import Box, Dict
 from lerobot.configs import parser
 from lerobot.configs.default import EvalConfig
-from lerobot.configs.types import FeatureType, PolicyFeature
+from lerobot.configs.types import PolicyFeature
 from lerobot.envs.configs import EnvConfig
-from lerobot.utils.constants import (
-    ACTION,
-    OBS_ENV_STATE,
-    OBS_IMAGE,
-    OBS_IMAGES,
-    OBS_STATE,
-    OBS_STR,
-)
 
 from envhub_sandbox.errors import EnvHubError, HubReferenceError
 from envhub_sandbox.factory.make_env import make_env
 from envhub_sandbox.hub.logins import without_login
+from envhub_sandbox.integrations.lerobot.features import (
+    Step,
+    as_features,
+    features_of,
+    left_out,
+    processors,
+    steps_for,
+)
 from envhub_sandbox.settings.options import OPTIONS, on_lerobots_command_line, use_option_names
 from envhub_sandbox.vector.suites import EnvSuites, closed_if_it_fails, for_lerobot, keep_only
+from envhub_worker.protocol.text import printable
 
 ASKS_CONFIGS = hasattr(EnvConfig, "create_envs")
 """Whether this LeRobot asks a configuration for its environments: 0.6 does, 0.4 and 0.5 do not."""
@@ -43,11 +43,6 @@ _SAID_OTHERWISE = {"n_envs", "use_async_envs", "trust_remote_code", "token"}
 _OPTIONS = {
     key: one for key, one in OPTIONS.items() if not one.field and key not in _SAID_OTHERWISE
 }
-_NAMED = {
-    "agent_pos": (OBS_STATE, FeatureType.STATE),
-    "environment_state": (OBS_ENV_STATE, FeatureType.ENV),
-}
-_NESTED = ("pixels", "robot_state", "policy", "camera_obs")
 
 
 class SpareSuites:
@@ -87,6 +82,8 @@ class SpareSuites:
 
 
 _SPARES = SpareSuites()
+_LONGEST = 200
+"""Characters of the repository's names in a text."""
 _NO_REPO = "env.repo is missing: which repository? --env.repo=org/repo@<commit>"
 
 
@@ -120,8 +117,11 @@ class SandboxedEnvConfig(EnvConfig):
         suite: The only suite that is wanted; all by default.
         task: The only task that is wanted, by its id; all by default.
         fps: What the environments say, where they do.
-        features: From their spaces, unless both are given.
-        features_map: Likewise.
+        features: From their spaces; what is given is added, or replaces what has the same key.
+        features_map: Likewise; by default what LeRobot's own processors call them.
+        state_keys: Of observations in the form of Isaac Lab Arena, those of ``policy`` that make
+            the state, separated by commas; all by default.
+        camera_keys: Likewise, of ``camera_obs``.
 
     The others are ``make_env``'s options; ``dependencies`` takes its mapping as JSON.
     """
@@ -130,8 +130,11 @@ class SandboxedEnvConfig(EnvConfig):
     features_map: dict[str, str] = field(default_factory=dict)
     repo: str | None = None
     suite: str | None = None
+    state_keys: str | None = None
+    camera_keys: str | None = None
 
     def __post_init__(self) -> None:
+        self._steps: list[Step] = []
         try:
             self._open()
         except (EnvHubError, ValueError, TypeError) as error:
@@ -178,6 +181,10 @@ class SandboxedEnvConfig(EnvConfig):
         """The repository, for a LeRobot in which ``install()`` has to route this, too."""
         return self.repo
 
+    def get_env_processors(self) -> tuple[Any, Any]:
+        """What LeRobot's own suites of the same form have, or what the repository declares."""
+        return processors(self._steps), processors([])
+
     def create_envs(self, n_envs: int, use_async_envs: bool = False) -> EnvSuites:
         """``{suite: {task_id: VectorEnv}}``; raises as ``envhub_sandbox.make_env``."""
         if not self.repo:
@@ -210,12 +217,35 @@ class SandboxedEnvConfig(EnvConfig):
                     f"{self.repo}: its tasks have different spaces, and LeRobot has one set of "
                     "features for all: choose one by env.suite and env.task"
                 )
-        features, names = features_of(*spaces, others=ASKS_CONFIGS)
-        if not self.features:
-            self.features, self.features_map = features, names
+        keys = {"state_keys": self.state_keys, "camera_keys": self.camera_keys}
+        self._steps = steps_for(spaces[0], first.metadata, keys)
+        seen = features_of(*spaces, self._steps, others=ASKS_CONFIGS)
+        self._merge(*as_features(seen))
+        lost = [name for name in left_out(spaces[0], seen) if name not in self.features]
+        if lost:
+            names = printable(", ".join(lost), _LONGEST)
+            warnings.warn(
+                f"{self.repo}: LeRobot's policies will not see {names} of its observations "
+                "(docs/lerobot.md says what they see)",
+                UserWarning,
+                stacklevel=2,
+            )
         fps = first.metadata.get("render_fps")
-        if isinstance(fps, int) and fps > 0:
+        if fps is not None:
             self.fps = fps
+
+    def _merge(self, features: dict[str, PolicyFeature], names: dict[str, str]) -> None:
+        """What was given goes before what the spaces say."""
+        self.features = {**features, **self.features}
+        self.features_map = {**names, **self.features_map}
+        for key in self.features.keys() ^ self.features_map.keys():
+            if key in self.features:
+                raise ValueError(
+                    f"env.features has {key!r}, and env.features_map does not say what a policy "
+                    f'calls it: --env.features_map=\'{{"{key}": "observation.NAME"}}\''
+                )
+            known = printable(", ".join(self.features), _LONGEST)
+            raise ValueError(f"env.features_map names {key!r}; {self.repo} has {known}")
 
     def _key(self, n_envs: int, use_async_envs: bool) -> str:
         own = [item.name for item in fields(SandboxedEnvConfig)]
@@ -240,47 +270,3 @@ def _expected() -> tuple[int, bool]:
     arguments = [f"--{name}={text}" for name, text in said.items() if text is not None]
     chosen = draccus.parse(config_class=EvalConfig, args=arguments)
     return chosen.batch_size, chosen.use_async_envs
-
-
-def features_of(
-    observations: Space[Any], actions: Space[Any], *, others: bool
-) -> tuple[dict[str, Any], dict[str, str]]:
-    """``features`` and ``features_map`` of an ``EnvConfig``, from the spaces of an environment.
-
-    Followed: ``preprocess_observation`` of ``lerobot.envs.utils``, which decides what of an
-    observation a policy sees, and under which name.
-
-    Keys are those of an observation, or, for one of several cameras, what LeRobot calls it when it
-    records. What LeRobot has no tensor for is left out: actions that are not a vector too, which
-    its evaluation does not give.
-
-    ``others``: whether this LeRobot hands on vectors of other names.
-    """
-    found: dict[str, tuple[str, FeatureType, tuple[int, ...]]] = {}
-    if isinstance(actions, Box) and len(actions.shape) == 1:
-        found[ACTION] = (ACTION, FeatureType.ACTION, actions.shape)
-    for name, space in observations.items() if isinstance(observations, Dict) else ():
-        if name == "pixels":
-            found |= _pixels(space)
-        elif name in _NAMED and isinstance(space, Box):
-            found[name] = (*_NAMED[name], space.shape)
-        elif others and name not in _NESTED and isinstance(space, Box) and len(space.shape) == 1:
-            found[name] = (f"{OBS_STR}.{name}", FeatureType.STATE, space.shape)
-    features = {
-        key: PolicyFeature(type=kind, shape=shape) for key, (_, kind, shape) in found.items()
-    }
-    return features, {key: policy_key for key, (policy_key, _, _) in found.items()}
-
-
-def _pixels(space: Space[Any]) -> dict[str, tuple[str, FeatureType, tuple[int, ...]]]:
-    """One camera, or several by their names; each (height, width, channels)."""
-    if isinstance(space, Dict):
-        cameras = {f"{OBS_IMAGES}.{name}": camera for name, camera in space.items()}
-        return {
-            key: (key, FeatureType.VISUAL, camera.shape)
-            for key, camera in cameras.items()
-            if isinstance(camera, Box) and len(camera.shape) == 3
-        }
-    if isinstance(space, Box) and len(space.shape) == 3:
-        return {"pixels": (OBS_IMAGE, FeatureType.VISUAL, space.shape)}
-    return {}

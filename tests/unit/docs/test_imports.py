@@ -27,6 +27,7 @@ OPTIONAL = {
     "envhub_worker.protocol.messages.compression": {"lz4"},
     "envhub_sandbox.integrations.sb3": {"stable_baselines3"},
     "envhub_sandbox.integrations.lerobot.config": {"draccus", "lerobot"},
+    "envhub_sandbox.integrations.lerobot.features": {"lerobot"},
     "envhub_sandbox.integrations.lerobot.install": {"lerobot"},
     "envhub_sandbox.integrations.lerobot_eval": {"lerobot"},
     "envhub_worker.protocol.messages.message": {"typing_extensions"},  # for type checkers alone
