@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Protocol
 
@@ -205,26 +205,22 @@ def _with_wheels(
     return Lock(text, tuple(options))
 
 
-def lock_checker(
-    lock: LockFile | None, label: str, env_kwargs: Mapping[str, Any], config: object
-) -> Callable[[Manifest], None]:
-    """What holds a manifest against the lock; with other arguments a repository may well make other
-    environments.
+def check_locked_tasks(
+    manifest: Manifest, lock: LockFile, label: str, env_kwargs: Mapping[str, Any]
+) -> None:
+    """Raise ``LockDriftError`` where a manifest's environments are not the locked ones.
+
+    With other arguments a repository may well make other environments.
     """
+    from envhub_sandbox.dependencies.locks import lockfile, making
 
-    def check(manifest: Manifest) -> None:
-        if lock is None or lock.spaces is None or config is not None:
-            return
-        from envhub_sandbox.dependencies.locks import lockfile, making
-
-        if lockfile.arguments_text(env_kwargs) == lock.spaces.arguments:
-            now = [
-                making.fingerprint_of_task(
-                    *(env.suite, env.task, env.autoreset_mode),
-                    *(env.single_observation_space, env.single_action_space),
-                )
-                for env in manifest.envs
-            ]
-            making.refuse(list(making.drift_of_tasks(lock.spaces.tasks, now)), label)
-
-    return check
+    if lock.spaces is None or lockfile.arguments_text(env_kwargs) != lock.spaces.arguments:
+        return
+    now = [
+        making.fingerprint_of_task(
+            *(env.suite, env.task, env.autoreset_mode),
+            *(env.single_observation_space, env.single_action_space),
+        )
+        for env in manifest.envs
+    ]
+    making.refuse(list(making.drift_of_tasks(lock.spaces.tasks, now)), label)

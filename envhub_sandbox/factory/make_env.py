@@ -7,21 +7,12 @@ import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from envhub_sandbox.dependencies.modules import MissingModule, note_missing
-from envhub_sandbox.dependencies.packages import (
-    PackageSet,
-    lock_checker,
-    locked_packages,
-    opened_lock,
-    packages_for,
-)
-from envhub_sandbox.dependencies.request import Choice, chosen
-from envhub_sandbox.errors import DependencyError, PolicyError, SandboxUnavailableError
+from envhub_sandbox.errors import DependencyError, PolicyError
 from envhub_sandbox.factory.env_factory import EnvFactory
+from envhub_sandbox.factory.package_source import PackageSource, source_of
 from envhub_sandbox.hub.snapshot import Snapshot, snapshot_named
-from envhub_sandbox.hub.sources.assets import with_assets
 from envhub_sandbox.sandboxes import inprocess
 from envhub_sandbox.sandboxes.sandbox import Sandbox, is_list
 from envhub_sandbox.session.launcher import Launcher
@@ -41,9 +32,6 @@ from envhub_sandbox.vector.tracebacks import short_traceback
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.records import dataclass
 from envhub_worker.protocol.runtime import Runtime
-
-if TYPE_CHECKING:
-    from envhub_sandbox.dependencies.locks.lockfile import LockFile
 
 
 @short_traceback
@@ -162,29 +150,22 @@ def _make(cfg: Any, given: Options) -> EnvSuites:
     occupy_streams()  # before anything of ours is opened
     wanted = _wanted(options.sandbox, options)
     snapshot = snapshot_named(reference, **options.source)
-    locked = wanted.lock.assets if wanted.lock is not None else ()
-    snapshot = with_assets(snapshot, options.assets, options.hub, locked)
+    snapshot = _with_assets(snapshot, options, wanted.source.assets)
+    target = wanted.place.package_target()
     while True:
         try:
             suites = _suites(snapshot, config, wanted, options)
             break
         except DependencyError as error:
-            if error.reason != "module" or not _may_infer(wanted):
-                raise
-            if not note_missing(snapshot, str(error)):
+            if error.reason != "module" or not wanted.source.note(snapshot, target, str(error)):
                 raise
     return for_lerobot(suites) if options.trust_remote_code else suites
 
 
-def _may_infer(wanted: _Plan) -> bool:
-    """Whether packages are ours to choose, and may be more than what is declared."""
-    ours = wanted.lock is None and wanted.place.package_target() is not None
-    return ours and wanted.choice.infer and wanted.choice.where != "host"
-
-
 def _suites(snapshot: Snapshot, config: Any, wanted: _Plan, options: Options) -> EnvSuites:
     """The environments of a snapshot. Raises ``DependencyError``."""
-    packages = _packages(snapshot, wanted)
+    target, gpu = wanted.place.package_target(), bool(wanted.policy.gpu)
+    packages = wanted.source.packages(snapshot, target, gpu=gpu)
     load = m.Load(
         n_envs=options.n_envs,
         use_async_envs=options.use_async_envs,
@@ -200,11 +181,16 @@ def _suites(snapshot: Snapshot, config: Any, wanted: _Plan, options: Options) ->
             assets=tuple(one.pinned for one in snapshot.assets),
             policy=wanted.policy,
             timeouts=wanted.timeouts,
-            python=wanted.python,
-            dependencies="auto" if wanted.python is not None else options.dependencies,
+            python=wanted.source.python,
+            dependencies="auto" if wanted.source.python is not None else options.dependencies,
         ),
     )
-    own = packages is not None
+
+    def advice(said: str) -> str:
+        return wanted.source.advice(
+            snapshot, wanted.place.name, own=packages is not None, said=said
+        )
+
     repository = Repository(
         snapshot,
         load,
@@ -216,15 +202,13 @@ def _suites(snapshot: Snapshot, config: Any, wanted: _Plan, options: Options) ->
         min_ready=options.min_ready,
         recipe=recipe,
         installed=packages.facts if packages else None,
-        advice=MissingModule(
-            snapshot, wanted.place.name, wanted.choice.where, wanted.python, own
-        ).advice,
+        advice=advice,
     )
     return EnvFactory(
         _launchers(repository, wanted.place, options),
         options.num_workers,
         _ahead(wanted, options),
-        lock_checker(wanted.lock, snapshot.label, load.env_kwargs, config),
+        lambda manifest: wanted.source.check(manifest, snapshot.label, load.env_kwargs, config),
     ).make()
 
 
@@ -245,31 +229,26 @@ class _Plan:
     place: Sandbox
     policy: Policy
     timeouts: Timeouts
-    choice: Choice
-    python: Any
+    source: PackageSource
     runtime: Runtime
-    lock: LockFile | None
 
 
 def _wanted(sandbox: str | Sandbox, options: Options) -> _Plan:
-    lock = None
-    if options.lock is not None:
-        lock = opened_lock(options.lock, sandbox, options.python, options.dependencies)
-    choice, python = chosen(options.dependencies, options.python)
+    source = source_of(options)
     policy = policy_from(options.policy, options.limits)
     timeouts = timeouts_from(options.timeouts)
     place = sandbox_of(sandbox, options.server_key)
-    if choice.where == "own" and place.package_target() is None:
+    if source.always and place.package_target() is None:
         raise PolicyError(
             f"packages by {option_name('dependencies')} are for this machine, for containers and "
             "for servers on other hosts; this place has packages of its own"
         )
-    runtime = Runtime(interpreter(python))
+    runtime = Runtime(interpreter(source.python))
     place.note_interpreter(runtime)
     if place.is_here:
         check_executable(runtime.python)
         check_readable(policy.readable)
-    return _Plan(place, policy, timeouts, choice, python, runtime, lock)
+    return _Plan(place, policy, timeouts, source, runtime)
 
 
 def _make_here(reference: str, config: Any, options: Options) -> EnvSuites:
@@ -283,14 +262,16 @@ def _make_here(reference: str, config: Any, options: Options) -> EnvSuites:
     return EnvSuites(envs, lambda: provenance_of(snapshot, None, []))
 
 
-def _packages(snapshot: Snapshot, wanted: _Plan) -> PackageSet | None:
-    """The packages that are made for it; None for those of the place."""
-    if wanted.lock is not None:
-        return locked_packages(snapshot, wanted.lock)
-    target = wanted.place.package_target()
-    if target is None:
-        return None
-    return packages_for(snapshot, wanted.choice, target, gpu=bool(wanted.policy.gpu))
+def _with_assets(snapshot: Snapshot, options: Options, locked: Sequence[str]) -> Snapshot:
+    """The snapshot with its assets; without that extra, a card's are not looked for."""
+    module, name = "envhub_sandbox.hub.sources.assets", "with_assets"
+    if options.assets or locked:
+        extras.required(module, name, option_name("assets"))
+    with_assets = extras.find(module, name)
+    if with_assets is None:
+        return snapshot
+    found: Snapshot = with_assets(snapshot, options.assets, options.hub, locked)
+    return found
 
 
 def _ahead(wanted: _Plan, options: Options) -> int | None:
@@ -366,15 +347,8 @@ def _extra(module: str, name: str) -> Any:
     """What makes a place that is no part of the core, which therefore imports it by its name.
     Raises ``SandboxUnavailableError``: this installation lacks it.
     """
-    module = f"envhub_sandbox.sandboxes.{module}"
-    place = extras.find(module, name)
-    if place is None:
-        raise SandboxUnavailableError(
-            f"{option_name('sandbox')} needs {module}, which this installation of "
-            "envhub-sandbox lacks: install the whole package, or use "
-            f"{option_name('sandbox', 'process')}"
-        )
-    return place
+    module, what = f"envhub_sandbox.sandboxes.{module}", option_name("sandbox")
+    return extras.required(module, name, what, f"use {option_name('sandbox', 'process')}")
 
 
 def _unknown(sandbox: object) -> PolicyError:

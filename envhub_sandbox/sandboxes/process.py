@@ -27,13 +27,14 @@ import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 import envhub_worker.protocol
 from envhub_sandbox.errors import SandboxUnavailableError, WorkerStartupError
 from envhub_sandbox.sandboxes.pool import ServerPool, ServerUse, WorkerServer
 from envhub_sandbox.sandboxes.sandbox import Sandbox
 from envhub_sandbox.settings.options import option_name
+from envhub_sandbox.system import extras
 from envhub_sandbox.system.locks import LifeLock, is_held
 from envhub_sandbox.system.log import WORKER
 from envhub_sandbox.system.platform import (
@@ -48,9 +49,6 @@ from envhub_sandbox.system.platform import (
     user_id,
 )
 from envhub_worker.protocol.runtime import OWN, Runtime, site_options
-
-if TYPE_CHECKING:
-    from envhub_sandbox.dependencies.packages import PackageTarget
 
 BOOTSTRAP = Path(envhub_worker.protocol.__file__).parent.parent / "bootstrap.py"
 _STARTUP_S = 60.0
@@ -170,11 +168,9 @@ class ProcessSandbox(Sandbox):
     def __init__(self) -> None:
         self._pool: ServerPool[LocalServer] = ServerPool()
 
-    def package_target(self) -> PackageTarget:
+    def package_target(self) -> Any:
         """Packages are made for the interpreters of this machine."""
-        from envhub_sandbox.dependencies.packages import HERE
-
-        return HERE
+        return extras.find("envhub_sandbox.dependencies.packages", "HERE")
 
     def acquire(
         self, store: Path, runtime: Runtime = OWN, idle_s: float | None = 0.0

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from time import monotonic, sleep
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from envhub_sandbox.errors import (
     EnvHubError,
@@ -26,7 +26,6 @@ from envhub_worker.protocol.messages.server import DRAINING
 from envhub_worker.protocol.runtime import OWN, Runtime
 
 if TYPE_CHECKING:
-    from envhub_sandbox.dependencies.packages import PackageTarget
     from envhub_sandbox.settings.policy import Policy
     from envhub_sandbox.transport.connection import WorkerConnection
     from envhub_worker.protocol.messages import OpenJail
@@ -92,8 +91,9 @@ class Sandbox:
         """What runs the repository there; a remembered manifest holds for this only."""
         return runtime
 
-    def package_target(self) -> PackageTarget | None:
-        """Makes a repository's own packages for what runs there; None where nothing can.
+    def package_target(self) -> Any:
+        """A ``dependencies.packages.PackageTarget``, which makes a repository's own packages for
+        what runs there; None where nothing can.
 
         Asks the place nothing before it has to make some.
         """

@@ -20,7 +20,7 @@ from typing import Any
 import zmq
 
 from envhub_sandbox.check.play import confinement, task, traces
-from envhub_sandbox.dependencies import environments, interpreters, modules, resolutions
+from envhub_sandbox.dependencies import environments, interpreters, modules, resolutions, source
 from envhub_sandbox.factory import make_env
 from envhub_sandbox.sandboxes import remote
 from envhub_sandbox.sandboxes.docker import container
@@ -90,7 +90,7 @@ def choice_of_runtime() -> Spot:
 
 def choice_of_packages() -> Spot:
     """Makes the packages that a repository declares."""
-    return make_env, "packages_for"
+    return source, "packages_for"
 
 
 def cut_s() -> Spot:

@@ -55,8 +55,7 @@ MAY_IMPORT = {
         *("sandboxes", "session"),
     },
     "envhub_sandbox.factory": {
-        *("dependencies", "hub", "sandboxes", "session"),
-        *("transport", "vector"),
+        *("hub", "sandboxes", "session", "transport", "vector"),
     },
     "envhub_sandbox.check": {"", "dependencies", "factory", "hub", "vector"},
     "envhub_sandbox.integrations": {"factory", "hub", "session", "vector"},

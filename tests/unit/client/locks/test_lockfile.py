@@ -17,8 +17,8 @@ from envhub_sandbox.dependencies.locks import lockfile, making, pylock
 from envhub_sandbox.dependencies.locks.lockfile import LockFile, Runner, Spaces
 from envhub_sandbox.dependencies.locks.making import fingerprint_of_spaces, fingerprint_of_task
 from envhub_sandbox.dependencies.locks.pylock import PylockPackage, Wheel
-from envhub_sandbox.dependencies.packages import lock_checker
-from envhub_sandbox.dependencies.request import chosen
+from envhub_sandbox.dependencies.request import AUTO, chosen
+from envhub_sandbox.dependencies.source import RepositoryPackages
 from envhub_sandbox.errors import EnvHubError, LockDriftError, LockError
 from envhub_sandbox.hub.snapshot import local
 from envhub_worker.protocol.manifest.manifest import Manifest
@@ -225,7 +225,7 @@ def test_spaces_are_held_against_the_lock_for_the_same_arguments() -> None:
 
     def check(task: Any, given: dict[str, Any], config: object = None) -> None:
         lock = changed(spaces=Spaces('{"size": 8}', (task,)))
-        lock_checker(lock, "org/repo", given, config)(manifest)
+        RepositoryPackages(AUTO, None, lock).check(manifest, "org/repo", given, config)
 
     check(same, {"size": 8})
     check(other, {"size": 9})
@@ -233,7 +233,7 @@ def test_spaces_are_held_against_the_lock_for_the_same_arguments() -> None:
     with pytest.raises(LockDriftError, match="actions were"):
         check(other, {"size": 8})
     for lock in (None, changed(spaces=None)):
-        lock_checker(lock, "org/repo", {}, None)(manifest)
+        RepositoryPackages(AUTO, None, lock).check(manifest, "org/repo", {}, None)
 
 
 def spoiled(tmp_path: Path, change: Callable[[str], str]) -> Path:
