@@ -21,7 +21,7 @@ from envhub_sandbox.errors import (
     PolicyError,
     name_source,
 )
-from envhub_sandbox.hub import registered
+from envhub_sandbox.hub.reference import PYPI
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.system import log
@@ -121,7 +121,7 @@ def packages_for(
                 DEPENDENCIES.warning("%s: nothing is installed for it: %s", snapshot.label, error)
                 return None
     except DependencyError as error:
-        if snapshot.repo_type == registered.KIND and _is_unknown(snapshot.repo_id, error):
+        if snapshot.repo_type == PYPI and _is_unknown(snapshot.repo_id, error):
             error.args = (f"{error}\n{_CHECK_REFERENCE}", *error.args[1:])
         name_source(error, snapshot.label)
         raise

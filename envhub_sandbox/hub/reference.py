@@ -1,19 +1,21 @@
 """Hub references: ``[models/|spaces/|datasets/]owner/name[@revision][:path]``, and Hub URLs.
 
 And of other places: a commit of git (``hub.git.address``), and an environment that a package of the
-index registers (``hub.registered``). A reference is text that somebody pasted, so every
-form that can mean only one thing works, and for every other form the error says what to write
-instead. Extends the grammar of ``lerobot.envs.utils._parse_hub_url``. Nothing is asked of the
-network.
+index registers (``hub.registered``). These are extras: ``read`` and ``check`` of such a module are
+to its references what those of ``hub.grammar`` are to the Hub's. A reference is text that somebody
+pasted, so every form that can mean only one thing works, and for every other form the error says
+what to write instead. Extends the grammar of ``lerobot.envs.utils._parse_hub_url``. Nothing is
+asked of the network.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 from envhub_sandbox.errors import HubReferenceError
-from envhub_sandbox.hub import grammar, registered
-from envhub_sandbox.hub.git import address
+from envhub_sandbox.hub import grammar
 from envhub_sandbox.hub.grammar import (
     DEFAULT_PATH,
     LOCAL_TYPES,
@@ -24,12 +26,36 @@ from envhub_sandbox.hub.grammar import (
     is_local,
     local_reference,
 )
+from envhub_sandbox.system import extras
 from envhub_worker.protocol.records import dataclass
 
 __all__ = ["DEFAULT_PATH", "REPO_TYPES", "HubRef", "is_local", "is_of_another_place", "pinned"]
 
-_OTHERS = (address, registered)
-"""References that are none of the Hub's."""
+
+class _Scheme(NamedTuple):
+    """References that are none of the Hub's: how they begin, and the module that reads them."""
+
+    kind: str
+    module: str
+    starts: tuple[str, ...]
+
+    def function(self, name: str) -> Any:
+        """A function of the module. Raises ``SandboxUnavailableError``: it is not installed."""
+        return extras.required(self.module, name, f"a reference of {self.kind}")
+
+
+GIT, PYPI = "git", "pypi"
+_SCHEMES = (
+    _Scheme(
+        GIT,
+        "envhub_sandbox.hub.git.address",
+        (
+            *("git+http:", "git+https:", "git+file:", "git+ext:", "github:"),
+            *("https://github.com/", "https://www.github.com/", "github.com/"),
+        ),
+    ),
+    _Scheme(PYPI, "envhub_sandbox.hub.registered", ("pypi:",)),
+)
 
 
 @dataclass(frozen=True)
@@ -71,7 +97,9 @@ class HubRef:
             raise HubReferenceError(f"a hub reference is a str ({grammar.GRAMMAR}), got {text!r}")
         try:
             plain = text.strip()
-            parts = next((one for one in _OTHERS if one.is_one(plain)), grammar).read(plain)
+            scheme = _scheme_of(plain)
+            read: Callable[[str], Parts] = scheme.function("read") if scheme else grammar.read
+            parts = read(plain)
             _check(parts)
         except Wrong as wrong:
             raise _refusal(text, wrong) from None
@@ -83,7 +111,7 @@ class HubRef:
     @property
     def is_pinned(self) -> bool:
         """Whether the revision is a full commit, which can never mean anything else."""
-        known = self.repo_type != registered.KIND and self.revision is not None
+        known = self.repo_type != PYPI and self.revision is not None
         return known and is_commit(self.revision or "")
 
     @property
@@ -94,7 +122,7 @@ class HubRef:
     @property
     def usual_revision(self) -> str | None:
         """The revision, or what none means."""
-        return self.revision or {"git": "HEAD", "pypi": None}.get(self.repo_type or "", "main")
+        return self.revision or {GIT: "HEAD", PYPI: None}.get(self.repo_type or "", "main")
 
     @property
     def parts(self) -> Parts:
@@ -106,19 +134,24 @@ def pinned(repo_type: str, repo_id: str, commit: str, path: str) -> str:
     """``Snapshot.reference``, by what a provenance says of it, which may be a stranger's."""
     if repo_type in LOCAL_TYPES:
         return local_reference(repo_type, repo_id, path)
-    if repo_type == registered.KIND:
+    if repo_type == PYPI:
         return str(HubRef.parse(f"{repo_type}:{repo_id}"))
     return str(HubRef(repo_id, commit, path, repo_type))
 
 
 def is_of_another_place(text: str) -> bool:
     """Whether it is of git or of the package index, by how it begins."""
-    return any(one.is_one(text.strip()) for one in _OTHERS)
+    return _scheme_of(text.strip()) is not None
+
+
+def _scheme_of(text: str) -> _Scheme | None:
+    return next((one for one in _SCHEMES if text.lower().startswith(one.starts)), None)
 
 
 def _check(parts: Parts) -> None:
-    kind = parts.repo_type
-    next((one for one in _OTHERS if kind == one.KIND), grammar).check(parts)
+    scheme = next((one for one in _SCHEMES if one.kind == parts.repo_type), None)
+    check: Callable[[Parts], None] = scheme.function("check") if scheme else grammar.check
+    check(parts)
 
 
 def _refusal(text: str, wrong: Wrong) -> HubReferenceError:

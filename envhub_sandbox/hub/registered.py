@@ -1,6 +1,6 @@
 """Environments that a package registers with Gymnasium: ``pypi:NAME[EXTRA][@VERSION]#ID``.
 
-``read`` and ``check`` are to these what those of ``hub.grammar`` are to references of the Hub. The
+``hub.reference`` says how they begin. The
 name of the repository is ``NAME[EXTRA]#ID``, and its revision the version. Its entry file is
 generated and runs in a jail, as any repository's: what is in the package is looked at there.
 ``registered_env.txt`` is its text but for what the reference says.
@@ -22,11 +22,6 @@ _NAME = r"[A-Za-z0-9](?:[A-Za-z0-9._-]{0,98}[A-Za-z0-9])?"
 _PACKAGE = rf"(?a)({_NAME})(\[{_NAME}(?:,{_NAME}){{0,15}}\])?"
 _VERSION = r"(?a)[0-9][A-Za-z0-9.!+_-]{0,99}"
 _ID = r"(?a)[A-Za-z0-9_][A-Za-z0-9_.:/-]{0,199}"
-
-
-def is_one(text: str) -> bool:
-    """Whether a text is meant as such a reference."""
-    return text.lower().startswith(_PREFIX)
 
 
 def read(text: str) -> Parts:

@@ -23,11 +23,9 @@ from envhub_sandbox.errors import (
     SnapshotError,
     SnapshotIntegrityError,
 )
-from envhub_sandbox.hub import registered
 from envhub_sandbox.hub import store as store
 from envhub_sandbox.hub.answers import ABSENT, UNREACHABLE, HubFailure, Kind
 from envhub_sandbox.hub.client import HubClient, checked_endpoint, checked_token
-from envhub_sandbox.hub.git import address
 from envhub_sandbox.hub.grammar import FOLDER
 from envhub_sandbox.hub.listing import (
     DEFAULT_LIMITS,
@@ -42,7 +40,15 @@ from envhub_sandbox.hub.listing import (
     listing_within_limits,
 )
 from envhub_sandbox.hub.logins import without_login
-from envhub_sandbox.hub.reference import DEFAULT_PATH, HubRef, is_local, is_of_another_place
+from envhub_sandbox.hub.reference import (
+    DEFAULT_PATH,
+    GIT,
+    PYPI,
+    HubRef,
+    is_local,
+    is_of_another_place,
+)
+from envhub_sandbox.system import extras
 from envhub_sandbox.system.log import SNAPSHOT, tell
 from envhub_worker.protocol.records import dataclass
 
@@ -131,7 +137,7 @@ def fetch(
         SnapshotError: A hostile name in the listing, or the store cannot be written.
         HubReferenceError: The token or endpoint cannot be one.
     """
-    if ref.repo_type == registered.KIND:
+    if ref.repo_type == PYPI:
         return _registered(ref)
     if public:
         token, endpoint = False, without_login(checked_endpoint(endpoint))
@@ -161,13 +167,12 @@ def _candidates(
     public: bool = False,
 ) -> Sequence[_Candidate]:
     """As what it may be read."""
-    if ref.repo_type == address.KIND:
-        from envhub_sandbox.hub.git.commits import GitHost
-
+    if ref.repo_type == GIT:
+        host_of = extras.required("envhub_sandbox.hub.git.commits", "GitHost", str(ref))
         scheme, _, rest = ref.repo_id.partition("://")
         place, _, name = rest.partition("/")
-        host = GitHost(f"{scheme}://{place}")
-        return [_Candidate(ref, Repository(address.KIND, name), host, limits, needs_entry)]
+        host: RepositoryHost = host_of(f"{scheme}://{place}")
+        return [_Candidate(ref, Repository(GIT, name), host, limits, needs_entry)]
     hub = HubClient(checked_endpoint(endpoint), checked_token(token), hub_cache_dir)
     every = ("model", "space") if needs_entry else ("model", "dataset", "space")
     kinds = (ref.repo_type,) if ref.repo_type else every
@@ -252,7 +257,7 @@ def local(folder: str | Path, *, allow_secrets: bool = False) -> Snapshot:
 
 def _registered(ref: HubRef) -> Snapshot:
     """The repository of one file that stands for an environment of a package."""
-    text = registered.entry(ref.parts)
+    text: bytes = extras.required("envhub_sandbox.hub.registered", "entry", str(ref))(ref.parts)
     digest = f"{SHA256}:{hashlib.sha256(text).hexdigest()}"
     files = (FileRecord(DEFAULT_PATH, len(text), digest),)
     name = str(ref).partition(":")[2]
@@ -260,7 +265,7 @@ def _registered(ref: HubRef) -> Snapshot:
     def write(_: FileRecord, target: Path) -> None:
         target.write_bytes(text)
 
-    return _by_content(registered.KIND, name, DEFAULT_PATH, files, write)
+    return _by_content(PYPI, name, DEFAULT_PATH, files, write)
 
 
 def _by_content(

@@ -2,7 +2,7 @@
 
 And ``github:org/repo`` for short, or a page of that site.
 
-``read`` and ``check`` are to these what those of ``hub.grammar`` are to references of the Hub.
+``hub.reference`` says how they begin.
 """
 
 from __future__ import annotations
@@ -27,14 +27,8 @@ GRAMMAR = "git+https://host/org/repo@commit:path.py, or github:org/repo@commit:p
 PROTOCOLS = ("https",)
 REVISION = r"(?!.*(?:\.\.|//|@\{))[A-Za-z0-9_][A-Za-z0-9_./+-]{0,200}"
 _GITHUB = "github:"
-_SCHEMES = ("git+http:", "git+https:", "git+file:", "git+ext:")
 _PAGES = ("https://github.com/", "https://www.github.com/", "github.com/")
 _URL = r"([a-z]+)://([A-Za-z0-9][A-Za-z0-9.-]*(?::\d{1,5})?)(/[A-Za-z0-9_.~/+%-]{1,200})"
-
-
-def is_one(text: str) -> bool:
-    """Whether a text is meant as such a reference."""
-    return text.lower().startswith((*_SCHEMES, _GITHUB, *_PAGES))
 
 
 def is_url(text: str) -> bool:

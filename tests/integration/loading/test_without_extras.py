@@ -31,11 +31,12 @@ with hub.make_env(repository, n_envs=2) as envs:
     print(env.step(env.action_space.sample())[1].shape)
 for argument, value in json.loads(sys.argv[3]).items():
     try:
-        hub.make_env(repository, **{argument: value})
+        hub.make_env(**{"cfg": repository, argument: value})
     except errors.SandboxUnavailableError as error:
         print(error)
 """
 _ASKED = {
+    "cfg": ("pypi:minigrid#MiniGrid-Empty-5x5-v0", "hub.registered"),
     "lock": ("pylock.toml", "dependencies.source"),
     "dependencies": ({}, "dependencies.source"),
     "assets": (["org/data"], "hub.sources.assets"),
@@ -73,4 +74,5 @@ def test_the_core_needs_no_extra(tmp_path: Path) -> None:
     shape, *refused = done.stdout.splitlines()
     assert shape == "(2,)"
     for line, (argument, (_, module)) in zip(refused, _ASKED.items(), strict=True):
-        assert line.startswith(f"{argument} needs envhub_sandbox.{module}, which this")
+        what = "a reference of pypi" if argument == "cfg" else argument
+        assert line.startswith(f"{what} needs envhub_sandbox.{module}, which this")

@@ -43,13 +43,14 @@ EXTRAS = {
         "envhub_worker.supervisor.served_slabs",
     },
     "sources": {  # of snapshots, beside the Hub and folders
-        *("envhub_sandbox.hub.git", "envhub_sandbox.hub.registered"),
+        *("envhub_sandbox.hub.git.address", "envhub_sandbox.hub.git.commits"),
+        "envhub_sandbox.hub.registered",
         "envhub_sandbox.hub.sources.assets",
     },
 }
 # The extras that an extra may import.
 EXTRAS_OF_EXTRAS = {
-    "check": {"packages", "sources"},
+    "check": {"packages"},
     "docker": {"packages", "remote"},
     "fleet": {"packages", "remote"},
     "packages": {"sources"},
@@ -72,9 +73,6 @@ CORE_IMPORTS_EXTRAS = {
     "envhub_sandbox.cli.shared.options": {"hub.sources.assets"},
     "envhub_sandbox.cli.shared.results": {"check.play.confinement", "check.play.episodes"},
     "envhub_sandbox.factory.env_factory": {"session.parts.fleet_session"},
-    "envhub_sandbox.hub.local": {"hub.git.checkout"},
-    "envhub_sandbox.hub.reference": {"hub.git.address", "hub.registered"},
-    "envhub_sandbox.hub.snapshot": {"hub.git.address", "hub.git.commits", "hub.registered"},
     "envhub_sandbox.sandboxes.pool": {"transport.tcp"},
     "envhub_sandbox.session.builder": {"transport.shared_memory.served_lane"},
     "envhub_sandbox.transport.connection": {"transport.tcp"},
