@@ -108,7 +108,8 @@ def make_env(
         num_workers: Number of processes for the sub-environments. The default is one. With
             ``use_async_envs`` it is one for each sub-environment, as with ``AsyncVectorEnv``; those
             that were found to be independent of each other share as many as are fastest. Several
-            places in ``sandbox`` have at least one each.
+            places in ``sandbox`` have at least one each. Of ``"ray"`` each has a server of its own,
+            which Ray places.
         prewarm: How many of a suite's next tasks start in the background when a task is first
             reset; this is also the maximum of unused jails. By default one, if tasks are closed
             before the next is reset, on this machine and without a GPU; otherwise none.

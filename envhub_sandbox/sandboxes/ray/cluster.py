@@ -223,8 +223,9 @@ def _busy(within_s: float) -> ServerBusyError:
     shown = {one: free[one] for one in sorted(free) if not one.startswith(("node:", "object_"))}
     return ServerBusyError(
         f"Ray has started no worker server within {within_s:g} s, and {shown} are free in the "
-        "whole cluster. Close environments, ask for less in RaySandbox(num_cpus=..., "
-        "resources=...), add nodes, or wait for longer with placement_s",
+        f"whole cluster. Close environments, ask for less in RaySandbox(num_cpus=..., "
+        f"resources=...) or by a smaller {option_name('num_workers')}, add nodes, or wait for "
+        "longer with placement_s",
         quota="cluster",
     )
 

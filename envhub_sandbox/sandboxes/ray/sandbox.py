@@ -1,4 +1,4 @@
-"""``sandbox="ray"``: a worker server on a node of a Ray cluster, for each ``make_env``.
+"""``sandbox="ray"``: a worker server on a node of a Ray cluster, for each worker of a ``make_env``.
 
 Ray places an actor, which starts an ``envhub-worker listen`` beside it (``actor.py``). From then on
 it is a server on another host: the repository's files travel from here and steps go straight over
@@ -45,29 +45,33 @@ _FATE_S = 30.0
 class RaySandbox(Sandbox):
     """Workers on a Ray cluster. ``sandbox="ray"`` is this with its defaults.
 
-    Each ``make_env`` has a worker server of its own, in an actor that Ray places by these options.
-    An unused server serves the next ``make_env`` with the same object. Ray only counts the
-    resources of an actor, whose processes include the server's; ``Limits`` enforces limits.
+    Each of ``num_workers`` has a worker server of its own, in an actor that Ray places by these
+    options; without ``num_workers`` there is one server. An unused server serves the next
+    ``make_env`` with the same object. Ray only counts the resources of an actor, whose processes
+    include the server's; ``Limits`` enforces limits.
 
     Attributes:
-        num_cpus: CPUs that Ray reserves for the actor; fractions are permitted.
-        num_gpus: GPUs that Ray reserves; a policy with ``gpu=True`` grants those that Ray assigns.
-        resources: The cluster's own resources to reserve, as in ``{"simulator": 1}``.
-        scheduling_strategy: ``"DEFAULT"``, ``"SPREAD"``, or an object of Ray's, such as
+        num_cpus: CPUs that Ray reserves for each actor; fractions are permitted.
+        num_gpus: GPUs that Ray reserves for each; a policy with ``gpu=True`` grants those that Ray
+            assigns.
+        resources: The cluster's own resources to reserve for each, as in ``{"simulator": 1}``.
+        scheduling_strategy: ``"SPREAD"`` takes the nodes in turn, ``"DEFAULT"`` fills some first;
+            or an object of Ray's, such as
             ``ray.util.scheduling_strategies.NodeAffinitySchedulingStrategy``.
         runtime_env: What the node prepares, as in ``{"pip": ["envhub-sandbox[ray]"]}``.
         address: As in ``ray.init``, for a process that has not called it; by default the cluster
             that runs already, otherwise a local one.
         placement_s: Seconds to wait until Ray has placed and started the server. A cluster that
             scales itself may need minutes.
-        shared: One server for all environments of this process that use this object.
+        shared: One server for all environments of this process that use this object, and for
+            their workers.
         heartbeat_s: As in ``RemoteSandbox``.
     """
 
     num_cpus: float = 1.0
     num_gpus: float = 0.0
     resources: Mapping[str, float] | None = None
-    scheduling_strategy: Any = None
+    scheduling_strategy: Any = "SPREAD"
     runtime_env: Mapping[str, Any] | None = None
     address: str = ""
     placement_s: float = 300.0
@@ -90,6 +94,10 @@ class RaySandbox(Sandbox):
     def is_placed_anew(self) -> bool:  # type: ignore[override]
         """See ``Sandbox``: ``[RaySandbox()] * 4`` is four servers."""
         return not self.shared
+
+    def workers(self, num_workers: int | None) -> list[RaySandbox]:
+        """See ``Sandbox``: each asks for a server of its own, and where that runs, Ray decides."""
+        return [self] * (1 if self.shared else num_workers or 1)
 
     def __reduce__(self) -> Any:
         """Without the servers, which are this process's."""
@@ -144,7 +152,7 @@ def _made(given: dict[str, Any]) -> RaySandbox:
 
 @dataclass(eq=False)
 class RayRepository(UploadedRepository):
-    """The sandbox of one repository: one server, which its environments share."""
+    """The sandbox of one repository for one worker: a server, which its environments share."""
 
     name = "ray"
     options: RaySandbox

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -24,6 +25,7 @@ def test_the_blocks_run(cluster: Any, tmp_path: Path) -> None:
     variables = {**os.environ, "RAY_ADDRESS": cluster.address}
     for block in ours:
         text = block.text.replace("org/repo@<commit>", EXAMPLE)
+        text = re.sub(r"(num.workers.)16", r"\g<1>4", text)  # as this cluster has CPUs
         command = [sys.executable, "-c", text]
         if block.language == "sh":
             words = text.split()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from typing import Any
 
@@ -9,24 +10,26 @@ import numpy as np
 import pytest
 
 from envhub_sandbox import RaySandbox
+from envhub_sandbox.errors import WorkerDiedError
 from tests.compliance.conftest import pytest_generate_tests as pytest_generate_tests
 from tests.compliance.pair import Pair
 from tests.compliance.vector_env import Case, VectorEnvCompliance, paired
 from tests.faults.mortal import LIVE
 from tests.remote.ray.clusters import add_node, node_of, servers
+from tests.support.command_line import gone
 from tests.support.processes import eventually
-from tests.support.samples import sample
+from tests.support.samples import reference, sample
 from tests.support.started import started
 
 ray = pytest.importorskip("ray")
 AT_ONCE = {"server_idle_s": 0.0}
+ROWS, WORKERS = 64, 8
 
 
 @pytest.fixture(scope="class")
 def pair(request: pytest.FixtureRequest, case: Case, cluster: Any) -> Iterator[Pair]:
     """The reference, and an environment over as many servers as it has workers."""
-    places = [RaySandbox(num_cpus=0.5)] * (case.num_workers or 1)
-    with paired(request.cls.sample, case, sandbox=places) as both:
+    with paired(request.cls.sample, case, sandbox=RaySandbox(num_cpus=0.5)) as both:
         yield both
 
 
@@ -39,25 +42,64 @@ class TestCounter(VectorEnvCompliance):
     steps = 60
 
 
+@pytest.mark.short
 def test_a_lost_node_loses_its_rows_alone(cluster: Any) -> None:
-    """Of four nodes behind one environment; they begin anew on another, the others go on."""
-    more = [add_node(cluster, num_cpus=2, place=1) for _ in range(4)]
-    places = [RaySandbox(num_cpus=1, resources={"place": 1}, placement_s=60)] * 4
-    policy = {"restart": "transparent", "crash_history": 0}
-    options = {"n_envs": 8, "sandbox": places, "policy": policy, "timeouts": AT_ONCE}
-    with started(sample("mortal"), **options) as env:
-        assert eventually(lambda: len(servers()) == 4)
-        assert {node_of(one) for one in servers()} == {one.node_id for one in more}
-        assert env.step([LIVE] * 8)[0][:, 1].tolist() == [1.0] * 8
-        spare = add_node(cluster, num_cpus=2, place=1)
-        lost = more.pop()
-        cluster.remove_node(lost, allow_graceful=False)
-        assert eventually(lambda: len(servers()) == 3)
-        observations, _, _, truncations, infos = env.step([LIVE] * 8)
-        assert truncations.sum() == 2
-        assert np.array_equal(infos["worker_restarted"], truncations)
-        assert observations[:, 1].tolist() == [0.0 if one else 2.0 for one in truncations]
-        assert {node_of(one) for one in servers()} == {one.node_id for one in (*more, spare)}
+    """Ray spreads workers over the nodes, and one of these goes in the midst of an episode: what
+    ``restart`` promises comes true, by ``num_workers`` and by a list of places. Ray counts what is
+    held, and in the end nothing is.
+    """
+    nodes = {node.node_id: node for node in (add_node(cluster, 1, place=16) for _ in range(4))}
+    place = RaySandbox(num_cpus=0.05, resources={"place": 1}, placement_s=60)
+    workers = {"sandbox": place, "num_workers": WORKERS}
+    listed = {"sandbox": [place] * 4}
+    actions, oracle = [LIVE] * ROWS, reference("mortal", n_envs=ROWS)
+    oracle.reset(seed=1)
+    with started(**environment("transparent"), **workers) as env:
+        spread = placed()
+        assert set(spread) == set(nodes)
+        with started(**environment("on_reset"), **listed) as other:
+            assert eventually(lambda: free("place") == 4 * 16 - WORKERS - 4)
+            expected = oracle.step(actions)
+            assert results_equal(env.step(actions), expected)
+            assert results_equal(other.step(actions), expected)
+            victim, _ = (placed() - spread).most_common(1)[0]
+            there = [server for server in servers() if node_of(server) == victim]
+            cluster.remove_node(nodes.pop(victim), allow_graceful=False)
+            assert eventually(lambda: gone(there))
+            expected = oracle.step(actions)
+            with pytest.raises(WorkerDiedError, match=f"on Ray's node {victim[:12]}"):
+                other.step(actions)
+            observations, rewards, _, lost, infos = env.step(actions)
+            assert np.array_equal(infos["worker_restarted"], lost)
+            assert lost.sum() == spread[victim] * ROWS // WORKERS
+            assert observations[lost, 1].tolist() == [0.0] * int(lost.sum())
+            assert np.array_equal(observations[~lost], expected[0][~lost])
+            assert np.array_equal(rewards[~lost], expected[1][~lost])
+            assert np.array_equal(other.reset(seed=5)[0], oracle.reset(seed=5)[0])
+            assert results_equal(other.step(actions), oracle.step(actions))
+            assert set(placed()) <= set(nodes)
+            assert sum(placed().values()) == WORKERS + 4
     assert eventually(lambda: not servers())
-    for node in (*more, spare):
+    assert eventually(lambda: free("place") == 3 * 16)
+    for node in nodes.values():
         cluster.remove_node(node)
+
+
+def environment(restart: str) -> dict[str, Any]:
+    policy = {"restart": restart, "crash_history": 0}
+    return {"cfg": sample("mortal"), "n_envs": ROWS, "policy": policy, "timeouts": AT_ONCE}
+
+
+def placed() -> Counter[str]:
+    """How many servers each node has."""
+    return Counter(map(node_of, servers()))
+
+
+def free(resource: str) -> float | None:
+    """What the cluster has left of it, as ``ray status`` says."""
+    return ray.available_resources().get(resource)
+
+
+def results_equal(results: tuple[Any, ...], expected: tuple[Any, ...]) -> bool:
+    """All but the infos."""
+    return all(map(np.array_equal, results[:4], expected[:4]))

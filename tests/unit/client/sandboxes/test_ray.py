@@ -258,6 +258,8 @@ def test_copies_have_the_options_and_none_of_the_servers() -> None:
     for other in (copy.copy(place), copy.deepcopy(place), pickle.loads(pickle.dumps(place))):
         assert other is not place
         assert other != place
-        assert other.placement() == {"num_cpus": 2, "num_gpus": 0.0, "resources": {"x": 1}}
-        assert other.shared
+        options = {"num_cpus": 2, "num_gpus": 0.0, "resources": {"x": 1}}
+        assert other.placement() == {**options, "scheduling_strategy": "SPREAD"}
+        assert other.workers(4) == [other]  # it is shared
+    assert len(sandbox.RAY.workers(4)) == 4
     assert sandbox_of("ray", None) is sandbox_of("ray", None) is sandbox.RAY
