@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import hashlib
 import threading
@@ -26,7 +27,12 @@ from envhub_sandbox.errors import (
 )
 from envhub_sandbox.sandboxes import remote, remote_keys, remote_repository
 from envhub_sandbox.sandboxes.remote import facts_of
-from envhub_sandbox.sandboxes.remote_repository import ServerPackages, order_of, request_packages
+from envhub_sandbox.sandboxes.remote_repository import (
+    ServerPackages,
+    UploadedRepository,
+    order_of,
+    request_packages,
+)
 from envhub_sandbox.transport.connection import WorkerConnection
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.tcp import TcpServer
@@ -279,6 +285,24 @@ def test_a_server_that_never_ends_is_given_up(server: LyingServer) -> None:
             request_packages(order_of(REQUEST), client, Deadline(0.05))
     finally:
         client.close()
+
+
+def test_a_start_is_not_shorter_for_the_packages_of_a_new_server(
+    server: LyingServer, tmp_path: Path
+) -> None:
+    """Two polls take longer than the start may; its time counts from the fork of a jail."""
+    half = packages("making")
+    says(server, half, half, packages("made", "k1", **FACTS))
+    server.lies[m.OfferSnapshot] = lambda asked: [asked.answer(m.MissingBlobs("sent", ()))]
+    repository = UploadedRepository(tmp_path, order_of(REQUEST), "k1")
+    deadline = Deadline(1.0)
+    client = WorkerConnection(server.endpoint, server.process_fd)
+    server.uploading = threading.Lock()
+    with contextlib.closing(client):
+        order = repository.prepare(m.OpenJail("", "", "", "", "", {}, 1), server, client, deadline)
+    assert (order.snapshot, order.packages) == ("sent", "k1")
+    assert not deadline.passed
+    assert deadline.left_s() < 1.0
 
 
 @pytest.mark.parametrize("given", [{"python": "/usr/bin/python3"}, {"fetch_python": True}])
