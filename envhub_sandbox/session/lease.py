@@ -32,6 +32,7 @@ from envhub_worker.protocol.codec.inert import one_line
 from envhub_worker.protocol.lifecycle import Lifecycle, State
 
 if TYPE_CHECKING:
+    from envhub_sandbox.transport.jail import AttributeAnswer
     from envhub_sandbox.transport.lane import Lane
 
 _WITHOUT_A_JAIL = frozenset({State.EXPIRED, State.DEAD, State.FOREIGN, State.CLOSED})
@@ -376,7 +377,7 @@ class AttributeCache:
         self._counters = lease.counters
         self._reads: dict[str, _Reads] = {}
 
-    def get(self, name: str) -> tuple[Any, ...] | None:
+    def get(self, name: str) -> AttributeAnswer | None:
         """The values, if a step was answered since the last read; None: a request is needed."""
         reads, lane = self._reads.get(name), self._lease.lane
         if reads is None or lane is None or reads.step == self._counters.steps:
@@ -405,7 +406,7 @@ class AttributeCache:
         reads.step = steps
         return reads.rounds >= reads.patience
 
-    def put(self, name: str, values: tuple[Any, ...], *, watched: bool) -> None:
+    def put(self, name: str, values: AttributeAnswer, *, watched: bool) -> None:
         """Keep the answer to a request after ``should_watch``; ``watched`` is the runners' word."""
         lane, reads = self._lease.lane, self._reads[name]
         reads.watched = (
@@ -422,13 +423,13 @@ class FleetAttributes:
         self._parts = parts
         self._bounds = bounds
 
-    def get(self, name: str) -> tuple[Any, ...] | None:
+    def get(self, name: str) -> AttributeAnswer | None:
         """The values, if all parts know theirs."""
         found: list[Any] = []
         for one in self._parts:
             values = one.get(name)
-            if values is None:
-                return None
+            if type(values) is not tuple:
+                return values
             found += values
         return tuple(found)
 
@@ -437,7 +438,8 @@ class FleetAttributes:
         wanted = [one.should_watch(name) for one in self._parts]  # each takes note of it
         return all(wanted)
 
-    def put(self, name: str, values: tuple[Any, ...], *, watched: bool) -> None:
+    def put(self, name: str, values: AttributeAnswer, *, watched: bool) -> None:
         """Keep the answers of all parts."""
         for one, (start, stop) in zip(self._parts, self._bounds, strict=True):
-            one.put(name, values[start:stop], watched=watched)
+            own = values[start:stop] if isinstance(values, tuple) else values
+            one.put(name, own, watched=watched)

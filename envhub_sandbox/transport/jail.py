@@ -11,6 +11,7 @@ from typing import Any
 
 from envhub_sandbox.errors import (
     EnvHubError,
+    RemoteEnvError,
     RemoteProtocolError,
     WorkerDiedError,
     WorkerError,
@@ -387,6 +388,10 @@ def _runners(opened: m.JailOpened, count: int) -> list[int]:
     return runners
 
 
+AttributeAnswer = tuple[Any, ...] | RemoteEnvError
+"""Values of an attribute, one for each sub-environment; or what is raised where none has it."""
+
+
 class WatchedAttributes:
     """The values of attributes that the runners watch: by the environment's number and their name.
 
@@ -396,17 +401,17 @@ class WatchedAttributes:
     """
 
     def __init__(self) -> None:
-        self._values: dict[Attribute, tuple[Any, ...]] = {}
+        self._values: dict[Attribute, AttributeAnswer] = {}
 
-    def note(self, number: int, name: str, values: tuple[Any, ...]) -> bool:
+    def note(self, number: int, name: str, values: AttributeAnswer) -> bool:
         """Keep values that were read. Returns whether they can be kept."""
-        if not all(type(value) in WATCHED_TYPES for value in values):
+        if type(values) is tuple and any(type(value) not in WATCHED_TYPES for value in values):
             return False
         self._values[number, name] = values
         return True
 
-    def values(self, number: int, name: str) -> tuple[Any, ...] | None:
-        """One for each sub-environment; None if they are not known."""
+    def values(self, number: int, name: str) -> AttributeAnswer | None:
+        """One for each sub-environment, or what is raised; None if that is not known."""
         return self._values.get((number, name))
 
     def forget(self) -> None:

@@ -18,7 +18,7 @@ import gymnasium as gym
 from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import VectorEnv
 
-from envhub_sandbox.errors import EnvHubError
+from envhub_sandbox.errors import EnvHubError, RemoteEnvError
 from envhub_sandbox.session.requests import SENT, MessageFor
 from envhub_sandbox.system.platform import OwnerProcess
 from envhub_sandbox.transport.deadline import Deadline
@@ -321,16 +321,29 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
         """``call`` without arguments; what is read after each step is watched."""
         attributes = self._requests.attributes
         known = attributes.get(name)
+        if isinstance(known, RemoteEnvError):
+            raise copy(known)
         if known is not None:
             return known
         if not attributes.should_watch(name):
-            self._send_call(name, (), {})
-            return self._end_call(self._timeouts.call_s)
+            return self._called(name)
         self._send_call(name, (), {}, lambda number, _: m.Watch(number, name))
         replies = self._requests.collect(self._timeouts.call_s, m.WatchDone)
+        watched = all(reply.watched for reply in replies)
+        absent_in = [type(reply.value) is tuple and not reply.value for reply in replies]
+        if any(absent_in):
+            try:
+                return self._called(name)
+            except RemoteEnvError as error:
+                attributes.put(name, copy(error), watched=watched and all(absent_in))
+                raise
         values = self._requests.one_each("call", replies)
-        attributes.put(name, values, watched=all(reply.watched for reply in replies))
+        attributes.put(name, values, watched=watched)
         return values
+
+    def _called(self, name: str) -> tuple[Any, ...]:
+        self._send_call(name, (), {})
+        return self._end_call(self._timeouts.call_s)
 
     @short_traceback
     def call_async(self, name: str, /, *args: Any, **kwargs: Any) -> None:

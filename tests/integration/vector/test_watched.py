@@ -48,7 +48,7 @@ class Told(Still):
         if self.mortal:
             self.die()
         if action == 2:
-            self.task = f"task {self.steps}"
+            self.task = self.late = f"task {self.steps}"
         return 1, 0.0, False, False, {}
 
     @property
@@ -95,7 +95,7 @@ SUITE = REPOSITORY.replace(
     "    kinds = (gym.vector.SyncVectorEnv, gym.vector.SyncVectorEnv, Live)\n"
     "    return {'suite': {task: kind([Told] * n_envs) for task, kind in enumerate(kinds)}}\n",
 )
-READ = ("task", "kind", "steps", "episodes", "count", "asked", "absent")
+READ = ("task", "kind", "steps", "episodes", "count", "asked", "absent", "late")
 WAYS = [
     {"lane": "auto", "num_workers": 1},
     {"lane": "frames", "num_workers": 1},
@@ -161,6 +161,30 @@ def test_an_evaluation_asks_for_its_task_but_twice(folder: Path) -> None:
             env.step(np.zeros(ENVS, np.int64))
             assert env.call("kind") == ("reacher",) * ENVS
         assert env.sandbox.stats()["requests"] - before == 50 + 1
+
+
+@pytest.mark.parametrize("way", WAYS, ids=str)
+def test_what_is_absent_is_asked_for_until_that_is_watched(
+    folder: Path, way: dict[str, Any]
+) -> None:
+    """The error is then the same, each time another one; and the first that has it is noticed."""
+    with make_env(folder, ENVS, **way) as suites:
+        env = suites.env
+        env.reset()
+        before, errors = env.sandbox.stats()["requests"], []
+        for _ in range(20):
+            env.step(np.zeros(ENVS, np.int64))
+            with pytest.raises(AttributeError) as caught:
+                env.call("late")
+            errors.append(caught.value)
+        assert env.sandbox.stats()["requests"] - before == 20 + 3
+        assert len({id(error) for error in errors}) == 20
+        assert len({repr(vars(error)) + str(error) for error in errors}) == 1
+        env.step(np.array([2, 0, 0]))
+        with pytest.raises(AttributeError):  # of the second sub-environment
+            env.call("late")
+        env.step(np.full(ENVS, 2))
+        assert env.call("late") == ("task 22",) * ENVS
 
 
 def test_who_waits_for_a_change_sees_it(folder: Path) -> None:

@@ -18,6 +18,7 @@ import re
 import signal
 import warnings
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import gymnasium as gym
@@ -128,8 +129,10 @@ class Watches:
         self.readings: dict[Attribute, list[_Reading]] = {}
         self.changed: dict[Attribute, None] = {}
 
-    def begin(self, number: int, env: Any, name: str, values: Any) -> bool:
-        """Watch an attribute whose values have just been read; whether that is possible."""
+    def begin(self, number: int, env: Any, name: str, values: Any | None) -> bool:
+        """Watch an attribute whose values have just been read; whether that is possible.
+        ``values``: None where it is watched that no sub-environment has the attribute.
+        """
         key = (number, name)
         self.readings.pop(key, None)
         self.changed.pop(key, None)
@@ -137,8 +140,11 @@ class Watches:
             return False
         if not _can_be_watched(env, name, values):
             return False
-        reads = [one.get_wrapper_attr for one in env.envs]
-        self.readings[key] = list(zip(reads, values, strict=True))
+        if values is None:
+            self.readings[key] = [(partial(_has, one), False) for one in env.envs]
+        else:
+            reads = [one.get_wrapper_attr for one in env.envs]
+            self.readings[key] = list(zip(reads, values, strict=True))
         return True
 
     def look(self) -> None:
@@ -171,10 +177,11 @@ class Watches:
 def _can_be_watched(env: Any, name: str, values: Any) -> bool:
     if not isinstance(env, SubEnvs) or len(name) > MAX_ATTRIBUTE:
         return False
-    if not all(type(value) in WATCHED_TYPES for value in values):
+    if not all(type(value) in WATCHED_TYPES for value in values or ()):
         return False
+    wanted = None if values is None else True
     try:
-        return all(_is_plain(one, name) for one in env.envs)
+        return all(_is_plain(one, name) is wanted for one in env.envs)
     except Exception:  # of a kind that we do not know
         return False
 
@@ -191,8 +198,19 @@ def _are(name: str, readings: list[_Reading]) -> bool:
     return True
 
 
-def _is_plain(env: Any, name: str) -> bool:
-    """Whether reading an attribute runs nothing but Gymnasium's own search through the wrappers."""
+def _has(env: Any, name: str) -> bool:
+    """Whether an environment or what it wraps has an attribute."""
+    while not hasattr(env, name):
+        if not isinstance(env, gym.Wrapper):
+            return False
+        env = env.env
+    return True
+
+
+def _is_plain(env: Any, name: str) -> bool | None:
+    """Whether reading an attribute runs nothing but Gymnasium's own search through the wrappers.
+    None: likewise, and the search is in vain.
+    """
     while True:
         kind: Any = type(env)
         if kind.get_wrapper_attr not in _SEARCHES or _intercepts(kind):
@@ -203,8 +221,8 @@ def _is_plain(env: Any, name: str) -> bool:
         own = vars(env)
         if name in own:
             return True
-        if not isinstance(env, gym.Wrapper) or "env" not in own:
-            return False
+        if not isinstance(env, gym.Wrapper):
+            return None
         env = own["env"]
 
 

@@ -264,8 +264,12 @@ class Runner:
         return m.Value(tuple(results) if isinstance(results, list) else results)
 
     def watch(self, request: m.Watch) -> m.Message:
-        """``VectorEnv.call`` without arguments, and from now on its answer is watched."""
+        """``VectorEnv.call`` without arguments, and from now on its answer is watched; none where
+        no sub-environment has the attribute.
+        """
         number, name = request.env, request.name
+        if self.watches.begin(number, self._envs[number], name, None):
+            return m.WatchDone((), True)
         called = self.call(m.Call(number, name, (), {}))
         values = called.value if isinstance(called, m.Value) else ()
         return m.WatchDone(values, self.watches.begin(number, self._envs[number], name, values))

@@ -166,6 +166,9 @@ def test_other_values_are_not(name: str) -> None:
 def test_who_has_a_say_is_not_watched(wrapper: Any) -> None:
     assert not begun(envs_of(lambda: wrapper(Told())), "task")
     assert not begun(envs_of(lambda: gym.Wrapper(wrapper(Told()))), "task")
+    assert not watching().begin(ENV, envs_of(lambda: wrapper(Told())), "absent", None)
+    assert watching().begin(ENV, envs_of(lambda: gym.Wrapper(Told())), "absent", None)
+    assert not watching().begin(ENV, envs_of(lambda: gym.Wrapper(Told())), "counted", None)
 
 
 _WITH_A_THREAD = """
