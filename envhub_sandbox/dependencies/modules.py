@@ -216,7 +216,7 @@ def _recalled(snapshot: Snapshot) -> tuple[tuple[str, str, int], ...]:
 
     files = parsing.read(snapshot)
     found = [(one.module, one.file, one.line) for one in parsing.imports(snapshot, files)]
-    found = [row for row in found if row[0] not in _WORKERS]
+    found = [row for row in found if row[0].partition(".")[0] not in _WORKERS]
     rows = [*found, *(row for row in parsing.ids(snapshot, files) if _of_id(row[0]))]
     keep(*place, json.dumps(rows))
     return tuple(rows)

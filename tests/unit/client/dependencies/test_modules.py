@@ -45,7 +45,7 @@ def requirements(found: Snapshot) -> list[str]:
     [
         ("import cv2" + MAKE, ["opencv-python-headless"]),
         ("from google.protobuf import message" + MAKE, ["protobuf"]),
-        ("import os, numpy, gymnasium, nobody_knows_this" + MAKE, []),
+        ("import os, numpy, gymnasium.wrappers, nobody_knows_this" + MAKE, []),
         ("def make_env():\n    import chess", ["chess"]),
         ("def make_env(): return C()\nclass C:\n  def render(self):\n    import chess", ["chess"]),
         ("try:\n  import chess\nexcept ImportError as e:\n  raise E from e" + MAKE, ["chess"]),
