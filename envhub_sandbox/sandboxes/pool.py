@@ -31,7 +31,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 from envhub_sandbox.system.platform import OwnerProcess, each_after_fork
 
 if TYPE_CHECKING:
-    from envhub_sandbox.transport.tcp import TcpServer
+    from envhub_sandbox.transport.connection import FarServer
 
 _LONGEST_WAIT_S = 3600.0
 
@@ -55,7 +55,7 @@ class WorkerServer(ABC):
     fd_path: str | None = None
     layers: Sequence[Mapping[str, Any]] = ()
     silent_s: float = float("-inf")
-    far: TcpServer | None = None
+    far: FarServer | None = None
     uploading: threading.Lock
     is_ours = True
 

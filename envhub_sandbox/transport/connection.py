@@ -8,8 +8,8 @@ import os
 import secrets
 import signal
 import sys
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
 
 import zmq
 
@@ -26,7 +26,6 @@ from envhub_sandbox.system.log import MESSAGES
 from envhub_sandbox.system.platform import OwnerProcess, fork_error_text
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.replies import expect_reply
-from envhub_sandbox.transport.tcp import TcpLink, TcpServer
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.wire import Buffer
 from envhub_worker.protocol.errors import UNTRUSTED
@@ -69,6 +68,21 @@ _ROOM_S = 30.0
 """How long a socket may be full, or without a connection, until what is sent counts as lost."""
 
 
+class FarServer(Protocol):
+    """A server on another host: ``tcp.TcpServer``, of the extra that knows such servers."""
+
+    @property
+    def held(self) -> set[int]:
+        """The numbers of the jails that we have open there."""
+
+    @property
+    def why_ended(self) -> Callable[[], str]:
+        """Says what is known of its end, as the rest of a sentence; may wait some seconds."""
+
+    def link(self, socket: zmq.Socket[bytes], endpoint: str) -> Any:
+        """A ``TcpLink``, which watches a socket before it connects."""
+
+
 class WorkerConnection:
     """A connection. Not thread-safe: its owner holds a lock.
 
@@ -89,7 +103,7 @@ class WorkerConnection:
         endpoint: str,
         process_fd: int,
         limits: WireLimits = DEFAULT_LIMITS,
-        far: TcpServer | None = None,
+        far: FarServer | None = None,
     ) -> None:
         self._owner = OwnerProcess()
         self._limits = limits
@@ -99,7 +113,7 @@ class WorkerConnection:
         self._socket.setsockopt(zmq.MAXMSGSIZE, limits.frame_bytes)
         self._socket.setsockopt(zmq.RCVHWM, 64)
         self._far = far
-        self._link = None if far is None else TcpLink(self._socket, endpoint, far)
+        self._link = None if far is None else far.link(self._socket, endpoint)
         self._socket.connect(endpoint)
         self._process_fd = process_fd
         self._poller = zmq.Poller()

@@ -61,6 +61,10 @@ class TcpServer:
     links: WeakSet[TcpLink] = field(default_factory=WeakSet, compare=False, repr=False)
     why_ended: Callable[[], str] = field(default=str, compare=False, repr=False)
 
+    def link(self, socket: zmq.Socket[bytes], endpoint: str) -> TcpLink:
+        """What watches a socket of ours, before it connects."""
+        return TcpLink(socket, endpoint, self)
+
     def public_key(self) -> str:
         """Our public key, as the server's list of clients has it."""
         if self.client_key is None:

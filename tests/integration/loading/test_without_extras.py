@@ -29,19 +29,22 @@ with hub.make_env(repository, n_envs=2) as envs:
     env = envs.env
     env.reset(seed=1)
     print(env.step(env.action_space.sample())[1].shape)
-for argument, value in json.loads(sys.argv[3]).items():
+for argument, value in json.loads(sys.argv[3]):
     try:
         hub.make_env(**{"cfg": repository, argument: value})
     except errors.SandboxUnavailableError as error:
         print(error)
 """
-_ASKED = {
-    "cfg": ("pypi:minigrid#MiniGrid-Empty-5x5-v0", "hub.registered"),
-    "lock": ("pylock.toml", "dependencies.source"),
-    "dependencies": ({}, "dependencies.source"),
-    "assets": (["org/data"], "hub.sources.assets"),
-}
-"""By argument, a value that needs an extra, and the extra's module."""
+_ASKED = [
+    ("cfg", "pypi:minigrid#MiniGrid-Empty-5x5-v0", "a reference of pypi", "hub.registered"),
+    ("sandbox", "docker", "sandbox", "sandboxes.docker.sandbox"),
+    ("sandbox", "tcp://localhost:1", "sandbox", "sandboxes.remote"),
+    ("sandbox", ["process"], "sandbox", "sandboxes.fleet.fleet"),
+    ("lock", "pylock.toml", "lock", "dependencies.source"),
+    ("dependencies", {}, "dependencies", "dependencies.source"),
+    ("assets", ["org/data"], "assets", "hub.sources.assets"),
+]
+"""An argument, a value that needs an extra, how the error calls it, and the extra's module."""
 
 
 def absent() -> list[str]:
@@ -64,7 +67,7 @@ def absent() -> list[str]:
 
 def test_the_core_needs_no_extra(tmp_path: Path) -> None:
     """It runs an environment; what a caller asks for beyond that is named."""
-    asked = {argument: value for argument, (value, _) in _ASKED.items()}
+    asked = [(argument, value) for argument, value, _, _ in _ASKED]
     arguments = json.dumps(absent()), sample("cartpole"), json.dumps(asked)
     done = subprocess.run(
         [sys.executable, "-c", _PROGRAM, *arguments],
@@ -73,6 +76,6 @@ def test_the_core_needs_no_extra(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     shape, *refused = done.stdout.splitlines()
     assert shape == "(2,)"
-    for line, (argument, (_, module)) in zip(refused, _ASKED.items(), strict=True):
-        what = "a reference of pypi" if argument == "cfg" else argument
-        assert line.startswith(f"{what} needs envhub_sandbox.{module}, which this")
+    assert [line.partition(", which this")[0] for line in refused] == [
+        f"{what} needs envhub_sandbox.{module}" for _, _, what, module in _ASKED
+    ]
