@@ -21,8 +21,10 @@ pytest_plugins = [
 ]
 
 # A loaded machine is slow at random; what may be slow is bounded by pytest-timeout instead.
-settings.register_profile("local", deadline=None, suppress_health_check=[HealthCheck.too_slow])
-settings.register_profile("ci", settings.get_profile("local"), derandomize=True)
+# CI tries more examples, and the same ones each time.
+_SLOW = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.register_profile("local", _SLOW, max_examples=25)
+settings.register_profile("ci", _SLOW, max_examples=100, derandomize=True)
 settings.load_profile("ci" if "ENVHUB_CI" in os.environ else "local")
 
 

@@ -254,6 +254,7 @@ def do(act: Act, thing: object) -> None:
         act(thing)
 
 
+@functools.cache
 def names_asked_for() -> set[str]:
     """Every name that one of these acts looks for, by trying them all."""
     spy = Spy()

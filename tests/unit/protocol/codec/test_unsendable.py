@@ -21,7 +21,7 @@ from envhub_worker.protocol.codec.arrays import INLINE_BYTES
 from envhub_worker.protocol.codec.encoder import encode
 from envhub_worker.protocol.codec.inert import RemoteObject
 from envhub_worker.protocol.errors import LocalProtocolError, RemoteProtocolError
-from envhub_worker.protocol.limits import DEFAULT_LIMITS
+from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 from tests.support.compare import assert_identical, assert_same
 from tests.support.decode import decode
 from tests.support.objects import handed
@@ -166,18 +166,19 @@ def _cyclic() -> list[Any]:
     return value
 
 
-_MOST = DEFAULT_LIMITS.items
+_LIMITS = WireLimits(items=2_000, text_bytes=10_000, header_bytes=100_000, frame_bytes=1 << 20)
+_MOST = _LIMITS.items
 _PARTS = {
     "too deep": deep(40),
     "cyclic": _cyclic(),
     "large integer": 2**10_000,
-    "long text": "x" * (DEFAULT_LIMITS.text_bytes + 1),
-    "many bytes": b"x" * DEFAULT_LIMITS.header_bytes,
+    "long text": "x" * (_LIMITS.text_bytes + 1),
+    "many bytes": b"x" * _LIMITS.header_bytes,
     "long list": [0] * _MOST,
     "long lists": [[1] * (_MOST // 3)] * 4,
     "many keys": dict.fromkeys(range(_MOST), 1),
     "wide texts": np.zeros(1, "U300000"),
-    "large array": np.broadcast_to(np.uint8(0), (DEFAULT_LIMITS.frame_bytes + 1,)),
+    "large array": np.broadcast_to(np.uint8(0), (_LIMITS.frame_bytes + 1,)),
     "large set": set(range(_MOST)),
     "two in a tuple": (deep(40), 2**10_000),
     "in an object array": objects(1, 2**10_000),
@@ -195,8 +196,9 @@ def test_of_a_reply_that_cannot_be_sent_the_rest_arrives(name: str) -> None:
     """A description stands in its place; where that is not asked for, it is refused."""
     message = [71, np.arange(3), {"a": 1, "part": _PARTS[name], "z": {"x": [2, "text"]}}]
     with pytest.raises(LocalProtocolError):
-        encode(message)
-    found = cast("list[Any]", decode(encode(message, reduces=True)))
+        encode(message, limits=_LIMITS)
+    frames = encode(message, reduces=True, limits=_LIMITS)
+    found = cast("list[Any]", decode(frames, limits=_LIMITS))
     assert (found[0], found[1].tolist()) == (71, [0, 1, 2])
     assert list(found[2]) == ["a", "part", "z"]
     assert found[2]["z"] == {"x": [2, "text"]}
@@ -206,7 +208,7 @@ def test_of_a_reply_that_cannot_be_sent_the_rest_arrives(name: str) -> None:
 def test_a_field_itself_is_never_a_description() -> None:
     infos = dict.fromkeys(range(_MOST), 1)
     with pytest.raises(LocalProtocolError, match="items"):
-        encode([71, infos], reduces=True)
+        encode([71, infos], reduces=True, limits=_LIMITS)
     assert type(unsendable.reduced([71, {}], lambda _: None, DEFAULT_LIMITS)[1]) is dict
 
 
