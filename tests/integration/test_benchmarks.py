@@ -1,6 +1,7 @@
 """Each benchmark is started once, as short as can be: it runs, and says nothing about speed.
 
-``reach`` is a step of CI; ``suites`` imports torch in each of its interpreters, and is left out.
+``reach`` is a step of CI; ``suites`` imports torch in each of its interpreters, and ``remote``
+takes longer than what it shows: they are left out.
 """
 
 from __future__ import annotations
@@ -8,24 +9,17 @@ from __future__ import annotations
 import subprocess
 from pathlib import Path
 
-import pytest
-
 from tests.support.command_line import python
 
-SHORT = {
-    "auto --workloads cartpole --sizes 2 --rounds 1 --seconds 0.01 --busy 1": "| CartPole | 2 |",
-    "remote 0.01 plain": "| plain, n=1 |",
-}
+SHORT = "auto --workloads cartpole --sizes 2 --rounds 1 --seconds 0.01 --busy 1"
 
 
 def benchmark(checkout: Path, *words: str, code: int = 0) -> subprocess.CompletedProcess[str]:
     return python("-m", *words, cwd=checkout, code=code, PYTHONDONTWRITEBYTECODE="1")
 
 
-@pytest.mark.parametrize("words", SHORT)
-def test_a_benchmark_runs(words: str, checkout: Path) -> None:
-    done = benchmark(checkout, "benchmarks", *words.split())
-    assert SHORT[words] in done.stdout
+def test_a_benchmark_runs(checkout: Path) -> None:
+    assert "| CartPole | 2 |" in benchmark(checkout, "benchmarks", *SHORT.split()).stdout
 
 
 def test_the_comparison_runs(checkout: Path, tmp_path: Path) -> None:
@@ -41,5 +35,5 @@ def test_a_benchmark_that_lacks_its_environment_says_how_to_make_it(checkout: Pa
 def test_the_benchmarks_are_listed_with_a_sentence_each(checkout: Path) -> None:
     _, _, *lines = benchmark(checkout, "benchmarks").stdout.splitlines()
     words = {line.split()[0]: line.split(maxsplit=1)[1] for line in lines}
-    assert {name.split()[0] for name in SHORT} | {"steps", "suites", "reach", "memory"} <= {*words}
+    assert {"auto", "remote", "steps", "suites", "reach", "memory"} <= {*words}
     assert all(text.endswith(".") for text in words.values())

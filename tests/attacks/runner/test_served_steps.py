@@ -29,7 +29,7 @@ from tests.support import inside
 
 FAMILY = "The client, from inside a jail"
 
-STEPS = 100
+STEPS = 30
 _PATIENCE_S = 240.0
 """A jail that hammers leaves little of a busy machine to who answers it."""
 OBSERVATION_BYTES = 96 * 1024

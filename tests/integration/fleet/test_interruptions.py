@@ -25,9 +25,7 @@ from tests.support.in_process.interrupts import at_call
 from tests.support.processes import eventually, halted
 from tests.support.started import started
 
-pytestmark = [
-    pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning"),
-]
+pytestmark = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 lanes = pytest.mark.parametrize("lane", ["auto", "frames"])
 WORKERS = 3
 STILL = np.zeros(2 * WORKERS, np.int64)

@@ -23,7 +23,8 @@ def _return_of(suite: str, task: Any, env: Any) -> float:
 
 def test_what_comes_of_tasks_does_not_depend_on_how_many_live() -> None:
     """Two at once over a fleet, one started ahead: the same as one after the other."""
-    with make_env(sample("many_tasks"), n_envs=2) as suites:
+    options: dict[str, Any] = {"n_envs": 2, "env_kwargs": {"tasks": 6}}
+    with make_env(sample("many_tasks"), **options) as suites:
         alone = {
             suite: {task: _return_of(suite, task, env) for task, env in tasks.items()}
             for suite, tasks in suites.items()
@@ -37,7 +38,7 @@ def test_what_comes_of_tasks_does_not_depend_on_how_many_live() -> None:
             most[0] = max(most[0], sum(s.lifecycle.state.name == "READY" for s in sessions))
         return result
 
-    with make_env(sample("many_tasks"), n_envs=2, sandbox=["process", "process"]) as suites:
+    with make_env(sample("many_tasks"), sandbox=["process", "process"], **options) as suites:
         assert suites.map(play, max_live_tasks=3) == alone
         assert 1 <= most[0] <= 3
         assert all(env.closed for tasks in suites.values() for env in tasks.values())
