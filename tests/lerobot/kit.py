@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -14,6 +15,7 @@ import pytest
 import envhub_sandbox
 import envhub_worker
 from tests.hub.olah_server import OlahServer
+from tests.support.documents import blocks
 
 OVERLAY = "ENVHUB_TEST_LEROBOT"
 """A folder with LeRobot and what it imports at least, for this interpreter: ``./test`` makes it."""
@@ -21,6 +23,27 @@ OWN = "ENVHUB_TEST_LEROBOT_PYTHON"
 """An interpreter that has all of LeRobot: ``python -m tests.lerobot`` makes it."""
 THEIRS = "ENVHUB_TEST_LEROBOT_SOURCE"
 """A folder with LeRobot's repository at that version, if there is one."""
+
+READ_AS = {
+    "org/policy": "robots/policy",
+    "org/dataset": "robots/recorded",
+    "=...": "=robots/policy",
+    '{"gpu": true}': "{}",
+    '{"gpu": True}': "{}",
+}
+"""What our own pages write, and what stands there instead: nobody here has a GPU."""
+
+
+def written(repository: str) -> tuple[list[list[str]], str]:
+    """The commands of LeRobot's, and the Python, that ``blocks.APART`` leaves to this folder."""
+    here = Path(__file__).with_name("test_pages.py").relative_to(blocks.CHECKOUT).as_posix()
+    ours = [one for one in blocks.tested(blocks.OWN) if one.apart == here]
+    texts = {"sh": "", "python": ""}
+    for one in ours:
+        texts[one.language] += one.text.replace("\\\n", " ")
+    for old, new in {"org/repo@<commit>": f"{repository}@main", **READ_AS}.items():
+        texts = {language: text.replace(old, new) for language, text in texts.items()}
+    return [shlex.split(line) for line in texts["sh"].splitlines()], texts["python"]
 
 
 def run(program: str, olah: OlahServer, home: Path, *arguments: str) -> Any:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import json
-import shlex
 from pathlib import Path
 
 import pytest
 
 from tests.hub.olah_server import OlahServer
-from tests.lerobot.kit import run
+from tests.lerobot.kit import run, written
 from tests.lerobot.repositories import REACH, publish
-from tests.support.documents import blocks
 
 pytest.importorskip("torch")
 
@@ -69,28 +67,13 @@ FEATURES = {
 }
 
 
-# What our own pages write, and what stands there instead: nobody here has a GPU.
 POLICY = '{"type": "act"}'
-READ_AS = {"org/repo@<commit>": "robots/reach@main", "org/policy": "robots/policy"}
-READ_AS |= {"=...": "=robots/policy", '{"gpu": true}': "{}", '{"gpu": True}': "{}"}
-
-
-def written() -> tuple[list[list[str]], str]:
-    """The commands of LeRobot's, and the Python, that ``blocks.APART`` leaves to this."""
-    here = Path(__file__).relative_to(blocks.CHECKOUT).as_posix()
-    ours = [one for one in blocks.tested(blocks.OWN) if one.apart == here]
-    texts = {"sh": "", "python": ""}
-    for one in ours:
-        texts[one.language] += one.text.replace("\\\n", " ")
-    for old, new in READ_AS.items():
-        texts = {language: text.replace(old, new) for language, text in texts.items()}
-    return [shlex.split(line) for line in texts["sh"].splitlines()], texts["python"]
 
 
 def test_the_pages_hold(olah: OlahServer, tmp_path: Path) -> None:
     """With LeRobot's own functions, in one process, which has loaded nothing of the Hub after."""
     olah.repository("robots/policy").commit({"config.json": POLICY})
-    commits, (commands, python) = publish(olah), written()
+    commits, (commands, python) = publish(olah), written("robots/reach")
     arguments = json.dumps(commits), json.dumps(commands), python, REACH
     found = run("pages_program.py", olah, tmp_path, *arguments)
     features = found.pop("features")

@@ -7,16 +7,21 @@ from pathlib import Path
 import pytest
 
 from tests.hub.olah_server import OlahServer
-from tests.lerobot.kit import run
+from tests.lerobot.kit import run, written
 from tests.lerobot.repositories import REACH
 
 
 def test_a_training_is_the_same(olah: OlahServer, tmp_path: Path) -> None:
-    """To its end: what it evaluates to, the bytes of videos, and the weights of checkpoints."""
+    """To its end: what it evaluates to, the bytes of videos, and the weights of checkpoints; by the
+    command of the page, with the sizes of a test added.
+    """
     commit = olah.repository("robots/trained").commit({"env.py": REACH})
+    [command] = [
+        words for program, *words in written("robots/trained")[0] if program == "lerobot-train"
+    ]
     file = tmp_path / "env.py"
     file.write_text(REACH)
-    found = run("training_program.py", olah, tmp_path, "robots/trained", str(file))
+    found = run("training_program.py", olah, tmp_path, str(file), *command)
     if not found["asks configs"]:
         pytest.skip("this LeRobot lets no configuration make its environments")
     here = found["here"]

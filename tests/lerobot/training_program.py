@@ -70,12 +70,12 @@ def trained(name: str, *arguments: str) -> dict[str, Any]:
     """What a training leaves: its evaluations, their videos, and its weights."""
     folder = Path(name)
     TOLD.clear()
-    sys.argv = ["lerobot-train", *(f"--policy.{key}={value}" for key, value in ACT.items())]
-    sys.argv += ["--dataset.repo_id=robots/recorded", f"--dataset.root={Path('recorded')}"]
+    sizes = {key: value for key, value in ACT.items() if key != "push_to_hub"}
+    sys.argv = ["lerobot-train", *arguments, f"--dataset.root={Path('recorded')}"]
+    sys.argv += [f"--policy.{key}={value}" for key, value in sizes.items()]
     sys.argv += [f"--steps={STEPS}", "--env_eval_freq=2", "--save_freq=2", "--log_freq=1"]
     sys.argv += ["--batch_size=4", "--num_workers=0", "--seed=7", "--eval.use_async_envs=false"]
     sys.argv += ["--eval.n_episodes=4", "--eval.batch_size=2", f"--output_dir={folder}"]
-    sys.argv += arguments
     lerobot_train.main()
     return found_in(folder)
 
@@ -109,16 +109,16 @@ def listened() -> None:
 
 
 if __name__ == "__main__":
-    reference, file = sys.argv[1:]
+    file, *page = sys.argv[1:]
     if not hasattr(EnvConfig, "create_envs"):
         print(json.dumps({"asks configs": False}))
         sys.exit()
     recorded(Path("recorded"))
     listened()
-    here = trained("here", "--env.type=of_this_process", f"--env.file={file}")
+    own = ("--dataset.repo_id=robots/recorded", "--policy.push_to_hub=false")
+    here = trained("here", "--env.type=of_this_process", f"--env.file={file}", *own)
     executed = os.environ.pop("REACHED", None) is not None
-    ours = ("--env.type=envhub_sandbox", f"--env.repo={reference}")
-    sandboxed = trained("sandboxed", PLUGIN, *ours)
+    sandboxed = trained("sandboxed", *page)
     saved = Path("sandboxed/checkpoints/last/pretrained_model/train_config.json")
     report = {
         "asks configs": True,
