@@ -47,14 +47,11 @@ class Sandbox:
     Attributes:
         name: How errors call it.
         is_here: Whether jails run on this machine and see its files.
-        is_placed_anew: Whether it is another place, with a server of its own, each time that a
-            fleet names it.
         retry_s: For how long to wait for room in a place that others use, too.
     """
 
     name: str
     is_here: bool = False
-    is_placed_anew: bool = False
     retry_s: float = 0.0
 
     def for_repository(

@@ -40,10 +40,12 @@ class Member(Sandbox):
         absent: Whether it did not answer when packages were to be made there, or had no room.
     """
 
-    def __init__(self, sandbox: Sandbox, runtime: Callable[[Member], Runtime]) -> None:
+    def __init__(
+        self, sandbox: Sandbox, runtime: Callable[[Member], Runtime], weight: int = 1
+    ) -> None:
         self.sandbox = sandbox
         self.name, self.retry_s = sandbox.name, sandbox.retry_s
-        self.weight = 1
+        self.weight = weight
         self.absent = False
         self._opening = threading.RLock()  # interruption.md, rule 12
         self._make_runtime = runtime

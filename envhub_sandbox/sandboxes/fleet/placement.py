@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import threading
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -100,6 +101,11 @@ ASK_S = 10.0
 Resolve = Callable[["str | Sandbox"], Sandbox]
 
 
+def _key(entry: str | Sandbox) -> str | int:
+    """By what an entry of the list is known again."""
+    return entry if isinstance(entry, str) else id(entry)
+
+
 class Placement:
     """The places of the workers of one ``make_env``. Thread-safe.
 
@@ -119,7 +125,6 @@ class Placement:
         self._resolve = resolve
         self._runtime = runtime
         self._lock = threading.RLock()  # interruption.md, rule 12
-        self._known: dict[object, Member] = {}
         self._members: list[Member] = []
         self._at: dict[int, Member] = {}
         self._placed_s: dict[int, float] = {}
@@ -131,21 +136,13 @@ class Placement:
         """The places, each once, with its weight. Raises ``EnvHubError``: one is none."""
         with self._lock:
             if not self._members:
-                found: dict[Member, int] = {}
-                for entry in self._places:
-                    member = self._member(entry if isinstance(entry, str) else id(entry), entry)
-                    while member in found and member.sandbox.is_placed_anew:
-                        member = self._member(member, entry)
-                    found[member] = found.get(member, 0) + 1
-                for member, weight in found.items():
-                    member.weight = weight
-                self._members = list(found)
+                named = {_key(entry): entry for entry in self._places}
+                members: list[Member] = []
+                for key, count in Counter(map(_key, self._places)).items():
+                    each = self._resolve(named[key]).workers(count)
+                    members += [Member(one, self._runtime, count // len(each)) for one in each]
+                self._members = members
             return list(self._members)
-
-    def _member(self, key: object, entry: str | Sandbox) -> Member:
-        if key not in self._known:
-            self._known[key] = Member(self._resolve(entry), self._runtime)
-        return self._known[key]
 
     def seats(self, num_workers: int | None) -> list[Seat]:
         """One for each worker; by default as many as the list has places."""

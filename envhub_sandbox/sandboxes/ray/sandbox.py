@@ -90,11 +90,6 @@ class RaySandbox(Sandbox):
             if not value > 0:
                 raise PolicyError(f"RaySandbox: {option} is {value!r}; it takes seconds above 0")
 
-    @property
-    def is_placed_anew(self) -> bool:  # type: ignore[override]
-        """See ``Sandbox``: ``[RaySandbox()] * 4`` is four servers."""
-        return not self.shared
-
     def workers(self, num_workers: int | None) -> list[RaySandbox]:
         """See ``Sandbox``: each asks for a server of its own, and where that runs, Ray decides."""
         return [self] * (1 if self.shared else num_workers or 1)

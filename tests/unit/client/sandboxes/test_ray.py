@@ -18,6 +18,7 @@ import pytest
 from envhub_sandbox import RaySandbox
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError, WorkerStartupError
 from envhub_sandbox.factory.make_env import sandbox_of
+from envhub_sandbox.sandboxes.fleet.placement import Placement
 from envhub_sandbox.sandboxes.ray import cluster, sandbox
 from envhub_sandbox.sandboxes.ray.actor import WorkerActor
 from envhub_sandbox.settings.policy import Policy
@@ -262,4 +263,11 @@ def test_copies_have_the_options_and_none_of_the_servers() -> None:
         assert other.placement() == {**options, "scheduling_strategy": "SPREAD"}
         assert other.workers(4) == [other]  # it is shared
     assert len(sandbox.RAY.workers(4)) == 4
+
+
+@pytest.mark.parametrize(("shared", "weights"), [(False, [1, 1, 1]), (True, [3])])
+def test_each_place_of_a_list_is_another_server(shared: bool, weights: list[int]) -> None:
+    places = [RaySandbox(shared=shared)] * 3
+    members = Placement(places, lambda place: place, lambda member: OWN).members()
+    assert [member.weight for member in members] == weights
     assert sandbox_of("ray", None) is sandbox_of("ray", None) is sandbox.RAY
