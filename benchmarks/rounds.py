@@ -79,10 +79,7 @@ def measure(
 
 
 def _take_turn(
-    player: Player,
-    order: Slice,
-    turns: dict[str, list[dict[str, Any]]],
-    failed: dict[str, str],
+    player: Player, order: Slice, turns: dict[str, list[dict[str, Any]]], failed: dict[str, str]
 ) -> None:
     name = player.peer.name
     if name in failed:

@@ -149,10 +149,7 @@ def _first(prepare: str, measured: str, cache: str) -> float:
 
 
 def _tables(options: argparse.Namespace, suite: Suite) -> Iterator[str]:
-    with (
-        tempfile.TemporaryDirectory() as cache,
-        patch.dict(os.environ, {"ENVHUB_CACHE": cache}),
-    ):
+    with tempfile.TemporaryDirectory() as cache, patch.dict(os.environ, {"ENVHUB_CACHE": cache}):
         for part in ("light", "heavy"):
             if part in options.parts:
                 rounds = options.rounds if part == "light" else max(options.rounds // 2, 1)

@@ -81,13 +81,7 @@ def _gymnasium(name: str, title: str, **given: Any) -> Peer:
 
 def _envhub(name: str, title: str, runs: Any = _always, **given: Any) -> Peer:
     return Peer(
-        name,
-        title,
-        "envhub",
-        needs=("zmq", "msgpack"),
-        runs=runs,
-        digested=True,
-        given=given,
+        name, title, "envhub", needs=("zmq", "msgpack"), runs=runs, digested=True, given=given
     )
 
 

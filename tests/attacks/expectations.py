@@ -19,30 +19,24 @@ _FLOCK = "flock takes no more than a descriptor; programs need it on their own f
 # attack: {a profile, or a condition of the host: why}
 NOT_STOPPED: dict[str, dict[str, str]] = {
     "learn that a file exists, and its size": {
-        "no-userns": "Landlock does not restrict stat; hiding names takes a mount namespace",
+        "no-userns": "Landlock does not restrict stat; hiding names takes a mount namespace"
     },
-    "hold a readable file: flock": {
-        "strict": _FLOCK,
-        "no-userns": _FLOCK,
-    },
+    "hold a readable file: flock": {"strict": _FLOCK, "no-userns": _FLOCK},
     "use up the user's descriptors in flight": {
-        PLAIN: "the kernel counts them per user, and compares with each sender's own limit",
+        PLAIN: "the kernel counts them per user, and compares with each sender's own limit"
     },
     "use up the user's pages of pipes": {
-        PLAIN: "the kernel counts them per user; new pipes of the others hold 8 KiB",
+        PLAIN: "the kernel counts them per user; new pipes of the others hold 8 KiB"
     },
-    "memory bomb: file locks": {
-        "strict": _LOCKS,
-        "no-userns": _LOCKS,
-    },
+    "memory bomb: file locks": {"strict": _LOCKS, "no-userns": _LOCKS},
     "memory bomb: epoll watches": {
-        MEASURED: "no process's account shows them; the kernel limits a user to 4% of the memory",
+        MEASURED: "no process's account shows them; the kernel limits a user to 4% of the memory"
     },
     "memory bomb: sockets in flight": {
-        f"no-userns, {MEASURED}": "only a network namespace counts what waits in another socket",
+        f"no-userns, {MEASURED}": "only a network namespace counts what waits in another socket"
     },
     "with gpu, on a real one: read what another process offers on it, by its handle": {
-        "strict": "the driver maps what was exported (cudaIpcGetMemHandle) by its 64 bytes alone",
+        "strict": "the driver maps what was exported (cudaIpcGetMemHandle) by its 64 bytes alone"
     },
 }
 

@@ -120,9 +120,7 @@ _STEPS = {
         "an infinite reward": _REWARD + "np.inf if self.count > 5 else 1.0",
         "a reward of minus infinity": _REWARD + "-np.inf if self.count > 5 else 1.0",
     },
-    "info-types": {
-        "an info that cannot cross": _INFO + "{'goal': {'who': lambda: 1}}",
-    },
+    "info-types": {"an info that cannot cross": _INFO + "{'goal': {'who': lambda: 1}}"},
     "step-types": {
         "a reward in an array": _REWARD + "np.array(self.at)",
         "a reward as text": _REWARD + "'1.0'",

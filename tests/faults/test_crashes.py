@@ -98,7 +98,7 @@ def test_a_bundle_holds_what_is_promised(tmp_path: Path) -> None:
     assert [entry.name for entry in tmp_path.iterdir()] == [folder.name]
     assert stat.S_IMODE(folder.stat().st_mode) == 0o700
     assert sorted(path.name for path in folder.iterdir()) == [
-        *("README.txt", "arguments.bin", "bundle.json", "requests.bin"),
+        *("README.txt", "arguments.bin", "bundle.json", "requests.bin")
     ]
     document = json.loads((folder / "bundle.json").read_text())
     assert document["provenance"] == json.loads(json.dumps(provenance))

@@ -19,18 +19,7 @@ from envhub_sandbox import errors, make_env
 from envhub_sandbox.session.recovery import derived_seed
 from envhub_worker.protocol.lifecycle import State
 from tests.faults.endurance.monkey import same
-from tests.faults.mortal import (
-    ALL_LIVE,
-    CRASH,
-    EXIT,
-    KILL,
-    LIVE,
-    MEMORY,
-    RAISE,
-    SEED,
-    SPIN,
-    oracle,
-)
+from tests.faults.mortal import ALL_LIVE, CRASH, EXIT, KILL, LIVE, MEMORY, RAISE, SEED, SPIN, oracle
 from tests.support import inside
 from tests.support.processes import eventually, halted
 from tests.support.repositories import write_repository

@@ -37,7 +37,7 @@ EXPECTED = {
     # what is given of features goes before what the spaces say
     "renamed": ["action", "observation.environment_state", "observation.state.arm"],
     "further": [
-        *("action", "observation.environment_state", "observation.state", "observation.touch"),
+        *("action", "observation.environment_state", "observation.state", "observation.touch")
     ],
     "unnamed": True,
     "misspelt feature": True,

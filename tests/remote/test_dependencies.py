@@ -17,9 +17,7 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.dependencies.builds import download
-from envhub_sandbox.errors import (
-    PolicyError,
-)
+from envhub_sandbox.errors import PolicyError
 from envhub_sandbox.sandboxes import remote
 from envhub_worker.access import packages as server_side
 from envhub_worker.access.packages import Packages

@@ -21,13 +21,7 @@ from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.spaces.spaces import encode_space
-from tests.attacks.client.lying_server import (
-    NUM_ENVS,
-    Frames,
-    Lie,
-    LyingSandbox,
-    LyingServer,
-)
+from tests.attacks.client.lying_server import NUM_ENVS, Frames, Lie, LyingSandbox, LyingServer
 
 MIB = 1 << 20
 GROWTH = 192 * MIB

@@ -12,11 +12,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.limits import DEFAULT_LIMITS
 from envhub_worker.protocol.messages.prefix import CHANGES
 from tests.attacks.client.lies import ACTIONS, opened, relayed
-from tests.attacks.client.lying_server import (
-    NUM_ENVS,
-    LyingServer,
-    step_done,
-)
+from tests.attacks.client.lying_server import NUM_ENVS, LyingServer, step_done
 
 TRUE = ("reach",) * NUM_ENVS
 

@@ -22,15 +22,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.codec.encoder import encode
 from envhub_worker.protocol.codec.wire import GENERATOR, SPACE, SPEC
 from envhub_worker.protocol.limits import WireLimits
-from tests.attacks.client.lies import (
-    STATES,
-    nested,
-    pcg64,
-    refuses,
-    relayed,
-    spec_of,
-    started,
-)
+from tests.attacks.client.lies import STATES, nested, pcg64, refuses, relayed, spec_of, started
 from tests.attacks.client.lying_server import Frames, LyingServer
 from tests.support.wire import ext, packed, value
 

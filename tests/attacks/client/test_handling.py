@@ -124,11 +124,7 @@ def test_what_handling_raises_is_the_workers_fault(
 
 @pytest.mark.parametrize("error", [KeyError("k"), MemoryError(), StopIteration()], ids=repr)
 def test_what_decoding_raises_is_the_workers_fault(
-    liar: LyingServer,
-    folder: str,
-    other: Any,
-    monkeypatch: pytest.MonkeyPatch,
-    error: Exception,
+    liar: LyingServer, folder: str, other: Any, monkeypatch: pytest.MonkeyPatch, error: Exception
 ) -> None:
     with started(liar, folder, policy={"restart": "on_reset"}) as env:
         with monkeypatch.context() as patched:

@@ -265,9 +265,7 @@ def test_what_is_remembered_is_not(liar: LyingServer, folder: str) -> None:
 DISAGREEING: dict[str, dict[str, Any]] = {
     "batched space of another number": {"num_envs": 3},
     "batched space of another kind": {"observation_space": encode_space(spaces.Discrete(5))},
-    "action space of another number": {
-        "action_space": encode_space(spaces.MultiDiscrete([2] * 7)),
-    },
+    "action space of another number": {"action_space": encode_space(spaces.MultiDiscrete([2] * 7))},
     "its own action space, and slabs for the single one": {
         "shardable": False,
         "action_space": encode_space(spaces.MultiDiscrete([2] * 7)),

@@ -33,13 +33,7 @@ from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.manifest.names import GYMNASIUMS, PROBED
 from envhub_worker.protocol.spaces.spaces import encode_space
 from tests.attacks.client.lies import SCRIPT, opened, relayed, spec_of
-from tests.attacks.client.lying_server import (
-    ACTION,
-    OBSERVATION,
-    Lie,
-    LyingServer,
-    manifest,
-)
+from tests.attacks.client.lying_server import ACTION, OBSERVATION, Lie, LyingServer, manifest
 from tests.attacks.harness import Arena
 from tests.support import inside
 from tests.support.objects import curious

@@ -70,11 +70,7 @@ MAKERS: dict[str, Callable[[EnvSpec], object]] = {
 
 @pytest.mark.parametrize("how", list(MAKERS))
 def test_specs_make_nothing_here(
-    liar: LyingServer,
-    folder: str,
-    tmp_path: Path,
-    how: str,
-    monkeypatch: pytest.MonkeyPatch,
+    liar: LyingServer, folder: str, tmp_path: Path, how: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """``gym.make(env.spec)`` runs no entry point that a worker names, but makes it again by
     ``make_env``, of the caller's own reference."""

@@ -184,11 +184,7 @@ def test_files_outside_cannot_be_altered(
             os.removexattr(path, "user.attack")
 
     jail.attack(
-        f"{title} outside",
-        payload,
-        lambda run: changed(path),
-        before=prepare,
-        path=str(path),
+        f"{title} outside", payload, lambda run: changed(path), before=prepare, path=str(path)
     )
 
 

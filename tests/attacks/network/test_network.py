@@ -122,10 +122,7 @@ def _device_events(mark: str) -> Iterator[str]:
 def test_tables_of_the_hosts_sockets_are_not_told(jail: OpenJail, home: Path, table: str) -> None:
     """Who talks to whom, and what the socket files are called, is in /proc as well."""
     path = home / f"{token()}.sock"
-    with (
-        listening(**TCP) as inet,
-        listening(socket.AF_UNIX, socket.SOCK_STREAM, str(path)),
-    ):
+    with listening(**TCP) as inet, listening(socket.AF_UNIX, socket.SOCK_STREAM, str(path)):
         mark = f" 0100007F:{inet.port:04X} " if table == "tcp" else path.name
         title = f"read the host's table of sockets: {table}"
         jail.steal(title, "network_table", mark, name=table)

@@ -16,9 +16,7 @@ from envhub_sandbox.hub.snapshot import snapshot_named
 from tests.hub.olah_server import GitRepository
 from tests.support.packages.git_server import ran
 
-pytestmark = [
-    pytest.mark.skipif(shutil.which("git") is None, reason="needs git"),
-]
+pytestmark = [pytest.mark.skipif(shutil.which("git") is None, reason="needs git")]
 
 
 @pytest.fixture

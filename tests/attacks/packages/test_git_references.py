@@ -33,9 +33,7 @@ from tests.support.packages.git_server import commit, git, git_served, make_repo
 from tests.support.ports import QuietHandler, serving
 from tests.support.repositories import CARTPOLE
 
-pytestmark = [
-    pytest.mark.skipif(shutil.which("git") is None, reason="needs git"),
-]
+pytestmark = [pytest.mark.skipif(shutil.which("git") is None, reason="needs git")]
 
 
 @pytest.fixture

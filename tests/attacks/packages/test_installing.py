@@ -132,10 +132,7 @@ def test_a_plugin_of_a_package_that_is_loaded_early(
 
 @pytest.mark.parametrize(
     ("version", "names"),
-    [
-        ("3.0", ["numpy"]),
-        ("3.1", ["encodings", "json", "msgpack", "zmq", "envhub_worker"]),
-    ],
+    [("3.0", ["numpy"]), ("3.1", ["encodings", "json", "msgpack", "zmq", "envhub_worker"])],
 )
 def test_a_package_of_a_name_that_we_import(
     real_index: Index, tmp_path: Path, traces: Path, version: str, names: list[str]
@@ -292,7 +289,7 @@ def test_a_compiler_that_is_taken_over_has_only_the_folder(tmp_path: Path) -> No
     outside.mkdir()
     (outside / "secret").write_text("a secret")
     assert escaped("free", tmp_path / "control", outside) == {
-        *("written", "copied", "heard", "reached"),
+        *("written", "copied", "heard", "reached")
     }
     assert (tmp_path / "control/copied").read_text() == "a secret"
     (outside / "written").unlink()

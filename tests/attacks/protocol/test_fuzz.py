@@ -178,10 +178,7 @@ class Forgetful:
 
 
 SPACE = spaces.Dict({"x": spaces.Box(-1, 1, (2,)), "t": spaces.Tuple([spaces.Discrete(3)])})
-GOOD: dict[str, Any] = {
-    "t": (np.zeros(3, np.int64),),
-    "x": np.zeros((3, 2), np.float32),
-}
+GOOD: dict[str, Any] = {"t": (np.zeros(3, np.int64),), "x": np.zeros((3, 2), np.float32)}
 MISFITS: dict[str, dict[str, Any]] = {
     "shape": {"x": np.zeros((3, 3), np.float32)},
     "dtype": {"x": np.zeros((3, 2))},

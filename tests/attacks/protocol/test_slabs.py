@@ -18,11 +18,7 @@ import pytest
 from gymnasium import spaces
 
 from envhub_sandbox.errors import RemoteProtocolError
-from envhub_sandbox.transport.shared_memory.client_slabs import (
-    LaneShard,
-    ObservationSlab,
-    SlotRing,
-)
+from envhub_sandbox.transport.shared_memory.client_slabs import LaneShard, ObservationSlab, SlotRing
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.shared_memory import slabs
 from envhub_worker.protocol.shared_memory.packets import packet_bytes, write_packet

@@ -411,10 +411,7 @@ class Place:
     """Where the environments are: what is to be looked at there."""
 
     def __init__(
-        self,
-        folder: Path,
-        server: clients.Server | None,
-        others: Sequence[clients.Server] = (),
+        self, folder: Path, server: clients.Server | None, others: Sequence[clients.Server] = ()
     ) -> None:
         self._folder, self._server = folder, server
         self.others = others

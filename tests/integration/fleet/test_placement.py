@@ -78,10 +78,7 @@ def test_a_server_that_is_not_there_gets_no_worker(rows: Path, servers: list[Lis
 
 
 def test_a_server_that_opens_no_jail_leaves_time_for_the_next(
-    rows: Path,
-    stays: Listening,
-    serve: Callable[..., Listening],
-    monkeypatch: pytest.MonkeyPatch,
+    rows: Path, stays: Listening, serve: Callable[..., Listening], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It says that it has room, and what would make the jail does nothing."""
     stuck = serve("stuck")

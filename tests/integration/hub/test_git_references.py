@@ -21,9 +21,7 @@ from envhub_sandbox.hub.snapshot import SnapshotLimits, fetch, snapshot_named
 from tests.support.packages.git_server import commit, git, git_served, make_repository
 from tests.support.repositories import CARTPOLE, CARTPOLES
 
-pytestmark = [
-    pytest.mark.skipif(shutil.which("git") is None, reason="needs git"),
-]
+pytestmark = [pytest.mark.skipif(shutil.which("git") is None, reason="needs git")]
 
 
 @pytest.fixture

@@ -214,11 +214,7 @@ def test_nothing_is_made_where_nothing_is_missing(
     ("requirements", "reason", "said"),
     [
         ("numpy\n-e .\n", "requirement", "line 2 of requirements.txt"),
-        (
-            "not-here>=3\n",
-            "resolution",
-            "line 1 of requirements.txt; installed here from file://",
-        ),
+        ("not-here>=3\n", "resolution", "line 1 of requirements.txt; installed here from file://"),
     ],
 )
 def test_an_error_names_the_repository_and_runs_nothing(

@@ -117,10 +117,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(params=["auto", "frames", "async", "worker"])
 def single(folder: Path, request: pytest.FixtureRequest) -> Iterator[SandboxEnv]:
     """One environment over each lane, and where its vector environment is of another kind."""
-    options: dict[str, Any] = {
-        "async": {"use_async_envs": True},
-        "worker": {"min_ready": 1},
-    }.get(request.param, {"lane": request.param})
+    options: dict[str, Any] = {"async": {"use_async_envs": True}, "worker": {"min_ready": 1}}.get(
+        request.param, {"lane": request.param}
+    )
     with contextlib.closing(SandboxEnv(folder, **options)) as env:
         yield env
 

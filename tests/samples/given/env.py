@@ -13,10 +13,7 @@ class OwnAsyncVectorEnv(gym.vector.AsyncVectorEnv):
 
 
 def make_env(
-    n_envs: int = 1,
-    use_async_envs: bool = False,
-    pickled: bytes = b"",
-    subclass: bool = False,
+    n_envs: int = 1, use_async_envs: bool = False, pickled: bytes = b"", subclass: bool = False
 ) -> gym.vector.VectorEnv:
     env_fns, kwargs = cloudpickle.loads(pickled)
     if subclass:

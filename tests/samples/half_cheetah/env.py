@@ -14,11 +14,7 @@ def make_env(
 
     def one() -> gym.Env:
         return gym.make(
-            "HalfCheetah-v5",
-            render_mode="rgb_array",
-            width=64,
-            height=48,
-            max_episode_steps=40,
+            "HalfCheetah-v5", render_mode="rgb_array", width=64, height=48, max_episode_steps=40
         )
 
     return vector([one] * n_envs, autoreset_mode=autoreset_mode)

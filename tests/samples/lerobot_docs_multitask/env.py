@@ -15,7 +15,5 @@ def make_env(n_envs: int = 1, use_async_envs: bool = False):
             0: env_cls([lambda: gym.make("Task1-v0") for _ in range(n_envs)]),
             1: env_cls([lambda: gym.make("Task2-v0") for _ in range(n_envs)]),
         },
-        "suite_2": {
-            0: env_cls([lambda: gym.make("Task3-v0") for _ in range(n_envs)]),
-        },
+        "suite_2": {0: env_cls([lambda: gym.make("Task3-v0") for _ in range(n_envs)])},
     }

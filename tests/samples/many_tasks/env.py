@@ -36,6 +36,4 @@ class Room(gym.Env):
 
 def make_env(n_envs: int = 1, use_async_envs: bool = False, tasks: int = 40):
     vector = gym.vector.AsyncVectorEnv if use_async_envs else gym.vector.SyncVectorEnv
-    return {
-        "rooms": {task: vector([lambda t=task: Room(t)] * n_envs) for task in range(tasks)},
-    }
+    return {"rooms": {task: vector([lambda t=task: Room(t)] * n_envs) for task in range(tasks)}}

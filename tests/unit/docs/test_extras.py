@@ -24,7 +24,7 @@ EXTRAS = {
     "libraries": {"envhub_sandbox.integrations"},
     "old gym": {"envhub_worker.runner.old_gym"},
     "packages": {
-        *("envhub_sandbox.cli.download", "envhub_sandbox.cli.lock", "envhub_sandbox.dependencies"),
+        *("envhub_sandbox.cli.download", "envhub_sandbox.cli.lock", "envhub_sandbox.dependencies")
     },
     "ray": {"envhub_sandbox.sandboxes.ray"},
     "remote": {
@@ -57,7 +57,7 @@ EXTRAS_OF_EXTRAS = {
 # What modules of the core import of extras today, in the same package: this list only gets shorter.
 CORE_IMPORTS_EXTRAS = {
     "envhub_sandbox.cli.cache": {
-        *("dependencies.builds.wheels", "dependencies.environments", "sandboxes.docker.leftovers"),
+        *("dependencies.builds.wheels", "dependencies.environments", "sandboxes.docker.leftovers")
     },
     "envhub_sandbox.cli.doctor": {"cli.init", "sandboxes.docker.engines", "sandboxes.remote"},
     "envhub_sandbox.cli.inspect": {

@@ -54,9 +54,7 @@ MAY_IMPORT = {
         *("", "check", "dependencies", "factory", "hub"),
         *("sandboxes", "session"),
     },
-    "envhub_sandbox.factory": {
-        *("hub", "sandboxes", "session", "transport", "vector"),
-    },
+    "envhub_sandbox.factory": {*("hub", "sandboxes", "session", "transport", "vector")},
     "envhub_sandbox.check": {"", "dependencies", "factory", "hub", "vector"},
     "envhub_sandbox.integrations": {"factory", "hub", "session", "vector"},
     "envhub_sandbox.vector": {"session", "transport"},

@@ -70,13 +70,7 @@ def test_large_frames_are_not_copied_when_packed() -> None:
 
 @pytest.mark.parametrize(
     "data",
-    [
-        head(0),
-        head(5),
-        head(2**32 - 1),
-        head(2**64 - 1),
-        head(1, request_id=2**63),
-    ],
+    [head(0), head(5), head(2**32 - 1), head(2**64 - 1), head(1, request_id=2**63)],
     ids=["no frame", "too many frames", "endless frames", "more than 32 bits", "id out of range"],
 )
 def test_heads_that_break_the_rules_are_refused_at_once(data: bytes) -> None:

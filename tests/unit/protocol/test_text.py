@@ -6,13 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from envhub_worker.protocol.text import (
-    counted,
-    duration_text,
-    parse_size,
-    printable,
-    size_text,
-)
+from envhub_worker.protocol.text import counted, duration_text, parse_size, printable, size_text
 
 
 @pytest.mark.parametrize(

@@ -21,9 +21,7 @@ from envhub_sandbox.dependencies import index as index_settings
 from envhub_sandbox.dependencies.environments import Environment
 from envhub_sandbox.dependencies.packages import ThisMachine
 from envhub_sandbox.dependencies.request import chosen, request_of
-from envhub_sandbox.errors import (
-    DependencyError,
-)
+from envhub_sandbox.errors import DependencyError
 from envhub_sandbox.hub.snapshot import local
 from envhub_sandbox.system.locks import SharedLock
 from envhub_worker.protocol.runtime import RECORD

@@ -23,9 +23,7 @@ from envhub_sandbox.dependencies import resolve as module
 from envhub_sandbox.dependencies.declared import parse_requirement
 from envhub_sandbox.dependencies.request import PackageRequest, chosen
 from envhub_sandbox.dependencies.resolve import Lock, Target
-from envhub_sandbox.errors import (
-    DependencyError,
-)
+from envhub_sandbox.errors import DependencyError
 from tests.support.packages.refusals import refused_dependency
 from tests.support.packages.wheels import WORKERS, Index, make_wheel
 from tests.unit.docs.test_distributions import project

@@ -23,13 +23,7 @@ from envhub_sandbox.errors import (
 )
 from envhub_sandbox.hub import local as module
 from envhub_sandbox.hub.local import LeftOut, split_local
-from envhub_sandbox.hub.snapshot import (
-    Snapshot,
-    SnapshotLimits,
-    is_here,
-    local,
-    snapshot_named,
-)
+from envhub_sandbox.hub.snapshot import Snapshot, SnapshotLimits, is_here, local, snapshot_named
 from tests.support.interpreter import needs
 
 
@@ -254,10 +248,7 @@ def test_a_link_to_nothing_is_left_out_and_said(folder: Path, target: str) -> No
     assert here.seen(listing).endswith("2 files of it; left out: sub/link (a link to nothing)")
 
 
-@pytest.mark.parametrize(
-    ("target", "said"),
-    [(".", "loop"), ("../sub", "loop"), ("..", "loop")],
-)
+@pytest.mark.parametrize(("target", "said"), [(".", "loop"), ("../sub", "loop"), ("..", "loop")])
 def test_link_without_an_end_is_named(folder: Path, target: str, said: str) -> None:
     """One that leads to a folder above itself is not followed for ever."""
     (folder / "sub" / "link").symlink_to(target)

@@ -106,11 +106,7 @@ def test_a_message_has_one_budget() -> None:
     space = spaces.Box(0, 1, (3000,))
     assert arrived((space,), limits) == (space,)
     bits = np.random.default_rng(1)
-    for many in (
-        (space, spaces.Box(0, 2, (3000,)), space),
-        (EnvSpec("A-v0"),) * 49,
-        (bits,) * 13,
-    ):
+    for many in ((space, spaces.Box(0, 2, (3000,)), space), (EnvSpec("A-v0"),) * 49, (bits,) * 13):
         with pytest.raises(RemoteProtocolError, match="cost more"):
             arrived(many, limits)
 

@@ -82,10 +82,7 @@ def test_anything_else_is_refused(lie: Buffer) -> None:
 
 @pytest.mark.parametrize(
     ("prefix", "largest"),
-    [
-        (WARNINGS, ("é" * MAX_CATEGORY, "é" * MAX_TEXT)),
-        (CHANGES, (2**62, "é" * MAX_ATTRIBUTE)),
-    ],
+    [(WARNINGS, ("é" * MAX_CATEGORY, "é" * MAX_TEXT)), (CHANGES, (2**62, "é" * MAX_ATTRIBUTE))],
 )
 def test_a_giant_is_refused_unread(prefix: Prefix[Any], largest: Any) -> None:
     frames = prefix.put([largest] * prefix.most, REPLY)

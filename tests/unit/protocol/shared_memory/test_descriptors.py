@@ -12,11 +12,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from envhub_worker.protocol.shared_memory.descriptors import (
-    OwnBell,
-    RunnerBell,
-    Watch,
-)
+from envhub_worker.protocol.shared_memory.descriptors import OwnBell, RunnerBell, Watch
 
 
 @pytest.fixture

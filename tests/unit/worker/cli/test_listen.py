@@ -61,11 +61,7 @@ def test_connections_leave_descriptors_to_jails(monkeypatch: pytest.MonkeyPatch)
 
 @pytest.mark.parametrize(
     ("text", "address"),
-    [
-        ("9090", ("127.0.0.1", 9090)),
-        ("0.0.0.0:0", ("0.0.0.0", 0)),
-        ("[::1]:80", ("::1", 80)),
-    ],
+    [("9090", ("127.0.0.1", 9090)), ("0.0.0.0:0", ("0.0.0.0", 0)), ("[::1]:80", ("::1", 80))],
 )
 def test_addresses_of_metrics(text: str, address: tuple[str, int]) -> None:
     assert http_port.parse_address(text) == address

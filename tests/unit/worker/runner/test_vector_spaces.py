@@ -51,21 +51,13 @@ def one_space(space: Space, action: Space) -> dict[str, Space]:
             },
             spaces.Tuple((ROW, spaces.Discrete(4))),
         ),
-        (
-            np.zeros((3, 4), np.uint8),
-            {"action_space": ROWS},
-            spaces.Box(0, 255, (4,), np.uint8),
-        ),
+        (np.zeros((3, 4), np.uint8), {"action_space": ROWS}, spaces.Box(0, 255, (4,), np.uint8)),
         (
             np.zeros((3, 1), np.int16),
             {"action_space": ROWS},
             spaces.Box(-(2**15), 2**15 - 1, (1,), np.int16),
         ),
-        (
-            SEEN,
-            {"envs": [SimpleNamespace(observation_space=ROW, action_space=ROW)]},
-            ROW,
-        ),
+        (SEEN, {"envs": [SimpleNamespace(observation_space=ROW, action_space=ROW)]}, ROW),
     ],
 )
 def test_one_row_is_the_space_of_one(

@@ -43,9 +43,7 @@ def test_nothing_there_is_not_the_end(ends: tuple[Channel, Channel]) -> None:
     assert ours.drain() == ([({"a": 1}, [])], True)
 
 
-def test_last_words_arrive_although_our_own_were_never_read(
-    ends: tuple[Channel, Channel],
-) -> None:
+def test_last_words_arrive_although_our_own_were_never_read(ends: tuple[Channel, Channel]) -> None:
     """A peer that closes with unread messages resets the stream; what it sent still counts."""
     ours, theirs = ends
     ours.send({"unread": True})

@@ -17,13 +17,7 @@ from envhub_worker.spawn.jail import JailFailed, RunnerExited, RunnerStarted
 from envhub_worker.spawn.spawner import RUNNER_TARGET
 from envhub_worker.spawn.zygote_process import ZygoteProcess
 from tests.support import inside
-from tests.support.confinement_kit import (
-    Cell,
-    make_snapshot,
-    new_cell,
-    open_folder,
-    spawner_in,
-)
+from tests.support.confinement_kit import Cell, make_snapshot, new_cell, open_folder, spawner_in
 from tests.support.interpreter import needs, profiles
 from tests.support.packages.environments import base_interpreter
 from tests.support.trees import fingerprint

@@ -50,8 +50,7 @@ def played(mode: str, begun: Sequence[float], *steps: tuple[float, bool]) -> Tra
 
 
 @pytest.mark.parametrize(
-    ("after", "noted"),
-    [(_MORE, False), ((1.0, False), True), (_END, True), ((1.0, True), True)],
+    ("after", "noted"), [(_MORE, False), ((1.0, False), True), (_END, True), ((1.0, True), True)]
 )
 def test_the_step_that_resets_gives_nothing_and_ends_nothing(
     after: tuple[float, bool], noted: bool

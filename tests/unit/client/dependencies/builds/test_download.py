@@ -11,9 +11,7 @@ from pathlib import Path
 import pytest
 
 from envhub_sandbox.dependencies.builds import download, project
-from envhub_sandbox.errors import (
-    DependencyError,
-)
+from envhub_sandbox.errors import DependencyError
 from envhub_sandbox.hub.git import address, commits
 from envhub_sandbox.hub.logins import authorization
 from tests.support.packages.git_server import commit, git_served, make_repository
@@ -64,8 +62,7 @@ def test_the_files_of_a_commit(url: str, repository: Path, target: Path) -> None
 
 
 @pytest.mark.parametrize(
-    "revision",
-    ["v2", "1234567", "main~1", "--upload-pack=x", "a b", "", "a..b", "a@{0}", "-x"],
+    "revision", ["v2", "1234567", "main~1", "--upload-pack=x", "a b", "", "a..b", "a@{0}", "-x"]
 )
 def test_what_is_not_there_or_an_option(url: str, revision: str) -> None:
     with pytest.raises((DependencyError, DependencyError), match=r"40 digits|not a commit"):

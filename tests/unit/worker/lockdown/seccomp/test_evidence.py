@@ -25,10 +25,7 @@ _WRITING = os.O_WRONLY | os.O_CREAT
 
 
 def ask(
-    call: str,
-    *words: int | bytes,
-    waits: Callable[[], object] = lambda: None,
-    own: OwnPaths = _OWN,
+    call: str, *words: int | bytes, waits: Callable[[], object] = lambda: None, own: OwnPaths = _OWN
 ) -> list[tuple[str, str]]:
     """What a call of this thread's is seen to ask for; bytes stand where their address would."""
     buffers = [ctypes.create_string_buffer(one) for one in words if isinstance(one, bytes)]
