@@ -25,6 +25,7 @@ from envhub_sandbox.check.play.task import TaskJudge
 from envhub_sandbox.check.settings import JudgeOptions
 from envhub_sandbox.check.static import survey, undeclared
 from envhub_sandbox.dependencies.declared import declared
+from envhub_sandbox.dependencies.locks.day import days_for
 from envhub_sandbox.dependencies.packages import packages_for
 from envhub_sandbox.dependencies.request import chosen
 from envhub_sandbox.errors import (
@@ -42,6 +43,7 @@ from envhub_sandbox.factory.make_env import make_env
 from envhub_sandbox.hub.reference import HubRef
 from envhub_sandbox.hub.snapshot import Snapshot, snapshot_named
 from envhub_sandbox.hub.sources import parsing
+from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.settings.policy import policy_from
 from envhub_sandbox.vector.suites import EnvSuites
 from envhub_worker.protocol.text import size_text
@@ -220,10 +222,28 @@ class _Judge:
     def _unloaded(self, error: EnvHubError) -> None:
         if isinstance(error, (WorkerDiedError, WorkerTimeoutError)):
             self._report.raised("survives", error, message=f"while it loaded: {error}")
-        elif not isinstance(error, DependencyError):  # also a name that a terminal would obey
-            self._report.raised("loads", error)
-        elif all(one.id != "imports" for one in self._report.findings):  # else it has been said
-            self._report.raised("imports", error)
+            return
+        dated = self._with_older_packages(error)
+        if not isinstance(error, DependencyError):  # also a name that a terminal would obey
+            self._report.raised("loads", error, message=f"{error}{dated}")
+        elif dated or all(one.id != "imports" for one in self._report.findings):  # else it was said
+            self._report.raised("imports", error, message=f"{error}{dated}")
+
+    def _with_older_packages(self, error: EnvHubError) -> str:
+        """The latest of a few days whose packages cure an error of a start, where there is one."""
+        if not self._is_here or self._arguments.get("dependencies", "auto") != "auto":
+            return ""
+        found = ""
+        for day in days_for(self._snapshot, error):
+            self._asked.tell(f"loading it with packages of {day}")
+            try:
+                with self.make(num_workers=1, dependencies={"exclude_newer": day}) as suites:
+                    suite, task = self._asked.tasks(suites)[0]
+                    suites[suite][task].reset(seed=self._asked.seed)
+            except EnvHubError:
+                break
+            found = option_name("dependencies", {"exclude_newer": day})
+        return f"\nIt starts with {found}, which a lock can keep" if found else ""
 
     def _denied(self, denied: Iterable[str] | None, task: str = "") -> None:
         """What a jail was refused, where that was recorded."""
@@ -252,6 +272,7 @@ class _Judge:
             check = "observation-space" if isinstance(error, OutsideSpaceError) else "runs"
             self._report.judged(check, [str(error)], task)
         except RemoteEnvError as error:
+            error.message += self._with_older_packages(error)
             self._report.raised("runs", error, task)
         except (LoadError, DependencyError, RemoteProtocolError) as error:
             again = f"another result than the first time: {error}"

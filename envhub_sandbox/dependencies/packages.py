@@ -106,8 +106,10 @@ def packages_for(
 
     Progress is shown on a terminal. Raises ``DependencyError``, with what to change.
     """
+    from envhub_sandbox.dependencies.locks.day import settled
+
     try:
-        request = request_of(snapshot, choice, gpu=gpu)
+        request = request_of(snapshot, settled(snapshot, choice), gpu=gpu)
         if request is None or (not request.always and target.meets(request)):
             return None
         with log.progress_shown("packages") as tell:

@@ -24,6 +24,8 @@ if TYPE_CHECKING:  # they cost time, and most repositories need none of them
 Tell = Callable[[str], None]
 """Gets a line for people, for each thing that happens."""
 DATE = r"\d{4}-\d{2}-\d{2}(T\d{2}:\d{2}:\d{2}(Z|[+-]\d{2}:\d{2}))?"
+AS_WRITTEN = "auto"
+"""Instead of a date: that of the repository."""
 _DECLARE = ("requirements.txt", "pyproject.toml")
 _SCRIPT, _LOOKED_AT = b"# /// script", 1024 * 1024  # as ``declared.py`` has them
 _ALIKE = 0.85
@@ -39,7 +41,8 @@ class Choice:
         where: ``"auto"``: its own environment, unless this interpreter has all of it; ``"host"``:
             this interpreter; ``"own"``: its own environment.
         python: A version or versions, or a path; empty for what the repository runs in.
-        exclude_newer: A date: packages of later are not seen.
+        exclude_newer: A date: packages of later are not seen; or ``"auto"`` for that of the
+            repository.
         infer: Whether what it imports and does not declare is installed, too.
         only: Requirements instead of those that it declares; None for those.
         without: Names of packages that are left out, also where others need them.
@@ -161,9 +164,10 @@ def _date(given: object) -> str | None:
     if given is None:
         return None
     text = given if isinstance(given, str) else getattr(given, "isoformat", lambda: "")()
-    if not re.fullmatch(DATE, text):
+    if text != AS_WRITTEN and not re.fullmatch(DATE, text):
         raise PolicyError(
-            f"exclude_newer in dependencies is {given!r}; it takes a date such as '2026-01-31'"
+            f"exclude_newer in dependencies is {given!r}; it takes a date such as '2026-01-31', or "
+            f"{AS_WRITTEN!r} for the day of the repository's commit, release or newest file"
         )
     return str(text)
 

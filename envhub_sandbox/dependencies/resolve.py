@@ -197,6 +197,15 @@ def sources_of(
     ]
 
 
+def uploaded(wanted: WantedPackage, python: str) -> str:
+    """The day of the release that is chosen, as the index says it; empty if it does not."""
+    words = [*uv.NO_BUILDS, "--no-deps", "--format", "pylock.toml"]
+    request = PackageRequest("", (wanted,), runs_worker=False)
+    text = _compiled(request, Target(python=python), words, lambda line: None)
+    days = re.findall(r"upload-time = [^\d]{0,40}(\d{4}-\d{2}-\d{2})", text)
+    return max(days, default="")
+
+
 def _may_be_built(names: Iterable[str]) -> dict[str, str]:
     """uv's settings with which these are chosen as sources."""
     tables = "".join(

@@ -18,6 +18,7 @@ from envhub_sandbox.dependencies.packages import (
     packages_for,
 )
 from envhub_sandbox.dependencies.request import Choice, chosen
+from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.hub.snapshot import Snapshot
 
 if TYPE_CHECKING:
@@ -69,9 +70,22 @@ class RepositoryPackages:
 
     def note(self, snapshot: Snapshot, target: PackageTarget | None, said: str) -> bool:
         """Note a module that was missing; whether ``packages`` gives others now."""
-        ours = self.lock is None and target is not None
-        infers = self.choice.infer and self.choice.where != "host"
-        return ours and infers and note_missing(snapshot, said)
+        return self.choice.infer and self._chooses(target) and note_missing(snapshot, said)
+
+    def _chooses(self, target: PackageTarget | None) -> bool:
+        """Whether the versions of its packages are ours to choose."""
+        return self.lock is None and target is not None and self.choice.where != "host"
+
+    def of_its_day(
+        self, snapshot: Snapshot, target: PackageTarget | None, error: EnvHubError
+    ) -> str:
+        """What to do about an error that older packages may cure; empty for others."""
+        of_today = self._chooses(target) and self.choice.exclude_newer is None
+        if not of_today:
+            return ""
+        from envhub_sandbox.dependencies.locks import day
+
+        return day.of_its_day(snapshot, error)
 
     def check(
         self, manifest: Manifest, label: str, env_kwargs: Mapping[str, Any], config: object

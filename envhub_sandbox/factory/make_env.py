@@ -204,6 +204,7 @@ def _suites(snapshot: Snapshot, config: Any, wanted: _Plan, options: Options) ->
         recipe=recipe,
         installed=packages.facts if packages else None,
         advice=advice,
+        of_its_day=partial(wanted.source.of_its_day, snapshot, target),
     )
     return EnvFactory(
         _launchers(repository, wanted.place, options),

@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, cast
 
+from envhub_sandbox.errors import EnvHubError
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.settings.options import Options, option_name
 from envhub_sandbox.system import extras
@@ -42,6 +43,10 @@ class PackageSource:
     def note(self, snapshot: Snapshot, target: Any, said: str) -> bool:
         """Note a module that was missing; whether ``packages`` gives others now."""
         return False
+
+    def of_its_day(self, snapshot: Snapshot, target: Any, error: EnvHubError) -> str:
+        """What to do about an error that older packages may cure; empty for others."""
+        return ""
 
     def check(
         self, manifest: Manifest, label: str, env_kwargs: Mapping[str, Any], config: object

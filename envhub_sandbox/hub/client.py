@@ -116,6 +116,11 @@ class HubClient:
                 raise ValueError("the answer has no full commit")
         return commit
 
+    def changed(self, repo: Repository, commit: str) -> str:
+        """The day of a commit, as the Hub says it: ``"2024-05-31"``."""
+        with self._explained(repo, commit):
+            return str(self._about(repo, commit)["lastModified"])[:10]
+
     def is_public(self, repo: Repository, commit: str) -> bool:
         """Whether everybody gets this commit, without a login. Raises nothing."""
         everybody = replace(self, endpoint=self.public_endpoint, token=False)

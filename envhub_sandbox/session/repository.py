@@ -33,7 +33,11 @@ from envhub_sandbox.errors import (
 from envhub_sandbox.hub.client import default_endpoint
 from envhub_sandbox.hub.logins import without_login
 from envhub_sandbox.hub.snapshot import Snapshot
-from envhub_sandbox.session.error_text import add_author_line, add_reach_advice, why_missing
+from envhub_sandbox.session.error_text import (
+    add_author_line,
+    add_reach_advice,
+    why_missing,
+)
 from envhub_sandbox.session.recorder import Crash, Recorder, recorder_for
 from envhub_sandbox.settings.options import Options, option_name
 from envhub_sandbox.settings.policy import Limits, Policy, Timeouts
@@ -203,6 +207,7 @@ class Repository:
         copy: Whether observations are copied for the caller, or lent.
         installed: What was installed for it, for the provenance.
         advice: Says what to do where a module is missing, for the error's text.
+        of_its_day: Says so where packages of today may be at fault; empty for other errors.
 
     Attributes:
         label: Repository, commit and entry file, for errors.
@@ -230,6 +235,7 @@ class Repository:
         recipe: Recipe,
         installed: dict[str, Any] | None,
         advice: Callable[[str], str],
+        of_its_day: Callable[[EnvHubError], str] = lambda error: "",
     ) -> None:
         self.snapshot = snapshot
         self.arguments = arguments
@@ -253,6 +259,7 @@ class Repository:
         self.recipe = recipe
         self.installed = installed
         self._advice = advice
+        self._of_its_day = of_its_day
 
     def hold(self, holder: object) -> None:
         """Keep its files and packages from being removed, until each holder has let go."""
@@ -292,6 +299,8 @@ class Repository:
                 error.args = (f"{error.args[0]}\n{advice}", *error.args[1:])
             name_source(error, self.label)
             add_reach_advice(error, self.policy)
+            if "__notes__" not in vars(error) and (dated := self._of_its_day(error)):
+                error.args = (f"{error.args[0]}\n{dated}", *error.args[1:])
             add_author_line(error, self.snapshot)
             raise
 

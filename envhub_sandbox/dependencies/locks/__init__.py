@@ -1,1 +1,1 @@
-"""Lock files: what a repository was when it was locked, and whether it still is."""
+"""What a repository was when it was locked or written, and whether it still is."""

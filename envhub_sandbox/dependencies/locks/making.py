@@ -13,6 +13,7 @@ import numpy as np
 from envhub_sandbox.dependencies import interpreters
 from envhub_sandbox.dependencies.declared import WantedPackage, parse_requirement
 from envhub_sandbox.dependencies.locks import lockfile, pylock
+from envhub_sandbox.dependencies.locks.day import settled
 from envhub_sandbox.dependencies.locks.lockfile import (
     LOCAL,
     LockFile,
@@ -150,7 +151,7 @@ def drift_of_tasks(
 
 def locked(snapshot: Snapshot, choice: Choice, *, upgrade: bool = False) -> LockFile:
     """A lock of a repository with the packages of a choice; nothing of either runs."""
-    request = request_of(snapshot, replace(choice, where="own"))
+    request = request_of(snapshot, replace(settled(snapshot, choice), where="own"))
     assert request is not None  # which only another choice gives
     found = resolution_for(request, upgrade=upgrade)
     empty = LockFile(
@@ -165,7 +166,7 @@ def locked(snapshot: Snapshot, choice: Choice, *, upgrade: bool = False) -> Lock
             for one in request.guesses
             if one.module in found.taken
         ),
-        exclude_newer=choice.exclude_newer,
+        exclude_newer=request.exclude_newer,
     )
     return with_files(empty, snapshot)
 

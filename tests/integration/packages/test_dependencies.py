@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import datetime
 import importlib.util
 import os
+import re
 import subprocess
 import sys
 import sysconfig
@@ -16,7 +18,12 @@ from typing import Any
 import pytest
 
 from envhub_sandbox import make_env
-from envhub_sandbox.errors import DependencyError, DependencyReason
+from envhub_sandbox.check.judge import judge
+from envhub_sandbox.check.settings import JudgeOptions
+from envhub_sandbox.dependencies.locks.making import locked
+from envhub_sandbox.dependencies.request import Choice
+from envhub_sandbox.errors import DependencyError, DependencyReason, LoadError
+from envhub_sandbox.hub.snapshot import local
 from envhub_sandbox.sandboxes.process import BOOTSTRAP
 from envhub_sandbox.system.log import DEPENDENCIES
 from tests.support.compare import assert_same, rolled
@@ -122,6 +129,34 @@ def test_what_a_package_imports_undeclared_joins_it(packages: Index, tmp_path: P
     with pytest.raises(DependencyError, match="made_up"):
         make_env(asking)
     assert not [path for path in packages.asked if "made" in path]
+
+
+def test_code_of_years_ago_runs_with_packages_of_its_day(packages: Index, tmp_path: Path) -> None:
+    """The error says the day, ``"auto"`` means it, a lock keeps it, and a check finds a later one
+    that does.
+    """
+    for version, text in (("1.0", "new = old = 1\n"), ("2.0", "new = 1\n")):
+        make_wheel(packages.folder, "ages", version, files={"ages/__init__.py": text})
+    packages.uploaded = dict.fromkeys((one.name for one in packages.folder.iterdir()), "2023-01-01")
+    packages.uploaded["ages-2.0-py3-none-any.whl"] = "2026-03-01"
+    code = importing("ages", version="ages.old") + "\nages.old\n"
+    folder = write_repository(tmp_path / "old", code, requirements__txt="ages\n")
+    written = datetime.datetime(2024, 6, 1).timestamp()
+    for path in folder.iterdir():
+        os.utime(path, (written, written))
+    try:
+        with pytest.raises(LoadError, match=r"dependencies={'exclude_newer': '2024-06-01'}"):
+            make_env(folder)
+        for day in ("2024-06-01", "auto"):
+            with make_env(folder, dependencies={"exclude_newer": day}) as suites:
+                assert "ages==1.0" in suites.provenance["installed"]["packages"]
+        kept = locked(local(folder), Choice("auto", exclude_newer="auto"))
+        assert kept.exclude_newer == "2024-06-01"
+        asked = JudgeOptions(reference=str(folder), arguments={})
+        [found] = [one for one in judge(asked).findings if one.id == "loads"]
+        assert re.search(r"It starts with dependencies={'exclude_newer': '202[56]-", found.message)
+    finally:
+        packages.uploaded = {}
 
 
 FINDER = """

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import html
+import json
 import os
 import threading
 import zipfile
@@ -13,6 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -100,6 +102,7 @@ class Index:
         yanked: Names of files that were taken back.
         replaced: What is sent instead of a file, by its name; its hash stays that of the file.
         broken: Answers everything with this status, if it is one.
+        uploaded: Days of files, by name; of others it says none.
     """
 
     folder: Path
@@ -108,6 +111,7 @@ class Index:
     yanked: set[str] = field(default_factory=set)
     replaced: dict[str, bytes] = field(default_factory=dict)
     broken: int = 0
+    uploaded: dict[str, str] = field(default_factory=dict)
     _held_prefix: str = ""
     _waiting: threading.Event = field(default_factory=threading.Event)
     _free: threading.Event = field(default_factory=threading.Event)
@@ -124,13 +128,20 @@ class Index:
         self._free.set()
 
     def page(self, name: str) -> bytes | None:
-        rows = []
+        rows, files = list[str](), list[dict[str, Any]]()
         for path in sorted(self.folder.iterdir()):
             if path.name.split("-")[0].lower().replace("_", "-") == name:
                 digest = hashlib.sha256(path.read_bytes()).hexdigest()
                 mark = ' data-yanked="broken"' if path.name in self.yanked else ""
                 link = f"/files/{html.escape(path.name)}#sha256={digest}"
                 rows.append(f'<a href="{link}"{mark}>{html.escape(path.name)}</a><br>')
+                known = {"filename": path.name, "url": link, "hashes": {"sha256": digest}}
+                day = self.uploaded.get(path.name)
+                files.append(known | ({"upload-time": f"{day}T00:00:00Z"} if day else {}))
+        if self.uploaded and files:
+            return json.dumps(
+                {"meta": {"api-version": "1.1"}, "name": name, "files": files}
+            ).encode()
         return "\n".join(["<!DOCTYPE html><html><body>", *rows]).encode() if rows else None
 
     def answer(self, path: str) -> bytes | None:
@@ -157,8 +168,9 @@ def served(folder: Path) -> Iterator[Index]:
         def do_GET(self) -> None:
             body = None if index.broken else index.answer(self.path)
             self.send_response(index.broken or (200 if body is not None else 404))
+            kind = "application/vnd.pypi.simple.v1+json" if index.uploaded else "text/html"
             page = self.path.startswith("/simple")
-            self.send_header("Content-Type", "text/html" if page else "application/octet-stream")
+            self.send_header("Content-Type", kind if page else "application/octet-stream")
             self.send_header("Content-Length", str(len(body or b"")))
             self.end_headers()
             if self.command == "GET":
