@@ -7,7 +7,6 @@ guarded output, help that is text, errors that name options.
 from __future__ import annotations
 
 import contextlib
-import importlib
 import inspect as python
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -18,7 +17,9 @@ from typer.core import TyperCommand, TyperGroup
 
 from envhub_sandbox.cli.shared.console import expects_json, guarded, out, print_json_error, say
 from envhub_sandbox.cli.shared.exits import EXIT_CODES, Exit, reported
+from envhub_sandbox.errors import SandboxUnavailableError
 from envhub_sandbox.settings.options import on_command_line, use_option_names
+from envhub_sandbox.system import extras
 
 Where = Mapping[str, str]
 """The commands of a group: where the function of each is, below this package."""
@@ -92,7 +93,10 @@ class Program(TyperGroup):
         if args[0] in _REPLACED:
             ctx.fail(f"There is no command {args[0]!r} any more: use '{_REPLACED[args[0]]}'.")
         if args[0] in _COMMANDS:
-            self.commands[args[0]] = whole_command(args[0])
+            try:
+                self.commands[args[0]] = whole_command(args[0])
+            except SandboxUnavailableError as missing:
+                ctx.fail(str(missing))
         return super().resolve_command(ctx, args)
 
     def main(self, args: Any = None, *more: Any, **options: Any) -> Any:
@@ -162,7 +166,7 @@ def functions(name: str) -> dict[str, Callable[..., None]]:
     found = {}
     for one, place in ({name: where} if isinstance(where, str) else where).items():
         module, _, function = place.partition(":")
-        found[one] = getattr(importlib.import_module(f"{__package__}.{module}"), function)
+        found[one] = extras.required(f"{__package__}.{module}", function, f"envhub {name}")
     return found
 
 

@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Union
+from typing import Annotated, Any, Protocol
 
 import typer
 
@@ -17,16 +17,29 @@ from envhub_sandbox.cli.shared import options as opt
 from envhub_sandbox.cli.shared.console import out, print_json, safe_line, say, show, show_rows
 from envhub_sandbox.cli.shared.exits import Exit, UsageError
 from envhub_sandbox.hub.grammar import FOLDER
+from envhub_sandbox.system import extras
 from envhub_worker.protocol.text import counted, size_text
 
-if TYPE_CHECKING:
-    from envhub_sandbox.dependencies.builds.wheels import KeptWheel
-    from envhub_sandbox.dependencies.environments import Environment
-
-Stored = Union["StoredSnapshot", "Environment", "KeptWheel"]
+_ENVIRONMENTS = "envhub_sandbox.dependencies.environments"
+_WHEELS = "envhub_sandbox.dependencies.builds.wheels"
 _DAY_S = 24 * 3600.0
 _SHOWN = 18
 """Characters of a commit: twelve digits behind local-, as errors show it; --json has all."""
+
+
+class Stored(Protocol):
+    """A snapshot, an environment of packages, or a wheel that was built here."""
+
+    @property
+    def used(self) -> float:
+        """Unix time (seconds) of the last use."""
+
+    @property
+    def size(self) -> int:
+        """Bytes of all files."""
+
+    def answers_to(self, name: str) -> bool:
+        """Whether a name means it."""
 
 
 @dataclass(frozen=True)
@@ -104,11 +117,9 @@ def list_(
     json: opt.Json = False,
 ) -> None:
     """List snapshots, environments of packages and wheels built here, last used first."""
-    from envhub_sandbox.dependencies import environments
-    from envhub_sandbox.dependencies.builds import wheels
     from envhub_sandbox.system.folders import cache_root
 
-    found, made, built = stored_snapshots(), environments.every(), wheels.every()
+    found, made, built = stored_snapshots(), _every(_ENVIRONMENTS), _every(_WHEELS)
     if json:
         names = ("repository", "commit", "revision", "folder")
         own = _documents(found, **dict(zip(names, names, strict=True)))
@@ -138,7 +149,13 @@ def list_(
     say(f"{_told(found, made, built)}, in {cache_root()}")
 
 
-def _told(found: list[StoredSnapshot], made: list[Environment], built: list[KeptWheel]) -> str:
+def _every(module: str) -> list[Any]:
+    """All that an extra has stored; nothing where it is not installed."""
+    every = extras.find(module, "every")
+    return [] if every is None else list(every())
+
+
+def _told(found: list[StoredSnapshot], made: list[Any], built: list[Any]) -> str:
     everything: list[Stored] = [*found, *made, *built]
     total = sum(one.size for one in everything)
     texts = [counted(len(found), "snapshot"), counted(len(made), "environment")]
@@ -181,11 +198,9 @@ def remove(
     ] = None,
 ) -> None:
     """Remove snapshots and environments of packages that are not in use, and built wheels."""
-    from envhub_sandbox.dependencies import environments
-    from envhub_sandbox.dependencies.builds import wheels
     from envhub_sandbox.system.folders import cache_root
 
-    found, made, built = stored_snapshots(), environments.every(), wheels.every()
+    found, made, built = stored_snapshots(), _every(_ENVIRONMENTS), _every(_WHEELS)
     if everything:
         for folder in ("imports", "manifests", "resolutions"):
             shutil.rmtree(cache_root() / folder, ignore_errors=True)
@@ -194,8 +209,9 @@ def remove(
         found, made = [*filter(is_chosen, found)], [*filter(is_chosen, made)]
         built = [*filter(is_chosen, built)]
     kept = {one.commit: why for one in found if (why := _users_of(one))}
-    kept |= {one.key: why for one in made if (why := environments.remove(one))}
-    environments.remove_abandoned()
+    if remove_environment := extras.find(_ENVIRONMENTS, "remove"):
+        kept |= {one.key: why for one in made if (why := remove_environment(one))}
+        extras.find(_ENVIRONMENTS, "remove_abandoned")()
     for wheel in built:
         wheel.remove()
     gone = [one for one in found if one.commit not in kept]
@@ -250,9 +266,8 @@ def gc(
     another user, or to clients on another machine that share the engine stays; root removes the
     containers and control groups of all users. Exit code 9: an installed engine did not answer.
     """
-    from envhub_sandbox.sandboxes.docker import leftovers
-
-    found, unasked = leftovers.find()
+    find = extras.required("envhub_sandbox.sandboxes.docker.leftovers", "find", "envhub cache gc")
+    found, unasked = find()
     removed = [] if dry_run else [one for one in found if one.remove()]
     if json:
         items = [{"kind": one.kind, "name": one.name, "removed": one in removed} for one in found]

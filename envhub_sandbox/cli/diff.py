@@ -19,7 +19,7 @@ from envhub_sandbox.cli.shared.console import (
     show_rows,
 )
 from envhub_sandbox.cli.shared.exits import Exit
-from envhub_sandbox.cli.shared.findings import STYLES, FailOn, level
+from envhub_sandbox.cli.shared.findings import STYLES, level
 from envhub_worker.protocol.text import MARGIN, counted
 
 if TYPE_CHECKING:
@@ -40,7 +40,7 @@ def diff(
         bool,
         typer.Option("--run", help="Load both, each in a sandbox, and compare tasks and spaces."),
     ] = False,
-    fail_on: FailOn = None,
+    fail_on: opt.FailOn = None,
     json: opt.Json = False,
     make: opt.MakeOptions,
 ) -> None:

@@ -19,7 +19,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -33,19 +33,15 @@ from envhub_sandbox.cli.shared.console import (
     print_json,
     safe_line,
     safe_text,
-    show,
     show_below,
     show_rows,
 )
 from envhub_sandbox.cli.shared.exits import Exit, UsageError, describe
 from envhub_sandbox.cli.shared.host import free_memory_bytes, versions
 from envhub_sandbox.errors import EnvHubError, SandboxUnavailableError, SnapshotError
+from envhub_sandbox.system import extras
 from envhub_sandbox.system.platform import IS_LINUX, NAME, user_id
 from envhub_worker.protocol.confinement import PROFILES
-from envhub_worker.protocol.text import size_text
-
-if TYPE_CHECKING:
-    from envhub_sandbox.sandboxes.remote import RemoteSandbox, ServerFacts
 
 _PROBE_S = 60.0
 _PROFILES = ("profile", "available", "first step", "enforces", "without")
@@ -114,15 +110,16 @@ def doctor(
 
     Policy(profile=profile)  # refuses a name that there is not, before anything is tried
     if server is not None:
-        from envhub_sandbox.sandboxes.remote import RemoteSandbox
-
+        what = "a server on another host"
+        place = extras.required("envhub_sandbox.sandboxes.remote", "RemoteSandbox", what)
+        examine_server = extras.required("envhub_sandbox.cli.doctor_server", "examine_server", what)
         if insecure_loopback and server_key is not None:
             raise UsageError(
                 "--server-key is for a server with keys, and --insecure-loopback for one without: "
                 "leave one out"
             )
-        place = RemoteSandbox(server, server_key=server_key, insecure_loopback=insecure_loopback)
-        raise typer.Exit(examine_server(place, profile, json=json))
+        asked = place(server, server_key=server_key, insecure_loopback=insecure_loopback)
+        raise typer.Exit(examine_server(asked, profile, json=json))
     if server_key is not None or insecure_loopback:
         raise UsageError(
             "--server-key and --insecure-loopback need a server: envhub doctor tcp://HOST:PORT"
@@ -211,10 +208,9 @@ def host() -> dict[str, Any]:
 
 def engine() -> dict[str, Any]:
     """The container engine that ``sandbox="docker"`` would use, or why there is none."""
-    from envhub_sandbox.sandboxes.docker.engines import find_engine
-
+    module, what = "envhub_sandbox.sandboxes.docker.engines", "a container engine"
     try:
-        found = find_engine(None)
+        found = extras.required(module, "find_engine", what)(None)
     except EnvHubError as error:
         return {"kind": None, "version": None, "rootless": None, "problem": describe(error)}
     facts = {"kind": found.kind, "version": found.version, "rootless": found.rootless}
@@ -329,84 +325,3 @@ def _print_missing(probed: dict[str, Any]) -> None:
         out()
         out("An AppArmor profile that permits user namespaces to this interpreter:")
         out(safe_text(probed["apparmor_profile"]))
-
-
-# --- a server on another host: what it says, if it lets us in ------------------------------------
-
-_USED = {
-    "sessions": "sessions",
-    "jails": "jails",
-    "runners": "runners",
-    "memory_bytes": "memory_limit_bytes",
-    "upload_bytes": "upload_bytes",
-    "inflight_bytes": "inflight_bytes",
-}
-"""Quotas, and what is used of them, by their names in the figures."""
-
-
-def examine_server(server: RemoteSandbox, profile: str, *, json: bool) -> Exit:
-    """Ask a server and print what it says; the exit code is that of the profile.
-    Raises ``EnvHubError``: it is not reached, or does not let us in.
-    """
-    from envhub_sandbox.sandboxes.remote import ask_facts
-
-    facts = ask_facts(server)
-    code, problem = _verdict(facts, profile)
-    if json:
-        server_facts = {**asdict(facts), "endpoint": server.endpoint}
-        print_json({"server": server_facts, "profile": profile, "problem": problem, "code": code})
-    else:
-        print_facts(server, facts, problem)
-    return code
-
-
-def _verdict(facts: ServerFacts, profile: str) -> tuple[Exit, str | None]:
-    if facts.draining:
-        return Exit.WORKER, "it drains: it accepts nothing new"
-    if not facts.detailed or facts.enforces(profile):
-        return Exit.OK, None
-    return Exit.SANDBOX, (
-        f"no jail with the profile {profile!r} there: {facts.profile!r} is the strongest that it "
-        f"can have, and {facts.weakest_profile!r} the weakest that its operator permits"
-    )
-
-
-def print_facts(server: RemoteSandbox, facts: ServerFacts, problem: str | None) -> None:
-    """Print what a server says, and what keeps it from having a jail. Trust: the server's word."""
-    release = f"envhub-worker {facts.version}, protocol {facts.protocol}"
-    out(f"{safe_line(server.endpoint)}: {release}", "bold")
-    let_in = "asks for no key" if server.insecure_loopback else "knows our key"
-    show("answered", f"after {facts.answered_s:.2f} s; it {let_in}")
-    if facts.detailed:
-        granted = {"network": facts.network, "gpu": facts.gpu, "dependencies": facts.dependencies}
-        show("python", facts.python)
-        show("profiles", f"{facts.profile} at most; policies may ask for {facts.weakest_profile}")
-        show("permits", ", ".join(name for name, given in granted.items() if given) or "no more")
-    else:
-        out("It is older than this client, and does not say what it can enforce.")
-    if facts.quotas:
-        out()
-        show_rows([("quota", "used", "limit"), *_quotas(facts)], right=(1, 2))
-    if problem is not None:
-        out()
-        out(problem, BAD)
-
-
-def _quotas(facts: ServerFacts) -> list[tuple[str, str, str]]:
-    used: dict[str, Any] = facts.used
-    return [
-        (
-            _name(name),
-            _amount(name, used.get(_USED[name], 0)) if name in _USED else "",
-            _amount(name, limit),
-        )
-        for name, limit in facts.quotas.items()
-    ]
-
-
-def _name(quota: str) -> str:
-    return safe_line(quota.removesuffix("_bytes").replace("_", " "))
-
-
-def _amount(quota: str, amount: Any) -> str:
-    return size_text(amount) if quota.endswith("_bytes") else f"{amount:,}"

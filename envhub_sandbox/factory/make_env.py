@@ -12,7 +12,7 @@ from typing import Any
 from envhub_sandbox.errors import DependencyError, PolicyError
 from envhub_sandbox.factory.env_factory import EnvFactory
 from envhub_sandbox.factory.package_source import PackageSource, source_of
-from envhub_sandbox.hub.snapshot import Snapshot, snapshot_named
+from envhub_sandbox.hub.snapshot import Snapshot, snapshot_named, with_assets
 from envhub_sandbox.sandboxes import inprocess
 from envhub_sandbox.sandboxes.sandbox import Sandbox, is_list
 from envhub_sandbox.session.launcher import Launcher
@@ -151,7 +151,7 @@ def _make(cfg: Any, given: Options) -> EnvSuites:
     occupy_streams()  # before anything of ours is opened
     wanted = _wanted(options.sandbox, options)
     snapshot = snapshot_named(reference, **options.source)
-    snapshot = _with_assets(snapshot, options, wanted.source.assets)
+    snapshot = with_assets(snapshot, options.assets, options.hub, wanted.source.assets)
     target = wanted.place.package_target()
     while True:
         try:
@@ -262,18 +262,6 @@ def _make_here(reference: str, config: Any, options: Options) -> EnvSuites:
     further = dict(options.env_kwargs or {})
     envs = inprocess.make(snapshot, options.n_envs, options.use_async_envs, config, further)
     return EnvSuites(envs, lambda: provenance_of(snapshot, None, []))
-
-
-def _with_assets(snapshot: Snapshot, options: Options, locked: Sequence[str]) -> Snapshot:
-    """The snapshot with its assets; without that extra, a card's are not looked for."""
-    module, name = "envhub_sandbox.hub.sources.assets", "with_assets"
-    if options.assets or locked:
-        extras.required(module, name, option_name("assets"))
-    with_assets = extras.find(module, name)
-    if with_assets is None:
-        return snapshot
-    found: Snapshot = with_assets(snapshot, options.assets, options.hub, locked)
-    return found
 
 
 def _ahead(wanted: _Plan, options: Options) -> int | None:

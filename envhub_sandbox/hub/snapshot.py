@@ -12,7 +12,7 @@ import contextlib
 import hashlib
 import os
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TypeVar
@@ -48,6 +48,7 @@ from envhub_sandbox.hub.reference import (
     is_local,
     is_of_another_place,
 )
+from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.system import extras
 from envhub_sandbox.system.log import SNAPSHOT, tell
 from envhub_worker.protocol.records import dataclass
@@ -222,6 +223,20 @@ def _in_store(candidates: Sequence[_Candidate], even_if_none: bool) -> str:
         for stored in others
     )
     return f" These are in the store and need no Hub: {shown}."
+
+
+def with_assets(
+    snapshot: Snapshot, given: Sequence[str], hub: Mapping[str, Any], locked: Sequence[str] = ()
+) -> Snapshot:
+    """The snapshot with its assets: see ``hub.sources.assets``. Without that extra a card's are not
+    looked for. Raises ``SandboxUnavailableError``: others are asked for.
+    """
+    module, name = "envhub_sandbox.hub.sources.assets", "with_assets"
+    if given or locked:
+        extras.required(module, name, option_name("assets"))
+    extra = extras.find(module, name)
+    found: Snapshot = snapshot if extra is None else extra(snapshot, given, hub, locked)
+    return found
 
 
 def local(folder: str | Path, *, allow_secrets: bool = False) -> Snapshot:

@@ -27,7 +27,6 @@ from envhub_sandbox.cli.shared.console import (
 )
 from envhub_sandbox.cli.shared.exits import Exit, UsageError, reported
 from envhub_sandbox.cli.shared.findings import (
-    FailOn,
     annotate,
     level,
     show_finding,
@@ -95,7 +94,7 @@ def check(
         ),
     ] = 1.0,
     seed: Annotated[int, typer.Option("--seed", "-s", min=0, help="The seed of each play.")] = 0,
-    fail_on: FailOn = "error",
+    fail_on: opt.FailOn = "error",
     settings: Annotated[
         Path | None,
         typer.Option(

@@ -5,9 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from typing import TYPE_CHECKING
 
 from envhub_sandbox.cli.shared.console import command, show
 from envhub_sandbox.cli.shared.exits import UsageError
@@ -19,16 +17,6 @@ if TYPE_CHECKING:
 _MOST_OF_A_SUMMARY = 1_000_000
 """Characters, all of them ASCII: GitHub takes 1 MiB for each step."""
 STYLES = {"error": "red", "warning": "yellow", "note": "dim"}
-
-FailOn = Annotated[
-    str | None,
-    typer.Option(
-        "--fail-on",
-        metavar="|".join(STYLES),
-        autocompletion=lambda: list(STYLES),
-        help="Exit with 1 for findings of this severity or a worse one.",
-    ),
-]
 
 
 def show_finding(one: Finding, *, fails: bool = False) -> None:

@@ -45,6 +45,16 @@ Task = Annotated[
     list[str] | None,
     typer.Option("--task", help="Only this task id (repeatable).", rich_help_panel=_PANEL),
 ]
+SEVERITIES = ("error", "warning", "note")
+FailOn = Annotated[
+    str | None,
+    typer.Option(
+        "--fail-on",
+        metavar="|".join(SEVERITIES),
+        autocompletion=lambda: list(SEVERITIES),
+        help="Exit with 1 for findings of this severity or a worse one.",
+    ),
+]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON document on stdout.")]
 Debug = Annotated[bool, typer.Option("--debug", help="Show tracebacks.")]
 
@@ -142,7 +152,7 @@ class MakeOptions:
 
     def snapshot_with_assets(self, ref: str, locked: Sequence[str] = ()) -> Snapshot:
         """The same, with its assets: those of the command line, or of a lock."""
-        from envhub_sandbox.hub.sources.assets import with_assets
+        from envhub_sandbox.hub.snapshot import with_assets
 
         return with_assets(self.snapshot(ref), self.given.get("assets") or (), self.hub, locked)
 

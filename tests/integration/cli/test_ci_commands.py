@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from envhub_sandbox import make_env
-from envhub_sandbox.cli import doctor
+from envhub_sandbox.cli import doctor_server
 from envhub_sandbox.cli.shared.console import guarded
 from envhub_sandbox.errors import WorkerDiedError
 from envhub_sandbox.sandboxes.remote import ServerFacts
@@ -187,7 +187,7 @@ def test_a_server_on_another_host_is_obeyed_no_more(capsys: pytest.CaptureFixtur
     )
     server: Any = type("Server", (), {"endpoint": _LONG, "insecure_loopback": False})()
     with guarded():
-        doctor.print_facts(server, facts, _LONG)
+        doctor_server.print_facts(server, facts, _LONG)
     shown = capsys.readouterr().out
     assert "forged" in shown
     assert obeyed(shown) == []

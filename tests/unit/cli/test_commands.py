@@ -19,8 +19,9 @@ from typer.testing import CliRunner
 from envhub_sandbox import __version__
 from envhub_sandbox.check import reports
 from envhub_sandbox.check.findings import Finding, Report
-from envhub_sandbox.cli import cache, doctor, init, inspect
+from envhub_sandbox.cli import cache, doctor_server, init
 from envhub_sandbox.cli.app import app
+from envhub_sandbox.cli.check import static
 from envhub_sandbox.cli.shared import exits, findings, host
 from envhub_sandbox.cli.shared.console import guarded
 from envhub_sandbox.cli.shared.exits import Exit
@@ -81,7 +82,7 @@ def test_what_cannot_be_done_is_said_in_one_line(words: str, code: int, text: st
 def test_reading_is_no_running(monkeypatch: pytest.MonkeyPatch) -> None:
     """``--static`` goes another way, with its own options."""
     asked = list[Any]()
-    monkeypatch.setattr(inspect, "inspect_static", lambda ref, **options: asked.append(options))
+    monkeypatch.setattr(static, "inspect_static", lambda ref, **options: asked.append(options))
     assert said("inspect", "./here", "--static", "--json")[0] == 0
     assert [one["as_json"] for one in asked] == [True]
     assert said("inspect", "./here", "--fail-on", "note")[0] == 2
@@ -247,7 +248,9 @@ def looks() -> Iterator[Examine]:
         def run(said: dict[Any, Any], profile: str = "no-userns", *, json: bool = False) -> Exit:
             answer = m.Sessions((), said)
             server.lies[m.GetSessions] = lambda asked: [asked.answer(answer)]
-            return doctor.examine_server(cast("RemoteSandbox", _Place(server)), profile, json=json)
+            return doctor_server.examine_server(
+                cast("RemoteSandbox", _Place(server)), profile, json=json
+            )
 
         yield run
 

@@ -14,8 +14,8 @@ from tests.unit.docs.test_imports import below, imported, modules
 # Each extra, and the packages and modules of it. Whatever is named in none of them is core.
 EXTRAS = {
     "check": {
-        *("envhub_sandbox.check", "envhub_sandbox.cli.check"),
-        *("envhub_sandbox.cli.diff", "envhub_sandbox.cli.init"),
+        *("envhub_sandbox.check", "envhub_sandbox.cli.check", "envhub_sandbox.cli.diff"),
+        "envhub_sandbox.cli.shared.findings",
     },
     "crash": {"envhub_sandbox.cli.replay", "envhub_sandbox.session.crash"},
     "denials": {f"envhub_worker.lockdown.seccomp.{name}" for name in ("evidence", "notify")},
@@ -28,6 +28,7 @@ EXTRAS = {
     },
     "ray": {"envhub_sandbox.sandboxes.ray"},
     "remote": {
+        "envhub_sandbox.cli.doctor_server",
         *(f"envhub_sandbox.sandboxes.{name}" for name in ("remote", "remote_keys")),
         *("envhub_sandbox.sandboxes.remote_repository", "envhub_sandbox.transport.tcp"),
         "envhub_worker.access",
@@ -45,6 +46,8 @@ EXTRAS = {
         "envhub_sandbox.hub.sources.assets",
     },
 }
+# What lies in the folder of an extra, and is core: ``envhub run`` plays, and prints what confines.
+CORE = {f"envhub_sandbox.check.play.{name}" for name in ("confinement", "episodes", "plays")}
 # The extras that an extra may import.
 EXTRAS_OF_EXTRAS = {
     "check": {"packages"},
@@ -56,19 +59,6 @@ EXTRAS_OF_EXTRAS = {
 }
 # What modules of the core import of extras today, in the same package: this list only gets shorter.
 CORE_IMPORTS_EXTRAS = {
-    "envhub_sandbox.cli.cache": {
-        *("dependencies.builds.wheels", "dependencies.environments", "sandboxes.docker.leftovers")
-    },
-    "envhub_sandbox.cli.doctor": {"cli.init", "sandboxes.docker.engines", "sandboxes.remote"},
-    "envhub_sandbox.cli.inspect": {
-        *("check.contents", "check.findings", "check.play.episodes", "check.reports"),
-        *("check.settings", "check.static", "cli.download"),
-    },
-    "envhub_sandbox.cli.run": {"check.play.episodes", "check.play.plays"},
-    "envhub_sandbox.cli.shared.console": {"check.play.episodes"},
-    "envhub_sandbox.cli.shared.findings": {"check.checks", "check.findings", "check.settings"},
-    "envhub_sandbox.cli.shared.options": {"hub.sources.assets"},
-    "envhub_sandbox.cli.shared.results": {"check.play.confinement", "check.play.episodes"},
     "envhub_worker.__main__": {"cli.drain", "cli.health", "cli.keygen", "cli.listen", "cli.status"},
     "envhub_worker.runner.recording": {"runner.old_gym"},
     "envhub_worker.runner.sync_envs": {"runner.old_gym"},
@@ -84,7 +74,7 @@ CORE_IMPORTS_EXTRAS = {
 def extra_of(module: str) -> str | None:
     """The extra that a module belongs to; None of the core."""
     for extra, parts in EXTRAS.items():
-        if any(below(module, part) for part in parts):
+        if module not in CORE and any(below(module, part) for part in parts):
             return extra
     return None
 

@@ -105,7 +105,6 @@ WITHOUT_IO = {"asyncio", "multiprocessing", "os", "select", "socket", "subproces
 # who runs code by a name that is not written in its source, and whose code that is
 IMPORTERS = {
     "envhub_sandbox": "our own public names",
-    "envhub_sandbox.cli.app": "our own commands",
     "envhub_sandbox.system.extras": "our own extras",
     "envhub_sandbox.sandboxes.inprocess": "the repository's, where sandbox=None trusts it",
     "envhub_worker.bootstrap": "our own programs",
