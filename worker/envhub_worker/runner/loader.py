@@ -20,7 +20,6 @@ import os
 import sys
 from collections.abc import Callable, Iterable
 from dataclasses import MISSING, field, fields, is_dataclass, make_dataclass
-from operator import attrgetter
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -88,11 +87,14 @@ def _stand_in(
     name: tuple[str, str], base: type[Any] | None, field_names: Iterable[str], computed: Any
 ) -> type[Any]:
     parameters: Any = getattr(base, "__dataclass_params__", None)
+    namespace = {"__module__": name[0], **computed}
+    if name[0].startswith("lerobot."):  # which is not imported for it, but may be later
+        namespace["__class__"] = property(lambda self: _loaded_class(*name) or type(self))
     made = make_dataclass(
         name[1].rpartition(".")[2],
         [(one, Any, field(default=None)) for one in field_names],
         bases=() if base is None else (base,),
-        namespace={"__module__": name[0], **computed},
+        namespace=namespace,
         kw_only=True,
         frozen=bool(parameters and parameters.frozen),
     )
@@ -151,9 +153,17 @@ def call_make_env(make_env: Callable[..., Any], request: Load | LoadTask) -> Any
     return make_env(**(taken | request.env_kwargs))
 
 
+def _loaded_class(module: str, qualified_name: str) -> type[Any] | None:
+    """What ``isinstance`` takes an object for, once the repository has imported the class."""
+    found = vars(sys.modules.get(module, object)).get(qualified_name)
+    return found if isinstance(found, type) else None
+
+
 def _class_named(module: str, qualified_name: str) -> type[Any] | None:
     try:
-        found = attrgetter(qualified_name)(importlib.import_module(module))
+        found: Any = importlib.import_module(module)
+        for part in qualified_name.split("."):  # what it has: getattr may import LeRobot itself
+            found = vars(found)[part]
     except Exception:  # not here, or not importable, or local to a function
         return None
     return found if isinstance(found, type) else None

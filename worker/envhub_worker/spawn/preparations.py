@@ -9,15 +9,18 @@ The display is Xvfb, as confined as what draws on it. It listens on a socket fil
 ``/tmp`` and nowhere else: neither TCP nor an abstract socket, so that no other jail and no program
 of the host finds it, and no display of the host is there in the jail.
 
-LeRobot is stood in for where a repository imports it for names alone, and it is not installed. An
-``env.py`` often imports ``EnvConfig`` for an annotation, or constants that name observations.
-LeRobot itself is gigabytes. So where nothing else brings these modules they have the names of
-LeRobot's contract with environments; whatever else is imported of it is missing, as before.
+LeRobot is stood in for where a repository imports it for names alone. An ``env.py`` often imports
+``EnvConfig`` for an annotation, or constants that name observations; a caller's configuration is of
+a class of LeRobot's. LeRobot itself is gigabytes, and takes seconds to import. So a stub has the
+names of LeRobot's contract with environments; what else is asked of it comes from LeRobot itself,
+if that is installed.
 """
 
 from __future__ import annotations
 
 import contextlib
+import importlib
+import importlib.util
 import os
 import select
 import shutil
@@ -25,7 +28,9 @@ import subprocess
 import sys
 import types
 import warnings
+from abc import ABCMeta
 from collections.abc import Callable, Mapping, Sequence
+from functools import lru_cache
 from importlib.abc import Loader, MetaPathFinder
 from importlib.machinery import ModuleSpec
 from typing import Any
@@ -136,37 +141,68 @@ _FEATURES = ("STATE", "VISUAL", "ENV", "ACTION", "REWARD", "LANGUAGE")
 
 
 def install_lerobot_stub() -> None:
-    """Have it found last, behind everything that the interpreter and its packages bring."""
-    sys.meta_path.append(_Finder())
+    """Have its names found first: importing LeRobot itself takes seconds of CPU in each jail."""
+    sys.meta_path.insert(0, _Stub())
 
 
-class _Finder(MetaPathFinder, Loader):
-    """Finds and loads the modules of ``_MODULES``."""
+class _Stub(MetaPathFinder, Loader):
+    """Finds and loads the modules of ``_MODULES``, until something else of LeRobot is asked for:
+    then LeRobot itself takes its place, if it is installed.
+    """
 
     def find_spec(
         self, name: str, path: Sequence[str] | None, target: object = None
     ) -> ModuleSpec | None:
-        """The spec of a module of the stub; None for others, and below a LeRobot that is real."""
-        root = sys.modules.get("lerobot")
-        real = root is not None and not isinstance(getattr(root, "__loader__", None), _Finder)
-        if name not in _MODULES or real:
-            return None
-        return ModuleSpec(name, self, origin="stub of envhub-sandbox", is_package=True)
+        """The spec of a module of the stub, or of LeRobot's own."""
+        if name in _MODULES:
+            return ModuleSpec(name, self, origin="stub of envhub-sandbox", is_package=True)
+        if name.startswith("lerobot.") and self._step_aside():
+            return importlib.util.find_spec(name)
+        return None
 
     def create_module(self, spec: ModuleSpec) -> None:
         """An ordinary one."""
 
     def exec_module(self, module: types.ModuleType) -> None:
-        """Fill it, and warn with the first: that is of all."""
-        vars(module).update(_MODULES[module.__name__]())
-        if module.__name__ == "lerobot":
+        """Fill it; the first warns, if LeRobot is not installed."""
+        name = module.__name__
+
+        def other(attribute: str) -> Any:
+            if not attribute.startswith("__") and self._step_aside():
+                return getattr(importlib.import_module(name), attribute)
+            raise AttributeError(f"module {name!r} has no attribute {attribute!r}")
+
+        vars(module).update(_MODULES[name](), __getattr__=other)
+        if name == "lerobot" and not self._is_installed():
             warnings.warn(
                 "lerobot is not installed in the jail: a stub replaces it, with EnvConfig, "
                 "HubEnvConfig, PolicyFeature, FeatureType and the constants of observations",
                 stacklevel=2,
             )
 
+    def _is_installed(self) -> bool:
+        finders = [finder for finder in sys.meta_path if finder is not self]
+        return any(finder.find_spec("lerobot", None) is not None for finder in finders)
 
+    def _step_aside(self) -> bool:
+        """Whether LeRobot itself is imported now."""
+        if self in sys.meta_path and self._is_installed():
+            sys.meta_path.remove(self)
+            for name in _MODULES:
+                sys.modules.pop(name, None)
+            importlib.import_module("lerobot")
+        return self not in sys.meta_path
+
+
+class _AnyOfThisName(ABCMeta):
+    """A class of the stub, which LeRobot's own of that name counts as, too."""
+
+    def __instancecheck__(cls, instance: Any) -> bool:
+        name = (cls.__module__, cls.__qualname__)
+        return any((c.__module__, c.__qualname__) == name for c in type(instance).__mro__)
+
+
+@lru_cache
 def _types() -> dict[str, Any]:
     from dataclasses import make_dataclass
     from enum import Enum
@@ -177,11 +213,12 @@ def _types() -> dict[str, Any]:
     return {"FeatureType": kind, "PolicyFeature": feature}
 
 
+@lru_cache
 def _configs() -> dict[str, Any]:
     from dataclasses import dataclass, field
 
     @dataclass
-    class EnvConfig:
+    class EnvConfig(metaclass=_AnyOfThisName):
         """The fields that every configuration of an environment has."""
 
         task: str | None = None
@@ -213,9 +250,9 @@ def _configs() -> dict[str, Any]:
 
 
 _MODULES: dict[str, Callable[[], dict[str, Any]]] = {
-    **dict.fromkeys(("lerobot", "lerobot.envs", "lerobot.utils", "lerobot.configs"), dict),
-    "lerobot.envs.configs": _configs,
-    "lerobot.configs.types": _types,
+    **dict.fromkeys(("lerobot", "lerobot.utils"), dict),
+    **dict.fromkeys(("lerobot.envs", "lerobot.envs.configs"), _configs),
+    **dict.fromkeys(("lerobot.configs", "lerobot.configs.types"), _types),
     "lerobot.utils.constants": lambda: _CONSTANTS,
     "lerobot.constants": lambda: _CONSTANTS,
 }

@@ -17,7 +17,9 @@ from huggingface_hub import snapshot_download
 
 from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.protocol.confinement import Confinement
+from envhub_worker.protocol.messages import CONFIG_CLASS
 from envhub_worker.protocol.runtime import HubCopy
+from envhub_worker.runner.loader import config_of
 from envhub_worker.spawn.preparations import install_lerobot_stub, make_hub_cache
 
 COMMIT = "ab" * 20
@@ -98,10 +100,32 @@ def test_the_rest_is_missing_as_before() -> None:
         exec("from lerobot.envs.configs import AlohaEnv")
 
 
-def test_lerobot_itself_goes_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "lerobot").mkdir()
-    (tmp_path / "lerobot" / "__init__.py").write_text("REAL = True\n")
+def test_lerobot_itself_is_imported_for_what_the_stub_lacks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither for the stub's names nor for a caller's configuration, which counts as what it is in
+    LeRobot once that is there; and without a warning, since LeRobot is installed.
+    """
+    for package in ("lerobot", "lerobot/envs"):
+        (tmp_path / package).mkdir()
+        (tmp_path / package / "__init__.py").write_text("")
+    (tmp_path / "lerobot" / "envs" / "configs.py").write_text(
+        "class EnvConfig: pass\nclass HubEnvConfig(EnvConfig): pass\n"
+        "class Arena(HubEnvConfig): pass\n"
+    )
     monkeypatch.syspath_prepend(tmp_path)
-    assert importlib.import_module("lerobot").REAL
+    names = tuple(("lerobot.envs.configs", kind) for kind in ("Arena", "HubEnvConfig"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        stub = importlib.import_module("lerobot.envs.configs")
+    cfg = config_of({"hub_path": "org/repo", CONFIG_CLASS: (names, ("hub_path",), {})})
+    assert isinstance(cfg, stub.HubEnvConfig)
+    assert sys.modules["lerobot.envs.configs"] is stub, "LeRobot itself was imported"
+    from lerobot.envs.configs import Arena
+
+    assert Arena is vars(importlib.import_module("lerobot.envs.configs"))["Arena"]
+    assert isinstance(cfg, Arena)
+    assert isinstance(Arena(), stub.EnvConfig)
+    assert not isinstance(tmp_path, stub.EnvConfig)
     with pytest.raises(ModuleNotFoundError):
-        importlib.import_module("lerobot.envs")
+        importlib.import_module("lerobot.policies")
