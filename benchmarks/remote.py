@@ -62,7 +62,7 @@ def main(seconds: float = 2.0, *workloads: str) -> None:
         for name, n_envs in (one for one in _WORKLOADS if one[0] in workloads or not workloads):
             options: list[dict[str, Any]] = [
                 {"sandbox": "process"},
-                {"sandbox": "process", "lane": "frames"},
+                {"sandbox": "process", "policy": {"lane": "frames"}},
                 *({"sandbox": sandbox} for sandbox in (plain, keyed, *delayed)),
             ]
             with contextlib.ExitStack() as stack:
@@ -81,7 +81,7 @@ def driver(seconds: float) -> None:
     with _servers() as (keyed, _, _):
         for count in _WORKERS:
             costs = []
-            for options in ({"lane": "frames"}, {"sandbox": keyed}):
+            for options in ({"policy": {"lane": "frames"}}, {"sandbox": keyed}):
                 with contextlib.ExitStack() as stack:
                     places = [_env("cartpole", 1, options) for _ in range(count)]
                     costs.append(_cost([stack.enter_context(one) for one in places], seconds))

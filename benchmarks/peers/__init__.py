@@ -131,7 +131,9 @@ PEERS = {
         _envhub(
             "envhub-each", "envhub, a worker each", _waits, use_async_envs=True, num_workers=-1
         ),
-        _envhub("envhub-frames", "envhub, ZeroMQ lane", use_async_envs=True, lane="frames"),
+        _envhub(
+            "envhub-frames", "envhub, ZeroMQ lane", use_async_envs=True, policy={"lane": "frames"}
+        ),
         _envhub("envhub-view", "envhub, copy=False", use_async_envs=True, copy=False),
     )
 }

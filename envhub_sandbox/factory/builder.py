@@ -90,13 +90,17 @@ def _repository(folder: Path, order: Mapping[str, Any]) -> Repository:
     limits = Limits(**order["limits"])
     wall_s = float(order["wall_s"])
     policy = Policy(
-        profile=order["profile"], readable=tuple(order["readable"]), limits=limits, crash_history=0
+        profile=order["profile"],
+        readable=tuple(order["readable"]),
+        limits=limits,
+        crash_history=0,
+        lane="frames",
     )
     timeouts = Timeouts(call_s=wall_s, server_idle_s=0)
     runtime = Runtime(*order["runtime"])
     snapshot = local(str(entry))
     return Repository(
-        *(snapshot, m.Load(1, False, None, {}), policy, timeouts, runtime, "frames", True),
+        *(snapshot, m.Load(1, False, None, {}), policy, timeouts, runtime, True),
         recipe=Recipe(make_env=_built, reference=snapshot.reference, config=None),
         installed=None,
         advice=lambda text: "",

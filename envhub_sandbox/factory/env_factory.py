@@ -261,7 +261,7 @@ class EnvFactory:
         self, manifest: Manifest, env: EnvManifest, shared: SharedJails | None
     ) -> AnySession:
         workers = min(len(self._launchers), env.num_envs) if env.shardable else 1
-        trials = self._cache.shard_trials(self._repository.lane)
+        trials = self._cache.shard_trials(self._repository.policy.lane)
         bounds = trials.bounds_for(env, self._num_workers if workers == 1 else workers)
         forget = self._cache.forget
 

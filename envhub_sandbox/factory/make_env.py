@@ -55,11 +55,8 @@ def make_env(
     lock: str | os.PathLike[str] | None = None,
     assets: Sequence[str] = (),
     num_workers: int | None = None,
-    prewarm: int | None = None,
     min_ready: int | None = None,
-    lane: str = "auto",
     copy: bool = True,
-    server_key: str | None = None,
 ) -> EnvSuites:
     """Make the vector environments of a repository, without its code entering this process.
 
@@ -78,10 +75,11 @@ def make_env(
             ``make_env`` gives them: a ``reset`` after ``close`` opens one again, and the
             ``render_fps`` in their metadata is an integer.
         sandbox: Where the code runs: ``"process"``; ``"docker"``, ``"docker:IMAGE"`` or a
-            ``DockerSandbox``; ``"ray"`` or a ``RaySandbox``; ``"tcp://HOST:PORT"`` or a
-            ``RemoteSandbox``. A list of these, or a ``Fleet``, spreads the sub-environments of each
-            environment over several places (``docs/scaling.md``). None runs the code in this
-            process without protection, as LeRobot does.
+            ``DockerSandbox``; ``"ray"`` or a ``RaySandbox``; ``"tcp://HOST:PORT KEY"``, or
+            without the server's public key where that is known, or a ``RemoteSandbox``. A list of
+            these, or a ``Fleet``, spreads the sub-environments of each environment over several
+            places (``docs/scaling.md``). None runs the code in this process without protection, as
+            LeRobot does.
         env_kwargs: Further keyword arguments for the repository's ``make_env``.
         policy: What the code may reach; see ``Policy``.
         timeouts: How long operations may take; see ``Timeouts``.
@@ -110,17 +108,12 @@ def make_env(
             that were found to be independent of each other share as many as are fastest. Several
             places in ``sandbox`` have at least one each. Of ``"ray"`` each has a server of its own,
             which Ray places.
-        prewarm: How many of a suite's next tasks start in the background when a task is first
-            reset; this is also the maximum of unused jails. By default one, if tasks are closed
-            before the next is reset, on this machine and without a GPU; otherwise none.
         min_ready: How many sub-environments ``env.recv`` waits for by default. Each sub-environment
             then has its own worker, or ``num_workers`` workers share them: the sub-environments of
             one worker are stepped together, and so are ready together. ``reset`` and ``step`` work
             as before.
-        lane: ``"auto"`` steps over shared memory where that is possible, ``"frames"`` never does.
         copy: False returns observations in shared memory instead of copies. As in Gymnasium, no
             later step changes an array that is still in use; but the worker can.
-        server_key: For ``sandbox="tcp://..."``: that server's public key.
 
     Returns:
         ``{suite: {task_id: VectorEnv}}``. Environments of a known pin start no process before
@@ -198,7 +191,6 @@ def _suites(snapshot: Snapshot, config: Any, wanted: _Plan, options: Options) ->
         wanted.policy,
         wanted.timeouts,
         Runtime(packages.python, packages.packages) if packages else wanted.runtime,
-        options.lane,
         options.copy,
         min_ready=options.min_ready,
         recipe=recipe,
@@ -239,7 +231,7 @@ def _wanted(sandbox: str | Sandbox, options: Options) -> _Plan:
     source = source_of(options)
     policy = policy_from(options.policy, options.limits)
     timeouts = timeouts_from(options.timeouts)
-    place = sandbox_of(sandbox, options.server_key)
+    place = sandbox_of(sandbox)
     if source.always and place.package_target() is None:
         raise PolicyError(
             f"packages by {option_name('dependencies')} are for this machine, for containers and "
@@ -269,9 +261,10 @@ def _ahead(wanted: _Plan, options: Options) -> int | None:
 
     A container's memory is all its jails', a quota is all a key's, and a GPU everybody's.
     """
-    if options.prewarm is None and (options.sandbox != "process" or wanted.policy.gpu):
+    asked = wanted.policy.prewarm
+    if asked is None and (options.sandbox != "process" or wanted.policy.gpu):
         return 0
-    return options.prewarm
+    return asked
 
 
 # --- what arguments mean
@@ -294,7 +287,7 @@ def reference_of(cfg: Any) -> tuple[str, Any]:
     raise TypeError(f"cfg is a hub reference, a folder, or an object with a hub_path, not {kind}")
 
 
-def sandbox_of(sandbox: str | Sandbox | list[str | Sandbox], server_key: str | None) -> Sandbox:
+def sandbox_of(sandbox: str | Sandbox | list[str | Sandbox]) -> Sandbox:
     """The sandbox of a name, or the one that was given; of a list, a fleet of these.
     Raises ``PolicyError``: there is none of that name; ``SandboxUnavailableError``: this platform
     has none of that kind.
@@ -304,16 +297,11 @@ def sandbox_of(sandbox: str | Sandbox | list[str | Sandbox], server_key: str | N
         fleet = _extra("fleet.fleet", "Fleet")(sandbox)
     place: Sandbox
     if callable(getattr(fleet, "opened", None)):
-        place = fleet.opened(partial(sandbox_of, server_key=None), server_key)
+        place = fleet.opened(sandbox_of)
         return place
     if isinstance(sandbox, str) and sandbox.startswith("tcp://"):
-        place = _extra("remote", "RemoteSandbox")(sandbox, server_key=server_key)
+        place = _extra("remote", "RemoteSandbox")(sandbox)
         return place
-    if server_key is not None:
-        raise PolicyError(
-            f"{option_name('server_key')} is for {option_name('sandbox', 'tcp://HOST:PORT')}; a "
-            "RemoteSandbox has its own"
-        )
     if not isinstance(sandbox, str):
         if isinstance(sandbox, list) or not callable(getattr(sandbox, "for_repository", None)):
             raise _unknown(sandbox)

@@ -47,7 +47,8 @@ class RemoteSandbox(Sandbox):
     """Workers on another host.
 
     Attributes:
-        endpoint: ``tcp://HOST:PORT`` of its ``envhub-worker listen``.
+        endpoint: ``tcp://HOST:PORT`` of its ``envhub-worker listen``; ``tcp://HOST:PORT KEY`` has
+            the server's public key, too.
         server_key: Its public key; by default ``$ENVHUB_SERVER_KEY``, or what ``known_hosts`` in
             the configuration folder says (a line is ``HOST:PORT KEY``).
         client_key: Our secret key, or a file that holds it; by default ``$ENVHUB_CLIENT_KEY``
@@ -71,6 +72,8 @@ class RemoteSandbox(Sandbox):
     )
 
     def __post_init__(self) -> None:
+        self.endpoint, _, key = self.endpoint.partition(" ")
+        self.server_key = key.strip() or self.server_key
         remote_keys.address_of(self.endpoint)
         if self.insecure_loopback and not remote_keys.is_loopback(self.endpoint):
             raise PolicyError(

@@ -66,9 +66,10 @@ def server_key(endpoint: str, given: str | None) -> bytes:
     if not text:
         raise SandboxUnavailableError(
             f"the public key of {endpoint} is not known, and without it another program could "
-            "imitate that server. It prints its key when it starts; pass it with "
-            f"{option_name('server_key')}, set {SERVER_KEY_VARIABLE}, or write "
-            f"'{address_of(endpoint)} KEY' into {config_folder() / 'known_hosts'}"
+            "imitate that server. It prints its key when it starts; name it after "
+            f"the address, as in {option_name('sandbox', f'{endpoint} KEY')}, set "
+            f"{SERVER_KEY_VARIABLE}, or write '{address_of(endpoint)} KEY' into "
+            f"{config_folder() / 'known_hosts'}"
         )
     return _parsed(text, "server_key")
 

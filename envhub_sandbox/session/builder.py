@@ -240,7 +240,7 @@ class Builder:
         server = loaded.server
         if not self._own:
             return relay  # a runner has one lane, and environments of one jail share theirs
-        if server.fd_path is None or self._repository.lane == "frames":
+        if server.fd_path is None or self._repository.policy.lane == "frames":
             served = extras.find("envhub_sandbox.transport.shared_memory.served_lane", "ServedLane")
             other: Lane = relay if served is None else served.open(relay, deadline)
             return other

@@ -203,7 +203,6 @@ class Repository:
     Args:
         arguments: What the repository's ``make_env`` is called with.
         runtime: The interpreter of the jails, and their packages.
-        lane: ``"auto"`` or ``"frames"``.
         copy: Whether observations are copied for the caller, or lent.
         installed: What was installed for it, for the provenance.
         advice: Says what to do where a module is missing, for the error's text.
@@ -228,7 +227,6 @@ class Repository:
         policy: Policy,
         timeouts: Timeouts,
         runtime: Runtime,
-        lane: str,
         copy: bool,
         *,
         min_ready: int | None = None,
@@ -247,7 +245,6 @@ class Repository:
         self._in_use: list[SharedLock] = []
         self._holders: set[object] = set()
         self._lock_files()
-        self.lane = lane
         self.copy = copy
         self.min_ready = min_ready
         self.warnings = RemoteWarnings()

@@ -28,7 +28,6 @@ from envhub_worker.protocol.records import dataclass
 
 MAX_ASSETS = 16
 _CODE, _LIMITS, _HUB = "How it is built", "What it may do", "Where it comes from"
-_LANES = ("auto", "frames")
 
 
 @dataclass(frozen=True)
@@ -101,12 +100,6 @@ def _flag(value: Any) -> bool:
     if not isinstance(value, (bool, np.bool_)):
         raise TypeError(f"`use_async_envs` is {value!r}; it is True or False")
     return bool(value)
-
-
-def _lane(value: Any) -> str:
-    if value not in _LANES:
-        raise PolicyError(f"lane is {value!r}; it is one of {', '.join(_LANES)}")
-    return str(value)
 
 
 def _assets(value: Any) -> tuple[str, ...]:
@@ -198,25 +191,14 @@ class Options:
         least=1,
         sandboxed=True,
     )
-    prewarm: int | None = _option(None, kind=int, least=0, sandboxed=True)
     min_ready: int | None = _option(None, kind=int, least=1, sandboxed=True)
-    lane: str = _option("auto", check=_lane)
     copy: bool = _option(True, kind=bool)
     sandbox: Any = _option(
         "process",
         "--sandbox",
         "Where it runs; several places are separated by commas.",
-        metavar="process|docker[:IMAGE]|ray|tcp://HOST:PORT",
+        metavar="process|docker[:IMAGE]|ray|tcp://HOST:PORT[ KEY]",
         panel=_LIMITS,
-    )
-    server_key: str | None = _option(
-        None,
-        "--server-key",
-        "With --sandbox tcp://...: that server's public key; otherwise $ENVHUB_SERVER_KEY or "
-        "known_hosts.",
-        metavar="KEY",
-        panel=_LIMITS,
-        sandboxed=True,
     )
     trust_remote_code: bool = _option(
         False,
@@ -334,7 +316,8 @@ _KEYS: dict[str, dict[str, Option]] = {
 }
 """By the argument that is a mapping: those of its keys that commands have."""
 _IN_PYTHON = {
-    "policy": "restart restart_budget restart_backoff_s record_denials crash_history crash_folder",
+    "policy": "restart restart_budget restart_backoff_s record_denials crash_history crash_folder "
+    "prewarm lane",
     "limits": "open_files disk_files file_bytes output_bytes message_bytes elements",
     "timeouts": "close_s idle_s server_idle_s",
 }

@@ -31,6 +31,7 @@ __all__ = [
 ]
 
 RESTARTS = ("never", "on_reset", "transparent")
+LANES = ("auto", "frames")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -102,6 +103,10 @@ class Policy:
         crash_history: How many requests since the last seeded reset are kept for a crash bundle
             (``docs/crashes.md``), within 8 MiB; 0 keeps none and writes no bundles.
         crash_folder: Where crash bundles are written; ``crashes`` in the cache by default.
+        prewarm: How many of a suite's next tasks start in the background when a task is first
+            reset; this is also the maximum of unused jails. By default one, if tasks are closed
+            before the next is reset, on this machine and without a GPU; otherwise none.
+        lane: ``"auto"`` steps over shared memory where that is possible, ``"frames"`` never does.
     """
 
     profile: str = "strict"
@@ -118,15 +123,20 @@ class Policy:
     record_denials: bool = False
     crash_history: int = 10_000
     crash_folder: str | None = None
+    prewarm: int | None = None
+    lane: str = "auto"
 
     def __post_init__(self) -> None:
         _one_of("profile", self.profile, PROFILES)
         _one_of("network", self.network, NETWORKS)
         _one_of("display", self.display, DISPLAYS)
         _one_of("restart", self.restart, RESTARTS)
+        _one_of("lane", self.lane, LANES)
         _count("restart_budget", self.restart_budget)
         _seconds("restart_backoff_s", self.restart_backoff_s)
         _count("crash_history", self.crash_history)
+        if self.prewarm is not None:
+            _count("prewarm", self.prewarm)
         object.__setattr__(self, "output", _path("output", self.output))
         if self.crash_folder is not None:
             object.__setattr__(self, "crash_folder", _path("crash_folder", self.crash_folder))

@@ -13,7 +13,7 @@ from tests.compliance.vector_env import Case, paired
 @pytest.fixture(scope="class")
 def pair(request: pytest.FixtureRequest, case: Case, lane: str) -> Iterator[Pair]:
     """The reference and the sandboxed environment of a case; its tests share them."""
-    with paired(request.cls.sample, case, lane=lane) as both:
+    with paired(request.cls.sample, case, policy={"lane": lane}) as both:
         yield both
 
 

@@ -55,7 +55,7 @@ def _spread(n_envs: int, workers: int, modes: tuple[str, ...] = MODES) -> list[C
 @pytest.fixture(scope="class")
 def pair(request: pytest.FixtureRequest, case: Case, lane: str) -> Iterator[Pair]:
     """The reference, and an environment of which each worker is on a place of its own."""
-    options = {"sandbox": ["process"] * (case.num_workers or 1), "lane": lane}
+    options = {"sandbox": ["process"] * (case.num_workers or 1), "policy": {"lane": lane}}
     with paired(request.cls.sample, case, **options) as both:
         yield both
 
@@ -126,7 +126,9 @@ def test_infos_that_do_not_fit_together(tmp_path: Path, lane: str) -> None:
     exec(_UNLIKE, here)
     for spread in ([0, 1], [0, 1, 2, 3, 4, 5]):
         expected = here["make_env"](n_envs=6)
-        with make_env(repository, n_envs=6, sandbox=["process"] * len(spread), lane=lane) as suites:
+        with make_env(
+            repository, n_envs=6, sandbox=["process"] * len(spread), policy={"lane": lane}
+        ) as suites:
             assert_same(expected.reset(seed=4), suites.env.reset(seed=4), "reset")
             for step in range(8):
                 actions = np.zeros(6, np.int64)

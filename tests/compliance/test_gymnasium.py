@@ -30,7 +30,7 @@ WAYS: dict[str, dict[str, Any]] = {
     "sync": {},
     "async": {"use_async_envs": True},
     "subclass": {"options": {"env_kwargs": {"subclass": True}}},
-    "frames": {"options": {"lane": "frames"}},
+    "frames": {"options": {"policy": {"lane": "frames"}}},
     "workers": {"use_async_envs": True, "options": {"num_workers": 2}},
 }
 

@@ -171,7 +171,10 @@ ACTIONS: dict[str, tuple[gym.Space[Any], Any]] = {
     ("name", "options"),
     [
         *((name, {"num_workers": 2}) for name in ACTIONS),
-        *(("in a dict", options) for options in ({}, {"lane": "frames", "num_workers": 2})),
+        *(
+            ("in a dict", options)
+            for options in ({}, {"policy": {"lane": "frames"}, "num_workers": 2})
+        ),
     ],
 )
 def test_an_action_reaches_the_environment_as_it_is(

@@ -72,7 +72,9 @@ def _is_inert(value: Any) -> bool:
     return isinstance(value, RemoteObject)
 
 
-@pytest.mark.parametrize("options", [{}, {"lane": "frames"}, {"num_workers": 2}], ids=str)
+@pytest.mark.parametrize(
+    "options", [{}, {"policy": {"lane": "frames"}}, {"num_workers": 2}], ids=str
+)
 def test_the_rest_of_a_step_arrives(folder: Path, options: dict[str, Any]) -> None:
     """Observations, rewards, flags, other infos; and of what is odd its value or a description."""
     with make_env(folder, n_envs=2, **options) as suites:
@@ -134,7 +136,11 @@ class Tells(gym.Env[Any, Any]):
 
 SEVERAL = pytest.mark.parametrize(
     "options",
-    [{"num_workers": 3}, {"num_workers": 3, "lane": "frames"}, {"sandbox": ["process"] * 2}],
+    [
+        {"num_workers": 3},
+        {"num_workers": 3, "policy": {"lane": "frames"}},
+        {"sandbox": ["process"] * 2},
+    ],
     ids=str,
 )
 

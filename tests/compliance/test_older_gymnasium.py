@@ -73,7 +73,7 @@ def opened(name: str, case: Case, runtime: Runtime, **options: Any) -> Iterator[
 def pair(case: OlderCase, lane: str, runtimes: Any) -> Iterator[Pair]:
     """The reference in the client's Gymnasium, and the older one in a jail."""
     expected = reference("counter", case.n_envs, autoreset_mode=case.mode)
-    with opened("counter", case, runtimes(case.requirements), lane=lane) as env:
+    with opened("counter", case, runtimes(case.requirements), policy={"lane": lane}) as env:
         yield Pair(expected, env)
     expected.close()
 

@@ -457,7 +457,7 @@ def test_an_own_vector_is_stepped_in_shared_memory_and_returns_the_same(
     pytest.importorskip("torch")
     folder = write_repository(tmp_path, _PLAIN)
     options: dict[str, Any] = {"env_kwargs": {"mode": mode, "wide": wide}, "copy": copy}
-    with make_env(folder, 2, lane="frames", **options) as suites:
+    with make_env(folder, 2, policy={"lane": "frames"}, **options) as suites:
         expected = _played(suites.env)
     with make_env(folder, 2, **options) as suites:
         actual = _played(suites.env)

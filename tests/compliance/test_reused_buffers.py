@@ -89,7 +89,7 @@ def _played(env: Any) -> list[Any]:
 
 @pytest.mark.parametrize("mode", ["SameStep", "NextStep"])
 @pytest.mark.parametrize("of_all", [None, "flat", "nested"])
-@pytest.mark.parametrize("options", [{}, {"lane": "frames"}, {"copy": False}], ids=str)
+@pytest.mark.parametrize("options", [{}, {"policy": {"lane": "frames"}}, {"copy": False}], ids=str)
 def test_one_process(folder: Path, mode: str, of_all: str | None, options: dict[str, Any]) -> None:
     """Also where sub-environments fill the same objects, as they do in one process."""
     kwargs = {"mode": mode, "of_all": of_all}
@@ -104,7 +104,7 @@ def test_several_processes(folder: Path, mode: str) -> None:
     expected = _played(_here(folder).make_env(3, True, mode=mode))
     options: Any = {"n_envs": 3, "use_async_envs": True, "env_kwargs": {"mode": mode}}
     for workers, lane in ((1, "auto"), (2, "frames"), (3, "auto")):
-        with make_env(folder, num_workers=workers, lane=lane, **options) as suites:
+        with make_env(folder, num_workers=workers, policy={"lane": lane}, **options) as suites:
             assert_same(expected, _played(suites.env), f"{workers} {lane}")
 
 
@@ -113,7 +113,7 @@ def test_the_end_of_a_single_environment_is_the_end(folder: Path, lane: str) -> 
     """In a vector environment that resets in the same step, which a ``gymnasium.Env`` does not."""
     here = _here(folder).Reuses(2)
     del here.info["masked"]  # of one alone, it is a text
-    with contextlib.closing(SandboxEnv(folder, lane=lane)) as there:
+    with contextlib.closing(SandboxEnv(folder, policy={"lane": lane})) as there:
         for _ in range(3):
             for env in (here, there):
                 env.reset()

@@ -38,7 +38,7 @@ def _sent_in_pieces(env: Any, rng: Any) -> Any:
 @pytest.fixture(scope="class")
 def pair(request: pytest.FixtureRequest, case: Case, lane: str) -> Iterator[Pair]:
     """The reference, and an environment whose steps are sent and received."""
-    with paired(request.cls.sample, case, lane=lane, min_ready=1) as both:
+    with paired(request.cls.sample, case, policy={"lane": lane}, min_ready=1) as both:
         both.sandboxed.step = _sent_in_pieces(both.sandboxed, np.random.default_rng(0))
         yield both
 
@@ -140,7 +140,7 @@ def test_results_do_not_depend_on_who_is_ready_first(
     actions = rng.integers(0, 3, (count, _STEPS))
     taken: dict[int, list[Any]] = {index: [] for index in range(count)}
     sent = [0] * count
-    options = {"lane": lane, "num_workers": workers, "min_ready": 2}
+    options = {"policy": {"lane": lane}, "num_workers": workers, "min_ready": 2}
     with make_env(folder, count, env_kwargs={"autoreset_mode": mode}, **options) as suites:
         env = suites.env
         env.reset(seed=100)
@@ -200,7 +200,7 @@ def make_env(n_envs=1, use_async_envs=False):
 def test_an_error_does_not_overtake_the_result_before_it(tmp_path: Path, lane: str) -> None:
     """While a receipt waits for another worker, the first one's next answer may be an error."""
     folder = write_repository(tmp_path, _RAISING)
-    with make_env(folder, 2, min_ready=2, lane=lane) as suites:
+    with make_env(folder, 2, min_ready=2, policy={"lane": lane}) as suites:
         env = suites.env
         env.reset()
         env.send(np.array([0, 2]))
@@ -219,7 +219,7 @@ def test_who_has_ended_is_refused_in_its_turn(tmp_path: Path, lane: str) -> None
     folder, here = write_repository(tmp_path, _ENDING), dict[str, Any]()
     exec(_ENDING, here)
     expected = here["make_env"](3)
-    with make_env(folder, 3, lane=lane) as suites:
+    with make_env(folder, 3, policy={"lane": lane}) as suites:
         for env in (expected, suites.env):
             env.reset()
             env.step(np.array([0, 1, 0]))

@@ -20,7 +20,7 @@ from tests.support.compare import assert_same, assert_same_space
 WAYS: dict[str, dict[str, Any]] = {
     "plain": {},
     "subclass": {"options": {"env_kwargs": {"subclass": True}}},
-    "tcp": {},  # by messages, as with ``lane="frames"``
+    "tcp": {},  # by messages, as with the lane ``"frames"``
 }
 
 

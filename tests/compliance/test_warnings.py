@@ -20,7 +20,7 @@ from tests.compliance.theirs.through_sandbox import vector
 WAYS: dict[str, dict[str, Any]] = {
     "sync": {},
     "subclass": {"options": {"env_kwargs": {"subclass": True}}},
-    "frames": {"options": {"lane": "frames"}},
+    "frames": {"options": {"policy": {"lane": "frames"}}},
     "workers": {"use_async_envs": True, "options": {"num_workers": 2}},
 }
 _COLORS = re.compile("\x1b\\[[0-9;]*m")

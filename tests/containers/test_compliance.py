@@ -17,7 +17,7 @@ def pair(
     request: pytest.FixtureRequest, case: Case, lane: str, docker: DockerSandbox
 ) -> Iterator[Pair]:
     """The reference and the environment in a container; the tests of a case share them."""
-    with paired(request.cls.sample, case, lane=lane, sandbox=docker) as both:
+    with paired(request.cls.sample, case, policy={"lane": lane}, sandbox=docker) as both:
         yield both
 
 

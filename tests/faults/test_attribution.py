@@ -61,12 +61,12 @@ class Attribution(RuleBasedStateMachine):
             n_envs=2,
             use_async_envs=True,
             num_workers=self.shards,
-            lane=self.lane,
             policy={
                 "restart": self.restart,
                 "restart_backoff_s": 0,
                 "restart_budget": 10_000,
                 "crash_history": 0,
+                "lane": self.lane,
             },
         )
         self.env = self.suites.env

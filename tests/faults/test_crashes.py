@@ -53,7 +53,12 @@ def test_a_replay_dies_at_the_same_step(
     tmp_path: Path, lane: str, n_envs: int, shards: int, sandbox: Any
 ) -> None:
     """Over both lanes and in a fleet, with autoresets, masks, calls and attributes on the way."""
-    place = {"use_async_envs": True, "num_workers": shards, "lane": lane, "sandbox": sandbox}
+    place = {
+        "use_async_envs": True,
+        "num_workers": shards,
+        "policy": {"lane": lane},
+        "sandbox": sandbox,
+    }
     with brittle(tmp_path, n_envs=n_envs, **place) as suites:
         env = suites.env
         env.set_attr("weight", 0.5)
@@ -231,8 +236,8 @@ def test_a_death_that_is_hidden_leaves_a_bundle_too(
     tmp_path: Path, lane: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level("INFO", "envhub_sandbox.crashes")
-    place = {"n_envs": 3, "use_async_envs": True, "num_workers": 2, "lane": lane}
-    policy = {"restart": "transparent", "restart_backoff_s": 0}
+    place = {"n_envs": 3, "use_async_envs": True, "num_workers": 2}
+    policy = {"restart": "transparent", "restart_backoff_s": 0, "lane": lane}
     with brittle(tmp_path, policy=policy, **place) as suites:
         env = suites.env
         env.action_space.seed(5)

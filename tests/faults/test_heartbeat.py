@@ -30,10 +30,8 @@ def test_timeout_tells_what_the_worker_does(
     """Busy, asleep and stopped are different things to whoever reads the error."""
     fails: dict[str, Any] = {"moment": "step", "fault": fault}
     output = tmp_path / "output"
-    policy = {"output": str(output)}
-    with started(
-        sample("faulty"), n_envs=2, env_kwargs=fails, lane=lane, policy=policy, seed=None
-    ) as env:
+    policy = {"output": str(output), "lane": lane}
+    with started(sample("faulty"), n_envs=2, env_kwargs=fails, policy=policy, seed=None) as env:
         [runner] = inside.pids(env)
         inside.asks_patiently(env)
         env.step_async([0, 1])
@@ -48,7 +46,7 @@ def test_timeout_tells_what_the_worker_does(
 def test_late_reply_survives_the_question(monkeypatch: pytest.MonkeyPatch) -> None:
     """Asking how it is does not lose the reply: the same process is recovered by ``reset``."""
     monkeypatch.setattr(*inside.LATE_REPLY_GRACE, 120.0)
-    with started(sample("echo"), lane="frames", seed=None) as env:
+    with started(sample("echo"), policy={"lane": "frames"}, seed=None) as env:
         before = inside.loaded(env)
         with halted(inside.pids(env)):
             env.step_async([[1.0, 0.0]])

@@ -37,9 +37,8 @@ def made(
         n_envs=4,
         use_async_envs=True,
         num_workers=shards,
-        lane=lane,
         timeouts={"idle_s": idle_s},
-        policy={"restart": restart, "restart_budget": 0},
+        policy={"restart": restart, "restart_budget": 0, "lane": lane},
     ) as suites:
         yield suites.env
 

@@ -27,7 +27,8 @@ lanes = pytest.mark.parametrize("lane", ["auto", "frames"])
 def made(lane: str = "auto", **options: Any) -> Any:
     """Two sub-environments, of which the last hangs at a certain action; reset."""
     fails = options.pop("fails", {"moment": "step", "fault": "hang"})
-    suites = make_env(sample("faulty"), n_envs=2, lane=lane, env_kwargs=fails, **options)
+    policy = {"lane": lane, **options.pop("policy", {})}
+    suites = make_env(sample("faulty"), n_envs=2, policy=policy, env_kwargs=fails, **options)
     suites.env.reset()
     return suites
 

@@ -65,7 +65,7 @@ def repository(tmp_path: Path) -> Path:
 @pytest.mark.parametrize("lane", ["auto", "frames"])
 def test_everything_is_exported(registry: Any, repository: Path, lane: str) -> None:
     label = f"{repository}:env.py"
-    with started(repository, lane=lane, policy={"restart": "on_reset"}, seed=None) as env:
+    with started(repository, policy={"restart": "on_reset", "lane": lane}, seed=None) as env:
         for _ in range(7):
             env.step([[1.0, 0.0]])
         with pytest.raises(errors.WorkerDiedError):
@@ -108,8 +108,8 @@ def test_counts_outlive_their_environments(registry: Any, repository: Path) -> N
 @pytest.mark.parametrize("lane", ["auto", "frames"])
 def test_bytes_are_counted_over_both_lanes(lane: str) -> None:
     """At least the arrays that went, at most a little more; also after a restart."""
-    policy = {"restart": "on_reset", "restart_backoff_s": 0}
-    with started(sample("echo"), n_envs=4, lane=lane, policy=policy, seed=None) as env:
+    policy = {"restart": "on_reset", "restart_backoff_s": 0, "lane": lane}
+    with started(sample("echo"), n_envs=4, policy=policy, seed=None) as env:
         before = env.sandbox.stats()
         for _ in range(10):
             env.step(np.ones((4, 2)) * [1.0, 0.0])
@@ -163,8 +163,8 @@ def test_names_of_the_worker_cannot_break_the_exposition(
 def test_counters_follow_what_happens(lane: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Steps, timeouts, deaths and restarts are counted once each, over both lanes."""
     monkeypatch.setattr(*inside.LATE_REPLY_GRACE, 120.0)
-    policy = {"restart": "on_reset"}
-    with started(sample("echo"), lane=lane, policy=policy, seed=None) as env:
+    policy = {"restart": "on_reset", "lane": lane}
+    with started(sample("echo"), policy=policy, seed=None) as env:
         for _ in range(5):
             env.step([[1.0, 0.0]])
         with halted(inside.pids(env)):

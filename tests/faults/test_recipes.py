@@ -43,8 +43,7 @@ def test_options_and_tasks_travel() -> None:
         n_envs=3,
         env_kwargs={"tasks": 2},
         timeouts={"step_s": 12.5},
-        policy={"restart": "on_reset"},
-        lane="frames",
+        policy={"restart": "on_reset", "lane": "frames"},
     ) as suites:
         with pickle.loads(pickle.dumps(suites)) as again:
             assert list(again["suite"]) == [0, 1]

@@ -13,7 +13,7 @@ from tests.support.started import started
 
 def test_a_task_that_does_not_run_is_not_confined() -> None:
     """Others of its repository may run, and may have run; the provenance still says how."""
-    with make_env(sample("many_tasks"), prewarm=0) as suites:
+    with make_env(sample("many_tasks"), policy={"prewarm": 0}) as suites:
         [first, second, *_] = [env for tasks in suites.values() for env in tasks.values()]
         assert (first.sandbox.report(), first.sandbox.usage()) == ([], {})
         first.reset()
@@ -31,8 +31,8 @@ def test_a_task_that_does_not_run_is_not_confined() -> None:
 @pytest.mark.parametrize("lane", ["auto", "frames"])
 def test_a_jail_that_was_lost_confines_nobody(lane: str) -> None:
     """Until a reset has brought another; while it is merely late it is still the same one."""
-    policy = {"restart": "on_reset"}
-    with started(sample("echo"), lane=lane, policy=policy, seed=None) as env:
+    policy = {"restart": "on_reset", "lane": lane}
+    with started(sample("echo"), policy=policy, seed=None) as env:
         report = env.sandbox.report()
         assert report
         with halted(inside.pids(env)):

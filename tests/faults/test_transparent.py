@@ -41,8 +41,7 @@ def made(
         n_envs=4,
         use_async_envs=True,
         num_workers=shards,
-        lane=lane,
-        policy=policy | more.pop("policy", {}),
+        policy={**policy | more.pop("policy", {}), "lane": lane},
         env_kwargs=env_kwargs or {},
         **more,
     )
@@ -188,7 +187,7 @@ def test_a_reset_is_done_again_in_the_fresh_process(lane: str) -> None:
 def test_infos_that_differ_in_kind_survive_a_death(tmp_path: Path, lane: str, dies_in: str) -> None:
     folder = write_repository(tmp_path / "mixed", _MIXED)
     policy = {"restart": "transparent", "restart_backoff_s": 0, "crash_history": 0}
-    options: dict[str, Any] = {"num_workers": 2, "lane": lane, "policy": policy}
+    options: dict[str, Any] = {"num_workers": 2, "policy": {**policy, "lane": lane}}
     with make_env(str(folder), n_envs=4, use_async_envs=True, **options) as suites:
         env = suites.env
         _, expected = env.reset()

@@ -65,7 +65,7 @@ def record() -> list[Frames]:
 
 
 def _run(name: str, lane: str, workers: int) -> None:
-    options: dict[str, Any] = {"lane": lane, "num_workers": workers, "n_envs": 3}
+    options: dict[str, Any] = {"policy": {"lane": lane}, "num_workers": workers, "n_envs": 3}
     with make_env(str(SAMPLES / name), **options) as suites:
         env = next(iter(next(iter(suites.values())).values()))
         env.action_space.seed(0)

@@ -271,7 +271,7 @@ def judgement(
 
     arguments = _arguments(make, policy)
     del arguments["cfg"]
-    arguments["prewarm"] = 0  # a jail started ahead would be one more at once
+    arguments["policy"]["prewarm"] = 0  # a jail started ahead would be one more at once
     report, doing = Report(make.ref, folder=settings.folder_below_here(make.ref)), ["starting"]
     with ProgressBar(quiet=quiet, long_s=_LONG_S) as bar, says_what_is_seen():
 

@@ -73,20 +73,17 @@ class Fleet(Sandbox):
     def __deepcopy__(self, memo: dict[int, Any]) -> Fleet:
         return replace(self)
 
-    def opened(self, resolve: Resolve, server_key: str | None) -> OpenFleet:
+    def opened(self, resolve: Resolve) -> OpenFleet:
         """The fleet of one ``make_env``.
         ``resolve``: makes a sandbox of a name that is no address.
-        ``server_key``: of places that are addresses, where they do not say another.
         """
 
         def sandbox_of(place: str | Sandbox) -> Sandbox:
             if is_fleet(place):
                 raise PolicyError("a fleet's places are named one by one: no fleet is one")
-            address, _, key = place.partition(" ") if isinstance(place, str) else ("", "", "")
-            if not address.startswith("tcp://"):
-                return resolve(place)
-            known = {"server_key": server_key, **self.remote}
-            return RemoteSandbox(address, **(known | {"server_key": key} if key else known))
+            if isinstance(place, str) and place.startswith("tcp://"):
+                return RemoteSandbox(place, **self.remote)
+            return resolve(place)
 
         return OpenFleet(places_of(self.places), sandbox_of)
 

@@ -232,5 +232,6 @@ def replayed_arguments(bundle: Bundle, *, granted: bool) -> dict[str, Any]:
         **(_own(bundle) if granted else {}),
     }
     if bundle.task is not None:
-        arguments |= {"num_workers": bundle.task["shards"], "lane": bundle.task["lane"]}
+        arguments["num_workers"] = bundle.task["shards"]
+        arguments["policy"]["lane"] = bundle.task["lane"]
     return arguments

@@ -120,7 +120,7 @@ def liar(warm_server: None, open_ground: Path, canary: Path) -> Iterator[Any]:
     for name, frames in lies.items():
         (folder / name).write_bytes(pickle.dumps([bytes(frame) for frame in frames]))
     policy = {"restart": "on_reset", "restart_backoff_s": 0, "restart_budget": 1000}
-    options: dict[str, Any] = {"lane": "frames", "policy": policy, "timeouts": TIMEOUTS}
+    options: dict[str, Any] = {"policy": {**policy, "lane": "frames"}, "timeouts": TIMEOUTS}
     with make_env(str(folder), n_envs=2, **options) as suites:
         yield suites.env
 

@@ -202,7 +202,7 @@ def among(strict: Arena, folder: str, lane: str, **options: Any) -> Iterator[Any
             with_keys = stack.enter_context(listening(Path(folder).parent / "server"))
             given["sandbox"] = with_keys.sandbox()
         else:
-            given["lane"] = lane
+            given["policy"] = {**given["policy"], "lane": lane}
         yield stack.enter_context(make_env(folder, COUNT, timeouts=TIMEOUTS, **given))
 
 

@@ -377,7 +377,7 @@ def make_env(n_envs=1, use_async_envs=False):
 def test_what_is_denied_while_a_known_environment_is_built_is_told(tmp_path: Path) -> None:
     """In a jail of its own, of which nobody but its server knows once it has died."""
     folder = write_repository(tmp_path / "second", _SECOND)
-    with make_env(str(folder), prewarm=0, policy={"record_denials": True}) as suites:
+    with make_env(str(folder), policy={"prewarm": 0, "record_denials": True}) as suites:
         env = suites["suite"]["second"]
         with pytest.raises(WorkerDiedError) as raised:
             env.reset()

@@ -80,7 +80,7 @@ def test_a_flood_of_warnings_is_small_plain_and_ours(home: Path, lane: str) -> N
     assert max(len(str(one.message)) for one in control) > GIANT
     assert {one.filename for one in control} == {"/etc/passwd"}
 
-    told = told_by(lambda: make_env(str(folder), lane=lane).env)
+    told = told_by(lambda: make_env(str(folder), policy={"lane": lane}).env)
     assert 0 < len(told) <= MOST + 1
     assert {one.category for one in told} == {RemoteEnvWarning}
     assert not [one for one in told if paints(str(one.message))]

@@ -149,8 +149,12 @@ def stepping(arena: Arena, folder: Path, mode: str, alias: str = "", lane: str =
         n_envs=2,
         use_async_envs=True,
         num_workers=2,
-        lane=lane,
-        policy={"profile": arena.profile, "restart": "transparent", "crash_history": 0},
+        policy={
+            "profile": arena.profile,
+            "restart": "transparent",
+            "crash_history": 0,
+            "lane": lane,
+        },
         timeouts={**TIMEOUTS, "close_s": 0.5},
     )
 

@@ -120,9 +120,9 @@ def test_a_jail_that_lies_rings_and_punches_holes_holds_no_server() -> None:
 def test_a_server_is_not_held_by_a_doorbell(strict: Arena, home: Path) -> None:
     """It rings for the next step of the jail, and goes on with those of another."""
     repository = abuser(home)
-    options: dict[str, Any] = {"lane": "frames", "policy": {"profile": strict.profile}}
+    options: dict[str, Any] = {"policy": {"profile": strict.profile, "lane": "frames"}}
     short = {**TIMEOUTS, "close_s": 1.0}
-    with strict.environment(lane="frames") as neighbour:
+    with strict.environment(policy={"lane": "frames"}) as neighbour:
         neighbour.reset()
         for act in ACTS:
             with make_env(str(repository), timeouts=short, **options) as suites:

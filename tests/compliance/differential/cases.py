@@ -56,7 +56,7 @@ def case(number: int) -> Case:
     variety = draw.choice([0.0, 0.0, 0.1, 0.5])
     reuses, odd = draw.random() < 0.3, tuple(draw.sample(list(ODD_REWARDS), 3))
     how = variety, reuses, odd if draw.random() < 0.3 else ()
-    options: dict[str, Any] = {"lane": draw.choice(["auto", "auto", "frames"])}
+    options: dict[str, Any] = {"policy": {"lane": draw.choice(["auto", "auto", "frames"])}}
     if draw.random() < 0.2:
         options["env_kwargs"] = {"subclass": True}
     elif draw.random() < 0.2:

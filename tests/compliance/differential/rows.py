@@ -36,7 +36,7 @@ def case(number: int) -> Case:
     observed, acted = space(draw, loose=loose, least=0), flat_space(draw)
     how = 0.0, draw.random() < 0.3, (), draw.choice([0.0, 0.03, 0.1])
     env_fns = [partial(made, observed, acted, number, index, *how) for index in range(count)]
-    options: dict[str, Any] = {"lane": draw.choice(["auto", "frames"])}
+    options: dict[str, Any] = {"policy": {"lane": draw.choice(["auto", "frames"])}}
     if draw.random() < 0.3:
         options["sandbox"] = ["process"] * draw.randrange(2, 4)
     else:

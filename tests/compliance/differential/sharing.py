@@ -54,7 +54,7 @@ def case(number: int) -> Case:
         "told": draw.random() < 0.3,
         "mode": draw.choice(["NextStep", "SameStep", "Disabled"]),
     }
-    options: dict[str, Any] = {"lane": draw.choice(["auto", "auto", "frames"])}
+    options: dict[str, Any] = {"policy": {"lane": draw.choice(["auto", "auto", "frames"])}}
     if draw.random() < 0.2:
         options["sandbox"] = ["process", "process"]
     return Case(number, draw.randrange(2, 5), kwargs, options)

@@ -28,7 +28,7 @@ REPOSITORY = Path(__file__).resolve().parents[2] / "samples" / "given"
 VARIANTS: dict[str, dict[str, Any]] = {
     "plain": {},
     "subclass": {"env_kwargs": {"subclass": True}},
-    "frames": {"lane": "frames"},
+    "frames": {"policy": {"lane": "frames"}},
     "workers": {"num_workers": 2},
     "tcp": {},
     "single": {},

@@ -81,9 +81,8 @@ class Subject:
             n_envs=self.n_envs,
             use_async_envs=bool(rng.integers(2)),
             num_workers=self.workers,
-            lane=self.lane,
             sandbox=sandbox,
-            policy={**policy, "crash_history": 0, **clients.MEMORY},
+            policy={**policy, "crash_history": 0, **clients.MEMORY, "lane": self.lane},
         )
         self.env = self.suites.env
         self.model = make_env_of(folder)(self.n_envs)

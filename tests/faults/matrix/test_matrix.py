@@ -78,13 +78,12 @@ def _make(cell: Cell, repository: Path) -> Any:
         n_envs=2,
         use_async_envs=cell.mode == "async",
         num_workers=2 if cell.mode == "async" else None,
-        lane=cell.lane,
         env_kwargs={
             "moment": row.moment,
             "fault": row.fault,
             "tasks": 2 if cell.mode == "suite" else 0,
         },
-        policy={"restart": "on_reset"},
+        policy={"restart": "on_reset", "lane": cell.lane},
         limits=_limits(row.fault),
         timeouts=Timeouts(
             startup_s=5.0 if hangs else _WAIT_S,

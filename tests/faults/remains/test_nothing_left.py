@@ -24,7 +24,7 @@ ENDS = {
     "never used it": "make_env(REPOSITORY)",
     "two shards, an env each": (
         "one = made(use_async_envs=True, num_workers=2)\n"
-        "two = made(use_async_envs=True, num_workers=2, lane='frames')\nos._exit(5)"
+        "two = made(use_async_envs=True, num_workers=2, policy={'lane': 'frames'})\nos._exit(5)"
     ),
     "dies with daemons in the jail": (
         "suites = made('step', 'children')\nsuites.env.step([0, 1])\nos._exit(6)"
@@ -98,7 +98,7 @@ def test_fork_refuses_and_ends_nothing(folder: Path) -> None:
                 sys.exit(code)
 
         for lane in ("auto", "frames"):
-            suites = made(lane=lane)
+            suites = made(policy={"lane": lane})
             suites.env.step_async([0, 0])  # a reply is under way while we fork
             child = os.fork()
             if child == 0:
@@ -133,7 +133,7 @@ def test_signal_handler_may_close_what_its_own_thread_waits_for(folder: Path) ->
         """
         from gymnasium.error import ClosedEnvironmentError
         for lane in ("auto", "frames"):
-            suites = made("step", "hang", lane=lane)
+            suites = made("step", "hang", policy={"lane": lane})
             signal.signal(signal.SIGALRM, lambda *_: suites.close())
             signal.setitimer(signal.ITIMER_REAL, 0.5)
             try:
@@ -176,7 +176,7 @@ def test_dead_server_is_told_and_replaced(folder: Path) -> None:
         """
         from tests.support import inside
         for lane in ("auto", "frames"):
-            suites = made(lane=lane, policy={"restart": "on_reset"})
+            suites = made(policy={"restart": "on_reset", "lane": lane})
             inside.server(suites.env).process.kill()
             try:
                 while True:  # the jail may live a moment longer

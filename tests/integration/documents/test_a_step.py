@@ -22,7 +22,7 @@ def test_the_log_names_what_is_sent(
 ) -> None:
     """In order, and a step only where it is a message."""
     caplog.set_level("DEBUG", "envhub_sandbox.messages")
-    with make_env(str(SAMPLES / "cartpole"), n_envs=2, lane=lane) as suites:
+    with make_env(str(SAMPLES / "cartpole"), n_envs=2, policy={"lane": lane}) as suites:
         suites.env.reset(seed=0)
         suites.env.step(ACTIONS)
     said = "\n".join(caplog.messages)

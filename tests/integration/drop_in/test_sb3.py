@@ -30,7 +30,7 @@ _DESCRIBED = ("mode",)  # no plain value: it arrives as text
 _PLACES = [
     *((mode, {}) for mode in _MODES),
     ("SameStep", {"num_workers": 2}),
-    ("NextStep", {"num_workers": 2, "lane": "frames"}),
+    ("NextStep", {"num_workers": 2, "policy": {"lane": "frames"}}),
     ("Disabled", {"num_workers": 2, "min_ready": 1}),
 ]
 _GOALS = """

@@ -35,7 +35,7 @@ _STEPS = 11
 
 
 def _options(lane: str) -> dict[str, Any]:
-    return {"n_envs": 2 * WORKERS, "sandbox": ["process"] * WORKERS, "lane": lane}
+    return {"n_envs": 2 * WORKERS, "sandbox": ["process"] * WORKERS, "policy": {"lane": lane}}
 
 
 @lanes

@@ -24,7 +24,7 @@ _STARTS, _CLOSES = (23, 7) if "ENVHUB_TEST_LONG" in os.environ else (167, 41)
 """Calls between two moments: of some 500 in a start, and of some 120 in a close."""
 _WAYS: dict[str, dict[str, Any]] = {
     "auto": {"use_async_envs": True},
-    "frames": {"use_async_envs": True, "lane": "frames"},
+    "frames": {"use_async_envs": True, "policy": {"lane": "frames"}},
     "fleet": {"n_envs": 6, "sandbox": ["process"] * 3},
 }
 ways = pytest.mark.parametrize("way", _WAYS)

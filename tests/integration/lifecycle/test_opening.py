@@ -44,7 +44,7 @@ def test_all_shards_start_and_load_side_by_side(asked: list[str], shards: int) -
     with make_env(sample("counter"), **options):
         pass  # its manifest is remembered
     asked.clear()
-    with make_env(sample("counter"), lane="frames", **options) as suites:
+    with make_env(sample("counter"), policy={"lane": "frames"}, **options) as suites:
         suites.env.reset(seed=0)
         assert len(suites.env.call("get_wrapper_attr", "spec")) == 3
         asked_until_now = Counter(asked)

@@ -111,7 +111,7 @@ def settled(tasks: Tasks, expected: list[int]) -> bool:
 
 
 def test_the_next_task_is_up_and_built_before_anybody_asks(tasks: Callable[..., Tasks]) -> None:
-    first, second = envs = tasks(2, prewarm=1)
+    first, second = envs = tasks(2, policy={"prewarm": 1})
     first.reset()
     assert eventually(lambda: ahead(envs) == [1])
     started, asked = descendants(), time.monotonic()
@@ -122,7 +122,7 @@ def test_the_next_task_is_up_and_built_before_anybody_asks(tasks: Callable[..., 
 
 def test_without_it_nothing_is_started_ahead(tasks: Callable[..., Tasks]) -> None:
     """The control: each task is made when it is asked."""
-    first, second = envs = tasks(2, prewarm=0)
+    first, second = envs = tasks(2, policy={"prewarm": 0})
     first.reset()
     first.close()
     assert settled(envs, [])
@@ -149,7 +149,7 @@ def test_by_default_who_closes_each_task_finds_the_next_one_up(
 @pytest.mark.parametrize("count", [1, 3])
 def test_no_more_are_up_unused_than_was_said(tasks: Callable[..., Tasks], count: int) -> None:
     """Whichever task is used next; what is not among the following is given up, and can return."""
-    envs = tasks(8, prewarm=count)
+    envs = tasks(8, policy={"prewarm": count})
     used: set[int] = set()
     for index in (0, 4, 1):
         assert envs[index].reset()[0][0][0] == index
@@ -220,7 +220,7 @@ def test_while_one_is_waited_for_the_next_is_started(
     """Else, where starting takes longer than playing, nothing would be gained; or nothing is up."""
     repository, opened, policy = gated
     elsewhere = descendants()
-    with make_env(repository, policy=policy, prewarm=1) as suites:
+    with make_env(repository, policy={**policy, "prewarm": 1}) as suites:
         envs = _of(suites)
         if plays:
             envs[0].reset()
@@ -249,7 +249,7 @@ def test_what_fails_is_raised_by_the_first_request_of_that_task(
 ) -> None:
     """Not by the task before, which goes on; and the one after it is unharmed."""
     bundles = set(_bundles())
-    envs = tasks(3, n_envs=2, prewarm=1, env_kwargs={"fails": 1})
+    envs = tasks(3, n_envs=2, policy={"prewarm": 1}, env_kwargs={"fails": 1})
     envs[0].reset()
     for _ in range(50):
         envs[0].step(np.zeros(2, int))
@@ -264,7 +264,7 @@ def test_what_fails_is_raised_by_the_first_request_of_that_task(
 def test_what_dies_unused_is_started_again(tasks: Callable[..., Tasks]) -> None:
     """Although the policy restarts nothing: without prewarming it would not have died."""
     elsewhere = descendants()  # other tests' Hubs, say
-    envs = tasks(2, prewarm=1)
+    envs = tasks(2, policy={"prewarm": 1})
     # the server that lingers, its zygote's two
     assert eventually(lambda: len(descendants() - elsewhere) == 3)
     server = descendants()
@@ -286,7 +286,7 @@ def test_closed_in_the_midst_it_leaves_nothing(repository: Path) -> None:
     stop_idle()
     before, bundles = descendants(), set(_bundles())
     for pause_s in (0.0, 0.05, 0.2):
-        suites = make_env(repository, prewarm=2, timeouts={"server_idle_s": 0})
+        suites = make_env(repository, policy={"prewarm": 2}, timeouts={"server_idle_s": 0})
         envs = _of(suites)
         envs[0].reset()
         time.sleep(pause_s)
@@ -301,7 +301,7 @@ def test_closed_in_the_midst_it_leaves_nothing(repository: Path) -> None:
 def test_the_last_close_waits_for_all(tasks: Callable[..., Tasks]) -> None:
     """The others do not, and that is not left to chance: nothing of a jail is there after it."""
     elsewhere = descendants()
-    envs = tasks(4, prewarm=0)
+    envs = tasks(4, policy={"prewarm": 0})
     server = descendants()
     for env in envs[:3]:
         env.reset()
@@ -313,7 +313,7 @@ def test_the_last_close_waits_for_all(tasks: Callable[..., Tasks]) -> None:
 def test_a_suite_that_nobody_holds_gives_up_what_it_started_ahead(repository: Path) -> None:
     stop_idle()
     before = descendants()
-    suites = make_env(repository, prewarm=1, timeouts={"server_idle_s": 0})
+    suites = make_env(repository, policy={"prewarm": 1}, timeouts={"server_idle_s": 0})
     envs = _of(suites)
     envs[0].reset()
     assert eventually(lambda: ahead(envs) == [1])
@@ -323,7 +323,7 @@ def test_a_suite_that_nobody_holds_gives_up_what_it_started_ahead(repository: Pa
 
 
 def test_suites_do_not_start_each_others_tasks(tasks: Callable[..., Tasks]) -> None:
-    envs = tasks(2, prewarm=2, env_kwargs={"suites": 2})
+    envs = tasks(2, policy={"prewarm": 2}, env_kwargs={"suites": 2})
     envs[1].reset()
     assert settled(envs, [])
 
@@ -337,7 +337,7 @@ def played(env: Any) -> list[Any]:
 
 def test_threads_may_play_tasks_at_once(tasks: Callable[..., Tasks]) -> None:
     """A pool of threads, as ``max_parallel_tasks`` has; closed from the main one."""
-    envs = tasks(8, prewarm=2)
+    envs = tasks(8, policy={"prewarm": 2})
     with concurrent.futures.ThreadPoolExecutor(3) as pool:
         futures = {pool.submit(played, env): index for index, env in enumerate(envs)}
         for future in concurrent.futures.as_completed(futures):
@@ -345,15 +345,6 @@ def test_threads_may_play_tasks_at_once(tasks: Callable[..., Tasks]) -> None:
             assert future.result()[0][0][0] == index
             envs[index].close()
     assert states(envs) == ["CLOSED"] * 8
-
-
-def test_it_takes_a_whole_number_or_none() -> None:
-    with pytest.raises(ValueError, match="`prewarm` is -1, and must be at least 0"):
-        make_env(sample("counter"), prewarm=-1)
-    with pytest.raises(TypeError, match="`prewarm` is 'one'"):
-        make_env(sample("counter"), prewarm="one")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match="prewarm: for environments in a sandbox"):
-        make_env(sample("counter"), prewarm=1, sandbox=None, trust_remote_code=True)
 
 
 def _bundles() -> list[Path]:

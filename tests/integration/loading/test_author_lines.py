@@ -72,7 +72,7 @@ def play_one(reference: str, **options: Any) -> None:
 )
 def test_the_line_in_the_authors_own_folder(tmp_path: Path, at: str, lane: str) -> None:
     folder = repository(tmp_path)
-    error = failure(str(folder), at=at, lane=lane)
+    error = failure(str(folder), at=at, policy={"lane": lane})
     where = f'  File "{folder}/parts/motor.py", line 2, in turn\n'
     assert str(error).endswith(f"{where}    raise ZeroDivisionError('stuck')")
     [note] = vars(error)["__notes__"]
@@ -97,7 +97,7 @@ def test_a_result_that_does_not_fit_leads_to_its_return(
     """With the call, the sub-environment among all of them, and what its space says."""
     text = ENV.replace("return 0, {}", "self.angle = [0, 1.5][seed - 2]\n        return 0, {}")
     folder = repository(tmp_path, text.replace("turn(action)", "self.angle"))
-    with make_env(str(folder), n_envs=2, lane=lane, num_workers=workers) as suites:
+    with make_env(str(folder), n_envs=2, policy={"lane": lane}, num_workers=workers) as suites:
         suites.env.reset(seed=[2, 3])
         with pytest.raises(TypeError) as caught:
             suites.env.step([0, 0])
@@ -124,7 +124,9 @@ def test_a_traceback_has_one_frame_of_ours(
     folder = repository(tmp_path)
     broken = {"broken": True} if at == "make_env" else None
     with pytest.raises(ZeroDivisionError) as caught:
-        (play_one if at == "single" else play)(str(folder), env_kwargs=broken, lane=lane)
+        (play_one if at == "single" else play)(
+            str(folder), env_kwargs=broken, policy={"lane": lane}
+        )
     files = [frame.filename for frame in traceback.extract_tb(caught.value.__traceback__)]
     ours = [name for name in files if name.startswith(PACKAGE)]
     assert files[: -len(ours)] == [__file__] * 2

@@ -83,7 +83,7 @@ def oracle(n_envs: int, mode: str) -> Any:
 WAYS: dict[str, dict[str, Any]] = {
     "plain": {},
     "two workers": {"num_workers": 2, "use_async_envs": True},
-    "frames": {"lane": "frames"},
+    "frames": {"policy": {"lane": "frames"}},
 }
 
 

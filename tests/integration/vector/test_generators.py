@@ -118,7 +118,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def single(folder: Path, request: pytest.FixtureRequest) -> Iterator[SandboxEnv]:
     """One environment over each lane, and where its vector environment is of another kind."""
     options: dict[str, Any] = {"async": {"use_async_envs": True}, "worker": {"min_ready": 1}}.get(
-        request.param, {"lane": request.param}
+        request.param, {"policy": {"lane": request.param}}
     )
     with contextlib.closing(SandboxEnv(folder, **options)) as env:
         yield env
@@ -192,7 +192,7 @@ def _vectors(env: Any) -> list[Any]:
 
 
 @pytest.mark.parametrize(
-    "where", [{}, {"lane": "frames"}, {"sandbox": ["process", "process"]}], ids=str
+    "where", [{}, {"policy": {"lane": "frames"}}, {"sandbox": ["process", "process"]}], ids=str
 )
 def test_those_of_a_vector_environment_are_gymnasiums(folder: Path, where: dict[str, Any]) -> None:
     """Live in a ``SyncVectorEnv``, copies of an ``AsyncVectorEnv``, and one of a class's own."""

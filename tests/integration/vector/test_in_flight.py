@@ -34,7 +34,7 @@ lanes = pytest.mark.parametrize("lane", ["auto", "frames"])
 def gates(tmp_path: Path, lane: str) -> Iterator[Gates]:
     """Environments with a worker for each sub-environment."""
     with ExitStack() as stack:
-        yield Gates(tmp_path, stack, lane=lane, min_ready=1)
+        yield Gates(tmp_path, stack, policy={"lane": lane}, min_ready=1)
 
 
 Call = Callable[[], object]

@@ -227,7 +227,7 @@ def play(env: Any) -> list[Any]:
 
 
 @pytest.mark.parametrize(
-    "where", [{}, {"lane": "frames"}, {"sandbox": ["process", "process"]}], ids=str
+    "where", [{}, {"policy": {"lane": "frames"}}, {"sandbox": ["process", "process"]}], ids=str
 )
 @pytest.mark.parametrize("kind", ["numpy", "random", "logged", "closed over"])
 def test_results_are_those_of_gymnasium_in_every_use(
@@ -251,7 +251,7 @@ def test_results_are_those_of_gymnasium_in_every_use(
 def test_what_is_shared_later_is_said_once_and_separated_from_then_on(
     repository: Path, lane: str
 ) -> None:
-    with make_env(repository, N_ENVS, use_async_envs=True, lane=lane) as suites:
+    with make_env(repository, N_ENVS, use_async_envs=True, policy={"lane": lane}) as suites:
         env = suites.env
         env.reset(seed=1)
         assert len(inside.bounds(env)) < N_ENVS
@@ -264,7 +264,7 @@ def test_what_is_shared_later_is_said_once_and_separated_from_then_on(
     [warning] = [one for one in heard if issubclass(one.category, RemoteEnvWarning)]
     assert "np.random" in str(warning.message)
     assert "num_workers" in str(warning.message)
-    assert processes(repository, lane=lane) == N_ENVS
+    assert processes(repository, policy={"lane": lane}) == N_ENVS
 
 
 def test_an_explicit_number_of_processes_holds_and_is_not_watched(repository: Path) -> None:

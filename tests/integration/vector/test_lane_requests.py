@@ -78,7 +78,9 @@ def talker(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def conversation(folder: Path, lane: str, num_workers: int) -> list[Any]:
     """Large and small answers of every kind, one after the other."""
-    with make_env(folder, 4, use_async_envs=True, lane=lane, num_workers=num_workers) as suites:
+    with make_env(
+        folder, 4, use_async_envs=True, policy={"lane": lane}, num_workers=num_workers
+    ) as suites:
         env = suites.env
         heard: list[Any] = []
         for large in (True, False, True):
@@ -102,7 +104,7 @@ def test_ctrl_c_while_a_large_answer_is_taken_leaves_the_next_reset_its_own(
 ) -> None:
     """What did not fit has been asked for by then: it is dropped with the answer, and the same
     process goes on."""
-    with make_env(talker, 2, lane=lane) as suites:
+    with make_env(talker, 2, policy={"lane": lane}) as suites:
         env = suites.env
         asked, moment, came = 0, 0, True
         while came:
@@ -134,7 +136,7 @@ def test_an_operation_has_one_deadline(
         running.__set__(self, value)
 
     timeouts = {"step_s": 1001.0, "reset_s": 1002.0, "call_s": 1003.0}
-    options = {"lane": lane, "num_workers": 4, "policy": {"restart": restart}}
+    options = {"num_workers": 4, "policy": {"restart": restart, "lane": lane}}
     with make_env(talker, 4, use_async_envs=True, timeouts=timeouts, **options) as suites:
         env = suites.env
         env.reset()
@@ -193,10 +195,10 @@ def test_what_comes_is_what_a_step_gives(tmp_path: Path, lane: str, count: int, 
     """Also where infos do not fit, change their columns or are not there, and where one raises;
     back and forth between steps through slabs and steps as messages."""
     folder = changing(tmp_path, size)
-    with started(folder, count, lane="auto") as env:
+    with started(folder, count, policy={"lane": "auto"}) as env:
         expected = one_by_one(env)
     took: list[bool] = []
-    with started(folder, count, lane=lane) as env:
+    with started(folder, count, policy={"lane": lane}) as env:
         found = inside.session(env).lease.lane
         assert found is not None
         assert isinstance(found, ServedLane) == (lane == "frames")
@@ -239,7 +241,7 @@ def _repository(folder: Path, size: int) -> Path:
 def test_a_smaller_limit_is_the_jails_own(tmp_path: Path, lane: str) -> None:
     """What is larger is an error of that call; the environment goes on."""
     folder = _repository(tmp_path, 4)
-    with make_env(folder, lane=lane, limits={"message_bytes": 1 << 20}) as suites:
+    with make_env(folder, policy={"lane": lane}, limits={"message_bytes": 1 << 20}) as suites:
         env = suites.env
         env.reset()
         with pytest.raises(RemoteEnvError, match=r"1048576 \(message_bytes\)"):

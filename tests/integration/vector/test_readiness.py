@@ -25,7 +25,7 @@ pytestmark = pytest.mark.parametrize("lane", ["auto", "frames"])
 @pytest.fixture
 def gates(tmp_path: Path, lane: str) -> Iterator[Gates]:
     with ExitStack() as stack:
-        yield Gates(tmp_path, stack, lane=lane)
+        yield Gates(tmp_path, stack, policy={"lane": lane})
 
 
 def send(env: Any, *gates: int, large: int = 0) -> None:

@@ -35,7 +35,7 @@ def lane(request: pytest.FixtureRequest) -> str:
 def gates(tmp_path: Path, lane: str) -> Iterator[Gates]:
     """Environments with a worker for each sub-environment."""
     with ExitStack() as stack:
-        yield Gates(tmp_path, stack, lane=lane, min_ready=2)
+        yield Gates(tmp_path, stack, policy={"lane": lane}, min_ready=2)
 
 
 def test_who_is_ready_first_comes_first(gates: Gates) -> None:
@@ -217,7 +217,7 @@ def test_one_worker_is_ready_as_a_whole(gates: Gates) -> None:
 def shards(tmp_path: Path, lane: str) -> Iterator[Gates]:
     """Environments whose workers are the processes of one jail."""
     with ExitStack() as stack:
-        yield Gates(tmp_path, stack, lane=lane)
+        yield Gates(tmp_path, stack, policy={"lane": lane})
 
 
 def test_workers_of_one_jail_are_ready_one_by_one(shards: Gates) -> None:

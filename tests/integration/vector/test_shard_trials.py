@@ -20,7 +20,7 @@ STEPS = shard_trials.LEAST_STEPS
 
 def use(lane: str, steps: int) -> tuple[list[tuple[int, int]], list[Any]]:
     """How it was cut, and all that it gave."""
-    with make_env(sample("cartpole"), N_ENVS, use_async_envs=True, lane=lane) as suites:
+    with make_env(sample("cartpole"), N_ENVS, use_async_envs=True, policy={"lane": lane}) as suites:
         env = suites.env
         found: list[Any] = [env.reset(seed=3)]
         found += [env.step(np.arange(N_ENVS) % 2) for _ in range(steps)]

@@ -152,7 +152,7 @@ def here(folder: Path) -> gym.Env[Any, Any]:
 
 @pytest.fixture(params=["auto", "frames"])
 def env(folder: Path, request: pytest.FixtureRequest) -> Iterator[Any]:
-    made = SandboxEnv(folder, lane=request.param)
+    made = SandboxEnv(folder, policy={"lane": request.param})
     yield made
     made.close()
 
@@ -174,7 +174,7 @@ def test_what_it_gives_is_what_the_environment_gave(
     folder: Path, here: gym.Env[Any, Any], mode: str, lane: str
 ) -> None:
     """Observations and infos have the same keys, classes and values, in each autoreset mode."""
-    env = SandboxEnv(folder, lane=lane, env_kwargs={"mode": mode})
+    env = SandboxEnv(folder, policy={"lane": lane}, env_kwargs={"mode": mode})
     try:
         seen = _played(env)
     finally:
@@ -236,7 +236,7 @@ def test_a_reward_that_is_no_number_comes_as_it_is(
     noted = lambda self, *request: (asked.append(request), send(self, *request))[1]  # noqa: E731
     folder = write_repository(tmp_path / "rewards", _REWARDS)
     here = make_env_of(folder)().envs[0]
-    with contextlib.closing(SandboxEnv(folder, lane=lane)) as env:
+    with contextlib.closing(SandboxEnv(folder, policy={"lane": lane})) as env:
         env.reset()
         monkeypatch.setattr(WorkerConnection, "send", noted)
         for action in (1, 1, 3, 1, 5, *range(9)):  # also where infos have become columns
@@ -254,7 +254,11 @@ def test_a_reward_that_is_no_number_comes_as_it_is(
             env.vector.step([3])
     for is_async, workers in ((False, None), (True, 1), (True, 2)):
         with make_env(
-            str(folder), n_envs=3, use_async_envs=is_async, num_workers=workers, lane=lane
+            str(folder),
+            n_envs=3,
+            use_async_envs=is_async,
+            num_workers=workers,
+            policy={"lane": lane},
         ) as suites:
             suites.env.reset()
             for action, kind in ((3, "list"), (5, "dict"), (8, "str")):
@@ -334,7 +338,7 @@ def make_env(n_envs=1, use_async_envs=False, kind=0, mode="NextStep"):
 
 
 @pytest.mark.parametrize("kind", range(4))
-@pytest.mark.parametrize("options", [{}, {"lane": "frames"}], ids=str)
+@pytest.mark.parametrize("options", [{}, {"policy": {"lane": "frames"}}], ids=str)
 def test_empty_mappings_and_tuples_are_members_too(
     tmp_path: Path, kind: int, options: dict[str, Any]
 ) -> None:

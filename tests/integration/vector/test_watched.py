@@ -97,9 +97,9 @@ SUITE = REPOSITORY.replace(
 )
 READ = ("task", "kind", "steps", "episodes", "count", "asked", "absent", "late")
 WAYS = [
-    {"lane": "auto", "num_workers": 1},
-    {"lane": "frames", "num_workers": 1},
-    {"lane": "auto", "num_workers": 2},
+    {"policy": {"lane": "auto"}, "num_workers": 1},
+    {"policy": {"lane": "frames"}, "num_workers": 1},
+    {"policy": {"lane": "auto"}, "num_workers": 2},
 ]
 
 
@@ -253,7 +253,7 @@ def test_fresh_runners_are_asked_anew(
 ) -> None:
     """What those that died have said no longer counts; only who is to be, is as it was set."""
     policy = {"restart": restart, "restart_backoff_s": 0}
-    with make_env(folder, ENVS, policy=policy, **way) as suites:
+    with make_env(folder, ENVS, **{**way, "policy": {**policy, **way["policy"]}}) as suites:
         env = suites.env
         env.reset()
         env.set_attr("task", ["set"] * ENVS)
@@ -273,7 +273,7 @@ def test_fresh_runners_are_asked_anew(
 def test_who_comes_back_in_the_midst_is_asked_anew(folder: Path, way: dict[str, Any]) -> None:
     """A shard dies in a step, and the others go on: of each, what it is now."""
     policy = {"restart": "transparent", "restart_backoff_s": 0}
-    with make_env(folder, ENVS, policy=policy, **way) as suites:
+    with make_env(folder, ENVS, **{**way, "policy": {**policy, **way["policy"]}}) as suites:
         env = suites.env
         env.reset(seed=0)
         env.set_attr("mortal", [False] * ENVS)

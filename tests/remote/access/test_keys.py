@@ -124,8 +124,7 @@ def test_keys_are_found_in_the_configuration_folder(
         {"sandbox": "tcp://nowhere"},
         {"sandbox": "tcp://host:99999"},
         {"sandbox": "tcp://host:1/path"},
-        {"sandbox": "tcp://host:1", "server_key": "no key"},
-        {"sandbox": "process", "server_key": "0" * 64},
+        {"sandbox": "tcp://host:1 0123 no key"},
     ],
 )
 def test_what_cannot_be_reached_is_refused_at_once(

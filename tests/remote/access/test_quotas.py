@@ -173,7 +173,7 @@ def test_this_machines_paths_are_refused_before_anything_is_sent(
 
 def test_what_was_started_ahead_makes_room_under_a_quota(tmp_path: Path) -> None:
     """A task that somebody uses comes first; where there is no room nothing is started ahead."""
-    options: dict[str, Any] = {"env_kwargs": {"tasks": 4}, "prewarm": 1}
+    options: dict[str, Any] = {"env_kwargs": {"tasks": 4}, "policy": {"prewarm": 1}}
     with listening(tmp_path / "server", "--max-jails", "2") as server:
         with make_env(sample("many_tasks"), sandbox=server.sandbox(), **options) as suites:
             envs = [env for tasks in suites.values() for env in tasks.values()]

@@ -34,8 +34,7 @@ _READ_AS = {
     "/etc/envhub-worker/clients": "clients",
     "/var/lib/envhub-worker": "$XDG_STATE_HOME/envhub-worker",
     "<server.pub>": '"$(cat "$XDG_STATE_HOME/envhub-worker/server.pub")"',
-    '"<what the server printed>"': "PRINTED",
-    '"tcp://$ADDRESS:5555", server_key': 'f"tcp://{ADDRESS}:5555", server_key',
+    '"tcp://$ADDRESS:5555 <what the server printed>"': 'f"tcp://{ADDRESS}:5555 {PRINTED}"',
 }
 # What Python has from the blocks before it, and from what was printed.
 _IMPORTED = """

@@ -71,8 +71,9 @@ class Gates:
         self.repository = write_repository(folder / "repository", text)
 
     def env(self, count: int = 1, **options: Any) -> Any:
+        options = {**self._options, **options}
         policy = {"readable": [str(self._folder / "gates")], **options.pop("policy", {})}
-        made = started(self.repository, count, policy=policy, **{**self._options, **options})
+        made = started(self.repository, count, policy=policy, **options)
         return self._stack.enter_context(made)
 
     def open(self, *gates: int) -> None:

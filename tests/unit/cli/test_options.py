@@ -62,13 +62,12 @@ def test_env_kwargs_take_json_and_pairs() -> None:
 def test_only_what_was_given_reaches_the_policy() -> None:
     """Defaults stay the library's; a limit of nothing is refused, and not taken for one."""
     nothing = options().arguments()
-    assert (nothing["policy"], nothing["timeouts"], nothing["server_key"]) == ({}, {}, None)
+    assert (nothing["policy"], nothing["timeouts"]) == ({}, {})
     granted: dict[str, Any] = {"network": "loopback", "readable": ["/data"], "environment": ["A"]}
     limits: dict[str, Any] = {"memory_bytes": "1G", "cpu_time_s": 5}
-    given = options(gpu="all", sandbox="tcp://127.0.0.1:5555", server_key="k", **granted, **limits)
+    given = options(gpu="all", sandbox="tcp://127.0.0.1:5555 k", **granted, **limits)
     assert given.arguments()["policy"] == {**granted, "gpu": True, "limits": limits}
-    assert given.arguments()["sandbox"] == "tcp://127.0.0.1:5555"
-    assert given.arguments()["server_key"] == "k"
+    assert given.arguments()["sandbox"] == "tcp://127.0.0.1:5555 k"
     read = options(env_kwargs=["size=8"], dependencies='{"python": "3.12"}', output="-").arguments()
     assert (read["env_kwargs"], read["dependencies"]) == ({"size": 8}, {"python": "3.12"})
     assert (read["cfg"], "output" in read["policy"]) == ("org/repo", False)

@@ -48,9 +48,9 @@ def launcher(server: LyingServer, tmp_path: Path, snapshot_store: Path) -> Launc
     (tmp_path / "repo").mkdir()
     (tmp_path / "repo" / "env.py").write_text("")
     load = m.Load(NUM_ENVS, False, None, {})
-    given: Any = (local(tmp_path / "repo"), load, Policy(), Timeouts())
+    given: Any = (local(tmp_path / "repo"), load, Policy(lane="frames"), Timeouts())
     more: Any = {"recipe": None, "installed": None, "advice": str}
-    repository = Repository(*given, OWN, "frames", True, **more)
+    repository = Repository(*given, OWN, True, **more)
     return Launcher(repository, LyingSandbox(server), snapshot_store)
 
 

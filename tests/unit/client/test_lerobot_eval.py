@@ -11,10 +11,10 @@ from envhub_sandbox.integrations.lerobot_eval import main, split_eval_arguments
 
 
 def test_ours_are_taken_out() -> None:
-    ours = ['--sandbox.policy={"gpu": true}', "--sandbox.num-workers=2", "--sandbox.lane=frames"]
+    ours = ['--sandbox.policy={"gpu": true}', "--sandbox.num-workers=2", "--sandbox.lock=l.toml"]
     theirs = ["--env.type=pusht", "--env.sandbox=process", "--seed", "1"]
     options, rest = split_eval_arguments([theirs[0], *ours, *theirs[1:]])
-    assert options == {"policy": {"gpu": True}, "num_workers": 2, "lane": "frames"}
+    assert options == {"policy": {"gpu": True}, "num_workers": 2, "lock": "l.toml"}
     assert rest == theirs
 
 

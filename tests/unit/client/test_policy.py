@@ -70,6 +70,7 @@ def _limit(name: str, value: object, takes: str = "") -> Any:
         (lambda: Policy(readable=("data",)), "'data'; it takes absolute paths"),
         *(_is("output", value) for value in ("", 5, None)),
         *(_is("crash_history", value) for value in (-1, 1.5, True)),
+        *(_is("prewarm", value) for value in (-1, "one")),
         *(_is("crash_folder", value) for value in (b"crashes", "")),
         *(_limit("memory_bytes", value) for value in (0, None, float("inf"), float("nan"))),
         *(_limit("processes", value) for value in (-1, "4K")),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import pickle
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,11 +29,10 @@ from envhub_worker.protocol.keys import key_text
 
 
 def test_a_fleet_is_no_place_of_another() -> None:
-    resolve = partial(sandbox_of, server_key=None)
     for nested in (Fleet(["tcp://a:1"]), "tcp://a:1,tcp://b:1", ["tcp://a:1"]):
         places: Any = [nested]
         with pytest.raises(PolicyError, match="no fleet"):
-            Fleet(places).opened(resolve, None)
+            Fleet(places).opened(sandbox_of)
 
 
 @pytest.mark.parametrize(

@@ -270,4 +270,4 @@ def test_each_place_of_a_list_is_another_server(shared: bool, weights: list[int]
     places = [RaySandbox(shared=shared)] * 3
     members = Placement(places, lambda place: place, lambda member: OWN).members()
     assert [member.weight for member in members] == weights
-    assert sandbox_of("ray", None) is sandbox_of("ray", None) is sandbox.RAY
+    assert sandbox_of("ray") is sandbox_of("ray") is sandbox.RAY
