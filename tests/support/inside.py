@@ -364,7 +364,7 @@ def taking(env: Any) -> Spot:
 
 def started(env: Any) -> Spot:
     """Where its history is told that it has started."""
-    return session(env).history, "started"
+    return session(env).recorder, "started"
 
 
 def ending(env: Any) -> Spot:

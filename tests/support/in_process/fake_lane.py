@@ -129,7 +129,7 @@ class FakeRepository(Repository):
         self.snapshot = cast("Any", SimpleNamespace(**known))
         self.policy, self.timeouts = Policy(crash_history=8), Timeouts()
         self.warnings, self.recipe, self.copy = RemoteWarnings(), None, True
-        self.min_ready = None
+        self.min_ready, self.for_lerobot = None, False
         self.label, self.wire_limits = "a/b", DEFAULT_LIMITS
 
     def keep_crash(self, *_: object, **__: object) -> None:
