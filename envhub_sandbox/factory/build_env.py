@@ -42,26 +42,26 @@ class Build(gym.Env[Any, Any]):
         sys.path.insert(0, order["tools"])
         from pyproject_hooks import BuildBackendHookCaller, HookMissing
 
-        place = Path(tempfile.gettempdir(), "build")
-        shutil.copytree(order["source"], place / "source", copy_function=_copied)
-        (place / "wheel").mkdir()
+        folder = Path(tempfile.gettempdir(), "build")
+        shutil.copytree(order["source"], folder / "source", copy_function=_copied)
+        (folder / "wheel").mkdir()
         hooks = BuildBackendHookCaller(
-            *(str(place / "source"), order["backend"], order["backend_path"] or None),
-            runner=_Runner(place / "log", order),
+            *(str(folder / "source"), order["backend"], order["backend_path"] or None),
+            runner=_Runner(folder / "log", order),
             python_executable=order["python"],
         )
         try:
-            needed = [str(one) for one in hooks.get_requires_for_build_wheel()]
-            if further := [one for one in needed if one not in order["known"]]:
+            needed = map(str, hooks.get_requires_for_build_wheel())
+            if further := [name for name in needed if name not in order["known"]]:
                 return {"requires": further}
-            name = hooks.build_wheel(str(place / "wheel"))
+            name = hooks.build_wheel(str(folder / "wheel"))
         except subprocess.CalledProcessError:
-            return {"failed": _tail(place / "log")}
+            return {"failed": _tail(folder / "log")}
         except HookMissing as error:
             return {"failed": repr(error)}
         except Exception as error:  # what the backend raised, or a backend that is not there
-            return {"failed": f"{_tail(place / 'log')}\n{type(error).__name__}: {error}"}
-        self._wheel = place / "wheel" / Path(name).name
+            return {"failed": f"{_tail(folder / 'log')}\n{type(error).__name__}: {error}"}
+        self._wheel = folder / "wheel" / Path(name).name
         mend(self._wheel)
         return {"wheel": self._wheel.name, "size": self._wheel.stat().st_size}
 
@@ -75,18 +75,18 @@ class Build(gym.Env[Any, Any]):
 def mend(wheel: Path) -> None:
     """Write requirements of old metadata such as ``x (>=3.)`` as they are read today."""
     with zipfile.ZipFile(wheel) as archive:
-        files = {one: archive.read(one) for one in archive.infolist()}
-    [about] = [one for one in files if one.filename.endswith(".dist-info/METADATA")]
+        files = {member: archive.read(member) for member in archive.infolist()}
+    [about] = [member for member in files if member.filename.endswith(".dist-info/METADATA")]
     old = files[about]
     new = b"\n".join(map(_mended, old.split(b"\n")))
     if new == old:
         return
     files[about] = new
-    [record] = [one for one in files if one.filename.endswith(".dist-info/RECORD")]
+    [record] = [member for member in files if member.filename.endswith(".dist-info/RECORD")]
     rows = files[record].replace(_row(about, old), _row(about, new))
     with zipfile.ZipFile(wheel, "w", zipfile.ZIP_DEFLATED) as archive:
-        for one, data in {**files, record: rows}.items():
-            archive.writestr(one, data)
+        for member, data in {**files, record: rows}.items():
+            archive.writestr(member, data)
 
 
 def _mended(line: bytes) -> bytes:

@@ -39,14 +39,14 @@ def main(folder: Path, ended: int) -> int:
     order = json.loads((folder / "order.json").read_text())
     os.environ[CACHE_VARIABLE] = str(folder / "cache")  # it goes with the folder
     try:
-        said = _built(folder, order)
+        reply = _built(folder, order)
     except WorkerTimeoutError:
-        said = {"failed": f"it was not done after {order['wall_s']:.0f} s, and was ended"}
+        reply = {"failed": f"it was not done after {order['wall_s']:.0f} s, and was ended"}
     except WorkerDiedError as error:
-        said = {"failed": f"it was ended: {error}"}
+        reply = {"failed": f"it was ended: {error}"}
     except EnvHubError as error:
-        said = {"error": type(error).__name__, "said": str(error)}
-    print(json.dumps(said))
+        reply = {"error": type(error).__name__, "said": str(error)}
+    print(json.dumps(reply))
     return 0
 
 
@@ -58,17 +58,17 @@ def _built(folder: Path, order: Mapping[str, Any]) -> dict[str, Any]:
         env = suites.env
         names = ("packages", "python", "backend", "backend_path", "known", "environment")
         asked = {name: order[name] for name in names}
-        [said] = env.call("build", {**asked, "source": order["source"], "tools": str(tools)})
-        if not isinstance(said, dict):
-            return {"failed": f"it answered {type(said).__name__}"}
-        if "wheel" not in said:
-            return {name: said[name] for name in ("failed", "requires") if name in said}
-        return _received(env, said, folder / "wheel", int(order["max_bytes"]))
+        [reply] = env.call("build", {**asked, "source": order["source"], "tools": str(tools)})
+        if not isinstance(reply, dict):
+            return {"failed": f"it answered {type(reply).__name__}"}
+        if "wheel" not in reply:
+            return {name: reply[name] for name in ("failed", "requires") if name in reply}
+        return _received(env, reply, folder / "wheel", int(order["max_bytes"]))
 
 
-def _received(env: Any, said: Mapping[str, Any], target: Path, most: int) -> dict[str, Any]:
+def _received(env: Any, reply: Mapping[str, Any], target: Path, most: int) -> dict[str, Any]:
     """The wheel, piece by piece. Trust: input from the worker."""
-    name, size = said["wheel"], said["size"]
+    name, size = reply["wheel"], reply["size"]
     if type(name) is not str or type(size) is not int or not 0 < size <= most:
         return {"failed": f"the wheel has not 1 to {most} bytes"}
     if "/" in name or not name.endswith(".whl") or not name.isprintable() or len(name) > 200:
@@ -109,10 +109,10 @@ def _repository(folder: Path, order: Mapping[str, Any]) -> Repository:
 
 def _tools(target: Path) -> Path:
     """A folder with ``pyproject_hooks``, for the path of an interpreter."""
-    found = importlib.util.find_spec("pyproject_hooks")
-    assert found is not None
-    assert found.origin is not None
-    shutil.copytree(Path(found.origin).parent, target / "pyproject_hooks")
+    spec = importlib.util.find_spec("pyproject_hooks")
+    assert spec is not None
+    assert spec.origin is not None
+    shutil.copytree(Path(spec.origin).parent, target / "pyproject_hooks")
     return target
 
 

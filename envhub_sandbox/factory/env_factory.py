@@ -182,8 +182,8 @@ class EnvFactory:
         self._repository = repository = launcher.repository
         self._num_workers = num_workers
         self._prewarm = prewarm
-        given = repository.snapshot, repository.arguments, repository.policy, launcher.runs_on
-        key = manifest_key(*given)
+        identity = repository.snapshot, repository.arguments, repository.policy, launcher.runs_on
+        key = manifest_key(*identity)
         self._cache = ManifestCache(cache_root() / "manifests", key)
         if num_workers is None:
             repository.warnings.note_shared = self._cache.note_shared
@@ -214,8 +214,8 @@ class EnvFactory:
             self._launcher.close(loaded)
             raise
 
-    def _open(self, deadline: Deadline, known: ExpectedManifest | None = None) -> LoadedJail:
-        ask = partial(self._launcher.open, deadline, known)
+    def _open(self, deadline: Deadline, expected: ExpectedManifest | None = None) -> LoadedJail:
+        ask = partial(self._launcher.open, deadline, expected)
         return retry_while_busy(ask, self._launcher.retry_s, deadline, self._repository.label)
 
     def _open_again(self, played: LoadedJail, deadline: Deadline) -> LoadedJail:
@@ -252,7 +252,9 @@ class EnvFactory:
 
     def _shared(self, loaded: LoadedJail | None) -> SharedJails:
         """A jail for all environments, for each worker."""
-        shared = {one: SharedJail(one, self._cache.forget) for one in self._launchers}
+        shared = {
+            launcher: SharedJail(launcher, self._cache.forget) for launcher in self._launchers
+        }
         if loaded is not None:
             shared[self._launcher].provide(loaded)
         return shared
@@ -314,5 +316,5 @@ def _each(launcher: Launcher, start: int, stop: int) -> Iterator[tuple[Launcher,
 
 def _close_all(shared: SharedJails) -> None:
     with ExitStack() as stack:  # interruption.md, rule 9
-        for one in shared.values():
-            stack.callback(one.close)
+        for jail in shared.values():
+            stack.callback(jail.close)

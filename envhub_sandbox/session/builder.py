@@ -211,8 +211,8 @@ class Builder:
     def take_apart(self, lane: Lane, shards: Sequence[int], deadline: Deadline) -> None:
         """Have each sub-environment's infos come as it gives them: see ``Results.apart``."""
         message = m.TakeApart(lane.number)
-        asked: list[tuple[int, m.Message]] = [(lane.runners[shard], message) for shard in shards]
-        for reply in lane.jail.exchange("make_env", asked, deadline):
+        requests: list[tuple[int, m.Message]] = [(lane.runners[shard], message) for shard in shards]
+        for reply in lane.jail.exchange("make_env", requests, deadline):
             typed_reply(reply, m.Value)
 
     def _check_built(self, reply: m.BuildDone, start: int, stop: int) -> Pair:
@@ -260,8 +260,8 @@ class Builder:
 
     def _check_manifest(self, loaded: LoadedJail) -> None:
         key = (self._manifest.suite, self._manifest.task)
-        found = next((e for e in loaded.manifest.envs if (e.suite, e.task) == key), None)
-        if found is None or loaded.changed or _shape(found) != _shape(self._manifest):
+        described = next((e for e in loaded.manifest.envs if (e.suite, e.task) == key), None)
+        if described is None or loaded.changed or _shape(described) != _shape(self._manifest):
             self._refuse()
 
     def _refuse(self) -> NoReturn:

@@ -122,17 +122,17 @@ class EnvSession:
         start, stop = self.rows
         alone = stop == start + 1
         which = f"sub-environment {start}" if alone else f"sub-environments {start} to {stop - 1}"
-        where = f"({which} of {self.manifest.num_envs}, on {self.lease.place})"
-        if where not in str(error.args[0]):
+        position = f"({which} of {self.manifest.num_envs}, on {self.lease.place})"
+        if position not in str(error.args[0]):
             first, *rest = str(error.args[0]).split("\n")
-            error.args = ("\n".join([f"{first} {where}", *rest]), *error.args[1:])
+            error.args = ("\n".join([f"{first} {position}", *rest]), *error.args[1:])
 
     def usage(self) -> dict[str, int]:
         """What its jail holds, as its server counts it; empty if it does not say."""
         status = self.lease.status()
         counts = {name: status.get(name) for name in _USAGE}
-        known = all(type(one) is int and 0 <= one < _MOST for one in counts.values())
-        return cast("dict[str, int]", counts) if known else {}
+        valid = all(type(count) is int and 0 <= count < _MOST for count in counts.values())
+        return cast("dict[str, int]", counts) if valid else {}
 
     def stats(self) -> dict[str, Any]:
         """Counters, and its state."""

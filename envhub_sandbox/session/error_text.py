@@ -41,55 +41,55 @@ def add_author_line(error: EnvHubError, snapshot: Snapshot) -> None:
     remote = error if isinstance(error, RemoteEnvError) else error.__cause__
     if not isinstance(remote, RemoteEnvError) or "__notes__" in vars(error):
         return
-    frames = [found for found in re.finditer(_FRAME, remote.traceback) if _place(found, snapshot)]
-    where = ""
+    frames = [frame for frame in re.finditer(_FRAME, remote.traceback) if _place(frame, snapshot)]
+    author_line = ""
     for last in frames[-1:]:
-        where = _line(last, snapshot)
+        author_line = _line(last, snapshot)
         remote.file, remote.line = _name(last, snapshot), int(last["line"])
-    named = re.sub(_FRAME, lambda found: _named(found, snapshot), remote.traceback)
+    named = re.sub(_FRAME, lambda frame: _named(frame, snapshot), remote.traceback)
     remote.traceback = printable(named, _TRACEBACK_CHARS)
-    remote.where = where
-    if where:
-        error.args = (f"{error.args[0]}\n{where}", *error.args[1:])
+    remote.where = author_line
+    if author_line:
+        error.args = (f"{error.args[0]}\n{author_line}", *error.args[1:])
     if remote.traceback:
         note = f"In the environment:\n{quoted(remote.traceback.rstrip())}"
         # before Python 3.11 only some shells and test runners show it
         vars(error)["__notes__"] = [note]
 
 
-def _place(found: re.Match[str], snapshot: Snapshot) -> str | None:
-    return snapshot.known_as(_name(found, snapshot))
+def _place(frame: re.Match[str], snapshot: Snapshot) -> str | None:
+    return snapshot.known_as(_name(frame, snapshot))
 
 
-def _name(found: re.Match[str], snapshot: Snapshot) -> str:
+def _name(frame: re.Match[str], snapshot: Snapshot) -> str:
     """Of a file in the repository; older workers give its whole path."""
-    return found["file"].removeprefix(f"{snapshot.root}/")
+    return frame["file"].removeprefix(f"{snapshot.root}/")
 
 
-def _named(found: re.Match[str], snapshot: Snapshot) -> str:
-    place, rest = _place(found, snapshot), found[0].partition('"')[2].partition('"')[2]
-    return found[0] if place is None else f"{found['margin']}File {place}{rest}"
+def _named(frame: re.Match[str], snapshot: Snapshot) -> str:
+    path, rest = _place(frame, snapshot), frame[0].partition('"')[2].partition('"')[2]
+    return frame[0] if path is None else f"{frame['margin']}File {path}{rest}"
 
 
-def _line(found: re.Match[str], snapshot: Snapshot) -> str:
-    place = printable(str(_place(found, snapshot)))
-    function = found["function"]
+def _line(frame: re.Match[str], snapshot: Snapshot) -> str:
+    path = printable(str(_place(frame, snapshot)))
+    function = frame["function"]
     inside = f", in {one_line(function, _FUNCTION_CHARS)}" if function else ""
-    lines = [f"  File {place}, line {found['line']}{inside}", *_source(found)]
+    lines = [f"  File {path}, line {frame['line']}{inside}", *_source(frame)]
     return "\n    ".join(lines)
 
 
-def _source(found: re.Match[str]) -> list[str]:
+def _source(frame: re.Match[str]) -> list[str]:
     """The line, and below it the caret of a syntax error, whose line alone says little.
 
     Python indents both alike, by blanks and by the tabs of the line itself.
     """
-    source = (found["source"] or "").replace("\t", " ")
+    source = (frame["source"] or "").replace("\t", " ")
     text = source.lstrip(" |")
     shown = one_line(text.rstrip(" |"), _SOURCE_CHARS)
-    caret = (found["caret"] or "")[len(source) - len(text) :].replace("\t", " ")
+    caret = (frame["caret"] or "")[len(source) - len(text) :].replace("\t", " ")
     aligned = text.startswith(shown) and len(caret) <= _SOURCE_CHARS
-    return [line for line in (shown, caret if aligned and not found["function"] else "") if line]
+    return [line for line in (shown, caret if aligned and not frame["function"] else "") if line]
 
 
 # --- what it wanted to reach, and which option brings that ---------------------------------------
@@ -225,7 +225,7 @@ def why_missing(error: EnvHubError, snapshot: Snapshot) -> str:
         return ""
     shown = {record.path for record in snapshot.files}
     for path in _names(text[:_NAMED_CHARS].replace(f"{snapshot.root}/", ""), snapshot.repo_id):
-        is_shown = path in shown or any(one.startswith(f"{path}/") for one in shown)
+        is_shown = path in shown or any(prefix.startswith(f"{path}/") for prefix in shown)
         if not is_shown and os.path.lexists(os.path.join(snapshot.repo_id, path)):
             return LocalFolder.of(snapshot).advice(path)
     return ""
@@ -233,17 +233,17 @@ def why_missing(error: EnvHubError, snapshot: Snapshot) -> str:
 
 def _names(text: str, folder: str) -> Iterator[str]:
     """Paths below a folder that a text may mean, the likeliest first."""
-    modules = [found[1].split(".")[0] for found in re.finditer(_NO_MODULE, text)]
+    modules = [match[1].split(".")[0] for match in re.finditer(_NO_MODULE, text)]
     for module in modules[:_MOST_NAMES]:
         yield from (f"{module}.py", module)
         # in a folder that code puts on its path
         for path in sorted(Path(folder).glob(f"*/{module}*")):
             if path.name in (module, f"{module}.py"):
                 yield path.relative_to(folder).as_posix()
-    for found in list(re.finditer(_QUOTED, text))[:_MOST_NAMES]:
-        steps = (found[1] or found[2] or found[3]).rstrip(".,:;)").replace("\\", "/").split("/")
+    for match in list(re.finditer(_QUOTED, text))[:_MOST_NAMES]:
+        steps = (match[1] or match[2] or match[3]).rstrip(".,:;)").replace("\\", "/").split("/")
         steps = [step for step in steps if step not in ("", ".")]
-        if steps and ".." not in steps and "\0" not in found[0]:
+        if steps and ".." not in steps and "\0" not in match[0]:
             # of an absolute path, or of one on another host, only the end is known
             yield from ("/".join(steps[first:]) for first in range(min(len(steps), _DEEPEST)))
 
@@ -256,15 +256,15 @@ _NAMED_DENIALS, _SHOWN = 8, 200
 """Denials in the text of an error, and characters of each."""
 
 
-def read_denials(said: object) -> tuple[str, ...] | None:
+def read_denials(reported: object) -> tuple[str, ...] | None:
     """What a jail was denied, as its server remembers it; None where it is not recorded.
 
     Trust: a server on another host may say anything, and paths are a stranger's words.
     """
-    if not isinstance(said, tuple):
+    if not isinstance(reported, tuple):
         return None
-    texts = (one for one in said[:_MOST_DENIALS] if isinstance(one, str) and one.isprintable())
-    return tuple(one for one in texts if re.fullmatch(_DENIAL, one))
+    texts = (text for text in reported[:_MOST_DENIALS] if isinstance(text, str))
+    return tuple(text for text in texts if text.isprintable() and re.fullmatch(_DENIAL, text))
 
 
 def name_denied(error: WorkerDiedError) -> None:
@@ -272,7 +272,7 @@ def name_denied(error: WorkerDiedError) -> None:
     text = ""
     if error.denied:
         more = len(error.denied) - _NAMED_DENIALS
-        named = [one_line(one, _SHOWN) for one in error.denied[:_NAMED_DENIALS]]
+        named = [one_line(denial, _SHOWN) for denial in error.denied[:_NAMED_DENIALS]]
         text = f"Before that it was denied: {', '.join(named)}{f' and {more} more' * (more > 0)}"
     elif error.denied is None and error.signal not in (None, "SIGKILL"):
         recording = option_name("policy", {"record_denials": True})

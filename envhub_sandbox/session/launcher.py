@@ -139,15 +139,15 @@ class Launcher:
     def __init__(self, repository: Repository, sandbox: Sandbox, store: Path) -> None:
         self.repository = repository
         runtime = repository.runtime
-        assets = tuple(one.root for one in repository.snapshot.assets)
+        assets = tuple(asset.root for asset in repository.snapshot.assets)
         own = repository.snapshot.root
-        place = sandbox.for_repository(own, repository.policy, runtime, assets)
-        self._sandbox = place
-        self.runs_on = place.runs_on(runtime)
-        self.retry_s = place.retry_s
+        confined = sandbox.for_repository(own, repository.policy, runtime, assets)
+        self._sandbox = confined
+        self.runs_on = confined.runs_on(runtime)
+        self.retry_s = confined.retry_s
         self._store = store
         self._worker = len(repository.places)
-        repository.places.append(place.address)
+        repository.places.append(confined.address)
         ours = object()
         self.plays = True
         hold, let_go = partial(repository.hold, ours), partial(repository.let_go, ours)
@@ -165,11 +165,11 @@ class Launcher:
         """Keep the server between two jails; returns what gives it back."""
         return self._acquire().release
 
-    def _acquire(self, place: Sandbox | None = None) -> ServerUse[WorkerServer]:
+    def _acquire(self, sandbox: Sandbox | None = None) -> ServerUse[WorkerServer]:
         idle_s = self.repository.timeouts.server_idle_s
-        return (place or self._sandbox).acquire(self._store, self.repository.runtime, idle_s)
+        return (sandbox or self._sandbox).acquire(self._store, self.repository.runtime, idle_s)
 
-    def open(self, deadline: Deadline, known: ExpectedManifest | None = None) -> LoadedJail:
+    def open(self, deadline: Deadline, expected: ExpectedManifest | None = None) -> LoadedJail:
         """Fork a jail and have its first runner call ``make_env``.
         ``known``: what that returns. It is then described no more, which for a suite means to build
         an environment of each of its tasks; ``BuildDone`` is held against it instead.
@@ -177,21 +177,21 @@ class Launcher:
         ``WorkerError``: the jail did not come up, died, or took too long.
         """
         failures: list[EnvHubError] = []
-        for place in self._sandbox.candidates():
+        for sandbox in self._sandbox.candidates():
             try:
-                return self._open_at(place, deadline, known)
+                return self._open_at(sandbox, deadline, expected)
             except EnvHubError as error:
                 if not may_go_elsewhere(error):
                     raise
-                WORKER.info("%s: %s: %s", self.repository.label, place.address, error)
+                WORKER.info("%s: %s: %s", self.repository.label, sandbox.address, error)
                 failures.append(error)
         raise worst_of(failures)
 
     def _open_at(
-        self, place: Sandbox, deadline: Deadline, known: ExpectedManifest | None
+        self, sandbox: Sandbox, deadline: Deadline, expected: ExpectedManifest | None
     ) -> LoadedJail:
         began = monotonic()
-        use = self._acquire(place)
+        use = self._acquire(sandbox)
         if use.server.far is not None:
             deadline.postpone(monotonic() - began)  # a cluster may have started a machine for it
         loaded: LoadedJail | None = None
@@ -200,8 +200,8 @@ class Launcher:
             if self.repository.timeouts.server_idle_s != 0 and use.server.is_ours:
                 self.server_hold.keep(use.server)
             with self.repository.starting(deadline):
-                loaded = self._open(use, place, deadline, known)
-                self.repository.places[self._worker] = loaded.address = place.address
+                loaded = self._open(use, sandbox, deadline, expected)
+                self.repository.places[self._worker] = loaded.address = sandbox.address
                 return loaded
         except BaseException:
             if loaded is None:
@@ -213,9 +213,9 @@ class Launcher:
     def _open(
         self,
         use: ServerUse[WorkerServer],
-        place: Sandbox,
+        sandbox: Sandbox,
         deadline: Deadline,
-        known: ExpectedManifest | None,
+        expected: ExpectedManifest | None,
     ) -> LoadedJail:
         server = use.server
         wanted = self._wanted_output()
@@ -223,10 +223,10 @@ class Launcher:
         try:
             client.hello(deadline)
             # all at once, where they will load what is known: else it is asked for, and then again
-            order = self._order(known.shards if known else 1)
-            order = place.prepare(order, server, client, deadline)
-            in_turn = server.far is not None and place is not self._sandbox
-            jail = self._open_jail(client, order, deadline, place if in_turn else None)
+            order = self._order(expected.shards if expected else 1)
+            order = sandbox.prepare(order, server, client, deadline)
+            in_turn = server.far is not None and sandbox is not self._sandbox
+            jail = self._open_jail(client, order, deadline, sandbox if in_turn else None)
         except BaseException:
             client.close()
             wanted.close()
@@ -241,10 +241,10 @@ class Launcher:
             layers = [*map(dict, server.layers), *jail.report]
             jail.report = self.repository.latest_report = layers
             self.repository.latest_profile = str(order.confinement["profile"])
-            if known is None:
+            if expected is None:
                 return self._load(jail, use, deadline)
-            loaded = LoadedJail(jail, known.manifest, {}, set(), use, self.close)
-            self.load(loaded, jail.runners, deadline, known.task)
+            loaded = LoadedJail(jail, expected.manifest, {}, set(), use, self.close)
+            self.load(loaded, jail.runners, deadline, expected.task)
             return loaded
         except BaseException as error:
             try:
@@ -254,7 +254,11 @@ class Launcher:
             raise
 
     def _open_jail(
-        self, client: WorkerConnection, order: m.OpenJail, deadline: Deadline, place: Sandbox | None
+        self,
+        client: WorkerConnection,
+        order: m.OpenJail,
+        deadline: Deadline,
+        sandbox: Sandbox | None,
     ) -> JailHandle:
         """Open it.
 
@@ -263,15 +267,15 @@ class Launcher:
         """
         from envhub_sandbox.transport.jail import open_jail  # sandboxes/process.py says why here
 
-        part = deadline if place is None else PartDeadline(deadline, _SHARE)
+        part = deadline if sandbox is None else PartDeadline(deadline, _SHARE)
         try:
             return open_jail(client, order, self.repository.wire_limits, part)
         except WorkerTimeoutError as error:
-            if place is None or deadline.passed:
+            if sandbox is None or deadline.passed:
                 raise
             more = option_name("startup_s", 2 * (self.repository.timeouts.startup_s or 1))
             raise WorkerStartupError(
-                f"{place.address} has not opened a jail in {part.timeout_s:.0f} s; read that "
+                f"{sandbox.address} has not opened a jail in {part.timeout_s:.0f} s; read that "
                 f"server's log, or raise {more}"
             ) from error
 
@@ -347,11 +351,11 @@ class Launcher:
         """Have runners of a jail call ``make_env``, for a task that is known."""
         jail = loaded.jail
         load = self.repository.arguments
-        given = load.n_envs, load.use_async_envs, load.cfg, load.env_kwargs
-        again = m.LoadTask(*given, task.suite, task.task)
+        arguments = load.n_envs, load.use_async_envs, load.cfg, load.env_kwargs
+        again = m.LoadTask(*arguments, task.suite, task.task)
         replies = jail.exchange("make_env", [(runner, again) for runner in runners], deadline)
-        found = [typed_reply(reply, m.Value).value for reply in replies]
-        loaded.changed |= not all(_is_what(value, task) for value in found)
+        values = [typed_reply(reply, m.Value).value for reply in replies]
+        loaded.changed |= not all(_is_what(value, task) for value in values)
         loaded.loaded.update(runners)
 
     def connect(self, loaded: LoadedJail, deadline: Deadline) -> LoadedJail:
@@ -419,7 +423,7 @@ class Launcher:
                 jails = [
                     one for one in expect_reply(status, m.Status).jails if isinstance(one, dict)
                 ]
-                return next((one for one in jails if one.get("jail") == jail), {})
+                return next((status for status in jails if status.get("jail") == jail), {})
         except EnvHubError:  # it is for a text, or a figure that may be missing
             return {}
 

@@ -425,21 +425,21 @@ class FleetAttributes:
 
     def get(self, name: str) -> AttributeAnswer | None:
         """The values, if all parts know theirs."""
-        found: list[Any] = []
-        for one in self._parts:
-            values = one.get(name)
+        gathered: list[Any] = []
+        for part in self._parts:
+            values = part.get(name)
             if type(values) is not tuple:
                 return values
-            found += values
-        return tuple(found)
+            gathered += values
+        return tuple(gathered)
 
     def should_watch(self, name: str) -> bool:
         """Whether every part is to be asked to watch it."""
-        wanted = [one.should_watch(name) for one in self._parts]  # each takes note of it
+        wanted = [part.should_watch(name) for part in self._parts]  # each takes note of it
         return all(wanted)
 
     def put(self, name: str, values: AttributeAnswer, *, watched: bool) -> None:
         """Keep the answers of all parts."""
-        for one, (start, stop) in zip(self._parts, self._bounds, strict=True):
+        for part, (start, stop) in zip(self._parts, self._bounds, strict=True):
             own = values[start:stop] if isinstance(values, tuple) else values
-            one.put(name, own, watched=watched)
+            part.put(name, own, watched=watched)

@@ -258,7 +258,7 @@ class SuitePrewarm:
         """A task has its first request."""
         with self._lock:
             self._tried.add(used)
-            self._ahead = [one for one in self._ahead if one != used]
+            self._ahead = [task for task in self._ahead if task != used]
             self._wanted = list(self._following(used))
             self._start_threads()
 
@@ -285,8 +285,10 @@ class SuitePrewarm:
         count = self._count
         if count is None:
             count = 1 if index and _is_closed(suite[index - 1]) else 0
-        left = [one for one in suite[index + 1 :] if one in self._ahead or one not in self._tried]
-        yield from [one for one in left if not _is_closed(one)][:count]
+        left = [
+            task for task in suite[index + 1 :] if task in self._ahead or task not in self._tried
+        ]
+        yield from [task for task in left if not _is_closed(task)][:count]
 
     def _run(self, task: TaskPrewarm, start: bool) -> None:
         try:
@@ -305,14 +307,14 @@ class SuitePrewarm:
         All that are passed over come first, and nothing starts before they have gone: so there are
         never more unused jails than the count.
         """
-        for ref in [one for one in self._ahead if one not in self._wanted]:
+        for ref in [task for task in self._ahead if task not in self._wanted]:
             self._ahead.remove(ref)
             self._tried.discard(ref)
             task = ref()
             if task is not None:
                 self._cancelling += 1
                 return task, False
-        untried = [one for one in self._wanted if one not in self._tried]
+        untried = [task for task in self._wanted if task not in self._tried]
         for ref in [] if self._cancelling else untried:
             task = ref()
             self._tried.add(ref)

@@ -156,7 +156,9 @@ class Recovery:
         try:
             answers = self._bring_back(deaths, operation, messages_for)
             with UNTRUSTED:
-                fresh = {index: rows_of(one, self._size(index)) for index, one in answers.items()}
+                fresh = {
+                    index: rows_of(answer, self._size(index)) for index, answer in answers.items()
+                }
         except WorkerTimeoutError as error:
             if lifecycle.closed:
                 raise failures.dead(error) from error
@@ -211,10 +213,10 @@ class Recovery:
     def _set_again(self, lane: Lane, dead: Sequence[int], deadline: Deadline) -> None:
         """Set attributes in fresh runners; what one's setter raises is only logged."""
         for (name, *_), frames in list(self._settings.items()):
-            asked: list[tuple[int, list[Buffer]]] = [
+            requests: list[tuple[int, list[Buffer]]] = [
                 (lane.runners[index], [*frames[index]]) for index in dead
             ]
-            replies = lane.jail.ask("set_attr", asked, deadline)
+            replies = lane.jail.ask("set_attr", requests, deadline)
             if any(isinstance(reply, m.RaisedException) for reply in replies):
                 label = self._lease.repository.label
                 WORKER.warning("%s: %r could not be set again", label, name)
@@ -249,8 +251,8 @@ def _target_of(messages: Sequence[m.Message]) -> tuple[Any, ...] | None:
     args = max((call.args for call in calls), key=len)  # one has them where only one is meant
     if not args or not isinstance(args[0], str):
         return None
-    where = [(getattr(call, "index", None), getattr(call, "depth", None)) for call in calls]
-    return (args[0], calls[0].name, *where)
+    targets = [(getattr(call, "index", None), getattr(call, "depth", None)) for call in calls]
+    return (args[0], calls[0].name, *targets)
 
 
 def _step_rows(reply: m.Message, size: int) -> m.Message:
@@ -269,8 +271,8 @@ def _ask_anew(
 ) -> dict[int, m.Message]:
     replies: list[m.Message] = []
     for messages in zip(*(messages_for(lane, index) for index in dead), strict=True):
-        asked = [(lane.runners[i], message) for i, message in zip(dead, messages, strict=True)]
-        replies = lane.jail.exchange("reset", asked, deadline)
+        requests = [(lane.runners[i], message) for i, message in zip(dead, messages, strict=True)]
+        replies = lane.jail.exchange("reset", requests, deadline)
     return dict(zip(dead, replies, strict=True))
 
 

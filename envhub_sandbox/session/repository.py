@@ -111,15 +111,15 @@ class Recipe:
             facts: What the repository's own spec says, if it has one. Trust: input from the worker;
                 nothing is taken of how it is made.
         """
-        known = {name: value for name, value in (facts or {}).items() if name in _SPEC_FACTS}
-        if (known.get("max_episode_steps") or 0) < 1:
-            known["max_episode_steps"] = None
+        safe_facts = {name: value for name, value in (facts or {}).items() if name in _SPEC_FACTS}
+        if (safe_facts.get("max_episode_steps") or 0) < 1:
+            safe_facts["max_episode_steps"] = None
         return EnvSpec(
             ENV_ID,
             entry_point=f"{_MAKERS}:make_again",
             vector_entry_point=f"{_MAKERS}:make_vector",
             kwargs={"ref": self._cfg, "suite": suite, "task": task, **self.differing},
-            **{**known, "nondeterministic": bool(known.get("nondeterministic"))},
+            **{**safe_facts, "nondeterministic": bool(safe_facts.get("nondeterministic"))},
         )
 
     @property
@@ -173,7 +173,7 @@ def provenance_of(
         "files": {record.path: record.digest for record in snapshot.files},
         "interpreter": dict(manifest.interpreter) if manifest else None,
         "packages": dict(manifest.packages) if manifest else None,
-        "assets": [one.pinned for one in snapshot.assets],
+        "assets": [asset.pinned for asset in snapshot.assets],
         "installed": installed,
         "protocol": VERSION,
         "profile": profile,
@@ -266,7 +266,7 @@ class Repository:
     def _lock_files(self) -> None:
         if self._in_use:
             return
-        folders = [one.root.parent for one in (self.snapshot, *self.snapshot.assets)]
+        folders = [snapshot.root.parent for snapshot in (self.snapshot, *self.snapshot.assets)]
         if os.path.isabs(self.runtime.packages):  # else they have a name, on another host
             folders.append(Path(self.runtime.packages).with_name(RECORD))
         self._in_use = [SharedLock(folder) for folder in folders]
@@ -306,8 +306,8 @@ class Repository:
     ) -> dict[str, Any]:
         """What runs: see ``provenance_of``. ``report``: None for that of the latest jail."""
         layers = self.latest_report if report is None else report
-        known = self.installed, self.latest_profile, self.places
-        return provenance_of(self.snapshot, manifest, layers, *known)
+        run = self.installed, self.latest_profile, self.places
+        return provenance_of(self.snapshot, manifest, layers, *run)
 
     @contextmanager
     def starting(self, deadline: Deadline) -> Iterator[None]:
@@ -316,8 +316,8 @@ class Repository:
             yield
         except WorkerDiedError as error:
             if error.reason == "zygote" and error.exit_code == LACKS_PACKAGES:
-                what = error.detail.strip().removeprefix("ModuleNotFoundError: ")
-                raise DependencyError(f"{self.label}: {printable(what)}") from error
+                missing = error.detail.strip().removeprefix("ModuleNotFoundError: ")
+                raise DependencyError(f"{self.label}: {printable(missing)}") from error
             if not deadline.unasked:
                 self.keep_crash(error)
             raise
@@ -395,11 +395,15 @@ def _attributes(config: Any, depth: int) -> dict[str, object]:
     names = list(getattr(config, "__dict__", {}))
     if is_dataclass(config):
         names = list(dict.fromkeys([*(item.name for item in fields(config)), *names]))
-    made = _known({name: _plain(getattr(config, name, None), depth + 1) for name in names})
-    wanted = {item.name for item in fields(config)} if is_dataclass(config) else made
+    attributes = _known({name: _plain(getattr(config, name, None), depth + 1) for name in names})
+    wanted = {item.name for item in fields(config)} if is_dataclass(config) else attributes
     computed = _known({name: _plain(value, 1) for name, value in _computed(config, depth)})
-    described = (_names(type(config)), tuple(name for name in made if name in wanted), computed)
-    return {**made, CONFIG_CLASS: described}
+    described = (
+        _names(type(config)),
+        tuple(name for name in attributes if name in wanted),
+        computed,
+    )
+    return {**attributes, CONFIG_CLASS: described}
 
 
 def _is_key(key: Any) -> bool:
@@ -443,8 +447,8 @@ def _plain(value: Any, depth: int) -> Any:
         kept = _known({key: _plain(value[k], depth + 1) for k, key in keys.items()})
         return kept if type(value) is dict else {**kept, CONFIG_CLASS: ((), (), {})}
     if isinstance(value, (list, tuple, set, frozenset)):
-        made = [item for item in (_plain(v, depth + 1) for v in value) if item is not _LEFT_OUT]
-        return tuple(made) if isinstance(value, tuple) else made
+        plain = [item for item in (_plain(v, depth + 1) for v in value) if item is not _LEFT_OUT]
+        return tuple(plain) if isinstance(value, tuple) else plain
     if hasattr(value, "__dict__") or is_dataclass(value):
         return _attributes(value, depth)
     return _LEFT_OUT

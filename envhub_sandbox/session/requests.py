@@ -144,7 +144,7 @@ class RequestOrder(ABC):
         timeout_s = timeouts.get(name, self._timeouts.call_s)
         replies = self._ask(operation, message_for, (m.Value, m.Method), timeout_s)
         holds = (start <= index < stop for start, stop in self.results.bounds)
-        return next(reply for reply, here in zip(replies, holds, strict=True) if here)
+        return next(reply for reply, holds_it in zip(replies, holds, strict=True) if holds_it)
 
     def _ask(
         self,
@@ -175,7 +175,9 @@ class RequestOrder(ABC):
         """With the lock held, the shards' replies to the last ``submit``."""
 
     @abstractmethod
-    def one_each(self, what: str, replies: list[m.Value] | list[m.WatchDone]) -> tuple[Any, ...]:
+    def one_each(
+        self, operation: str, replies: list[m.Value] | list[m.WatchDone]
+    ) -> tuple[Any, ...]:
         """One value for each sub-environment, out of the shards' replies."""
 
     def explain(self, error: BaseException) -> None:
@@ -374,10 +376,12 @@ class Requests(RequestOrder):
             self._recovery.answered()
         return answers
 
-    def one_each(self, what: str, replies: list[m.Value] | list[m.WatchDone]) -> tuple[Any, ...]:
+    def one_each(
+        self, operation: str, replies: list[m.Value] | list[m.WatchDone]
+    ) -> tuple[Any, ...]:
         """See ``RequestOrder``."""
         with self._incoming():
-            return self.results.one_each(what, replies)
+            return self.results.one_each(operation, replies)
 
     def finish_reset(
         self, replies: list[m.ResetDone], timeout: float | Deadline | None

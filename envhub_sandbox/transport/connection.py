@@ -199,10 +199,10 @@ class WorkerConnection:
         """
         self.check_process()
         while True:
-            found = self._arrived.pop(request_id, None)
-            if isinstance(found, EnvHubError):
-                raise found
-            reply, payload = found or self._receive(request_id, deadline)
+            arrived = self._arrived.pop(request_id, None)
+            if isinstance(arrived, EnvHubError):
+                raise arrived
+            reply, payload = arrived or self._receive(request_id, deadline)
             if not self._must_say_hello(request_id, reply):
                 self._sent.pop(request_id, None)
                 self._kept.discard(request_id)
@@ -250,8 +250,8 @@ class WorkerConnection:
 
     def peek(self, request_id: int) -> tuple[m.Message | None, list[Buffer]]:
         """The reply that has ``arrived``, which stays there for ``receive``; None for an error."""
-        found = self._arrived.get(request_id)
-        return (None, []) if found is None or isinstance(found, EnvHubError) else found
+        arrived = self._arrived.get(request_id)
+        return (None, []) if arrived is None or isinstance(arrived, EnvHubError) else arrived
 
     def keep(self, request_id: int) -> None:
         """Keep its reply where it comes before another one that is waited for."""
@@ -308,8 +308,8 @@ class WorkerConnection:
                 raise WorkerTimeoutError(f"the worker took no request for {_ROOM_S:.0f} s")
 
     def _has_ended(self) -> WorkerDiedError:
-        known = "" if self._far is None else self._far.why_ended()
-        text = f"the worker server has ended{known}{describe_exit(self._process_fd)}"
+        reason = "" if self._far is None else self._far.why_ended()
+        text = f"the worker server has ended{reason}{describe_exit(self._process_fd)}"
         return WorkerDiedError(text, reason="server")
 
     def _take(self) -> list[Buffer]:
@@ -395,8 +395,8 @@ def describe_exit(process_fd: int) -> str:
         return f". {_what_next()}"
     number = status.si_status - _KILLED_IN_A_CONTAINER
     if number in signal.valid_signals():
-        where = "; the container's own limit is DockerSandbox(memory=...) in Python"
-        why = _culprit(number) + (where if number == _SIGKILL else "")
+        advice = "; the container's own limit is DockerSandbox(memory=...) in Python"
+        why = _culprit(number) + (advice if number == _SIGKILL else "")
         return f" with its container, by {_signal_name(number)}{why}. {_what_next()}"
     return f", with exit code {status.si_status}. {_what_next()}"
 

@@ -75,7 +75,7 @@ class PartDeadline(Deadline):
     def left_ms(self) -> int | None:
         """As the other: its waits may be short."""
         left = (super().left_ms(), self._whole.left_ms())
-        return min((one for one in left if one is not None), default=None)
+        return min((seconds for seconds in left if seconds is not None), default=None)
 
     @property
     def passed(self) -> bool:

@@ -193,15 +193,15 @@ class JailHandle:
             RemoteProtocolError: A runner broke the rules.
         """
         reply, payload = self.client.receive(request_id, deadline)
-        asked = self._asked.pop(request_id, None)
+        count = self._asked.pop(request_id, None)
         with UNTRUSTED:
             if type(reply) is not m.RelayDone and not (
                 self.kept and isinstance(reply, m.RelayDonePartly)
             ):
                 reply = expect_reply(reply, m.RelayDone)
             parts = _cut(payload, reply.parts)
-            if len(parts) != asked:
-                raise RemoteProtocolError(f"{asked} runners were asked, {len(parts)} answered")
+            if len(parts) != count:
+                raise RemoteProtocolError(f"{count} runners were asked, {len(parts)} answered")
             unpack = unpack or self._unpack
             if isinstance(reply, m.RelayDonePartly):
                 raise self._died(reply.dead, parts, unpack)
@@ -228,8 +228,10 @@ class JailHandle:
         """The server says which runners have died; a runner cannot."""
         if not dead or not set(dead) <= set(range(len(parts))):
             raise RemoteProtocolError("the worker names dead runners that were not asked")
-        said = {index: self._unpack(index, parts[index]) for index in dead}
-        deaths = {index: death(typed_reply(one, m.Death)) for index, one in said.items()}
+        messages = {index: self._unpack(index, parts[index]) for index in dead}
+        deaths = {
+            index: death(typed_reply(message, m.Death)) for index, message in messages.items()
+        }
         living = [None if i in deaths else unpack(i, part) for i, part in enumerate(parts)]
         return RunnersDiedError(living, deaths)
 

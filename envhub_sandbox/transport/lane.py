@@ -262,31 +262,31 @@ def answered_first(lanes: Sequence[Lane], deadline: Deadline) -> list[int]:
     import zmq
 
     everywhere = range(len(lanes))
-    found = _answered(lanes, everywhere)
-    if found or deadline.passed:
-        return found
+    answered = _answered(lanes, everywhere)
+    if answered or deadline.passed:
+        return answered
     poller, places = zmq.Poller(), _listen(lanes)
     for source in places:
         poller.register(source, zmq.POLLIN)
     look = Deadline(RECHECK_MS / 1000)  # an answer may have crossed with our beginning to listen
-    while not found and not deadline.passed:
+    while not answered and not deadline.passed:
         left_ms, look_ms = deadline.left_ms(), look.left_ms() or 0
         rung = poller.poll(look_ms if left_ms is None else min(look_ms, left_ms))
-        some: Iterable[int] = sorted({place for source, _ in rung for place in places[source]})
+        some: Iterable[int] = sorted({index for source, _ in rung for index in places[source]})
         if look.passed:  # also where one rings without end
             some, look = everywhere, Deadline(LOOK_MS / 1000)
-        found = _answered(lanes, some)
-    return found
+        answered = _answered(lanes, some)
+    return answered
 
 
 def _listen(lanes: Sequence[Lane]) -> dict[Source, list[int]]:
     """What is to be polled, and for which lanes: those in one server share some of it."""
     places: dict[Source, list[int]] = {}
-    for place, lane in enumerate(lanes):
+    for index, lane in enumerate(lanes):
         for source in lane.sources():
-            places.setdefault(source, []).append(place)
+            places.setdefault(source, []).append(index)
     return places
 
 
 def _answered(lanes: Sequence[Lane], places: Iterable[int]) -> list[int]:
-    return [place for place in places if lanes[place].answered()]
+    return [index for index in places if lanes[index].answered()]

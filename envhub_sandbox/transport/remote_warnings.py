@@ -58,22 +58,22 @@ class RemoteWarnings:
         Raises:
             RemoteProtocolError: These are not what was agreed on.
         """
-        found, rest = WARNINGS.read(frames)
-        for one in found:
-            if one[0] != SHARED_CATEGORY:
-                self._collect(one)
+        warnings, rest = WARNINGS.read(frames)
+        for warning in warnings:
+            if warning[0] != SHARED_CATEGORY:
+                self._collect(warning)
             elif self.note_shared is not None:
                 self.note_shared()
                 self.note_shared = None  # a hostile worker says it again and again
-                self._collect(("SharedStateWarning", _SHARED.format(SHARED_STATE[one[1]])))
+                self._collect(("SharedStateWarning", _SHARED.format(SHARED_STATE[warning[1]])))
         return rest
 
-    def _collect(self, one: RemoteWarning) -> None:
-        known = self._known
-        if one in known or len(known) > MOST:
+    def _collect(self, warning: RemoteWarning) -> None:
+        shown = self._known
+        if warning in shown or len(shown) > MOST:
             return
-        known.add(one)
-        self.unshown.append(one if len(known) <= MOST else _NO_MORE)
+        shown.add(warning)
+        self.unshown.append(warning if len(shown) <= MOST else _NO_MORE)
 
     def show(self, label: str) -> None:
         """Show those that are new, with the line of the caller's own code.

@@ -106,7 +106,7 @@ def typed_reply(reply: m.Message, kind: type[m.M] | tuple[type[m.M], ...]) -> m.
     if isinstance(reply, kind):
         return reply
     kinds = kind if isinstance(kind, tuple) else (kind,)
-    wanted = " or ".join(one.__name__ for one in kinds)
+    wanted = " or ".join(kind.__name__ for kind in kinds)
     raise RemoteProtocolError(
         f"the worker answered with {type(reply).__name__} where {wanted} belongs"
     )
@@ -117,7 +117,7 @@ def typed_reply(reply: m.Message, kind: type[m.M] | tuple[type[m.M], ...]) -> m.
 
 def _named(fix: str) -> str:
     """What to do, with a profile written as an option of the place that the user is at."""
-    return re.sub(_PROFILE, lambda found: option_name("profile", found[1]), fix)
+    return re.sub(_PROFILE, lambda match: option_name("profile", match[1]), fix)
 
 
 def refusal(reply: m.Refusal) -> Exception:
@@ -199,16 +199,16 @@ def raised(reply: m.RaisedException) -> EnvHubError:
     reply = _harmless(reply)
     if reply.stage not in _LOADING:
         return remote_error(reply.builtin, reply.type_name, reply.message, reply.traceback)
-    what, said = _LOADING[reply.stage], continued(reply.message)
+    failure, message = _LOADING[reply.stage], continued(reply.message)
     if reply.stage == "return":
-        return load_error("ValueError", said)
+        return load_error("ValueError", message)
     cause: Any = remote_error(reply.builtin, reply.type_name, reply.message, reply.traceback)
     if reply.builtin == "ModuleNotFoundError":
-        error: EnvHubError = DependencyError(f"{what}: {said}", reason="module")
+        error: EnvHubError = DependencyError(f"{failure}: {message}", reason="module")
     elif reply.type_name.endswith(_LOADERS_OWN):
-        return load_error(reply.builtin, said)
+        return load_error(reply.builtin, message)
     else:
-        error = load_error(reply.builtin, f"{what}: {reply.type_name}: {said}")
+        error = load_error(reply.builtin, f"{failure}: {reply.type_name}: {message}")
     error.__cause__ = cause
     return error
 

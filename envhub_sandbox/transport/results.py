@@ -176,7 +176,7 @@ class Results:
         """Infos as ``VectorEnv`` has them, also where they came apart; raises as ``own``."""
         if not self.apart:
             return infos
-        pairs = [(at, one) for at, some in enumerate(self.each(infos)) for one in some]
+        pairs = [(at, pair) for at, some in enumerate(self.each(infos)) for pair in some]
         return self._joined_pairs(pairs)
 
     def each(self, infos: dict[Any, Any]) -> list[list[dict[Any, Any]]]:
@@ -203,10 +203,10 @@ class Results:
         if type(reward) is not tuple or len(reward) > 1:
             raise RemoteProtocolError("the worker sent more than one reward")
         own: list[list[dict[Any, Any]]] = [[] for _ in range(self.count)]
-        for place in places:
-            if type(infos[place]) is not dict or place >= 2 * self.count:
+        for index in places:
+            if type(infos[index]) is not dict or index >= 2 * self.count:
                 raise RemoteProtocolError(_NOT_ONE_EACH)
-            own[place % self.count].append(infos[place])
+            own[index % self.count].append(infos[index])
         if type(which) is not tuple:
             raise RemoteProtocolError(_NOT_ONE_EACH)
         for key in infos:  # marks of ours: which were lost and came back
@@ -236,12 +236,12 @@ class Results:
             raise RemoteProtocolError("the worker's infos are not a mapping")
         return said.value
 
-    def one_each(self, what: str, replies: Sequence[m.Value | m.WatchDone]) -> tuple[Any, ...]:
+    def one_each(self, operation: str, replies: Sequence[m.Value | m.WatchDone]) -> tuple[Any, ...]:
         """One value for each sub-environment."""
         gathered: list[Any] = []
         for reply, size in zip(replies, self._sizes, strict=True):
             if type(reply.value) is not tuple or len(reply.value) != size:
-                raise RemoteProtocolError(f"the worker's {what} does not hold one result each")
+                raise RemoteProtocolError(f"the worker's {operation} does not hold one result each")
             gathered += reply.value
         return tuple(gathered)
 

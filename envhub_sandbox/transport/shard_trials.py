@@ -92,8 +92,12 @@ class ShardTrials:
         if slower * _ANOTHER_LOAD < 1:
             times = {}
         elif slower > _ANOTHER_LOAD:  # what was far slower on a quieter machine is so here, too
-            far = {key: one for key, one in times.items() if one > times[name] * _ANOTHER_LOAD}
-            times = {key: one * slower for key, one in far.items()}
+            far = {
+                key: seconds
+                for key, seconds in times.items()
+                if seconds > times[name] * _ANOTHER_LOAD
+            }
+            times = {key: seconds * slower for key, seconds in far.items()}
         entries[self._key(env)] = {**times, name: step_s}
         with contextlib.suppress(OSError):
             write_whole_file(self._path, json.dumps(entries).encode())
@@ -102,16 +106,16 @@ class ShardTrials:
         return json.dumps([env.suite, str(env.task), self._cores])
 
     def _times(self, entries: dict[str, object], env: EnvManifest) -> dict[str, float]:
-        found = entries.get(self._key(env))
-        times = found if isinstance(found, dict) else {}
+        entry = entries.get(self._key(env))
+        times = entry if isinstance(entry, dict) else {}
         return {name: step_s for name, step_s in times.items() if _is_sane(step_s)}
 
     def _read(self) -> dict[str, object]:
         try:
-            found = json.loads(self._path.read_bytes()) if self._path else {}
+            content = json.loads(self._path.read_bytes()) if self._path else {}
         except (OSError, ValueError):
             return {}
-        return found if isinstance(found, dict) else {}
+        return content if isinstance(content, dict) else {}
 
 
 def ways_to_cut(count: int, cores: int) -> list[Bounds]:

@@ -70,16 +70,16 @@ def seeds(value: object) -> Any:
     Raises:
         RemoteProtocolError: It is neither a number nor None.
     """
-    for one in value if type(value) is tuple else (value,):
-        if one is not None and (isinstance(one, bool) or not isinstance(one, (int, np.integer))):
-            raise RemoteProtocolError(f"the worker sent a {type(one).__name__} for a seed")
+    for seed in value if type(value) is tuple else (value,):
+        if seed is not None and (isinstance(seed, bool) or not isinstance(seed, (int, np.integer))):
+            raise RemoteProtocolError(f"the worker sent a {type(seed).__name__} for a seed")
     return value
 
 
-def _misfit(form: _Form, value: Any, where: str) -> str | None:
+def _misfit(form: _Form, value: Any, path: str) -> str | None:
     """Which field has no such value; fields are exactly those of the form."""
     if type(value) is not dict or value.keys() != form.keys():
-        return f"{where} has the fields {', '.join(form)}"
+        return f"{path} has the fields {', '.join(form)}"
     for name, check in form.items():
         if isinstance(check, Mapping):
             wrong = _misfit(check, value[name], name)
@@ -205,8 +205,8 @@ unpacked = partial(m.unpack, tensors=to_tensor, things=DescriptionReader)
 def _spec(value: object) -> Any:
     """A spec; a description of one whose id this Gymnasium cannot read."""
     facts = read_spec_facts(value)
-    made = spec_of(facts)
-    return RemoteObject(_SPEC_TYPE, one_line(str(facts), _SHOWN)) if made is None else made
+    spec = spec_of(facts)
+    return RemoteObject(_SPEC_TYPE, one_line(str(facts), _SHOWN)) if spec is None else spec
 
 
 def spec_of(given: dict[str, Any] | None) -> EnvSpec | None:
@@ -233,9 +233,9 @@ def not_here(*args: Any, reference: str = "", **kwargs: Any) -> NoReturn:
     Raises:
         gymnasium.error.Error: Always.
     """
-    where = f", {reference}" if reference else ""
+    named = f", {reference}" if reference else ""
     raise gym.error.Error(
-        f"this describes an environment in a sandbox{where}, whose code never enters this process. "
+        f"this describes an environment in a sandbox{named}, whose code never enters this process. "
         "Use envhub_sandbox.make_env with that repository, or copy.deepcopy(env) for a copy"
     )
 

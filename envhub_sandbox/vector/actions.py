@@ -171,7 +171,7 @@ def seeds_for_all(seed: Any, manifest: EnvManifest) -> Any:
         each = list(seed)
     except TypeError:
         raise SeedError(seed) from None
-    seeds = [None if one is None else _seed(one) for one in each]
+    seeds = [None if seed is None else _seed(seed) for seed in each]
     if len(seeds) != count:
         raise ValueError(
             "If seeds are passed as a list the length must match "
@@ -180,10 +180,10 @@ def seeds_for_all(seed: Any, manifest: EnvManifest) -> Any:
     return seeds
 
 
-def _seed(given: Any) -> int:
-    if not isinstance(given, int):
-        raise SeedError(given)
-    return given
+def _seed(seed: Any) -> int:
+    if not isinstance(seed, int):
+        raise SeedError(seed)
+    return seed
 
 
 def check_mask(mask: Any, num_envs: int) -> None:
@@ -246,15 +246,13 @@ def _kinds_for(space: gym.Space[Any]) -> frozenset[str]:
     return _NUMBERS if np.dtype(space.dtype).kind == "f" else _INTEGERS
 
 
-def _array(space: gym.Space[Any], value: Any, where: str) -> Any:
+def _array(space: gym.Space[Any], value: Any, path: str) -> Any:
     try:
         if hasattr(value, "detach"):  # a torch tensor, possibly on a device or with a gradient
             value = value.detach().cpu()
         return np.asarray(value)
     except Exception as error:
-        raise ActionError(
-            f"{where}: {_named(value)} is not a batch for {space}: {error}"
-        ) from error
+        raise ActionError(f"{path}: {_named(value)} is not a batch for {space}: {error}") from error
 
 
 def _named(value: Any) -> str:

@@ -157,8 +157,8 @@ def _seeds_of(rows: Rows, seed: Any, manifest: EnvManifest) -> Any:
     """A seed or None for each sub-environment of all, of which those of ``rows`` count."""
     if seed is None or isinstance(seed, (int, np.integer)):
         return seeds_for_all(seed, manifest)
-    given = list(seed)
-    if len(given) != len(rows.named):
-        raise ValueError(f"`seed` has {len(given)} entries for {len(rows.named)} sub-environments")
-    by_id = dict(zip(rows.named, given, strict=True))
+    seeds = list(seed)
+    if len(seeds) != len(rows.named):
+        raise ValueError(f"`seed` has {len(seeds)} entries for {len(rows.named)} sub-environments")
+    by_id = dict(zip(rows.named, seeds, strict=True))
     return seeds_for_all([by_id.get(index) for index in range(manifest.num_envs)], manifest)

@@ -175,8 +175,8 @@ class SingleEnv(gym.Env[Any, Any]):
         """The environment's generator: a draw here advances it there, and the other way round."""
         if isinstance(self._vector, SandboxVectorEnv):
             return self._vector._generators.read()[0]
-        found = self._vector.np_random
-        return found[0] if isinstance(found, tuple) else found
+        generator = self._vector.np_random
+        return generator[0] if isinstance(generator, tuple) else generator
 
     @np_random.setter
     @short_traceback
@@ -195,8 +195,8 @@ class SingleEnv(gym.Env[Any, Any]):
     @short_traceback
     def np_random_seed(self) -> int:
         """The seed of its generator, as Gymnasium has it: -1 if it is not known."""
-        found: Any = self._vector.np_random_seed
-        seed = found[0] if isinstance(found, tuple) else found
+        seeds: Any = self._vector.np_random_seed
+        seed = seeds[0] if isinstance(seeds, tuple) else seeds
         return -1 if seed is None else int(seed)
 
     @property

@@ -98,9 +98,9 @@ class SubEnvironment(gym.Env[Any, Any]):
         """
         if self._depth is not None and self._depth >= _MOST_WRAPPERS:
             raise RemoteProtocolError(f"the worker says that more than {_MOST_WRAPPERS} wrap one")
-        found = self._get("env")
-        if self._depth is None or not (callable(found) or isinstance(found, RemoteObject)):
-            return found
+        wrapped = self._get("env")
+        if self._depth is None or not (callable(wrapped) or isinstance(wrapped, RemoteObject)):
+            return wrapped
         return SubEnvironment(self._vector, self._index, self._depth + 1)
 
     @property
@@ -163,9 +163,9 @@ class SubEnvironment(gym.Env[Any, Any]):
     @short_traceback
     def has_wrapper_attr(self, name: str) -> bool:
         """Whether it has an attribute, or a wrapper of it."""
-        found = self._call("has_wrapper_attr", (name,), {})
+        has_attribute = self._call("has_wrapper_attr", (name,), {})
         with UNTRUSTED:  # an array has no truth value
-            return bool(found)
+            return bool(has_attribute)
 
     @short_traceback
     def get_wrapper_attr(self, name: str) -> Any:
@@ -214,16 +214,16 @@ class SubEnvironment(gym.Env[Any, Any]):
         return id(self._vector), self._index, self._depth
 
     def _get(self, name: str, depth: int | None = None) -> Any:
-        where = self._depth if depth is None else depth
+        level = self._depth if depth is None else depth
         reply = self._vector._requests.ask_one(
-            name, self._index, lambda number, place: m.GetOne(number, place, where, name)
+            name, self._index, lambda number, row: m.GetOne(number, row, level, name)
         )
         if isinstance(reply, m.Value):
             return reply.value
 
         @short_traceback
         def method(*args: Any, **kwargs: Any) -> Any:
-            return self._call(name, args, kwargs, where)
+            return self._call(name, args, kwargs, level)
 
         method.__name__ = method.__qualname__ = name
         return method
@@ -231,11 +231,11 @@ class SubEnvironment(gym.Env[Any, Any]):
     def _call(
         self, name: str, args: tuple[Any, ...], kwargs: dict[str, Any], depth: int | None = None
     ) -> Any:
-        where = self._depth if depth is None else depth
+        level = self._depth if depth is None else depth
 
-        def message(number: int, place: int | None) -> m.Message:
-            given = (args, kwargs) if place is not None else ((), {})
-            return m.CallOne(number, place, where, name, *given)
+        def message(number: int, row: int | None) -> m.Message:
+            call = (args, kwargs) if row is not None else ((), {})
+            return m.CallOne(number, row, level, name, *call)
 
         reply = self._vector._requests.ask_one(name, self._index, message)
         return typed_reply(reply, m.Value).value

@@ -172,15 +172,15 @@ def choose(
     Raises:
         ValueError: There is not exactly one; the text names what there is.
     """
-    found = _named(suites, suite, lambda one: task in (None, one))
-    if len(found) == 1:
-        return suites[found[0][0]][found[0][1]]
-    if found:
-        raise ValueError(f"there are {len(found)} environments; choose one: {_names(found)}")
-    there = _names(_named(suites, None, lambda _: True))
+    chosen = _named(suites, suite, lambda task_id: task in (None, task_id))
+    if len(chosen) == 1:
+        return suites[chosen[0][0]][chosen[0][1]]
+    if chosen:
+        raise ValueError(f"there are {len(chosen)} environments; choose one: {_names(chosen)}")
+    available = _names(_named(suites, None, lambda _: True))
     named = [("suite", suite), ("task", task)]
     wanted = " with a ".join(f"{word} {name!r}" for word, name in named if name is not None)
-    raise ValueError(f"there is no {wanted}; there are: {there}")
+    raise ValueError(f"there is no {wanted}; there are: {available}")
 
 
 def keep_only(suites: EnvSuites, suite: str | None = None, task: int | str | None = None) -> None:
@@ -189,11 +189,11 @@ def keep_only(suites: EnvSuites, suite: str | None = None, task: int | str | Non
     Raises:
         ValueError: Nothing would be left; the text names what there is.
     """
-    chosen = _named(suites, suite, lambda one: task in (None, one, str(one)))
+    chosen = _named(suites, suite, lambda task_id: task in (None, task_id, str(task_id)))
     if not chosen:
         choose(suites, suite, task)
     for a_suite, tasks in list(suites.items()):
-        for a_task in [one for one in tasks if (a_suite, one) not in chosen]:
+        for a_task in [task_id for task_id in tasks if (a_suite, task_id) not in chosen]:
             tasks.pop(a_task).close()
         if not tasks:
             del suites[a_suite]
@@ -206,8 +206,8 @@ def _named(
     return [(name, task) for name, tasks in meant for task in tasks if is_meant(task)]
 
 
-def _names(found: list[tuple[str, int | str]]) -> str:
-    return ", ".join(f"[{suite!r}][{task!r}]" for suite, task in found)
+def _names(tasks: list[tuple[str, int | str]]) -> str:
+    return ", ".join(f"[{suite!r}][{task!r}]" for suite, task in tasks)
 
 
 # --- many tasks at once, within a budget --------------------------------------------------------

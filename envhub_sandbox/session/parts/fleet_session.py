@@ -96,15 +96,15 @@ class FleetSession:
 
     def denials(self) -> tuple[str, ...] | None:
         """What any of the jails was denied; None where that is not recorded."""
-        found = [denials for part in self.parts if (denials := part.denials()) is not None]
-        return tuple(dict.fromkeys(one for some in found for one in some)) if found else None
+        recorded = [denials for part in self.parts if (denials := part.denials()) is not None]
+        return tuple(dict.fromkeys(chain.from_iterable(recorded))) if recorded else None
 
     def usage(self) -> dict[str, int]:
         """What all jails hold; empty if one does not say."""
-        found = [part.usage() for part in self.parts]
-        if not all(found):
+        figures = [part.usage() for part in self.parts]
+        if not all(figures):
             return {}
-        return {name: sum(one[name] for one in found) for name in found[0]}
+        return {name: sum(figure[name] for figure in figures) for name in figures[0]}
 
     def stats(self) -> dict[str, Any]:
         """Counters of the whole, and of each worker."""
@@ -198,7 +198,9 @@ class FleetRequests(RequestOrder):
         self._parts = parts
         self._each: list[Requests] = [part.requests for part in parts]
         use = FleetUse([part.use for part in parts])
-        attributes = FleetAttributes([one.attributes for one in self._each], results.bounds)
+        attributes = FleetAttributes(
+            [requests.attributes for requests in self._each], results.bounds
+        )
         super().__init__(parts[0].repository, results, use, attributes)
         self._recorder = recorder
         self._counters = counters
@@ -216,8 +218,8 @@ class FleetRequests(RequestOrder):
 
     @closed.setter
     def closed(self, closed: bool) -> None:
-        for one in self._each:
-            one.closed = closed
+        for requests in self._each:
+            requests.closed = closed
 
     def note_sent(self, actions: Any | None) -> None:
         """See ``RequestOrder``."""
@@ -250,7 +252,7 @@ class FleetRequests(RequestOrder):
             self.before_request()
         self._make_ready(operation)
         try:
-            packed = [one.pack(operation, message_for, instead) for one in self._each]
+            packed = [requests.pack(operation, message_for, instead) for requests in self._each]
         except LocalProtocolError:
             count = self.results.manifest.num_envs
             self._each[0].refuse_whole(operation, message_for, count)
@@ -268,10 +270,12 @@ class FleetRequests(RequestOrder):
         self.note_answered(kind)
         return [reply for some in replies for reply in some]
 
-    def one_each(self, what: str, replies: list[m.Value] | list[m.WatchDone]) -> tuple[Any, ...]:
+    def one_each(
+        self, operation: str, replies: list[m.Value] | list[m.WatchDone]
+    ) -> tuple[Any, ...]:
         """One value for each sub-environment; a part whose reply is none of these is given up."""
         parts: list[list[Any]] = [[reply] for reply in replies]
-        values = self._of_all(lambda at: self._each[at].one_each(what, parts[at]))
+        values = self._of_all(lambda at: self._each[at].one_each(operation, parts[at]))
         return tuple(value for some in values for value in some)
 
     def finish_reset(
@@ -309,7 +313,7 @@ class FleetRequests(RequestOrder):
         """
         try:
             pairs = zip(self._each, rows, strict=True)
-            return [one.pack("step", partial(_step, row)) for one, row in pairs]
+            return [requests.pack("step", partial(_step, row)) for requests, row in pairs]
         except LocalProtocolError:
             count = self.results.manifest.num_envs
             self._each[0].refuse_whole("step", partial(_step, actions), count)
@@ -349,18 +353,18 @@ class FleetRequests(RequestOrder):
             self._of_all(lambda at: self._each[at].checked_own_infos(deadline, failed=True))
             raise
         pairs = zip(self._each, self.results.bounds, strict=True)
-        fresh = [bounds for one, bounds in pairs if one.came_back]
+        fresh = [bounds for requests, bounds in pairs if requests.came_back]
         return mark_revived(infos, self.results.count, fresh) if fresh else infos
 
     # --- to all parts, and of all --------------------------------------------------------------
 
     def _make_ready(self, operation: str) -> None:
-        states = [one.lifecycle.state for one in self._each]
+        states = [requests.lifecycle.state for requests in self._each]
         idle = [at for at, state in enumerate(states) if state is State.IDLE]
-        for at, one in enumerate(self._each):
+        for at, requests in enumerate(self._each):
             if at not in idle:
                 with self._parts[at].naming():
-                    one.make_ready(operation)
+                    requests.make_ready(operation)
         if idle:
             started = self._start([self._parts[at] for at in idle])
             for at, start in zip(idle, started, strict=True):
@@ -385,7 +389,7 @@ class FleetRequests(RequestOrder):
                 deadline.give_up()
             self._wait_for_starts()
             raise
-        return [one.result for one in starting.each]
+        return [start.result for start in starting.each]
 
     def _wait_for_starts(self) -> None:
         if not self._starting.wait(_ENDS_S):
@@ -442,11 +446,11 @@ def _step(actions: Any, number: int, bounds: tuple[int, int]) -> m.Message:
 
 def _joined(packed: Sequence[Packed], bounds: Sequence[tuple[int, int]]) -> Request:
     """The parts' requests as one, to be recorded."""
-    requests = [one.request for one in packed]
+    requests = [part.request for part in packed]
     return Request(
         requests[0].operation,
-        [message for one in requests for message in one.messages],
-        [frames for one in requests for frames in one.frames],
+        [message for request in requests for message in request.messages],
+        [frames for request in requests for frames in request.frames],
         list(bounds),
-        plain=all(one.plain for one in requests),
+        plain=all(request.plain for request in requests),
     )

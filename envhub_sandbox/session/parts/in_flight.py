@@ -127,9 +127,9 @@ class InFlight:
         while at < len(ordered):
             workers.append(self._worker_of[ordered[at]])
             start, stop = self._queues[workers[-1]].rows
-            given = ordered[at : at + stop - start]
-            if given != list(range(start, stop)):
-                missing = min(set(range(start, stop)) - set(given))
+            indices = ordered[at : at + stop - start]
+            if indices != list(range(start, stop)):
+                missing = min(set(range(start, stop)) - set(indices))
                 raise ActionError(
                     f"sub-environments {start} to {stop - 1} are stepped together, by one worker, "
                     f"and env_ids lacks {missing}: name all of them, or give each a worker of its "
@@ -226,8 +226,8 @@ class InFlight:
         with self._held([queue for queue in self._queues if queue.busy]):
             try:
                 while (taken := self._first(min_ready)) is None:
-                    for place in self._wait(deadline):
-                        self._take(place)
+                    for worker in self._wait(deadline):
+                        self._take(worker)
                 return self._joined(taken)
             except Exception:
                 self._order.refuse_if_closed()  # as by a signal handler
@@ -251,30 +251,30 @@ class InFlight:
 
     def _wait(self, deadline: Deadline) -> list[int]:
         """Sleep until workers have answered, or are late; which. Raises ``WorkerTimeoutError``."""
-        busy = [place for place, queue in enumerate(self._queues) if queue.busy]
-        lanes = [self._queues[place].lane for place in busy]
-        ended = [place for place, lane in zip(busy, lanes, strict=True) if lane is None]
+        busy = [worker for worker, queue in enumerate(self._queues) if queue.busy]
+        lanes = [self._queues[worker].lane for worker in busy]
+        ended = [worker for worker, lane in zip(busy, lanes, strict=True) if lane is None]
         if ended:
             return ended
-        lefts = [deadline.left_s(), *(self._queues[place].left_s for place in busy)]
+        lefts = [deadline.left_s(), *(self._queues[worker].left_s for worker in busy)]
         until = Deadline(min((left for left in lefts if left is not None), default=None))
-        found = answered_first([lane for lane in lanes if lane is not None], until)
-        late = [at for at, place in enumerate(busy) if self._queues[place].left_s == 0]
-        if not found and not late and deadline.passed:
+        answered = answered_first([lane for lane in lanes if lane is not None], until)
+        late = [at for at, worker in enumerate(busy) if self._queues[worker].left_s == 0]
+        if not answered and not late and deadline.passed:
             raise _too_few(deadline)
-        return [busy[at] for at in found or late]
+        return [busy[at] for at in answered or late]
 
-    def _take(self, place: int) -> None:
+    def _take(self, worker: int) -> None:
         """Take a worker's oldest answer. An error waits for the worker's results before it."""
         try:
-            self._queues[place].take(partial(self._keep, place))
+            self._queues[worker].take(partial(self._keep, worker))
         except (EnvHubError, RemoteEnvWarning) as error:
-            if all(at != place for at, _ in self._ready):
+            if all(at != worker for at, _ in self._ready):
                 raise
-            self._keep(place, error)
+            self._keep(worker, error)
 
-    def _keep(self, place: int, result: StepResult | Exception) -> None:
-        self._ready.append((place, result))
+    def _keep(self, worker: int, result: StepResult | Exception) -> None:
+        self._ready.append((worker, result))
 
     def _first(self, min_ready: int) -> dict[int, StepResult] | None:
         """Results by workers, in the order in which they were taken; None while these are too few.
@@ -284,19 +284,19 @@ class InFlight:
         self._order.refuse_if_closed()
         oldest: dict[int, StepResult] = {}
         for entry in self._ready:
-            place, result = entry
-            if place in oldest:
+            worker, result = entry
+            if worker in oldest:
                 continue
             if isinstance(result, Exception):
                 self._ready.remove(entry)
                 raise result
-            oldest[place] = result
+            oldest[worker] = result
         owing = any(queue.busy for at, queue in enumerate(self._queues) if at not in oldest)
         taken: dict[int, StepResult] = {}
         rows = 0
-        for place, result in oldest.items():
-            taken[place] = result
-            rows += self._queues[place].count
+        for worker, result in oldest.items():
+            taken[worker] = result
+            rows += self._queues[worker].count
             if rows >= min_ready:
                 return taken
         return None if owing else taken
@@ -304,9 +304,9 @@ class InFlight:
     def _joined(self, taken: dict[int, StepResult]) -> Received:
         """One batch, by ids. The results that it is made of are taken away."""
         places = sorted(taken)
-        queues = [self._queues[place] for place in places]
+        queues = [self._queues[worker] for worker in places]
         env_ids = np.concatenate([np.arange(*queue.rows) for queue in queues])
-        results = [taken[place] for place in places]
+        results = [taken[worker] for worker in places]
         observations, rewards, terminations, truncations, infos = zip(*results, strict=True)
         if len(results) == 1:
             received = Received(*results[0], env_ids)
@@ -320,7 +320,7 @@ class InFlight:
                 batches.gather_infos(infos, sizes, DEFAULT_LIMITS.message_bytes),
                 env_ids,
             )
-        self._ready = deque(one for one in self._ready if taken.get(one[0]) is not one[1])
+        self._ready = deque(entry for entry in self._ready if taken.get(entry[0]) is not entry[1])
         return received
 
     def drop(self) -> None:
@@ -340,7 +340,7 @@ def _queues_of(parts: Sequence[EnvSession]) -> list[WorkerQueue]:
     [part, *others] = parts
     # a runner that comes back in the same jail repeats the last request of all
     if others or len(part.bounds) == 1 or part.repository.policy.restart == "transparent":
-        return [WorkerQueue(one, one.rows, sliced=bool(others)) for one in parts]
+        return [WorkerQueue(part, part.rows, sliced=bool(others)) for part in parts]
     shards: list[ShardQueue] = []
     return [ShardQueue(part, shard, shards) for shard in range(len(part.bounds))]
 
