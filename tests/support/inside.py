@@ -286,6 +286,7 @@ PATIENCE_FOR_AN_END: Spot = (task, "_EPISODE_S")
 wrong_types = task._untyped
 wrong_masks = traces._masks
 info_bytes = traces._bytes_of
+small_trace = partial(traces.Trace, _left=1 << 20)
 
 # --- the connection to another host ------------------------------------------------------------
 
