@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from gymnasium.vector import VectorEnv
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from envhub_worker.protocol.spaces.batches import join_infos
@@ -45,7 +45,6 @@ def added(infos: list[dict[str, Any]]) -> dict[str, Any]:
     return joined
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.lists(INFO, min_size=1, max_size=6), st.data())
 def test_shards_join_as_one_batch(infos: list[dict[str, Any]], data: st.DataObject) -> None:
     """However the sub-environments are cut into shards, the joined infos are Gymnasium's."""

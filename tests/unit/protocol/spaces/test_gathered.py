@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from envhub_worker.protocol.spaces.batches import (
@@ -36,7 +36,6 @@ def joined(infos: list[dict[str, Any]]) -> dict[Any, Any]:
     return join_pairs(list(enumerate(infos)), len(infos))
 
 
-@settings(max_examples=200, deadline=None)
 @given(st.lists(INFO, min_size=1, max_size=6), st.data())
 def test_what_goes_together_is_joined_as_ever(
     infos: list[dict[str, Any]], data: st.DataObject
@@ -68,7 +67,6 @@ ANY = st.one_of(
 UNLIKE = st.fixed_dictionaries({}, optional={"one": ANY, "other": ANY})
 
 
-@settings(max_examples=200, deadline=None)
 @given(st.lists(UNLIKE, min_size=1, max_size=6))
 @example([{"other": {"b": ""}}, {"other": {"a": 0, "b": ""}}, {"other": 0}])
 def test_each_has_its_own_whatever_the_others_say(infos: list[dict[str, Any]]) -> None:
@@ -140,7 +138,6 @@ _DEEPER = st.recursive(_ODD, lambda some: st.dictionaries(_KEYS, some, max_size=
 _LIES = st.dictionaries(_KEYS, _DEEPER, max_size=5)
 
 
-@settings(max_examples=100, deadline=None)
 @given(st.lists(_LIES, min_size=2, max_size=4))
 def test_nothing_that_is_let_in_keeps_others_back(lies: list[dict[Any, Any]]) -> None:
     """Whatever workers say, if it has a row for each of their sub-environments, it is gathered."""
