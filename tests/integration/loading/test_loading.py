@@ -297,22 +297,6 @@ class TestWhatMakeEnvReturns:
             wrapped = gym.vector.VectorWrapper(suites.env)
             assert wrapped.unwrapped.sandbox.stats()["state"] == "READY"
 
-    @pytest.mark.parametrize(
-        ("mistake", "named"),
-        [
-            ("none", "None"),
-            ("list of ints", "list"),
-            ("empty", "empty"),
-            ("task of int", "42"),
-            ("empty suite", "without an environment"),
-            ("tuple key", "tuple"),
-        ],
-    )
-    def test_wrong_types_are_named(self, mistake: str, named: str) -> None:
-        """The error says what ``make_env`` returned instead of an environment."""
-        with pytest.raises(LoadError, match=named):
-            make_env(sample("wrong_types"), env_kwargs={"mistake": mistake})
-
 
 class TestWhatGoesWrong:
     """Each failure to load has an error of its own that says where it came from."""

@@ -91,9 +91,16 @@ def test_results_become_tasks(returned: Any, names: list[tuple[str, Any]]) -> No
     assert all(one.num_envs == 2 for one in made.envs)
 
 
-@pytest.mark.parametrize("returned", [None, 3, Inner, {}, {"a": {}}, {"a": {0: 3}}, [many]])
-def test_what_is_no_environment_is_said(returned: Any) -> None:
-    with pytest.raises(tasks.ResultError, match="make_env"):
+@pytest.mark.parametrize(
+    ("returned", "named"),
+    [
+        *((None, "None"), ([1, 2], "list"), (Inner, "Inner"), ([many], "list")),
+        *(({}, "empty"), ({"a": {}}, "without an environment"), ({"a": {0: 42}}, "42")),
+        *(({"a": None}, "None"), ({("a", "b"): {0: None}}, "tuple")),
+    ],
+)
+def test_what_is_no_environment_is_named(returned: Any, named: str) -> None:
+    with pytest.raises(tasks.ResultError, match=f"make_env.*{named}"):
         tasks.tasks_of(returned, 2, False, lambda: returned)
 
 

@@ -113,13 +113,6 @@ def test_another_type_ends_the_columns() -> None:
     assert slab.outcomes == [slabs.DONE, slabs.COLUMNS, slabs.DONE, slabs.DONE]
 
 
-def test_a_byte_that_is_no_boolean_becomes_one() -> None:
-    [column] = columns_of({"a": np.array([False, True])}) or ()
-    memory = bytearray([2, 0])
-    read = column.view(memory, 0).astype(column.dtype)
-    assert read.tobytes() == b"\x01\x00"
-
-
 @pytest.mark.parametrize(
     "infos",
     [
