@@ -223,7 +223,8 @@ class ShardSlabs:
         self.answer_bytes += length
         with UNTRUSTED:
             frames = read_packet(area[:length], limits)
-        return unpacked(frames, limits=limits)
+        borrows = slots is not None and slots.chosen != _SPARE
+        return unpacked(frames, limits=limits, borrows=borrows)
 
     def _learn(self, infos: dict[Any, Any]) -> None:
         start = slabs.INFOS

@@ -170,10 +170,12 @@ def test_warnings_that_are_not_checked_are_noticed(
 class Forgetful:
     """In the place of what reads a document that is known: it has lost the fields."""
 
-    def __init__(self, document: bytes, make: type[m.Message], limits: WireLimits) -> None:
+    def __init__(
+        self, document: bytes, tail: Any, buffers: Any, make: type[m.Message], limits: WireLimits
+    ) -> None:
         self.limits, self.make = limits, make
 
-    def message(self, *_: object) -> m.Message:
+    def message(self, *_: object, **__: object) -> m.Message:
         return self.make(*[None] * len(self.make.FIELDS))
 
 

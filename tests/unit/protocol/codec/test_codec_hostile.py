@@ -4,20 +4,23 @@ from __future__ import annotations
 
 import pickle
 import struct
+from functools import partial
+from typing import Any
 
 import msgpack
 import numpy as np
 import pytest
 
+from envhub_worker.protocol.codec.decoder import Decoder
 from envhub_worker.protocol.codec.encoder import encode
 from envhub_worker.protocol.codec.inert import RemoteObject
-from envhub_worker.protocol.codec.wire import Buffer
+from envhub_worker.protocol.codec.wire import GENERATOR, Buffer, split_frames
 from envhub_worker.protocol.errors import (
     LocalProtocolError,
     MessageTooLargeError,
     RemoteProtocolError,
 )
-from envhub_worker.protocol.limits import WireLimits
+from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
 from tests.support.compare import assert_same
 from tests.support.decode import decode
 from tests.support.wire import deep, ext, message, packed
@@ -177,3 +180,26 @@ def test_hostile_description_is_cleaned_by_the_receiver() -> None:
     assert remote.type_name.isprintable()
     assert remote.text.isprintable()
     assert len(repr(remote)) < 3000
+
+
+def test_what_is_looked_at_is_never_borrowed() -> None:
+    """Flags, and what a thing is described by, are copies; the control, an array, lies where its
+    frame does. Whoever sent them may still write there.
+    """
+    large = np.zeros(20_000)
+    sent = [large, large.astype(bool), object()]
+    frames = encode(sent, describer=lambda _: (GENERATOR, {"keys": (large,)}))
+    frames = [frames[0], *(memoryview(bytearray(frame)) for frame in frames[1:])]
+    document, tail, buffers = split_frames(frames, DEFAULT_LIMITS)
+    lies = [np.frombuffer(buffer, np.uint8) for buffer in buffers]
+    for borrows in (True, False):
+        described: list[Any] = []
+
+        def things(_: object, noted: list[Any] = described) -> Any:
+            return lambda code, value: noted.append(value)
+
+        decoder = Decoder(tail, buffers, DEFAULT_LIMITS, None, None, things, borrows=borrows)
+        array, flags, _ = decoder.value(document)  # type: ignore[misc]
+        looked_at = [flags, described[0]["keys"][0]]
+        assert [any(map(partial(np.shares_memory, one), lies)) for one in looked_at] == [False] * 2
+        assert any(map(partial(np.shares_memory, array), lies)) is borrows

@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import struct
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -54,6 +54,8 @@ _CODES = {
     char: _DTYPES.index(np.dtype(char)) for char in "?bBhHiIlLqQefdFD" if np.dtype(char) in _DTYPES
 }
 """By the character of a dtype: "l" and "q" are the same integer on most platforms."""
+_SCALAR_CODES = {np.dtype(char).type: bytes((code,)) for char, code in _CODES.items()}
+_NUMBERS = frozenset(_SCALAR_CODES)
 
 
 class ArrayWriter:
@@ -79,25 +81,41 @@ class ArrayWriter:
         in_tail, in_frame, plain = _descriptors(array.dtype, array.shape)
         if not plain:
             array = native(array)
-        nbytes = array.nbytes
-        if nbytes <= INLINE_BYTES and self._tail_bytes + nbytes <= MAX_TAIL_BYTES:
+        if _has_room(array.nbytes, self._tail_bytes):
             self.tail.append(array.tobytes())
-            self._tail_bytes += nbytes
+            self._tail_bytes += array.nbytes
             return in_tail
-        self.frames.append(_raw(array))
+        self.frames.append(raw(array))
         return in_frame
+
+
+def _has_room(nbytes: int, tail_bytes: int) -> bool:
+    return nbytes <= INLINE_BYTES and tail_bytes + nbytes <= MAX_TAIL_BYTES
+
+
+def in_tail(sizes: Sequence[int]) -> list[bool]:
+    """Which of some arrays, in their order, ``ArrayWriter`` puts into the tail."""
+    found, tail_bytes = [], 0
+    for nbytes in sizes:
+        found.append(_has_room(nbytes, tail_bytes))
+        tail_bytes += nbytes * found[-1]
+    return found
 
 
 class ArrayReader:
     """Hands out one message's arrays in the order of their descriptors, as copies.
 
     Trust: input from the worker. ``tail`` has the bytes of small arrays, ``frames`` those of large
-    ones, one each.
+    ones, one each. If it ``borrows``, large arrays of numbers lie where their frames do, and the
+    worker may still write them.
     """
 
-    __slots__ = ("_frames", "_limits", "_next_byte", "_next_frame", "_tail")
+    __slots__ = ("_borrows", "_frames", "_limits", "_next_byte", "_next_frame", "_tail")
 
-    def __init__(self, tail: Buffer, frames: Sequence[Buffer], limits: WireLimits) -> None:
+    def __init__(
+        self, tail: Buffer, frames: Sequence[Buffer], limits: WireLimits, *, borrows: bool = False
+    ) -> None:
+        self._borrows = borrows
         self._tail, self._next_byte = tail, 0
         self._frames, self._next_frame = frames, 0
         self._limits = limits
@@ -106,12 +124,19 @@ class ArrayReader:
         """Returns the array of the next descriptor, native in byte order and C-contiguous.
         Raises ``RemoteProtocolError``: its bytes are missing, or not what the descriptor says.
         """
-        dtype, shape, nbytes, own_frame = parse_descriptor(descriptor)
+        return self.read(*parse_descriptor(descriptor))
+
+    def read(
+        self, dtype: np.dtype[Any], shape: tuple[int, ...], nbytes: int, own_frame: bool
+    ) -> Array:
+        """The same of what ``parse_descriptor`` has made of it."""
         if not nbytes:
             return np.empty(shape, dtype)
         array: Array
         if own_frame:
-            array = np.ndarray(shape, dtype, self._frame(nbytes)).copy()
+            array = np.ndarray(shape, dtype, self._frame(nbytes))
+            if not self._borrows or dtype.kind in "bUM":  # these are copied, and then looked at
+                array = array.copy()
         else:
             array = np.ndarray(shape, dtype, self._slice(nbytes))
         if dtype.kind in "bUM":
@@ -245,7 +270,7 @@ def _plain_text(array: Array) -> Array:
     return replaced.view(array.dtype).reshape(array.shape)
 
 
-def _raw(array: Array) -> memoryview:
+def raw(array: Array) -> memoryview:
     """Returns the array's bytes in C order, without a copy where it is contiguous."""
     view: memoryview = np.ascontiguousarray(array).reshape(-1).view(np.uint8).data
     return view
@@ -335,14 +360,65 @@ def _write_text_scalar(encoder: Encoder, value: np.str_ | np.bytes_) -> object:
 
 
 def _write_tensor(encoder: Encoder, tensor: Any) -> object:
-    name = str(tensor.dtype).rpartition(".")[2]
-    if name not in wire.TENSOR_DTYPES or str(tensor.layout) != "torch.strided":
+    name, array = _bits(tensor)
+    if array is None:
         return encoder.unknown(tensor)
-    plain = tensor.detach().cpu().resolve_conj().resolve_neg()
-    if name == "bfloat16":
-        plain = plain.view(sys.modules["torch"].int16)
-    array = plain.numpy().view(wire.TENSOR_DTYPES[name])
     return [msgpack.ExtType(wire.TENSOR, name.encode()), array]
+
+
+def _bits(tensor: Any) -> tuple[str, Array | None]:
+    """Torch's name of a tensor's dtype, and its bits; None where it has no form."""
+    name, strided = _tensor_form(tensor.dtype, tensor.layout)
+    if not strided or name not in wire.TENSOR_DTYPES:
+        return name, None
+    try:
+        return name, tensor.numpy()
+    except (RuntimeError, TypeError):  # it has a gradient, lies elsewhere, or is a view of a kind
+        plain = tensor.detach().cpu().resolve_conj().resolve_neg()
+        if name == "bfloat16":
+            plain = plain.view(sys.modules["torch"].int16)
+        return name, plain.numpy().view(wire.TENSOR_DTYPES[name])
+
+
+@lru_cache(maxsize=64)
+def _tensor_form(dtype: Any, layout: Any) -> tuple[str, bool]:
+    """The name of a dtype, and whether the layout is the usual one."""
+    return str(dtype).rpartition(".")[2], str(layout) == "torch.strided"
+
+
+def outlined(value: Any) -> tuple[Any, Array | None]:
+    """All that the descriptor of an array of numbers or of a tensor depends on, and the array; of a
+    scalar of numpy's, its class.
+    """
+    kind = type(value)
+    if kind is np.ndarray and value.dtype.char in _CODES and value.dtype.isnative:
+        return (kind, value.dtype.char, value.shape), value
+    if kind in _NUMBERS:
+        return kind, None
+    if kind is getattr(sys.modules.get("torch"), "Tensor", None):
+        name, array = _bits(value)
+        if array is not None:
+            return (kind, name, array.shape), array
+    return None, None
+
+
+def written(value: Any, in_tail: Iterator[bool]) -> bytes | None:
+    """The piece of a document for a value that is ``outlined``; None for a scalar."""
+    kind = type(value)
+    if kind in _NUMBERS:
+        return None
+    head, array = b"", value
+    if kind is not np.ndarray:
+        name, array = _bits(value)
+        tensor_head = msgpack.ExtType(wire.TENSOR, name.encode())
+        head = msgpack.Packer().pack_array_header(2) + msgpack.packb(tensor_head)
+    described = _descriptors(array.dtype, array.shape)[0 if next(in_tail) else 1]
+    return bytes(head + msgpack.packb(msgpack.ExtType(wire.ARRAY, described)))
+
+
+def scalar(value: np.generic) -> Any:
+    """What msgpack packs for a scalar of numpy's that is ``outlined``."""
+    return msgpack.ExtType(wire.SCALAR, _SCALAR_CODES[type(value)] + value.tobytes())
 
 
 def write_numpy(encoder: Encoder, value: Any) -> object:
@@ -414,6 +490,11 @@ def _build_tensor(payload: bytes, items: list[Any], tensors: Tensors) -> object:
     array = items[0] if len(items) == 1 else None
     if not isinstance(array, np.ndarray) or array.dtype.name != wire.TENSOR_DTYPES.get(name):
         raise RemoteProtocolError("A tensor is not made of a fitting array.")
+    return tensor(array, name, tensors)
+
+
+def tensor(array: Array, name: str, tensors: Tensors) -> object:
+    """The tensor of such bits; without a maker of tensors, an array."""
     if tensors is not None:
         return tensors(array, name)
     return widened_numpy(array) if name == "bfloat16" else array

@@ -60,11 +60,15 @@ class Decoder:
         tensors: Makes a tensor of an array and a dtype name (``"bfloat16"`` comes as uint16
             bits). Without it tensors come as arrays, bfloat16 as float32.
         things: Begins to make what is described. Decoders without it refuse descriptions.
+        borrows: As ``ArrayReader`` has it. What is described is made of copies all the same.
+
+    Attributes:
+        notes: Where each array and its descriptor are noted; None where nobody asks.
     """
 
     __slots__ = (
-        *("_arrays", "_buffers", "_hashed_keys", "_heads", "_make", "_tail"),
-        *("limits", "tensors", "things", "unpickler"),
+        *("_arrays", "_borrows", "_buffers", "_hashed_keys", "_heads", "_make", "_tail"),
+        *("limits", "notes", "tensors", "things", "unpickler"),
     )
 
     def __init__(
@@ -75,12 +79,16 @@ class Decoder:
         unpickler: Unpickler | None,
         tensors: TensorMaker | None,
         things: ThingReader | None = None,
+        *,
+        borrows: bool = False,
     ) -> None:
+        self._borrows = borrows
         self._tail, self._buffers, self.limits = tail, buffers, limits
         self.unpickler, self.tensors, self.things = unpickler, tensors, things
         self._arrays: ArrayReader | None = None
         self._make: Callable[[int, object], object] | None = None
         self._heads = self._hashed_keys = 0
+        self.notes: list[tuple[Array, bytes]] | None = None
 
     def value(self, document: bytes) -> object:
         """Decodes a document. Trust: input from the other side.
@@ -151,8 +159,12 @@ class Decoder:
         if self._arrays is None:
             from envhub_worker.protocol.codec.arrays import ArrayReader
 
-            self._arrays = ArrayReader(self._tail, self._buffers, self.limits)
-        return self._arrays.take(descriptor)
+            reader = ArrayReader(self._tail, self._buffers, self.limits, borrows=self._borrows)
+            self._arrays = reader
+        array = self._arrays.take(descriptor)
+        if self.notes is not None:
+            self.notes.append((array, descriptor))
+        return array
 
     def make(self, head: _Head, items: list[Any]) -> object:
         """What is described; all of one message share a budget."""
@@ -160,7 +172,7 @@ class Decoder:
             raise RemoteProtocolError("The message describes what is not made here.")
         if self._make is None:
             self._make = self.things(self.limits)
-        return self._make(head.code, items[0])
+        return self._make(head.code, _owned(items[0]) if self._borrows else items[0])
 
     def check_keys(self, keys: list[Any]) -> None:
         """Refuses keys chosen to collide, which would make a dict or set take quadratic time."""
@@ -175,6 +187,15 @@ class Decoder:
         same = Counter(chosen).most_common(1)
         if same and same[0][1] > _MAX_SAME_HASH:
             raise RemoteProtocolError("Keys were chosen so that their hashes collide.")
+
+
+def _owned(value: Any) -> Any:
+    """A plain value with copies of its arrays, which nobody writes while they are checked."""
+    if type(value) is dict:
+        return {key: _owned(item) for key, item in value.items()}
+    if type(value) is list or type(value) is tuple:
+        return type(value)(map(_owned, value))
+    return value.copy() if hasattr(value, "dtype") else value
 
 
 def _distinct(keys: list[Any]) -> list[Any]:

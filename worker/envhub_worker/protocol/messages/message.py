@@ -7,25 +7,28 @@ class says. Trust: what comes from a jail is hostile.
 
 Between client and server an id ties a reply to its request. It stands in front of the header, so
 that a message that recurs is the same bytes again. Packets to a runner have ids of their own.
-
-What recurs, such as calls and what a server is asked, is encoded and decoded once: what the codec
-has made of a document without arrays is kept, when it is met again, as a *form*. The key is the
-whole document, or all that it depends on, so a form says exactly what the codec would say. Forms
-are few and small: a peer that sends nothing twice gains nothing and costs nothing.
 """
 
 from __future__ import annotations
 
+import contextlib
 import struct
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, ClassVar, Generic, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 from envhub_worker.protocol.codec.decoder import Decoder, TensorMaker, ThingReader, Unpickler
 from envhub_worker.protocol.codec.encoder import Describer, encode
-from envhub_worker.protocol.codec.wire import Buffer, Pickler, split_frames
+from envhub_worker.protocol.codec.wire import DOCUMENT_BYTES, Buffer, Pickler, split_frames
 from envhub_worker.protocol.errors import UNTRUSTED, LocalProtocolError, RemoteProtocolError
 from envhub_worker.protocol.limits import DEFAULT_LIMITS, WireLimits
+from envhub_worker.protocol.messages.forms import (
+    MAX_DOCUMENT_BYTES,
+    Forms,
+    Incoming,
+    Outgoing,
+    Outlined,
+)
 from envhub_worker.protocol.records import About, FrozenRecord
 
 if TYPE_CHECKING:
@@ -119,143 +122,12 @@ def check_fields(cls: type[Message], values: list[object]) -> None:
             )
 
 
-_MAX_HEADER_BYTES = 1024
-_MAX_FORMS = 256
-_MAX_ITEMS = 32
-_MAX_TEXT = 256
-_CONSTANTS = frozenset({int, bool, str, bytes, type(None)})
-_BITS = struct.Struct("<d")
-_TEXTS = frozenset({str, bytes})
-
-K = TypeVar("K")
-F = TypeVar("F")
-
-
-class Forms(Generic[K, F]):
-    """Forms by key; one is made when its key is met for the second time.
-
-    Until then there is no more of a key than its hash: most keys of a server come once, with the
-    number of a jail or a time in them, and some are large. Two keys of one hash only get forms
-    earlier, for a form is kept under the whole key.
-    """
-
-    def __init__(self) -> None:
-        self._forms: dict[K, F] = {}
-        self._once: set[int] = set()
-        self.get = self._forms.get
-
-    def met(self, key: K, make: Callable[[], F]) -> None:
-        """Take note of a key that has no form, or none that holds.
-
-        The codec has already made the message. So if ``make`` fails, for whatever reason, there is
-        no form, and the codec makes the next message of this key too.
-        """
-        hashed = hash(key)
-        if hashed not in self._once and key not in self._forms:
-            if len(self._once) >= _MAX_FORMS:
-                self._once.clear()
-            self._once.add(hashed)
-            return
-        self._once.discard(hashed)
-        try:
-            form = make()
-        except Exception:
-            return
-        if len(self._forms) >= _MAX_FORMS:
-            self._forms.clear()
-        self._forms[key] = form
-
-
-class Outgoing(NamedTuple):
-    """The frames of messages of one outline, and the limits that they were encoded for."""
-
-    frames: list[Buffer]
-    limits: WireLimits
-
-
-class Incoming:
-    """What to make of a document that was decoded before.
-
-    Args:
-        document: All of it.
-        make: The class of the message.
-        limits: For which it was decoded, and holds.
-
-    Raises:
-        Exception: There is no form for it: it holds more than constants, tuples, lists and dicts.
-    """
-
-    __slots__ = ("_fields", "_make", "_message", "limits")
-
-    def __init__(self, document: bytes, make: type[Message], limits: WireLimits) -> None:
-        self.limits = limits
-        self._make = make
-        value: Any = Decoder(b"", (), limits, None, None).value(document)
-        fields = value[1:]
-        self._fields = _maker(tuple(fields))
-        self._message = make(*fields)
-
-    def message(self) -> Message:
-        """The message; what of it can be changed is fresh."""
-        return self._message if self._fields is None else self._make(*self._fields())
-
-
-class _IrregularError(Exception):
-    """There is no form for this."""
-
-
-def _maker(value: Any) -> Callable[[], Any] | None:
-    """Makes a fresh value like this one; None where it cannot be changed."""
-    kind = type(value)
-    if kind in _CONSTANTS or kind is float:
-        return None
-    if kind is dict and not set(map(type, value)) - {str}:
-        named = [(key, item, _maker(item)) for key, item in value.items()]
-        return lambda: {key: make() if make else item for key, item, make in named}
-    if kind is not tuple and kind is not list:
-        raise _IrregularError
-    parts = [(item, _maker(item)) for item in value]
-    if kind is list:
-        return lambda: [make() if make else item for item, make in parts]
-    if all(make is None for _, make in parts):
-        return None
-    return lambda: tuple([make() if make else item for item, make in parts])
-
-
-def outline(values: list[Any]) -> tuple[Any, ...] | None:
-    """All that the document of these values depends on.
-
-    None if they hold anything but constants, and small tuples, lists and dicts.
-    """
-    try:
-        return tuple([_outlined(value) for value in values])
-    except (_IrregularError, RecursionError):  # deep or cyclic: the codec says what is wrong
-        return None
-
-
-def _outlined(value: Any) -> Any:
-    kind = type(value)
-    if kind is float:
-        return kind, _BITS.pack(value)  # 0.0 is -0.0, and nan is not nan
-    if kind in _CONSTANTS:
-        if kind in _TEXTS and len(value) > _MAX_TEXT:
-            raise _IrregularError
-        return kind, value
-    if kind is dict and len(value) <= _MAX_ITEMS:
-        if set(map(type, value)) - {str}:
-            raise _IrregularError
-        return kind, tuple([(key, _outlined(item)) for key, item in value.items()])
-    if (kind is tuple or kind is list) and len(value) <= _MAX_ITEMS:
-        return kind, tuple([_outlined(item) for item in value])
-    raise _IrregularError
-
-
 _NUMBER = struct.Struct(">Q")
 """The id in front of a header between client and server; 0 for ``CompressionHeader`` alone."""
 _MOST = (1 << 63) - 1
 _OUTGOING: Forms[Any, Outgoing] = Forms()
-_INCOMING: Forms[bytes, Incoming] = Forms()
-"""By the whole header, where that is nothing but the document."""
+_INCOMING: Forms[bytes, Incoming[Message]] = Forms()
+"""By the document, with its length in front: the whole header, where there are no arrays."""
 
 
 def pack(
@@ -276,19 +148,21 @@ def pack(
     values = values_of(message)
     if pickler is not None and cls.HANDED:
         values = _handed(message, values, pickler, limits)
-    key = cls, outline(values)
-    if key[1] is None:
+    outlined = Outlined(values)
+    if outlined.key is None:
         return _encoded(message, values, pickler, limits, describer, reduces=reduces)
+    key = cls, outlined.key
     form = _OUTGOING.get(key)
     if form is not None and form.limits is limits:
-        return list(form.frames)
+        with contextlib.suppress(UnicodeEncodeError):
+            return form.frames(outlined)
     try:
         frames = _encoded(message, values, pickler, limits)
     except LocalProtocolError:
         if not reduces:
             raise
         return _encoded(message, values, pickler, limits, describer, reduces=True)
-    _OUTGOING.met(key, lambda: Outgoing(list(frames), limits))
+    _OUTGOING.met(key, lambda: Outgoing(cls.kind, values, frames, outlined, limits))
     return frames
 
 
@@ -342,18 +216,26 @@ def unpack(
     unpickler: Unpickler | None = None,
     tensors: TensorMaker | None = None,
     things: ThingReader | None = None,
+    borrows: bool = False,
 ) -> Message:
-    """The message of some frames. Raises ``RemoteProtocolError``: the peer broke the rules."""
+    """The message of some frames; ``borrows``: as ``Decoder`` has it.
+    Raises ``RemoteProtocolError``: the peer broke the rules.
+    """
     with UNTRUSTED:
         header = _alone(frames)
         form = _INCOMING.get(header)
         if form is not None and form.limits is limits:
-            return form.message()
+            return form.message(tensors=tensors)
         document, tail, buffers = split_frames(frames, limits)
-        decoder = Decoder(tail, buffers, limits, unpickler, tensors, things)
+        if len(document) <= MAX_DOCUMENT_BYTES:
+            key = DOCUMENT_BYTES.pack(len(document)) + document
+            form = _INCOMING.get(key)
+            if form is not None and form.limits is limits:
+                return form.message(tail, buffers, tensors, borrows=borrows)
+        decoder = Decoder(tail, buffers, limits, unpickler, tensors, things, borrows=borrows)
         message = _checked(decoder.value(document))
-        if header and not tail:
-            _INCOMING.met(header, lambda: Incoming(document, type(message), limits))
+        if len(document) <= MAX_DOCUMENT_BYTES:
+            _INCOMING.met(key, lambda: Incoming(document, tail, buffers, type(message), limits))
         return message
 
 
@@ -362,7 +244,7 @@ def _alone(frames: Sequence[Buffer]) -> bytes:
     if len(frames) != 1:
         return b""
     header = frames[0] if type(frames[0]) is bytes else memoryview(frames[0]).cast("B")
-    return bytes(header) if len(header) <= _MAX_HEADER_BYTES else b""
+    return bytes(header) if len(header) <= MAX_DOCUMENT_BYTES else b""
 
 
 def pack_header(message: Message, number: int) -> list[Buffer]:
