@@ -241,7 +241,7 @@ def said_once() -> None:
 
 
 def freezes() -> None:
-    """The repository's sub-environments in a rollout, beside the same in LeRobot's own wrapper."""
+    """Sub-environments that count their resets, beside the same in LeRobot's own wrapper."""
     wrapper = getattr(utils, "FreezeAfterEpisodeEnd", None)
     if wrapper is None:  # before 0.6
         FOUND["freezes"] = True
@@ -251,7 +251,7 @@ def freezes() -> None:
     os.environ.pop("REACHED")
     lengths = (2, 5, 3)
     theirs = SyncVectorEnv([lambda: wrapper(names["Reach"]())] * len(lengths))
-    envs = make_env("robots/reach", n_envs=len(lengths))
+    envs = make_env("robots/counting", n_envs=len(lengths))
     ours = envs["hub_env"][0]
     for env in (theirs, ours):
         env.set_attr("_max_episode_steps", list(lengths))
@@ -266,7 +266,8 @@ def freezes() -> None:
             pairs = [env.step(actions) for env in (theirs, ours)]  # type: ignore[misc]
             same.append(alike(theirs.call("render"), ours.call("render")))
     steps = [env.get_attr("steps") for env in (theirs, ours)]
-    FOUND["freezes"] = all(same) and steps == [lengths, lengths]
+    resets = [env.get_attr("resets") for env in (theirs, ours)]
+    FOUND["freezes"] = all(same) and [*steps, *resets] == [lengths, lengths, (2, 2, 2), (2, 2, 2)]
     theirs.close()
     envs.close()
 

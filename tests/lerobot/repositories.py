@@ -60,6 +60,14 @@ def make_env(n_envs=1, use_async_envs=False, cfg=None):
     return vector([Reach] * n_envs)
 '''
 
+# takes the next of its initial states at each reset, as LIBERO does
+COUNTING = REACH.replace(
+    "        self.steps = 0\n",
+    "        self.resets = getattr(self, 'resets', 0) + 1\n"
+    "        self.goal += self.resets\n        self.steps = 0\n",
+)
+assert COUNTING != REACH
+
 SUITES = """
 import gymnasium as gym
 from reach import Reach
@@ -229,6 +237,7 @@ def publish(olah: OlahServer) -> dict[str, str]:
     commits = {}
     for name, files in {
         "reach": {"env.py": REACH, "envs/reach_task.py": REACH},
+        "counting": {"env.py": COUNTING},
         "suites": {"env.py": SUITES, "reach.py": REACH},
         "single": {"env.py": SINGLE, "reach.py": REACH},
         "configured": {"env.py": CONFIGURED, "reach.py": REACH},

@@ -9,7 +9,7 @@ import pytest
 
 from tests.hub.olah_server import OlahServer
 from tests.lerobot.kit import run, written
-from tests.lerobot.repositories import REACH, publish
+from tests.lerobot.repositories import COUNTING, publish
 
 pytest.importorskip("torch")
 
@@ -74,7 +74,7 @@ def test_the_pages_hold(olah: OlahServer, tmp_path: Path) -> None:
     """With LeRobot's own functions, in one process, which has loaded nothing of the Hub after."""
     olah.repository("robots/policy").commit({"config.json": POLICY})
     commits, (commands, python) = publish(olah), written("robots/reach")
-    arguments = json.dumps(commits), json.dumps(commands), python, REACH
+    arguments = json.dumps(commits), json.dumps(commands), python, COUNTING
     found = run("pages_program.py", olah, tmp_path, *arguments)
     features = found.pop("features")
     features.pop("observation.forces", None)  # LeRobot 0.6 hands it on, 0.4 does not
