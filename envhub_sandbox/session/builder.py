@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, NoReturn
 
 from envhub_sandbox.errors import LoadError, remote_error
 from envhub_sandbox.session.launcher import ExpectedManifest, Launcher, LoadedJail
-from envhub_sandbox.system import extras
 from envhub_sandbox.system.platform import OwnerProcess
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.replies import check_reply, typed_reply
@@ -241,9 +240,9 @@ class Builder:
         if not self._own:
             return relay  # a runner has one lane, and environments of one jail share theirs
         if server.fd_path is None or self._repository.policy.lane == "frames":
-            served = extras.find("envhub_sandbox.transport.shared_memory.served_lane", "ServedLane")
-            other: Lane = relay if served is None else served.open(relay, deadline)
-            return other
+            from envhub_sandbox.transport.shared_memory.served_lane import ServedLane
+
+            return ServedLane.open(relay, deadline)
         # late, for Linux alone has what they import
         from envhub_sandbox.transport.shared_memory.attachment import Attachment
         from envhub_sandbox.transport.shared_memory.client_slabs import RING

@@ -39,6 +39,7 @@ import os
 import sys
 from collections.abc import Callable, Sequence
 
+from envhub_worker import extras
 from envhub_worker.cli import serve
 
 
@@ -96,18 +97,18 @@ def _check_command(parser: argparse.ArgumentParser, names: list[str], argv: Sequ
 
 
 def _add_others(commands: argparse._SubParsersAction[argparse.ArgumentParser]) -> None:
-    from envhub_worker.cli import drain, health, keygen, listen, status
-
-    for name, command, what in (
-        ("listen", listen, "serve clients on other hosts, with keys"),
-        ("status", status, "print sessions, connections and jails of a server"),
-        ("drain", drain, "end a server after its open jails are closed"),
-        ("keygen", keygen, "make a CURVE key pair"),
-        ("health", health, "test whether the server on this machine answers"),
+    for name, what in (
+        ("listen", "serve clients on other hosts, with keys"),
+        ("status", "print sessions, connections and jails of a server"),
+        ("drain", "end a server after its open jails are closed"),
+        ("keygen", "make a CURVE key pair"),
+        ("health", "test whether the server on this machine answers"),
     ):
-        parser = commands.add_parser(name, help=what)
-        command.add_arguments(parser)
-        parser.set_defaults(run=command.run)
+        command = extras.find(f"cli.{name}")
+        if command is not None:
+            parser = commands.add_parser(name, help=what)
+            command.add_arguments(parser)
+            parser.set_defaults(run=command.run)
 
 
 if __name__ == "__main__":

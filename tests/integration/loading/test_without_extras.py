@@ -3,39 +3,33 @@
 from __future__ import annotations
 
 import json
+import shutil
 import subprocess
 import sys
+from pathlib import Path
+
+import pytest
 
 from tests.support.samples import sample
 from tests.unit.docs.test_extras import extra_of
 from tests.unit.docs.test_imports import modules
 
-_ALONE = """
-import importlib.abc, json, sys
-
-missing, repository = json.loads(sys.argv.pop(1)), sys.argv[1]
-
-class Missing(importlib.abc.MetaPathFinder):
-    def find_spec(self, name, path=None, target=None):
-        if name in missing:
-            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
-
-sys.meta_path.insert(0, Missing())
-"""
 _COMMAND = "from envhub_sandbox.cli.app import app; app()"
 _CALLS = """
+import json, sys
 import envhub_sandbox as hub
 from envhub_sandbox import errors
 
+repository, asked = sys.argv[1], json.loads(sys.argv[2])
 with hub.make_env(repository, n_envs=2) as envs:
     env = envs.env
     env.reset(seed=1)
     print(env.step(env.action_space.sample())[1].shape)
-for argument, value in json.loads(sys.argv[2]):
+for argument, value in asked:
     try:
         hub.make_env(**{"cfg": repository, argument: value})
     except errors.SandboxUnavailableError as error:
-        print(error)
+        print(str(error).splitlines()[0])
 """
 _ASKED = [
     ("cfg", "pypi:minigrid#MiniGrid-Empty-5x5-v0", "a reference of pypi", "hub.registered"),
@@ -47,38 +41,55 @@ _ASKED = [
     ("assets", ["org/data"], "assets", "hub.sources.assets"),
 ]
 """An argument, a value that needs an extra, how the error calls it, and the extra's module."""
+_RECORD = ["policy", {"record_denials": True}]
 
 
-def absent() -> list[str]:
-    """The client's modules of extras, without the folders that modules of the core lie in."""
-    core = {name for name in modules() if extra_of(name) is None}
-    parents = {name[:end] for name in core for end in range(len(name)) if name[end] == "."}
-    extras = modules().keys() - core - parents
-    return sorted(name for name in extras if name.startswith("envhub_sandbox."))
+@pytest.fixture(scope="module")
+def core(checkout: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with both packages, without the modules of extras."""
+    root = tmp_path_factory.mktemp("core")
+    for package in (checkout / "envhub_sandbox", checkout / "worker" / "envhub_worker"):
+        ignored = shutil.ignore_patterns("__pycache__")
+        shutil.copytree(package, root / package.name, ignore=ignored)
+    kept = {name for name in modules() if extra_of(name) is None}
+    kept |= {name[:end] for name in kept for end in range(len(name)) if name[end] == "."}
+    for name in modules().keys() - kept:
+        path = root.joinpath(*name.split("."))
+        if path.is_dir():
+            shutil.rmtree(path)
+        path.with_suffix(".py").unlink(missing_ok=True)
+    return root
 
 
-def alone(program: str, *arguments: str, code: int = 0) -> str:
-    """What a program prints where no extra can be imported."""
-    command = [sys.executable, "-c", _ALONE + program, json.dumps(absent()), *arguments]
+def alone(core: Path, program: str, *arguments: str, code: int = 0) -> str:
+    """What a program prints that has the core alone."""
+    # without what an editable installation adds, which has the extras
+    begin = (
+        f"import sys; sys.path.insert(0, {str(core)!r}); sys.meta_path[:] = [finder for finder in "
+        "sys.meta_path if 'editable' not in getattr(finder, '__module__', '')]\n"
+    )
+    command = [sys.executable, "-c", begin + program, *arguments]
     done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == code, done.stderr
+    assert done.returncode == code, done.stdout + done.stderr
     return done.stdout + done.stderr
 
 
-def test_the_core_needs_no_extra() -> None:
+def test_the_core_needs_no_extra(core: Path) -> None:
     """It makes an environment; what a caller asks for beyond that is named."""
-    asked = json.dumps([(argument, value) for argument, value, _, _ in _ASKED])
-    shape, *refused = alone(_CALLS, sample("cartpole"), asked).splitlines()[-1 - len(_ASKED) :]
+    asked = [*((argument, value) for argument, value, _, _ in _ASKED), _RECORD]
+    printed = alone(core, _CALLS, sample("cartpole"), json.dumps(asked)).splitlines()
+    shape, *refused, record = printed[-2 - len(_ASKED) :]
     assert shape == "(2,)"
     assert [line.partition(", which this")[0] for line in refused] == [
         f"{what} needs envhub_sandbox.{module}" for _, _, what, module in _ASKED
     ]
+    assert "installed without envhub_worker.lockdown.seccomp.evidence" in record
 
 
-def test_a_command_of_an_extra_is_named() -> None:
-    """Those of the core run."""
-    assert "steps/s" in alone(_COMMAND, "run", "examples:cartpole", "--episodes", "1")
-    for words in (["check", "x"], ["inspect", "x", "--static"], ["doctor", "tcp://a:1"]):
-        assert "which this installation of envhub-sandbox lacks" in alone(
-            _COMMAND, *words, code=2 if words[0] == "check" else 6
-        )
+def test_the_commands_of_the_core_run(core: Path, checkout: Path) -> None:
+    """Those of extras are named."""
+    example = str(checkout / "examples" / "cartpole")
+    assert "steps/s" in alone(core, _COMMAND, "run", example, "--n-envs", "4", "--episodes", "4")
+    for code, *words in ((2, "check", "x"), (6, "inspect", "x", "--static"), (6, "doctor", "tcp:")):
+        said = alone(core, _COMMAND, *words, code=code)
+        assert "which this installation of envhub-sandbox lacks" in said.replace("\n", " ")

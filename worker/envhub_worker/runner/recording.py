@@ -27,7 +27,7 @@ from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv, VectorEnv
 
 from envhub_worker.protocol.records import dataclass
 from envhub_worker.runner import gymnasium_compat as compat
-from envhub_worker.runner import old_gym
+from envhub_worker.runner.foreign import old_gym
 
 _KEY = "_envhub_recording"
 _ANSWERED = frozenset({"unwrapped", "spec", "closed", "close", "num_envs"})

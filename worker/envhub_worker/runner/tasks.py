@@ -18,7 +18,7 @@ from gymnasium.vector import VectorEnv
 from envhub_worker.protocol.manifest.manifest import TaskId
 from envhub_worker.protocol.spaces.differing import Pair, differing
 from envhub_worker.runner import gymnasium_compat as compat
-from envhub_worker.runner import old_gym
+from envhub_worker.runner.foreign import old_gym
 from envhub_worker.runner.recording import Recording, recording
 from envhub_worker.runner.sync_envs import SubEnvs
 from envhub_worker.runner.vector_spaces import (

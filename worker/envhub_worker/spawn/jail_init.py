@@ -32,12 +32,13 @@ import traceback
 from dataclasses import dataclass
 from typing import Any, NoReturn
 
+from envhub_worker import extras
 from envhub_worker.lockdown.context import Common, JailContext
 from envhub_worker.lockdown.layers import LayerUnavailableError
 from envhub_worker.lockdown.limits.watchdog import Watchdog
 from envhub_worker.lockdown.mechanisms import process, procfs, reap
 from envhub_worker.lockdown.plan import plan
-from envhub_worker.lockdown.seccomp import evidence, notify
+from envhub_worker.lockdown.seccomp import notify
 from envhub_worker.lockdown.seccomp.syscalls import NAMED
 from envhub_worker.lockdown.spec import JailSpec
 from envhub_worker.lockdown.stages import jail
@@ -45,6 +46,9 @@ from envhub_worker.lockdown.stages.runner import runner_paths
 from envhub_worker.protocol.confinement import Reason
 from envhub_worker.spawn import runner_entry
 from envhub_worker.spawn.channel import Channel, close_fds
+
+# before anything is confined
+evidence = extras.find("lockdown.seccomp.evidence")
 
 
 def run(control: int, output: int, common: Common) -> NoReturn:
@@ -115,6 +119,12 @@ class Init:
 
     def _set_up(self, message: dict[str, Any], fds: list[int]) -> None:
         spec = JailSpec.from_wire(message["spec"])
+        if spec.confinement.record_denials and evidence is None:
+            raise LayerUnavailableError(
+                "record_denials",
+                "this worker is installed without envhub_worker.lockdown.seccomp.evidence",
+                "Install the whole package, or leave out record_denials.",
+            )
         events, *joins = fds or [-1]
         layers = plan(
             spec.confinement,
@@ -224,6 +234,7 @@ class Init:
             if detail or not notify.is_own_affair(call, self._common.watched):
                 self._report_denied(call, detail)
             return
+        assert evidence is not None  # see ``_set_up``
         mine = runner_paths(self._jail, request.caller, request.thread)
         waits = request.still_waits
         for deed, path in evidence.asked(call, request.words, request.thread, mine, waits):

@@ -17,8 +17,8 @@ from collections.abc import Callable, Collection, Sequence
 from typing import BinaryIO
 
 from envhub_worker.lockdown.context import OwnPaths
-from envhub_worker.lockdown.mechanisms import procfs
-from envhub_worker.lockdown.seccomp.syscalls import NAMED, NAMING, SIGNUM, WHICH, c_int
+from envhub_worker.lockdown.seccomp.syscalls import NAMED, c_int
+from envhub_worker.lockdown.seccomp.targets import never_a_target
 from envhub_worker.protocol.text import printable
 
 _LONGEST_PATH = 4096
@@ -204,45 +204,3 @@ def _is_within(path: str, folders: Collection[str]) -> bool:
 def _shown(path: str) -> str:
     text = printable(path.encode(errors="backslashreplace").decode())[:_SHOWN]
     return text.replace("\n", "\\n").replace("\t", "\\t")
-
-
-#: The detail of a call that names another process.
-OTHER = "OTHER_PROCESS"
-
-_FIRST = 1
-_ENTRY = re.compile(r"/proc/(\d{1,18})(/.*)?", re.DOTALL)
-
-
-def is_another_target(call: str, arguments: Sequence[int], caller: int, init: int) -> bool:
-    """Whether a call, one of ``NAMING``, is about a process outside of its jail, as its init is.
-    ``arguments``: the first three, as C integers.
-    """
-    if call in WHICH and arguments[0] != WHICH[call]:
-        return False
-    if call in SIGNUM and arguments[SIGNUM[call]] == 0:
-        return False  # it only looks whether somebody is there
-    number = arguments[NAMING[call]]
-    if call == "kill" and number < 0:
-        return number == -1 or _never_was(-number)
-    if number <= 0 or (call == "pidfd_open" and number == init):
-        return False
-    process = procfs.process_of(number)
-    if process == 0:
-        return _never_was(number)  # else it may have been a child's: then nothing is said of it
-    return process == init or (process != caller and not procfs.is_below(process, init))
-
-
-def never_a_target(path: str) -> bool:
-    """Whether a path is below the entry of a process that the jail cannot have met."""
-    entry = _ENTRY.fullmatch(path)
-    return entry is not None and _never_was(int(entry[1]))
-
-
-def _never_was(number: int) -> bool:
-    """Whether a jail's own namespace has not yet come to that number, or no other can.
-
-    A host begins again at low numbers, and a jail hardly ever lives that long.
-    """
-    is_ours = os.getpid() == _FIRST
-    most = procfs.text("/proc/loadavg" if is_ours else "/proc/sys/kernel/pid_max")
-    return most is not None and number > int(most.split()[-1])

@@ -21,9 +21,9 @@ import struct
 from collections.abc import Callable, Collection
 
 from envhub_worker.lockdown.mechanisms import kernel, procfs
-from envhub_worker.lockdown.seccomp.evidence import OTHER, is_another_target
 from envhub_worker.lockdown.seccomp.policy import WITHOUT_ATTRIBUTES, refusal
 from envhub_worker.lockdown.seccomp.syscalls import NAMING, PRETENDED, c_int, syscall_name
+from envhub_worker.lockdown.seccomp.targets import OTHER, is_another_target
 from envhub_worker.protocol.records import dataclass
 
 _RECEIVE = 0xC0502100
