@@ -73,8 +73,8 @@ export ENVHUB_CI=1 ENVHUB_TEST_IMAGE=$image
 if [ -x "$CI_WORK/tests/venv/bin/python" ]; then
   cd "$CI_WORK/tests/checkout"
   with_summary container bash "$CI_AGAIN" "$CI_WORK/tests/venv/bin/python" -m pytest -n 2 --dist loadfile \
-    tests/containers
+    --durations=20 tests/containers
 else
   export ENVHUB_TEST_DIR=$CI_WORK/container ENVHUB_TEST_RUNNER="bash $CI_AGAIN"
-  with_summary container ./test -n 2 --dist loadfile tests/containers
+  with_summary container ./test -n 2 --dist loadfile --durations=20 tests/containers
 fi

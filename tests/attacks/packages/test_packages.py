@@ -58,7 +58,7 @@ def seen_in_a_jail(arena: Arena, repository: Path, runtime: Runtime) -> list[str
         return list(found)
 
 
-def test_nothing_of_a_package_runs_outside_of_its_jail(arena: Arena, place: Path) -> None:
+def test_nothing_of_a_package_runs_outside_of_its_jail(strict: Arena, place: Path) -> None:
     """Not at the start of an interpreter, and not in the place of what the worker imports."""
     home, folder = place.parent, place / "trapped"
     traps.real_packages(folder)
@@ -68,16 +68,16 @@ def test_nothing_of_a_package_runs_outside_of_its_jail(arena: Arena, place: Path
     assert ran == list(traps.TRAPS), "a control failed"
     for name in traps.TRAPS:
         traps.canary(home, name).unlink()
-    found = seen_in_a_jail(arena, place / "repository", Runtime(base_interpreter(), str(folder)))
+    found = seen_in_a_jail(strict, place / "repository", Runtime(base_interpreter(), str(folder)))
     # in the jail they are what they claim to be, but for the names of what was there before
     expected = {"a .pth file", "its own msgpack", "its own numpy"}
     assert set(found[1:]) == expected
     for name in traps.TRAPS:
         through = traps.canary(home, name).exists()
-        arena.judge(f"run before there is a jail: {name}", "succeeds", through, "")
+        strict.judge(f"run before there is a jail: {name}", "succeeds", through, "")
 
 
-def test_plugins_of_gymnasium_run_in_the_jail_only(arena: Arena, place: Path) -> None:
+def test_plugins_of_gymnasium_run_in_the_jail_only(strict: Arena, place: Path) -> None:
     """Gymnasium 0.29 imports every entry point ``gymnasium.envs`` when it is imported itself."""
     home, folder, name = place.parent, place / "old", "an entry point gymnasium.envs"
     runtime = install(folder, "gymnasium==0.29.1", "numpy==1.26.4")
@@ -89,9 +89,9 @@ def test_plugins_of_gymnasium_run_in_the_jail_only(arena: Arena, place: Path) ->
     traps.use_unprotected(folder, place / "control")
     assert traps.canary(home, name).exists(), "the control failed"
     traps.canary(home, name).unlink()
-    assert seen_in_a_jail(arena, place / "repository", runtime) == ["0.29.1", name]
+    assert seen_in_a_jail(strict, place / "repository", runtime) == ["0.29.1", name]
     through = traps.canary(home, name).exists()
-    arena.judge(f"run before there is a jail: {name}", "succeeds", through, "")
+    strict.judge(f"run before there is a jail: {name}", "succeeds", through, "")
 
 
 def test_a_jail_of_another_environment_is_out_of_reach(arena: Arena, place: Path) -> None:

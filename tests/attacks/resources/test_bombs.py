@@ -271,9 +271,9 @@ def test_disk_cannot_be_filled(
     )
 
 
-def test_processor_time_runs_out(arena: Arena) -> None:
+def test_processor_time_runs_out(strict: Arena) -> None:
     """A process that burns more than its seconds is killed, ignore the warning as it may."""
-    arena.attack(
+    strict.attack(
         "burn processor time",
         "spin",
         lambda run: sum(spent(pid) for pid in run.pids()) > (CPU_S + SPIN_S) / 2,

@@ -85,7 +85,7 @@ def test_open_files_are_not_inherited(arena: Arena, inherited: str) -> None:
         arena.judge("read inherited descriptors", "succeeds", inherited in run.text, run.text)
 
 
-def test_descriptors_cannot_be_pushed_into_the_server(arena: Arena, home: Path) -> None:
+def test_descriptors_cannot_be_pushed_into_the_server(strict: Arena, home: Path) -> None:
     """What a jail attaches to its messages is never received: the server's table does not grow."""
     name = f"pushed-{token()[:8]}"
     path = home / "receiver"
@@ -100,14 +100,14 @@ def test_descriptors_cannot_be_pushed_into_the_server(arena: Arena, home: Path) 
             for fd in fds:
                 os.close(fd)
     assert any(name in link for link in received), "the control of pushing failed"
-    with arena.environment() as other:
+    with strict.environment() as other:
         other.reset()
-        with arena.environment() as env:
+        with strict.environment() as env:
             run = run_in(env, "send_descriptor", name=name, path="")
             held = [link for process in servers() for link in open_files(process)]
         other.reset()
     pushed = any(name in link for link in held)
-    arena.judge("push descriptors over the stream (SCM_RIGHTS)", "succeeds", pushed, run.text)
+    strict.judge("push descriptors over the stream (SCM_RIGHTS)", "succeeds", pushed, run.text)
 
 
 def open_files(pid: int) -> list[str]:
@@ -216,11 +216,11 @@ NOISE = {
 
 @pytest.mark.short("strict-ff")
 @pytest.mark.parametrize("noise", NOISE.values(), ids=NOISE)
-def test_noise_on_the_stream_ends_only_its_jail(arena: Arena, noise: bytes) -> None:
+def test_noise_on_the_stream_ends_only_its_jail(strict: Arena, noise: bytes) -> None:
     """A jail that writes past our code to its stream is killed; server and neighbours go on."""
-    with arena.environment() as other:
+    with strict.environment() as other:
         other.reset()
-        with arena.environment() as env:
+        with strict.environment() as env:
             env.reset()
             before = resident()
             run = Run(new_alias(), True)
@@ -231,7 +231,7 @@ def test_noise_on_the_stream_ends_only_its_jail(arena: Arena, noise: bytes) -> N
         other.step([0])
     text = str(caught.value)
     through = grown > 64 << 20 or "rules" not in text
-    arena.judge("write noise to the stream", "succeeds", through, f"{text} (grew {grown})")
+    strict.judge("write noise to the stream", "succeeds", through, f"{text} (grew {grown})")
 
 
 def make_noise(env: Any, noise: bytes, run: Run) -> None:

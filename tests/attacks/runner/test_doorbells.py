@@ -57,13 +57,14 @@ def test_a_shared_description_holds_its_writer(tmp_path: Path) -> None:
             os.close(bell)
 
 
-@pytest.mark.short("strict")
+@pytest.mark.short
 @pytest.mark.parametrize("what", WAYS)
-def test_no_client_is_held_by_its_doorbells(arena: Arena, home: Path, what: str) -> None:
-    """Whatever is done to them; by the act that has a control under every profile."""
+def test_no_client_is_held_by_its_doorbells(strict: Arena, home: Path, what: str) -> None:
+    """Whatever is done to them."""
     acts, order = WAYS[what]
-    acts = acts if arena.profile == "strict" else ["block"]
-    ended, said = watched(arena, home, acts, **order)
-    arena.judge(f"hold the client{what} by a doorbell", "succeeds", not ended, "; ".join(said[-3:]))
+    ended, said = watched(strict, home, acts, **order)
+    strict.judge(
+        f"hold the client{what} by a doorbell", "succeeds", not ended, "; ".join(said[-3:])
+    )
     if what == "'s step":
         assert {f"{act} WorkerTimeoutError" for act in acts} <= set(said), said
