@@ -33,7 +33,7 @@ import sysconfig
 import types
 from typing import Any
 
-_SHARED = ("attachment", "lane")
+_SHARED = ("attachment", "column_lane", "lane")
 LINUX_ALONE = (
     "envhub_sandbox.dependencies.for_a_server",
     "envhub_sandbox.sandboxes.docker.monitor",
