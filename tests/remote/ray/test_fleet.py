@@ -16,7 +16,7 @@ from tests.compliance.pair import Pair
 from tests.compliance.vector_env import Case, VectorEnvCompliance, paired
 from tests.faults.mortal import LIVE
 from tests.remote.ray.clusters import add_node, node_of, servers
-from tests.support.command_line import gone
+from tests.support.command_line import below, gone
 from tests.support.processes import eventually
 from tests.support.samples import reference, sample
 from tests.support.started import started
@@ -63,18 +63,19 @@ def test_a_lost_node_loses_its_rows_alone(cluster: Any) -> None:
             assert results_equal(env.step(actions), expected)
             assert results_equal(other.step(actions), expected)
             victim, _ = (placed() - spread).most_common(1)[0]
-            there = [server for server in servers() if node_of(server) == victim]
+            lost = [server for server in servers() if node_of(server) == victim]
+            lost += [process for server in lost for process in below(server.pid)]
             cluster.remove_node(nodes.pop(victim), allow_graceful=False)
-            assert eventually(lambda: gone(there))
+            assert eventually(lambda: gone(lost))
             expected = oracle.step(actions)
-            with pytest.raises(WorkerDiedError, match=f"on Ray's node {victim[:12]}"):
+            with pytest.raises(WorkerDiedError, match=f"on Ray's node {victim[:12]}: Ray says"):
                 other.step(actions)
-            observations, rewards, _, lost, infos = env.step(actions)
-            assert np.array_equal(infos["worker_restarted"], lost)
-            assert lost.sum() == spread[victim] * ROWS // WORKERS
-            assert observations[lost, 1].tolist() == [0.0] * int(lost.sum())
-            assert np.array_equal(observations[~lost], expected[0][~lost])
-            assert np.array_equal(rewards[~lost], expected[1][~lost])
+            observations, rewards, _, anew, infos = env.step(actions)
+            assert np.array_equal(infos["worker_restarted"], anew)
+            assert anew.sum() == spread[victim] * ROWS // WORKERS
+            assert not observations[anew, 1].any()
+            assert np.array_equal(observations[~anew], expected[0][~anew])
+            assert np.array_equal(rewards[~anew], expected[1][~anew])
             assert np.array_equal(other.reset(seed=5)[0], oracle.reset(seed=5)[0])
             assert results_equal(other.step(actions), oracle.step(actions))
             assert set(placed()) <= set(nodes)
