@@ -18,7 +18,7 @@ from typer.core import TyperCommand, TyperGroup
 from envhub_sandbox.cli.shared.console import expects_json, guarded, out, print_json_error, say
 from envhub_sandbox.cli.shared.exits import EXIT_CODES, Exit, reported
 from envhub_sandbox.errors import SandboxUnavailableError
-from envhub_sandbox.settings.options import on_command_line, use_option_names
+from envhub_sandbox.settings.options import OPTIONS, on_command_line, use_option_names
 from envhub_sandbox.system import extras
 
 Where = Mapping[str, str]
@@ -67,6 +67,8 @@ _COMMANDS: dict[str, tuple[str, str | Where]] = {
     "image": ("Build container images for repositories.", {"build": "image:build"}),
 }
 
+_FIRST = {"--n-envs", "--network", "--sandbox", "--task"}
+"""Of the options of ``make_env`` those that a help has; ``--help-all`` has them all."""
 _REPLACED = {
     "push": "envhub check . && hf upload OWNER/NAME .",
     "verify": "envhub lock --check FILE",
@@ -151,13 +153,30 @@ class Command(TyperCommand):
         with use_option_names(on_command_line(known)):
             return super().invoke(ctx)
 
+    def parse_args(self, ctx: Any, args: list[str]) -> Any:
+        """``--help-all`` is ``--help`` that leaves nothing out."""
+        self._whole_help = "--help-all" in args
+        return super().parse_args(ctx, ["--help" if a == "--help-all" else a for a in args])
+
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Print the help, in which rich reads no ``[word]`` of an option as markup."""
         for one in self.params:
             text = getattr(one, "help", None)
             if text:
                 vars(one)["help"] = text.replace("[", "\\[")
+        later = [] if self._whole_help else [one for one in self.params if _comes_later(one)]
+        for one in later:
+            vars(one)["hidden"] = True
+        if later:
+            self.epilog = f"{len(later)} more options: {ctx.command_path} --help-all"
         super().format_help(ctx, formatter)
+
+
+def _comes_later(parameter: Any) -> bool:
+    """Whether it is an option of ``make_env`` that few need."""
+    panels = {option.panel for option in OPTIONS.values()}
+    panel = getattr(parameter, "rich_help_panel", None)
+    return panel in panels and not _FIRST.intersection(parameter.opts)
 
 
 def functions(name: str) -> dict[str, Callable[..., None]]:

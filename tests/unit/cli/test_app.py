@@ -42,10 +42,10 @@ LISTED = typer.main.get_command(app).commands  # type: ignore[attr-defined]
 _COMMANDS = dict(commands())
 
 
-def help_of(name: str, width: int = _WIDTH) -> str:
-    """What ``--help`` prints."""
+def help_of(name: str, width: int = _WIDTH, option: str = "--help-all") -> str:
+    """What a help prints."""
     done = CliRunner().invoke(
-        app, [*name.split(), "--help"], env={"COLUMNS": str(width), "TERM": "dumb"}
+        app, [*name.split(), option], env={"COLUMNS": str(width), "TERM": "dumb"}
     )
     assert done.exit_code == 0, done.output
     return done.output
@@ -81,6 +81,17 @@ def test_a_help_loads_nothing_heavy(words: list[str], shown: str, unwanted: set[
         f"sys.exit(' '.join({_HEAVY | unwanted} & set(sys.modules)) or 0)"
     )
     assert shown in python("-c", code).stdout
+
+
+def test_the_help_has_what_most_need_and_says_how_to_see_the_rest() -> None:
+    """Both in a terminal's usual width; the control is the whole help."""
+    short, whole = help_of("run", 80, "--help"), help_of("run", 80)
+    shown, every = (re.findall(r"^│[ *]*(--[\w-]+)", text, re.M) for text in (short, whole))
+    assert {"--episodes", "--video", "--n-envs", "--sandbox", "--network"} < set(shown)
+    assert len(shown) == 12
+    assert short.count("\n") <= 50
+    assert f"{len(every) - len(shown)} more options: envhub run --help-all" in short
+    assert "more options" not in whole
 
 
 @pytest.mark.parametrize("name", _COMMANDS)
