@@ -7,7 +7,7 @@ set -euo pipefail
 . "$(dirname "${BASH_SOURCE[0]}")/../lib.sh"
 unset PYTHON "${!ENVHUB_@}"
 export ENVHUB_TEST_RUNNER="bash $CI_AGAIN"
-mapfile -t commands < <(awk '/^```sh$/ {inside = 1; next} /^```$/ {inside = 0} inside' README.md | head -2)
+mapfile -t commands < <(awk '/^```sh$/ {inside = 1; next} /^```$/ {inside = 0} inside' README.md | grep -E '^(python3|\./test)')
 
 # newcomer NAME PREFIX...: both commands, in a copy of the checkout.
 newcomer() {

@@ -8,6 +8,8 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import pytest
+
 from envhub_sandbox.sandboxes.docker.engines import Engine
 from tests.containers.kit import IMAGE
 from tests.hub.stub_hub import StubHub
@@ -45,10 +47,12 @@ exec $engine "${{words[@]}}"
 """
 
 
-def ours() -> list[Block]:
-    """What ``blocks.APART`` leaves to this."""
+def ours(document: str) -> list[Block]:
+    """What ``blocks.APART`` leaves to this of a document."""
     here = Path(__file__).relative_to(blocks.CHECKOUT).as_posix()
-    return [one for one in blocks.tested(blocks.OWN) if one.apart == here]
+    return [
+        one for one in blocks.tested(blocks.OWN) if (one.document, one.apart) == (document, here)
+    ]
 
 
 def of_this_engine(block: Block) -> Block:
@@ -56,16 +60,21 @@ def of_this_engine(block: Block) -> Block:
     return replace(block, text=block.text.replace('engine="podman"', 'engine="docker"'))
 
 
-def test_the_blocks_about_containers_run(engine: Engine, stub_hub: StubHub, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("document", "languages"), [("README.md", {"sh"}), ("docs/deployment.md", {"sh", "python"})]
+)
+def test_the_blocks_about_containers_run(
+    document: str, languages: set[str], engine: Engine, stub_hub: StubHub, tmp_path: Path
+) -> None:
     """Shell and Python, one after the other; the server that is started there runs then."""
-    assert {one.language for one in ours()} == {"sh", "python"}
+    assert {one.language for one in ours(document)} == languages
     name, command = f"envhub-test-{secrets.token_hex(6)}", shutil.which(engine.command)
     assert command is not None
     script, image = shlex.quote(command), shlex.quote(IMAGE)
     checkout = shlex.quote(str(blocks.CHECKOUT))
     docker = _DOCKER.format(engine=script, image=image, name=name, checkout=checkout)
     try:
-        execute(map(of_this_engine, ours()), stub_hub, tmp_path, docker=docker)
+        execute(map(of_this_engine, ours(document)), stub_hub, tmp_path, docker=docker)
         assert name in engine.run("ps", "--format", "{{.Names}}")
     finally:
         engine.run("rm", "--force", name)

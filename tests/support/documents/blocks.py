@@ -33,6 +33,7 @@ _RAY = "tests/remote/ray/test_documents.py"
 APART = {
     ("README.md", "python3 -m venv .venv"): ".ci/steps/readme.sh",
     ("README.md", "./test"): ".ci/steps/readme.sh",
+    ("README.md", "docker build"): _CONTAINERS,
     ("docs/deployment.md", "docker build"): _CONTAINERS,
     ("docs/deployment.md", "from envhub_sandbox import DockerSandbox"): _CONTAINERS,
     ("docs/deployment.md", 'make_env("org/repo@<commit>", sandbox="docker")'): _CONTAINERS,
