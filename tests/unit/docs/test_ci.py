@@ -199,7 +199,7 @@ def test_what_is_named_exists(checkout: Path) -> None:
         " ".join(words(checkout, "envhub-check")),
     ]
     done = subprocess.run(
-        [sys.executable, "-I", "-m", "envhub_sandbox", "check", "--help"],
+        [sys.executable, "-I", "-m", "envhub_sandbox", "check", "--help-all"],
         capture_output=True,
         text=True,
         env={"COLUMNS": "200", "TERM": "dumb", "NO_COLOR": "1"},
