@@ -325,8 +325,11 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
             raise copy(known)
         if known is not None:
             return known
-        if not attributes.should_watch(name):
-            return self._called(name)
+        return self._watched(name) if attributes.should_watch(name) else self._called(name)
+
+    def _watched(self, name: str) -> tuple[Any, ...]:
+        """Have it watched, or that it is absent: what is raised then is the answer to a call."""
+        attributes = self._requests.attributes
         self._send_call(name, (), {}, lambda number, _: m.Watch(number, name))
         replies = self._requests.collect(self._timeouts.call_s, m.WatchDone)
         watched = all(reply.watched for reply in replies)
