@@ -9,6 +9,7 @@ from __future__ import annotations
 import platform
 from collections.abc import Sequence
 from time import perf_counter_ns
+from typing import Any
 
 from envhub_sandbox.errors import EnvHubError, RemoteProtocolError, WorkerDiedError
 from envhub_sandbox.system.log import MESSAGES
@@ -176,6 +177,19 @@ class SharedMemoryLane(Lane):
     def _ask_for(self, shards: Sequence[int]) -> None:
         packed = [self.jail.pack(m.FetchInfos(self.number))] * len(shards)
         super().send_some(self._asked, [self.runners[index] for index in shards], packed)
+
+    def send_step(self, actions: Any, *, ahead: bool = False) -> None:
+        """See ``Lane``."""
+        [shard, *others], ring = self.shards, self.slots[0]
+        if not others and self._asked == STEP:  # as the last time, which it usually is
+            self._asked_ns = perf_counter_ns()
+            self._spin = self._step_spin
+            ring.choose()
+            if shard.step_again(actions, (0, self._spin.budget_ns, 0), ring):
+                return
+        super().send_step(actions, ahead=ahead)
+        if not others and self._asked == STEP:
+            shard.note_actions(actions)
 
     def _send_to_all(
         self, operation: str, packed: Sequence[Frames], *, ahead: bool = False

@@ -7,32 +7,75 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Sequence
+from functools import lru_cache
 from itertools import accumulate
+from operator import add
 from typing import Any
 
 from envhub_worker.protocol.codec.wire import Buffer
 from envhub_worker.protocol.errors import RemoteProtocolError
 from envhub_worker.protocol.limits import WireLimits
+from envhub_worker.protocol.messages.forms import Incoming
 from envhub_worker.protocol.shared_memory.words import LINE
 from envhub_worker.protocol.stream import check_lengths
 
 _COUNT = struct.Struct("<Q")
 
 
-def _starts(lengths: Sequence[int]) -> list[int]:
+def array_start(frames: Sequence[Buffer], nbytes: int) -> int:
+    """Where the bytes of the only array of a message lie in its packet."""
+    lengths = _lengths(frames)
+    starts = _starts(lengths)
+    return starts[1] if len(lengths) > 1 else starts[0] + lengths[0] - nbytes
+
+
+@lru_cache(maxsize=64)
+def _starts(lengths: tuple[int, ...]) -> tuple[int, ...]:
     """Where each frame begins, and one more frame would."""
     sizes = [_COUNT.size * (1 + len(lengths)), *lengths]
-    return list(accumulate(-(-size // LINE) * LINE for size in sizes))
+    return tuple(accumulate(-(-size // LINE) * LINE for size in sizes))
+
+
+def _lengths(frames: Sequence[Buffer]) -> tuple[int, ...]:
+    return tuple([memoryview(frame).nbytes for frame in frames])
+
+
+class Recurring:
+    """A packet whose next one differs in the bytes of its arrays alone, and what to make of it.
+
+    Trust: input from a peer. What it is told apart by was checked, and is compared as a copy.
+    """
+
+    __slots__ = ("_buffers", "_form", "_header", "_tail", "_words", "length")
+
+    def __init__(self, frames: Sequence[Buffer], document_bytes: int, form: Incoming[Any]) -> None:
+        lengths = _lengths(frames)
+        start, *starts = _starts(lengths)
+        end = start + document_bytes
+        self._words = struct.pack(f"<{1 + len(lengths)}Q", len(lengths), *lengths)
+        self._header = start, end, bytes(frames[0][:document_bytes])
+        self._tail = slice(end, start + lengths[0])
+        self._buffers = list(map(slice, starts, map(add, starts, lengths[1:])))
+        self._form = form
+        self.length = _starts(lengths)[-1]
+
+    def message(self, memory: memoryview, tensors: Any, *, borrows: bool) -> Any:
+        """The message that lies there; None if it is not of that form."""
+        words, (start, end, document) = self._words, self._header
+        if bytes(memory[: len(words)]) != words or bytes(memory[start:end]) != document:
+            return None
+        buffers = [memory[part] for part in self._buffers]
+        return self._form.message(memory[self._tail], buffers, tensors, borrows=borrows)
 
 
 def packet_bytes(frames: Sequence[Buffer]) -> int:
     """What a packet of these frames takes."""
-    return _starts([memoryview(frame).nbytes for frame in frames])[-1]
+    return _starts(_lengths(frames))[-1]
 
 
 def write_packet(memory: Any, start: int, room: int, frames: Sequence[Buffer]) -> int:
     """Write frames into a slab; returns the bytes that they take, or 0 if there is no room."""
-    lengths = [memoryview(frame).nbytes for frame in frames]
+    lengths = _lengths(frames)
     starts = _starts(lengths)
     if starts[-1] > room:
         return 0
