@@ -182,7 +182,7 @@ def test_a_peer_that_never_repeats_itself_fills_nothing() -> None:
 
 
 @pytest.mark.parametrize(
-    ("number", "size", "times"), [(10_000, 5, 1), (5_000, 5, 2), (20, 1 << 17, 2)]
+    ("number", "size", "times"), [(10_000, 5, 1), (3_000, 5, 2), (20, 1 << 17, 2)]
 )
 def test_what_is_kept_of_a_peers_messages_has_a_bound(number: int, size: int, times: int) -> None:
     """However many of them come, come again, or are large."""
