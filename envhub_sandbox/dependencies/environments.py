@@ -23,6 +23,7 @@ import json
 import os
 import stat
 import subprocess
+import time
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -44,6 +45,7 @@ _FORMAT = 1
 _INSTALL_S = 3600.0
 _WAIT_S = 2 * 3600.0
 _COMPILE_S = 1800.0
+_COMPILERS = 8
 _FULL = "'envhub cache remove --unused-for 30' removes what was not used for 30 days"
 _THERE = (errno.EEXIST, errno.ENOTEMPTY, errno.ENOTDIR)
 
@@ -207,7 +209,7 @@ def _made(key: str, lock: Lock, interpreter: Interpreter, held: int, tell: Tell)
             _install(lock, interpreter, building, held, watch, tell)
             size, count = checked(packages)
             watch.bounds.check(size, count, "its packages have")
-        tell(f"compiling {size / 2**20:.0f} MiB")
+        tell(f"compiling its {size / 2**20:.0f} MiB to bytecode, once")
         _compile(interpreter, packages, held)
         checked(packages)  # again: a compiler with a fault may leave a link, which chmod follows
         _close(packages)
@@ -277,21 +279,30 @@ def _install(
 
 
 def _compile(interpreter: Interpreter, packages: Path, held: int) -> None:
-    """Bytecode for all of it, by a process that is confined to the folder (``bytecode.py``).
+    """Bytecode for all of it, by processes that are confined to the folder (``bytecode.py``).
 
     What fails is only slower, so it is no error.
     """
-    with contextlib.suppress(subprocess.SubprocessError):
-        subprocess.run(
-            [interpreter.path, "-I", "-S", str(_BOOTSTRAP), "bytecode", str(packages)],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-            cwd="/",
-            env=own_variables(),
-            pass_fds=(held,),
-            timeout=_COMPILE_S,
-        )
+    count = min(_COMPILERS, os.cpu_count() or 1)
+    command = [interpreter.path, "-I", "-S", str(_BOOTSTRAP), "bytecode", str(packages)]
+    until = time.monotonic() + _COMPILE_S
+    with contextlib.ExitStack() as stack:
+        running = []
+        for number in range(count):
+            process = subprocess.Popen(
+                [*command, str(number), str(count)],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                cwd="/",
+                env=own_variables(),
+                pass_fds=(held,),
+            )
+            running.append(stack.enter_context(process))
+            stack.callback(process.kill)
+        for process in running:
+            with contextlib.suppress(subprocess.TimeoutExpired):
+                process.wait(max(until - time.monotonic(), 0))
 
 
 def _close(packages: Path) -> None:

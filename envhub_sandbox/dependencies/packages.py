@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import os
 import re
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Protocol
@@ -27,6 +28,7 @@ from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.system import log
 from envhub_sandbox.system.log import DEPENDENCIES
 from envhub_worker.protocol.records import dataclass
+from envhub_worker.protocol.text import size_text
 
 if TYPE_CHECKING:
     from envhub_sandbox.dependencies.builds.wheels import WheelOrigin
@@ -91,9 +93,29 @@ class ThisMachine:
         from envhub_sandbox.dependencies import environments, resolutions
 
         found = resolutions.resolution_for(request, tell, upgrade=self.upgrade)
+        if found.lock.has_cuda and not request.gpu:
+            _warn_of_cuda(found.lock, found.interpreter)
         made = PackageSet.of(environments.provide(found.lock, found.interpreter, tell))
         inferred = [one.facts for one in request.guesses if one.module in found.taken]
         return replace(made, facts=made.facts | {"inferred": inferred}) if inferred else made
+
+
+def _warn_of_cuda(lock: Lock, interpreter: Interpreter) -> None:
+    """Say what is to come, before it is downloaded, and what brings less."""
+    from envhub_sandbox.dependencies import environments
+    from envhub_sandbox.dependencies.locks import pylock
+
+    if environments.ready(environments.key_of(lock, interpreter)) is not None:
+        return
+    found = pylock.listed(lock.packages, interpreter.path, lock.options)
+    size = sum(max((wheel.size or 0 for wheel in one.wheels), default=0) for one in found)
+    much = f" ({size_text(size)} of downloads)" if size else ""
+    warnings.warn(
+        f"PyTorch comes with CUDA{much}, and jails have no GPU here: the index has no build "
+        "without. UV_TORCH_BACKEND=cpu in the environment takes PyTorch's own, by its index; "
+        f"{option_name('policy', {'gpu': True})} gives jails a GPU",
+        stacklevel=2,
+    )
 
 
 HERE = ThisMachine()

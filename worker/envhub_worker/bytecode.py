@@ -1,4 +1,5 @@
-"""Makes the bytecode of a folder of packages: ``bootstrap.py bytecode FOLDER``.
+"""Makes the bytecode of a folder of packages: ``bootstrap.py bytecode FOLDER NUMBER COUNT``, by one
+of several processes that share it.
 
 A compiler runs nothing of what it reads, but what it reads is a stranger's, and compilers have
 faults. So this process is confined before it opens any of it: it may read the standard library and
@@ -47,8 +48,8 @@ def confine_to_bytecode_folder(folder: str) -> None:
 
 
 def main(argv: Sequence[str]) -> int:
-    """Compile all that is below a folder, but for tests, which are not imported."""
-    [folder] = argv
+    """Compile a share of the folders below one, but for tests, which are not imported."""
+    folder, number, count = argv[0], int(argv[1]), int(argv[2])
     try:
         confine_to_bytecode_folder(folder)
     except LayerUnavailableError:
@@ -56,7 +57,10 @@ def main(argv: Sequence[str]) -> int:
     left_out = re.compile(re.escape(folder) + r"(/.*)?/tests?/", re.DOTALL)
     # never held against its source again: both are read-only by then
     mode = py_compile.PycInvalidationMode.UNCHECKED_HASH
-    compileall.compile_dir(
-        folder, quiet=2, stripdir=folder, rx=left_out, maxlevels=64, invalidation_mode=mode
-    )
+    # but those that the others make meanwhile: each has the same list
+    below = sorted(top for top, _, _ in os.walk(folder) if not top.endswith("/__pycache__"))
+    for place in below[number::count]:
+        compileall.compile_dir(
+            place, quiet=2, stripdir=folder, rx=left_out, maxlevels=0, invalidation_mode=mode
+        )
     return 0

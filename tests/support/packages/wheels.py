@@ -135,7 +135,13 @@ class Index:
                 mark = ' data-yanked="broken"' if path.name in self.yanked else ""
                 link = f"/files/{html.escape(path.name)}#sha256={digest}"
                 rows.append(f'<a href="{link}"{mark}>{html.escape(path.name)}</a><br>')
-                known = {"filename": path.name, "url": link, "hashes": {"sha256": digest}}
+                size = path.stat().st_size
+                known = {
+                    "filename": path.name,
+                    "url": link,
+                    "hashes": {"sha256": digest},
+                    "size": size,
+                }
                 day = self.uploaded.get(path.name)
                 files.append(known | ({"upload-time": f"{day}T00:00:00Z"} if day else {}))
         if self.uploaded and files:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import io
 import tarfile
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -189,9 +190,16 @@ def test_an_index_that_has_both(cuda: Path) -> None:
     assert names(TORCH) == {"torch==2.5+cpu", "torchvision==0.20+cpu"}
 
 
-def test_an_index_without_stays_as_it_is(cuda: Path) -> None:
+def test_an_index_without_stays_as_it_is(cuda: Path, index: Index) -> None:
+    """The size of what comes is told before, and once."""
     make_wheel(cuda, "torch", "2.4+cpu")
+    index.uploaded["torch-2.5-py3-none-any.whl"] = "2026-01-01"
     assert names(TORCH) == {"torch==2.5", "torchvision==0.20", "nvidia-cublas==1.0"}
+    with pytest.warns(UserWarning, match=r"CUDA \([\d.]+ KiB of downloads\).*UV_TORCH_BACKEND=cpu"):
+        packages.HERE.make(TORCH, lambda line: None)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        packages.HERE.make(TORCH, lambda line: None)
 
 
 @pytest.mark.parametrize("gpu", [True, False])
