@@ -299,6 +299,10 @@ def cures(error: DependencyError) -> Iterator[dict[str, list[str]]]:
     """Keys of ``dependencies`` that may help against what uv says, by the packages it speaks of."""
     said = str(error).partition(REQUIRED)[0]
     unknown = re.findall(rf"([A-Za-z0-9][A-Za-z0-9._-]*) was {_NOT_FOUND}", said)
+    unbuilt = re.match(r"([A-Za-z0-9][\w.-]*) \S+(?: \(.{0,300}?\))? has no wheel for", said)
+    if unbuilt is not None:
+        yield {"override": [unbuilt[1]]}  # another version may have one
+        unknown.append(unbuilt[1])
     yield from ({"without": [name]} for name in unknown)
     words = Counter(name.lower() for name in _BOUNDED.findall(said))
     ours = {line.partition(">")[0]: line for line in WORKERS}

@@ -25,6 +25,7 @@ from envhub_sandbox.dependencies.request import PackageRequest, chosen
 from envhub_sandbox.dependencies.resolve import Lock, Target
 from envhub_sandbox.errors import DependencyError
 from tests.support.packages.refusals import refused_dependency
+from tests.support.packages.sdists import backend, make_sdist
 from tests.support.packages.wheels import WORKERS, Index, make_wheel
 from tests.unit.docs.test_distributions import project
 
@@ -125,6 +126,8 @@ def test_a_contradiction_names_both_lines(index: Index) -> None:
         (("numpy<1.20",), {"override": ["numpy>=1.21"]}),  # the worker's own line
         (("one", "shared>=2"), {"override": ["shared"]}),
         (("one", "nowhere"), {"without": ["nowhere"]}),
+        (("unbuilt==2",), {"override": ["unbuilt"]}),
+        (("broken",), {"without": ["broken"]}),
     ],
 )
 def test_the_advice_is_one_with_which_there_are_versions(
@@ -135,6 +138,10 @@ def test_the_advice_is_one_with_which_there_are_versions(
     make_wheel(index.folder, "one", requires=["shared<2"])
     for version in ("1.0", "2.0"):
         make_wheel(index.folder, "shared", version)
+    make_wheel(index.folder, "unbuilt")
+    fails = backend("x", further="def further():\n    raise SystemExit('no')\n")
+    for name, version in (("unbuilt", "2"), ("broken", "1")):
+        make_sdist(index.folder, name, version, fails)
     wanted = tuple(parse_requirement(line, "requirements.txt") for line in lines)
     asked = PackageRequest("requirements.txt", wanted)
     with refused_dependency("resolution", match=re.escape(f"dependencies={cure}")):
