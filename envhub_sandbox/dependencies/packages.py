@@ -153,7 +153,7 @@ def packages_for(
 
 def _is_unknown(repo_id: str, error: DependencyError) -> bool:
     """Whether the index does not have the package that a reference names, or not that version."""
-    name = re.escape(re.sub(r"[-_.]+", "-", re.split(r"[\[#]", repo_id)[0]).lower())
+    name = re.escape(re.sub(r"[-_.]+", "-", re.split(r"[\[#@]", repo_id)[0]).lower())
     said = rf"no version of {name}\b|\b{name} was not found"
     return error.reason == "resolution" and re.search(said, str(error)) is not None
 
