@@ -1,6 +1,6 @@
-# Repositories around real packages and in different styles, in an environment that has none of these:
-# cold, warm, and without a network; and equal to the same repository in an ordinary environment. All of
-# them by hand: python -m benchmarks reach
+# Environments of strangers by their reference alone, or by the advice of their errors, in an environment
+# that has none of these; and equal to the same in an ordinary one. All of them by hand:
+# python -m benchmarks reach
 set -euo pipefail
 . "$(dirname "${BASH_SOURCE[0]}")/../lib.sh"
 built=$(wheel)
@@ -9,5 +9,4 @@ python=$(find_python 3.11 || command -v python3)
 make_venv "$python" "$CI_WORK/packages"
 "$CI_WORK/packages/bin/uv" pip install --quiet --compile-bytecode \
   --python "$CI_WORK/packages/bin/python" "$built"
-"$CI_WORK/packages/bin/python" -m benchmarks.reach --quick --client "$CI_WORK/packages/bin/python" \
-  --results "$CI_WORK/reach.json"
+"$CI_WORK/packages/bin/python" -m benchmarks.reach --quick

@@ -1,3 +1,0 @@
-from walks import make_env
-
-__all__ = ["make_env"]

@@ -1,3 +1,0 @@
-from walk_env.walk import make_env
-
-__all__ = ["make_env"]
