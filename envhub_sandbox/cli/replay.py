@@ -18,10 +18,8 @@ from envhub_sandbox.cli.shared.console import (
     print_json,
     safe_line,
     show,
-    show_rows,
 )
 from envhub_sandbox.cli.shared.exits import Exit, UsageError
-from envhub_sandbox.errors import RepositoryUnavailableError
 
 if TYPE_CHECKING:
     from envhub_sandbox.session.crash.bundle_reader import Bundle
@@ -39,8 +37,8 @@ Grant = Annotated[
     bool,
     typer.Option(
         "--grant",
-        help="Use the bundle's own policy, limits, timeouts, interpreter, packages and Hub, where "
-        "they differ from an ordinary run. Only for bundles that you trust.",
+        help="Replay a bundle that may be a stranger's, with its repository, policy, interpreter, "
+        "packages and Hub. Only for bundles that you trust.",
     ),
 ]
 
@@ -61,7 +59,6 @@ def replay(
 
     [bold]envhub replay ~/.cache/envhub-sandbox/crashes/20261121T081500-5f3a9c01[/bold]
     """
-    from envhub_sandbox.hub.snapshot import is_here
     from envhub_sandbox.session.crash import bundle_reader
     from envhub_sandbox.session.crash import replay as repeating
 
@@ -69,22 +66,16 @@ def replay(
     given = {
         name: value for name, value in make.given.items() if name != "sandbox" and value is not None
     }
-    wishes = bundle_reader.wishes(loaded)
-    wanted = [wish for wish in wishes if wish.partition("=")[0] not in given]
-    if wanted and not grant:
+    if not (grant or loaded.is_ours):
         raise UsageError(
-            f"the bundle needs more than an ordinary run: {', '.join(wanted)}. If you trust its "
-            "source, add --grant"
+            "the bundle may be a stranger's. If you trust its source, add --grant: a replay uses "
+            f"{bundle_reader.wishes(loaded)}"
         )
     for doubt in loaded.doubts:
         show("not exact", doubt, "yellow", stderr=True)
-    options = bundle_reader.replayed_arguments(loaded, granted=grant)
+    options = bundle_reader.replayed_arguments(loaded) | {**given, "sandbox": sandbox}
     if "profile" in given:
-        options["policy"] = {**options["policy"], "profile": given.pop("profile")}
-    options |= {**given, "sandbox": sandbox}
-    hub = {name: options[name] for name in opt.SOURCE if name in options}
-    if not (grant or loaded.is_ours or "token" in given or is_here(loaded.reference)):
-        _require_public(loaded, hub)
+        options["policy"] |= {"profile": options.pop("profile")}
     changed: list[str] = []
     with ProgressBar(quiet=json) as bar, contextlib.ExitStack() as stack:
         bar.begin(f"loading {safe_line(loaded.label)}")
@@ -95,18 +86,6 @@ def replay(
         _print(loaded, replayed)
     codes = {repeating.Verdict.SAME: Exit.OK, repeating.Verdict.DIFFERENT: Exit.DIFFERENT}
     raise typer.Exit(codes.get(replayed.verdict, Exit.SURVIVED))
-
-
-def _require_public(bundle: Bundle, hub: dict[str, Any]) -> None:
-    """Refuse a repository that only the user's login brings: a stranger may have named it."""
-    from envhub_sandbox.hub.snapshot import snapshot_named
-
-    try:
-        snapshot_named(bundle.reference, **hub, public=True)
-    except RepositoryUnavailableError as error:
-        why = "What a bundle names is had without a login. If you trust its source, add --grant"
-        error.args = (f"{error}\n{why}",)
-        raise
 
 
 def _made(
@@ -144,16 +123,8 @@ def _made(
 
 def _print(bundle: Bundle, replayed: ReplayResult) -> None:
     show("repository", bundle.label, "bold")
-    out()
-    show_rows(
-        [
-            ("", "request", "step", "how it ended"),
-            _row("recorded", bundle.count, bundle.steps, bundle.death),
-            _row("replayed", replayed.requests, replayed.steps, replayed.death),
-        ],
-        right=(1, 2),
-    )
-    out()
+    show("recorded", _row(bundle.count, bundle.steps, bundle.death))
+    show("replayed", _row(replayed.requests, replayed.steps, replayed.death))
     if replayed.note:
         show("note", replayed.note)
     out(*_CONCLUSIONS[replayed.verdict.value])
@@ -185,17 +156,11 @@ _CONCLUSIONS = {
 }
 
 
-def _row(run: str, requests: int, steps: int, death: dict[str, Any] | None) -> tuple[str, ...]:
-    ended = "nothing died" if death is None else _how(death)
-    where = (str(requests), str(steps)) if requests else ("-", "-")
-    return (run, *where, ended if requests else f"{ended}, in make_env")
-
-
-def _how(death: dict[str, Any]) -> str:
+def _row(requests: int, steps: int, death: dict[str, Any] | None) -> str:
     """An ending in few words. Trust: from the bundle, or from the worker."""
-    words = safe_line(death["reason"], 100)
-    if death["signal"]:
+    words = "nothing died" if death is None else safe_line(death["reason"], 100)
+    if death is not None and death["signal"]:
         words += f" ({safe_line(death['signal'], 100)})"
-    elif death["exit_code"] is not None:
+    elif death is not None and death["exit_code"] is not None:
         words += f" (exit code {death['exit_code']})"
-    return words
+    return f"request {requests}, step {steps}: {words}" if requests else f"in make_env: {words}"

@@ -370,9 +370,8 @@ class Repository:
         if bundle is None:
             return
         error.bundle = str(bundle)
-        # of a folder, a bundle elsewhere than in the cache might be anybody's
-        elsewhere = self.snapshot.is_local and self.policy.crash_folder
-        options = " --grant" if elsewhere else ""
+        # a bundle elsewhere than in the cache might be anybody's
+        options = " --grant" if self.policy.crash_folder else ""
         again = f"To try the same again: envhub replay {shlex.quote(error.bundle)}{options}"
         error.args = (f"{error.args[0]}\n{again}", *error.args[1:])
         CRASHES.info("%s: crash bundle %s", self.label, bundle)

@@ -1,8 +1,8 @@
 """Reads crash bundles. Trust: a bundle is a stranger's input, who would like us to run something.
 
 Only regular files of bounded size are read, nothing is unpickled, and every value is checked for
-its type before it is used. What a bundle needs beyond an ordinary run is in ``wishes``, and only
-the user grants it.
+its type before it is used. ``wishes`` says what a replay uses of this machine; the user grants it,
+but for bundles that this program has written where it writes them.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from typing import Any, TypeVar
 
 from envhub_sandbox.errors import BundleError, EnvHubError
 from envhub_sandbox.hub.grammar import LOCAL_TYPES, is_commit
-from envhub_sandbox.hub.local import split_local
-from envhub_sandbox.hub.reference import is_local, pinned
+from envhub_sandbox.hub.reference import pinned
 from envhub_sandbox.session.crash.bundle_writer import FORMAT
+from envhub_sandbox.system import folders
 from envhub_sandbox.system.folders import cache_root
 from envhub_sandbox.transport.values import to_tensor
 from envhub_worker.protocol import messages as m
@@ -99,7 +99,7 @@ def _bundle(folder: Path, document: dict[str, Any]) -> Bundle:
     return Bundle(
         label=one_line(_member(document, "label", str), 1000),
         reference=_reference(provenance),
-        is_ours=folder.resolve().parent == (cache_root() / "crashes").resolve(),
+        is_ours=_is_ours(folder.resolve()),
         files=_texts(_member(provenance, "files", dict)),
         death=_death(_member(document, "death", dict)),
         load=_load(folder),
@@ -110,6 +110,11 @@ def _bundle(folder: Path, document: dict[str, Any]) -> Bundle:
         count=len(are_steps),
         steps=sum(are_steps),
     )
+
+
+def _is_ours(folder: Path) -> bool:
+    crashes = (cache_root() / "crashes").resolve()
+    return folder.parent == crashes and folders.is_ours_alone(crashes)
 
 
 def _doubts(doubts: list[Any]) -> tuple[str, ...]:
@@ -186,52 +191,36 @@ def _texts(mapping: dict[str, Any]) -> dict[str, str]:
     return mapping
 
 
-# --- what it needs of this machine -------------------------------------------------------------
+# --- made again ---------------------------------------------------------------------------------
 
 
-def wishes(bundle: Bundle) -> list[str]:
-    """What it needs beyond an ordinary run, one ``name=value`` each: for the user to grant.
-
-    Raises ``BundleError``: they are too long to be shown whole.
+def wishes(bundle: Bundle) -> str:
+    """What a replay uses of this machine, in a line: for the user, before it is a stranger's.
+    Raises ``BundleError``: it is too long to be shown whole.
     """
-    needed = {**_policy(bundle), **_own(bundle)}
-    if bundle.reference.startswith("git+") or _is_another_folder(bundle):
-        # a host that the bundle chose is asked, or what lies anywhere here is shown to a jail
-        needed["repository"] = bundle.reference
-    lines = [one_line(f"{name}={value!r}", 2 * _MAX_WISHES) for name, value in needed.items()]
-    if sum(map(len, lines)) > _MAX_WISHES:
-        raise BundleError(f"it asks for more than can be shown: {one_line(' '.join(lines), 300)}")
-    return lines
+    policy = _chosen(bundle.arguments.get("policy"), _OF_POLICY)
+    needed = {"repository": bundle.reference, **policy, **_chosen(bundle.arguments, _OF_MAKE_ENV)}
+    text = ", ".join(f"{name}={value!r}" for name, value in needed.items())
+    if len(text) > _MAX_WISHES:
+        raise BundleError(f"it asks for more than can be shown: {one_line(text, 300)}")
+    return one_line(text, 2 * _MAX_WISHES)
 
 
-def _is_another_folder(bundle: Bundle) -> bool:
-    """Whether it is about a folder of this machine, but not the one that the user stands in."""
-    if bundle.is_ours or not is_local(bundle.reference):
-        return False
-    return split_local(bundle.reference).folder.resolve() != Path.cwd()
+def _chosen(mapping: Any, names: tuple[str, ...]) -> dict[str, Any]:
+    known = mapping if isinstance(mapping, dict) else {}
+    return {name: known[name] for name in names if name in known}
 
 
-def _policy(bundle: Bundle) -> dict[str, Any]:
-    policy = bundle.arguments.get("policy")
-    known = policy if isinstance(policy, dict) else {}
-    return {name: known[name] for name in _OF_POLICY if name in known}
-
-
-def _own(bundle: Bundle) -> dict[str, Any]:
-    known = bundle.arguments
-    return {name: known[name] for name in _OF_MAKE_ENV if name in known}
-
-
-def replayed_arguments(bundle: Bundle, *, granted: bool) -> dict[str, Any]:
-    """The arguments of ``make_env`` that make it again; ``wishes`` are left out unless granted."""
-    arguments: dict[str, Any] = {
+def replayed_arguments(bundle: Bundle) -> dict[str, Any]:
+    """The arguments of ``make_env`` that make it again."""
+    policy = _chosen(bundle.arguments.get("policy"), _OF_POLICY) | {"crash_history": 0}
+    arguments = {
+        **_chosen(bundle.arguments, _OF_MAKE_ENV),
         "n_envs": bundle.load.n_envs,
         "use_async_envs": bundle.load.use_async_envs,
         "env_kwargs": bundle.load.env_kwargs,
-        "policy": {**(_policy(bundle) if granted else {}), "crash_history": 0},
-        **(_own(bundle) if granted else {}),
     }
     if bundle.task is not None:
         arguments["num_workers"] = bundle.task["shards"]
-        arguments["policy"]["lane"] = bundle.task["lane"]
-    return arguments
+        policy["lane"] = bundle.task["lane"]
+    return {**arguments, "policy": policy}

@@ -184,5 +184,5 @@ def test_a_crash_bundle_has_it(packages: Index, tmp_path: Path) -> None:
             suites.env.step(suites.env.action_space.sample())
     [folder] = [path.parent for path in tmp_path.rglob("bundle.json")]
     assert load_bundle(folder).reference == ref
-    replayed = CliRunner().invoke(app, ["replay", str(folder)])
+    replayed = CliRunner().invoke(app, ["replay", "--grant", str(folder)])
     assert replayed.exit_code == 0, replayed.output

@@ -27,7 +27,6 @@ from envhub_sandbox.session.crash.bundle_reader import (
 from envhub_sandbox.session.crash.history import History
 from envhub_sandbox.session.crash.replay import Verdict, replay
 from envhub_sandbox.session.recorder import Crash
-from envhub_sandbox.settings.policy import Policy
 from envhub_worker.protocol import messages as m
 from tests.support import inside
 from tests.support.wire import requested
@@ -77,8 +76,7 @@ def test_a_bundle_comes_back(tmp_path: Path) -> None:
     assert found.steps == 3
     assert [type(one).__name__ for one in found.requests()] == ["Reset", "Step", "Step", "Step"]
     assert found.load.env_kwargs["size"].tolist() == [0, 1, 2]  # type: ignore[attr-defined]
-    assert wishes(found) == []
-    arguments = replayed_arguments(found, granted=False)
+    arguments = replayed_arguments(found)
     assert arguments["policy"] == {"crash_history": 0, "lane": "frames"}
     assert arguments["num_workers"] == 1
 
@@ -195,14 +193,12 @@ def test_requests_are_not_decoded_all_at_once(name: str, tmp_path: Path) -> None
         tracemalloc.stop()
 
 
-def test_what_a_bundle_needs_beyond_an_ordinary_run_is_a_wish(tmp_path: Path) -> None:
-    """Nothing of it is used unless it is granted: packages could be any, and assets what only the
-    caller's token reads. What the run of a bundle may not choose is not even that.
-    """
+def test_what_a_replay_uses_is_told(tmp_path: Path) -> None:
+    """All of it, or the bundle is refused; what the run of a bundle may not choose is not used."""
     limits = {"memory_bytes": 1 << 20}
     policy = {"profile": "no-userns", "environment": ["SECRET"], "limits": limits}
     own = {
-        "timeouts": {"step_s": 1e12},
+        "timeouts": {"step_s": 60},
         "hub_cache_dir": "/tmp/cache",
         "endpoint": "https://evil.example",
         "python": "/tmp/python",
@@ -212,23 +208,29 @@ def test_what_a_bundle_needs_beyond_an_ordinary_run_is_a_wish(tmp_path: Path) ->
     }
     ignored = {"sandbox": "tcp://evil.example:1", "trust_remote_code": True}
     restart = {"restart": "transparent", "crash_folder": "/etc"}
-    found = load_bundle(bundle(tmp_path, policy=policy | restart, **own, **ignored))
-    assert wishes(found) == [f"{name}={value!r}" for name, value in (policy | own).items()]
-    refused = replayed_arguments(found, granted=False)
-    assert refused["policy"] == {"crash_history": 0, "lane": "frames"}
-    granted = replayed_arguments(found, granted=True)
-    assert granted == {**refused, **own, "policy": {**policy, **refused["policy"]}}
-    assert Policy(**{name: value for name, value in granted["policy"].items() if name != "limits"})
-
-
-def test_the_whole_of_the_wishes_is_shown(tmp_path: Path) -> None:
-    """What stands behind many others is granted with them; where all cannot be shown, none is."""
-    many = [f"org/{'x' * 80}{number}" for number in range(15)] + ["me/private"]
-    [wish] = wishes(load_bundle(bundle(tmp_path / "a", assets=many)))
-    assert wish.endswith("'me/private']")
-    found = load_bundle(bundle(tmp_path / "b", assets=[*many * 4, "me/private"]))
+    found = load_bundle(bundle(tmp_path / "a", policy=policy | restart, **own, **ignored))
+    told = {"repository": found.reference, **policy, **own}
+    assert all(f"{name}={value!r}" in wishes(found) for name, value in told.items())
+    arguments = replayed_arguments(found)
+    assert arguments["policy"] == {**policy, "crash_history": 0, "lane": "frames"}
+    assert {name: arguments[name] for name in own} == own
+    assert not (ignored | restart).keys() & {*arguments, *arguments["policy"]}
+    found = load_bundle(bundle(tmp_path / "b", assets=["org/x"] * 1000))
     with pytest.raises(BundleError, match="more than can be shown"):
         wishes(found)
+
+
+def test_a_bundle_is_ours_where_only_we_write(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the cache's folder of bundles; a folder that others may write there is anybody's."""
+    monkeypatch.setenv("ENVHUB_CACHE", str(tmp_path))
+    folder = bundle(tmp_path / "crashes")
+    assert load_bundle(folder).is_ours
+    assert not load_bundle(bundle(tmp_path / "elsewhere")).is_ours
+    if os.name == "posix":
+        folder.parent.chmod(0o777)
+        assert not load_bundle(folder).is_ours
 
 
 def test_a_bundle_says_nothing_in_lines_of_its_own(tmp_path: Path) -> None:
@@ -240,8 +242,8 @@ def test_a_bundle_says_nothing_in_lines_of_its_own(tmp_path: Path) -> None:
     for name in ("signal", "reason", "request", "message"):
         edit(folder, "death", name, value="\x1b]0;title\x07")
     found = load_bundle(folder)
-    [wish] = wishes(found)
-    assert wish.startswith("profile='memory_bytes")
+    wish = wishes(found)
+    assert "profile='memory_bytes" in wish
     assert wish.isprintable()
     assert found.label.isprintable()
     assert "\x1b" not in found.label + "".join(map(str, found.death.values())) + safe_line(
@@ -324,7 +326,7 @@ def test_a_request_that_does_not_fit_is_said(tmp_path: Path) -> None:
 
 
 def test_a_bundle_of_git_names_a_host(tmp_path: Path) -> None:
-    """Which the user grants: a stranger chose it. A package is the index's, as for any other."""
+    """Which the user is told: a stranger chose it."""
     folder = bundle(tmp_path)
 
     def of(repository: str, kind: str) -> bundle_reader.Bundle:
@@ -334,11 +336,11 @@ def test_a_bundle_of_git_names_a_host(tmp_path: Path) -> None:
 
     found = of("https://git.example/org/repo", "git")
     assert found.reference == f"git+https://git.example/org/repo@{COMMIT}"
-    assert wishes(found) == [f"repository='{found.reference}'"]
+    assert f"repository='{found.reference}'" in wishes(found)
     with pytest.raises(BundleError, match="not fetched by 'file'"):
         of("file:///etc", "git")
     found = of("x@1.0#Y-v0", "pypi")
-    assert (found.reference, wishes(found)) == ("pypi:x@1.0#Y-v0", [])
+    assert found.reference == "pypi:x@1.0#Y-v0"
     edit(folder, "provenance", "commit", value="main")
     with pytest.raises(BundleError, match="is not a commit"):
         of("x@1.0#Y-v0", "model")
