@@ -112,6 +112,7 @@ IMPORTERS = {
     "envhub_worker.extras": "our own extras",
     "envhub_worker.runner.loader": "the repository's",
     "envhub_worker.runner.returned": "nothing but 'raise error', in the place of a line",
+    "envhub_worker.spawn.preparations": "LeRobot's, where it is installed in a jail",
     "envhub_worker.spawn.runner_entry": "the program of a runner, which the server names",
     "envhub_worker.spawn.zygote": "a list of our own",
 }
