@@ -324,13 +324,13 @@ _PREFIXES: dict[type[EnvHubError], str] = {RemoteEnvError: "Remote", LoadError: 
 
 def _group(kind: Any) -> Any:
     """A twin of a group of exceptions, of which there must be one: its text by itself."""
-    made = _twin(RemoteEnvError, kind)
-    made.__new__ = lambda cls, *given: kind.__new__(cls, given[1], [RemoteEnvError(*given)])
+    twin = _twin(RemoteEnvError, kind)
+    twin.__new__ = lambda cls, *given: kind.__new__(cls, given[1], [RemoteEnvError(*given)])
     # a group's own cannot be set
-    made.message = property(
+    twin.message = property(
         lambda self: vars(self)["message"], lambda self, text: vars(self).update(message=text)
     )
-    return made
+    return twin
 
 
 _TWINS = {(ours, name): _twin(ours, kind) for ours in _PREFIXES for name, kind in _BUILTINS.items()}
@@ -351,18 +351,18 @@ def _gymnasiums() -> dict[str, Any]:
         for name, kind in vars(module).items()
         if isinstance(kind, type) and issubclass(kind, Exception) and kind.__module__ == _GYMNASIUM
     }
-    made = {f"{_GYMNASIUM}.{name}": _twin(RemoteEnvError, kind) for name, kind in kinds.items()}
-    for twin in made.values():
+    twins = {f"{_GYMNASIUM}.{name}": _twin(RemoteEnvError, kind) for name, kind in kinds.items()}
+    for twin in twins.values():
         twin.name = ""  # of the call that was pending, which nothing tells
-    return made
+    return twins
 
 
 def _nearest(ours: type[EnvHubError], builtin: str) -> Any:
     """The twin of a builtin exception, or of its nearest ancestor that has one."""
     kind = getattr(builtins, builtin, None)
     ancestors = kind.__mro__ if isinstance(kind, type) else ()
-    known = (_TWINS.get((ours, one.__name__)) for one in ancestors)
-    return next((twin for twin in known if twin is not None), ours)
+    candidates = (_TWINS.get((ours, ancestor.__name__)) for ancestor in ancestors)
+    return next((twin for twin in candidates if twin is not None), ours)
 
 
 def _builtin_of(cls: type[RemoteEnvError]) -> str:

@@ -181,10 +181,10 @@ UNREACHABLE = frozenset(
 class HubFailure(Exception):
     """A request to the Hub failed. ``what`` and ``advice`` are sentences without a full stop."""
 
-    def __init__(self, kind: Kind, what: str, advice: str) -> None:
-        super().__init__(what, advice)
+    def __init__(self, kind: Kind, failure: str, advice: str) -> None:
+        super().__init__(failure, advice)
         self.kind = kind
-        self.what = what
+        self.what = failure
         self.advice = advice
 
 
@@ -205,8 +205,8 @@ def explain(
     endpoint: str,
 ) -> HubFailure:
     """The failure that an exception of the Hub client stands for."""
-    found = ((kind, link) for link in chain(error) if (kind := _kind_of(link)) is not None)
-    kind, source = next(found, (Kind.OTHER, error))
+    known_kinds = ((kind, link) for link in chain(error) if (kind := _kind_of(link)) is not None)
+    kind, source = next(known_kinds, (Kind.OTHER, error))
     response = getattr(source, "response", None)
     fields = {
         "repo_type": repo_type,
@@ -220,8 +220,8 @@ def explain(
         "reason": _reason(source),
         "no_token": option_name("token", False),
     }
-    what, advice = (text.format(**fields) for text in kind.value)
-    return HubFailure(kind, redact(what, secrets), redact(advice, secrets))
+    failure, advice = (text.format(**fields) for text in kind.value)
+    return HubFailure(kind, redact(failure, secrets), redact(advice, secrets))
 
 
 def _reason(error: BaseException) -> str:

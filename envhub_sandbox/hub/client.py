@@ -126,8 +126,10 @@ class HubClient:
         everybody = replace(self, endpoint=self.public_endpoint, token=False)
         try:
             with everybody._explained(repo, commit):
-                said = everybody._about(repo, commit)
-                return said["sha"] == commit and not said.get("private") and not said.get("gated")
+                about = everybody._about(repo, commit)
+                return (
+                    about["sha"] == commit and not about.get("private") and not about.get("gated")
+                )
         except (HubFailure, SnapshotError):
             return False
 
@@ -143,14 +145,14 @@ class HubClient:
             with self._explained(repo, commit):
                 items, following = self._get(url, query)
                 records = [_record_of(item, repo) for item in list(items)]
-            found = [record for record in records if record is not None]
-            idle = 0 if found else idle + 1
+            files = [record for record in records if record is not None]
+            idle = 0 if files else idle + 1
             if idle > MAX_IDLE_PAGES:
                 raise SnapshotIntegrityError(
                     f"{repo.repo_id} on {self.public_endpoint}: its listing does not end: {idle} "
                     "pages without a file. Check that the endpoint is a Hugging Face Hub"
                 )
-            yield from found
+            yield from files
             query = _next_page(following, query)
 
     @contextmanager
@@ -252,7 +254,7 @@ class HubClient:
         except Exception as error:
             secrets = self._secrets()
             conceal(error, secrets)
-            hostile = [one for one in chain(error) if isinstance(one, HostileAnswerError)]
+            hostile = [link for link in chain(error) if isinstance(link, HostileAnswerError)]
             if hostile:
                 raise SnapshotIntegrityError(
                     f"{'/'.join(repo)}@{revision} on {self.public_endpoint}: {hostile[0]}. "

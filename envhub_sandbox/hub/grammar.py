@@ -46,9 +46,9 @@ class Parts(NamedTuple):
 class Wrong(Exception):
     """A reference cannot be read: what is wrong with it, and what to write instead."""
 
-    def __init__(self, what: str, write: str) -> None:
-        super().__init__(what, write)
-        self.what = what
+    def __init__(self, reason: str, write: str) -> None:
+        super().__init__(reason, write)
+        self.what = reason
         self.write = write
 
 
@@ -76,9 +76,9 @@ def is_commit(revision: str) -> bool:
 
 def is_local(text: str) -> bool:
     """Whether it names a folder here: ``./env``, ``../env``, ``/env``, ``~/env``, ``examples:``."""
-    here = ("./", "../", "/", "~/", ".\\", "..\\", "examples:")
+    prefixes = ("./", "../", "/", "~/", ".\\", "..\\", "examples:")
     drive = IS_WINDOWS and _DRIVE.match(text) is not None
-    return text in (".", "..", "~") or text.startswith(here) or drive
+    return text in (".", "..", "~") or text.startswith(prefixes) or drive
 
 
 def has_control_characters(text: str) -> bool:
@@ -137,7 +137,7 @@ def check_path(parts: Parts) -> None:
         raise Wrong("the path has control characters", _INSIDE)
     if _DRIVE.match(path):
         raise Wrong("the path has a drive letter", _INSIDE)
-    for bad, what in (
+    for bad, complaint in (
         ("\\" in path, "the path has backslashes"),
         (path.startswith("/"), "the path is absolute"),
         (".." in pieces, "the path has '..'"),
@@ -145,7 +145,7 @@ def check_path(parts: Parts) -> None:
         (any(p != p.strip() for p in pieces), "the path has spaces around a name"),
     ):
         if bad:
-            raise Wrong(what, _suggest(parts, _inside(pieces)))
+            raise Wrong(complaint, _suggest(parts, _inside(pieces)))
     _check_suffix(parts, pieces[-1])
 
 
@@ -247,8 +247,8 @@ def _split_repo(repo: str, rest: str) -> tuple[str | None, str]:
             example = f"pypi:{package}#{env_id}"
             raise Wrong("this names an environment of Gymnasium, not a repository", repr(example))
         if not prefix and not rest and repo.endswith(".py"):
-            what = "this is the name of a file, which does not exist here"
-            raise Wrong(what, f"'./FOLDER/{repo}' or 'OWNER/NAME:{repo}'")
+            reason = "this is the name of a file, which does not exist here"
+            raise Wrong(reason, f"'./FOLDER/{repo}' or 'OWNER/NAME:{repo}'")
         local = "" if prefix or rest else f" (or './{repo}' for a local folder)"
         example = f"{prefix}OWNER/{steps[0]}{rest}"
         raise Wrong("the owner is missing", f"{example!r} with the owner's name{local}")
@@ -339,8 +339,8 @@ def _read_git(_: str, rest: str) -> Parts:
     raise _git_remote(*rest.partition("/")[::2])
 
 
-def _git_remote(place: str, path: str) -> Wrong:
-    repo, host = path.removesuffix(".git").strip("/"), place.rpartition("@")[2].lower()
+def _git_remote(remote: str, path: str) -> Wrong:
+    repo, host = path.removesuffix(".git").strip("/"), remote.rpartition("@")[2].lower()
     elsewhere = "github:" if host == "github.com" else f"git+https://{host}/"
     write = repo if host in HUB_HOSTS else elsewhere + repo
     return Wrong("this is a git remote", repr(write) if repo else GRAMMAR)

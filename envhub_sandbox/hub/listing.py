@@ -146,13 +146,13 @@ class Snapshot:
         """
         return tuple(
             (
-                f"{one.repo_type}s--{one.repo_id.replace('/', '--')}",
-                one.commit,
-                _cached_revisions(one),
-                "" if one is self else str(one.root),
+                f"{snapshot.repo_type}s--{snapshot.repo_id.replace('/', '--')}",
+                snapshot.commit,
+                _cached_revisions(snapshot),
+                "" if snapshot is self else str(snapshot.root),
             )
-            for one in (self, *self.assets)
-            if one.repo_type in REPO_TYPES
+            for snapshot in (self, *self.assets)
+            if snapshot.repo_type in REPO_TYPES
         )
 
     @property
@@ -170,8 +170,8 @@ class Snapshot:
 
     def known_as(self, path: str) -> str | None:
         """A file as its author knows it, for tracebacks; None if there is none of that name."""
-        found = bisect_left(self.files, path, key=lambda file: file.path)
-        if found == len(self.files) or self.files[found].path != path:
+        index = bisect_left(self.files, path, key=lambda file: file.path)
+        if index == len(self.files) or self.files[index].path != path:
             return None
         if self.is_local:
             return f'"{self.repo_id.rstrip("/")}/{path}"'
@@ -191,10 +191,14 @@ def content_digest(files: tuple[FileRecord, ...]) -> str:
 
 def _cached_revisions(snapshot: Snapshot) -> tuple[str, ...]:
     """What is found in a jail: ``main``, and what was asked for, if a file can be called so."""
-    asked = snapshot.revision or "main"
+    revision = snapshot.revision or "main"
     # beside the file "main" there is no folder of that name
-    known = asked != snapshot.commit and not asked.startswith("main/") and is_cached_revision(asked)
-    return tuple(sorted({"main", *([asked] if known else [])}))
+    cached = (
+        revision != snapshot.commit
+        and not revision.startswith("main/")
+        and is_cached_revision(revision)
+    )
+    return tuple(sorted({"main", *([revision] if cached else [])}))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -206,10 +210,10 @@ class SnapshotLimits:
     max_file_bytes: int = 2 * 2**30
 
     def __post_init__(self) -> None:
-        for one in fields(self):
-            value = getattr(self, one.name)
+        for limit in fields(self):
+            value = getattr(self, limit.name)
             if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise PolicyError(f"{one.name} must be a positive int, got {value!r}")
+                raise PolicyError(f"{limit.name} must be a positive int, got {value!r}")
 
 
 DEFAULT_LIMITS = SnapshotLimits()
@@ -228,8 +232,8 @@ def listing_within_limits(
         taken.append(file)
         total += file.size
         if file.size > limits.max_file_bytes:
-            what = f"the file {file.path!r} has {size_text(file.size)}"
-            raise _too_large(title, what, "max_file_bytes", limits.max_file_bytes)
+            excess = f"the file {file.path!r} has {size_text(file.size)}"
+            raise _too_large(title, excess, "max_file_bytes", limits.max_file_bytes)
         if len(taken) > limits.max_files:
             raise _too_large(title, "it has too many files", "max_files", limits.max_files)
         if total > limits.max_bytes:
@@ -237,12 +241,12 @@ def listing_within_limits(
     return tuple(sorted(taken, key=lambda file: file.path))
 
 
-def _too_large(title: str, what: str, name: str, limit: int) -> SnapshotTooLargeError:
+def _too_large(title: str, excess: str, name: str, limit: int) -> SnapshotTooLargeError:
     shown = f" ({size_text(limit)})" if name.endswith("_bytes") else ""
     return SnapshotTooLargeError(
-        f"{title}: {what}, over the limit {name}={limit}{shown}. If you accept the size, download "
-        "it once, then make_env uses it: envhub_sandbox.hub.snapshot.fetch(HubRef.parse(...), "
-        f"limits=SnapshotLimits({name}=...))"
+        f"{title}: {excess}, over the limit {name}={limit}{shown}. If you accept the size, "
+        "download it once, then make_env uses it: "
+        f"envhub_sandbox.hub.snapshot.fetch(HubRef.parse(...), limits=SnapshotLimits({name}=...))"
     )
 
 
@@ -284,9 +288,9 @@ SHA256 = "sha256"
 class HashMismatch(Exception):
     """Bytes are not the ones that were recorded; ``found`` says in words what they are."""
 
-    def __init__(self, found: str) -> None:
-        super().__init__(found)
-        self.found = found
+    def __init__(self, digest: str) -> None:
+        super().__init__(digest)
+        self.found = digest
 
 
 def _start(kind: str, size: int) -> Any:
@@ -323,9 +327,9 @@ def write_verified(stream: IO[bytes], target: Path, record: FileRecord) -> None:
         written = copy_bounded(stream, out, record.size, running)
     if written > record.size:
         raise HashMismatch(f"more than {record.size} bytes")
-    found = f"{kind}:{running.hexdigest()}"
-    if written != record.size or found != record.digest:
-        raise HashMismatch(f"{written} bytes with {found}")
+    digest = f"{kind}:{running.hexdigest()}"
+    if written != record.size or digest != record.digest:
+        raise HashMismatch(f"{written} bytes with {digest}")
 
 
 def differing(root: Path, mine: Iterable[FileRecord], theirs: Iterable[FileRecord]) -> list[str]:

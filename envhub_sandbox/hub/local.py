@@ -139,7 +139,7 @@ class LocalFolder:
         """The files of the snapshot, with ``/`` in their names. A link that leaves the folder is
         refused.
         """
-        return (one for one in self._found() if isinstance(one, LocalFile))
+        return (item for item in self._found() if isinstance(item, LocalFile))
 
     def listed(self, *, allow_secrets: bool = False) -> Listing:
         """The files of the snapshot, within limits, and their records, by reading all of them.
@@ -150,54 +150,55 @@ class LocalFolder:
         if self.entry is None and not allow_secrets and is_home(self.root):
             raise self._secret("is a home directory, or has one in it")
         try:
-            found = listing_within_limits(self._kept(left), DEFAULT_LIMITS, str(self))
+            listing = listing_within_limits(self._kept(left), DEFAULT_LIMITS, str(self))
         except OSError as error:
             raise SnapshotError(f"{self}: it cannot be read: {error}") from error
         except SnapshotTooLargeError as error:
             if self.checkout is None:
                 error.args = (f"{error}. {_ALL_COUNTS}",)
             raise
-        secret = [one.path for one in found if self.entry is None and looks_secret(one.path)]
+        secret = [file.path for file in listing if self.entry is None and looks_secret(file.path)]
         if secret and not allow_secrets:
             raise self._secret(f"holds what looks like keys or passwords: {_shown(secret)}")
         records = tuple(
-            FileRecord(one.path, one.size, _digest(one, str(self)), one.executable) for one in found
+            FileRecord(file.path, file.size, _digest(file, str(self)), file.executable)
+            for file in listing
         )
         check_listing_names(records, str(self))
-        return Listing(found, records, tuple(left))
+        return Listing(listing, records, tuple(left))
 
-    def _secret(self, what: str) -> PolicyError:
+    def _secret(self, reason: str) -> PolicyError:
         ignore = ", have git ignore it" if self.checkout else ""
         return PolicyError(
-            f"{self} {what}. The code would see all of it. Move away what it should not see"
+            f"{self} {reason}. The code would see all of it. Move away what it should not see"
             f"{ignore}, or name the .py file alone, as {self.root / 'env.py'}, whose code sees of "
             "its folder only what it imports. If it may see everything here, pass "
             f"{option_name('allow_secrets', True)}"
         )
 
     def _kept(self, left: list[LeftOut]) -> Iterator[LocalFile]:
-        for one in self._found():
-            if isinstance(one, LocalFile):
-                yield one
-            elif not _is_empty_folder(self.root / one.path):
-                left.append(one)
+        for item in self._found():
+            if isinstance(item, LocalFile):
+                yield item
+            elif not _is_empty_folder(self.root / item.path):
+                left.append(item)
 
     def seen(self, listing: Listing) -> str:
         """One line about what the code gets to see."""
-        names = [one.path for one in listing.files]
-        said = f"{self}: the code sees {counted(len(names), 'file')} of "
-        said += "it" if self.entry is None else f"its folder: {_shown(names)}"
-        left = [one for one in listing.left_out if one.why not in (IGNORED, REPOSITORY)]
+        names = [item.path for item in listing.files]
+        summary = f"{self}: the code sees {counted(len(names), 'file')} of "
+        summary += "it" if self.entry is None else f"its folder: {_shown(names)}"
+        left = [item for item in listing.left_out if item.why not in (IGNORED, REPOSITORY)]
         if left:
-            said += f"; left out: {_shown([f'{one.path} ({one.why})' for one in left])}"
-        return said
+            summary += f"; left out: {_shown([f'{item.path} ({item.why})' for item in left])}"
+        return summary
 
     def warn_of_requirements(self, listing: Listing) -> None:
         """Other packages than its author's may give other results."""
         beside = self.root / _REQUIREMENTS
         if self.entry is None or not beside.is_file():
             return
-        if any(one.path == _REQUIREMENTS for one in listing.files):
+        if any(file.path == _REQUIREMENTS for file in listing.files):
             return
         warnings.warn(
             f"{self.root / self.entry} is named alone, so {beside} does not say which packages it "
@@ -217,27 +218,30 @@ class LocalFolder:
                 "only what it imports, and what git tracks. To show it the whole folder, name that "
                 f"with its entry: {self.as_folder()}"
             )
-        what, cure = self.why_left_out(path) or (f"has {path!r} now", "Make the environment again")
-        return f"{self} {what}. {cure}"
+        otherwise = f"has {path!r} now", "Make the environment again"
+        reason, cure = self.why_left_out(path) or otherwise
+        return f"{self} {reason}. {cure}"
 
     def why_left_out(self, path: str) -> tuple[str, str] | None:
         """What to say of a file that is there, and that is not in the snapshot, and what to do."""
-        for one in self.left_out():
-            if f"{path}/".startswith(f"{one.path.rstrip('/')}/"):
+        for item in self.left_out():
+            if f"{path}/".startswith(f"{item.path.rstrip('/')}/"):
                 allow = option_name("allow_secrets", True)
-                what = f"has the file {path!r}, but left it out: {one.path} is {one.why}"
-                return what, _CURES[one.why].format(path=path, allow=allow)
+                reason = f"has the file {path!r}, but left it out: {item.path} is {item.why}"
+                return reason, _CURES[item.why].format(path=path, allow=allow)
         return None
 
     def left_out(self) -> Iterator[LeftOut]:
         """Yield what lies here and is not in the snapshot; empty folders aside."""
-        found = (one for one in self._found() if isinstance(one, LeftOut))
-        return (one for one in found if not _is_empty_folder(self.root / one.path))
+        items = (item for item in self._found() if isinstance(item, LeftOut))
+        return (item for item in items if not _is_empty_folder(self.root / item.path))
 
     def _found(self) -> Iterator[LocalFile | LeftOut]:
         if self.entry is not None:
-            found = self._of_the_file(self.entry)
-            return (LeftOut(one.path, _SECRET) if looks_secret(one.path) else one for one in found)
+            items = self._of_the_file(self.entry)
+            return (
+                LeftOut(item.path, _SECRET) if looks_secret(item.path) else item for item in items
+            )
         if self.checkout is None:
             return self._all(self.root, "", (self.root,))
         return self._committed(self.checkout, self.root, "")
@@ -252,10 +256,10 @@ class LocalFolder:
             return
         own = own_files(self.root, entry, self.checkout.names_in)
         folders = tuple(name for name in own if name.endswith("/"))
-        for one in self._committed(self.checkout, self.root, ""):
-            is_tracked = one.path in self.checkout.tracked
-            if is_tracked or one.path in own or one.path.startswith(folders):
-                yield one
+        for item in self._committed(self.checkout, self.root, ""):
+            is_tracked = item.path in self.checkout.tracked
+            if is_tracked or item.path in own or item.path.startswith(folders):
+                yield item
 
     def _committed(
         self, checkout: Checkout, folder: Path, prefix: str
@@ -314,7 +318,9 @@ class LocalFolder:
         if prefix.count("/") >= MAX_DEPTH:
             raise SnapshotError(f"{self}: {prefix!r} is over {MAX_DEPTH} folders deep")
         with os.scandir(folder) as listing:
-            return sorted((one for one in listing if one.name != _GIT), key=lambda one: one.name)
+            return sorted(
+                (item for item in listing if item.name != _GIT), key=lambda item: item.name
+            )
 
     def _inside(self, path: Path, name: str) -> Path:
         if not path.is_symlink():
@@ -353,7 +359,9 @@ def _names_below(root: Path) -> Callable[[str], Collection[str]]:
             return ()
         try:
             with os.scandir(path) as listing:
-                return frozenset(one.name for one in listing if one.is_file(follow_symlinks=False))
+                return frozenset(
+                    item.name for item in listing if item.is_file(follow_symlinks=False)
+                )
         except OSError:
             return ()
 
@@ -376,8 +384,8 @@ class LocalPath(NamedTuple):
 
     def listed(self, *, allow_secrets: bool = False) -> tuple[LocalFolder, Listing]:
         """What its code gets to see; raises as ``LocalFolder.listed``."""
-        here = LocalFolder.at(self.folder, self.path if self.is_file else None)
-        return here, here.listed(allow_secrets=allow_secrets)
+        folder = LocalFolder.at(self.folder, self.path if self.is_file else None)
+        return folder, folder.listed(allow_secrets=allow_secrets)
 
     @property
     def repo_type(self) -> str:
@@ -415,7 +423,9 @@ def _similar(path: Path) -> str:
     import difflib
 
     with contextlib.suppress(OSError):
-        names = [one.name for one in path.parent.iterdir() if one.suffix == ".py" or one.is_dir()]
+        names = [
+            item.name for item in path.parent.iterdir() if item.suffix == ".py" or item.is_dir()
+        ]
         close = difflib.get_close_matches(path.name, names, n=1)
         return f". Did you mean {str(path.parent / close[0])!r}?" if close else ""
     return ""
@@ -427,16 +437,18 @@ def _example(text: str) -> Path:
     import sysconfig  # rarely needed, and slow to import
 
     schemes = ("data", sysconfig.get_default_scheme()), ("data", "posix_user")
-    installed = [checkout / "share"] + [Path(sysconfig.get_path(*one), "share") for one in schemes]
+    installed = [checkout / "share"] + [
+        Path(sysconfig.get_path(*scheme), "share") for scheme in schemes
+    ]
     roots = [checkout] if (checkout / "worker" / "envhub_worker").is_dir() else []
     roots += [share / "envhub-sandbox" for share in installed]
-    examples = next((one for root in roots if (one := root / "examples").is_dir()), None)
-    known = sorted(one.parent.name for one in examples.glob("*/env.py")) if examples else []
+    examples = next((path for root in roots if (path := root / "examples").is_dir()), None)
+    names = sorted(path.parent.name for path in examples.glob("*/env.py")) if examples else []
     name = text.removeprefix(_EXAMPLES)
-    if examples is None or name not in known:
+    if examples is None or name not in names:
         raise RepositoryUnavailableError(
             f"{text!r}: there is no such example; choose one: "
-            + (", ".join(f"{_EXAMPLES}{one}" for one in known) or "none is installed")
+            + (", ".join(f"{_EXAMPLES}{example}" for example in names) or "none is installed")
         )
     return examples / name
 
@@ -452,10 +464,10 @@ def _digest(file: LocalFile, title: str) -> str:
 
 def copier(files: tuple[LocalFile, ...], title: str) -> Callable[[FileRecord, Path], None]:
     """A function that copies one file into the store, or says that it changed meanwhile."""
-    found = {file.path: file for file in files}
+    by_path = {file.path: file for file in files}
 
     def copy(record: FileRecord, target: Path) -> None:
-        file = found[record.path]
+        file = by_path[record.path]
         if file.link is not None:
             target.write_bytes(file.link)
             return

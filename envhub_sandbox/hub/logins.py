@@ -20,10 +20,10 @@ def without_login(url: str) -> str:
 
 def login_of(url: str) -> tuple[str, str] | None:
     """User and password of a URL, or None."""
-    found = _LOGIN.search(url)
-    if found is None:
+    match = _LOGIN.search(url)
+    if match is None:
         return None
-    user, _, password = found.group()[:-1].partition(":")
+    user, _, password = match.group()[:-1].partition(":")
     return unquote(user), unquote(password)
 
 

@@ -207,24 +207,24 @@ def _verify_again(slot: Slot, changed: list[FileRecord]) -> None:
     for entry in changed:
         path = slot.tree / entry.path
         try:
-            found = digest_of(path, entry.digest.partition(":")[0], entry.size)
+            digest = digest_of(path, entry.digest.partition(":")[0], entry.size)
         except (OSError, HashMismatch) as error:
             raise _damaged(slot, f"the file {entry.path!r} cannot be read ({error})") from error
-        if found != entry.digest or path.lstat().st_size != entry.size:
+        if digest != entry.digest or path.lstat().st_size != entry.size:
             raise _damaged(
-                slot, f"the file {entry.path!r} was changed: {found}, not {entry.digest}"
+                slot, f"the file {entry.path!r} was changed: {digest}, not {entry.digest}"
             )
         with contextlib.suppress(OSError):
             path.chmod(_mode_of(entry))
 
 
 def _damaged(
-    slot: Slot, what: str, kind: type[SnapshotIntegrityError] = SnapshotIntegrityError
+    slot: Slot, damage: str, kind: type[SnapshotIntegrityError] = SnapshotIntegrityError
 ) -> SnapshotIntegrityError:
     return kind(
-        f"{slot.title}: the copy in the store is not what was verified: {what}. Nothing of it was "
-        f"used. Remove it; the next use downloads it again: chmod -R u+w '{slot.home}' && rm -r "
-        f"'{slot.home}'"
+        f"{slot.title}: the copy in the store is not what was verified: {damage}. Nothing of it "
+        "was used. Remove it; the next use downloads it again: "
+        f"chmod -R u+w '{slot.home}' && rm -r '{slot.home}'"
     )
 
 
@@ -346,11 +346,11 @@ def mark_used(slot: Slot) -> None:
         os.utime(slot.record)
 
 
-def _refuse_shared_store(place: Path) -> None:
+def _refuse_shared_store(store: Path) -> None:
     """A user who can write there can put both a tree and a record that vouches for it."""
     root = cache_root()
     try:
-        why = folders.why_distrusted(place, root)
+        why = folders.why_distrusted(store, root)
     except PermissionError as error:
         raise SnapshotError(f"the snapshot store {root} cannot be looked at: {error}") from error
     if why:
@@ -402,10 +402,10 @@ def _rename(building: Path, home: Path) -> None:
 
 def commits(folder: Path) -> list[StoredCommit]:
     """The commits of a repository in the store, the latest fetched first. Nothing is verified."""
-    found = []
+    commits = []
     for record in folder.glob("[!.]*/record.json"):
         with contextlib.suppress(OSError, ValueError):
             document = json.loads(record.read_bytes())
             revision, fetched = document.get("revision"), document.get("fetched", "")
-            found.append(StoredCommit(record.parent.name, revision, str(fetched)))
-    return sorted(found, key=lambda stored: stored.fetched, reverse=True)
+            commits.append(StoredCommit(record.parent.name, revision, str(fetched)))
+    return sorted(commits, key=lambda stored: stored.fetched, reverse=True)

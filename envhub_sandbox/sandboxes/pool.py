@@ -89,8 +89,8 @@ class _Entry(Generic[S_co]):
 
     def uses(self) -> list[ServerUse[Any]]:
         """Those that have not been given back."""
-        found = (ref() for ref in self._uses)
-        return [use for use in found if use is not None and use.live]
+        live = (ref() for ref in self._uses)
+        return [use for use in live if use is not None and use.live]
 
     def add(self, use: ServerUse[Any]) -> None:
         """There is one more; those that have ended are forgotten."""
@@ -166,16 +166,16 @@ class ServerPool(Generic[S]):
                 the end of this process.
             group: Who shares it. One of another group gets it only while it is unused.
         """
-        place = os.getpid(), key, group
+        slot = os.getpid(), key, group
         with self._changed:
-            starting = self._starts.setdefault(place, threading.RLock())
+            starting = self._starts.setdefault(slot, threading.RLock())
         with starting:
             with self._changed:
-                entry = self._used.get(place)
+                entry = self._used.get(slot)
                 if entry is not None:
                     use = ServerUse(self, entry, idle_s)
                     # the garbage collector may just have closed the one environment that used it
-                    if self._used.get(place) is entry and entry.server.runs:
+                    if self._used.get(slot) is entry and entry.server.runs:
                         return use
                     use.release()
                 entry = self._take(key)
@@ -183,7 +183,7 @@ class ServerPool(Generic[S]):
             with self._changed:
                 entry.group = group
                 use = ServerUse(self, entry, idle_s)
-                self._used[place] = entry
+                self._used[slot] = entry
                 return use
 
     def give_back(self, use: ServerUse[S], entry: _Entry[S], idle_s: float | None) -> bool:
@@ -192,9 +192,9 @@ class ServerPool(Generic[S]):
             use.live = False
             if entry.uses():
                 return True  # the last of them gives the server up
-            place = entry.pid, entry.key, entry.group
-            if self._used.get(place) is entry:
-                del self._used[place]
+            slot = entry.pid, entry.key, entry.group
+            if self._used.get(slot) is entry:
+                del self._used[slot]
             if idle_s != 0 and not self._ends and entry.server.runs:
                 self._keep(entry, None if idle_s is None else monotonic() + idle_s)
                 return True
@@ -228,7 +228,7 @@ class ServerPool(Generic[S]):
 
     def _earliest(self) -> tuple[float, _Entry[S]] | None:
         timed = [(entry.until, entry) for entry in self._mine() if entry.until is not None]
-        return min(timed, key=lambda one: one[0], default=None)
+        return min(timed, key=lambda timer: timer[0], default=None)
 
     def _watch(self) -> None:
         self._changed.notify_all()
@@ -269,8 +269,10 @@ class ServerPool(Generic[S]):
     def stop_all(self) -> None:
         """End all that this process has started, and keep none from now on: at its exit."""
         self._ends = True
-        here = os.getpid()
-        self._stop(lambda: [*self._mine(), *(e for e in self._used.values() if e.pid == here)])
+        process_id = os.getpid()
+        self._stop(
+            lambda: [*self._mine(), *(e for e in self._used.values() if e.pid == process_id)]
+        )
 
     def _stop(self, which: Callable[[], list[_Entry[S]]]) -> None:
         with self._changed:
@@ -359,15 +361,15 @@ class ServerHold:
 
     def settle(self) -> bool:
         """Wait for the jails that are on their way out; whether there was one."""
-        found = False
+        settled = False
         while self._pending_closes:
             try:
                 wait = self._pending_closes.pop()
             except IndexError:  # another thread was faster
                 break
-            found = True
+            settled = True
             wait()
-        return found
+        return settled
 
     def _is_kept(self, server: WorkerServer) -> bool:
         use = self._use

@@ -252,8 +252,8 @@ def _wait_until_ready(ready: int, server: LocalServer) -> None:
     if readable and os.read(ready, 16):
         return
     log = (server.folder / "server.log").read_text("utf-8", "replace")[-4000:]
-    what = "ended" if readable else f"was not ready after {_STARTUP_S:.0f} s"
-    raise WorkerStartupError(f"the worker server {what} ({sys.executable}):\n{log}")
+    failure = "ended" if readable else f"was not ready after {_STARTUP_S:.0f} s"
+    raise WorkerStartupError(f"the worker server {failure} ({sys.executable}):\n{log}")
 
 
 PROCESS = ProcessSandbox()
@@ -289,12 +289,12 @@ class RuntimeFolder:
 def _made(prefix: str) -> Path:
     """A new folder in the first place that takes one: whether it does only an attempt can tell."""
     why = ""
-    for place in places():
-        if _is_short(place):
+    for parent in places():
+        if _is_short(parent):
             try:
-                return Path(tempfile.mkdtemp(prefix=prefix, dir=place))
+                return Path(tempfile.mkdtemp(prefix=prefix, dir=parent))
             except OSError as error:
-                why = why or f" ({error.strerror}: {place})"
+                why = why or f" ({error.strerror}: {parent})"
     raise SandboxUnavailableError(
         f"no folder can be used for sockets: their paths can have {_SOCKET_BYTES} bytes at most, "
         f"and {', '.join(map(str, places()))} are too long or not writable{why}; set TMPDIR to a "
@@ -304,24 +304,24 @@ def _made(prefix: str) -> Path:
 
 def places() -> list[Path]:
     """Where they may lie, best first: a short one stands in for a temporary folder that is not."""
-    found = []
+    parents = []
     with contextlib.suppress(FileNotFoundError):  # nothing can be written here
-        found.append(Path(tempfile.gettempdir()))
+        parents.append(Path(tempfile.gettempdir()))
     own = os.environ.get("XDG_RUNTIME_DIR", "")
     if os.path.isabs(own) and user_id() != 0:  # root's jails, another user, have to get through
-        found.append(Path(own))
-    return list(dict.fromkeys([*found, *([] if IS_WINDOWS else [Path("/tmp")])]))
+        parents.append(Path(own))
+    return list(dict.fromkeys([*parents, *([] if IS_WINDOWS else [Path("/tmp")])]))
 
 
-def _is_short(place: Path) -> bool:
+def _is_short(folder: Path) -> bool:
     if not IS_LINUX:  # there it holds no sockets
         return True
-    return len(os.fsencode(place) + os.fsencode(_LONGEST)) <= _SOCKET_BYTES
+    return len(os.fsencode(folder) + os.fsencode(_LONGEST)) <= _SOCKET_BYTES
 
 
-def stale_folders(place: Path) -> Iterator[Path]:
+def stale_folders(parent: Path) -> Iterator[Path]:
     """Ours below one of the places whose client has ended, or the server without a client."""
-    for path in sorted(place.glob(f"{SERVER}*")):
+    for path in sorted(parent.glob(f"{SERVER}*")):
         with contextlib.suppress(OSError):
             if _NAME.fullmatch(path.name) and _belongs_to_us(path) and _is_deserted(path):
                 yield path
@@ -332,8 +332,8 @@ def remove_stale() -> list[Path]:
 
     These are for people to judge: a file system may be shared, and not pass locks on.
     """
-    found = [path for place in places() for path in stale_folders(place)]
-    ours = [path for path in found if not _is_elsewhere(path)]
+    folders = [path for parent in places() for path in stale_folders(parent)]
+    ours = [path for path in folders if not _is_elsewhere(path)]
     for path in ours:
         shutil.rmtree(path, ignore_errors=True)
         WORKER.info("removed %s, which a client that was killed had left", path)

@@ -137,9 +137,9 @@ def worst_of(failures: Sequence[EnvHubError]) -> EnvHubError:
 
     ``failures``: at least one, in the order of the tries.
     """
-    busy = (one for one in failures if isinstance(one, ServerBusyError))
+    busy = (failure for failure in failures if isinstance(failure, ServerBusyError))
     error = next(busy, failures[0])
-    others = [str(one).partition("\n")[0] for one in failures if one is not error]
+    others = [str(failure).partition("\n")[0] for failure in failures if failure is not error]
     if others and error.args:
         more = "\n".join(["The other places of the fleet:", *others])
         error.args = (f"{error.args[0]}\n{more}", *error.args[1:])

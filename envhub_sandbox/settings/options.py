@@ -103,7 +103,7 @@ def _flag(value: Any) -> bool:
 
 
 def _assets(value: Any) -> tuple[str, ...]:
-    if not isinstance(value, (list, tuple)) or not all(isinstance(one, str) for one in value):
+    if not isinstance(value, (list, tuple)) or not all(isinstance(ref, str) for ref in value):
         raise TypeError(f"`assets` is {value!r}; it takes a list such as ['org/data@COMMIT']")
     if len(value) > MAX_ASSETS:
         raise ValueError(f"`assets` has {len(value)} repositories; it takes {MAX_ASSETS} at most")
@@ -121,8 +121,8 @@ def _keyword_arguments(value: Any) -> dict[str, Any]:
     return dict(value)
 
 
-def _option(default: Any, command: str = "", text: str = "", **known: Any) -> Any:
-    return field(default=default, metadata={"option": Option(command, text, **known)})
+def _option(default: Any, command: str = "", text: str = "", **attributes: Any) -> Any:
+    return field(default=default, metadata={"option": Option(command, text, **attributes)})
 
 
 @dataclass(frozen=True, kw_only=True, repr=False)
@@ -251,8 +251,8 @@ class Options:
 
     def refuse_sandboxed(self) -> None:
         """Without a sandbox: refuse what would silently do nothing, by name."""
-        given = {name: value for name, value in vars(self).items() if OPTIONS[name].sandboxed}
-        idle = [name for name, value in given.items() if value and value != OPTIONS[name].default]
+        values = {name: value for name, value in vars(self).items() if OPTIONS[name].sandboxed}
+        idle = [name for name, value in values.items() if value and value != OPTIONS[name].default]
         if idle:
             raise PolicyError(
                 f"{', '.join(idle)}: for environments in a sandbox; with sandbox=None there is none"
@@ -325,19 +325,19 @@ _IN_PYTHON = {
 
 
 def _table() -> dict[str, Option]:
-    found = {}
-    for one in fields(Options):
-        option = one.metadata["option"]
+    options = {}
+    for item in fields(Options):
+        option = item.metadata["option"]
         panel = option.panel or _CODE
-        found[one.name] = replace(option, argument=one.name, default=one.default, panel=panel)
+        options[item.name] = replace(option, argument=item.name, default=item.default, panel=panel)
     for argument, keys in _KEYS.items():
         for key, option in {
             **keys,
             **dict.fromkeys(_IN_PYTHON[argument].split(), Option()),
         }.items():
             panel = option.panel or _LIMITS
-            found[key] = replace(option, argument=argument, field=key, panel=panel)
-    return found
+            options[key] = replace(option, argument=argument, field=key, panel=panel)
+    return options
 
 
 OPTIONS = _table()
@@ -355,19 +355,19 @@ def in_python(option: Option, value: Any) -> str:
     return f"{option.argument}={ {option.field: value} if option.field else value!r}"
 
 
-def on_command_line(known: Collection[str]) -> Spelling:
+def on_command_line(available: Collection[str]) -> Spelling:
     """``--dependencies host``, ``--profile no-userns``, an option again for each of a list; in
     Python what is not ``known`` to the command.
     """
 
     def spelling(option: Option, value: Any) -> str:
         command = option.command.partition(" ")[0]
-        if not command or command not in known or value is False:
+        if not command or command not in available or value is False:
             return f"{in_python(option, value)} in Python"
         if value is _NO_VALUE or value is True:
             return command
         every = value if option.kind is list and isinstance(value, list) else [value]
-        return " ".join(f"{command} {shlex.quote(_text(one))}" for one in every)
+        return " ".join(f"{command} {shlex.quote(_text(member))}" for member in every)
 
     return spelling
 
@@ -378,8 +378,8 @@ def on_lerobots_command_line(prefix: str = "--env.") -> Spelling:
     def spelling(option: Option, value: Any) -> str:
         if value is _NO_VALUE:
             return f"{prefix}{in_python(option, value)}"
-        given = {option.field: value} if option.field else value
-        return f"{prefix}{option.argument}={shlex.quote(_text(given))}"
+        shown = {option.field: value} if option.field else value
+        return f"{prefix}{option.argument}={shlex.quote(_text(shown))}"
 
     return spelling
 
@@ -404,11 +404,11 @@ def option_name(key: str, value: Any = _NO_VALUE) -> str:
     return _spelling(OPTIONS[key], value)
 
 
-def nearest(name: object, known: Iterable[str], cutoff: float = 0.6) -> str:
+def nearest(name: object, names: Iterable[str], cutoff: float = 0.6) -> str:
     """A question in brackets about the known name that is most like another; empty for none."""
     import difflib
 
-    close = difflib.get_close_matches(str(name), list(known), 1, cutoff)
+    close = difflib.get_close_matches(str(name), list(names), 1, cutoff)
     return f" (did you mean {close[0]!r}?)" if close else ""
 
 

@@ -219,29 +219,31 @@ def timeouts_from(value: Timeouts | Mapping[str, Any] | None) -> Timeouts:
     return _from(Timeouts, value, "timeouts")
 
 
-def _from(cls: type[T], value: T | Mapping[str, Any] | None, what: str) -> T:
+def _from(cls: type[T], value: T | Mapping[str, Any] | None, argument: str) -> T:
     if value is None:
         return cls()
     if isinstance(value, cls):
         return value
     if not isinstance(value, Mapping):
-        raise PolicyError(f"{what} takes a {cls.__name__} or a mapping, not {type(value).__name__}")
-    known = [item.name for item in fields(cls)]
-    unknown = [name for name in value if name not in known]
+        raise PolicyError(
+            f"{argument} takes a {cls.__name__} or a mapping, not {type(value).__name__}"
+        )
+    names = [item.name for item in fields(cls)]
+    unknown = [name for name in value if name not in names]
     if unknown:
         raise PolicyError(
-            f"{what} has no field {', '.join(map(str, unknown))}{nearest(unknown[0], known)}; it "
-            f"has {', '.join(known)}"
+            f"{argument} has no field {', '.join(map(str, unknown))}{nearest(unknown[0], names)}; "
+            f"it has {', '.join(names)}"
         )
-    made = dict(value)
-    if cls is Policy and isinstance(made.get("limits"), Mapping):
-        made["limits"] = _from(Limits, made["limits"], "limits")
-    return cls(**made)
+    values = dict(value)
+    if cls is Policy and isinstance(values.get("limits"), Mapping):
+        values["limits"] = _from(Limits, values["limits"], "limits")
+    return cls(**values)
 
 
-def _one_of(name: str, value: str, known: tuple[str, ...]) -> None:
-    if value not in known:
-        raise PolicyError(f"{option_name(name)} is {value!r}; it is one of {', '.join(known)}")
+def _one_of(name: str, value: str, permitted: tuple[str, ...]) -> None:
+    if value not in permitted:
+        raise PolicyError(f"{option_name(name)} is {value!r}; it is one of {', '.join(permitted)}")
 
 
 def _count(name: str, value: object) -> None:

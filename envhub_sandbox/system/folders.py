@@ -79,7 +79,7 @@ def write_private(path: Path, content: bytes) -> None:
         file.write(content)
 
 
-def why_distrusted(place: Path, ours: Path) -> str:
+def why_distrusted(folder: Path, ours: Path) -> str:
     """Who besides us and root can change what lies at a place, and what to do; empty if none can.
 
     Every step of the path counts, links and what they lead to included: a user who can write in
@@ -92,10 +92,10 @@ def why_distrusted(place: Path, ours: Path) -> str:
     Raises ``OSError``: a step cannot be looked at.
     """
     if IS_WINDOWS:
-        place.stat()
+        folder.stat()
         return ""
     inner = os.path.realpath(ours)
-    for path, status in _steps(place):
+    for path, status in _steps(folder):
         strict = path == inner or path.startswith(f"{inner}/")
         fault = _fault(path, status, strict)
         if fault:
@@ -103,26 +103,26 @@ def why_distrusted(place: Path, ours: Path) -> str:
     return ""
 
 
-def _steps(place: Path) -> Iterator[tuple[str, os.stat_result]]:
+def _steps(folder: Path) -> Iterator[tuple[str, os.stat_result]]:
     """Each step of a path from the root on; a link, and then each step of what it leads to."""
-    left, here, links = list(reversed(place.parts[1:])), "/", 0
-    yield here, os.lstat(here)
+    left, current, links = list(reversed(folder.parts[1:])), "/", 0
+    yield current, os.lstat(current)
     while left:
         step = left.pop()
         if step == "..":
-            here = os.path.dirname(here)
+            current = os.path.dirname(current)
             continue
-        path = os.path.join(here, step)
+        path = os.path.join(current, step)
         status = os.lstat(path)
         yield path, status
         if not stat.S_ISLNK(status.st_mode):
-            here = path
+            current = path
             continue
         links += 1
         if links > _MAX_LINKS:
             raise OSError(errno.ELOOP, os.strerror(errno.ELOOP), path)
         target = os.readlink(path)
-        here = "/" if target.startswith("/") else here
+        current = "/" if target.startswith("/") else current
         left += [part for part in reversed(target.split("/")) if part not in ("", ".")]
 
 
@@ -247,11 +247,11 @@ def cache_root() -> Path:
 @contextlib.contextmanager
 def draft(folder: Path, prefix: str = BUILDING) -> Iterator[Path]:
     """A new folder (0700) to be filled and then renamed into place; otherwise it is removed."""
-    made = Path(tempfile.mkdtemp(prefix=prefix, dir=folder))
+    draft_folder = Path(tempfile.mkdtemp(prefix=prefix, dir=folder))
     try:
-        yield made
+        yield draft_folder
     finally:
-        remove_tree(made)
+        remove_tree(draft_folder)
 
 
 def remove_tree(path: Path) -> None:
@@ -259,13 +259,13 @@ def remove_tree(path: Path) -> None:
 
     Without recursion, as ``shutil.rmtree`` has it: of a package, a stranger chose how deep it is.
     """
-    found = [] if path.is_symlink() else [str(path)]
-    for folder in found:  # which grows
+    waiting = [] if path.is_symlink() else [str(path)]
+    for folder in waiting:  # which grows
         with contextlib.suppress(OSError):
             os.chmod(folder, 0o700)
             with os.scandir(folder) as items:
-                found += [item.path for item in items if item.is_dir(follow_symlinks=False)]
-    for folder in reversed(found):
+                waiting += [item.path for item in items if item.is_dir(follow_symlinks=False)]
+    for folder in reversed(waiting):
         with contextlib.suppress(OSError):
             for name in os.listdir(folder):
                 with contextlib.suppress(OSError):

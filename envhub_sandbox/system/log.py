@@ -52,11 +52,11 @@ def progress_shown_by(show: Callable[[str], None]) -> Iterator[None]:
 @contextlib.contextmanager
 def told_by(show: Callable[[str], None]) -> Iterator[None]:
     """While it lasts, what users have to know goes to ``show``, too; each line once."""
-    said: set[str] = set()
+    names: set[str] = set()
 
     def once(line: str) -> None:
-        if line not in said:
-            said.add(line)
+        if line not in names:
+            names.add(line)
             show(line)
 
     _told_by.append(once)

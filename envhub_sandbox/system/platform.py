@@ -50,32 +50,32 @@ _WINDOWS_VARIABLES = (
 
 def user_id() -> int:
     """The effective user's id; -1 on Windows, which has none."""
-    found = -1
+    number = -1
     if sys.platform != "win32":
-        found = os.geteuid()
-    return found
+        number = os.geteuid()
+    return number
 
 
 def homes_of(path: Path) -> list[Path]:
     """The home directories of the caller and of whom a file or folder belongs to, without links;
     Windows does not say it of others.
     """
-    found = [os.path.expanduser("~")]
+    homes = [os.path.expanduser("~")]
     if sys.platform != "win32":
         import pwd
 
         with contextlib.suppress(KeyError, OSError):  # a container knows few of its users
-            found.append(pwd.getpwuid(os.stat(path).st_uid).pw_dir)
+            homes.append(pwd.getpwuid(os.stat(path).st_uid).pw_dir)
     # of whom nothing is known it is a bare "~"
-    return [Path(os.path.realpath(one)) for one in found if os.path.isabs(one)]
+    return [Path(os.path.realpath(home)) for home in homes if os.path.isabs(home)]
 
 
 def cores() -> int:
     """How many processors this process may use."""
-    found = os.cpu_count() or 1
+    count = os.cpu_count() or 1
     if sys.platform == "linux":
-        found = len(os.sched_getaffinity(0))
-    return found
+        count = len(os.sched_getaffinity(0))
+    return count
 
 
 def boot_id() -> str:
@@ -111,8 +111,8 @@ def each_after_fork(objects: Iterable[T], function: Callable[[T], object]) -> No
     """The same of each object that there is then."""
 
     def forked() -> None:
-        for one in list(objects):
-            function(one)
+        for instance in list(objects):
+            function(instance)
 
     run_after_fork(forked)
 
@@ -281,8 +281,8 @@ def wrong_on_windows(path: str) -> str | None:
     ``path``: relative, with ``/``.
     """
     for step in path.split("/"):
-        if found := re.search(_REFUSED, step):
-            return f"has {found[0]!r} in its name, which Windows reads as something else"
+        if match := re.search(_REFUSED, step):
+            return f"has {match[0]!r} in its name, which Windows reads as something else"
         if re.fullmatch(_RESERVED, step):
             return f"has the step {step!r}, which is a device on Windows"
         if step.endswith((".", " ")):
@@ -297,12 +297,12 @@ def wrong_here(path: str) -> str | None:
 
 def taken_as_one(paths: Iterable[str]) -> tuple[str, str] | None:
     """Two of these, or of the folders above them, that a file system without case takes for one."""
-    known: dict[str, str] = {}
+    taken: dict[str, str] = {}
     for path in paths:
         folded = name = ""
         for step in path.split("/"):
             folded, name = f"{folded}/{_folded(step)}", f"{name}/{step}" if name else step
-            other = known.setdefault(folded, name)
+            other = taken.setdefault(folded, name)
             if other != name:
                 return other, name
     return None

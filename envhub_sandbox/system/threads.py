@@ -74,7 +74,7 @@ class Calls(Generic[T]):
     def wait(self, timeout_s: float | None = None) -> bool:
         """Until all are done, or so many seconds; whether they are. If interrupted, they go on."""
         until = None if timeout_s is None else monotonic() + timeout_s
-        while not all(one.done for one in self.each):
+        while not all(call.done for call in self.each):
             left_s = _LOOK_S if until is None else min(_LOOK_S, until - monotonic())
             if left_s <= 0:
                 return False
@@ -87,7 +87,7 @@ class Calls(Generic[T]):
     def results(self) -> list[T]:
         """What all returned. Raises what one raised, without a wait for those that have begun."""
         try:
-            return [self._result(one) for one in self.each]
+            return [self._result(call) for call in self.each]
         finally:
             self._left.clear()
 

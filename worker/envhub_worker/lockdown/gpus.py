@@ -44,9 +44,9 @@ def granted(gpu: bool | tuple[int, ...], host: HostFiles) -> GpuGrant:
     """
     if gpu is False:
         return GpuGrant()
-    found = gpus(host)
-    wanted = range(len(found)) if gpu is True else gpu
-    if not found:
+    devices = gpus(host)
+    wanted = range(len(devices)) if gpu is True else gpu
+    if not devices:
         raise LayerUnavailableError(
             "gpu",
             "the policy grants the GPU, and there is none here: no /dev/dri/renderD* and no "
@@ -54,13 +54,15 @@ def granted(gpu: bool | tuple[int, ...], host: HostFiles) -> GpuGrant:
             "Install its driver, or give it to the container (docker run --gpus all), or grant "
             "no GPU.",
         )
-    missing = [index for index in wanted if index >= len(found)]
+    missing = [index for index in wanted if index >= len(devices)]
     if missing:
-        there = "; ".join(f"{index}: {' '.join(nodes)}" for index, nodes in enumerate(found))
+        available = "; ".join(f"{index}: {' '.join(nodes)}" for index, nodes in enumerate(devices))
         raise LayerUnavailableError(
-            "gpu", f"the policy grants GPU {missing[0]}, and these are here: {there}", "Name those."
+            "gpu",
+            f"the policy grants GPU {missing[0]}, and these are here: {available}",
+            "Name those.",
         )
-    return _granted([found[index] for index in wanted], host)
+    return _granted([devices[index] for index in wanted], host)
 
 
 def gpus(host: HostFiles) -> list[tuple[str, ...]]:
@@ -92,8 +94,8 @@ def _address(node: str, host: HostFiles) -> str:
     name = posixpath.basename(node)
     if not _is_nvidias(node):
         folder = resolve(f"/sys/class/drm/{name}", host, {})
-        found: list[str] = _ADDRESS.findall(folder)
-        return found[-1] if found else ""
+        addresses: list[str] = _ADDRESS.findall(folder)
+        return addresses[-1] if addresses else ""
     for address in host.listdir(_NVIDIAS):
         minor = _MINOR.search(host.read(f"{_NVIDIAS}/{address}/information"))
         if minor is not None and name == f"nvidia{minor[1]}" and _ADDRESS.fullmatch(address):
@@ -115,9 +117,9 @@ def _granted(chosen: Collection[tuple[str, ...]], host: HostFiles) -> GpuGrant:
 def _folders(node: str, host: HostFiles) -> list[str]:
     """Where drivers look up this one device: its folder, by the names that lead to it."""
     address = _address(node, host)
-    found = [f"/sys/bus/pci/devices/{address}"] if address else []
+    folders = [f"/sys/bus/pci/devices/{address}"] if address else []
     if not _is_nvidias(node):
         name = posixpath.basename(node)
         number = host.read(f"/sys/class/drm/{name}/dev").strip()
-        found += [f"/sys/class/drm/{name}", f"/sys/dev/char/{number}"] if number else []
-    return found
+        folders += [f"/sys/class/drm/{name}", f"/sys/dev/char/{number}"] if number else []
+    return folders

@@ -55,13 +55,13 @@ def plan(
 
 def _check(confinement: Confinement, machine: str, landlock_abi: int) -> None:
     """Refuse what there cannot be."""
-    for name, value, known in (
+    for name, value, permitted in (
         ("profile", confinement.profile, PROFILES),
         ("network", confinement.network, NETWORKS),
     ):
-        if value not in known:
+        if value not in permitted:
             raise LayerUnavailableError(
-                name, f"there is no {name} {value!r}", f"Choose one of {', '.join(known)}."
+                name, f"there is no {name} {value!r}", f"Choose one of {', '.join(permitted)}."
             )
     if machine not in NUMBERS:
         raise no_system_calls(machine)

@@ -236,9 +236,9 @@ _LAYERS: dict[str, Callable[[], str]] = {
 }
 
 
-def announcement(found: Surroundings, **more: str) -> str:
+def announcement(surroundings: Surroundings, **more: str) -> str:
     """One line of JSON for the client that started the container. ``more``: of a server there."""
-    return json.dumps({"envhub-worker": __version__, **vars(found), **more})
+    return json.dumps({"envhub-worker": __version__, **vars(surroundings), **more})
 
 
 def own_runtime() -> Runtime:
@@ -267,11 +267,11 @@ def surroundings() -> Surroundings:
 
 def profiles(layers: list[dict[str, Any]], landlock_abi: int) -> list[str]:
     """Which profiles' layers are all there; a pure function of what ``probe`` found."""
-    there = {layer["layer"] for layer in layers if layer["available"]}
-    found = ["strict"] if there >= _NAMESPACED else []
-    if "seccomp" in there and landlock_abi >= LEAST_LANDLOCK["no-userns"]:
-        found.append("no-userns")
-    return [*found, "container"] if "seccomp" in there else found
+    available = {layer["layer"] for layer in layers if layer["available"]}
+    enforceable = ["strict"] if available >= _NAMESPACED else []
+    if "seccomp" in available and landlock_abi >= LEAST_LANDLOCK["no-userns"]:
+        enforceable.append("no-userns")
+    return [*enforceable, "container"] if "seccomp" in available else enforceable
 
 
 def network_devices(table: str) -> list[str]:

@@ -110,7 +110,7 @@ def plan_root(
     wanted = [
         path
         for path, both in named.items()
-        if not any(within(one, other) for one in private for other in both)
+        if not any(within(path, other) for path in private for other in both)
     ]
     trees = [*wanted, *readable, *_ETC_FOLDERS, *_SYS_FOLDERS, *_SYSTEM]
     copies = list(_ETC_FILES)

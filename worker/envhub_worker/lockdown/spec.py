@@ -59,12 +59,16 @@ def confinement_from_wire(data: dict[str, Any]) -> Confinement:
     if set(data) != names:
         raise RemoteProtocolError("a confinement has other fields")
     checked = {"limits": _limits(data["limits"]), "gpu": _gpu(data["gpu"])}
-    made = Confinement(**{**data, "readable": tuple(_texts(data["readable"])), **checked})
-    known = made.profile in PROFILES and made.network in NETWORKS
-    known = known and made.display in DISPLAYS and type(made.record_denials) is bool
-    if not known or len(made.readable) > _MAX_READABLE or not _may_be_granted(made.environment):
+    confinement = Confinement(**{**data, "readable": tuple(_texts(data["readable"])), **checked})
+    valid = confinement.profile in PROFILES and confinement.network in NETWORKS
+    valid = valid and confinement.display in DISPLAYS and type(confinement.record_denials) is bool
+    if (
+        not valid
+        or len(confinement.readable) > _MAX_READABLE
+        or not _may_be_granted(confinement.environment)
+    ):
         raise RemoteProtocolError("a confinement that there cannot be")
-    return made
+    return confinement
 
 
 def _texts(value: Any) -> Any:

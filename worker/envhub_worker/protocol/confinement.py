@@ -133,14 +133,16 @@ class Surroundings:
     python: str
 
     @classmethod
-    def read(cls, said: Mapping[str, Any]) -> Surroundings:
+    def read(cls, document: Mapping[str, Any]) -> Surroundings:
         """What was announced, each field as its type. Raises whatever the values lead to.
 
         Unknown profiles are left out. Trust: input from the worker.
         """
-        fields = {name: _READERS[kind](said[name]) for name, kind in cls.__annotations__.items()}
-        known = tuple(name for name in fields.pop("profiles") if name in PROFILES)
-        return cls(profiles=known, **fields)
+        fields = {
+            name: _READERS[kind](document[name]) for name, kind in cls.__annotations__.items()
+        }
+        profiles = tuple(name for name in fields.pop("profiles") if name in PROFILES)
+        return cls(profiles=profiles, **fields)
 
 
 _READERS: dict[str, Callable[[Any], Any]] = {

@@ -134,21 +134,21 @@ def _completed(record: Any, values: tuple[Any, ...], named: dict[str, Any]) -> d
     """All fields in order: those given in order, those given by name, and defaults."""
     about: About = record.__record__
     names, defaults = about.names, about.defaults
-    given = dict(zip(about.positional, values)) | named  # noqa: B905 - seen below
-    found = {
-        name: given[name] if name in given else defaults[name]()
+    given_values = dict(zip(about.positional, values)) | named  # noqa: B905 - seen below
+    complete = {
+        name: given_values[name] if name in given_values else defaults[name]()
         for name in names
-        if name in given or name in defaults
+        if name in given_values or name in defaults
     }
-    if len(given) < len(values) + len(named) or not given.keys() <= found.keys():
+    if len(given_values) < len(values) + len(named) or not given_values.keys() <= complete.keys():
         raise TypeError(
             f"{type(record).__name__} takes {', '.join(names)}; it was given "
             f"{len(values)} in order, and {', '.join(named) or 'none'} by name"
         )
-    if len(found) < len(names):
-        missing = ", ".join(name for name in names if name not in found)
+    if len(complete) < len(names):
+        missing = ", ".join(name for name in names if name not in complete)
         raise TypeError(f"{type(record).__name__} needs {missing}")
-    return found
+    return complete
 
 
 def _compared(record: Any) -> tuple[Any, ...]:

@@ -66,15 +66,14 @@ def mapped_modules(finders: Iterable[object]) -> dict[str, tuple[str, ...]]:
 
     A path may lack its suffix, as setuptools writes that of a single file.
     """
-    found: dict[str, tuple[str, ...]] = {}
+    folders: dict[str, tuple[str, ...]] = {}
     for table in _tables(finders):
         for name, paths in table.items():
             each = paths if isinstance(paths, (list, tuple, set)) else (paths,)
-            known = (one for one in each if isinstance(one, str) or hasattr(one, "__fspath__"))
-            texts = tuple(map(str, known))
+            texts = tuple(str(p) for p in each if isinstance(p, str) or hasattr(p, "__fspath__"))
             if isinstance(name, str) and texts:  # any finder may have a table of this name
-                found[name] = found.get(name, ()) + texts
-    return found
+                folders[name] = folders.get(name, ()) + texts
+    return folders
 
 
 def _tables(finders: Iterable[object]) -> Iterator[Mapping[str, Any]]:
@@ -131,8 +130,8 @@ def _copy(value: Any) -> HubCopy:
     texts = (folder, commit, tree, *revisions)
     if not all(type(text) is str for text in texts) or len(tree) > _MAX_PATH or "\0" in tree:
         raise _wrong()
-    known = re.fullmatch(_FOLDER, folder) and re.fullmatch(_COMMIT, commit)
-    if not known or not all(map(is_cached_revision, revisions)):
+    matches = re.fullmatch(_FOLDER, folder) and re.fullmatch(_COMMIT, commit)
+    if not matches or not all(map(is_cached_revision, revisions)):
         raise _wrong()
     return HubCopy(folder, commit, tuple(revisions), tree)
 

@@ -80,5 +80,5 @@ def at_start(environment: Mapping[str, str]) -> dict[str, str]:
 def fixed_hash_seed(environment: Mapping[str, str]) -> dict[str, str]:
     """The seed that a caller's own interpreter has, where that is a number."""
     seed = environment.get(HASH_SEED, "")
-    known = seed.isascii() and seed.isdecimal() and int(seed) <= _MAX_HASH_SEED
-    return {HASH_SEED: str(int(seed))} if known else {}
+    fixed = seed.isascii() and seed.isdecimal() and int(seed) <= _MAX_HASH_SEED
+    return {HASH_SEED: str(int(seed))} if fixed else {}

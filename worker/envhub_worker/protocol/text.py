@@ -75,10 +75,10 @@ def parse_size(text: str, unit: str = "") -> int:
     Raises:
         ValueError: It is no size, or lacks a unit; the text says what is one.
     """
-    found = re.fullmatch(_SIZE, text.strip().lower())
-    if found is None:
+    match = re.fullmatch(_SIZE, text.strip().lower())
+    if match is None:
         raise ValueError(f"it takes {SIZES}")
-    number, prefix, rest = found.groups()
+    number, prefix, rest = match.groups()
     size = int(float(number) * 1024 ** " kmgt".index(prefix or ("" if rest else unit) or " "))
     if not (prefix or rest or unit) and 0 < size < _LEAST_BARE:
         raise ValueError(

@@ -49,8 +49,8 @@ def kept(value: Any, depth: int = _DEPTH, seen: dict[int, Any] | None = None) ->
         members: list[Any] = []
         seen[id(value)] = members
         members += [kept(member, depth - 1, seen) for member in value]
-        seen[id(value)] = made = members if isinstance(value, list) else tuple(members)
-        return made
+        seen[id(value)] = copied = members if isinstance(value, list) else tuple(members)
+        return copied
     if isinstance(value, (np.ndarray, set)):
         return value.copy()
     torch = sys.modules.get("torch")

@@ -112,8 +112,8 @@ def _traceback(error: BaseException, root: str) -> str:
     """The traceback, without the frames of this package that called into the repository."""
     try:
         whole = traceback.TracebackException.from_exception(error, compact=True)
-        for one in _chain(whole):
-            _tell(one, root)
+        for link in _chain(whole):
+            _tell(link, root)
         return "".join(whole.format())
     except Exception:
         return ""
@@ -123,25 +123,25 @@ def _chain(whole: traceback.TracebackException) -> Iterator[traceback.TracebackE
     """An exception, and all that its traceback shows."""
     waiting, seen = [whole], set()
     while waiting:
-        one = waiting.pop()
-        if id(one) in seen:
+        link = waiting.pop()
+        if id(link) in seen:
             continue
-        seen.add(id(one))
-        yield one
-        group = getattr(one, "exceptions", None) or ()
-        waiting += [two for two in (one.__cause__, one.__context__, *group) if two is not None]
+        seen.add(id(link))
+        yield link
+        group = getattr(link, "exceptions", None) or ()
+        waiting += [two for two in (link.__cause__, link.__context__, *group) if two is not None]
 
 
-def _tell(one: traceback.TracebackException, root: str) -> None:
+def _tell(link: traceback.TracebackException, root: str) -> None:
     """Leave out frames that are not the repository's, and name its files relative to it."""
-    theirs = [frame for frame in one.stack if not frame.filename.startswith((_OURS, *_IMPORTING))]
-    syntax = getattr(one, "filename", None) is not None  # which tells its line without a frame
+    theirs = [frame for frame in link.stack if not frame.filename.startswith((_OURS, *_IMPORTING))]
+    syntax = getattr(link, "filename", None) is not None  # which tells its line without a frame
     if theirs or syntax:
-        one.stack[:] = theirs
-    for frame in one.stack:
+        link.stack[:] = theirs
+    for frame in link.stack:
         frame.filename = _in_repository(frame.filename, root)
     if syntax:
-        one.filename = _in_repository(str(one.filename), root)
+        link.filename = _in_repository(str(link.filename), root)
 
 
 def _in_repository(name: str, root: str) -> str:

@@ -18,18 +18,18 @@ class Generators:
         generators = env.np_random
         if not isinstance(generators, tuple):
             return self._state(0, generators)
-        return tuple(self._state(place, one) for place, one in enumerate(generators))
+        return tuple(self._state(index, generator) for index, generator in enumerate(generators))
 
-    def _state(self, place: int, generator: Any) -> dict[str, Any]:
+    def _state(self, index: int, generator: Any) -> dict[str, Any]:
         if not isinstance(generator, np.random.Generator):
             raise TypeError(
                 f"np_random is a {type(generator).__name__} here, and no numpy Generator: draw "
                 "from it in the environment alone"
             )
-        number, last = self._last.get(place, (0, None))
+        number, last = self._last.get(index, (0, None))
         if generator is not last:  # kept, so that no other one gets its id
-            self._last[place] = number + 1, generator
-        return {"number": self._last[place][0], **generator.bit_generator.state}
+            self._last[index] = number + 1, generator
+        return {"number": self._last[index][0], **generator.bit_generator.state}
 
 
 def bring(env: Any, states: tuple[Any, ...]) -> None:

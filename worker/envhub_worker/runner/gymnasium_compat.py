@@ -72,13 +72,13 @@ def mode_of(env: Any, stated: Any) -> Any:
 
 def renamed(info: Mapping[Any, Any]) -> dict[Any, Any]:
     """The infos of a vector environment of old, under the names of today."""
-    found: dict[Any, Any] = {}
+    infos: dict[Any, Any] = {}
     for key, value in info.items():
         is_mask = isinstance(key, str) and key.startswith("_") and key[1:] in info
         if not is_mask:
             mask = info.get(f"_{key}")
-            found.update(_entry(_RENAMED.get(key, key), value, mask))
-    return found
+            infos.update(_entry(_RENAMED.get(key, key), value, mask))
+    return infos
 
 
 _RENAMED = {"final_observation": "final_obs"}
@@ -105,9 +105,9 @@ def step_result(env: Any, result: Any) -> tuple[Any, ...]:
     names = ("observations", "rewards", "terminations", "truncations", "infos")
     observation, *columns, infos = _parts(env, "step", result, names)
     each = zip(names[1:-1], columns, (np.float64, np.bool_, np.bool_), strict=True)
-    made = [_column(env, name, column, dtype) for name, column, dtype in each]
+    checked = [_column(env, name, column, dtype) for name, column, dtype in each]
     infos = _own_infos(env, "step", infos)
-    return (observation, *made, renamed(infos) if _BEFORE_1_0 else infos)
+    return (observation, *checked, renamed(infos) if _BEFORE_1_0 else infos)
 
 
 def _parts(env: Any, method: str, result: Any, names: tuple[str, ...]) -> Any:
@@ -127,8 +127,8 @@ def _column(env: Any, name: str, values: Any, dtype: Any) -> Any:
     shape, dtype = getattr(values, "shape", None), getattr(values, "dtype", None)
     if not shape or shape[0] != env.num_envs or getattr(dtype, "kind", "f") == "O":
         count = env.num_envs
-        found = f"{batches.shown(values)} as {name}"
-        raise _misfit(env, "step", f"returns {found}, which have to be one number each, {count}")
+        returned = f"{batches.shown(values)} as {name}"
+        raise _misfit(env, "step", f"returns {returned}, which have to be one number each, {count}")
     return values
 
 
@@ -136,16 +136,16 @@ def _own_infos(env: Any, method: str, infos: Any) -> Any:
     """A mapping; of a list of them, as other libraries' have it, what Gymnasium would make."""
     if isinstance(infos, dict):
         return infos
-    mappings = isinstance(infos, (list, tuple)) and all(isinstance(one, dict) for one in infos)
+    mappings = isinstance(infos, (list, tuple)) and all(isinstance(info, dict) for info in infos)
     if not mappings or len(infos) != env.num_envs:
         raise _misfit(env, method, f"returns infos that are a {type(infos).__name__}, no dict")
-    return batches.join_pairs([(i, one) for i, one in enumerate(infos) if one], len(infos))
+    return batches.join_pairs([(i, info) for i, info in enumerate(infos) if info], len(infos))
 
 
-def _misfit(env: Any, method: str, what: str) -> Exception:
+def _misfit(env: Any, method: str, complaint: str) -> Exception:
     kind = type(env)
     text = f"make_env returned a VectorEnv ({kind.__module__}.{kind.__qualname__}) whose {method}"
-    return returned.raised_at(TypeError(f"{text} {what}"), env, method)
+    return returned.raised_at(TypeError(f"{text} {complaint}"), env, method)
 
 
 class _WithMode(SyncVectorEnv):
@@ -164,8 +164,11 @@ class _OldSyncVectorEnv(_WithMode):
         return tuple(env.render() for env in self.envs)
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        found = [env.get_wrapper_attr(name) for env in self.envs]
-        return tuple(one(*args, **kwargs) if callable(one) else one for one in found)
+        attributes = [env.get_wrapper_attr(name) for env in self.envs]
+        return tuple(
+            attribute(*args, **kwargs) if callable(attribute) else attribute
+            for attribute in attributes
+        )
 
     def get_attr(self, name: str) -> tuple[Any, ...]:
         return self.call(name)
@@ -191,7 +194,7 @@ class _OldSyncVectorEnv(_WithMode):
 
     @property
     def np_random_seed(self) -> Any:
-        return tuple(entropy_of(one.bit_generator) for one in self.np_random)
+        return tuple(entropy_of(generator.bit_generator) for generator in self.np_random)
 
 
 def owner(env: Any, name: str) -> Any:

@@ -214,14 +214,16 @@ def _play(task: Task, indices: Sequence[int], steps: int | None, root: str) -> b
     turns.most_s = inf
     play.step()
     state.look_closely()
-    made = play.step_on(steps)
+    count = play.step_on(steps)
     play.reset(None)
     for _ in range(_STEPS_AFTER_RESET):
         play.step()
     state.look_closely()
     if moved:
         raise RuntimeError(f"shared: {moved}")
-    return made.to_bytes(_STEP_BYTES, "little") + b"".join(one.digest() for one in play.digests)
+    return count.to_bytes(_STEP_BYTES, "little") + b"".join(
+        digest.digest() for digest in play.digests
+    )
 
 
 class _Play:
@@ -247,19 +249,19 @@ class _Play:
                 self.step()
             return steps
         began_s = process_time()
-        for made in range(_MOST_STEPS):
+        for count in range(_MOST_STEPS):
             passed_s = process_time() - began_s
-            if made < _LEAST_STEPS and passed_s > _LEAST_STEPS_S:
+            if count < _LEAST_STEPS and passed_s > _LEAST_STEPS_S:
                 raise HeavyError
-            if made >= _LEAST_STEPS and passed_s > _MOST_STEPS_S:
-                return made
+            if count >= _LEAST_STEPS and passed_s > _MOST_STEPS_S:
+                return count
             self.step()
         return _MOST_STEPS
 
     def step(self) -> None:
         """Step all with actions of their own; where nothing else resets what has ended, do so."""
         envs, space = self._envs, self._envs.single_action_space
-        members = [one.sample() for one in self._actions]
+        members = [space.sample() for space in self._actions]
         empty: Any = create_empty_array(space, n=len(members), fn=np.zeros)
         self._note(envs.run_step(concatenate(space, members, empty)))
         ended = envs.batch.terminations | envs.batch.truncations

@@ -94,15 +94,15 @@ class Lane:
 
     def _wait_awake(self) -> bool:
         """Wait for the next request without sleeping, for as long as the client says."""
-        asked, served = self._asked, self._served
+        request, served = self._asked, self._served
         if self._spin_ns:
             self._told[slabs.PARKED] = 0
             until = perf_counter_ns() + self._spin_ns
             while perf_counter_ns() < until:
-                if asked[slabs.SEQUENCE] != served:
+                if request[slabs.SEQUENCE] != served:
                     return True
         self._told[slabs.PARKED] = 1
-        return asked[slabs.SEQUENCE] != served
+        return request[slabs.SEQUENCE] != served
 
     def serve(self) -> bool:
         """Serve a request if there is one."""
@@ -255,10 +255,10 @@ class ColumnLane(Lane):
 
     def _change(self) -> None:
         super()._change()
-        asked = self._asked
+        request = self._asked
         # a message that moves is a reset: of some of the sub-environments, perhaps
-        self._env.batch.choose(asked[slabs.SLOT], carry=bool(asked[slabs.MESSAGE]))
-        codes = asked[slabs.DTYPES : slabs.DTYPES + len(self._layout.actions)].tolist()
+        self._env.batch.choose(request[slabs.SLOT], carry=bool(request[slabs.MESSAGE]))
+        codes = request[slabs.DTYPES : slabs.DTYPES + len(self._layout.actions)].tolist()
         if codes != self._codes:
             self._codes = codes
             pairs = zip(self._layout.actions, codes, strict=True)
@@ -315,8 +315,8 @@ class InfoWriter:
         ``integers``: what ``joined`` says of the observation, which is part of the schema;
         ``encoded``: whether it says what is no column, as of a reward that is no number.
         """
-        known = self._keys is not None and integers == self._integers and not encoded
-        if known and self._write_columns(pairs):
+        unchanged = self._keys is not None and integers == self._integers and not encoded
+        if unchanged and self._write_columns(pairs):
             return slabs.COLUMNS, 0
         infos = self._joined(pairs)
         frames = self._pack(m.Value(infos))

@@ -46,17 +46,17 @@ def config_of(value: object) -> Any:
         return type(value)(config_of(item) for item in value)
     if not isinstance(value, dict):
         return value
-    made = {key: config_of(item) for key, item in value.items() if key != CONFIG_CLASS}
+    members = {key: config_of(item) for key, item in value.items() if key != CONFIG_CLASS}
     described: Any = value.get(CONFIG_CLASS)
     if described is None:
-        return made
+        return members
     names, field_names, computed = described
     if not names:
-        return ConfigMapping(made)
+        return ConfigMapping(members)
     if field_names is None:  # an enum's member, or a path
         cls = _class_named(*names[0])
-        return made["value"] if cls is None else cls(made["value"])
-    return _instance(names, field_names, made, config_of(computed))
+        return members["value"] if cls is None else cls(members["value"])
+    return _instance(names, field_names, members, config_of(computed))
 
 
 def _instance(names: Any, field_names: Any, values: dict[str, Any], computed: Any) -> Any:
@@ -64,8 +64,8 @@ def _instance(names: Any, field_names: Any, values: dict[str, Any], computed: An
     if cls is not None:
         with contextlib.suppress(Exception):  # it cannot be made without its arguments
             return _filled(cls, values)
-    found = (_class_named(*one) for one in names[1:])
-    for base in (next(filter(None, found), None), None):
+    classes = (_class_named(*names_of_class) for names_of_class in names[1:])
+    for base in (next(filter(None, classes), None), None):
         with contextlib.suppress(Exception):  # of a kind that no dataclass can inherit from
             return _filled(_stand_in(names[0], base, field_names, computed), values)
     raise TypeError(f"cfg: no {names[0][1]} can be made of {', '.join(values)}")
@@ -73,14 +73,14 @@ def _instance(names: Any, field_names: Any, values: dict[str, Any], computed: An
 
 def _filled(cls: type[Any], values: dict[str, Any]) -> Any:
     """An instance with these attributes, as unpickling makes one: no code of its class decides."""
-    made: Any = cls.__new__(cls)  # type: ignore[call-overload]
+    instance: Any = cls.__new__(cls)  # type: ignore[call-overload]
     for item in fields(cls) if is_dataclass(cls) else ():
-        if item.name not in values and not hasattr(made, item.name):
+        if item.name not in values and not hasattr(instance, item.name):
             absent = None if item.default_factory is MISSING else item.default_factory()
-            object.__setattr__(made, item.name, absent)
+            object.__setattr__(instance, item.name, absent)
     for name, value in values.items():
-        object.__setattr__(made, name, value)
-    return made
+        object.__setattr__(instance, name, value)
+    return instance
 
 
 def _stand_in(
@@ -90,17 +90,17 @@ def _stand_in(
     namespace = {"__module__": name[0], **computed}
     if name[0].startswith("lerobot."):  # which is not imported for it, but may be later
         namespace["__class__"] = property(lambda self: _loaded_class(*name) or type(self))
-    made = make_dataclass(
+    stand_in = make_dataclass(
         name[1].rpartition(".")[2],
-        [(one, Any, field(default=None)) for one in field_names],
+        [(name, Any, field(default=None)) for name in field_names],
         bases=() if base is None else (base,),
         namespace=namespace,
         kw_only=True,
         frozen=bool(parameters and parameters.frozen),
     )
-    made.__module__ = name[0]
-    made.__abstractmethods__ = frozenset()  # type: ignore[attr-defined]  # its methods stayed there
-    return made
+    stand_in.__module__ = name[0]
+    stand_in.__abstractmethods__ = frozenset()  # type: ignore[attr-defined]  # its methods stayed there
+    return stand_in
 
 
 PACKAGE = "hub_env"
@@ -161,12 +161,12 @@ def _loaded_class(module: str, qualified_name: str) -> type[Any] | None:
 
 def _class_named(module: str, qualified_name: str) -> type[Any] | None:
     try:
-        found: Any = importlib.import_module(module)
+        named: Any = importlib.import_module(module)
         for part in qualified_name.split("."):  # what it has: getattr may import LeRobot itself
-            found = vars(found)[part]
+            named = vars(named)[part]
     except Exception:  # not here, or not importable, or local to a function
         return None
-    return found if isinstance(found, type) else None
+    return named if isinstance(named, type) else None
 
 
 def _package_of(root: Path, path: PurePosixPath) -> tuple[Path, list[str]]:
@@ -192,8 +192,10 @@ def _make_importable(root: Path, folder: Path, scratch: str, package_path: Path)
     importlib.invalidate_caches()
 
 
-def _check_arguments(parameters: Parameters, taken: dict[str, Any], given: dict[str, Any]) -> None:
-    unknown = [name for name in given if not takes(parameters, name)]
+def _check_arguments(
+    parameters: Parameters, taken: dict[str, Any], arguments: dict[str, Any]
+) -> None:
+    unknown = [name for name in arguments if not takes(parameters, name)]
     if unknown:
         raise ArgumentsError(
             f"make_env takes no {', '.join(unknown)}; it takes {', '.join(parameters) or 'nothing'}"
@@ -204,7 +206,7 @@ def _check_arguments(parameters: Parameters, taken: dict[str, Any], given: dict[
         if item.default is inspect.Parameter.empty
         and item.kind not in (inspect.Parameter.VAR_KEYWORD, inspect.Parameter.VAR_POSITIONAL)
         and name not in taken
-        and name not in given
+        and name not in arguments
     ]
     if missing:
         raise ArgumentsError(

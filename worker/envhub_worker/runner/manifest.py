@@ -39,8 +39,8 @@ def describe(tasks: list[Task]) -> Manifest:
 
 
 def _describe_task(task: Task, sides: Sides) -> EnvManifest:
-    made = task.recording
-    if made is None:
+    recording = task.recording
+    if recording is None:
         return describe_vector(task, task.vector, sides)
     source = task.learn_spaces()
     return EnvManifest(
@@ -48,25 +48,25 @@ def _describe_task(task: Task, sides: Sides) -> EnvManifest:
         task=task.task,
         num_envs=task.num_envs,
         shardable=True,
-        sync=made.sync,
+        sync=recording.sync,
         independent=task.independent,
         single_observation_space=source.observation_space,
         single_action_space=source.action_space,
         observation_space=batch_space(source.observation_space, task.num_envs),
         action_space=batch_space(source.action_space, task.num_envs),
-        autoreset_mode=made.autoreset_mode,
+        autoreset_mode=recording.autoreset_mode,
         metadata=_metadata(source),
         render_mode=getattr(source, "render_mode", None),
         spec=_spec(source),
         attributes=(),
-        type_name=f"gymnasium.vector.{'Sync' if made.sync else 'Async'}VectorEnv",
+        type_name=f"gymnasium.vector.{'Sync' if recording.sync else 'Async'}VectorEnv",
     )
 
 
 def describe_vector(task: Task, env: Any, sides: Sides | None = None) -> EnvManifest:
     """The manifest of a vector environment with a ``step`` of its own."""
     mode = compat.mode_of(env, dict(getattr(env, "metadata", None) or {}).get("autoreset_mode"))
-    known = env if isinstance(env, SubEnvs) else task.vector_spaces({} if sides is None else sides)
+    spaces = env if isinstance(env, SubEnvs) else task.vector_spaces({} if sides is None else sides)
     return EnvManifest(
         suite=task.suite,
         task=task.task,
@@ -74,10 +74,10 @@ def describe_vector(task: Task, env: Any, sides: Sides | None = None) -> EnvMani
         shardable=False,
         sync=True,
         independent=False,
-        single_observation_space=known.single_observation_space,
-        single_action_space=known.single_action_space,
-        observation_space=known.observation_space,
-        action_space=known.action_space,
+        single_observation_space=spaces.single_observation_space,
+        single_action_space=spaces.single_action_space,
+        observation_space=spaces.observation_space,
+        action_space=spaces.action_space,
         autoreset_mode=getattr(mode, "value", mode),
         metadata=_metadata(env),
         render_mode=getattr(env, "render_mode", None),
@@ -123,13 +123,13 @@ def _platform() -> str:
 
 def _packages() -> dict[str, str]:
     """Versions by name, from the heads of the metadata: all of it would be 60 ms and 6 MB."""
-    found: dict[str, str] = {}
+    versions: dict[str, str] = {}
     for folder in sys.path:
         for file in _metadata_in(folder):
             fields = _head_of(file)
-            if "Name" in fields and "Version" in fields and len(found) < MAX_NAMES:
-                found.setdefault(fields["Name"], fields["Version"])
-    return dict(sorted(found.items(), key=lambda pair: pair[0].lower()))
+            if "Name" in fields and "Version" in fields and len(versions) < MAX_NAMES:
+                versions.setdefault(fields["Name"], fields["Version"])
+    return dict(sorted(versions.items(), key=lambda pair: pair[0].lower()))
 
 
 def _metadata_in(folder: str) -> list[str]:

@@ -85,15 +85,15 @@ def _is_as_before(env: Any) -> bool:
 
 def _converted(env: Any, above: Any, layer: Any) -> Any:
     """``env`` with an ``OldEnv`` around one of its layers, of which the next one is ``above``."""
-    told = f"{_where(layer, 'reset')} is as before Gymnasium 0.26"
+    message = f"{_where(layer, 'reset')} is as before Gymnasium 0.26"
     warnings.warn(
-        f"{told}. It runs through a compatibility wrapper of the sandbox, which seeds it by its "
+        f"{message}. It runs through a compatibility wrapper of the sandbox, which seeds it by its "
         "seed() and np_random where reset takes no seed: a time limit becomes a truncation. To "
         f"run without it, its author should follow {_GUIDE}",
         stacklevel=1,
     )
     adapter = OldEnv(layer)
-    vars(adapter)[CONVERTED] = told
+    vars(adapter)[CONVERTED] = message
     if above is None:
         return adapter
     above.env = adapter
@@ -128,8 +128,8 @@ class _Reset:
         if seed is not None and "seed" not in self._takes:
             self._seed(seed)
         offered = {"seed": seed, "options": options, "return_info": True}
-        given = {name: offered[name] for name in self._takes if offered[name] is not None}
-        result = self._env.reset(**given)
+        arguments = {name: offered[name] for name in self._takes if offered[name] is not None}
+        result = self._env.reset(**arguments)
         return result if self._has_info(result) else (result, {})
 
     def _seed(self, seed: Any) -> None:
@@ -168,7 +168,7 @@ class OldEnv(gym.Env[Any, Any]):
             for layer in compat.layers(env)
             if getattr(type(layer), "render", None) is not gym.Wrapper.render
         ]
-        asked = getattr(env, "render_mode", None) is None and all(
+        wants_mode = getattr(env, "render_mode", None) is None and all(
             _takes(layer.render, "mode") for layer in drawing
         )
         metadata = _metadata_of(env)
@@ -178,9 +178,9 @@ class OldEnv(gym.Env[Any, Any]):
             observation_space=space_of(env.observation_space),
             action_space=space_of(env.action_space),
             metadata=metadata,
-            render_mode=mode if asked else getattr(env, "render_mode", None),
+            render_mode=mode if wants_mode else getattr(env, "render_mode", None),
             spec=_spec_of(env),
-            _draw=partial(drawing[0].render, **({"mode": mode} if asked and mode else {})),
+            _draw=partial(drawing[0].render, **({"mode": mode} if wants_mode and mode else {})),
             _reset=_Reset(env),
         )
 
@@ -259,8 +259,8 @@ class OldVectorEnv:
         infos = list(infos) if isinstance(infos, tuple) else infos
         if len(results) == 3 and isinstance(infos, dict):
             infos.pop("_TimeLimit.truncated", None)
-        made = convert_to_terminated_truncated_step_api((*results, infos), is_vector_env=True)
-        observation, rewards, terminated, truncated, infos = made
+        converted = convert_to_terminated_truncated_step_api((*results, infos), is_vector_env=True)
+        observation, rewards, terminated, truncated, infos = converted
         flags = (np.asarray(terminated, np.bool_), np.asarray(truncated, np.bool_))
         return observation, rewards, *flags, self._joined(infos)
 
@@ -339,13 +339,13 @@ def explained(error: Exception, env: Any, method: str) -> Exception:
     if frames and frames[-1].name == f"env_{method}_passive_checker":  # of what it returned
         return returned.raised_at(error, env, method)
     function = getattr(getattr(type(env.unwrapped), method, None), "__code__", None)
-    theirs = any(function and one.filename == function.co_filename for one in frames)
+    theirs = any(function and frame.filename == function.co_filename for frame in frames)
     if function is None or theirs or not unpacked:
         return error
-    told = f"{_where(env.unwrapped, method)} does not return {_RETURNS[method]}"
+    message = f"{_where(env.unwrapped, method)} does not return {_RETURNS[method]}"
     if "got 4" in text or (method == "reset" and "non-iterable" not in text):
-        told = f"{told}. That is the API before Gymnasium 0.26; see {_GUIDE}"
-    return returned.raised_at(type(error)(f"{told} ({text})"), env, method)
+        message = f"{message}. That is the API before Gymnasium 0.26; see {_GUIDE}"
+    return returned.raised_at(type(error)(f"{message} ({text})"), env, method)
 
 
 def _where(env: Any, method: str) -> str:

@@ -81,12 +81,12 @@ class WarningLog:
             return
         try:
             text = _COLORS.sub("", str(message)[:_KEPT])
-            one = (type_name(category), printable(text, _KEPT)[:MAX_TEXT])
+            warning = (type_name(category), printable(text, _KEPT)[:MAX_TEXT])
         except Exception:  # it has no text
             return
-        if one not in self._heard:
-            self._heard.add(one)
-            self.pending.append(one)
+        if warning not in self._heard:
+            self._heard.add(warning)
+            self.pending.append(warning)
 
     def in_front(self, frames: list[Any]) -> list[Buffer]:
         """A reply's frames, with what is pending in front of them."""
@@ -215,9 +215,9 @@ def _is_plain(env: Any, name: str) -> bool | None:
         kind: Any = type(env)
         if kind.get_wrapper_attr not in _SEARCHES or _intercepts(kind):
             return False
-        found = [vars(one)[name] for one in kind.__mro__ if name in vars(one)]
-        if found:  # of the class: a property, a method, or a value
-            return not hasattr(type(found[0]), "__get__")
+        values = [vars(base)[name] for base in kind.__mro__ if name in vars(base)]
+        if values:  # of the class: a property, a method, or a value
+            return not hasattr(type(values[0]), "__get__")
         own = vars(env)
         if name in own:
             return True
@@ -229,4 +229,4 @@ def _is_plain(env: Any, name: str) -> bool | None:
 def _intercepts(kind: Any) -> bool:
     """Whether a class has a say in what its attributes are."""
     own = kind.__getattribute__ is not object.__getattribute__
-    return own or any("__getattr__" in vars(one) for one in kind.__mro__)
+    return own or any("__getattr__" in vars(base) for base in kind.__mro__)

@@ -53,8 +53,8 @@ class Recording:
 def recording(env: object) -> Recording | None:
     """The recording of a vector environment that was neither looked into nor closed, else None."""
     own = object.__getattribute__(env, "__dict__") if type(env) in _LAZY.values() else {}
-    found = None if own.get("closed") else own.get(_KEY)
-    return found if isinstance(found, Recording) else None
+    record = None if own.get("closed") else own.get(_KEY)
+    return record if isinstance(record, Recording) else None
 
 
 @contextmanager
@@ -74,12 +74,12 @@ def _recorder(cls: type[VectorEnv[Any, Any, Any]], lazy: type) -> Callable[..., 
     signature = inspect.signature(real)
 
     def __init__(self: Any, *args: Any, **kwargs: Any) -> None:
-        made = _record(cls, signature, self, args, kwargs) if type(self) is cls else None
-        if made is None:
+        record = _record(cls, signature, self, args, kwargs) if type(self) is cls else None
+        if record is None:
             real(self, *args, **kwargs)
             return
-        self.__dict__[_KEY] = made
-        self.__dict__["num_envs"] = len(made.env_fns)
+        self.__dict__[_KEY] = record
+        self.__dict__["num_envs"] = len(record.env_fns)
         self.__class__ = lazy
 
     return __init__
@@ -126,14 +126,14 @@ def _can_start(arguments: dict[str, Any]) -> bool:
 
 def _build_after_all(env: Any, cls: type) -> None:
     kept = dict(object.__getattribute__(env, "__dict__"))
-    made, closed = kept.pop(_KEY), kept.pop("closed", False)
+    record, closed = kept.pop(_KEY), kept.pop("closed", False)
     env.__class__ = cls
     del env.__dict__[_KEY]
     env.__dict__.pop("closed", None)
-    arguments = dict(made.arguments)
+    arguments = dict(record.arguments)
     method = arguments.get("context") or get_start_method()
-    if made.sync or method == "fork":  # another process could not import what adapts them
-        arguments["env_fns"] = [partial(_adapted, fn) for fn in made.env_fns]
+    if record.sync or method == "fork":  # another process could not import what adapts them
+        arguments["env_fns"] = [partial(_adapted, fn) for fn in record.env_fns]
     _REAL_INIT[cls](env, **arguments)
     env.__dict__.update(kept)
     if closed:  # and looked into only then
@@ -154,8 +154,8 @@ def _lazy_class(cls: type[VectorEnv[Any, Any, Any]]) -> type:
         return object.__getattribute__(self, name)
 
     def __reduce_ex__(self: Any, protocol: Any) -> Any:
-        made: Recording = self.__dict__[_KEY]
-        return partial(cls, **made.arguments), ()  # a copy is the same call once more
+        record: Recording = self.__dict__[_KEY]
+        return partial(cls, **record.arguments), ()  # a copy is the same call once more
 
     body: dict[str, Any] = {
         "__getattribute__": __getattribute__,

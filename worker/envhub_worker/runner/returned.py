@@ -67,9 +67,9 @@ def _misfits(
         if not _fits(flag, (), np.bool_):
             yield name, f"{call} {batches.shown(flag)} as {name}, which has to be one bool"
     for path, sub, seen in parts(space, observation):
-        where = f" as observation{path}" if path else ""
+        position = f" as observation{path}" if path else ""
         declared = f"its observation_space{path} is {one_line(str(sub), _SPACE_CHARS)}"
-        yield "observation", f"{call} {seen}{where}, {declared}{_changed(env, space)}"
+        yield "observation", f"{call} {seen}{position}, {declared}{_changed(env, space)}"
     if not hasattr(info, "items"):
         yield "info", f"{call} {batches.shown(info)} as info, which has to be a dict"
 
@@ -139,8 +139,8 @@ def raised_at(
         for layer in _layers(env):
             code = _code(type(layer), method, part)
             if code is not None:
-                known = result if layer is env else _passed_on(result)
-                return _with_line(error, code, _line_of_return(code, known))
+                known_result = result if layer is env else _passed_on(result)
+                return _with_line(error, code, _line_of_return(code, known_result))
     return error
 
 

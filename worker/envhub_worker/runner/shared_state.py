@@ -155,8 +155,8 @@ def _random_words() -> memoryview:
     """The position, and the first word of the state."""
     words = _words(id(random._inst) + object.__basicsize__)
     version, state, _ = random.getstate()
-    known = version == 3 and words.tolist() == [state[-1], *state[:-1]]
-    return words[:2] if known else _NO_WORDS
+    same_words = version == 3 and words.tolist() == [state[-1], *state[:-1]]
+    return words[:2] if same_words else _NO_WORDS
 
 
 def _words(address: int) -> memoryview:
@@ -181,7 +181,7 @@ def _torch_states() -> list[Any]:
 
 def _are_equal(before: list[Any], now: list[Any]) -> bool:
     """A library that was imported since has not been drawn from as far as is known."""
-    return all(one == other for one, other in zip(before, now))  # noqa: B905
+    return all(earlier == other for earlier, other in zip(before, now))  # noqa: B905
 
 
 def _working_directory() -> str:

@@ -71,8 +71,10 @@ class Task:
         self._refuse_differing(envs, start)
         env_fns: list[EnvFn] = [partial(_itself, env) for env in envs]
         sliced = stop - start < len(self.recording.env_fns)
-        made = self.recording
-        return SubEnvs(env_fns, made.autoreset_mode, made.sync, sliced=sliced, start=start)
+        recording = self.recording
+        return SubEnvs(
+            env_fns, recording.autoreset_mode, recording.sync, sliced=sliced, start=start
+        )
 
     def _refuse_differing(self, envs: list[Any], start: int) -> None:
         """Raise what Gymnasium raises of sub-environments with different spaces."""
@@ -187,8 +189,8 @@ class _Maker:
 
     def task(self, suite: str, task: TaskId, env: Any, pick: Picker) -> Task:
         if isinstance(env, VectorEnv) or _is_duck(env) or _has_single_spaces(env):
-            made = recording(env)
-            return Task(suite, task, recording=made, vector=None if made else env)
+            record = recording(env)
+            return Task(suite, task, recording=record, vector=None if record else env)
         if old_gym.is_vector(env):
             return Task(suite, task, vector=old_gym.adapted_vector(env))
         if isinstance(env, gym.Env) or old_gym.is_env(env):
@@ -274,8 +276,8 @@ _SPACES = ("observation_space", "action_space")
 
 
 def _suite_name(env: Any) -> str:
-    known = isinstance(env, (gym.Env, VectorEnv)) or old_gym.is_env(env)
-    spec = getattr(env, "spec", None) if known else None
+    is_known = isinstance(env, (gym.Env, VectorEnv)) or old_gym.is_env(env)
+    spec = getattr(env, "spec", None) if is_known else None
     return str(getattr(spec, "id", None) or "hub_env")
 
 

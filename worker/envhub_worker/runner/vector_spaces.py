@@ -65,8 +65,8 @@ def row_of(space: Space, count: int) -> Space | None:
     """The space of one row of a batched space; None where it is no batch of so many."""
     if isinstance(space, spaces.Dict):
         rows = {key: row_of(sub, count) for key, sub in space.spaces.items()}
-        known = {key: row for key, row in rows.items() if row is not None}
-        return spaces.Dict(known) if rows and len(known) == len(rows) else None
+        shown = {key: row for key, row in rows.items() if row is not None}
+        return spaces.Dict(shown) if rows and len(shown) == len(rows) else None
     if isinstance(space, spaces.Tuple):
         return _row_of_tuple(space, count)
     if (space.shape or ())[:1] != (count,):
@@ -86,9 +86,9 @@ def row_of(space: Space, count: int) -> Space | None:
 def _row_of_tuple(space: spaces.Tuple[Any], count: int) -> Space | None:
     """A tuple of batches, or of one space for each."""
     rows = [row_of(sub, count) for sub in space.spaces]
-    known = [row for row in rows if row is not None]
-    if rows and len(known) == len(rows):
-        return spaces.Tuple(known)
+    shown = [row for row in rows if row is not None]
+    if rows and len(shown) == len(rows):
+        return spaces.Tuple(shown)
     alike = len(rows) == count and all(sub == space.spaces[0] for sub in space.spaces)
     return space.spaces[0] if alike else None
 
@@ -173,13 +173,13 @@ def _first_observation(env: Any) -> Any:
 def _votes(space: Space, value: Any, count: int) -> Iterator[bool | None]:
     """Of each leaf, whether the value is a member of it, or so many members."""
     if isinstance(space, spaces.Dict):
-        known = isinstance(value, Mapping) and all(key in value for key in space.spaces)
+        fits = isinstance(value, Mapping) and all(key in value for key in space.spaces)
         for key, sub in space.spaces.items():
-            yield from _votes(sub, value[key], count) if known else (None,)
+            yield from _votes(sub, value[key], count) if fits else (None,)
     elif isinstance(space, spaces.Tuple):
-        known = isinstance(value, (tuple, list)) and len(value) == len(space.spaces)
+        fits = isinstance(value, (tuple, list)) and len(value) == len(space.spaces)
         for index, sub in enumerate(space.spaces):
-            yield from _votes(sub, value[index], count) if known else (None,)
+            yield from _votes(sub, value[index], count) if fits else (None,)
     elif isinstance(space, ARRAY_SPACES):
         sides = {len(space.shape or ()): True, len(space.shape or ()) + 1: False}
         yield sides.get(len(np.shape(value)))
@@ -191,8 +191,8 @@ def _space_of(value: Any, count: int) -> Space | None:
     """The space of one row of a batch of observations; None where it is no batch of numbers."""
     if isinstance(value, Mapping):
         rows = {key: _space_of(item, count) for key, item in value.items()}
-        known = {key: row for key, row in rows.items() if row is not None}
-        return spaces.Dict(known) if rows and len(known) == len(rows) else None
+        shown = {key: row for key, row in rows.items() if row is not None}
+        return spaces.Dict(shown) if rows and len(shown) == len(rows) else None
     array = np.asarray(value.detach().cpu() if hasattr(value, "detach") else value)
     if array.shape[:1] != (count,) or array.dtype.kind not in "fiub":
         return None

@@ -113,13 +113,13 @@ def start_display(spec: JailSpec) -> None:
 
 def _line(ready: int) -> bytes:
     """What Xvfb says in time: the number of its display, and the end of the line apart."""
-    said = b""
-    while b"\n" not in said and select.select([ready], [], [], _START_S)[0]:
+    text = b""
+    while b"\n" not in text and select.select([ready], [], [], _START_S)[0]:
         piece = os.read(ready, 16)
         if not piece:
             return b""
-        said += piece
-    return said.strip()
+        text += piece
+    return text.strip()
 
 
 _CONSTANTS = {
@@ -207,8 +207,8 @@ def _types() -> dict[str, Any]:
     from dataclasses import make_dataclass
     from enum import Enum
 
-    made: Any = Enum  # made of a tuple, whose members mypy cannot see
-    kind = made("FeatureType", [(name, name) for name in _FEATURES], type=str)
+    members: Any = Enum  # made of a tuple, whose members mypy cannot see
+    kind = members("FeatureType", [(name, name) for name in _FEATURES], type=str)
     feature = make_dataclass("PolicyFeature", [("type", kind), ("shape", tuple)])
     return {"FeatureType": kind, "PolicyFeature": feature}
 

@@ -93,10 +93,10 @@ def _main(
 
 
 def _resolve(target: str) -> Callable[[socket.socket, JailSpec, list[int]], int | None]:
-    place, _, function = target.partition(":")
-    if place.endswith(".py"):
-        return runpy.run_path(place)[function]  # type: ignore[no-any-return]
-    return getattr(importlib.import_module(place), function)  # type: ignore[no-any-return]
+    module, _, function = target.partition(":")
+    if module.endswith(".py"):
+        return runpy.run_path(module)[function]  # type: ignore[no-any-return]
+    return getattr(importlib.import_module(module), function)  # type: ignore[no-any-return]
 
 
 def confine(jail: JailContext, fds: list[int], init: Channel) -> None:

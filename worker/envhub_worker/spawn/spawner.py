@@ -97,8 +97,8 @@ class Spawner:
         self._cgroups = self._make_cgroups()
         self._channel = self._process.channel
         self._in_use = _keep(runtime.packages)
-        place = self._folder / "root"
-        place.mkdir()
+        root = self._folder / "root"
+        root.mkdir()
         config = ZygoteConfig(
             parent=os.getpid(),
             target=target,
@@ -108,7 +108,7 @@ class Spawner:
             readable=confinement.readable,
             packages=runtime.packages and os.path.realpath(runtime.packages),
             roots=tuple(readable_roots),
-            place=str(place),
+            place=str(root),
             canary=str(self._process.log),
             user=self._user,
             record=confinement.record_denials,
@@ -164,7 +164,7 @@ class Spawner:
         code = self._reap_zygote()
         log = self._process.log.read_bytes()[-_LOG_TAIL_BYTES:].decode(errors="replace")
         events: list[SpawnerEvent] = [ZygoteDied(code, log)]
-        events += [JailExited(one, None, int(signal.SIGKILL)) for one in self._jails.values()]
+        events += [JailExited(jail, None, int(signal.SIGKILL)) for jail in self._jails.values()]
         self._release_jails()
         return events
 

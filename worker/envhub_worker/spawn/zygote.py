@@ -104,8 +104,8 @@ def main(argv: Sequence[str]) -> int:
 
 def preload(target: str) -> None:
     """Import what every runner needs, the code that serves it included: ours, and inert."""
-    place, _, _ = target.partition(":")
-    import_all([*_PRELOAD, *([] if place.endswith(".py") else [place])])
+    module, _, _ = target.partition(":")
+    import_all([*_PRELOAD, *([] if module.endswith(".py") else [module])])
 
 
 def import_all(modules: Iterable[str]) -> None:

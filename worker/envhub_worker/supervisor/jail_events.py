@@ -81,8 +81,8 @@ class JailEvents:
                 callback()
             except Exception as error:
                 self._witness.failed(error)
-                what = f"an error of the worker server: {type(error).__name__}: {error}"
-                self.end(entry, whole_jail("killed", detail=what))
+                failure = f"an error of the worker server: {type(error).__name__}: {error}"
+                self.end(entry, whole_jail("killed", detail=failure))
 
         return guarded
 
@@ -332,7 +332,7 @@ class JailEvents:
             death = whole_jail("killed", detail="the jail was closed")
             self._reply(pending.asker, m.replace(death, operation=pending.operation))
         # the oldest dead, where there are many: their clients do not come back for them
-        dead = [number for number, one in self._jails.items() if one.released]
+        dead = [number for number, jail in self._jails.items() if jail.released]
         for number in dead[:-MAX_DEAD]:
             del self._jails[number]
 

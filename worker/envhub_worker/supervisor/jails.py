@@ -164,12 +164,12 @@ class Jails:
                 "interpreters for: close environments of some kind, or give them the same",
             )
 
-    def _check_runners(self, more: int, there: int) -> None:
+    def _check_runners(self, more: int, present: int) -> None:
         most = MAX_RUNNERS if self._local else MAX_REMOTE_RUNNERS
-        if not 1 <= more <= most - there:
+        if not 1 <= more <= most - present:
             raise RefusedError(
                 "WorkerError",
-                f"{there + more} processes for the sub-environments of one environment: here it "
+                f"{present + more} processes for the sub-environments of one environment: here it "
                 f"may have 1 to {most}; set num_workers to at most {most}",
             )
 
@@ -234,16 +234,16 @@ class Jails:
         entry = self._owned(asker, request.jail)
         most = self._wire_limits(entry).message_bytes
         room = entry.jail.spec.confinement.limits.memory_bytes
-        asked: set[int] = set()
+        pending: set[int] = set()
         for part in request.slabs:
             if type(part) is not tuple or list(map(type, part)) != [int] * 4:
                 raise RefusedError("LocalProtocolError", "slabs are four whole numbers each")
             runner, leaves, request_bytes, observation_bytes = part
             if runner in entry.lost:
                 continue  # the request that follows is answered with its death
-            if runner not in entry.links or runner in asked:
+            if runner not in entry.links or runner in pending:
                 raise RefusedError("LocalProtocolError", f"no runner {runner}, or named twice")
-            asked.add(runner)
+            pending.add(runner)
             if owes(entry, runner):
                 raise RefusedError("LocalProtocolError", f"runner {runner} owes an answer")
             if not words.served(leaves, request_bytes, observation_bytes, most):
@@ -328,7 +328,7 @@ class Jails:
         for entry in mine:
             self._events.catch_up(entry)  # it said so before it answered the client that asks now
         children = self._counting.children() if mine else None
-        return m.Status(tuple({**status_of(one), **_held(one, children)} for one in mine))
+        return m.Status(tuple({**status_of(record), **_held(record, children)} for record in mine))
 
     # --- zygotes -------------------------------------------------------------------------------
 
@@ -406,10 +406,10 @@ def _note_limits(entry: JailRecord, usage: dict[str, int]) -> None:
     """What a jail has used up it is denied; in front, where no flood of attempts hides it."""
     wanted = entry.jail.spec.confinement
     runners, own_root = entry.jail.runner_pids(), wanted.profile == "strict"
-    found = set(reached(wanted.limits, usage, runners, own_root=own_root))
+    limits = set(reached(wanted.limits, usage, runners, own_root=own_root))
     if entry.jail.refused_processes():
-        found.add("PROCESSES")
-    for name in sorted(found):
+        limits.add("PROCESSES")
+    for name in sorted(limits):
         if f"limit {name}" not in entry.denied:
             entry.denied.insert(0, f"limit {name}")
 

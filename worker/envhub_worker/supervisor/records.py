@@ -72,8 +72,8 @@ class OutputTail:
         kept = bytes(self._kept[-self._limit :])
         if len(kept) < self._total:
             kept = re.split(rb"[\r\n]", kept, maxsplit=1)[-1]
-        said = kept.decode("utf-8", "backslashreplace")
-        return printable("\n".join(said.splitlines()[-lines:]))
+        text = kept.decode("utf-8", "backslashreplace")
+        return printable("\n".join(text.splitlines()[-lines:]))
 
     def close(self) -> None:
         """Close the pipe. Idempotent."""
@@ -114,10 +114,10 @@ class IdleTimer:
 
     def passed(self, busy: bool) -> bool:
         """Whether it was too long; ``busy``: some runner owes an answer to a message."""
-        asked = [_sequence(request) for request, _ in self._slabs.values()]
+        sequences = [_sequence(request) for request, _ in self._slabs.values()]
         answered = [_sequence(reply) for _, reply in self._slabs.values()]
-        if busy or asked != answered or asked + answered != self._seen:
-            self._seen = asked + answered
+        if busy or sequences != answered or sequences + answered != self._seen:
+            self._seen = sequences + answered
             self.begin()
         return monotonic() - self._since >= self.limit_s
 
@@ -229,7 +229,9 @@ class JailRecord:
         """To its runners, and from them."""
         sent, received = self.moved
         links = self.links.values()
-        return sent + sum(one.sent for one in links), received + sum(one.received for one in links)
+        return sent + sum(link.sent for link in links), received + sum(
+            link.received for link in links
+        )
 
     def shared_bytes(self, but: Collection[object] = ()) -> int:
         """Of the slabs that the server shares with its runners, but for those of some."""
@@ -245,12 +247,12 @@ class JailRecord:
 
 def waiting(entry: JailRecord) -> list[Pending]:
     """Everything that runners owe an answer to; they owe it no more."""
-    found = {}
+    states = {}
     for link in entry.links.values():
         for pending, _ in link.owed:
-            found[id(pending)] = pending
+            states[id(pending)] = pending
         link.owe_nothing()
-    return list(found.values())
+    return list(states.values())
 
 
 def owes(entry: JailRecord, runner: int) -> int:

@@ -68,7 +68,7 @@ class ServedSlabs:
         self._words = (words.DTYPES - words.SPIN + leaves) * _WORD.size
         self._room = self._words + request_bytes - words.HEADER_BYTES
         self._runner_bell, self.bell = RunnerBell(), OwnBell()
-        ends = [one.fileno() for one in (request, reply, observations)]
+        ends = [slab.fileno() for slab in (request, reply, observations)]
         ends += [self._runner_bell.theirs, self.bell.fileno()]
         self.deposit: list[int] = []
         try:
@@ -190,10 +190,10 @@ class ServedSteps:
         """
         turn, wait_ms = perf_counter_ns() + _TURN_NS, None
         while self._owed:
-            for slabs in [one for one in self._owed if one.answered]:
+            for slabs in [slabs for slabs in self._owed if slabs.answered]:
                 if take := self._owed.pop(slabs, None):  # an answer may be the end of others
                     take()
-            awake = [one for one in self._owed if one.awake_until]
+            awake = [slabs for slabs in self._owed if slabs.awake_until]
             if not awake:
                 return wait_ms
             now = perf_counter_ns()

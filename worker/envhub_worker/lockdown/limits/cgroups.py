@@ -187,9 +187,9 @@ class Group:
         events = os.open(f"{self._folders[0]}/{name}", os.O_RDONLY | os.O_CLOEXEC)
         # A thread that moves itself alone needs no lock that waits for every core: 0.1 ms
         # instead of 12. Version 2 has no such file between groups like ours.
-        place = "cgroup.procs" if newer else "tasks"
+        file = "cgroup.procs" if newer else "tasks"
         joins = [
-            os.open(f"{folder}/{place}", os.O_WRONLY | os.O_CLOEXEC) for folder in self._folders
+            os.open(f"{folder}/{file}", os.O_WRONLY | os.O_CLOEXEC) for folder in self._folders
         ]
         return [events, *joins]
 

@@ -195,7 +195,7 @@ def shared_of_the_machine() -> int:
 
 def unlinked_bytes(pids: Iterable[int], device: int) -> int:
     """What files of ``device`` take that have no name any more, but that somebody has open."""
-    found: dict[int, int] = {}
+    sizes: dict[int, int] = {}
     for pid in pids:
         folder = f"/proc/{pid}/fd"
         with contextlib.suppress(OSError):
@@ -203,8 +203,8 @@ def unlinked_bytes(pids: Iterable[int], device: int) -> int:
                 with contextlib.suppress(OSError):
                     status = os.stat(f"{folder}/{name}")
                     if status.st_nlink == 0 and status.st_dev == device:
-                        found[status.st_ino] = status.st_blocks * 512
-    return sum(found.values())
+                        sizes[status.st_ino] = status.st_blocks * 512
+    return sum(sizes.values())
 
 
 def _proportional(pid: int) -> int:

@@ -27,8 +27,8 @@ class LockedFolder:
     ``place``: where it lies; by default below the folder for temporary files.
     """
 
-    def __init__(self, prefix: str, place: Path | None = None) -> None:
-        self.path = Path(tempfile.mkdtemp(prefix=prefix, dir=place))
+    def __init__(self, prefix: str, parent: Path | None = None) -> None:
+        self.path = Path(tempfile.mkdtemp(prefix=prefix, dir=parent))
         new = self.path / f".{_LOCK}"
         self._lock = os.open(new, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         fcntl.flock(self._lock, fcntl.LOCK_EX)
@@ -45,13 +45,13 @@ class LockedFolder:
 
 def place_for_sockets() -> Path:
     """The folder for temporary files; where its path is too long for a socket's, ``/tmp``."""
-    place = Path(tempfile.gettempdir())
-    return place if len(os.fsencode(place)) + len(_LONGEST) <= _SOCKET_BYTES else Path("/tmp")
+    folder = Path(tempfile.gettempdir())
+    return folder if len(os.fsencode(folder)) + len(_LONGEST) <= _SOCKET_BYTES else Path("/tmp")
 
 
-def remove_deserted(place: Path) -> None:
+def remove_deserted(parent: Path) -> None:
     """Remove folders of ours whose server has gone."""
-    for path in filter(lambda path: _NAME.fullmatch(path.name), place.iterdir()):
+    for path in filter(lambda path: _NAME.fullmatch(path.name), parent.iterdir()):
         with contextlib.suppress(OSError):
             if path.lstat().st_uid == os.geteuid():
                 with unheld(path / _LOCK):

@@ -48,7 +48,7 @@ _PROC_KEPT = frozenset(
 _PROC_COVERED = ("/proc/sys/kernel/random/boot_id",)
 
 
-def enter_root(plan: RootPlan, place: str, copied: Sequence[str], user: int | None) -> None:
+def enter_root(plan: RootPlan, root: str, copied: Sequence[str], user: int | None) -> None:
     """Make ``place`` a root with what ``plan`` says and the host's /proc; enter it, detach the old.
 
     Needs a mount namespace of our own; nothing propagates out of it.
@@ -69,19 +69,19 @@ def enter_root(plan: RootPlan, place: str, copied: Sequence[str], user: int | No
     files |= {path: text.encode() for path, text in plan.texts.items()}
     kernel.mount(
         "sandbox",
-        place,
+        root,
         "tmpfs",
         _PLAIN,
         "size=4m,nr_inodes=4096,mode=755",
     )
     for path in root_plan.OWN_FOLDERS:
-        os.makedirs(place + path, 0o755, exist_ok=True)
-    _put(trees | own, place)  # in this order: one of the latter may lie in one of the former
+        os.makedirs(root + path, 0o755, exist_ok=True)
+    _put(trees | own, root)  # in this order: one of the latter may lie in one of the former
     for path, content in files.items():
-        _write(place + path, content)
+        _write(root + path, content)
     for path, target in plan.links.items():
-        _link(place + path, target)
-    os.chdir(place)
+        _link(root + path, target)
+    os.chdir(root)
     kernel.pivot_root(".", ".")
     kernel.unmount(".")
     os.chdir("/")
@@ -113,10 +113,10 @@ def _take_for(user: int, paths: Iterable[str]) -> dict[str, int]:
     return trees
 
 
-def _put(trees: Mapping[str, int], place: str = "") -> None:
+def _put(trees: Mapping[str, int], below: str = "") -> None:
     """Attach each copy where it was taken, below ``place``."""
     for path, tree in trees.items():
-        target = place + path
+        target = below + path
         if os.path.isdir(f"/proc/self/fd/{tree}"):
             os.makedirs(target, 0o755, exist_ok=True)
         elif not os.path.exists(target):

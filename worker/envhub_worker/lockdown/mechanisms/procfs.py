@@ -40,12 +40,12 @@ def text(path: str) -> str | None:
 
 def numbers(path: str) -> dict[bytes, int]:
     """The lines ``Name:   123 kB`` (then in bytes) and ``Name:   123``."""
-    found: dict[bytes, int] = {}
+    values: dict[bytes, int] = {}
     for line in content(path).splitlines():
         words = line.split()
         if len(words) > 1 and words[1].isdigit():
-            found[words[0][:-1]] = int(words[1]) * (1024 if words[-1] == b"kB" else 1)
-    return found
+            values[words[0][:-1]] = int(words[1]) * (1024 if words[-1] == b"kB" else 1)
+    return values
 
 
 def process_of(thread: int) -> int:
@@ -78,13 +78,13 @@ def descendants(
     ``children``: what ``all_children`` gave a moment ago; looked up by default.
     """
     children = all_children() if children is None else children
-    found: list[int] = []
+    pids: list[int] = []
     pending = [root]
     while pending:
         below = [pid for pid in children.get(pending.pop(), ()) if pid not in keep]
-        found += below
+        pids += below
         pending += below
-    return found
+    return pids
 
 
 def is_below(pid: int, root: int) -> bool:

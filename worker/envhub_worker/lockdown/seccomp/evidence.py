@@ -69,10 +69,10 @@ def asked(
         with open(f"/proc/{thread}/mem", "rb", buffering=0) as memory:
             still_waits()  # not before it is open: from here on it is this caller's memory
             if call in _ADDRESS:
-                place, size = (words[one] for one in _ADDRESS[call])
+                place, size = (words[index] for index in _ADDRESS[call])
                 path = _addressed(memory, place, size, thread, own)
-                known = not path or path in _HARMLESS or _is_within(path, own.changed)
-                return [] if known else [(call, _shown(path))]
+                harmless = not path or path in _HARMLESS or _is_within(path, own.changed)
+                return [] if harmless else [(call, _shown(path))]
             deed, last = _deed(call, words)
             paths = [_named(memory, thread, words, own, last, *where) for where in NAMED[call]]
         return [(deed, _shown(path)) for path in paths if path and not _may(deed, path, own)]
@@ -110,13 +110,15 @@ def _named(
     return _absolute(thread, base, text, own, last=last)
 
 
-def _text(memory: BinaryIO, place: int) -> bytes:
+def _text(memory: BinaryIO, address: int) -> bytes:
     text = b""
     while b"\0" not in text and len(text) < _LONGEST_PATH:
-        more = os.pread(memory.fileno(), _PAGE - place % _PAGE, place)  # the next may be no page
+        more = os.pread(
+            memory.fileno(), _PAGE - address % _PAGE, address
+        )  # the next may be no page
         if not more:
             return b""
-        text, place = text + more, place + len(more)
+        text, address = text + more, address + len(more)
     text, end, _ = text.partition(b"\0")
     return text if end and len(text) < _LONGEST_PATH else b""
 
@@ -168,17 +170,17 @@ def _link(thread: int, folder: str, names: Sequence[str]) -> str:
     """What a link holds; empty where it is none. The kernel is led through no other for that."""
     if len(names) > _DEEPEST:
         return ""
-    place = os.open(f"/proc/{thread}/root{folder}", os.O_PATH | os.O_DIRECTORY)
+    descriptor = os.open(f"/proc/{thread}/root{folder}", os.O_PATH | os.O_DIRECTORY)
     try:
         for name in names[:-1]:
-            outer = place
-            place = os.open(name, os.O_PATH | os.O_DIRECTORY | os.O_NOFOLLOW, dir_fd=outer)
+            outer = descriptor
+            descriptor = os.open(name, os.O_PATH | os.O_DIRECTORY | os.O_NOFOLLOW, dir_fd=outer)
             os.close(outer)
-        return os.readlink(names[-1], dir_fd=place)
+        return os.readlink(names[-1], dir_fd=descriptor)
     except OSError:
         return ""
     finally:
-        os.close(place)
+        os.close(descriptor)
 
 
 def _addressed(memory: BinaryIO, place: int, size: int, thread: int, own: OwnPaths) -> str:
@@ -198,7 +200,7 @@ def _may(deed: str, path: str, own: OwnPaths) -> bool:
 
 
 def _is_within(path: str, folders: Collection[str]) -> bool:
-    return any(path == one or path.startswith(f"{one}/") for one in folders)
+    return any(path == folder or path.startswith(f"{folder}/") for folder in folders)
 
 
 def _shown(path: str) -> str:

@@ -56,7 +56,7 @@ def program(machine: str, verdicts: Mapping[str, Verdict]) -> list[bpf.BpfInstru
     numbers = NUMBERS[machine]
     highest = max(numbers.values())
     by_number = {numbers[name]: verdict for name, verdict in verdicts.items() if name in numbers}
-    known = set(numbers.values())
+    numbered = set(numbers.values())
     items: list[Item] = [
         Do(bpf.LOAD, _ARCHITECTURE),
         Branch(bpf.JUMP_EQUAL, _AUDIT_ARCH[machine], None, _returning(policy.KILL_PROCESS)),
@@ -66,7 +66,7 @@ def program(machine: str, verdicts: Mapping[str, Verdict]) -> list[bpf.BpfInstru
         items.append(Branch(bpf.JUMP_GREATER_OR_EQUAL, _X32, _returning(policy.KILL_PROCESS), None))
     items.append(Branch(bpf.JUMP_GREATER, highest, _returning(policy.ENOSYS), None))
     labels = [
-        _label(n, by_number.get(n, policy.EPERM if n in known else policy.ENOSYS))
+        _label(n, by_number.get(n, policy.EPERM if n in numbered else policy.ENOSYS))
         for n in range(highest + 1)
     ]
     # (first number, label) of each run of equal labels
@@ -171,18 +171,18 @@ def install(compiled: bytes, *, brokered: bool = False) -> int:
     return -1
 
 
-def _listener(place: int) -> int:
+def _listener(index: int) -> int:
     """Install the program there. A call that asks is no slow call, which signals interrupt.
 
     An older kernel knows no such flag: there a signal takes its caller out of it, with EINTR, or
     to ask anew where its handler has calls restarted.
     """
     try:
-        return kernel.syscall("seccomp", _SET_MODE_FILTER, _NEW_LISTENER | WAIT_KILLABLE, place)
+        return kernel.syscall("seccomp", _SET_MODE_FILTER, _NEW_LISTENER | WAIT_KILLABLE, index)
     except OSError as error:
         if error.errno != errno.EINVAL:
             raise
-    return kernel.syscall("seccomp", _SET_MODE_FILTER, _NEW_LISTENER, place)
+    return kernel.syscall("seccomp", _SET_MODE_FILTER, _NEW_LISTENER, index)
 
 
 def installed() -> bool:

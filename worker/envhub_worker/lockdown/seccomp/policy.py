@@ -199,11 +199,11 @@ def watched_calls(verdicts: Mapping[str, Verdict]) -> frozenset[str]:
 
 
 def _asking(name: str, verdict: Verdict) -> Verdict:
-    asked = {EPERM, _EAFNOSUPPORT} | ({PRETEND} if name in PRETENDED else set())
+    reported = {EPERM, _EAFNOSUPPORT} | ({PRETEND} if name in PRETENDED else set())
     if not isinstance(verdict, ByArguments):
-        return ASK if verdict in asked else verdict
-    rules = ((checks, ASK if one in asked else one) for checks, one in verdict.rules)
-    return ByArguments(tuple(rules), ASK if verdict.otherwise in asked else verdict.otherwise)
+        return ASK if verdict in reported else verdict
+    rules = ((checks, ASK if action in reported else action) for checks, action in verdict.rules)
+    return ByArguments(tuple(rules), ASK if verdict.otherwise in reported else verdict.otherwise)
 
 
 def refusal(call: str) -> int:
@@ -252,15 +252,15 @@ def _fcntls() -> ByArguments:
 
 def _by_option(arg: int, allowed: Iterable[int], denied: Iterable[int] = ()) -> ByArguments:
     """A call whose argument ``arg`` says what it does; an option of neither list is invalid."""
-    rules = [((Check(arg, one),), ALLOW) for one in allowed]
-    return ByArguments((*rules, *(((Check(arg, one),), EPERM) for one in denied)), EINVAL)
+    rules = [((Check(arg, option),), ALLOW) for option in allowed]
+    return ByArguments((*rules, *(((Check(arg, option),), EPERM) for option in denied)), EINVAL)
 
 
 def _socket_options() -> ByArguments:
     """Buffers keep the size that init counts them with; filters take the kernel's own memory."""
 
     def rules(verdict: int, *options: int) -> Rules:
-        return tuple(((Check(1, _SOL_SOCKET), Check(2, one)), verdict) for one in options)
+        return tuple(((Check(1, _SOL_SOCKET), Check(2, option)), verdict) for option in options)
 
     sizes = rules(PRETEND, _SO_SNDBUF, _SO_RCVBUF, _SO_SNDBUFFORCE, _SO_RCVBUFFORCE)
     filters = (_SO_ATTACH_FILTER, _SO_ATTACH_BPF, _SO_ATTACH_CBPF, _SO_ATTACH_EBPF)

@@ -144,7 +144,7 @@ def syscall_number(name: str) -> int:
 def syscall_name(call: int) -> str:
     """The name of a call of this machine by its number."""
     numbers = NUMBERS[os.uname().machine]
-    return next((name for name, one in numbers.items() if one == call), f"call {call}")
+    return next((name for name, number in numbers.items() if number == call), f"call {call}")
 
 
 def c_int(word: int) -> int:

@@ -71,25 +71,25 @@ def _mount(spec: JailSpec, common: Common) -> View:
 
 
 def _unmountable(error: OSError, spec: JailSpec, common: Common) -> LayerUnavailableError:
-    where = f" at {error.filename}" if error.filename else ""
+    position = f" at {error.filename}" if error.filename else ""
     shared = {"the snapshot": spec.snapshot, "the folder of packages": common.config.packages}
-    for what, path in shared.items():
+    for name, path in shared.items():
         if path and not _has_content(path):
             return LayerUnavailableError(
                 "mount-namespace",
-                f"{what} {path} was removed after this server began to use it",
+                f"{name} {path} was removed after this server began to use it",
                 "Close the environments that use it and call make_env again, which downloads it "
                 "again.",
             )
     if error.errno == errno.ENOSPC:
         return LayerUnavailableError(
             "scratch",
-            f"the scratch has no room for the folders of the snapshot{where}",
+            f"the scratch has no room for the folders of the snapshot{position}",
             "Raise disk_files or disk_bytes of the limits.",
         )
     return LayerUnavailableError(
         "mount-namespace",
-        f"{error.strerror}{where}",
+        f"{error.strerror}{position}",
         "Please report this with the output of `envhub doctor --json`.",
     )
 

@@ -156,9 +156,9 @@ def _enter_namespaces(config: ZygoteConfig, plan: root_plan.RootPlan) -> None:
         _be_the_first_process()
         mounts.mount_proc()
     except OSError as error:
-        where = f"mounting at {error.filename}: " if error.filename else ""
+        position = f"mounting at {error.filename}: " if error.filename else ""
         cause = namespaces.user_namespace_unavailable(error)
-        why = LayerUnavailableError("mount-namespace", where + cause.reason, cause.fix)
+        why = LayerUnavailableError("mount-namespace", position + cause.reason, cause.fix)
         raise why from error
 
 

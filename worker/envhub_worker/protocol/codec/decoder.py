@@ -204,7 +204,7 @@ def _distinct(keys: list[Any]) -> list[Any]:
     In the worker they were different objects: two with the same ``repr``, or a tensor.
     """
     seen: Counter[object] = Counter()
-    made = []
+    elements = []
     lossy = _LOSSY | {getattr(sys.modules.get("numpy"), "ndarray", tuple)}
     for key in keys:
         if key.__class__ in lossy:
@@ -213,8 +213,8 @@ def _distinct(keys: list[Any]) -> list[Any]:
             if seen[key] > 1:
                 same = key if isinstance(key, RemoteObject) else inert_copy(key)
                 key = RemoteObject(same.type_name, f"{same.text} #{seen[key]}")
-        made.append(key)
-    return made
+        elements.append(key)
+    return elements
 
 
 def _is_hashable(key: object) -> bool:

@@ -72,9 +72,9 @@ class Encoder:
     def unknown(self, value: object) -> object:
         """Pickles or describes what has no form."""
         if self.pickler is None:
-            found = None if self.describer is None else self.describer(value)
-            if found is not None:
-                return [_HEADS[found[0]], found[1]]
+            description = None if self.describer is None else self.describer(value)
+            if description is not None:
+                return [_HEADS[description[0]], description[1]]
             return self.default(inert_copy(value))
         try:
             data = self.pickler(value)

@@ -154,10 +154,10 @@ def explain(
     names: Sequence[str] = (),
 ) -> str:
     """Says what cannot be sent, and where in the value it is."""
-    found = _Search(limits, send).first(value, (), ())
-    if found is None:
+    misfit = _Search(limits, send).first(value, (), ())
+    if misfit is None:
         return f"The value cannot be sent: {error}"
-    path, reason = found
+    path, reason = misfit
     if path and names:
         path = (names[path[0]], *path[1:])  # type: ignore[call-overload]
     return f"{_path_text(path)} cannot be sent: {reason}."
@@ -219,9 +219,9 @@ class _Search:
             self._left -= 1
             if self._left < 0:
                 return None
-            found = self.first(child, (*path, step), (*above, id(value)))
-            if found is not None:
-                return found
+            misfit = self.first(child, (*path, step), (*above, id(value)))
+            if misfit is not None:
+                return misfit
         return None
 
 
@@ -326,10 +326,10 @@ class _Walk:
             return dict(pairs)
         if isinstance(value, np.ndarray):
             array = np.empty(value.size, object)
-            for index, one in enumerate(value.ravel().tolist()):
-                array[index] = self.value(one, depth + 1)
+            for index, member in enumerate(value.ravel().tolist()):
+                array[index] = self.value(member, depth + 1)
             return array.reshape(value.shape)
         if isinstance(value, (set, frozenset)):
             return value if self.is_sent(value) else inert_copy(value)
-        members = [self.value(one, depth + 1) for one in value]
+        members = [self.value(member, depth + 1) for member in value]
         return tuple(members) if isinstance(value, tuple) else members

@@ -197,9 +197,9 @@ def _decode_env(value: object, reader: SpaceReader) -> EnvManifest:
     )
 
 
-def _mapping(value: object, names: frozenset[str], what: str) -> Mapping[str, Any]:
+def _mapping(value: object, names: frozenset[str], name: str) -> Mapping[str, Any]:
     if type(value) is not dict or value.keys() != names:
-        raise RemoteProtocolError(f"{what} has the fields {', '.join(sorted(names))}")
+        raise RemoteProtocolError(f"{name} has the fields {', '.join(sorted(names))}")
     return value
 
 
@@ -220,8 +220,8 @@ def _attributes(value: object) -> tuple[str, ...]:
     return tuple(filter(is_servable, [checked_name(item, "attributes") for item in value]))
 
 
-def _texts(value: object, what: str) -> dict[str, str]:
-    return {key: checked_name(text, what) for key, text in string_keys(value, what).items()}
+def _texts(value: object, name: str) -> dict[str, str]:
+    return {key: checked_name(text, name) for key, text in string_keys(value, name).items()}
 
 
 MAX_METADATA = 4096
@@ -283,33 +283,33 @@ def read_spec_facts(value: object) -> dict[str, Any] | None:
     """
     if value is None:
         return None
-    given = string_keys(value, "spec")
-    return {name: read(given[name], name) for name, read in _FACTS.items() if name in given}
+    facts = string_keys(value, "spec")
+    return {name: read(facts[name], name) for name, read in _FACTS.items() if name in facts}
 
 
-def _optional_whole(value: object, what: str) -> int | None:
+def _optional_whole(value: object, name: str) -> int | None:
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
-        raise RemoteProtocolError(f"{what} is not a whole number")
+        raise RemoteProtocolError(f"{name} is not a whole number")
     if not -(1 << 63) <= value < 1 << 63:
-        raise RemoteProtocolError(f"{what} is out of range")
+        raise RemoteProtocolError(f"{name} is out of range")
     return int(value)
 
 
-def _optional_number(value: object, what: str) -> float | None:
+def _optional_number(value: object, name: str) -> float | None:
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, _NUMBERS):
-        raise RemoteProtocolError(f"{what} is not a number")
+        raise RemoteProtocolError(f"{name} is not a number")
     if isinstance(value, (float, np.floating)):
         return float(value)
-    return _optional_whole(value, what)
+    return _optional_whole(value, name)
 
 
-def _optional_flag(value: object, what: str) -> bool | None:
+def _optional_flag(value: object, name: str) -> bool | None:
     if value is not None and not isinstance(value, (bool, np.bool_)):
-        raise RemoteProtocolError(f"{what} is neither true nor false")
+        raise RemoteProtocolError(f"{name} is neither true nor false")
     return None if value is None else bool(value)
 
 

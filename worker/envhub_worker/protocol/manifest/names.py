@@ -76,39 +76,39 @@ def absent(owner: object, name: str, ask: str) -> AttributeError:
     )
 
 
-def checked_name(value: object, what: str) -> str:
+def checked_name(value: object, role: str) -> str:
     """A printable text of bounded length. Raises ``RemoteProtocolError``: it is none."""
     if type(value) is not str or len(value) > MAX_NAME:
-        raise RemoteProtocolError(f"{what} is not a string of at most {MAX_NAME} characters")
+        raise RemoteProtocolError(f"{role} is not a string of at most {MAX_NAME} characters")
     if not value.isprintable():  # names are printed all the time, and a terminal obeys what it gets
-        raise RemoteProtocolError(f"{what} holds control characters")
+        raise RemoteProtocolError(f"{role} holds control characters")
     return value
 
 
-def checked_key(value: object, what: str) -> str:
+def checked_key(value: object, role: str) -> str:
     """A name that can be part of a path: callers write videos and results under such names.
 
     A slash is allowed (``ALE/Pong-v5``), for it leads further down.
     Raises ``RemoteProtocolError``: it is no name, or leads out of the folder that it is put behind.
     """
-    name = checked_name(value, what)
+    name = checked_name(value, role)
     parts = name.replace("\\", "/").split("/")
     if ".." in parts or (not parts[0] and len(parts) > 1):
-        raise RemoteProtocolError(f"{what} {name[:80]!r} would lead out of a folder as a path")
+        raise RemoteProtocolError(f"{role} {name[:80]!r} would lead out of a folder as a path")
     return name
 
 
-def optional_name(value: object, what: str) -> str | None:
+def optional_name(value: object, role: str) -> str | None:
     """The same, or None."""
-    return None if value is None else checked_name(value, what)
+    return None if value is None else checked_name(value, role)
 
 
-def string_keys(value: object, what: str) -> dict[str, Any]:
+def string_keys(value: object, role: str) -> dict[str, Any]:
     """A mapping with such names for keys. Raises ``RemoteProtocolError``."""
     if type(value) is not dict or len(value) > MAX_NAMES:
-        raise RemoteProtocolError(f"{what} is not a mapping of at most {MAX_NAMES} entries")
+        raise RemoteProtocolError(f"{role} is not a mapping of at most {MAX_NAMES} entries")
     for key in value:
-        checked_name(key, what)
+        checked_name(key, role)
     return value
 
 

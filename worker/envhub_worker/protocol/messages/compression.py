@@ -48,8 +48,8 @@ def _packed(frame: Buffer, block: Any) -> bytes | None:
     sample = bytes(view[middle : middle + _SAMPLE])
     if len(block.compress(sample, store_size=False)) > _WORTH * len(sample):
         return None
-    made: bytes = block.compress(bytes(view), store_size=False)
-    return made if len(made) <= _WORTH * len(view) else None
+    compressed: bytes = block.compress(bytes(view), store_size=False)
+    return compressed if len(compressed) <= _WORTH * len(view) else None
 
 
 def unpack_frames(frames: Sequence[Buffer], limits: WireLimits) -> list[Buffer]:
@@ -88,12 +88,12 @@ def _check(header: m.CompressionHeader, bodies: Sequence[Buffer], limits: WireLi
 
 def _unpacked(body: Buffer, size: int, block: Any) -> bytes:
     try:
-        made: bytes = block.decompress(body, uncompressed_size=size)
+        content: bytes = block.decompress(body, uncompressed_size=size)
     except Exception as error:  # lz4 has errors of its own
         raise RemoteProtocolError(f"a frame cannot be unpacked: {error}") from None
-    if len(made) != size:
+    if len(content) != size:
         raise RemoteProtocolError("a frame is not as large as it says")
-    return made
+    return content
 
 
 def _size(frame: Buffer) -> int:

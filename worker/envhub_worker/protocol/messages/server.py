@@ -74,10 +74,10 @@ class Refusal(Message, kind=3):
         """
         if self.error != BUSY_ERROR:
             return None
-        found = re.fullmatch(_NUMBERS, self.fix)
-        if found is None or not re.fullmatch(_NAME, self.missing):
+        match = re.fullmatch(_NUMBERS, self.fix)
+        if match is None or not re.fullmatch(_NAME, self.missing):
             return Busy("", 0, 0, 1.0)
-        return Busy(self.missing, int(found[1]), int(found[2]), min(float(found[3]), LONGEST_S))
+        return Busy(self.missing, int(match[1]), int(match[2]), min(float(match[3]), LONGEST_S))
 
 
 class OpenJail(Message, kind=4):
@@ -107,8 +107,8 @@ class OpenJail(Message, kind=4):
 
     def with_trees(self, trees: Mapping[str, str]) -> tuple[object, ...]:
         """``hub_copies`` with other paths for these."""
-        known = self.repositories
-        return tuple((*copy[:3], trees.get(copy.tree, copy.tree)) for copy in known)
+        repositories = self.repositories
+        return tuple((*copy[:3], trees.get(copy.tree, copy.tree)) for copy in repositories)
 
 
 class JailOpened(Message, kind=5):

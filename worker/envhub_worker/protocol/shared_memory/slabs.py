@@ -220,8 +220,8 @@ def _aligned(offset: int) -> int:
 
 def view(buffer: Any, leaf: Leaf, dtype: np.dtype[Any] | None = None, base: int = 0) -> Array:
     """A leaf's array in a mapped slab; ``base`` is the offset of its slot."""
-    made: Array = np.ndarray(leaf.shape, dtype or leaf.dtype, buffer, base + leaf.offset)
-    return made
+    array: Array = np.ndarray(leaf.shape, dtype or leaf.dtype, buffer, base + leaf.offset)
+    return array
 
 
 def results(buffer: Any, layout: ObservationLayout) -> tuple[Array, Array]:
@@ -301,7 +301,7 @@ def own_infos(infos: dict[Any, Any]) -> list[dict[Any, Any]] | None:
     places = infos.keys() - {batches.APART_SCALARS}
     if not places or places != set(range(len(places))):
         return None
-    own = [infos[place] for place in range(len(places))]
+    own = [infos[row] for row in range(len(places))]
     if set(map(type, own)) != {dict}:
         return None
     forms = [[(key, type(value)) for key, value in info.items()] for info in own]

@@ -190,12 +190,12 @@ def integers(space: gym.Space[Any], member: Any) -> list[bool]:
     if isinstance(space, spaces.Discrete):
         return [isinstance(member, int)]
     if isinstance(space, spaces.Dict):
-        found = [integers(sub, member[key]) for key, sub in space.spaces.items()]
+        members = [integers(sub, member[key]) for key, sub in space.spaces.items()]
     elif isinstance(space, spaces.Tuple):
-        found = [integers(sub, member[index]) for index, sub in enumerate(space.spaces)]
+        members = [integers(sub, member[index]) for index, sub in enumerate(space.spaces)]
     else:
         return []
-    return list(itertools.chain.from_iterable(found))
+    return list(itertools.chain.from_iterable(members))
 
 
 def with_integers(space: gym.Space[Any], member: Any, which: Iterator[bool]) -> Any:
@@ -203,11 +203,11 @@ def with_integers(space: gym.Space[Any], member: Any, which: Iterator[bool]) -> 
     if isinstance(space, spaces.Discrete):
         return int(member) if next(which, False) else member
     if isinstance(space, spaces.Dict):
-        known = space.spaces
-        return {key: with_integers(sub, member[key], which) for key, sub in known.items()}
+        subspaces = space.spaces
+        return {key: with_integers(sub, member[key], which) for key, sub in subspaces.items()}
     if isinstance(space, spaces.Tuple):
         each = zip(space.spaces, member, strict=True)
-        return tuple(with_integers(sub, one, which) for sub, one in each)
+        return tuple(with_integers(sub, member, which) for sub, member in each)
     return member
 
 
@@ -257,8 +257,8 @@ class _Room:
 def _bytes(*parts: dict[Any, Any]) -> int:
     """Of the arrays in infos."""
     values = [value for part in parts for value in part.values()]
-    nested = _bytes(*(one for one in values if isinstance(one, dict))) if values else 0
-    return nested + sum(one.nbytes for one in values if isinstance(one, np.ndarray))
+    nested = _bytes(*(value for value in values if isinstance(value, dict))) if values else 0
+    return nested + sum(value.nbytes for value in values if isinstance(value, np.ndarray))
 
 
 def _join_part(
@@ -549,8 +549,10 @@ def restore_batch(space: gym.Space[Any], batch: Any) -> Any:
 def restore(space: Any, member: Any) -> Any:
     """One member with the class that Gymnasium gives it; what does not fit the space as it is."""
     if isinstance(space, spaces.Dict) and isinstance(member, dict):
-        known = space.spaces
-        return {k: restore(known[k], item) if k in known else item for k, item in member.items()}
+        subspaces = space.spaces
+        return {
+            k: restore(subspaces[k], item) if k in subspaces else item for k, item in member.items()
+        }
     if not isinstance(member, tuple):
         return member
     if isinstance(space, spaces.Graph) and len(member) == len(GraphInstance._fields):

@@ -168,10 +168,10 @@ class SpaceReader:
 
     def like(self, key: tuple[object, ...]) -> spaces.Box | None:
         """Another Box of the same description, which has the bounds of the first."""
-        found = None if self._twice else self._boxes.get(key)
-        if found is None:
+        twin = None if self._twice else self._boxes.get(key)
+        if twin is None:
             return None
-        another = copy.copy(found)
+        another = copy.copy(twin)
         another._np_random = None  # type: ignore[assignment]  # that one draws by itself
         return another
 
@@ -204,9 +204,9 @@ def _read_box(
 ) -> Space:
     dtype = _dtype(name, BOX_DTYPES)
     key = _box_key(name, shape, low, high, below, above)
-    known = None if key is None else reader.like(key)
-    if known is not None:
-        return known
+    twin = None if key is None else reader.like(key)
+    if twin is not None:
+        return twin
     size = reader.shape(shape, 2 * dtype.itemsize + 2)
     bounds = [_expand(bound, size, dtype) for bound in (low, high)]
     masks = [_expand(mask, size, np.dtype(bool)) for mask in (below, above)]
@@ -223,14 +223,14 @@ def _read_box(
 
 def _box_key(name: object, shape: object, *arrays: object) -> tuple[object, ...] | None:
     """All that a Box is made of, if that is little; None for others, and for what is no Box."""
-    known: list[object] = [name]
+    key: list[object] = [name]
     if not is_shape(shape):
         return None
     for array in arrays:
         if type(array) is not np.ndarray or array.nbytes > _SHARED_BYTES:
             return None
-        known += [array.dtype, array.shape, array.tobytes()]
-    return (*known, shape)
+        key += [array.dtype, array.shape, array.tobytes()]
+    return (*key, shape)
 
 
 def _read_discrete(reader: SpaceReader, n: object, start: object, name: object) -> Space:

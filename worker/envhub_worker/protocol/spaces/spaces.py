@@ -96,9 +96,9 @@ class OpaqueSpace(gym.Space[Any]):
     def _identity(self) -> tuple[object, ...]:
         return self.type_name, self.text, self.shape, self.dtype_text
 
-    def _refuse(self, what: str) -> NoReturn:
+    def _refuse(self, complaint: str) -> NoReturn:
         raise gym.error.CustomSpaceError(
-            f"Cannot {what} {self.type_name}: its code exists only inside the sandbox. "
+            f"Cannot {complaint} {self.type_name}: its code exists only inside the sandbox. "
             "Build values for it yourself, or call the environment's own method for it."
         )
 
@@ -153,14 +153,14 @@ def seeded_states(space: Space, single: Space | None = None) -> States | None:
     """
     if single is not None and not all(map(_may_be_batched, seeded_nodes(single))):
         return None
-    found: States = []
+    states: States = []
     first: dict[int, int] = {}
     for index, node in enumerate(seeded_nodes(space)):
         state = _state(node)
         # one that several share: the place of the first
         place = first.setdefault(id(getattr(node, "_np_random", None)), index)
-        found.append(state if state is None or place == index else place)
-    return found if any(state is not None for state in found) else None
+        states.append(state if state is None or place == index else place)
+    return states if any(state is not None for state in states) else None
 
 
 def _parts_of(space: Space) -> tuple[Space, ...]:
