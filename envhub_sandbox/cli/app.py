@@ -132,9 +132,9 @@ def _wrong_usage(ctx: Any = None) -> Iterator[None]:
         # an option without its value has no context: the command is known by its name
         command = " ".join(filter(None, ["envhub", getattr(ctx, "invoked_subcommand", None)]))
         path = getattr(getattr(error, "ctx", None), "command_path", command)
-        said = f"{text}{end} Try '{path} --help'."
-        say(f"Error: {said}", style="red")
-        print_json_error("UsageError", said, Exit.USAGE)
+        message = f"{text}{end} Try '{path} --help'."
+        say(f"Error: {message}", style="red")
+        print_json_error("UsageError", message, Exit.USAGE)
         raise typer.Exit(Exit.USAGE) from None
 
 
@@ -160,10 +160,10 @@ class Command(TyperCommand):
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Print the help, in which rich reads no ``[word]`` of an option as markup."""
-        for one in self.params:
-            text = getattr(one, "help", None)
+        for parameter in self.params:
+            text = getattr(parameter, "help", None)
             if text:
-                vars(one)["help"] = text.replace("[", "\\[")
+                vars(parameter)["help"] = text.replace("[", "\\[")
         later = [] if self._whole_help else [one for one in self.params if _comes_later(one)]
         for one in later:
             vars(one)["hidden"] = True
@@ -192,10 +192,10 @@ def functions(name: str) -> dict[str, Callable[..., None]]:
 def whole_command(name: str) -> Any:
     """A command, or a group, with all its options."""
     text, where = _COMMANDS[name]
-    made = _typer(text)
+    command = _typer(text)
     for one, function in functions(name).items():
-        made.command(one, cls=Command, no_args_is_help=one == "remove")(function)
-    group = typer.main.get_group(made)
+        command.command(one, cls=Command, no_args_is_help=one == "remove")(function)
+    group = typer.main.get_group(command)
     group.name = name
     return group.commands[name] if isinstance(where, str) else group
 

@@ -87,8 +87,11 @@ def stored_snapshots() -> list[StoredSnapshot]:
 
     folder = cache_root() / "snapshots"
     records = [*folder.glob("*/*/record.json"), *folder.glob("*/*/*/record.json")]
-    found = [_read(record) for record in records]
-    return sorted((one for one in found if one is not None), key=lambda one: -one.used)
+    snapshots = [_read(record) for record in records]
+    return sorted(
+        (snapshot for snapshot in snapshots if snapshot is not None),
+        key=lambda snapshot: -snapshot.used,
+    )
 
 
 def _read(record: Path) -> StoredSnapshot | None:
@@ -119,34 +122,37 @@ def list_(
     """List snapshots, environments of packages and wheels built here, last used first."""
     from envhub_sandbox.system.folders import cache_root
 
-    found, made, built = stored_snapshots(), _every(_ENVIRONMENTS), _every(_WHEELS)
+    snapshots, environments, built = stored_snapshots(), _every(_ENVIRONMENTS), _every(_WHEELS)
     if json:
         names = ("repository", "commit", "revision", "folder")
-        own = _documents(found, **dict(zip(names, names, strict=True)))
-        theirs = _documents(made, name="key", python="python", version="version", packages="pins")
+        own = _documents(snapshots, **dict(zip(names, names, strict=True)))
+        theirs = _documents(
+            environments, name="key", python="python", version="version", packages="pins"
+        )
         folder = str(cache_root())
         kept = _documents(built, file="file")
         print_json({"folder": folder, "snapshots": own, "environments": theirs, "wheels": kept})
         return
-    if found:
-        snapshots = [
-            (one.name, one.commit[:_SHOWN], one.revision or "", *_when_and_size(one))
-            for one in found
+    if snapshots:
+        lines = [
+            (entry.name, entry.commit[:_SHOWN], entry.revision or "", *_when_and_size(entry))
+            for entry in snapshots
         ]
         heads = ("repository", "commit", "revision", "last used", "size")
-        show_rows([heads, *snapshots], right=(4,))
-    if found and made:
+        show_rows([heads, *lines], right=(4,))
+    if snapshots and environments:
         out()
-    if made:
+    if environments:
         rows = [
-            (one.key[:12], one.version, *_when_and_size(one), " ".join(one.pins)) for one in made
+            (entry.key[:12], entry.version, *_when_and_size(entry), " ".join(entry.pins))
+            for entry in environments
         ]
         show_rows([("environment", "Python", "last used", "size", "packages"), *rows], right=(3,))
     if built:
         out()
-        files = [(one.file, *_when_and_size(one)) for one in built]
+        files = [(wheel.file, *_when_and_size(wheel)) for wheel in built]
         show_rows([("wheel built here", "last used", "size"), *files], right=(2,))
-    say(f"{_told(found, made, built)}, in {cache_root()}")
+    say(f"{_told(snapshots, environments, built)}, in {cache_root()}")
 
 
 def _every(module: str) -> list[Any]:
@@ -155,28 +161,28 @@ def _every(module: str) -> list[Any]:
     return [] if every is None else list(every())
 
 
-def _told(found: list[StoredSnapshot], made: list[Any], built: list[Any]) -> str:
-    everything: list[Stored] = [*found, *made, *built]
-    total = sum(one.size for one in everything)
-    texts = [counted(len(found), "snapshot"), counted(len(made), "environment")]
+def _told(snapshots: list[StoredSnapshot], environments: list[Any], built: list[Any]) -> str:
+    everything: list[Stored] = [*snapshots, *environments, *built]
+    total = sum(entry.size for entry in everything)
+    texts = [counted(len(snapshots), "snapshot"), counted(len(environments), "environment")]
     texts += [counted(len(built), "wheel")] if built else []
     return f"{', '.join(texts)}, {size_text(total)}"
 
 
-def _documents(found: Sequence[Stored], **named: str) -> list[dict[str, Any]]:
+def _documents(entries: Sequence[Stored], **named: str) -> list[dict[str, Any]]:
     """What is stored as data: by name, which attribute; and what all have."""
     return [
         {
-            **{name: getattr(one, attribute) for name, attribute in named.items()},
-            "last_used": time.strftime("%FT%TZ", time.gmtime(one.used)),
-            "bytes": one.size,
+            **{name: getattr(entry, attribute) for name, attribute in named.items()},
+            "last_used": time.strftime("%FT%TZ", time.gmtime(entry.used)),
+            "bytes": entry.size,
         }
-        for one in found
+        for entry in entries
     ]
 
 
-def _when_and_size(one: Stored) -> tuple[str, str]:
-    return time.strftime("%F", time.localtime(one.used)), size_text(one.size)
+def _when_and_size(entry: Stored) -> tuple[str, str]:
+    return time.strftime("%F", time.localtime(entry.used)), size_text(entry.size)
 
 
 @opt.with_options()
@@ -200,38 +206,41 @@ def remove(
     """Remove snapshots and environments of packages that are not in use, and built wheels."""
     from envhub_sandbox.system.folders import cache_root
 
-    found, made, built = stored_snapshots(), _every(_ENVIRONMENTS), _every(_WHEELS)
+    snapshots, environments, built = stored_snapshots(), _every(_ENVIRONMENTS), _every(_WHEELS)
     if everything:
         for folder in ("imports", "manifests", "resolutions"):
             shutil.rmtree(cache_root() / folder, ignore_errors=True)
     else:
-        is_chosen = _chooser([*found, *made, *built], names or [], unused_for)
-        found, made = [*filter(is_chosen, found)], [*filter(is_chosen, made)]
+        is_chosen = _chooser([*snapshots, *environments, *built], names or [], unused_for)
+        snapshots = [*filter(is_chosen, snapshots)]
+        environments = [*filter(is_chosen, environments)]
         built = [*filter(is_chosen, built)]
-    kept = {one.commit: why for one in found if (why := _users_of(one))}
+    kept = {entry.commit: why for entry in snapshots if (why := _users_of(entry))}
     if remove_environment := extras.find(_ENVIRONMENTS, "remove"):
-        kept |= {one.key: why for one in made if (why := remove_environment(one))}
+        kept |= {entry.key: why for entry in environments if (why := remove_environment(entry))}
         extras.find(_ENVIRONMENTS, "remove_abandoned")()
     for wheel in built:
         wheel.remove()
-    gone = [one for one in found if one.commit not in kept]
-    say(f"Removed {_told(gone, [one for one in made if one.key not in kept], built)}.")
+    gone = [entry for entry in snapshots if entry.commit not in kept]
+    say(
+        f"Removed {_told(gone, [entry for entry in environments if entry.key not in kept], built)}."
+    )
     if kept and names:
         raise UsageError("; ".join(kept.values()))
     for why in kept.values():
         say(f"Kept: {why}.")
 
 
-def _users_of(one: StoredSnapshot) -> str:
+def _users_of(snapshot: StoredSnapshot) -> str:
     """Remove a snapshot; who uses it, if somebody does: then it stays."""
     from envhub_sandbox.hub import store
 
-    users = [f"process {pid} ({command})" for pid, command in store.remove(one.home).items()]
+    users = [f"process {pid} ({command})" for pid, command in store.remove(snapshot.home).items()]
     if not users:
         return ""
     return (
-        f"the snapshot {one.repository}@{one.commit[:12]} is in use by {', '.join(users)}. Close "
-        "its environments in that process, or end the process"
+        f"the snapshot {snapshot.repository}@{snapshot.commit[:12]} is in use by "
+        f"{', '.join(users)}. Close its environments in that process, or end the process"
     )
 
 
@@ -239,15 +248,15 @@ def _chooser(
     everyone: Sequence[Stored], names: list[str], unused_for: float | None
 ) -> Callable[[Stored], bool]:
     for name in names:
-        if not any(one.answers_to(name) for one in everyone):
+        if not any(entry.answers_to(name) for entry in everyone):
             raise UsageError(f"the cache has nothing named {name!r}; see: envhub cache list")
     oldest = None if unused_for is None else time.time() - unused_for * _DAY_S
 
-    def is_chosen(one: Stored) -> bool:
+    def is_chosen(entry: Stored) -> bool:
         if not names and oldest is None:
             return False
-        meant = not names or any(one.answers_to(name) for name in names)
-        return meant and (oldest is None or one.used < oldest)
+        meant = not names or any(entry.answers_to(name) for name in names)
+        return meant and (oldest is None or entry.used < oldest)
 
     return is_chosen
 
@@ -267,18 +276,21 @@ def gc(
     containers and control groups of all users. Exit code 9: an installed engine did not answer.
     """
     find = extras.required("envhub_sandbox.sandboxes.docker.leftovers", "find", "envhub cache gc")
-    found, unasked = find()
-    removed = [] if dry_run else [one for one in found if one.remove()]
+    leftovers, unasked = find()
+    removed = [] if dry_run else [leftover for leftover in leftovers if leftover.remove()]
     if json:
-        items = [{"kind": one.kind, "name": one.name, "removed": one in removed} for one in found]
+        items = [
+            {"kind": leftover.kind, "name": leftover.name, "removed": leftover in removed}
+            for leftover in leftovers
+        ]
         print_json({"found": items, "unasked": unasked})
-    for one in () if json else found:
-        done = "removed" if one in removed else "found" if dry_run else "not removed"
-        show(done, f"{one.kind} {one.name}")
+    for leftover in () if json else leftovers:
+        done = "removed" if leftover in removed else "found" if dry_run else "not removed"
+        show(done, f"{leftover.kind} {leftover.name}")
     for engine, why in unasked.items():
         reason = safe_line(why, 500)
         say(f"{engine} could not be asked, so its containers are not known: {reason}")
     if not json:
-        say(f"{len(found)} left behind, {len(removed)} removed.")
+        say(f"{len(leftovers)} left behind, {len(removed)} removed.")
     if unasked:
         raise typer.Exit(Exit.UNASKED)

@@ -135,8 +135,8 @@ def doctor(
         probed = probe() if IS_LINUX else dict(_NOTHING_PROBED)
     cache = _cache_problem(by_others=profile != "strict" or not trials[0].available)
     if json:
-        here = {"host": host(), "versions": versions(), "engine": engine(), **resources(cache)}
-        print_json({**here, "profiles": list(map(asdict, trials)), **probed})
+        report = {"host": host(), "versions": versions(), "engine": engine(), **resources(cache)}
+        print_json({**report, "profiles": list(map(asdict, trials)), **probed})
     else:
         _print(trials, profile)
         _print_missing(probed)
@@ -183,11 +183,11 @@ def _cache_problem(*, by_others: bool) -> str | None:
         root = cache_root()
     except SnapshotError as error:
         return str(error)
-    there = next(path for path in (root, *root.parents) if path.exists())
+    existing = next(path for path in (root, *root.parents) if path.exists())
     cure = f"set ENVHUB_CACHE to another folder, such as {tempfile.gettempdir()}/envhub-cache"
-    if not there.is_dir() or not os.access(there, os.W_OK | os.X_OK):
+    if not existing.is_dir() or not os.access(existing, os.W_OK | os.X_OK):
         return f"{root} cannot be written: {cure}"
-    closed = [path for path in (there, *there.parents) if not path.stat().st_mode & 0o001]
+    closed = [path for path in (existing, *existing.parents) if not path.stat().st_mode & 0o001]
     if IS_LINUX and user_id() == 0 and by_others and closed:
         return (
             f"{root} cannot be read by the user of root's jails, because {closed[-1]} is closed to "
@@ -210,10 +210,14 @@ def engine() -> dict[str, Any]:
     """The container engine that ``sandbox="docker"`` would use, or why there is none."""
     module, what = "envhub_sandbox.sandboxes.docker.engines", "a container engine"
     try:
-        found = extras.required(module, "find_engine", what)(None)
+        container_engine = extras.required(module, "find_engine", what)(None)
     except EnvHubError as error:
         return {"kind": None, "version": None, "rootless": None, "problem": describe(error)}
-    facts = {"kind": found.kind, "version": found.version, "rootless": found.rootless}
+    facts = {
+        "kind": container_engine.kind,
+        "version": container_engine.version,
+        "rootless": container_engine.rootless,
+    }
     return {**facts, "problem": None}
 
 
@@ -223,7 +227,7 @@ def resources(problem: str | None) -> dict[str, Any]:
 
     disk: dict[str, Any] = {"folder": None, "free_bytes": None, "problem": problem}
     with contextlib.suppress(SnapshotError):  # it is the problem
-        folder = next(one for one in (cache_root(), *cache_root().parents) if one.is_dir())
+        folder = next(path for path in (cache_root(), *cache_root().parents) if path.is_dir())
         disk |= {"folder": str(folder), "free_bytes": shutil.disk_usage(folder).free}
     return {"free_memory_bytes": free_memory_bytes(), "disk": disk}
 
@@ -238,11 +242,11 @@ def probe() -> dict[str, Any]:
     command = worker_program("probe")
     try:
         done = subprocess.run(command, capture_output=True, timeout=_PROBE_S, check=True, cwd="/")
-        found = json_format.loads(done.stdout)
+        results = json_format.loads(done.stdout)
     except (OSError, subprocess.SubprocessError, ValueError):
         return dict(_NOTHING_PROBED)  # what the profiles say still stands
-    kept = {name: found[name] for name in ("layers", "apparmor_profile")}
-    return {**kept, "gpu": found["host"]["gpu"]}
+    kept = {name: results[name] for name in ("layers", "apparmor_profile")}
+    return {**kept, "gpu": results["host"]["gpu"]}
 
 
 def examine(folder: str, profile: str) -> Trial:
@@ -264,7 +268,7 @@ def examine(folder: str, profile: str) -> Trial:
     return Trial(profile, available=True, layers=layers, first_step_s=taken)
 
 
-def _print(trials: list[Trial], asked: str) -> None:
+def _print(trials: list[Trial], profile: str) -> None:
     """The layers of the profile that was asked for, and of each other what it goes without."""
     facts = host()
     user = "root" if facts["root"] else "a plain user"
@@ -276,12 +280,12 @@ def _print(trials: list[Trial], asked: str) -> None:
             "is --sandbox docker; the other way is a Linux host where 'envhub-worker listen' runs, "
             "with --sandbox tcp://HOST:PORT (check it with: envhub doctor tcp://HOST:PORT)."
         )
-    trials = sorted(trials, key=lambda one: one.profile != asked)
+    trials = sorted(trials, key=lambda one: one.profile != profile)
     out()
     bad = {number: "red" for number, one in enumerate(trials, 1) if not one.available}
     show_rows([_PROFILES, *map(_profile, trials)], right=(2,), styles=bad)
     for trial in trials:
-        if trial.problem is None and trial.profile == asked:
+        if trial.problem is None and trial.profile == profile:
             out()
             out(f"{trial.profile}: available", GOOD)
             show_rows([_LAYERS, *map(_layer, trial.layers)])
@@ -299,7 +303,7 @@ def _profile(trial: Trial) -> list[str]:
     """A row of the table: whether it can be had, and which layers it goes without."""
     if not trial.available:
         return [trial.profile, "no", "", "", ""]
-    lacks = [str(one.get("layer")) for one in trial.layers if not one.get("enforced")]
+    lacks = [str(layer.get("layer")) for layer in trial.layers if not layer.get("enforced")]
     holds = f"{len(trial.layers) - len(lacks)} of {len(trial.layers)} layers"
     return [trial.profile, "yes", f"{trial.first_step_s:.2f} s", holds, ", ".join(lacks)]
 

@@ -61,9 +61,9 @@ def neutralised(text: str, after: str = "") -> str:
     ``after``: what stands in the same line already; it is no part of the result.
     """
 
-    def broken(found: re.Match[str]) -> str:
-        char = found[found.lastgroup or 0]
-        return f"{found[0][:-1]}\\x{ord(char):02x}"
+    def broken(match: re.Match[str]) -> str:
+        char = match[match.lastgroup or 0]
+        return f"{match[0][:-1]}\\x{ord(char):02x}"
 
     return _COMMAND.sub(broken, after + text)[len(after) :]
 

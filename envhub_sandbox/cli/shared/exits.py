@@ -86,8 +86,8 @@ def code_for(error: BaseException) -> Exit:
 def describe(error: BaseException) -> str:
     """An error as text for a terminal: escaped, without tracebacks, with the end of the output."""
     if _is_full(error):
-        where = getattr(error, "filename", None) or "what is printed"
-        return safe_text(f"no space is left for {where}; free some, and try again")
+        file = getattr(error, "filename", None) or "what is printed"
+        return safe_text(f"no space is left for {file}; free some, and try again")
     if not isinstance(error, EnvHubError):
         return safe_text(f"a bug in envhub: {type(error).__name__}: {error}")
     text = str(error)
@@ -139,7 +139,7 @@ def _ignoring_full_or_closed_output() -> Iterator[None]:
 
 def _explain(error: Exception, debug: bool) -> None:
     both = (error, error.__cause__)
-    remotes = [text for one in both if (text := getattr(one, "traceback", ""))]
+    remotes = [text for source in both if (text := getattr(source, "traceback", ""))]
     if debug:
         say(safe_text("".join(traceback.format_exception(error)), limit=200_000))
         for remote in remotes:

@@ -19,20 +19,20 @@ _MOST_OF_A_SUMMARY = 1_000_000
 STYLES = {"error": "red", "warning": "yellow", "note": "dim"}
 
 
-def show_finding(one: Finding, *, fails: bool = False) -> None:
+def show_finding(finding: Finding, *, fails: bool = False) -> None:
     """Print what was found, and what cures it where it fails the whole."""
-    severity = one.check.severity.value
-    where = f"{one.task}: " if one.task else ""
-    show(severity, f"{one.id}: {where}{one.text}", STYLES[severity])
+    severity = finding.check.severity.value
+    task = f"{finding.task}: " if finding.task else ""
+    show(severity, f"{finding.id}: {task}{finding.text}", STYLES[severity])
     if fails:
-        show("", one.cure, "dim")
+        show("", finding.cure, "dim")
 
 
 def level(name: str) -> Severity:
     """What ``--fail-on`` says. Raises ``UsageError``: it says something else."""
     from envhub_sandbox.check.checks import Severity
 
-    if name not in {one.value for one in Severity}:
+    if name not in {severity.value for severity in Severity}:
         raise UsageError(f"--fail-on is {name!r}; it takes error, warning or note")
     return Severity(name)
 

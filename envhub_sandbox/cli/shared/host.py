@@ -45,8 +45,8 @@ def free_memory_bytes(proc: Path = Path("/proc")) -> int | None:
     A control group that we are in, or one around it, may have less left than the machine: that of
     a container, or of a service.
     """
-    found = [_of_machine(proc / "meminfo"), *map(_of_group, _groups(proc / "self"))]
-    return min((one for one in found if one is not None), default=None)
+    free = [_of_machine(proc / "meminfo"), *map(_of_group, _groups(proc / "self"))]
+    return min((size for size in free if size is not None), default=None)
 
 
 def _of_machine(meminfo: Path) -> int | None:
@@ -72,7 +72,7 @@ def _groups(process: Path) -> Iterator[Path]:
         below = group.relative_to(root) if group.is_relative_to(root) else PurePosixPath("..")
         # of a container it may be out of sight; both paths begin with .. where it was moved
         folder = top / ("" if ".." in below.parts else below)
-        yield from (one for one in (folder, *folder.parents) if one.is_relative_to(top))
+        yield from (group for group in (folder, *folder.parents) if group.is_relative_to(top))
 
 
 def _mounts(mountinfo: Path) -> Iterator[tuple[str, str, Path]]:
@@ -88,7 +88,7 @@ def _mounts(mountinfo: Path) -> Iterator[tuple[str, str, Path]]:
 
 
 def _unescaped(word: str) -> str:
-    return re.sub(r"\\([0-7]{3})", lambda found: chr(int(found[1], 8)), word)
+    return re.sub(r"\\([0-7]{3})", lambda match: chr(int(match[1], 8)), word)
 
 
 def _fields(path: Path) -> dict[str, int]:

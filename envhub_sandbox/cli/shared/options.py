@@ -77,14 +77,16 @@ def with_options(*keys: str, **defaults: Any) -> Callable[[_Command], _Command]:
         shown.setdefault("debug", _keyword("debug", False, Debug))
 
         @functools.wraps(function)
-        def command(**given: Any) -> None:
-            debug = given.get("debug", False) if "debug" in own else given.pop("debug", False)
+        def command(**arguments: Any) -> None:
+            debug = (
+                arguments.get("debug", False) if "debug" in own else arguments.pop("debug", False)
+            )
             with reported(debug=debug):
-                values = {name: given.pop(name) for name in made}
+                values = {name: arguments.pop(name) for name in made}
                 if "make" in own:
-                    said = {key: values[OPTIONS[key].parameter] for key in keys}
-                    given["make"] = MakeOptions(given.get("ref") or "", said)
-                function(**given)
+                    typed = {key: values[OPTIONS[key].parameter] for key in keys}
+                    arguments["make"] = MakeOptions(arguments.get("ref") or "", typed)
+                function(**arguments)
 
         # what typer reads
         vars(command)["__signature__"] = inspect.Signature(
@@ -103,29 +105,29 @@ def _keyword(name: str, default: Any, annotation: Any) -> inspect.Parameter:
 
 
 def _parameter(key: str, others: Sequence[str], defaults: Mapping[str, Any]) -> inspect.Parameter:
-    one = OPTIONS[key]
+    declared = OPTIONS[key]
     if key == "sandbox" and "trust_remote_code" in others:
         text = "Where it runs; 'none' is this process, unprotected."
-        one = replace(one, metavar=f"{one.metavar}|none", help=text)
+        declared = replace(declared, metavar=f"{declared.metavar}|none", help=text)
     option = typer.Option(
-        *one.command.split(),
-        help=one.help,
-        metavar=one.metavar,
-        min=one.least,
-        max=one.most,
-        autocompletion=_completion(one.metavar or ""),
-        rich_help_panel=one.panel,
+        *declared.command.split(),
+        help=declared.help,
+        metavar=declared.metavar,
+        min=declared.least,
+        max=declared.most,
+        autocompletion=_completion(declared.metavar or ""),
+        rich_help_panel=declared.panel,
     )
-    default = defaults.get(key, one.default)
-    kind: Any = list[str] if one.kind in (list, dict) else one.kind
+    default = defaults.get(key, declared.default)
+    kind: Any = list[str] if declared.kind in (list, dict) else declared.kind
     annotation: Any = Annotated[kind if default is not None else kind | None, option]
-    return _keyword(one.parameter, default, annotation)
+    return _keyword(declared.parameter, default, annotation)
 
 
 def _completion(metavar: str) -> Callable[[], list[str]] | None:
     """What a shell completes: what a metavar has in small letters."""
-    found = [re.match(r"[a-z][a-z:/-]*", one) for one in metavar.split("|")]
-    words = [one[0] for one in found if one is not None]
+    matches = [re.match(r"[a-z][a-z:/-]*", one) for one in metavar.split("|")]
+    words = [one[0] for one in matches if one is not None]
     return (lambda: words) if words else None
 
 

@@ -81,11 +81,11 @@ class Checkout:
 
     @cached_property
     def _names(self) -> dict[str, frozenset[str]]:
-        found: dict[str, set[str]] = {}
+        names_by_value: dict[str, set[str]] = {}
         for path in self.files:
             folder, _, name = path.rpartition("/")
-            found.setdefault(folder, set()).add(name)
-        return {folder: frozenset(names) for folder, names in found.items()}
+            names_by_value.setdefault(folder, set()).add(name)
+        return {folder: frozenset(names) for folder, names in names_by_value.items()}
 
     def converted(self, names: Iterable[str]) -> list[tuple[str, str]]:
         """Which of these files git commits with other bytes, and by which attribute.
@@ -94,12 +94,12 @@ class Checkout:
         latter git made the folder, and it may have converted ``.gitattributes``, too. Raises
         ``SnapshotError`` where git cannot say.
         """
-        given = b"".join(os.fsencode(name) + b"\0" for name in names)
-        return sorted({*self._attributes(given), *self._attributes(given, "--cached")})
+        paths = b"".join(os.fsencode(name) + b"\0" for name in names)
+        return sorted({*self._attributes(paths), *self._attributes(paths, "--cached")})
 
-    def _attributes(self, given: bytes, *source: str) -> Iterator[tuple[str, str]]:
+    def _attributes(self, paths: bytes, *source: str) -> Iterator[tuple[str, str]]:
         command = ("check-attr", "-z", "--stdin", *source, *_CONVERSIONS)
-        output = _git(self._repository, self.folder, *command, given=given)
+        output = _git(self._repository, self.folder, *command, given=paths)
         if output is None:
             raise SnapshotError(
                 f"local folder {self.folder}: git cannot read its .gitattributes. Mend or remove "
@@ -160,7 +160,7 @@ def make_checkout(folder: Path) -> None:
 def top_of(folder: Path) -> Path | None:
     """The folder, or the nearest one above it, that has a ``.git`` of any kind."""
     around = (folder, *folder.parents)
-    return next((one for one in around if os.path.lexists(one / ".git")), None)
+    return next((folder for folder in around if os.path.lexists(folder / ".git")), None)
 
 
 def _repository_of(folder: Path) -> _Repository | None:
@@ -198,7 +198,7 @@ def _git(
     program = _program()
     if program is None:
         return None
-    settings = [word for one in _SETTINGS for word in ("-c", one)]
+    settings = [word for setting in _SETTINGS for word in ("-c", setting)]
     try:
         done = subprocess.run(
             [program, *settings, *arguments],
@@ -215,16 +215,16 @@ def _git(
             f"{TIMEOUT_S:g} s. Mend or remove these files"
         ) from error
     except (OSError, subprocess.SubprocessError) as error:
-        said = getattr(error, "stderr", None) or b""
-        SNAPSHOT.warning("git cannot read the checkout %s: %s %r", folder, error, said[-300:])
+        printed = getattr(error, "stderr", None) or b""
+        SNAPSHOT.warning("git cannot read the checkout %s: %s %r", folder, error, printed[-300:])
         return None
     return done.stdout
 
 
 def _program() -> str | None:
-    found = shutil.which("git")
+    path = shutil.which("git")
     # with "." on the PATH it could be a file of the folder
-    return found if found is not None and os.path.isabs(found) else None
+    return path if path is not None and os.path.isabs(path) else None
 
 
 def _environment(repository: _Repository | None) -> dict[str, str]:

@@ -27,9 +27,9 @@ def own_files(root: Path, entry: str, names: Names) -> set[str]:
     """The paths of a file's own below ``root``; of a package its folder, with a slash at its end.
     Nothing is imported or run.
     """
-    found, waiting, left = set[str](), {entry}, parsing.MOST_BYTES_IN_ALL
+    files, waiting, left = set[str](), {entry}, parsing.MOST_BYTES_IN_ALL
     for _ in range(_MOST_ROUNDS):
-        found |= waiting
+        files |= waiting
         texts = {}
         for file in sorted(waiting):
             data = parsing.content(root / file, min(left, parsing.MOST_BYTES))
@@ -40,20 +40,24 @@ def own_files(root: Path, entry: str, names: Names) -> set[str]:
         waiting = {
             path for file, one in read.items() if one for path in _imported(file, one, names)
         }
-        waiting -= found
+        waiting -= files
         if not waiting or None in read.values():  # what took too much once is not tried on and on
             break
-    return {_package_of(path, names) or path for path in found | waiting}
+    return {_package_of(path, names) or path for path in files | waiting}
 
 
 def _read(texts: dict[str, bytes]) -> dict[str, parsing.ParsedFile | None]:
     """What each text is; one that was read in this process before is not parsed again."""
-    known = dict(_KNOWN)  # other threads may read files, too
-    found = parsing.parsed({file: text for file, text in texts.items() if text not in known})
-    if len(known) > _MOST_KNOWN:
+    parsed_before = dict(_KNOWN)  # other threads may read files, too
+    found = parsing.parsed(
+        {file: text for file, text in texts.items() if text not in parsed_before}
+    )
+    if len(parsed_before) > _MOST_KNOWN:
         _KNOWN.clear()
     _KNOWN.update((texts[file], one) for file, one in found.items())
-    return {file: found[file] if file in found else known[text] for file, text in texts.items()}
+    return {
+        file: found[file] if file in found else parsed_before[text] for file, text in texts.items()
+    }
 
 
 def _imported(file: str, read: parsing.ParsedFile, names: Names) -> Iterator[str]:
@@ -63,7 +67,7 @@ def _imported(file: str, read: parsing.ParsedFile, names: Names) -> Iterator[str
             for path in parsing.candidates(module, folder):
                 for own in _files_of(path, names):
                     yield own
-                    yield from (f"{one}/{_INIT}" for one in _packages_around(own, names))
+                    yield from (f"{package}/{_INIT}" for package in _packages_around(own, names))
 
 
 def _files_of(path: str, names: Names) -> Iterator[str]:

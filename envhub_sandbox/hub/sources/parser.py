@@ -131,31 +131,31 @@ def _rows(tree: ast.Module) -> dict[str, list[Any]]:
     nodes = list(ast.walk(tree))
     meanings = _Meanings(nodes)
     uses = {(name, line): None for node in nodes for name, line in meanings.used(node)}
-    found: dict[str, list[Any]] = {kind: [] for kind in ("imports", "texts", "entries", "ids")}
-    found["uses"] = [[name[-LONGEST:], line] for name, line in uses]  # its end says what it is
+    rows: dict[str, list[Any]] = {kind: [] for kind in ("imports", "texts", "entries", "ids")}
+    rows["uses"] = [[name[-LONGEST:], line] for name, line in uses]  # its end says what it is
     for node in nodes:
         if isinstance(node, (ast.Import, ast.ImportFrom)):
-            found["imports"].append(
+            rows["imports"].append(
                 [*_import(node), id(node) in required, node.lineno, within.get(id(node), "")]
             )
         elif isinstance(node, ast.Call):
             for module, names in _imported_by_name(meanings.of(node.func), node):
-                place = within.get(id(node), "")
-                found["imports"].append(
-                    [*(0, module, names, id(node) in required, node.lineno), place]
+                function = within.get(id(node), "")
+                rows["imports"].append(
+                    [*(0, module, names, id(node) in required, node.lineno), function]
                 )
-            found["ids"] += [[f"{text}{DRAWN}", node.lineno] for text in _drawn(node)]
+            rows["ids"] += [[f"{text}{DRAWN}", node.lineno] for text in _drawn(node)]
         elif isinstance(node, ast.Constant) and isinstance(node.value, str):
-            found["texts"] += _text(node)
+            rows["texts"] += _text(node)
             if _ID.fullmatch(node.value):
-                found["ids"].append([node.value, node.lineno])
-    found["entries"] += [
+                rows["ids"].append([node.value, node.lineno])
+    rows["entries"] += [
         [ast.unparse(node.args)[:LONGEST], node.lineno]
         for node in tree.body
         if isinstance(node, ast.FunctionDef) and node.name == "make_env"
     ]
-    found["definitions"] = _definitions(tree)
-    return found
+    rows["definitions"] = _definitions(tree)
+    return rows
 
 
 def _definition_of(statement: ast.stmt) -> str:
@@ -178,18 +178,18 @@ def _places(tree: ast.Module) -> dict[int, str]:
 
 def _definitions(tree: ast.Module) -> list[list[Any]]:
     """Each function and class at the top with the names that it uses; without a name: the rest."""
-    found: dict[str, dict[str, None]] = {"": {}}
+    definitions: dict[str, dict[str, None]] = {"": {}}
     left = MOST
     for statement in tree.body:
         if _is_program(statement):
             continue
-        names = found.setdefault(_definition_of(statement), {})
+        names = definitions.setdefault(_definition_of(statement), {})
         for node in ast.walk(statement):
             name = getattr(node, "id", "") or getattr(node, "attr", "")
             if isinstance(node, (ast.Name, ast.Attribute)) and left and name not in names:
                 names[name[:_LONGEST_TEXT]] = None
                 left -= 1
-    return [[name, list(names)] for name, names in found.items()]
+    return [[name, list(names)] for name, names in definitions.items()]
 
 
 def _imported_by_name(called: list[str], node: ast.Call) -> Iterator[tuple[str, list[str]]]:
@@ -207,11 +207,11 @@ def _imported_by_name(called: list[str], node: ast.Call) -> Iterator[tuple[str, 
 
 def _drawn(node: ast.Call) -> Iterator[str]:
     """Ids that a call names beside a ``render_mode``."""
-    given = {keyword.arg: keyword.value for keyword in node.keywords}
-    mode = given.get("render_mode")
+    arguments = {keyword.arg: keyword.value for keyword in node.keywords}
+    mode = arguments.get("render_mode")
     if mode is None or (isinstance(mode, ast.Constant) and mode.value is None):
         return
-    for value in (*node.args, *filter(None, [given.get("id")])):
+    for value in (*node.args, *filter(None, [arguments.get("id")])):
         text = _constant([value])
         if text and _ID.fullmatch(text):
             yield text
@@ -268,35 +268,39 @@ class _Meanings:
             builtins = [name for name in called if name in _BUILTINS]
             return [*builtins, *_arguments(called, node), *filter(_is_dotted, self.of(node))]
         if isinstance(node, ast.Name):
-            return [one for one in self.of(node) if _is_dotted(one) or one in self._free]
+            return [
+                meaning for meaning in self.of(node) if _is_dotted(meaning) or meaning in self._free
+            ]
         if isinstance(node, (ast.Attribute, ast.Subscript)):
             return list(filter(_is_dotted, self.of(node)))
         return []
 
     def of(self, node: ast.AST | None, left: int = _DEEPEST) -> list[str]:
         """An expression's meanings; those of a container are its members'."""
-        found: list[str] = []
+        dotted: list[str] = []
         if not left or node is None:
             return ["()"]
         if isinstance(node, ast.Name):
-            found = self._named(node.id)
+            dotted = self._named(node.id)
         elif isinstance(node, ast.Attribute):
             name = node.attr[:_LONGEST_TEXT]
-            found = [f"{base}.{name}" for base in self.of(node.value, left - 1)]
-            found += self._assigned.get(node.attr, [])
+            dotted = [f"{base}.{name}" for base in self.of(node.value, left - 1)]
+            dotted += self._assigned.get(node.attr, [])
         elif isinstance(node, ast.Call):
             for function in self.of(node.func, left - 1):
-                _add(found, self._called(function, node, left - 1))
+                _add(dotted, self._called(function, node, left - 1))
         elif isinstance(node, ast.Subscript):
             for base in self.of(node.value, left - 1):
-                _add(found, self._item(base, _constant([node.slice])))
+                _add(dotted, self._item(base, _constant([node.slice])))
         elif isinstance(node, (ast.Constant, ast.Lambda)):
-            found = ["()"]
+            dotted = ["()"]
         else:
             for child in ast.iter_child_nodes(node):
-                if isinstance(child, ast.expr) and len(found) < _MOST_MEANINGS:
-                    _add(found, [one for one in self.of(child, left - 1) if one != "()"])
-        return found[:_MOST_MEANINGS] or ["()"]
+                if isinstance(child, ast.expr) and len(dotted) < _MOST_MEANINGS:
+                    _add(
+                        dotted, [meaning for meaning in self.of(child, left - 1) if meaning != "()"]
+                    )
+        return dotted[:_MOST_MEANINGS] or ["()"]
 
     def _named(self, name: str) -> list[str]:
         if name == "__builtins__":
@@ -312,16 +316,16 @@ class _Meanings:
         text = _constant(arguments[:1])
         if name in _BY_TEXT and arguments:
             computed = "[computed]" if not isinstance(arguments[0], ast.Constant) else "()"
-            return [f"{one}.{text or computed}" for one in owners]
+            return [f"{owner}.{text or computed}" for owner in owners]
         if name in _IMPORTERS and text:
             self._roots.add(re.split("[.:]", text)[0])
             return [text.replace(":", ".")]
         if name in ("attrgetter", "methodcaller") and text:
             return [f"operator:{text}"]
         if function.startswith("operator:") and arguments:
-            return [f"{one}.{function[9:]}" for one in self.of(arguments[0], left)]
+            return [f"{owner}.{function[9:]}" for owner in self.of(arguments[0], left)]
         if name in ("vars", "getmembers") and arguments:
-            return [f"{one}.__dict__" for one in self.of(arguments[0], left)]
+            return [f"{owner}.__dict__" for owner in self.of(arguments[0], left)]
         return self._item(owner, text) if name in ("get", "pop") and text else [f"{function}()"]
 
     def _item(self, base: str, key: str) -> list[str]:
@@ -344,11 +348,11 @@ def _imported(node: ast.Import | ast.ImportFrom) -> list[str]:
     return [] if node.level else [f"{module}.{name}" for name in names]
 
 
-def _add(known: list[str], further: list[str]) -> bool:
+def _add(meanings: list[str], further: list[str]) -> bool:
     """Whether there was one among them that was not known."""
-    new = [one for one in dict.fromkeys(further) if one not in known]
-    known += new[: max(_MOST_MEANINGS - len(known), 0)]
-    return bool(new) and len(known) < _MOST_MEANINGS
+    new = [meaning for meaning in dict.fromkeys(further) if meaning not in meanings]
+    meanings += new[: max(_MOST_MEANINGS - len(meanings), 0)]
+    return bool(new) and len(meanings) < _MOST_MEANINGS
 
 
 def _is_dotted(name: str) -> bool:
@@ -387,7 +391,7 @@ def _assignments(node: ast.AST) -> Iterator[tuple[ast.AST, ast.expr]]:
         usual = [*node.posonlyargs, *node.args]
         yield from zip(reversed(usual), reversed(node.defaults), strict=False)
         pairs = zip(node.kwonlyargs, node.kw_defaults, strict=True)
-        yield from ((one, value) for one, value in pairs if value)
+        yield from ((target, value) for target, value in pairs if value)
 
 
 def _unpacked(target: ast.expr, value: ast.expr) -> Iterator[tuple[ast.AST, ast.expr]]:
@@ -395,8 +399,8 @@ def _unpacked(target: ast.expr, value: ast.expr) -> Iterator[tuple[ast.AST, ast.
         values = value.elts if isinstance(value, (ast.Tuple, ast.List)) else []
         if len(values) != len(target.elts):
             values = [value] * len(target.elts)
-        for one, its in zip(target.elts, values, strict=True):
-            yield from _unpacked(one, its)
+        for part, its in zip(target.elts, values, strict=True):
+            yield from _unpacked(part, its)
     elif isinstance(target, (ast.Subscript, ast.Starred)):
         yield from _unpacked(target.value, value)
     else:
@@ -405,16 +409,20 @@ def _unpacked(target: ast.expr, value: ast.expr) -> Iterator[tuple[ast.AST, ast.
 
 def _arguments(called: list[str], node: ast.Call) -> Iterator[str]:
     """What makes a call load pickles: an argument, or the lack of one."""
-    given = {one.arg: one.value for one in node.keywords}
-    if isinstance(several := given.pop(None, None), ast.Dict):
+    arguments = {one.arg: one.value for one in node.keywords}
+    if isinstance(several := arguments.pop(None, None), ast.Dict):
         keys = [_constant([key]) if key else "" for key in several.keys]
-        given |= zip(keys, several.values, strict=True)
+        arguments |= zip(keys, several.values, strict=True)
     if "numpy.load" in called and len(node.args) > 2:
-        given["allow_pickle"] = node.args[2]
+        arguments["allow_pickle"] = node.args[2]
     names = {name.rpartition(".")[2] for name in called}
-    if _may_be(given.get("allow_pickle", ast.Constant(None))) and names.isdisjoint(_SAVING):
+    if _may_be(arguments.get("allow_pickle", ast.Constant(None))) and names.isdisjoint(_SAVING):
         yield "allow_pickle=True"
-    if {"yaml.load", "yaml.load_all"} & {*called} and "Loader" not in given and len(node.args) < 2:
+    if (
+        {"yaml.load", "yaml.load_all"} & {*called}
+        and "Loader" not in arguments
+        and len(node.args) < 2
+    ):
         yield "yaml.load without a Loader"
 
 
@@ -476,14 +484,14 @@ def _suppresses(node: ast.expr) -> bool:
     return (
         isinstance(node, ast.Call)
         and _last(node.func) == "suppress"
-        and any(_last(one) in _MISSING for one in node.args)
+        and any(_last(argument) in _MISSING for argument in node.args)
     )
 
 
 def _asks(node: ast.If) -> bool:
     """``if importlib.util.find_spec("a"):``"""
     return any(
-        isinstance(one, ast.expr) and _last(one) == "find_spec" for one in ast.walk(node.test)
+        isinstance(child, ast.expr) and _last(child) == "find_spec" for child in ast.walk(node.test)
     )
 
 

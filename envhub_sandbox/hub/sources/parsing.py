@@ -89,7 +89,7 @@ def read(snapshot: Snapshot) -> dict[str, ParsedFile | None]:
     That is: larger than a person writes, beyond what all may take, or what the parser has not
     survived.
     """
-    names = sorted(one.path for one in snapshot.files if one.path.endswith(".py"))
+    names = sorted(file.path for file in snapshot.files if file.path.endswith(".py"))
     found: dict[str, ParsedFile | None] = dict.fromkeys(names)
     left, texts = MOST_BYTES_IN_ALL, {}
     for name in names:
@@ -189,7 +189,7 @@ def imports(snapshot: Snapshot, files: Files) -> list[Import]:
     text says. What may be missing does not count, nor what nothing leads to.
     """
     found = _ImportWalk(snapshot, files).imports
-    return sorted(found, key=lambda one: (one.file, one.line, one.name))
+    return sorted(found, key=lambda statement: (statement.file, statement.line, statement.name))
 
 
 def ids(snapshot: Snapshot, files: Files) -> list[tuple[str, str, int]]:
@@ -221,38 +221,38 @@ class _ImportWalk:
         for name, used in parsed.definitions:
             if not name or name in self._used:
                 self._used.update(used)
-        for one in parsed.imports:
-            if one.required and (not one.within or one.within in self._used):
-                for module, own in _targets(one, file, self._names):
+        for statement in parsed.imports:
+            if statement.required and (not statement.within or statement.within in self._used):
+                for module, own in _targets(statement, file, self._names):
                     name = module.partition(".")[0]
                     if own in self._parsed:
                         self.files.add(own)
                     elif not own and name and name not in sys.stdlib_module_names:
-                        self.imports.add(Import(name, file, one.line, module))
+                        self.imports.add(Import(name, file, statement.line, module))
 
 
-def _targets(one: ImportStatement, file: str, files: set[str]) -> Iterator[tuple[str, str]]:
+def _targets(statement: ImportStatement, file: str, files: set[str]) -> Iterator[tuple[str, str]]:
     """Each module that is named, and the repository's own file if it is one."""
-    folder, dotted = named_modules(one, file)
+    folder, dotted = named_modules(statement, file)
     for number, name in enumerate(dotted):
         own = next((path for path in candidates(name, folder) if path in files), "")
-        foreign = one.level < 0 or (one.level == 0 and number == 0)
+        foreign = statement.level < 0 or (statement.level == 0 and number == 0)
         first = name.partition(".")[0]
         if own or (foreign and files.isdisjoint(candidates(first, folder))):
             yield name, own
 
 
-def named_modules(one: ImportStatement, file: str) -> tuple[str, list[str]]:
+def named_modules(statement: ImportStatement, file: str) -> tuple[str, list[str]]:
     """The folder that a statement in a file is about, and what it may import, dotted; first what
     it surely does.
     """
     folder = file.rpartition("/")[0]
-    for _ in range(one.level - 1):
+    for _ in range(statement.level - 1):
         folder = folder.rpartition("/")[0]
-    if one.level < 0:
-        return folder, list(one.names)
-    names = dict.fromkeys(f"{one.module}.{name}".strip(".") for name in one.names)
-    return folder, [one.module, *names]
+    if statement.level < 0:
+        return folder, list(statement.names)
+    names = dict.fromkeys(f"{statement.module}.{name}".strip(".") for name in statement.names)
+    return folder, [statement.module, *names]
 
 
 def candidates(name: str, folder: str) -> Iterator[str]:
@@ -276,4 +276,6 @@ def _table() -> dict[str, list[str]]:
     text = Path(__file__).with_name("modules.txt").read_text("utf-8")
     rows = [line.split() for line in text.splitlines() if not line.startswith("#")]
     own = {module: [module] for sign, *names in rows if sign == "=" for module in names}
-    return own | {one: [] if names == ["-"] else names for one, *names in rows if one != "="}
+    return own | {
+        module: [] if names == ["-"] else names for module, *names in rows if module != "="
+    }

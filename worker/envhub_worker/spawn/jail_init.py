@@ -244,7 +244,7 @@ class Init:
         denial, kind = (call, detail), notify.kind(detail)
         if denial in self._denials:
             return
-        if sum(notify.kind(call) == kind for _, call in self._denials) < notify.MOST_OF_A_KIND:
+        if sum(notify.kind(other) == kind for _, other in self._denials) < notify.MOST_OF_A_KIND:
             self._denials.add(denial)
             self._channel.send({"event": "denied", "call": call, "detail": detail})
 

@@ -207,8 +207,8 @@ def _types() -> dict[str, Any]:
     from dataclasses import make_dataclass
     from enum import Enum
 
-    members: Any = Enum  # made of a tuple, whose members mypy cannot see
-    kind = members("FeatureType", [(name, name) for name in _FEATURES], type=str)
+    make_enum: Any = Enum  # made of a tuple, whose members mypy cannot see
+    kind = make_enum("FeatureType", [(name, name) for name in _FEATURES], type=str)
     feature = make_dataclass("PolicyFeature", [("type", kind), ("shape", tuple)])
     return {"FeatureType": kind, "PolicyFeature": feature}
 
