@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 _FORMAT = 2
 _READ: dict[tuple[Path, str], tuple[tuple[str, str, int], ...]] = {}
 _MOST = 64
+_MOST_NOTED = 4
+"""Of a commit: each costs another environment."""
 _SHOWN = 20
 _LONGEST = 100
 _MISSING = r"No module named '([\w.]+)'"
@@ -193,7 +195,8 @@ def note_missing(snapshot: Snapshot, said: str) -> bool:
     module = found[1][:_LONGEST] if (found := re.search(_MISSING, said)) else ""
     known = read(snapshot)
     names = {name.partition(".")[0] for name, _, _ in known}
-    if not of_module(module) or module.partition(".")[0] in names or len(known) >= _MOST:
+    noted = sum(line == 0 for _, _, line in known)
+    if not of_module(module) or module.partition(".")[0] in names or noted >= _MOST_NOTED:
         return False
     rows = *known, (module, f"a package of it, which imports {module}", 0)
     _READ[snapshot.root, snapshot.path] = rows

@@ -8,6 +8,7 @@ others, and nothing that has drifted.
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import warnings
@@ -107,8 +108,10 @@ def _warn_of_cuda(lock: Lock, interpreter: Interpreter) -> None:
 
     if environments.ready(environments.key_of(lock, interpreter)) is not None:
         return
-    found = pylock.listed(lock.packages, interpreter.path, lock.options)
-    size = sum(max((wheel.size or 0 for wheel in one.wheels), default=0) for one in found)
+    size = 0
+    with contextlib.suppress(DependencyError, LockError):  # the installation will say what is wrong
+        found = pylock.listed(lock.packages, interpreter.path, lock.options)
+        size = sum(max((wheel.size or 0 for wheel in one.wheels), default=0) for one in found)
     much = f" ({size_text(size)} of downloads)" if size else ""
     warnings.warn(
         f"PyTorch comes with CUDA{much}, and jails have no GPU here: the index has no build "

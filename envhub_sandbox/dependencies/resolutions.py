@@ -14,6 +14,7 @@ import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,7 +25,7 @@ from envhub_sandbox.dependencies.declared import Source, of_git, parse_requireme
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.dependencies.request import PackageRequest, Tell, chosen
 from envhub_sandbox.dependencies.resolve import WORKERS, Lock, Target
-from envhub_sandbox.errors import DependencyError
+from envhub_sandbox.errors import DependencyError, EnvHubError
 from envhub_sandbox.settings.options import option_name
 from envhub_sandbox.system import folders
 
@@ -32,6 +33,7 @@ if TYPE_CHECKING:
     from envhub_sandbox.dependencies.modules import Guess
 
 _FORMAT = 2
+_MOST_CURES = 6
 Builder = Callable[[Sequence[Source], Interpreter, Tell], Sequence[Path]]
 """Makes one wheel of each source, in the same order; each lies in a folder of wheels alone, and
 stays there. Raises ``DependencyError``."""
@@ -113,15 +115,15 @@ def _cure(
     request: PackageRequest, error: DependencyError, interpreter: Interpreter
 ) -> dict[str, list[str]] | None:
     """Keys of ``dependencies`` with which there are versions, as wheels, after all."""
-    for keys in resolve.cures(error):
-        changed = chosen(keys, None)[0]
-        asked = replace(
-            request,
-            guesses=(),
-            without=(*request.without, *changed.without),
-            override=(*request.override, *changed.override),
-        )
-        with contextlib.suppress(DependencyError):
+    for keys in islice(resolve.cures(error), _MOST_CURES):
+        with contextlib.suppress(EnvHubError):
+            changed = chosen(keys, None)[0]
+            asked = replace(
+                request,
+                guesses=(),
+                without=(*request.without, *changed.without),
+                override=(*request.override, *changed.override),
+            )
             resolve.resolve(asked, Target(python=interpreter.path))
             return keys
     return None

@@ -37,7 +37,6 @@ REQUIRED = "What is required of these packages:"
 _BOUNDED = re.compile(
     r"(?<![\w.-])(?!python\b)([A-Za-z][A-Za-z0-9._-]*)(?:\[[\w,-]+\])?[<>=!~]=?\d", re.I
 )
-_MOST_CURES = 4
 _NO_WHEELS = re.compile(r"Wheels are required for `([A-Za-z0-9._-]+)`")
 _NEEDS_PYTHON = re.compile(r"does not satisfy Python>=(3\.\d+)")
 _HASH = re.compile(r"    --hash=(sha(?:256|384|512):[0-9a-f]+)( \\)?")
@@ -306,7 +305,7 @@ def cures(error: DependencyError) -> Iterator[dict[str, list[str]]]:
     yield from ({"without": [name]} for name in unknown)
     words = Counter(name.lower() for name in _BOUNDED.findall(said))
     ours = {line.partition(">")[0]: line for line in WORKERS}
-    for name, _ in words.most_common(_MOST_CURES):
+    for name, _ in words.most_common():
         yield {"override": [ours.get(name, name)]}
 
 

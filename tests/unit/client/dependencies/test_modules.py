@@ -11,7 +11,7 @@ import pytest
 from envhub_sandbox.dependencies import interpreters, resolutions
 from envhub_sandbox.dependencies import resolve as resolving
 from envhub_sandbox.dependencies.interpreters import Interpreter
-from envhub_sandbox.dependencies.modules import MissingModule, guessed
+from envhub_sandbox.dependencies.modules import MissingModule, guessed, note_missing
 from envhub_sandbox.dependencies.packages import packages_for
 from envhub_sandbox.dependencies.request import AUTO, DECLARED, PackageRequest, chosen, request_of
 from envhub_sandbox.dependencies.resolve import Lock, Target
@@ -126,6 +126,15 @@ def test_no_index_is_asked_for_the_name_of_a_module(index: Index, tmp_path: Path
         "No module named 'cv2.aruco'"
     )
     assert "{'extra': ['opencv-python-headless']}" in known
+
+
+def test_a_jail_names_few_modules(tmp_path: Path) -> None:
+    """Of those of the table alone, each once; every one costs another environment."""
+    found = snapshot(tmp_path / "r", "import chess" + MAKE)
+    names = ("made_up", "chess", "six", "six", "cv2", "h5py", "scipy", "torch")
+    taken = [note_missing(found, f"No module named '{name}'") for name in names]
+    assert taken == [False, False, True, False, True, True, True, False]
+    assert len(requirements(found)) == 5
 
 
 def test_a_guess_never_stands_in_the_way(
