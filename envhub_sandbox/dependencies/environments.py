@@ -236,7 +236,7 @@ def _publish(building: Path, key: str, facts: dict[str, object]) -> None:
     except OSError as error:
         if error.errno not in _THERE:
             raise
-        # what bears the name is none, or we would not be here: a disk that lost power, a hand
+        # the existing folder is damaged, by a power loss or by hand: move it away
         with draft(root(), f"{BUILDING}{key}-") as damaged:
             os.rename(root() / key, damaged / "damaged")
             os.rename(building, root() / key)

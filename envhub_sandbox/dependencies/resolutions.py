@@ -265,6 +265,6 @@ def remember(key: str, found: Resolution) -> None:
 
 
 def _stamp(interpreter: Interpreter) -> list[int]:
-    """Another release under the same name is another file."""
+    """Size and time of the interpreter's file, to notice an upgrade in place."""
     status = os.stat(interpreter.path)
     return [status.st_size, status.st_mtime_ns]

@@ -39,7 +39,7 @@ class HostileAnswerError(Exception):
 
 def streamed(session: Any, url: str, options: Mapping[str, Any]) -> Any:
     """A context with the answer to a GET, before its body is read."""
-    if callable(getattr(session, "stream", None)):  # httpx; of requests it is a bool
+    if callable(getattr(session, "stream", None)):  # httpx; in a session of requests it is a bool
         return session.stream("GET", url, **options)
     return session.get(url, stream=True, **options)
 

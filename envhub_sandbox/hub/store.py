@@ -76,7 +76,7 @@ class StoredCommit(NamedTuple):
 
 
 class HalfDeletedError(SnapshotIntegrityError):
-    """Parts of a snapshot are gone, and what is left is what was verified: ``publish`` heals it."""
+    """Files of a snapshot are missing, and none differs: ``publish`` restores them."""
 
 
 def _fingerprint(status: os.stat_result) -> list[int]:

@@ -348,9 +348,9 @@ class ServerHold:
         self._let_go()
 
     def close_later(self, server: WorkerServer, wait: Callable[[], None]) -> bool:
-        """Have the next close wait for the end of a jail; False if no other is to come.
+        """Let the next close wait for the end of this jail; False if this is the last close.
 
-        Waits for the ends before this one, most of which have come.
+        Waits for the jails that were deferred earlier, most of which have ended by now.
         """
         with self._lock:
             if not self._is_kept(server) or len(self._open) <= 1:

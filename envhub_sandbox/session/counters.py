@@ -112,7 +112,7 @@ class FleetCounters(Counters):
         self._longest_ns = [0] * len(parts)
 
     def waited(self, worker: int, elapsed_ns: int) -> None:
-        """A step has waited so long for a worker, after those that were waited for before it."""
+        """Add the time that a step waited for this worker alone, after those before it."""
         self._waited_ns[worker] += elapsed_ns
         if elapsed_ns > self._longest_ns[worker]:
             self._longest_ns[worker] = elapsed_ns

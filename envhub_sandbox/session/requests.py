@@ -256,11 +256,24 @@ class Requests(RequestOrder):
         return self._recovery is not None and bool(self._recovery.fresh)
 
     def note_sent(self, actions: Any | None) -> None:
-        """See ``RequestOrder``; a step to all of them is noted where it is submitted."""
+        """Record a step of some workers; ``submit_step`` records a step of all."""
         if actions is None:
             self._recorder.skip()
 
     # --- requests ------------------------------------------------------------------------------
+
+    # The order of a request, which interruption.md explains by rule:
+    #
+    # 1. ``_sending``: the jail is opened, if there is none, and the message is packed. What fails
+    #    here has sent nothing, and the state is what it was.
+    # 2. ``_outgoing``: the state moves to PENDING, and only then the message goes out. After a
+    #    Ctrl-C in between, the next request is refused and ``reset`` waits for a reply.
+    # 3. Recovery and recorder note it: it is known to have been sent.
+    # 4. ``_finish``: the replies of all shards are in, and only then the state moves on.
+    # 5. ``_incoming``: the replies are decoded and compared with the manifest. A worker that breaks
+    #    a rule in them is given up; no reply is owed any more.
+    # 6. The repository's warnings are shown last: a filter of the caller's may raise, and must find
+    #    an environment that can be used.
 
     def submit(
         self, operation: str, message_for: MessageFor, instead: MessageFor | None = None

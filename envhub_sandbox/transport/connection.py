@@ -357,7 +357,7 @@ class WorkerConnection:
             self._far.held.add(jail)
 
     def let_go(self, jail: int) -> None:
-        """It no longer is; the server ends it."""
+        """Stop keeping the jail alive; the server will end it."""
         if self._far is not None:
             self._far.held.discard(jail)
 

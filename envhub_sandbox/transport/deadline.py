@@ -52,7 +52,7 @@ class Deadline:
         return None if left is None else int(min(left * 1000 + 1, _LONGEST_WAIT_MS))
 
     def postpone(self, seconds: float) -> None:
-        """So much of the time does not count."""
+        """Extend the deadline by ``seconds``."""
         if self._at:  # 0 has been given up
             self._at += seconds
 

@@ -217,7 +217,7 @@ class Results:
 
     def _restored(self, infos: dict[Any, Any]) -> dict[Any, Any]:
         final = infos.get("final_obs") if self._restores else None
-        # one that is something else is the repository's own, who has a step of its own
+        # a repository with its own vector environment may return any final_obs: leave those alone
         if type(final) is np.ndarray and final.dtype == object and final.ndim == 1:
             for index, member in enumerate(final):
                 final[index] = batches.restore(self._space, member)

@@ -45,7 +45,7 @@ def shortened(error: BaseException) -> bool:
 def short_traceback(ask: Callable[P, T]) -> Callable[P, T]:
     """Decorate a function: its errors have the caller's frames and one of ours.
 
-    What the machine has no more of becomes an error of this project, wherever it was needed.
+    ``EMFILE``, ``ENOMEM`` and the like are raised as a ``WorkerError``.
     """
 
     @functools.wraps(ask)

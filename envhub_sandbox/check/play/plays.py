@@ -217,7 +217,7 @@ class Play:
     film: Film | None = None
 
     def count(self, used: dict[str, int]) -> dict[str, int]:
-        """Keep the memory of what a jail uses; gives the same."""
+        """Append ``memory_bytes`` to the series, and return ``used``."""
         if "memory_bytes" in used:
             self.memory.append(used["memory_bytes"])
         return used

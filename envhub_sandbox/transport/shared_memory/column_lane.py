@@ -165,7 +165,7 @@ class ColumnLane(SharedMemoryLane):
         """See ``Lane``."""
         if self._asked == STEP:
             self._catch_up_with_server(deadline)
-            self._outcomes(deadline)  # wanted or not: later columns are of the schema they bring
+            self._outcomes(deadline)  # it may carry the schema of later columns
         else:
             super().catch_up(deadline)
 

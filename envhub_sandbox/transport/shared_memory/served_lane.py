@@ -155,7 +155,7 @@ class ServedLane(Lane):
             outcomes, deaths = error.replies, error.deaths
         self.elapsed_ns = perf_counter_ns() - self._asked_ns
         if 0 < self._spin.budget_ns < self.elapsed_ns:
-            self._spin.missed()  # the runner sleeps by now, far as it is or busy as its machine
+            self._spin.missed()  # the runner has gone to sleep: count a missed spin
         self._spin.measured(self.elapsed_ns)
         # what one has raised comes before the infos of others, unless a recovery needs these, or
         # they were asked for: warnings come with them

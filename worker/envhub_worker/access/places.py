@@ -186,8 +186,8 @@ class Places:
     def tick(self) -> None:
         """End the jails of clients that are not heard from, and what clients no longer hold."""
         self.end_deserted()
-        # Before the silent clients are looked for: time passes meanwhile, and it would be said of
-        # one of them that it gave up what it held when it was last heard.
+        # First: a client that times out in the loop below would otherwise be logged as having
+        # released its jails.
         given_up = self._given_up() if self._idle_s else []
         for session in self._sessions.idle(self._idle_s or _FORGOTTEN_S):
             if self._idle_s:

@@ -133,7 +133,7 @@ def _column(env: Any, name: str, values: Any, dtype: Any) -> Any:
 
 
 def _own_infos(env: Any, method: str, infos: Any) -> Any:
-    """A mapping; of a list of them, as other libraries' have it, what Gymnasium would make."""
+    """Infos as one dict; a list of dicts is merged as Gymnasium does."""
     if isinstance(infos, dict):
         return infos
     mappings = isinstance(infos, (list, tuple)) and all(isinstance(info, dict) for info in infos)

@@ -270,9 +270,9 @@ class JailEvents:
         self.kill(entry)
 
     def _hear_last(self, entry: JailRecord) -> None:
-        """Read what it was denied, which was sent before whatever ends it, on another descriptor.
+        """Drain the control channel before the jail is ended: denials may still lie in it.
 
-        It ends also where that cannot be read: then it may be this that ends it.
+        A channel that cannot be read is no reason not to end the jail.
         """
         try:
             events = entry.jail.poll()

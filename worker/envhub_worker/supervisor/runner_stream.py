@@ -88,7 +88,7 @@ class RunnerLink:
         try:
             sent = socket.send_fds(self.sock, [data], fds)
         except OSError:
-            return  # it is gone: its exit answers
+            return  # the runner has exited, and its exit event completes the request
         if sent != len(data):
             raise RuntimeError("the runner does not read its stream")
 

@@ -66,7 +66,7 @@ def jail_environment(
         "HF_HOME": f"{home}/.cache/huggingface",
         "HOME": home,
         "LOGNAME": "sandbox",
-        # it would be written into the scratch, once for each jail; child processes inherit this
+        # bytecode would be written to each jail's scratch; child processes inherit this
         "PYTHONDONTWRITEBYTECODE": "1",
         "TMPDIR": temporary,
         "USER": "sandbox",

@@ -67,7 +67,7 @@ def asked(
     """
     with contextlib.suppress(OSError, ValueError, OverflowError):
         with open(f"/proc/{thread}/mem", "rb", buffering=0) as memory:
-            still_waits()  # not before it is open: from here on it is this caller's memory
+            still_waits()  # after opening: the descriptor pins this caller's memory
             if call in _ADDRESS:
                 place, size = (words[index] for index in _ADDRESS[call])
                 path = _addressed(memory, place, size, thread, own)

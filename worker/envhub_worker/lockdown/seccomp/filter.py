@@ -23,7 +23,7 @@ _PR_SET_SECCOMP = 22
 _MODE_FILTER = 2
 _SET_MODE_FILTER = 1
 _NEW_LISTENER = 1 << 3
-#: Who has been heard is interrupted by nothing that does not end it (Linux 5.19).
+#: Once its notification was read, only a fatal signal interrupts the caller (Linux 5.19).
 WAIT_KILLABLE = 1 << 5
 
 _NUMBER, _ARCHITECTURE, _ARGUMENTS = 0, 4, 16

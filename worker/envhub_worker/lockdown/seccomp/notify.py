@@ -114,7 +114,7 @@ def kind(detail: str) -> str:
 
 
 def detail(request: Request) -> str:
-    """Of the arguments of a call what the kernel itself reads in a register."""
+    """The scalar arguments that are safe to report, such as the family of a socket."""
     call = request.call
     if call in NAMING and is_another_target(call, request.arguments, request.caller, os.getpid()):
         return OTHER
