@@ -131,6 +131,7 @@ class FakeRepository(Repository):
         self.warnings, self.recipe, self.copy = RemoteWarnings(), None, True
         self.min_ready, self.for_lerobot = None, False
         self.label, self.wire_limits = "a/b", DEFAULT_LIMITS
+        self._of_its_day = lambda error: ""
 
     def keep_crash(self, *_: object, **__: object) -> None:
         """There is none."""
