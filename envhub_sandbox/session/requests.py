@@ -57,6 +57,15 @@ _SHOWN = 64
 T = TypeVar("T")
 
 
+def for_every_shard(kind: Callable[..., m.Message], *fields: object) -> MessageFor:
+    """The same message for each shard of an environment, after the environment's number."""
+
+    def message_for(number: int, bounds: Bounds) -> m.Message:
+        return kind(number, *fields)
+
+    return message_for
+
+
 class RequestOrder(ABC):
     """The caller's order of requests to one environment, in one jail or in several.
 
@@ -129,7 +138,8 @@ class RequestOrder(ABC):
     def ask_own(self, operation: str, kind: Callable[..., m.Message], *fields: object) -> m.Message:
         """Ask about what the repository's vector environment has of its own: one shard has it."""
         kinds = (m.Value, m.Method)
-        [reply] = self._ask(operation, lambda n, _: kind(n, *fields), kinds, self._timeouts.call_s)
+        message_for = for_every_shard(kind, *fields)
+        [reply] = self._ask(operation, message_for, kinds, self._timeouts.call_s)
         return reply
 
     def ask_one(self, name: str, index: int, message: OneMessageFor) -> m.Message:

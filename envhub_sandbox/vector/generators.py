@@ -19,7 +19,7 @@ import numpy as np
 from gymnasium.error import AlreadyPendingCallError, ClosedEnvironmentError
 
 from envhub_sandbox.errors import RemoteEnvError, RemoteProtocolError, WorkerError
-from envhub_sandbox.session.requests import MessageFor, RequestOrder
+from envhub_sandbox.session.requests import MessageFor, RequestOrder, for_every_shard
 from envhub_sandbox.transport.values import generator
 from envhub_worker.protocol import messages as m
 from envhub_worker.protocol.errors import UNTRUSTED
@@ -133,7 +133,7 @@ class Generators:
                 self._fetch()
 
     def _fetch(self) -> None:
-        replies = self._ask(lambda number, _: m.GetRandom(number))
+        replies = self._ask(for_every_shard(m.GetRandom))
         with UNTRUSTED:  # a generator that numpy does not know breaks no rule of the wire
             self.single = type(replies[0].value) is dict
             if self.single:

@@ -19,7 +19,7 @@ from gymnasium.envs.registration import EnvSpec
 from gymnasium.vector import VectorEnv
 
 from envhub_sandbox.errors import EnvHubError, RemoteEnvError
-from envhub_sandbox.session.requests import SENT, MessageFor
+from envhub_sandbox.session.requests import SENT, MessageFor, for_every_shard
 from envhub_sandbox.system.platform import OwnerProcess
 from envhub_sandbox.transport.deadline import Deadline
 from envhub_sandbox.transport.remote_warnings import level_of_the_caller
@@ -330,7 +330,7 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
     def _watched(self, name: str) -> tuple[Any, ...]:
         """Have it watched, or that it is absent: what is raised then is the answer to a call."""
         attributes = self._requests.attributes
-        self._send_call(name, (), {}, lambda number, _: m.Watch(number, name))
+        self._send_call(name, (), {}, for_every_shard(m.Watch, name))
         replies = self._requests.collect(self._timeouts.call_s, m.WatchDone)
         watched = all(reply.watched for reply in replies)
         absent_in = [type(reply.value) is tuple and not reply.value for reply in replies]
@@ -368,7 +368,7 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
             raise ValueError(
                 f"Trying to call function `{name}` with `call`, use `{name}` directly instead."
             )
-        self._requests.submit("call", lambda number, _: m.Call(number, name, args, kwargs), instead)
+        self._requests.submit("call", for_every_shard(m.Call, name, args, kwargs), instead)
 
     @short_traceback
     def call_wait(self, timeout: float | None = None) -> tuple[Any, ...]:
@@ -406,7 +406,7 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
     @short_traceback
     def render(self) -> tuple[Any, ...] | None:
         """What each sub-environment renders; None where the environment gives None."""
-        replies = self._requests.ask("render", lambda number, _: m.Render(number))
+        replies = self._requests.ask("render", for_every_shard(m.Render))
         if self._manifest.shardable:
             rendered = self._requests.one_each("render", replies)
         else:
@@ -443,7 +443,7 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
     def np_random_seed(self) -> Any:
         """Their seeds."""
         name = "np_random_seed"
-        replies = self._requests.ask(name, lambda number, _: m.GetOwn(number, name))
+        replies = self._requests.ask(name, for_every_shard(m.GetOwn, name))
         if type(replies[0].value) is not tuple:
             return seeds(replies[0].value)
         return seeds(self._requests.one_each(name, replies))
