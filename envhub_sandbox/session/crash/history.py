@@ -83,7 +83,6 @@ class History(Recorder):
             self._reset([one.seeds for one in request.messages if isinstance(one, m.Reset)])
         passes = isinstance(message, m.CallOne) and message.name in _PASSING
         packed = _packed(request)._replace(lasts=isinstance(message, _LASTING) and not passes)
-        self.complete = self.complete and packed.exact
         self._add(packed)
 
     def _reset(self, seeds: list[Any]) -> None:
@@ -121,7 +120,8 @@ class History(Recorder):
             entry if isinstance(entry, RecordedRequest) else encoded(m.Step(0, entry))
             for entry in self._log
         ]
-        return Recording(requests, self.complete, self.seeded)
+        complete = self.complete and all(request.exact for request in requests)
+        return Recording(requests, complete, self.seeded)
 
     def of_part(self) -> Recorder:
         """See ``Recorder``."""

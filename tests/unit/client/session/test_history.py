@@ -88,9 +88,13 @@ def test_requests_come_back_in_order() -> None:
     assert_same(third.actions, np.array([2, 3], np.uint8))
     assert isinstance(render, m.Render)
     assert last.actions == [4, "a"]
-    assert kept.complete
+    assert kept.recording().complete
+    kept.step([object()])
+    assert not kept.recording().complete
+    reset(kept, [1, 2])
+    assert kept.recording().complete
     ask(kept, m.Call(0, "add", (object(),), {}))
-    assert not kept.complete
+    assert not kept.recording().complete
     assert "remote object" in repr(messages_of(kept)[-1])
 
 
