@@ -34,6 +34,16 @@ WANTED = {
     "tianshou": (("torch", "tianshou"), ("tianshou", "gymnasium"), "SubprocVectorEnv: 200 steps"),
     "hydra": (("hydra-core",), ("hydra-core", "omegaconf", "gymnasium"), "100 steps are equal"),
     "pufferlib": (("psutil", "gymnasium"), ("pufferlib", "gymnasium"), "200 steps are equal"),
+    "environments": (
+        ("highway-env", "gymnasium-robotics", "shimmy>=2", "dm-control", "mujoco<4"),
+        ("highway-env", "gymnasium-robotics", "shimmy", "dm-control", "mujoco"),
+        "dm_control by shimmy: 200 steps are equal",
+    ),
+    "wrappers": (
+        ("torch", "supersuit", "skrl", "d3rlpy>=2.8"),
+        ("supersuit", "skrl", "d3rlpy", "gymnasium"),
+        "d3rlpy: 200 steps are equal",
+    ),
     "sample_factory": (
         ("torch", "sample-factory"),
         ("sample-factory", "gymnasium"),

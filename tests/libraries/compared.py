@@ -17,10 +17,10 @@ def make_env(n_envs=1, use_async_envs=False):
 """
 
 
-def folder() -> str:
+def folder(env_py: str = ENV) -> str:
     made = Path(tempfile.mkdtemp(prefix="compared-"))
     made.chmod(0o755)  # jails of root run as another user
-    (made / "env.py").write_text(ENV)
+    (made / "env.py").write_text(env_py)
     return str(made)
 
 
