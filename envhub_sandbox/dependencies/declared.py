@@ -172,14 +172,15 @@ def not_read(root: Path, entry: str) -> list[str]:
     return found
 
 
+def _unsupported(text: str) -> DependencyError:
+    return DependencyError(text, reason="requirement")
+
+
 def parse_requirement(text: str, where: str) -> WantedPackage:
     """A requirement that somebody wrote, with the hashes behind it. Raises ``DependencyError``."""
     plain, *hashes = map(str.strip, re.split(r"(?<=\s)(?=--hash[= ])", text))
     if len(plain) > MAX_LINE:
-        raise DependencyError(
-            f"{where} has {len(plain)} characters; at most {MAX_LINE} are read",
-            reason="requirement",
-        )
+        raise _unsupported(f"{where} has {len(plain)} characters; at most {MAX_LINE} are read")
     found = [_HASH.fullmatch(one.strip()) for one in hashes]
     try:
         requirement = Requirement(plain)
@@ -188,17 +189,15 @@ def parse_requirement(text: str, where: str) -> WantedPackage:
         if not _is_literal(plain):
             raise InvalidRequirement("a text that would be printed as something else")
     except (InvalidRequirement, RecursionError) as error:
-        raise DependencyError(
+        raise _unsupported(
             f"{where} is {text[:200]!r}. Only plain requirements such as 'numpy>=2' are supported, "
             "with or without hashes: options, links, paths and files can run code during the "
-            f"installation. {_advice()}",
-            reason="requirement",
+            f"installation. {_advice()}"
         ) from error
     if requirement.url is not None and of_git(requirement, where) is None:
-        raise DependencyError(
+        raise _unsupported(
             f"{where} takes {requirement.name} from {requirement.url[:200]!r}; only packages of "
-            f"the index are installed. {_advice()}",
-            reason="requirement",
+            f"the index are installed. {_advice()}"
         )
     return WantedPackage(requirement, where, tuple(one[1] for one in found if one))
 
@@ -241,9 +240,7 @@ def read(root: Path, name: str) -> tuple[list[WantedPackage], list[WantedPackage
                 (constraints if constrains else wanted).append(parse_requirement(line, where))
         _bounded(len(wanted) + len(constraints), name)
         if len(seen) > MAX_FILES:
-            raise DependencyError(
-                f"{name} includes more than {MAX_FILES} files. {_advice()}", reason="requirement"
-            )
+            raise _unsupported(f"{name} includes more than {MAX_FILES} files. {_advice()}")
     return wanted, constraints
 
 
@@ -251,10 +248,9 @@ def _of_itself(root: Path, extras: str, where: str) -> Iterator[WantedPackage]:
     """What ``-e .`` brings besides the repository, whose modules are there already."""
     project = pyproject(root).get("project")
     if not isinstance(project, dict):
-        raise DependencyError(
+        raise _unsupported(
             f"{where} installs the repository itself, but its requirements are read only from "
-            f"[project] of {PROJECT}, which does not exist. {_advice()}",
-            reason="requirement",
+            f"[project] of {PROJECT}, which does not exist. {_advice()}"
         )
     yield from _list(project.get("dependencies", []), f"[project] of {PROJECT}")
     for name in filter(None, map(str.strip, extras.split(","))):
@@ -267,9 +263,8 @@ def _beside(root: Path, file: str, named: str, where: str) -> str:
     path = os.path.normpath(os.path.join(os.path.dirname(file), named))
     inside = not os.path.isabs(path) and path.split(os.sep)[0] != ".." and "://" not in named
     if not inside or not _is_file(root / path):
-        raise DependencyError(
-            f"{where} names {named[:200]!r}, which is not a file of the repository. {_advice()}",
-            reason="requirement",
+        raise _unsupported(
+            f"{where} names {named[:200]!r}, which is not a file of the repository. {_advice()}"
         )
     return path
 
@@ -304,15 +299,13 @@ def _script(path: Path, name: str) -> DeclaredPackages | None:
         with path.open("rb") as file:
             lines = file.read(_LOOKED_AT).decode("utf-8", "replace").splitlines()
     except OSError as error:
-        raise DependencyError(f"{name} cannot be read: {error}", reason="requirement") from error
+        raise _unsupported(f"{name} cannot be read: {error}") from error
     starts = [number for number, line in enumerate(lines) if line.rstrip() == _SCRIPT]
     blocks = [block for block in (_block(lines, start) for start in starts) if block is not None]
     if not blocks:
         return None
     if len(blocks) > 1:
-        raise DependencyError(
-            f"{name} has {len(blocks)} blocks {_SCRIPT!r}; one is permitted", reason="requirement"
-        )
+        raise _unsupported(f"{name} has {len(blocks)} blocks {_SCRIPT!r}; one is permitted")
     where = f"the script metadata of {name}"
     data = _toml(blocks[0], where)
     python = _specifier(data.get("requires-python", ""), where)
@@ -349,16 +342,12 @@ def _toml(text: str, where: str) -> dict[str, Any]:
     try:
         return toml.loads(text, MAX_BYTES)
     except ValueError as error:
-        raise DependencyError(
-            f"{where} is not valid TOML: {error}. {_advice()}", reason="requirement"
-        ) from error
+        raise _unsupported(f"{where} is not valid TOML: {error}. {_advice()}") from error
 
 
 def _list(found: object, where: str) -> tuple[WantedPackage, ...]:
     if not isinstance(found, list) or not all(isinstance(item, str) for item in found):
-        raise DependencyError(
-            f"dependencies in {where} is not a list of strings. {_advice()}", reason="requirement"
-        )
+        raise _unsupported(f"dependencies in {where} is not a list of strings. {_advice()}")
     _bounded(len(found), where)
     return tuple(parse_requirement(item, f"{item[:80]!r} in {where}") for item in found)
 
@@ -369,10 +358,9 @@ def _specifier(found: object, where: str) -> str:
             raise InvalidSpecifier("no text")
         return str(SpecifierSet(found))
     except InvalidSpecifier as error:
-        raise DependencyError(
+        raise _unsupported(
             f"requires-python in {where} is {str(found)[:80]!r}, which is not a range of versions "
-            f"such as '>=3.11'. {_advice()}",
-            reason="requirement",
+            f"such as '>=3.11'. {_advice()}"
         ) from error
 
 
@@ -392,9 +380,8 @@ def versions(asked: str) -> SpecifierSet:
 
 def _bounded(count: int, where: str) -> None:
     if count > MAX_REQUIREMENTS:
-        raise DependencyError(
-            f"{where} has {count} requirements; at most {MAX_REQUIREMENTS} are read. {_advice()}",
-            reason="requirement",
+        raise _unsupported(
+            f"{where} has {count} requirements; at most {MAX_REQUIREMENTS} are read. {_advice()}"
         )
 
 
@@ -405,12 +392,9 @@ def _text(path: Path, name: str) -> str:
         # PowerShell writes UTF-16
         text = data.decode(_BYTE_ORDER_MARKS.get(data[:2], "utf-8-sig"))
     except (OSError, UnicodeDecodeError) as error:
-        raise DependencyError(f"{name} cannot be read: {error}", reason="requirement") from error
+        raise _unsupported(f"{name} cannot be read: {error}") from error
     if len(data) > MAX_BYTES:
-        raise DependencyError(
-            f"{name} is too long; at most {MAX_BYTES} bytes are read. {_advice()}",
-            reason="requirement",
-        )
+        raise _unsupported(f"{name} is too long; at most {MAX_BYTES} bytes are read. {_advice()}")
     return text
 
 

@@ -72,7 +72,7 @@ def write_tree(members: Iterable[Member], folder: Path, title: str) -> None:
         try:
             check_listing_names([FileRecord(path, 0, "") for path in kept], title)
         except SnapshotError as error:
-            raise DependencyError(str(error), reason="integrity") from error
+            raise not_as_expected(str(error)) from error
         for number, path in enumerate(kept):
             folders.make((folder / path).parent)
             Path(numbered, str(number)).rename(folder / path)
@@ -81,9 +81,7 @@ def write_tree(members: Iterable[Member], folder: Path, title: str) -> None:
 def _write(member: Member, path: Path, title: str) -> None:
     with member.open() as source, path.open("xb") as target:
         if copy_bounded(source, target, member.size) != member.size:
-            raise DependencyError(
-                f"{title}: {member.path!r} has not the size that it says", reason="integrity"
-            )
+            raise not_as_expected(f"{title}: {member.path!r} has not the size that it says")
     path.chmod(0o755 if member.executable else 0o644)
 
 
@@ -106,13 +104,12 @@ def unpack_tree(archive: Path, folder: Path, title: str) -> Path:
         with _members(archive, title) as members:
             write_tree(members, folder, title)
     except (*_BROKEN, *_BROKEN_ZIP) as error:
-        raise DependencyError(f"{title} cannot be unpacked: {error}", reason="integrity") from error
+        raise not_as_expected(f"{title} cannot be unpacked: {error}") from error
     tops = list(folder.iterdir())
     if len(tops) != 1 or not tops[0].is_dir():
-        raise DependencyError(
+        raise not_as_expected(
             f"{title} is not a source distribution, which has a single folder: this has "
-            f"{len(tops)} entries",
-            reason="integrity",
+            f"{len(tops)} entries"
         )
     return tops[0]
 
@@ -126,9 +123,8 @@ def _members(archive: Path, title: str) -> Iterator[Iterator[Member]]:
         elif opener := _TARS.get(archive.suffix):
             yield _of_tar(_ForwardStream(stack.enter_context(opener(archive, "rb")), title), title)
         else:
-            raise DependencyError(
-                f"{title} is packed as {archive.suffix!r}; .tar.gz, .tar.bz2 and .zip are read",
-                reason="integrity",
+            raise not_as_expected(
+                f"{title} is packed as {archive.suffix!r}; .tar.gz, .tar.bz2 and .zip are read"
             )
 
 
@@ -182,9 +178,7 @@ class _ForwardStream:
             raise DependencyError(f"{self._title} is too large to be unpacked", reason="size")
         found = self._stream.read(size)
         if len(found) != size and (found or not may_end):
-            raise DependencyError(
-                f"{self._title} cannot be unpacked: its end is missing", reason="integrity"
-            )
+            raise not_as_expected(f"{self._title} cannot be unpacked: its end is missing")
         self.at += len(found)
         return found
 
@@ -252,9 +246,7 @@ def _size_of(header: tarfile.TarInfo, said: dict[str, str], title: str) -> int:
     """The bytes behind a header; of a file, what the header before it may have said."""
     size = said.get("size", "") if header.type in _REGULAR else ""
     if header.size < 0 or not re.fullmatch(r"[0-9]{0,20}", size):
-        raise DependencyError(
-            f"{title} holds {header.name[:200]!r}, of which the size is none", reason="integrity"
-        )
+        raise not_as_expected(f"{title} holds {header.name[:200]!r}, of which the size is none")
     return int(size or header.size)
 
 
@@ -270,16 +262,12 @@ def _said(kind: bytes, data: bytes, title: str) -> dict[str, str]:
             break
         name = record[2].decode("utf-8", "replace")
         if name.startswith("GNU.sparse") or (kind == tarfile.XGLTYPE and name in ("path", "size")):
-            raise DependencyError(
-                f"{title} is packed with {name}, which is not read", reason="integrity"
-            )
+            raise not_as_expected(f"{title} is packed with {name}, which is not read")
         if name in ("path", "size"):
             said[name] = data[record.end() : end - 1].decode("utf-8", "surrogateescape")
         at = end
     if data[at:].strip(b"\0"):
-        raise DependencyError(
-            f"{title} cannot be unpacked: a header of it is none", reason="integrity"
-        )
+        raise not_as_expected(f"{title} cannot be unpacked: a header of it is none")
     return said
 
 
@@ -291,15 +279,12 @@ def check_zip(members: Sequence[zipfile.ZipInfo], title: str) -> None:
         if stat.S_IFMT(member.external_attr >> 16) not in kinds:
             raise _no_file(title, member.filename)
         if member.compress_type not in _PACKINGS:
-            raise DependencyError(
-                f"{title} holds {member.filename[:200]!r}, packed in another way, which is not "
-                "read",
-                reason="integrity",
+            raise not_as_expected(
+                f"{title} holds {member.filename[:200]!r}, packed in another way, which is not read"
             )
         if member.header_offset < end:
-            raise DependencyError(
-                f"{title} holds {member.filename[:200]!r}, which lies within another file",
-                reason="integrity",
+            raise not_as_expected(
+                f"{title} holds {member.filename[:200]!r}, which lies within another file"
             )
         end = member.header_offset + _LEAST_HEADER + member.compress_size
 
@@ -314,8 +299,12 @@ def _of_zip(archive: zipfile.ZipFile, title: str) -> Iterator[Member]:
             yield Member(member.filename, member.file_size, bool(mode & stat.S_IXUSR), opened)
 
 
+def not_as_expected(text: str) -> DependencyError:
+    """The error for a package that is not what its hashes or its index say."""
+    return DependencyError(text, reason="integrity")
+
+
 def _no_file(title: str, name: str) -> DependencyError:
-    return DependencyError(
-        f"{title} holds {name[:200]!r}, which is a link or a device; only files are unpacked",
-        reason="integrity",
+    return not_as_expected(
+        f"{title} holds {name[:200]!r}, which is a link or a device; only files are unpacked"
     )

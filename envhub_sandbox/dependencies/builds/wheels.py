@@ -28,7 +28,12 @@ from packaging import tags
 from packaging.utils import InvalidWheelFilename, canonicalize_name, parse_wheel_filename
 from packaging.version import InvalidVersion, Version
 
-from envhub_sandbox.dependencies.builds.trees import MAX_TABLE, BoundedStream, check_zip
+from envhub_sandbox.dependencies.builds.trees import (
+    MAX_TABLE,
+    BoundedStream,
+    check_zip,
+    not_as_expected,
+)
 from envhub_sandbox.dependencies.declared import Source
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.errors import DependencyError, SnapshotError
@@ -74,7 +79,7 @@ def check(wheel: Path, name: str, version: str, interpreter: Interpreter) -> Non
         found = named(wheel.name, name, version)
         _fits(wheel.name, interpreter)
         if wheel.stat().st_size > MAX_BYTES:
-            raise DependencyError(f"it has more than {size_text(MAX_BYTES)}", reason="integrity")
+            raise not_as_expected(f"it has more than {size_text(MAX_BYTES)}")
         with (
             wheel.open("rb") as file,
             zipfile.ZipFile(BoundedStream(file, "it", MAX_TABLE)) as archive,
@@ -84,10 +89,9 @@ def check(wheel: Path, name: str, version: str, interpreter: Interpreter) -> Non
             _record(archive, f"{info}/RECORD")
     except (*_UNREADABLE, SnapshotError, DependencyError) as error:
         said = printable(str(error), 300)
-        raise DependencyError(
+        raise not_as_expected(
             f"the wheel {printable(wheel.name, 200)!r} that was built for {name} is not taken: "
-            f"{said}",
-            reason="integrity",
+            f"{said}"
         ) from error
 
 
@@ -97,11 +101,9 @@ def named(file: str, name: str, version: str) -> Version:
         found, number, _, _ = parse_wheel_filename(file)
         wanted = Version(version) if version else number
     except (InvalidWheelFilename, InvalidVersion) as error:
-        raise DependencyError(f"its name says nothing: {error}", reason="integrity") from error
+        raise not_as_expected(f"its name says nothing: {error}") from error
     if found != canonicalize_name(name) or number != wanted:
-        raise DependencyError(
-            f"it is {found} {number}, and not {name} {wanted}", reason="integrity"
-        )
+        raise not_as_expected(f"it is {found} {number}, and not {name} {wanted}")
     return number
 
 
@@ -115,17 +117,13 @@ def _fits(file: str, interpreter: Interpreter) -> None:
         *tags.compatible_tags((major, minor), interpreter=short, platforms=platforms),
     }
     if fitting.isdisjoint(found):
-        raise DependencyError(
-            f"it does not fit Python {interpreter.version} on this machine", reason="integrity"
-        )
+        raise not_as_expected(f"it does not fit Python {interpreter.version} on this machine")
 
 
 def _files(archive: zipfile.ZipFile) -> None:
     members = archive.infolist()
     if len(members) > MAX_FILES or sum(one.file_size for one in members) > MAX_UNPACKED:
-        raise DependencyError(
-            f"it holds more than {MAX_FILES} files or {size_text(MAX_UNPACKED)}", reason="integrity"
-        )
+        raise not_as_expected(f"it holds more than {MAX_FILES} files or {size_text(MAX_UNPACKED)}")
     check_zip(members, "it")
     names = (one.filename + "_" * one.is_dir() for one in members)  # a folder as a file in it
     check_listing_names([FileRecord(name, 0, "") for name in names], "it")
@@ -136,19 +134,15 @@ def _info(archive: zipfile.ZipFile, name: str, version: Version) -> str:
     tops = {one.partition("/")[0] for one in archive.namelist()}
     found = [top for top in tops if top.endswith(".dist-info")]
     if len(found) != 1:
-        raise DependencyError(f"it holds {len(found)} folders .dist-info", reason="integrity")
+        raise not_as_expected(f"it holds {len(found)} folders .dist-info")
     stem, _, number = found[0].removesuffix(".dist-info").rpartition("-")
     if canonicalize_name(stem) != canonicalize_name(name) or Version(number) != version:
-        raise DependencyError(f"its metadata are those of {found[0]!r}", reason="integrity")
+        raise not_as_expected(f"its metadata are those of {found[0]!r}")
     fields = _fields(_small(archive, f"{found[0]}/METADATA"))
     if canonicalize_name(fields.get("name", "")) != canonicalize_name(name):
-        raise DependencyError(
-            f"its metadata name the package {fields.get('name', '')!r}", reason="integrity"
-        )
+        raise not_as_expected(f"its metadata name the package {fields.get('name', '')!r}")
     if Version(fields.get("version", "")) != version:
-        raise DependencyError(
-            f"its metadata name the version {fields.get('version', '')!r}", reason="integrity"
-        )
+        raise not_as_expected(f"its metadata name the version {fields.get('version', '')!r}")
     return found[0]
 
 
@@ -168,9 +162,7 @@ def _small(archive: zipfile.ZipFile, path: str) -> bytes:
     with archive.open(path) as file:
         data = file.read(MAX_TABLE + 1)
     if len(data) > MAX_TABLE:
-        raise DependencyError(
-            f"{path} in it has more than {size_text(MAX_TABLE)}", reason="integrity"
-        )
+        raise not_as_expected(f"{path} in it has more than {size_text(MAX_TABLE)}")
     return data
 
 
@@ -181,12 +173,10 @@ def _record(archive: zipfile.ZipFile, path: str) -> None:
     there = {one.filename for one in archive.infolist() if not one.is_dir()}
     signatures = {path, f"{path}.jws", f"{path}.p7s"}
     if there - said.keys() - signatures or said.keys() - there - signatures:
-        raise DependencyError("its RECORD lists other files than it has", reason="integrity")
+        raise not_as_expected("its RECORD lists other files than it has")
     for name in sorted(there - signatures):
         if said[name] != _digest(archive, name):
-            raise DependencyError(
-                f"{name[:200]!r} is not the file that its RECORD says", reason="integrity"
-            )
+            raise not_as_expected(f"{name[:200]!r} is not the file that its RECORD says")
 
 
 def _digest(archive: zipfile.ZipFile, name: str) -> str:
