@@ -29,6 +29,11 @@ _OUTDATED = re.compile(
     r"has no attribute|unexpected keyword argument|required positional|positional arguments?\b|"
     r"cannot import name|No module named '\w+\.|(?i:\bremoved\b|no longer|deprecated)"
 )
+_BROKEN_BY = {
+    r"removed in the NumPy 2\.0 release": "numpy<2",
+    r"module 'numpy' has no attribute '(bool|complex|float|int|object|str)'": "numpy<1.24",
+}
+"""What a date may not cure, since the release was there already: by what is said then."""
 _DAY = r"\d{4}-\d{2}-\d{2}"
 _RECENT = timedelta(days=30)
 _MOST_DATES, _MOST_TEXT = 4, 65_536
@@ -38,6 +43,11 @@ def of_its_day(snapshot: Snapshot, error: EnvHubError) -> str:
     """What to do about an error at a start that packages of the repository's day may cure; empty
     for others, and for what is of today.
     """
+    said = _said_at_start(error)
+    for pattern, requirement in _BROKEN_BY.items():
+        if re.search(pattern, said):
+            older = option_name("dependencies", {"override": [requirement]})
+            return f"A later release of a package has broken it; {older} takes an earlier one"
     days = days_for(snapshot, error)
     if not days:
         return ""
@@ -77,7 +87,7 @@ def days_for(snapshot: Snapshot, error: EnvHubError) -> list[str]:
     """The day on which it was written, and a few later ones, each nearer to today by half: those
     whose packages may cure an error.
     """
-    day = written(snapshot) if _may_be_of_age(error) else ""
+    day = written(snapshot) if _OUTDATED.search(_said_at_start(error)) else ""
     now = datetime.now(timezone.utc)
     then = datetime.fromisoformat(day or now.date().isoformat()).replace(tzinfo=timezone.utc)
     found: list[str] = []
@@ -87,16 +97,15 @@ def days_for(snapshot: Snapshot, error: EnvHubError) -> list[str]:
     return found
 
 
-def _may_be_of_age(error: EnvHubError) -> bool:
-    """Whether code raised it as it was loaded or reset, and it is of a kind that older packages may
-    cure. Trust: text from the worker.
+def _said_at_start(error: EnvHubError) -> str:
+    """What code raised as it was loaded or reset; empty for any other error.
+    Trust: text from the worker, by which one of our sentences is chosen.
     """
     remote = error if isinstance(error, RemoteEnvError) else error.__cause__
     if not isinstance(remote, RemoteEnvError):
-        return False
-    said = f"{remote.type_name}: {remote.message}"[:_MOST_TEXT]
+        return ""
     starts = isinstance(error, (LoadError, DependencyError)) or ", in reset" in remote.traceback
-    return starts and _OUTDATED.search(said) is not None
+    return f"{remote.type_name}: {remote.message}"[:_MOST_TEXT] if starts else ""
 
 
 def _of_files(snapshot: Snapshot) -> str:

@@ -11,11 +11,12 @@ import pytest
 from envhub_sandbox.dependencies import interpreters, resolutions
 from envhub_sandbox.dependencies import resolve as resolving
 from envhub_sandbox.dependencies.interpreters import Interpreter
+from envhub_sandbox.dependencies.locks.day import of_its_day
 from envhub_sandbox.dependencies.modules import MissingModule, guessed, note_missing
 from envhub_sandbox.dependencies.packages import packages_for
 from envhub_sandbox.dependencies.request import AUTO, DECLARED, PackageRequest, chosen, request_of
 from envhub_sandbox.dependencies.resolve import Lock, Target
-from envhub_sandbox.errors import DependencyError, PolicyError
+from envhub_sandbox.errors import DependencyError, PolicyError, load_error, remote_error
 from envhub_sandbox.hub.snapshot import Snapshot, local
 from envhub_sandbox.hub.sources import parsing
 from tests.support import inside
@@ -135,6 +136,22 @@ def test_a_jail_names_few_modules(tmp_path: Path) -> None:
     taken = [note_missing(found, f"No module named '{name}'") for name in names]
     assert taken == [False, False, True, False, True, True, True, False]
     assert len(requirements(found)) == 5
+
+
+def test_a_release_that_took_names_away_is_named(tmp_path: Path) -> None:
+    """As it is loaded, and not in a later step; a repository of today gets no date."""
+    found = snapshot(tmp_path / "r", MAKE)
+    for text, said in (
+        ("`np.float_` was removed in the NumPy 2.0 release.", "{'override': ['numpy<2']}"),
+        ("module 'numpy' has no attribute 'int'", "{'override': ['numpy<1.24']}"),
+        ("'Space' object has no attribute 'x'", ""),
+    ):
+        error = load_error("AttributeError", "it failed")
+        error.__cause__ = remote_error("AttributeError", "AttributeError", text, "")
+        advice = of_its_day(found, error)
+        assert said in advice
+        assert bool(advice) == bool(said)
+        assert of_its_day(found, error.__cause__) == ""
 
 
 def test_a_guess_never_stands_in_the_way(
