@@ -5,6 +5,7 @@ Messages that recur are packed and unpacked by their form: nobody may notice.
 
 from __future__ import annotations
 
+import sys
 import tracemalloc
 from typing import Any
 from unittest.mock import Mock
@@ -194,6 +195,18 @@ def test_what_is_kept_of_a_peers_messages_has_a_bound(number: int, size: int, ti
     kept, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert kept < 600_000
+
+
+def test_a_form_keeps_no_array() -> None:
+    """Nor the memory that it was lent from: a slot that is held is not written again."""
+    header, lender = map(bytearray, m.pack(m.Value({"a": [np.zeros(50_000)]})))
+    unheld = sys.getrefcount(lender)
+    for _ in range(3):
+        lent = m.unpack([bytes(header), memoryview(lender)], borrows=True)
+        assert sys.getrefcount(lender) > unheld
+        del lent
+    assert inside.forms(INCOMING)
+    assert sys.getrefcount(lender) == unheld
 
 
 def test_memory_that_is_not_there_is_the_peers_fault(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -310,16 +310,22 @@ def _maker(value: Any, notes: Any, arrays: list[tuple[Any, str | None]]) -> Make
     if kind in _CONSTANTS or kind in _SCALARS:
         return None
     if kind is dict and not set(map(type, value)) - {str}:
-        named = [(key, item, _maker(item, notes, arrays)) for key, item in value.items()]
+        named = [(key, *_part(item, notes, arrays)) for key, item in value.items()]
         return lambda new: {key: make(new) if make else item for key, item, make in named}
     if kind is not tuple and kind is not list:
         return _array_maker(value, notes, arrays)
-    parts = [(item, _maker(item, notes, arrays)) for item in value]
+    parts = [_part(item, notes, arrays) for item in value]
     if kind is list:
         return lambda new: [make(new) if make else item for item, make in parts]
     if all(make is None for _, make in parts):
         return None
     return lambda new: tuple([make(new) if make else item for item, make in parts])
+
+
+def _part(item: Any, notes: Any, arrays: list[tuple[Any, str | None]]) -> tuple[Any, Make | None]:
+    """What is constant, or what makes it anew: an array must not be kept with a form."""
+    make = _maker(item, notes, arrays)
+    return (item if make is None else None), make
 
 
 def _array_maker(value: Any, notes: Any, arrays: list[tuple[Any, str | None]]) -> Make:
