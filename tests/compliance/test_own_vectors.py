@@ -13,7 +13,10 @@ import pytest
 
 from envhub_sandbox import make_env
 from envhub_sandbox.errors import RemoteEnvError, RemoteEnvWarning, RemoteProtocolError
+from envhub_sandbox.transport.shared_memory import lane
+from tests.support import inside
 from tests.support.compare import assert_same
+from tests.support.in_process.interrupts import before_line
 from tests.support.repositories import write_repository
 
 _TIMED = """
@@ -464,3 +467,23 @@ def test_an_own_vector_is_stepped_in_shared_memory_and_returns_the_same(
     assert_same(expected, actual)
     errors = [heard for heard in actual if isinstance(heard, str)]
     assert ["no step 5" in errors[0], "rewards" in errors[1], len(errors)] == [True, True, 4]
+
+
+def test_an_interrupted_step_leaves_the_next_reset_its_own(tmp_path: Path) -> None:
+    """Wherever the interrupt comes, also where the answer's slot is chosen and not written yet."""
+    pytest.importorskip("torch")
+    folder = write_repository(tmp_path, _PLAIN)
+    with make_env(folder, 2, copy=False) as suites:
+        env = suites.env
+        moment, came, jails = 0, True, set()
+        while came:
+            env.reset(seed=9)
+            held = [env.step(np.zeros((2, 2), np.float32)) for _ in range(3)]
+            came = before_line(lane.__file__, moment, lambda: env.step(np.ones((2, 2), np.float32)))
+            observation, _ = env.reset(seed=moment % 200)
+            assert set(observation["camera"].flat) == {moment % 200}
+            assert [set(each[0]["camera"].flat) for each in held] == [{10}, {11}, {12}]
+            jails.add(inside.jail(env).number)
+            moment += 1
+            del held, observation  # so that the next slot is one that was never written
+        assert (len(jails), moment > 10) == (1, True)

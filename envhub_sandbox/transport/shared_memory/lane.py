@@ -250,10 +250,7 @@ class SharedMemoryLane(Lane):
         operation = self._asked
         if operation == BY_SERVER:
             return super().replies(deadline)
-        try:
-            self._wait_for_all(deadline)
-        except RunnerGoneError:
-            raise self.jail.cause_of_death(self._asked) from None
+        self._wait_or_say_why(deadline)
         answers = [shard.answer(self.jail.limits) for shard in self.shards]
         missing = [index for index, answer in enumerate(answers) if answer is None]
         if missing:
@@ -302,8 +299,8 @@ class SharedMemoryLane(Lane):
     def catch_up(self, deadline: Deadline) -> None:
         """See ``Lane``."""
         self._catch_up_with_server(deadline)
-        if self._asked != BY_SERVER:
-            self.replies(deadline)
+        if self._asked != BY_SERVER:  # not read: its slot may have been chosen, and nothing sent
+            self._wait_or_say_why(deadline)
 
     def _catch_up_with_server(self, deadline: Deadline) -> None:
         super().catch_up(deadline)
@@ -334,6 +331,13 @@ class SharedMemoryLane(Lane):
             self._wait_for_each(deadline)
         self.elapsed_ns = perf_counter_ns() - self._asked_ns
         self._spin.measured(self.elapsed_ns)
+
+    def _wait_or_say_why(self, deadline: Deadline) -> None:
+        """The same; raises why a runner has ended."""
+        try:
+            self._wait_for_all(deadline)
+        except RunnerGoneError:
+            raise self.jail.cause_of_death(self._asked) from None
 
     def _wait_for_each(self, deadline: Deadline) -> None:
         for shard in self._sleepers:
