@@ -200,7 +200,8 @@ class SharedMemoryLane(Lane):
                 self.leave_slots()
             super()._send_to_all(operation, packed, ahead=ahead)
             return
-        MESSAGES.debug("> %s in shared memory", operation)
+        if operation != STEP:  # which has to cost nothing, and is often sent without this
+            MESSAGES.debug("> %s in shared memory", operation)
         self._asked = operation  # interruption.md, rule 1: first
         self._asked_ns = perf_counter_ns()
         self._spin = self._step_spin if operation == STEP else self._talk_spin
@@ -257,7 +258,8 @@ class SharedMemoryLane(Lane):
             self._refuse_further(missing)
             for index, reply in zip(missing, self._fetch(missing, deadline), strict=True):
                 answers[index] = reply
-        MESSAGES.debug("< %s in shared memory", operation)
+        if operation != STEP:
+            MESSAGES.debug("< %s in shared memory", operation)
         return [answer for answer in answers if answer is not None]
 
     def answered(self) -> bool:
