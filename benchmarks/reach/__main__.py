@@ -118,7 +118,9 @@ def outcome(reference: str, client: str, deadline_s: float) -> Outcome:
             advice = advised(error)
             if not error or len(tried) == _TRIES or not advice or advice in tried:
                 break
-            tried.append(advice)
+            # what was advised before still holds
+            before = {name: {**tried[-1].get(name, {}), **advice[name]} for name in advice}
+            tried.append({**tried[-1], **before})
         verdict = control(reference, own, folder, deadline_s, lines)
         return Outcome(reference, tried, shown(error), verdict)
     finally:
