@@ -1,4 +1,5 @@
 # Functions of the steps; sourced.
+: "${CI_WORK:?is the folder that a step works in}"  # without it, a step would write into /
 
 heading() {
   printf '\n======== %s ========\n' "$*"
