@@ -116,9 +116,12 @@ class RequestOrder(ABC):
     def refuse_if_closed(self) -> None:
         """Refuse every request after ``close``. Raises ``ClosedEnvironmentError``: it is closed."""
         if self.closed:
+            cure = (
+                "reset opens it again" if self._repository.for_lerobot else "make_env makes another"
+            )
             raise ClosedEnvironmentError(
                 f"Trying to operate on `{self.face}`, after a call to `close()`. "
-                f"{self._repository.label}: make_env makes another"
+                f"{self._repository.label}: {cure}"
             )
 
     def end_wait(self, operation: str) -> None:

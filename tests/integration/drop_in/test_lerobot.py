@@ -84,6 +84,9 @@ def test_evaluation_of_a_suite_is_the_same(
         assert all(env.closed and not env.sandbox.report() for env in envs["pendulum"].values())
     lerobot.close_envs(envs)
     envs.close()
+    env = envs["pendulum"][0]
+    with pytest.raises(ClosedEnvironmentError, match="reset opens it again"):
+        env.step(env.action_space.sample())
     with make_env(repository, **options) as refusing:
         env = refusing["pendulum"][0]
         assert env.metadata["render_fps"] == 12.5
