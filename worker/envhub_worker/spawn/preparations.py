@@ -168,7 +168,9 @@ class _Stub(MetaPathFinder, Loader):
         name = module.__name__
 
         def other(attribute: str) -> Any:
-            if not attribute.startswith("__") and self._step_aside():
+            # inspect asks every module for its __file__, which must not import anything
+            meant = not attribute.startswith("__") or attribute in ("__all__", "__version__")
+            if meant and self._step_aside():
                 return getattr(importlib.import_module(name), attribute)
             raise AttributeError(f"module {name!r} has no attribute {attribute!r}")
 

@@ -108,7 +108,7 @@ def test_lerobot_itself_is_imported_for_what_the_stub_lacks(
     """
     for package in ("lerobot", "lerobot/envs"):
         (tmp_path / package).mkdir()
-        (tmp_path / package / "__init__.py").write_text("")
+        (tmp_path / package / "__init__.py").write_text("__version__ = '9'\n")
     (tmp_path / "lerobot" / "envs" / "configs.py").write_text(
         "class EnvConfig: pass\nclass HubEnvConfig(EnvConfig): pass\n"
         "class Arena(HubEnvConfig): pass\n"
@@ -118,14 +118,17 @@ def test_lerobot_itself_is_imported_for_what_the_stub_lacks(
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         stub = importlib.import_module("lerobot.envs.configs")
+        root = importlib.import_module("lerobot")
     cfg = config_of({"hub_path": "org/repo", CONFIG_CLASS: (names, ("hub_path",), {})})
     assert isinstance(cfg, stub.HubEnvConfig)
+    assert not hasattr(sys.modules["lerobot"], "__file__")
     assert "Arena" not in vars(sys.modules["lerobot.envs.configs"]), "LeRobot itself was imported"
     from lerobot.envs.configs import Arena
 
     assert Arena is vars(importlib.import_module("lerobot.envs.configs"))["Arena"]
     assert isinstance(cfg, Arena)
     assert isinstance(Arena(), stub.EnvConfig)
+    assert root.__version__ == "9"
     assert not isinstance(tmp_path, stub.EnvConfig)
     with pytest.raises(ModuleNotFoundError):
         importlib.import_module("lerobot.policies")
