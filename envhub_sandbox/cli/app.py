@@ -73,8 +73,9 @@ _REPLACED = {
     "push": "envhub check . && hf upload OWNER/NAME .",
     "verify": "envhub lock --check FILE",
     "prefetch": "envhub inspect --download REF",
+    "--server-key": "tcp://HOST:PORT KEY",
 }
-"""What to use instead of commands that there were."""
+"""What to use instead of commands and options that there were."""
 
 
 class Program(TyperGroup):
@@ -92,8 +93,9 @@ class Program(TyperGroup):
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """The command that is called, with its options."""
-        if args[0] in _REPLACED:
-            ctx.fail(f"There is no command {args[0]!r} any more: use '{_REPLACED[args[0]]}'.")
+        options = {word.partition("=")[0] for word in args if word.startswith("--")}
+        for word in _REPLACED.keys() & {args[0], *options}:
+            ctx.fail(f"There is no {word!r} any more: use '{_REPLACED[word]}'.")
         if args[0] in _COMMANDS:
             try:
                 self.commands[args[0]] = whole_command(args[0])

@@ -75,8 +75,9 @@ def doctor(
     server: Annotated[
         str | None,
         typer.Argument(
-            metavar="[tcp://HOST:PORT]",
-            help="A server on another host, to test instead of this one.",
+            metavar="[tcp://HOST:PORT[ KEY]]",
+            help="A server on another host, to test instead of this one. Its public key is in "
+            "$ENVHUB_SERVER_KEY or known_hosts, or follows the address: 'tcp://HOST:PORT KEY'.",
         ),
     ] = None,
     profile: Annotated[
@@ -88,13 +89,6 @@ def doctor(
         ),
     ] = "strict",
     json: opt.Json = False,
-    server_key: Annotated[
-        str | None,
-        typer.Option(
-            metavar="KEY",
-            help="That server's public key; otherwise $ENVHUB_SERVER_KEY or known_hosts.",
-        ),
-    ] = None,
     insecure_loopback: Annotated[
         bool,
         typer.Option("--insecure-loopback", help="Test a server on this machine that has no keys."),
@@ -113,17 +107,10 @@ def doctor(
         what = "a server on another host"
         place = extras.required("envhub_sandbox.sandboxes.remote", "RemoteSandbox", what)
         examine_server = extras.required("envhub_sandbox.cli.doctor_server", "examine_server", what)
-        if insecure_loopback and server_key is not None:
-            raise UsageError(
-                "--server-key is for a server with keys, and --insecure-loopback for one without: "
-                "leave one out"
-            )
-        asked = place(server, server_key=server_key, insecure_loopback=insecure_loopback)
+        asked = place(server, insecure_loopback=insecure_loopback)
         raise typer.Exit(examine_server(asked, profile, json=json))
-    if server_key is not None or insecure_loopback:
-        raise UsageError(
-            "--server-key and --insecure-loopback need a server: envhub doctor tcp://HOST:PORT"
-        )
+    if insecure_loopback:
+        raise UsageError("--insecure-loopback needs a server: envhub doctor tcp://HOST:PORT")
     with ProgressBar(quiet=json) as bar, _scratch_folder() as folder:
         (folder / "idle").mkdir()
         (folder / "idle" / "env.py").write_text(starter("idle", 2026)["env.py"], "utf-8")

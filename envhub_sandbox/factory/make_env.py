@@ -22,7 +22,7 @@ from envhub_sandbox.session.repository import (
     plain_config,
     provenance_of,
 )
-from envhub_sandbox.settings.options import Options, option_name
+from envhub_sandbox.settings.options import Options, option_name, refuse_unknown_arguments
 from envhub_sandbox.settings.policy import Limits, Policy, Timeouts, policy_from, timeouts_from
 from envhub_sandbox.system import extras
 from envhub_sandbox.system.folders import cache_root
@@ -35,6 +35,7 @@ from envhub_worker.protocol.runtime import Runtime
 
 
 @short_traceback
+@refuse_unknown_arguments
 def make_env(
     cfg: Any,
     n_envs: int = 1,
@@ -331,8 +332,8 @@ def _extra(module: str, name: str) -> Any:
 
 def _unknown(sandbox: object) -> PolicyError:
     return PolicyError(
-        f"sandbox is {sandbox!r}; it takes 'process', 'docker', 'ray', 'tcp://HOST:PORT', a list "
-        "of these, or None to run the code here"
+        f"sandbox is {sandbox!r}; it takes 'process', 'docker', 'ray', 'tcp://HOST:PORT KEY', "
+        "a list of these, or None to run the code here"
     )
 
 

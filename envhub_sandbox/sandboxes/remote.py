@@ -80,6 +80,11 @@ class RemoteSandbox(Sandbox):
                 f"insecure_loopback=True is for a server on this machine, and {self.endpoint} is "
                 "not on a loopback address: anybody on the way could read and change everything"
             )
+        if self.insecure_loopback and self.server_key is not None:
+            raise PolicyError(
+                f"insecure_loopback=True is for a server without keys, and {self.endpoint} has "
+                "server_key: leave one out"
+            )
         if not self.heartbeat_s > 0:
             raise PolicyError(f"heartbeat_s is {self.heartbeat_s!r}; it takes seconds above 0")
         if not 0 <= self.retry_s < float("inf"):

@@ -10,7 +10,6 @@ from urllib.parse import urlsplit
 
 from envhub_sandbox.errors import PolicyError, SandboxUnavailableError
 from envhub_sandbox.hub.logins import without_login
-from envhub_sandbox.settings.options import option_name
 from envhub_worker.protocol.keys import parse_key
 
 SERVER_KEY_VARIABLE = "ENVHUB_SERVER_KEY"
@@ -66,10 +65,9 @@ def server_key(endpoint: str, given: str | None) -> bytes:
     if not text:
         raise SandboxUnavailableError(
             f"the public key of {endpoint} is not known, and without it another program could "
-            "imitate that server. It prints its key when it starts; name it after "
-            f"the address, as in {option_name('sandbox', f'{endpoint} KEY')}, set "
-            f"{SERVER_KEY_VARIABLE}, or write '{address_of(endpoint)} KEY' into "
-            f"{config_folder() / 'known_hosts'}"
+            "imitate that server. It prints its key when it starts: write it after the address, "
+            f"as in '{endpoint} KEY', set {SERVER_KEY_VARIABLE}, or write "
+            f"'{address_of(endpoint)} KEY' into {config_folder() / 'known_hosts'}"
         )
     return _parsed(text, "server_key")
 

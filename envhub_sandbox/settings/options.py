@@ -11,6 +11,8 @@ An error names an option by its key (``option_name``). What reads a command line
 from __future__ import annotations
 
 import contextlib
+import functools
+import inspect
 import json
 import operator
 import os
@@ -19,13 +21,15 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from dataclasses import field, fields, replace
 from keyword import iskeyword
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 from envhub_sandbox.errors import PolicyError
 from envhub_worker.protocol.confinement import DISPLAYS, NETWORKS, PROFILES
 from envhub_worker.protocol.limits import MAX_NUM_ENVS
 from envhub_worker.protocol.records import dataclass
 
+P = ParamSpec("P")
+T = TypeVar("T")
 MAX_ASSETS = 16
 _CODE, _LIMITS, _HUB = "How it is built", "What it may do", "Where it comes from"
 
@@ -410,6 +414,29 @@ def nearest(name: object, names: Iterable[str], cutoff: float = 0.6) -> str:
 
     close = difflib.get_close_matches(str(name), list(names), 1, cutoff)
     return f" (did you mean {close[0]!r}?)" if close else ""
+
+
+def refuse_unknown_arguments(make: Callable[P, T]) -> Callable[P, T]:
+    """Decorate ``make_env``: a ``TypeError`` says where an argument that it lacks belongs."""
+    arguments = inspect.signature(make).parameters
+
+    @functools.wraps(make)
+    def checked(*args: P.args, **kwargs: P.kwargs) -> T:
+        for name in kwargs.keys() - arguments:
+            hint = nearest(name, arguments)
+            raise TypeError(f"make_env has no argument {name!r}{hint}; {_place_of(name)}")
+        return make(*args, **kwargs)
+
+    return checked
+
+
+def _place_of(name: str) -> str:
+    if name == "server_key":
+        return "a server's key follows its address: sandbox='tcp://HOST:PORT KEY'"
+    if name in OPTIONS:
+        argument = OPTIONS[name].argument
+        return f"it is a key of {argument}: {argument}={{{name!r}: ...}}"
+    return "what the repository's own make_env takes is in env_kwargs={...}"
 
 
 @contextlib.contextmanager

@@ -95,7 +95,7 @@ def test_another_servers_key_is_refused_at_once(server: Listening, repository: P
         make_env(repository, sandbox=server.sandbox(server_key=other))
     assert eventually(lambda: "handshake_failed" in server.said())
     with pytest.raises(SandboxUnavailableError, match="does not speak ZeroMQ with CURVE"):
-        make_env(repository, sandbox=server.sandbox(insecure_loopback=True))
+        make_env(repository, sandbox=server.sandbox(server_key=None, insecure_loopback=True))
 
 
 def test_a_peer_without_keys_hears_nothing(server: Listening) -> None:
@@ -293,8 +293,9 @@ def test_without_keys_it_listens_on_loopback_only(tmp_path: Path, repository: Pa
             listening(tmp_path / "closed", "--insecure-loopback", bind=f"tcp://{address}:*"),
         ):
             pass
+    elsewhere = "tcp://192.0.2.1:5555"
     with pytest.raises(PolicyError, match="not on a loopback address"):
-        open_server.sandbox(endpoint="tcp://192.0.2.1:5555", insecure_loopback=True)
+        open_server.sandbox(endpoint=elsewhere, server_key=None, insecure_loopback=True)
 
 
 def test_a_key_that_is_taken_off_the_list_is_out(tmp_path: Path, repository: Path) -> None:

@@ -22,7 +22,7 @@ RUNNER = CliRunner()
 
 def doctor(server: Listening, *options: str, key: str | None = None) -> tuple[int, str, str]:
     """The exit code of a look at a server, and what was printed on both streams."""
-    words = ["doctor", server.endpoint, "--server-key", server.public, *options]
+    words = ["doctor", f"{server.endpoint} {server.public}", *options]
     done = RUNNER.invoke(app, words, env={"ENVHUB_CLIENT_KEY": key or server.client_key})
     return done.exit_code, done.stdout, done.stderr
 
@@ -60,20 +60,20 @@ def test_who_is_not_let_in_is_told_why(server: Listening) -> None:
     code, _, err = doctor(server, key=key_text(keys.generate().secret))
     assert code == 6
     assert "does not know our key" in err
-    other = ["doctor", server.endpoint, "--server-key", key_text(keys.generate().public)]
+    other = ["doctor", f"{server.endpoint} {key_text(keys.generate().public)}"]
     done = RUNNER.invoke(app, other, env={"ENVHUB_CLIENT_KEY": server.client_key})
     assert done.exit_code == 6
     assert RUNNER.invoke(app, ["doctor", "http://example"]).exit_code == 2
-    assert RUNNER.invoke(app, ["doctor", "--server-key", server.public]).exit_code == 2
     assert RUNNER.invoke(app, ["doctor", server.endpoint, "--profile", "lax"]).exit_code == 2
 
 
 def test_a_server_without_keys_can_be_asked(tmp_path: Path) -> None:
     """When it is said that it has none; a key beside that is a contradiction."""
     with listening(tmp_path / "server", "--insecure-loopback") as server:
-        words = ["doctor", server.endpoint, "--insecure-loopback", "--profile", "container"]
+        options = ["--insecure-loopback", "--profile", "container"]
+        words = ["doctor", server.endpoint, *options]
         done = RUNNER.invoke(app, [*words, "--json"])
         assert json.loads(done.stdout)["server"]["protocol"] == m.VERSION
         assert "it asks for no key" in RUNNER.invoke(app, words).stdout
-        assert RUNNER.invoke(app, [*words, "--server-key", "x"]).exit_code == 2
+        assert RUNNER.invoke(app, ["doctor", f"{server.endpoint} x", *options]).exit_code == 2
         assert RUNNER.invoke(app, ["doctor", "--insecure-loopback"]).exit_code == 2

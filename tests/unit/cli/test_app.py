@@ -201,8 +201,11 @@ def test_nothing_is_folded(capsys: pytest.CaptureFixture[str], monkeypatch: Any)
         (["run", "--seed"], "Option '--seed' requires an argument. Try 'envhub run --help'."),
         (
             ["verify", "FILE"],
-            "There is no command 'verify' any more: use 'envhub lock --check FILE'. "
-            "Try 'envhub --help'.",
+            "There is no 'verify' any more: use 'envhub lock --check FILE'. Try 'envhub --help'.",
+        ),
+        (
+            ["run", ".", "--server-key=KEY"],
+            "There is no '--server-key' any more: use 'tcp://HOST:PORT KEY'. Try 'envhub --help'.",
         ),
     ],
 )
