@@ -27,7 +27,8 @@ from envhub_sandbox.settings.options import option_name
 
 _OUTDATED = re.compile(
     r"has no attribute|unexpected keyword argument|required positional|positional arguments?\b|"
-    r"cannot import name|No module named '\w+\.|(?i:\bremoved\b|no longer|deprecated)"
+    r"cannot import name|No module named '\w+\.|"
+    r"(?i:\b(?:removed|renamed|moved to|no longer|deprecated)\b)"
 )
 _BROKEN_BY = {
     r"removed in the NumPy 2\.0 release": "numpy<2",

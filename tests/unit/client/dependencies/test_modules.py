@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -139,7 +140,9 @@ def test_a_jail_names_few_modules(tmp_path: Path) -> None:
 
 
 def test_a_release_that_took_names_away_is_named(tmp_path: Path) -> None:
-    """As it is loaded, and not in a later step; a repository of today gets no date."""
+    """As it is loaded, and not in a later step; a repository of today gets no date, unlike one of
+    years ago.
+    """
     found = snapshot(tmp_path / "r", MAKE)
     for text, said in (
         ("`np.float_` was removed in the NumPy 2.0 release.", "{'override': ['numpy<2']}"),
@@ -152,6 +155,10 @@ def test_a_release_that_took_names_away_is_named(tmp_path: Path) -> None:
         assert said in advice
         assert bool(advice) == bool(said)
         assert of_its_day(found, error.__cause__) == ""
+    os.utime(Path(found.repo_id, "env.py"), (1_600_000_000, 1_600_000_000))
+    said = "'AutoResetWrapper' has been renamed with `wrappers.Autoreset`"
+    error.__cause__ = remote_error("AttributeError", "AttributeError", said, "")
+    assert "{'exclude_newer': '2020-09-13'}" in of_its_day(found, error)
 
 
 def test_a_guess_never_stands_in_the_way(
