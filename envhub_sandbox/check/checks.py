@@ -54,8 +54,8 @@ error imports
     ImportError.
 error loads
     The entry file can be imported, and its make_env returns vector environments.
-    Cure: Define make_env(n_envs, use_async_envs) and return a gymnasium.vector.VectorEnv, or
-    {suite: {task: VectorEnv}}.
+    Cure: Mend what the import raises, and have make_env(n_envs, use_async_envs) return a
+    gymnasium.vector.VectorEnv, or {suite: {task: VectorEnv}}.
 error runs
     reset and step raise no exception for actions sampled from the action space.
     Cure: Fix what raises: reset must work at any time, and step for every member of the action
