@@ -138,6 +138,13 @@ def load(slot: Slot) -> tuple[FileRecord, ...] | None:
     return tuple(entries)
 
 
+def endpoint_of(tree: Path) -> str:
+    """The endpoint that a stored repository was downloaded from, without a login. Raises
+    ``OSError``, ``ValueError``, ``LookupError``: that is not known.
+    """
+    return str(json.loads((tree.parent / "record.json").read_bytes())["endpoint"])
+
+
 def is_public(slot: Slot) -> bool:
     """Whether a stored snapshot was once to be had without a login."""
     text = _record_of(slot)

@@ -241,6 +241,7 @@ class _Handler(BaseHTTPRequestHandler):
             "private": False,
             "gated": repository.gated,
             "disabled": False,
+            "lastModified": "2024-05-31T12:00:00.000Z",
             "downloads": 0,
             "likes": 0,
         }

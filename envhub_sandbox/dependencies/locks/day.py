@@ -20,8 +20,10 @@ from envhub_sandbox.errors import (
     PolicyError,
     RemoteEnvError,
 )
-from envhub_sandbox.hub import registered
+from envhub_sandbox.hub import registered, store
 from envhub_sandbox.hub.answers import HubFailure
+from envhub_sandbox.hub.grammar import REPO_TYPES
+from envhub_sandbox.hub.listing import Repository
 from envhub_sandbox.hub.snapshot import Snapshot
 from envhub_sandbox.settings.options import option_name
 
@@ -79,7 +81,7 @@ def written(snapshot: Snapshot) -> str:
             found = _of_files(snapshot)
         elif snapshot.repo_type == registered.KIND:
             found = _of_release(snapshot)
-        else:
+        elif snapshot.repo_type in REPO_TYPES:
             found = _of_commit(snapshot)
     return found if re.fullmatch(_DAY, found) else ""
 
@@ -126,8 +128,8 @@ def _of_release(snapshot: Snapshot) -> str:
 
 
 def _of_commit(snapshot: Snapshot) -> str:
-    from envhub_sandbox.hub.client import HubClient, checked_endpoint
-    from envhub_sandbox.hub.listing import Repository
+    from envhub_sandbox.hub.client import HubClient
 
     repo = Repository(snapshot.repo_type, snapshot.repo_id)
-    return HubClient(checked_endpoint(None)).changed(repo, snapshot.commit)
+    # only where it is from: the name of a private repository is nobody else's
+    return HubClient(store.endpoint_of(snapshot.root)).changed(repo, snapshot.commit)

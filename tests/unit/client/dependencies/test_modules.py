@@ -12,14 +12,15 @@ import pytest
 from envhub_sandbox.dependencies import interpreters, resolutions
 from envhub_sandbox.dependencies import resolve as resolving
 from envhub_sandbox.dependencies.interpreters import Interpreter
-from envhub_sandbox.dependencies.locks.day import of_its_day
+from envhub_sandbox.dependencies.locks.day import of_its_day, written
 from envhub_sandbox.dependencies.modules import MissingModule, guessed, note_missing
 from envhub_sandbox.dependencies.packages import packages_for
 from envhub_sandbox.dependencies.request import AUTO, DECLARED, PackageRequest, chosen, request_of
 from envhub_sandbox.dependencies.resolve import Lock, Target
 from envhub_sandbox.errors import DependencyError, PolicyError, load_error, remote_error
-from envhub_sandbox.hub.snapshot import Snapshot, local
+from envhub_sandbox.hub.snapshot import Snapshot, local, snapshot_named
 from envhub_sandbox.hub.sources import parsing
+from tests.hub.stub_hub import StubHub
 from tests.support import inside
 from tests.support.packages.refusals import refused_dependency
 from tests.support.packages.wheels import Index, make_wheel
@@ -159,6 +160,21 @@ def test_a_release_that_took_names_away_is_named(tmp_path: Path) -> None:
     said = "'AutoResetWrapper' has been renamed with `wrappers.Autoreset`"
     error.__cause__ = remote_error("AttributeError", "AttributeError", said, "")
     assert "{'exclude_newer': '2020-09-13'}" in of_its_day(found, error)
+
+
+def test_the_day_of_a_commit_is_asked_where_it_is_from(
+    stub_hub: StubHub, hub_cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A private repository's name goes to no other Hub, and a git address to none."""
+    with StubHub() as everybody:
+        monkeypatch.setenv("HF_ENDPOINT", everybody.endpoint)
+        stub_hub.add("org/repo", {"env.py": MAKE})
+        found = snapshot_named(
+            "org/repo", hub_cache_dir=hub_cache, endpoint=stub_hub.endpoint, token=False
+        )
+        assert written(found) == "2024-05-31"
+        assert written(replace(found, repo_type="git")) == ""
+        assert not [asked for asked in everybody.requests if "repo" in asked]
 
 
 def test_a_guess_never_stands_in_the_way(
