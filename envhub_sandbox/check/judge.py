@@ -233,7 +233,7 @@ class _Judge:
         """The latest of a few days whose packages cure an error of a start, where there is one."""
         if not self._is_here or self._arguments.get("dependencies", "auto") != "auto":
             return ""
-        found = ""
+        said = ""
         for day in days_for(self._snapshot, error):
             self._asked.tell(f"loading it with packages of {day}")
             try:
@@ -241,9 +241,10 @@ class _Judge:
                     suite, task = self._asked.tasks(suites)[0]
                     suites[suite][task].reset(seed=self._asked.seed)
             except EnvHubError:
-                break
-            found = option_name("dependencies", {"exclude_newer": day})
-        return f"\nIt starts with {found}, which a lock can keep" if found else ""
+                return said or f"\nIt does not start with packages of {day} either"
+            older = option_name("dependencies", {"exclude_newer": day})
+            said = f"\nIt starts with {older}, which a lock can keep"
+        return said
 
     def _denied(self, denied: Iterable[str] | None, task: str = "") -> None:
         """What a jail was refused, where that was recorded."""
