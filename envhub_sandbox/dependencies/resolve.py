@@ -25,6 +25,14 @@ from envhub_sandbox.settings.options import option_name
 WORKERS = ("cloudpickle>=3", "gymnasium>=0.26", "msgpack>=1.0.5", "numpy>=1.21")
 """What the worker's jails import besides: the repository's versions must be among these.
 Gymnasium and numpy may be older in a jail than outside."""
+_WORKERS_SINCE = {
+    "cloudpickle": "2023-11-01",
+    "gymnasium": "2022-11-01",
+    "gymnasium-notices": "2022-11-01",
+    "msgpack": "2023-11-01",
+    "numpy": "2021-12-31",
+}
+"""From when on there are such versions, with wheels: no earlier date counts for these packages."""
 _RESOLVE_S = 600.0
 _TORCH = ("torch", "torchvision", "torchaudio")
 _CPU_INDEX = ("--torch-backend", "cpu")
@@ -142,7 +150,7 @@ def _compiled(
         [
             *("pip", "compile", "-", "--no-header", "--no-annotate"),
             *(*target.options, *index.options(), *words),
-            *(("--exclude-newer", request.exclude_newer) if request.exclude_newer else ()),
+            *_exclude_newer(request),
             *(word for pair in named.items() for word in pair),
         ],
         what=f"no versions of the packages could be chosen for {target}",
@@ -159,6 +167,16 @@ def _compiled(
             _raise_refusal(ask)
         what = _what_is_required(str(error), [*every, *request.constraints, *request.override])
         raise DependencyError(f"{error}\n{what}", reason="resolution") from error
+
+
+def _exclude_newer(request: PackageRequest) -> Iterator[str]:
+    """The date of a request, for uv, and later ones for what the worker cannot have older."""
+    if not request.exclude_newer:
+        return
+    yield f"--exclude-newer={request.exclude_newer}"
+    for name, day in _WORKERS_SINCE.items():
+        if request.runs_worker and request.exclude_newer < day:
+            yield f"--exclude-newer-package={name}={day}"
 
 
 def _raise_refusal(ask: Callable[..., str]) -> None:

@@ -225,10 +225,20 @@ def test_no_password_of_an_index_is_in_an_error(
     assert "hidden" not in f"{caught.value} {caplog.text}"
 
 
-def test_only_what_uploads_before_a_date(index: Index) -> None:
-    """The index gives no times here, so that nothing is old enough."""
+def test_only_what_was_uploaded_before_a_date(
+    index: Index, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of the repository's packages; the worker's may be as new as it needs them, and no newer."""
+    wheels = [make_wheel(index.folder, "ages", version) for version in ("1.0", "2.0")]
+    make_wheel(index.folder, "cloudpickle", "99.0")
+    days = {path.name: "2020-01-01" for path in index.folder.iterdir()}
+    days[f"cloudpickle-{WORKERS['cloudpickle']}-py3-none-any.whl"] = "2023-10-16"
+    days |= {"cloudpickle-99.0-py3-none-any.whl": "2025-01-01", wheels[1].name: "2023-02-01"}
+    monkeypatch.setattr(index, "uploaded", days)
+    found = resolve("ages", exclude_newer="2023-01-05").packages
+    assert {"ages==1.0", f"cloudpickle=={WORKERS['cloudpickle']}"} <= set(found)
     with pytest.raises(DependencyError):
-        resolve("numpy", exclude_newer="2020-01-01")
+        resolve("ages", exclude_newer="2019-12-31")
 
 
 def test_no_setting_of_the_working_directory_counts(
