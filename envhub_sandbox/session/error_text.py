@@ -101,8 +101,8 @@ _HUB = (
 _INSTALL = r"\b(pip|pip3|uv|conda)\b[^\n]{0,80}\b(install|add|sync)\b"
 _REQUIREMENT = (
     r"(?<![\w.-])[A-Za-z0-9](?:[\w.-]{0,98}[A-Za-z0-9])?(?:\[[\w.,-]{1,99}\])?"
-    r"(?:[<>=!~]=?[\w.*,<>=!~]{0,98}[\w*])?(?![\w+:/@])"
-)
+    r"(?:[<>=!~][\w.*,<>=!~]{0,99}[\w*])?(?![\w+:/@])"
+)  # read in one way only: in two, what a list of them costs doubles with each
 _COMMAND = (
     r"(?P<quote>[`'\"]?)(?:python3? -m )?\b(?:pip3?|uv(?: pip)?|conda) (?:install|add) "
     rf"(?:(?:-U|-q|--upgrade|--quiet|--user|-y) )*['\"]?(?P<first>{_REQUIREMENT})['\"]?"

@@ -207,6 +207,7 @@ def advised(kind: str, message: str, network: str = "none") -> str:
         ),
         ("ImportError", "run `pip3 install -U a b[c]>=2` now", "{'extra': ['a', 'b[c]>=2']}"),
         ("ImportError", "pip install git+https://x/y", "{'extra': ['PACKAGE']}"),
+        ("ImportError", "`pip install " + "a==1 " * 64, "{'extra': ['a==1']}"),  # not in 2**64 ways
         ("EOFError", "EOF when reading a line", "policy={'environment': {'NAME': 'VALUE'}}"),
         ("ImportError", "('Unable to load OpenGL library', 'OSMesa: cannot open')", "libosmesa6"),
         ("AttributeError", "'NoneType' object has no attribute 'glGetError'", "libosmesa6"),
