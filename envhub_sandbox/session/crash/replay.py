@@ -12,6 +12,7 @@ from envhub_sandbox.session.crash.bundle_reader import Bundle
 from envhub_sandbox.session.crash.bundle_writer import death_of
 from envhub_worker.protocol import messages as m
 
+_SHOWN = 64
 _UNFIT = (ActionError, TypeError, ValueError)
 """What another environment than it was raises before it is asked."""
 
@@ -104,7 +105,8 @@ def _set_random(env: Any, message: m.SetRandom) -> None:
 def _ask_own(env: Any, message: m.GetOwn | m.CallOwn) -> None:
     """Ask about the repository's vector environment itself: no name is looked up in the proxy."""
     call = (message.args, message.kwargs) if isinstance(message, m.CallOwn) else ()
-    env._requests.ask_own(message.name, type(message), message.name, *call)
+    operation = f"env.{message.name[:_SHOWN]}"  # which is no reset or step of all
+    env._requests.ask_own(operation, type(message), message.name, *call)
 
 
 def _ask_one(env: Any, message: m.GetOne | m.CallOne) -> None:

@@ -282,7 +282,10 @@ def test_a_replay_asks_the_same(tmp_path: Path) -> None:
 
 
 def test_a_bundle_cannot_call_the_proxy_itself(tmp_path: Path) -> None:
-    """A name is the jail's business alone; so is a sub-environment, of those that there are."""
+    """A name is the jail's business alone; so is a sub-environment, of those that there are.
+
+    Nor is a name what is asked: a call of ``reset`` is no reset of all of them.
+    """
     folder = bundle(tmp_path)
     calls: list[m.Message] = [
         *(m.CallOwn(0, "close", (), {}), m.GetOwn(0, "__dict__")),
@@ -299,8 +302,8 @@ def test_a_bundle_cannot_call_the_proxy_itself(tmp_path: Path) -> None:
     assert asked == []
     own, one = env.requests.ask_own.call_args_list, env.requests.ask_one.call_args_list
     assert [call.args for call in own] == [
-        ("close", m.CallOwn, "close", (), {}),
-        ("__dict__", m.GetOwn, "__dict__"),
+        ("env.close", m.CallOwn, "close", (), {}),
+        ("env.__dict__", m.GetOwn, "__dict__"),
     ]
     [[name, index, message_for]] = [call.args for call in one]
     assert (name, index) == ("__setattr__", 1)
