@@ -9,7 +9,7 @@ import contextlib
 import os
 import re
 from dataclasses import replace
-from datetime import datetime, timedelta, timezone
+from datetime import date, datetime, timedelta, timezone
 from pathlib import Path
 
 from envhub_sandbox.dependencies.request import AS_WRITTEN, Choice
@@ -37,7 +37,6 @@ _BROKEN_BY = {
     r"module 'numpy' has no attribute '(bool|complex|float|int|object|str)'": "numpy<1.24",
 }
 """What a date may not cure, since the release was there already: by what is said then."""
-_DAY = r"\d{4}-\d{2}-\d{2}"
 _RECENT = timedelta(days=30)
 _MOST_DATES, _MOST_TEXT = 4, 65_536
 
@@ -83,7 +82,8 @@ def written(snapshot: Snapshot) -> str:
             found = _of_release(snapshot)
         elif snapshot.repo_type in REPO_TYPES:
             found = _of_commit(snapshot)
-    return found if re.fullmatch(_DAY, found) else ""
+        return date.fromisoformat(found).isoformat()
+    return ""
 
 
 def days_for(snapshot: Snapshot, error: EnvHubError) -> list[str]:

@@ -12,6 +12,7 @@ import pytest
 from envhub_sandbox.dependencies import interpreters, resolutions
 from envhub_sandbox.dependencies import resolve as resolving
 from envhub_sandbox.dependencies.interpreters import Interpreter
+from envhub_sandbox.dependencies.locks import day
 from envhub_sandbox.dependencies.locks.day import of_its_day, written
 from envhub_sandbox.dependencies.modules import MissingModule, guessed, note_missing
 from envhub_sandbox.dependencies.packages import packages_for
@@ -140,9 +141,11 @@ def test_a_jail_names_few_modules(tmp_path: Path) -> None:
     assert len(requirements(found)) == 5
 
 
-def test_a_release_that_took_names_away_is_named(tmp_path: Path) -> None:
-    """As it is loaded, and not in a later step; a repository of today gets no date, unlike one of
-    years ago.
+def test_a_release_that_took_names_away_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As it is loaded, and not in a later step; a repository of today, or of no day, gets no date,
+    unlike one of years ago.
     """
     found = snapshot(tmp_path / "r", MAKE)
     for text, said in (
@@ -160,6 +163,8 @@ def test_a_release_that_took_names_away_is_named(tmp_path: Path) -> None:
     said = "'AutoResetWrapper' has been renamed with `wrappers.Autoreset`"
     error.__cause__ = remote_error("AttributeError", "AttributeError", said, "")
     assert "{'exclude_newer': '2020-09-13'}" in of_its_day(found, error)
+    monkeypatch.setattr(day, "_of_files", lambda snapshot: "2024-02-30")
+    assert of_its_day(found, error) == ""
 
 
 def test_the_day_of_a_commit_is_asked_where_it_is_from(
