@@ -34,6 +34,8 @@ _WORKERS_SINCE = {
 }
 """From when on there are such versions, with wheels: no earlier date counts for these packages."""
 _RESOLVE_S = 600.0
+MOST_SOURCES = 50
+"""Packages that are built for one request: a repository names them, and each costs a resolution."""
 _TORCH = ("torch", "torchvision", "torchaudio")
 _CPU_INDEX = ("--torch-backend", "cpu")
 _PIN = re.compile(r"([a-z0-9][a-z0-9.-]*)==([A-Za-z0-9.!+_-]+) \\")
@@ -203,7 +205,7 @@ def sources_of(
             break
         except DependencyError as error:  # it names one at a time
             further = set(without_wheels(error)).difference(known)
-            if error.reason != "resolution" or not further:
+            if error.reason != "resolution" or not further or len(known) >= MOST_SOURCES:
                 raise
             known = sorted(further.union(known))
     rows = toml.loads(text, len(text), generated=True).get("packages", [])

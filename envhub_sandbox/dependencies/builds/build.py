@@ -26,7 +26,7 @@ from envhub_sandbox.dependencies.builds.wheels import MAX_BYTES
 from envhub_sandbox.dependencies.declared import Source, parse_requirement
 from envhub_sandbox.dependencies.interpreters import Interpreter
 from envhub_sandbox.dependencies.request import PackageRequest, Tell
-from envhub_sandbox.dependencies.resolve import Lock
+from envhub_sandbox.dependencies.resolve import MOST_SOURCES, Lock
 from envhub_sandbox.errors import DependencyError
 from envhub_sandbox.hub.logins import without_login
 from envhub_sandbox.system.platform import pidfd, program
@@ -102,7 +102,6 @@ def _run(order: Mapping[str, Any], folder: Path) -> dict[str, Any]:
 
 Choose = Callable[[PackageRequest, Interpreter, Tell], Lock]
 _DEEPEST = 8
-_MOST = 50
 _ROUNDS = 3
 """Backends may say what they need besides; once they have it, they may say more."""
 _UNDER_WAY: ContextVar[tuple[str, ...]] = ContextVar("sources that are being built", default=())
@@ -148,9 +147,9 @@ def _under_way(source: Source) -> Iterator[None]:
             f"it in turn ({' <- '.join(chain)})",
             reason="resolution",
         )
-    if next(_BUILDS.get()) > _MOST:
+    if next(_BUILDS.get()) > MOST_SOURCES:
         raise DependencyError(
-            f"{chain[0]} needs more than {_MOST} packages to be built", reason="resolution"
+            f"{chain[0]} needs more than {MOST_SOURCES} packages to be built", reason="resolution"
         )
     token = _UNDER_WAY.set(chain)
     try:

@@ -100,11 +100,17 @@ def test_what_is_named_beside_another_is_built_in_its_turn(
 
 
 def test_two_packages_without_wheels_in_one_file(
-    index: Index, tmp_path: Path, built: list[Source]
+    index: Index, tmp_path: Path, built: list[Source], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """uv names one at a time, and chooses no versions as long as another has none."""
+    """uv names one at a time, and chooses no versions as long as another has none. Each costs a
+    resolution, so there is an end to it, before anything is built.
+    """
     for name in ("only-source", "deeper-source", "third-source"):
         source_distribution(index.folder, name, "1.5", tmp_path / "ran")
+    with monkeypatch.context() as patch, refused_dependency("resolution", match="wheels"):
+        patch.setattr(resolve, "MOST_SOURCES", 1)
+        resolution_for(request("third-source==1.5", "only-source==1.5"))
+    assert not built
     found = resolution_for(request("third-source==1.5", "only-source==1.5")).lock.packages
     assert {"only-source==1.5", "deeper-source==1.5", "third-source==1.5"} <= set(found)
     assert len(built) == len({one.name for one in built})
