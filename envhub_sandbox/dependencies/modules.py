@@ -34,7 +34,7 @@ _FORMAT = 2
 _READ: dict[tuple[Path, str], tuple[tuple[str, str, int], ...]] = {}
 _MOST = 64
 _MOST_NOTED = 4
-"""Of a commit: each costs another environment."""
+"""Modules noted for a commit: each costs another installation."""
 _SHOWN = 20
 _LONGEST = 100
 _MISSING = r"No module named '([\w.]+)'"
@@ -60,8 +60,8 @@ _GYMNASIUM = (
         ("pygame", "gymnasium[toy-text]", "pygame pygame-ce"),
     ),
 )
-"""Environments of Gymnasium's that need an extra of it: by the texts of their ids, and whether they
-are drawn."""
+"""Extras of Gymnasium by patterns of the ids that need them; ``drawn`` follows an id that is made
+with a ``render_mode``."""
 
 
 @dataclass(frozen=True)

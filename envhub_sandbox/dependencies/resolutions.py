@@ -114,7 +114,7 @@ def _chosen(request: PackageRequest, first: Interpreter, refresh: bool, tell: Te
 def _cure(
     request: PackageRequest, error: DependencyError, interpreter: Interpreter
 ) -> dict[str, list[str]] | None:
-    """Keys of ``dependencies`` with which there are versions, as wheels, after all."""
+    """Keys of ``dependencies`` with which a resolution succeeds; None if none is known."""
     for keys in islice(resolve.cures(error), _MOST_CURES):
         with contextlib.suppress(EnvHubError):
             changed = chosen(keys, None)[0]

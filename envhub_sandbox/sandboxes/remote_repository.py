@@ -304,8 +304,8 @@ class UploadedRepository(Sandbox):
     def _check_packages(
         self, order: m.NeedPackages, client: WorkerConnection, deadline: Deadline
     ) -> None:
-        """The server may be a new one, or have needed the room; it may make them again. For a
-        start only the time from the fork of a jail on counts.
+        """Have the server make the packages again, if it is a new one or has removed them. That
+        does not count for the timeout of a start.
         """
         began = time.monotonic()
         deadline.postpone(_MAKE_S)

@@ -333,7 +333,7 @@ class Requests(RequestOrder):
         return Packed(request, sent)
 
     def submit_packed(self, operation: str, packed: Packed) -> None:
-        """The second half, which the caller records; raises as ``submit`` does."""
+        """Send a packed request; the caller records it. Raises as ``submit`` does."""
         with self._sending(operation):
             self._send_packed(operation, packed)
 
@@ -561,8 +561,8 @@ class Requests(RequestOrder):
 
     @contextmanager
     def _sending(self, operation: str) -> Iterator[None]:
-        """Around all that a request needs before its message, and the message: what fails in it
-        because of a ``close`` in another thread says so.
+        """Around the preparation and the sending of a request: an error that a ``close`` in another
+        thread has caused says so.
         """
         try:
             try:

@@ -196,9 +196,9 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
             prewarm.note_use()
 
     def _open_again(self) -> None:
-        """After a ``close`` by LeRobot: another life, with what it is and was told here.
+        """Start again after a ``close``, with the same settings, where it serves LeRobot.
 
-        A fork does not: the place that the next one would start in is its parent's.
+        A fork does not start again: the server that it would use is its parent's.
         """
         if not (self.closed and self._again and self._session.repository.for_lerobot):
             return
@@ -328,7 +328,7 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
         return self._watched(name) if attributes.should_watch(name) else self._called(name)
 
     def _watched(self, name: str) -> tuple[Any, ...]:
-        """Have it watched, or that it is absent: what is raised then is the answer to a call."""
+        """Ask for an attribute, and have its value or its absence watched from now on."""
         attributes = self._requests.attributes
         self._send_call(name, (), {}, for_every_shard(m.Watch, name))
         replies = self._requests.collect(self._timeouts.call_s, m.WatchDone)
@@ -541,8 +541,8 @@ class SandboxVectorEnv(SendRecv, VectorEnv[Any, Any, Any]):
 
 
 def serve_lerobot(env: SandboxVectorEnv) -> None:
-    """Have it be what LeRobot's programs expect: ``reset`` after ``close`` opens it again, as with
-    LeRobot's lazy environments, and ``render_fps`` is an integer.
+    """Do as LeRobot's lazy environments do: ``reset`` after ``close`` opens it again, and
+    ``render_fps`` is an integer.
     """
     env._session.repository.for_lerobot = True
     env.metadata = metadata_of(env._manifest, whole=True)

@@ -109,7 +109,7 @@ def _fits(one: Any, mode: str) -> bool:
 
 _SEEN = ("agent_pos", "environment_state", "pixels")
 _PROCESSED = ("camera_obs", "policy", "robot_state")
-"""What LeRobot's own processors make these of."""
+"""Observation keys from which LeRobot's processors make those that its policies see."""
 _LONGEST = 100
 
 

@@ -102,7 +102,7 @@ Resolve = Callable[["str | Sandbox"], Sandbox]
 
 
 def _key(entry: str | Sandbox) -> str | int:
-    """By what an entry of the list is known again."""
+    """What identifies an entry of the list."""
     return entry if isinstance(entry, str) else id(entry)
 
 

@@ -32,7 +32,7 @@ MAX_FILE_BYTES = 64 << 20
 MAX_DOCUMENT_BYTES = 16 << 20
 """``bundle.json``: an empty list takes two bytes there, and forty times as much in memory."""
 _MAX_WISHES = 4000
-"""Characters: what is cut off would be granted unseen."""
+"""Characters; a longer line is refused, because a shortened one would hide what is granted."""
 _MAX_DOUBTS = 8
 _OF_POLICY = ("profile", "network", "display", "readable", "gpu", "environment", "limits")
 _OF_MAKE_ENV = (
@@ -195,7 +195,7 @@ def _texts(mapping: dict[str, Any]) -> dict[str, str]:
 
 
 def wishes(bundle: Bundle) -> str:
-    """What a replay uses of this machine, in a line: for the user, before it is a stranger's.
+    """What a replay of a stranger's bundle would use of this machine, in a line for the user.
     Raises ``BundleError``: it is too long to be shown whole.
     """
     policy = _chosen(bundle.arguments.get("policy"), _OF_POLICY)

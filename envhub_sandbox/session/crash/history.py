@@ -47,12 +47,12 @@ class History(Recorder):
         self.started()
 
     def started(self) -> None:
-        """See ``Recorder``: what was asked of another jail is of no concern."""
+        """See ``Recorder``: requests to the former jail are forgotten."""
         self.complete = True
         self._begin(())
 
     def revived(self) -> None:
-        """See ``Recorder``: what was asked before, only some sub-environments still know."""
+        """See ``Recorder``: a replay is not exact, as only some processes had earlier requests."""
         self.complete = self.complete and not self._log
         self._begin(())
 

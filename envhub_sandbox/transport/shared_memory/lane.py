@@ -35,7 +35,7 @@ BY_SERVER = ""
 _BULKY = frozenset({"render"})
 """What hardly ever fits the slabs."""
 _BATCHES = frozenset({STEP, "reset"})
-"""What a batch comes back from, for which there is a slot."""
+"""Operations that return a batch of observations, which goes into a slot."""
 
 
 class RunnerGoneError(Exception):
@@ -109,7 +109,7 @@ class SharedMemoryLane(Lane):
         return lane if lane.agree(deadline) else None
 
     def agree(self, deadline: Deadline) -> bool:
-        """Whether all runners take it; else it is closed."""
+        """Whether all runners attach the slabs; if one refuses, the lane is closed."""
         agreed = False
         try:
             agreed = self._attach(range(len(self.shards)), deadline)
@@ -335,7 +335,7 @@ class SharedMemoryLane(Lane):
         self._spin.measured(self.elapsed_ns)
 
     def _wait_or_say_why(self, deadline: Deadline) -> None:
-        """The same; raises why a runner has ended."""
+        """``_wait_for_all``; raises the reason if a runner has ended."""
         try:
             self._wait_for_all(deadline)
         except RunnerGoneError:

@@ -165,7 +165,7 @@ class Lane:
         return slabs.DONE, written
 
     def leave_slot(self) -> None:
-        """The next batch comes another way: do not write where somebody may hold one."""
+        """The next batch is sent as a message: no longer write into the slot, which may be held."""
 
     def _change(self) -> None:
         self._spin_ns = self._asked[slabs.SPIN]

@@ -289,11 +289,11 @@ class Incoming(Generic[F]):
 
 
 class IrregularError(Exception):
-    """There is no form for this."""
+    """A value, or a document, that no form can be made of."""
 
 
 class _Tensor:
-    """In place of a tensor, while a form is made."""
+    """Stands for a tensor while a form is made."""
 
     def __init__(self, array: Array, name: str) -> None:
         self.array, self.name = array, name
@@ -323,7 +323,7 @@ def _maker(value: Any, notes: Any, arrays: list[tuple[Any, str | None]]) -> Make
 
 
 def _part(item: Any, notes: Any, arrays: list[tuple[Any, str | None]]) -> tuple[Any, Make | None]:
-    """What is constant, or what makes it anew: an array must not be kept with a form."""
+    """A constant and None, or None and a maker of fresh values: no form keeps an array."""
     make = _maker(item, notes, arrays)
     return (item if make is None else None), make
 
