@@ -191,8 +191,8 @@ def parse_requirement(text: str, where: str) -> WantedPackage:
     except (InvalidRequirement, RecursionError) as error:
         raise _unsupported(
             f"{where} is {text[:200]!r}. Only plain requirements such as 'numpy>=2' are supported, "
-            "with or without hashes: options, links, paths and files can run code during the "
-            f"installation. {_advice()}"
+            "with or without hashes, and 'NAME @ git+https://HOST/PATH@REVISION': other options, "
+            f"links, paths and files can run code during the installation. {_advice()}"
         ) from error
     if requirement.url is not None and of_git(requirement, where) is None:
         raise _unsupported(

@@ -9,6 +9,7 @@ import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from datetime import date
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -164,7 +165,11 @@ def _date(given: object) -> str | None:
     if given is None:
         return None
     text = given if isinstance(given, str) else getattr(given, "isoformat", lambda: "")()
-    if text != AS_WRITTEN and not re.fullmatch(DATE, text):
+    try:
+        is_date = re.fullmatch(DATE, text) and date.fromisoformat(text[:10])
+    except ValueError:  # of no calendar
+        is_date = None
+    if text != AS_WRITTEN and not is_date:
         raise PolicyError(
             f"exclude_newer in dependencies is {given!r}; it takes a date such as '2026-01-31', or "
             f"{AS_WRITTEN!r} for the day of the repository's commit, release or newest file"

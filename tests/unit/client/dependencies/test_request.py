@@ -76,6 +76,7 @@ def test_what_the_caller_says(tmp_path: Path) -> None:
         {"fetch_python": 1},
         *({"python": "soon"}, {"python": 3.11}, {"exclude_newer": "yesterday"}),
         *({"exclude_newer": "2026-01-01 --index-url=x"}, {"exclude_newer": 2026}),
+        {"exclude_newer": "2026-02-31"},
     ],
 )
 def test_what_nobody_could_have_meant_is_refused(wrong: Any) -> None:
