@@ -194,7 +194,7 @@ def note_missing(snapshot: Snapshot, said: str) -> bool:
 
     module = found[1][:_LONGEST] if (found := re.search(_MISSING, said)) else ""
     known = read(snapshot)
-    names = {name.partition(".")[0] for name, _, _ in known}
+    names = _WORKERS.union(name.partition(".")[0] for name, _, _ in known)
     noted = sum(line == 0 for _, _, line in known)
     if not of_module(module) or module.partition(".")[0] in names or noted >= _MOST_NOTED:
         return False
