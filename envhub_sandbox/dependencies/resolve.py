@@ -30,9 +30,9 @@ _WORKERS_SINCE = {
     "gymnasium": "2022-11-01",
     "gymnasium-notices": "2022-11-01",
     "msgpack": "2023-11-01",
-    "numpy": "2021-12-31",
+    "numpy": "2022-10-01",
 }
-"""From when on there are such versions, with wheels: no earlier date counts for these packages."""
+"""From when on there are such versions, with wheels for Python 3.11: no earlier date counts."""
 _RESOLVE_S = 600.0
 MOST_SOURCES = 50
 """Packages that are built for one request: a repository names them, and each costs a resolution."""
