@@ -149,7 +149,7 @@ def test_the_pages_before_internals_are_few_enough_to_read() -> None:
 
 def links(text: str) -> Iterator[str]:
     """The targets of all links that stay in the project."""
-    for target in re.findall(r"\]\(([^)\s]+)\)", text):
+    for target in re.findall(r'(?:\]\(|srcset=")([^)"\s]+)[)"]', text):
         if not target.startswith(("http://", "https://", "mailto:")):
             yield target
 
