@@ -87,7 +87,8 @@ def load_bundle(folder: Path) -> Bundle:
     try:
         document = json.loads(_read(folder, "bundle.json", MAX_DOCUMENT_BYTES))
         if type(document) is not dict or document.get("format") != FORMAT:
-            raise BundleError(f"it is not of format {FORMAT}")
+            reads = f"this release reads format {FORMAT}"
+            raise BundleError(f"{reads}; replay others with the release that wrote them")
         return _bundle(folder, document)
     except _UNREADABLE as error:
         raise BundleError(f"{folder} cannot be read as a crash bundle: {error}") from error
