@@ -33,7 +33,7 @@ _READ_AS = {
     "--metrics 9090": "--metrics $ADDRESS:9090",
     "/etc/envhub-worker/clients": "clients",
     "/var/lib/envhub-worker": "$XDG_STATE_HOME/envhub-worker",
-    "<server.pub>": '"$(cat "$XDG_STATE_HOME/envhub-worker/server.pub")"',
+    ' KEY"': ' $(cat "$XDG_STATE_HOME/envhub-worker/server.pub")"',
     '"tcp://$ADDRESS:5555 <what the server printed>"': 'f"tcp://{ADDRESS}:5555 {PRINTED}"',
 }
 # What Python has from the blocks before it, and from what was printed.
