@@ -56,6 +56,7 @@ def main(stream: socket.socket, spec: JailSpec, fds: list[int]) -> int:
     poller = select.poll()
     poller.register(stream, select.POLLIN)
     timeout: int | None = None
+    bell: int | None = None  # that is registered: of the lane, until the client has closed its end
     while True:
         ready = [fd for fd, _ in poller.poll(timeout)]
         lane = runner.lane
@@ -63,10 +64,14 @@ def main(stream: socket.socket, spec: JailSpec, fds: list[int]) -> int:
             if not _serve(stream, reader, runner):
                 return 0
             if runner.lane is not lane and runner.lane is not None:
-                poller.register(runner.lane.bell, select.POLLIN)
-        elif lane is not None and ready:
+                if bell is not None:  # where another runner refused, the client tries another lane
+                    poller.unregister(bell)
+                bell = runner.lane.bell
+                poller.register(bell, select.POLLIN)
+        elif lane is not None and bell is not None and ready:
             if not lane.wake():
-                poller.unregister(lane.bell)
+                poller.unregister(bell)
+                bell = None
         elif lane is not None:
             lane.serve()
         # a request may cross with our going to sleep: look again soon, once
