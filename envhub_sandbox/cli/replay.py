@@ -73,6 +73,8 @@ def replay(
         )
     for doubt in loaded.doubts:
         show("not exact", doubt, "yellow", stderr=True)
+    if (died_in := loaded.arguments.get("sandbox", "process")) != sandbox:
+        show("sandbox", f"it died in {died_in}; this is {sandbox}", "yellow", stderr=True)
     options = bundle_reader.replayed_arguments(loaded) | {**given, "sandbox": sandbox}
     if "profile" in given:
         options["policy"] |= {"profile": options.pop("profile")}
