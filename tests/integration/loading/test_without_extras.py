@@ -12,7 +12,7 @@ import pytest
 
 from tests.support.samples import sample
 from tests.unit.docs.test_extras import extra_of
-from tests.unit.docs.test_imports import modules
+from tests.unit.docs.test_imports import folder, modules
 
 _COMMAND = "from envhub_sandbox.cli.app import app; app()"
 _CALLS = """
@@ -45,12 +45,12 @@ _RECORD = ["policy", {"record_denials": True}]
 
 
 @pytest.fixture(scope="module")
-def core(checkout: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def core(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with both packages, without the modules of extras."""
     root = tmp_path_factory.mktemp("core")
-    for package in (checkout / "envhub_sandbox", checkout / "worker" / "envhub_worker"):
+    for package in ("envhub_sandbox", "envhub_worker"):
         ignored = shutil.ignore_patterns("__pycache__")
-        shutil.copytree(package, root / package.name, ignore=ignored)
+        shutil.copytree(folder(package), root / package, ignore=ignored)
     kept = {name for name in modules() if extra_of(name) is None}
     kept |= {name[:end] for name in kept for end in range(len(name)) if name[end] == "."}
     for name in modules().keys() - kept:
