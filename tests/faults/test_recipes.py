@@ -52,7 +52,7 @@ def test_options_and_tasks_travel() -> None:
         assert one.num_envs == 3
         assert inside.repository(one).timeouts.step_s == 12.5
         assert inside.repository(one).policy.restart == "on_reset"
-        assert inside.repository(one).lane == "frames"
+        assert inside.repository(one).policy.lane == "frames"
         assert inside.manifest(one).task == 1
         one.close()
 

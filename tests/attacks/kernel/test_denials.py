@@ -295,7 +295,7 @@ def test_files_that_are_asked_for_are_told(tmp_path: Path) -> None:
 
 _ENDINGS = {
     "raises": ("raise RuntimeError('it failed')", LoadError, ""),
-    "wants more": ("import nothing_of_this_name", DependencyError, ""),
+    "wants more": ("import nothing_of_this_name", DependencyError, "module"),
     "is killed": ("os.kill(os.getpid(), 9)", WorkerDiedError, "signal"),
     "crashes": ("ctypes.string_at(0)", WorkerDiedError, "signal"),
     "breaks the rules": (
